@@ -31,6 +31,7 @@ from clear_strategies.errors import SettingError, of_hydra, one_line
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.objective import Objective
+from clear_strategies.merging.skips import Skips
 from clear_strategies.schedules import REFERENCE_ITERATIONS, scaled
 from clear_strategies.settings import CHANGES_NO_RESULT, TARGET, build, with_defaults
 from clear_strategies.strategies.base import Strategy
@@ -56,6 +57,7 @@ class ConductorSettings:
     """
 
     objective: Objective
+    skips: Skips = field(default_factory=Skips)
     strategies: Mapping[str, Strategy] = field(default_factory=dict)
     decorators: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
     statistics_from: int | None = signature(Conductor).parameters["statistics_from"].default
@@ -72,6 +74,7 @@ class ConductorSettings:
         return Conductor(
             *(scaled(strategy, stretch) for strategy in self.strategies.values()),
             objective=scaled(self.objective, stretch),
+            skips=scaled(self.skips, stretch),
             statistics_from=None if self.statistics_from is None else round(self.statistics_from * stretch),
             decorators=tuple(self.decorators.values()),
             detail=detail,
@@ -102,7 +105,7 @@ def conductor(
 
 
 # Options for runs and hosts, such as readings=literal, set these as well; a host has its own, but for the rates of f_det.
-_TRAINERS: Final = ("optim", "skips", "data")
+_TRAINERS: Final = ("optim", "data")
 
 
 def _detail(config: DictConfig) -> DetailRates:

@@ -6,7 +6,7 @@ Used by `rasterizers.warp_backend` and by the Warp kernels in `clear_strategies.
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import torch
@@ -65,6 +65,19 @@ def _descriptor() -> Any:
     import warp as wp
 
     return type(wp.from_torch(torch.empty(1, device="cpu"), return_ctype=True))
+
+
+@lru_cache(maxsize=4096)
+def structure(owner: str, kind: Any, fields: tuple[tuple[str, int, int], ...], device: str) -> Any:
+    """A Warp structure of float32 arrays given by (name, address, length), cached because describing a tensor to Warp takes longer
+    than launching a kernel. `owner` keeps structures over the same addresses apart. A launch copies the structure.
+    """
+    import warp as wp
+
+    out = kind()
+    for name, address, length in fields:
+        setattr(out, name, wp.array(ptr=address, dtype=wp.float32, shape=(length,), device=device))
+    return out
 
 
 def on_stream(device: torch.device) -> AbstractContextManager[Any]:

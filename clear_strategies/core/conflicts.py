@@ -60,11 +60,13 @@ class GradientColumns:
         return Products(dot, l2, torch.mul(self.hr, self.hr, out=work) @ self.member)
 
     def minus(self, multiple: Float[Tensor, "N G"], like: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """h - multiple · l by group, each with the shape and type of `like`. This object's `hr` is the result, in float64."""
+        """The difference h - multiple · l by group, with the shapes and the type of `like`. It takes the place of `hr`."""
         corrected = self.hr.sub_((multiple @ self.member.T).mul_(self.lr))
         widths = [like[name].shape[1:].numel() for name in self.names]
-        parts = corrected.to(like[self.names[0]].dtype).split(widths, 1)
-        return {name: part.view(like[name].shape).to(like[name].dtype) for name, part in zip(self.names, parts, strict=True)}
+        parts = corrected.to(like[self.names[0]].dtype).split_with_sizes(widths, 1)
+        return {
+            name: part.view(like[name].shape).to(like[name].dtype) for name, part in zip(self.names, parts, strict=True)
+        }
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -102,7 +102,6 @@ class _Training:
             density=scaled(settings.density, stretch),
             rates=scaled(settings.optim, stretch).of_run(settings.fit.iterations),
             mip=scaled(settings.mip, stretch),
-            skips=scaled(settings.skips, stretch),
             near=place.drawing.near,
         )
         resume.resume(state, source, self.folder, self.compared)

@@ -18,7 +18,6 @@ from clear_strategies.training.densifier import DensifierSettings
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
 from clear_strategies.training.settings import FitSettings
-from clear_strategies.training.skips import Skips
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,7 +76,6 @@ class JobSettings(ConductorSettings):
     data: scene.DataSettings
     density: DensifierSettings
     optim: LearningRates
-    skips: Skips
     fit: RunSettings = field(default_factory=RunSettings)
     mip: MipFilter = field(default_factory=MipFilter)
     method: str | None = None

@@ -23,6 +23,7 @@ from clear_strategies.errors import StrategyConflict
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.iteration import HrGradients, Merged, Stepper, Update, require_finite_parts
 from clear_strategies.merging.objective import Losses, Objective
+from clear_strategies.merging.skips import SkipPolicy, Skips
 from clear_strategies.strategies.base import ScreenGradients, Strategy, by_class, overrides
 from rasterizers.interface import Color
 
@@ -43,8 +44,11 @@ class Conductor:
             as soon as λ_HR > 0 (F11).
         decorators: each takes a prior and returns one, e.g. `BackProjected`; `prior` applies them in this order.
         detail: the rates of f_det, for hosts.
+        skips: work that is left out; None: only what changes nothing.
 
     Attributes:
+        skips: which work of the run is left out.
+        regularizers: the strategies that override `regularize`.
         decorated: whether `prior` has been called, or there are no decorators.
 
     Raises:
@@ -53,12 +57,13 @@ class Conductor:
 
     def __init__(
         self, *strategies: Strategy, objective: Objective | None = None, statistics_from: int | None = 500,
-        decorators: Sequence[Callable[[Any], Any]] = (), detail: DetailRates | None = None,
+        decorators: Sequence[Callable[[Any], Any]] = (), detail: DetailRates | None = None, skips: Skips | None = None,
     ) -> None:  # fmt: skip
         self.strategies = strategies
         self.objective = objective if objective is not None else Objective()
         self.statistics_from = statistics_from
         self.decorators, self.detail = tuple(decorators), detail if detail is not None else DetailRates()
+        self.skips = SkipPolicy(skips)
         self.decorated = not self.decorators
         self.work_log = WorkLog()
         self._owner = dict.fromkeys(_ONE_ANSWER, Strategy())  # its hooks hold where no strategy overrides them
@@ -72,7 +77,7 @@ class Conductor:
                 )
             if owners:
                 self._owner[hook] = owners[0]
-        self._regularizers = [s for s in strategies if overrides(s, "regularize")]
+        self.regularizers = [s for s in strategies if overrides(s, "regularize")]
         others = ("regularize", "extra_views", "may_densify", "after_step")
         for s in strategies:
             if not any(overrides(s, hook) for hook in (*_ONE_ANSWER, *others)):
@@ -192,9 +197,15 @@ class Conductor:
         losses = {} if from_hr is None else from_hr.losses
         return Update(step, grads, score, ordinary, conflict, {**l_lr.values, **losses}, self.logs())
 
-    def hr_gradients(self, hr: Shot, view: View, t: int) -> HrGradients[Grads]:
-        """Compare Î_HR with the SR image, backpropagate both losses in one pass, and ask for the evidence."""
-        return self._backward_hr(hr, Step(t, view, hr.visible), _vjp)[1]
+    def hr_gradients(
+        self, hr: Shot, view: View, t: int, vjp: Callable[[Any, Tensor], Sequence[Any]] | None = None
+    ) -> HrGradients[Any]:
+        """Compare Î_HR with the SR image, backpropagate both losses in one pass, and ask for the evidence.
+
+        Args:
+            vjp: maps a shot and K cotangents to K gradients, each with `.screen`; None: `Shot.vjp`.
+        """
+        return self._backward_hr(hr, Step(t, view, hr.visible), vjp or _vjp)[1]
 
     def extra_views(self, t: int) -> list[ExtraView]:
         """The pictures that the field should match at t besides the view; each gets a step on `extra_loss`."""
@@ -224,18 +235,28 @@ class Conductor:
         """
         if hr is None:
             return Merged(g_lr + self._regularize(params, t))
-        λ, λ_hf = self.objective.lambda_hr(t), self.objective.lambda_hf
-        g_hf = None if hr.hf is None else hr.hf * hr.m * λ_hf  # m ∇L_HF        Eq. 12
+        g_hf = None if hr.hf is None else hr.hf * hr.m * self.objective.lambda_hf  # m ∇L_HF        Eq. 12
         g_hr = (hr.base if g_hf is None else hr.base + g_hf).without_detail()  # g^HR           Eq. 13
-        g_lr = g_lr.without_detail()
+        detail = None if g_hf is None else g_hf.get("detail")  # f_det: never corrected, never from L_base
+        return self.merge_routed(params, g_lr, g_hr, detail, hr.step, t)
+
+    def merge_routed(
+        self, params: Mapping[str, Tensor], g_lr: Grads, g_hr: Grads, detail: Tensor | None, step: Step, t: int
+    ) -> Merged:
+        """The merge after routing.
+
+        Args:
+            g_hr: g^HR of Eq. 13. detail: m λ_HF ∇L_HF of f_det; None: it has none.
+        """
+        λ, g_lr = self.objective.lambda_hr(t), g_lr.without_detail()
         conflict: Mapping[str, Number] = {}
         corrected = g_hr
         if λ > 0:
             conflict = conflict_ratio(g_lr, g_hr)  # before correction
-            corrected = self._owner["correct"].correct(g_lr, g_hr, hr.step)  # ĝ^HR           Eq. 6, 7, 11
+            corrected = self._owner["correct"].correct(g_lr, g_hr, step)  # ĝ^HR           Eq. 6, 7, 11
         g = g_lr + corrected * λ  # Eq. 8
-        if g_hf is not None and "detail" in g_hf:
-            g["detail"] = g_hf["detail"] * λ  # f_det: never corrected, never from L_base
+        if detail is not None:
+            g["detail"] = detail * λ
         return Merged(g + self._regularize(params, t), g_hr, corrected, conflict)  # Eq. 16
 
     def scores(
@@ -327,7 +348,7 @@ class Conductor:
 
     def _regularize(self, params: Mapping[str, Tensor], t: int) -> Grads:
         total = Grads()
-        for s in self._regularizers:
+        for s in self.regularizers:
             g = s.regularize(params, t)
             if g is None:
                 self.work_log.skip("regularize", "no anchor yet")

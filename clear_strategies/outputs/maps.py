@@ -26,8 +26,8 @@ from torch import Tensor
 
 from clear_strategies import files
 from clear_strategies.core import images
-from clear_strategies.core.evidence import PatchMaps
 from clear_strategies.core.conflicts import GradientColumns
+from clear_strategies.core.evidence import PatchMaps
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
@@ -150,7 +150,9 @@ def _compare(lr: Grads, hr: Grads, corrected: Grads | None) -> tuple[dict[str, T
     numbers = {}
     if corrected is not None:
         step = corrected + hr * -1.0
-        share = (GradientColumns.of(step, step).products().l2.sum(1) / hr2.clamp_min(torch.finfo(hr2.dtype).tiny)).sqrt()
+        share = (
+            GradientColumns.of(step, step).products().l2.sum(1) / hr2.clamp_min(torch.finfo(hr2.dtype).tiny)
+        ).sqrt()
         numbers["corrected"] = torch.where(compared, share.clamp(0, 1), 0.0)
     numbers["conflict"] = ((dot < 0) & compared).to(dot)
     return numbers, compared

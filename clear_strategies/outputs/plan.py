@@ -103,7 +103,7 @@ def _skipped(state: TrainState) -> list[str]:
         skipped.append(f"HR scale until iteration {hr.start} (lambda_HR = 0)")
     if state.mip.variance == 0:
         skipped.append("3D filter (variance 0)")
-    return skipped + state.skip_policy.descriptions(state.views)
+    return skipped + state.conductor.skips.descriptions(state.views)
 
 
 def _warn_of_idle_strategies(conductor: Conductor, iterations: int) -> None:

@@ -8,9 +8,9 @@ correct, score.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import torch
 from jaxtyping import Float, Int
@@ -24,7 +24,10 @@ from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, View
 from rasterizers.interface import Color
 
-_DEVICE = "device"
+_DEVICE: Final = "device"
+
+# A hook that compiled passes compute, and the fact that states it as data.
+_STATED_BY: Final = {"correct": "correction_rule", "regularize": "anchor"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,6 +227,15 @@ def describes(strategy: Strategy, fact: str) -> bool:
     return stated_by is not Strategy and all(
         getattr(cls, name) is method for name, method in _methods(stated_by).items()
     )
+
+
+def not_stated_as_data(strategies: Sequence[Strategy]) -> Iterator[str]:
+    """Why these strategies have no compiled merge: a sentence for each of them that computes what it does not state as data."""
+    for s in strategies:
+        if any(overrides(s, hook) and not describes(s, fact) for hook, fact in _STATED_BY.items()):
+            yield f"{type(s).__name__} does not state its arithmetic as data"
+    if sum(overrides(s, "regularize") for s in strategies) > 1:
+        yield "more than one strategy regularizes"
 
 
 def _methods(cls: type) -> dict[str, Any]:

@@ -23,7 +23,9 @@ from clear_strategies.core.step import Step
 from clear_strategies.kernels import merge
 from clear_strategies.strategies.base import Strategy
 
-_AT_LOWER_BOUND: Final = "omega_at_lower_bound"  # the column of their share of the corrections: near 1, the prior agrees with LR
+_AT_LOWER_BOUND: Final = (
+    "omega_at_lower_bound"  # the column of their share of the corrections: near 1, the prior agrees with LR
+)
 _SCALES: Final = CONFLICT_GROUPS.index("scales")
 _QUATS: Final = CONFLICT_GROUPS.index("quats")
 _TINY: Final = torch.finfo(torch.float64).tiny

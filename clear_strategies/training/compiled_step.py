@@ -28,7 +28,7 @@ from clear_strategies.kernels import gaussian_step as kernel
 from clear_strategies.kernels.gaussian_step import cpp
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrGradients
-from clear_strategies.strategies.base import Strategy, describes, overrides
+from clear_strategies.strategies.base import Strategy, not_stated_as_data, overrides
 from clear_strategies.training.field import LOG_SCALE_LIMIT, LOGIT_LIMIT, Activation, FieldShot
 from clear_strategies.training.optim import BETA1, BETA2, Adam
 from rasterizers.interface import BackendUnavailable, SplatGradients
@@ -42,8 +42,6 @@ FusedMode = Literal["auto", "off"]
 GaussianPass = Callable[..., kernel.GaussianStep]
 """`gaussian_step.cpp.CppGaussianStep`, or another class of its signature."""
 
-# A hook that the pass computes, and the fact that states it as data.
-_STATED_BY: Final = {"correct": "correction_rule", "regularize": "anchor"}
 _LIMITS: Final = {"opacities": LOGIT_LIMIT, "scales": LOG_SCALE_LIMIT}
 
 
@@ -52,18 +50,14 @@ def compiled_step_for(conductor: Conductor, optimizer: Adam, mode: FusedMode = "
     reason = next(_why_not(conductor, optimizer, mode), None)
     if reason is None:
         return CompiledStep(conductor, optimizer)
-    _log.debug("The per-Gaussian step takes the readable path: %s.", reason)
+    _log.info("The per-Gaussian step takes the readable path, which is several times slower: %s.", reason)
     return None
 
 
 def _why_not(conductor: Conductor, optimizer: Adam, mode: FusedMode) -> Iterator[str]:
     if mode == "off":
         yield "fit.fused=off"
-    for s in conductor.strategies:
-        if any(overrides(s, hook) and not describes(s, fact) for hook, fact in _STATED_BY.items()):
-            yield f"{type(s).__name__} does not state its arithmetic as data"
-    if sum(overrides(s, "regularize") for s in conductor.strategies) > 1:
-        yield "more than one strategy regularizes"
+    yield from not_stated_as_data(conductor.strategies)
     for thing, base in ((conductor, Conductor), (optimizer, Adam)):
         if type(thing) is not base:
             yield f"{type(thing).__name__} may compute something else than {base.__name__}"

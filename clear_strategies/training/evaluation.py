@@ -41,7 +41,7 @@ def loss_of_views(state: TrainState, rasterizer: Rasterizer) -> Number:
     objective, losses = state.conductor.objective, []
     for view in state.views[:_VIEWS_OF_LOSS]:
         if objective.lambda_hr(state.t) > 0:
-            shown = state.skip_policy.view(view, state.t).hr
+            shown = state.conductor.skips.view(view, state.t).hr
             compare, name = objective.hr, "base"
         else:
             shown, compare, name = view.lr, objective.lr, "lr"

@@ -23,11 +23,11 @@ from clear_strategies.core.view import ExtraView, View
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DivergedError
 from clear_strategies.merging.iteration import Update
+from clear_strategies.merging.skips import PLATEAU_LOSS
 from clear_strategies.training import checkpoint
 from clear_strategies.training.clock import Clock
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
 from clear_strategies.training.signals import Interrupted, deferred_signals, foremost
-from clear_strategies.training.skips import PLATEAU_LOSS
 from clear_strategies.training.state import TrainState
 from rasterizers import native
 from rasterizers.interface import Rasterizer, over
@@ -40,9 +40,9 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     """One iteration, in the paper's order."""
     t, θ, conductor, stage = s.t, s.field, s.conductor, s.conductor.work_log.stage
     θ.degree = min(s.settings.max_degree, (t - 1) // max(1, s.settings.degree_every))
-    view = s.skip_policy.view(view_at(s), t)
+    view = conductor.skips.view(view_at(s), t)
     hr_due = conductor.wants_hr(t)
-    scales = {"lr": conductor.wants_lr and s.skip_policy.lr_due(view, hr_due, conductor.work_log), "hr": hr_due}
+    scales = {"lr": conductor.wants_lr and conductor.skips.lr_due(view, hr_due, conductor.work_log), "hr": hr_due}
     over_color = over(rasterizer, conductor.background(t))
     z = conductor.gate(t, len(θ))  # zᵗ             Eq. 15       SVS
     with stage(f"render {' + '.join(scale.upper() for scale, wanted in scales.items() if wanted)}"):
@@ -63,7 +63,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
             s.refilter()
     low = images.area_mean(finest.image, view.factor) if lr is None else lr.image
     s.history.append(_row(s, u, low, view) | extra)
-    if s.skip_policy.measured(t) and not (restructured or s.reset_due(t)):
+    if s.conductor.skips.measured(t) and not (restructured or s.reset_due(t)):
         with stage("training views drawn whole"):
             s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)
     s.advance()

@@ -26,7 +26,6 @@ from clear_strategies.training.history import History
 from clear_strategies.training.mip import NEAR, MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
 from clear_strategies.training.settings import FitSettings
-from clear_strategies.training.skips import SkipPolicy, Skips
 
 _log = logging.getLogger(__name__)
 
@@ -52,7 +51,6 @@ class TrainState:
     t: int = 1
     history: History = field(default_factory=History)
     compiled_step: CompiledStep | None = None
-    skip_policy: SkipPolicy = field(default_factory=SkipPolicy)
 
     @classmethod
     def start(
@@ -64,13 +62,12 @@ class TrainState:
         density: DensifierSettings,
         rates: LearningRates,
         mip: MipFilter,
-        skips: Skips | None = None,
         near: float = NEAR,
     ) -> TrainState:
         """The state before the first iteration, on the device of the scene's views.
 
         Args:
-            settings, density, rates, mip, skips: with milestones already scaled to this run.
+            settings, density, rates, mip: with milestones already scaled to this run.
             density: replaced where a strategy brings a densifier.
             near: of the rasterizer that draws.
         """
@@ -88,7 +85,6 @@ class TrainState:
         conductor.on_fit_start(len(scene.train), settings.seed, device, scene.train)
         state = cls(theta, conductor, optimizer, densifier, settings, mip, scene.train, near)
         state.compiled_step = compiled_step_for(conductor, optimizer, settings.fused)
-        state.skip_policy = SkipPolicy(skips)
         state.refilter()
         return state
 
@@ -113,9 +109,9 @@ class TrainState:
     def advance(self) -> None:
         """Go to the next iteration, or from a plateau of the training views straight to its end."""
         done, self.t = self.t, self.t + 1
-        if not self.skip_policy.settled(self.history, done):
+        if not self.conductor.skips.settled(self.history, done):
             return
-        s = self.skip_policy.skips
+        s = self.conductor.skips.skips
         reason = f"the training views' loss fell by less than {s.plateau_gain:.1%} in {s.plateau_window} iterations"
         self.t = min(s.plateau_to, self.settings.iterations) + 1
         left_out = self.t - done - 1

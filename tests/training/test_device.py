@@ -23,7 +23,7 @@ from clear_strategies.core.gradients import Grads
 from clear_strategies.density.mcmc import MCMC, Sampler
 from clear_strategies.training import checkpoint
 from clear_strategies.training.loop import iterate
-from clear_strategies.training.skips import SkipPolicy, Skips
+from clear_strategies.merging.skips import SkipPolicy, Skips
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Rendering, SplatGradients, Traits
 from tests.helpers import toy
@@ -123,7 +123,7 @@ def on_meta(monkeypatch, names: tuple[str, ...]) -> TrainState:
     state = start(names)
     cache_evidence(state)
     state.compiled_step = None
-    state.skip_policy = SkipPolicy(COARSE)
+    state.conductor.skips = SkipPolicy(COARSE)
     # Statistics are gathered; a round reads, and does not come.
     state.density.settings = replace(state.density.settings, start=90, stop=100, statistics_from=1)
     return state
@@ -161,7 +161,7 @@ def splatsure(state: TrainState) -> None:
     state.conductor.on_fit_start(len(SCENE.train), 0, "meta")
     for view in state.views:  # whose poses are sent once
         state.conductor.strategies[0]._pose(view.name, view.lr.camera)
-    state.skip_policy = SkipPolicy()
+    state.conductor.skips = SkipPolicy()
 
 
 def clamped(state: TrainState) -> None:
@@ -225,7 +225,7 @@ def test_every_tensor_is_made_where_the_field_lies_and_late_numbers_are_the_same
 
     def begun() -> TrainState:
         state = start(names)
-        state.skip_policy, state.compiled_step = SkipPolicy(COARSE), None
+        state.conductor.skips, state.compiled_step = SkipPolicy(COARSE), None
         state.conductor.objective = replace(state.conductor.objective, kernels="torch")
         return state
 

@@ -16,7 +16,7 @@ from clear_strategies.schedules import Ramp, WarmupDecay, scaled
 from clear_strategies.strategies.svs import SVS
 from clear_strategies.training.evaluation import loss_of_views
 from clear_strategies.training.loop import fit, iterate
-from clear_strategies.training.skips import PLATEAU_LOSS, SkipPolicy, Skips
+from clear_strategies.merging.skips import PLATEAU_LOSS, SkipPolicy, Skips
 from tests.helpers import toy
 from tests.helpers.short_run import ITERATIONS, start
 
@@ -101,7 +101,7 @@ def test_what_raises_the_measured_loss_is_no_plateau():
     state.density.settings = replace(state.density.settings, start=11)
     hr = WarmupDecay(start=8, full=9, decay_from=14, end=ITERATIONS)
     state.conductor = Conductor(objective=Objective(lambda_hr=hr))
-    state.skip_policy = SkipPolicy(
+    state.conductor.skips = SkipPolicy(
         Skips(coarse_until=10, plateau_gain=1e-9, plateau_window=1, plateau_from=7, plateau_to=14)
     )
     fit(state, toy.scene(), toy.RASTERIZER)
@@ -124,7 +124,7 @@ def test_every_milestone_stretches_with_the_run():
 def test_a_plateau_is_left_out_and_the_run_has_its_end(caplog):
     state = start(("gco",))
     state.density.settings = replace(state.density.settings, stop=0)  # a change of structure is no plateau
-    state.skip_policy = SkipPolicy(Skips(plateau_gain=0.99, plateau_window=2, plateau_from=6, plateau_to=17))
+    state.conductor.skips = SkipPolicy(Skips(plateau_gain=0.99, plateau_window=2, plateau_from=6, plateau_to=17))
     with caplog.at_level("DEBUG"):
         fit(state, toy.scene(), toy.RASTERIZER)
     assert [int(row["t"]) for row in state.history] == [*range(1, 9), 18, 19, 20]
@@ -135,10 +135,10 @@ def test_a_plateau_is_left_out_and_the_run_has_its_end(caplog):
 
 def test_one_render_serves_both_scales_while_they_have_one_size():
     state = start(("gco", "p2g"))
-    state.skip_policy = SkipPolicy(Skips(coarse_until=12))
+    state.conductor.skips = SkipPolicy(Skips(coarse_until=12))
     state.views = [replace(view, hr=view.hr.reduced(2), truth=None) for view in state.views]  # SR by two
     assert not state.field.detail.any()  # so that both scales have one image
-    view, objective = state.skip_policy.view(state.views[0], 5), Objective(lambda_hr=WarmupDecay(start=0, full=1))
+    view, objective = state.conductor.skips.view(state.views[0], 5), Objective(lambda_hr=WarmupDecay(start=0, full=1))
     lr, hr = state.field.render_scales(toy.RASTERIZER, view)
     of_one, of_two = (Conductor(objective=objective).update(state.field.raw(), low, hr, view, 5) for low in (None, lr))
     assert of_one.losses == of_two.losses

@@ -2,8 +2,8 @@
 
     out = before + scale (g_LR + λ_HR ĝ_HR + stiffness (θ - θ^a))                                    Eq. 7, 8, 16
 
-`merging.conductor.Conductor.merge` and `strategies.gco.GCO.correct_in_torch` specify it. `cpp` runs on the CPU, `warp` on CUDA; both
-have the source of the decisions in common with the per-Gaussian step of this package's trainer.
+`merging.conductor.Conductor.merge` and `strategies.gco.GCO.correct_in_torch` specify it. `cpp` runs on the CPU, `warp` on
+CUDA; both share the source of the decisions with the per-Gaussian step of this package's trainer.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -62,6 +62,7 @@ class Merged(NamedTuple):
     finite: Number
 
 
+@runtime_checkable
 class Merge(Protocol):
     """Merges the attributes, and writes `out` of each."""
 

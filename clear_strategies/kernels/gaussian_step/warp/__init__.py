@@ -1,6 +1,6 @@
 """The per-Gaussian step in Warp, for CUDA; the same kernels run on a CPU, to check them.
 
-Counts stay on the device: `Comparison` and `StepCounts` hold tensors, int64 for counts and float64 for sums. Importing this
+Counts stay on the device: `StepCounts` holds tensors, int64 for counts and float64 for sums. Importing this
 package imports Warp; call `rasterizers.warp_runtime.require_warp` first.
 """
 
@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 from typing import Any, Final
 
 import torch
 import warp as wp
 from torch import Tensor
 
-from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule
-from clear_strategies.kernels.gaussian_step import Attribute, Comparison, StepCounts, StepSettings
+from clear_strategies.core.compiled_rules import CorrectionRule
+from clear_strategies.core.conflicts import ConflictCounts
+from clear_strategies.kernels.gaussian_step import Attribute, StepCounts, StepSettings
 from clear_strategies.kernels.gaussian_step.warp import adam, conflict, passes, raw_gradients
-from rasterizers.warp_runtime import array, on_stream
+from rasterizers.warp_runtime import array, on_stream, structure
 
 LANES: Final = {"cuda": 128, "cpu": 1}
 """Threads per block; on a CPU, Warp's blocks have one."""
@@ -28,7 +28,7 @@ _WIDTHS: Final = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "sh0": 3,
 
 
 class WarpGaussianStep:
-    """The gradients of one view's losses, as the rasterizer returns them, and the two passes over them.
+    """The gradients of one view's losses, as the rasterizer returns them, and the pass over them.
 
     Args:
         activation, lr, base, hf: as for `cpp.CppGaussianStep`, all on one device.
@@ -69,19 +69,13 @@ class WarpGaussianStep:
             view,
         )
 
-    def compare(self) -> Comparison:
-        if self._n and not self._has_base:
-            raise ValueError("there is no HR gradient to compare with.")
-        counts = self._blocks(passes.Counts, torch.int32)
-        with on_stream(self._like.device):
-            self._launch_tiled(passes.compare, *self._gradients, array(counts, passes.Counts))
-        return Comparison(*counts.sum(0).view(2, -1))
-
     def step(
         self, attributes: Mapping[str, Attribute], rule: CorrectionRule | None, q: Tensor | None, settings: StepSettings
     ) -> StepCounts:
         if self._n and rule is not None and not self._has_base:
             raise ValueError("there is no HR gradient to correct.")
+        if q is not None:
+            self._required("reliability", q, 1)
         parameters = {name: self._attribute(name, attributes[name], width) for name, width in _WIDTHS.items()}
         bands = self._attribute("shN", attributes["shN"], math.prod(attributes["shN"].p.shape[1:]))
         least, most = 3 * (self._bases - 1), min(bands.width, 45)
@@ -95,7 +89,7 @@ class WarpGaussianStep:
         adam_step = _adam(settings)
         with on_stream(self._like.device):
             self._launch_tiled(
-                passes.step, *self._gradients, self._rule(rule, q), array(q), _options(rule is not None, settings),
+                passes.step, *self._gradients, conflict.rule_of(rule, q), array(q), _options(self._has_base and settings.lambda_hr > 0, rule is not None, settings),
                 adam_step, *parameters.values(), bands, array(colours), array(moving),
                 array(counts, passes.Counts), array(omegas, conflict.Six),
             )  # fmt: skip
@@ -106,8 +100,13 @@ class WarpGaussianStep:
                     array(moving), adam_step, bands,
                 ],
             )  # fmt: skip
-        corrected, at_lower_bound, (still, _) = torch.split(counts.sum(0), [_GROUPS, _GROUPS, 2])
-        return StepCounts(corrected, omegas.sum(0), at_lower_bound, still if settings.skips else 0)
+        comparable, opposed, corrected, at_lower_bound, (still,) = counts.sum(0).split_with_sizes(
+            [_GROUPS + 1, _GROUPS + 1, _GROUPS, _GROUPS, 1]
+        )
+        conflicts = ConflictCounts(
+            *(x.unbind() for x in (comparable, opposed, corrected, omegas.sum(0), at_lower_bound))
+        )
+        return StepCounts(conflicts, still if settings.skips else 0)
 
     @property
     def _lanes(self) -> int:
@@ -136,17 +135,6 @@ class WarpGaussianStep:
         out.stiffness, out.rate, out.keep, out.limit = a.stiffness, -a.rate, a.keep, a.limit
         return out
 
-    def _rule(self, rule: CorrectionRule | None, q: Tensor | None) -> Any:
-        out = conflict.Rule()
-        if rule is None:
-            return out
-        out.groups = sum(on << k for k, on in enumerate(rule.corrects))
-        out.tolerance, out.weight_min, out.weight_max = rule.tolerance, rule.weight_min, rule.weight_max
-        out.rotation_noise, out.has_reliability = ROTATION_NOISE, q is not None
-        if q is not None:
-            self._required("reliability", q, 1)
-        return out
-
     def _rows(
         self,
         owner: str,
@@ -161,7 +149,7 @@ class WarpGaussianStep:
             for name, width in widths.items()
             if name not in optional or tensors[name] is not None
         )
-        return _structure(owner, kind, fields, str(self._like.device))
+        return structure(owner, kind, fields, str(self._like.device))
 
     def _required(self, name: str, tensor: Tensor | None, width: int) -> Tensor:
         """The tensor, if it has a row of `width` numbers for each Gaussian."""
@@ -174,21 +162,10 @@ class WarpGaussianStep:
         return tensor
 
 
-@lru_cache(maxsize=4096)
-def _structure(owner: str, kind: Any, fields: tuple[tuple[str, int, int], ...], device: str) -> Any:
-    """A structure of arrays given by (name, address, length), cached because describing a tensor to Warp takes longer than
-    launching a kernel. `owner` keeps structures over the same addresses apart. A launch copies the structure.
-    """
-    out = kind()
-    for name, address, length in fields:
-        setattr(out, name, wp.array(ptr=address, dtype=wp.float32, shape=(length,), device=device))
-    return out
-
-
-def _options(corrects: bool, settings: StepSettings) -> Any:
+def _options(compares: bool, corrects: bool, settings: StepSettings) -> Any:
     out = passes.StepOptions()
     out.lambda_hr, out.skips, out.width = settings.lambda_hr, settings.skips, settings.width
-    out.corrects = corrects
+    out.compares, out.corrects = compares, corrects
     return out
 
 

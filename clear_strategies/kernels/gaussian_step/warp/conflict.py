@@ -9,7 +9,9 @@ from __future__ import annotations
 from typing import Any, Final
 
 import warp as wp
+from torch import Tensor
 
+from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule
 from clear_strategies.kernels.gaussian_step.warp.raw_gradients import Gradient, RawGradient, View, basis_products
 
 GROUPS: Final = wp.constant(6)
@@ -44,6 +46,16 @@ class Rule:
     weight_max: wp.float64
     rotation_noise: wp.float64  # a ‖g_quats‖ up to this times ‖g_scales‖ counts as rounding
     has_reliability: wp.bool  # else q = 0
+
+
+def rule_of(rule: CorrectionRule | None, q: Tensor | None) -> Any:
+    """The rule as kernels take it; None: nothing is corrected."""
+    out = Rule()
+    if rule is not None:
+        out.groups = sum(on << k for k, on in enumerate(rule.corrects))
+        out.tolerance, out.weight_min, out.weight_max = rule.tolerance, rule.weight_min, rule.weight_max
+        out.rotation_noise, out.has_reliability = ROTATION_NOISE, q is not None
+    return out
 
 
 @wp.struct

@@ -1,7 +1,7 @@
-"""The kernels of the two passes: `compare` counts conflicts; `step` merges, corrects, adds the anchor's gradient and applies
-Adam, and `step_bands` does this for the rows of shN.
+"""The kernels of the step: `step` counts conflicts, merges, corrects, adds the anchor's gradient and applies Adam, and `step_bands`
+does this for the rows of shN.
 
-`compare` and `step` use one thread per Gaussian. `step_bands` uses one per number, because shN has three quarters of all
+`step` uses one thread per Gaussian. `step_bands` uses one per number, because shN has three quarters of all
 numbers and neighbouring threads then access neighbouring memory. `step` passes it a table of colours: the merged gradient
 of shN is Y ⊗ colour.
 
@@ -38,10 +38,8 @@ from clear_strategies.kernels.gaussian_step.warp.raw_gradients import Activation
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-Counts: Final[Any] = wp.types.vector(length=14, dtype=wp.int32)
-"""For `compare`: comparable and opposed Gaussians, [7] each. For `step`: rows corrected, and with ω at its lower bound, [6]
-each; then still rows.
-"""
+Counts: Final[Any] = wp.types.vector(length=27, dtype=wp.int32)
+"""Comparable and opposed Gaussians, [7] each; rows corrected, and with ω at its lower bound, [6] each; still rows."""
 
 
 @wp.struct
@@ -49,29 +47,10 @@ class StepOptions:
     """The settings of a step other than Adam's."""
 
     lambda_hr: wp.float32
+    compares: wp.bool
     corrects: wp.bool
     skips: wp.bool  # skip rows that would not change
     width: wp.int32  # numbers of an shN row that are stepped
-
-
-@wp.kernel
-def compare(
-    activation: Activation, lr: Gradient, base: Gradient, hf: Gradient, view: View, counts: wp.array[Counts]
-) -> None:
-    """One thread per Gaussian: whether its gradients are comparable and opposed."""
-    block, lane = wp.tid()
-    i = block * wp.block_dim() + lane
-    conflicts = Counts()
-    if i < view.n:
-        g_lr, g_hr, _ = load(activation, lr, base, hf, view, i)
-        p = group_products(g_lr, g_hr, lr, base, view, i)
-        for k in range(GROUPS + 1):
-            comparable = p.l2[k] > wp.float64(0.0) and p.h2[k] > wp.float64(0.0)
-            if comparable:
-                conflicts[k] = 1
-                if p.dot[k] < wp.float64(0.0):
-                    conflicts[GROUPS + 1 + k] = 1
-    wp.tile_store(counts, wp.tile_sum(wp.tile(conflicts, preserve_type=True)), offset=(block,))
 
 
 @wp.kernel
@@ -109,10 +88,16 @@ def step(
     still = still and is_still(means, i, 3) and is_still(quats, i, 4) and is_still(scales, i, 3)
     still = still and is_still(opacities, i, 1) and is_still(sh0, i, 3) and is_still(detail, i, 3)
     still = still and is_still(shN, i, options.width)
-    change = Corrected()
-    if options.corrects:
+    change, tally = Corrected(), Counts()
+    if options.compares:
         products = group_products(g_lr, g_hr, lr, base, view, i)
-        change = correct(products, rule, reliability, i)
+        for k in range(GROUPS + 1):
+            if products.l2[k] > wp.float64(0.0) and products.h2[k] > wp.float64(0.0):
+                tally[k] = 1
+                if products.dot[k] < wp.float64(0.0):
+                    tally[GROUPS + 1 + k] = 1
+        if options.corrects:
+            change = correct(products, rule, reliability, i)
 
     moves, λ = not still, options.lambda_hr
     d_means = merged3(g_lr.means, g_hr.means, change.multiple[MEANS], λ)
@@ -126,14 +111,14 @@ def step(
     if not view.one_basis:
         rgb_lr, rgb_hr = corrected3(g_lr.rgb, g_lr.rgb, change.multiple[SHN] * wp.float64(λ)), g_hr.rgb * λ
 
-    tally, omega = Counts(), Six()
-    if at < view.n:
-        omega = change.omega
-        for k in range(GROUPS):
-            tally[k] = (change.rows >> k) & 1
-            tally[GROUPS + k] = (change.at_lower_bound >> k) & 1
-        if still:
-            tally[2 * GROUPS] = 1
+    omega = change.omega
+    for k in range(GROUPS):
+        tally[2 * (GROUPS + 1) + k] = (change.rows >> k) & 1
+        tally[2 * (GROUPS + 1) + GROUPS + k] = (change.at_lower_bound >> k) & 1
+    if still:
+        tally[2 * (GROUPS + 1) + 2 * GROUPS] = 1
+    if at >= view.n:
+        tally, omega = Counts(), Six()
     wp.tile_store(counts, wp.tile_sum(wp.tile(tally, preserve_type=True)), offset=(block,))
     wp.tile_store(omegas, wp.tile_sum(wp.tile(omega, preserve_type=True)), offset=(block,))
     if at >= view.n:

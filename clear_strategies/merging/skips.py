@@ -59,18 +59,24 @@ class SkipPolicy:
         self.skips = skips if skips is not None else Skips()
         self._coarse: dict[str, View] = {}
 
-    def descriptions(self, views: Sequence[View]) -> list[str]:
-        """A phrase for each skip that is on, for the plan; a warning for one that has no effect."""
+    def descriptions(self, views: Sequence[View], *, in_host: bool = False) -> list[str]:
+        """A phrase for each skip that is on, for the plan; a warning for one that has no effect.
+
+        Args:
+            in_host: the iterations are a host's, so that none is left out.
+        """
         s, phrases = self.skips, []
         if s.coarse_until > 0 and not any(map(_halves, views)):
             _log.warning("skips.coarse_until has no effect: SR images are halved where data.views.sr_scale is even.")
         elif s.coarse_until > 0:
             phrases.append(f"HR at half its size until iteration {s.coarse_until}")
-        if s.plateau_gain > 0 and s.plateau_window == 0:
+        if in_host or s.plateau_gain == 0:
+            return phrases
+        if s.plateau_window == 0:
             _log.warning(
                 "skips.plateau_gain has no effect: plateau_window is less than an iteration of so short a run."
             )
-        elif s.plateau_gain > 0:
+        else:
             phrases.append(
                 f"the iterations until {s.plateau_to} once {s.plateau_window} iterations gain less than {s.plateau_gain:.1%}"
             )

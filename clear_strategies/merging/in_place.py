@@ -1,0 +1,185 @@
+"""The merge for trainers that have their own optimizer: their gradients become the merged ones, in place.
+
+One compiled pass over the Gaussians where the strategies state their arithmetic as data (`CorrectionRule`, `Anchor`), and
+`Conductor.merge` where they do not, or where nothing is compiled for the gradients' type and device. Both give the same within
+rounding; tests/merging/test_in_place.py compares them.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.core.compiled_rules import Anchor, CorrectionRule
+from clear_strategies.core.deferred import Number
+from clear_strategies.core.finite import require_finite
+from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads
+from clear_strategies.core.step import Step
+from clear_strategies.kernels import merge as kernel
+from clear_strategies.kernels.merge import Colour, Rows
+from clear_strategies.merging.conductor import Conductor
+from clear_strategies.strategies.base import not_stated_as_data
+
+_log = logging.getLogger(__name__)
+_HALF: Final = (torch.float16, torch.bfloat16)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RoutedGradients:
+    """g^HR of one view after routing, of the raw parameters.  Eq. 12, 13
+
+    Args:
+        grads: by attribute, without f_det, and without sh0 and shN where `colour` has them.
+        colour: the gradient of sh0 and shN as its factors, for shN of as many bands as the basis has, or more.
+        detail: m λ_HF ∇L_HF of f_det; None: there is no f_det, or no L_HF.
+    """
+
+    grads: Mapping[str, Tensor]
+    step: Step
+    colour: Colour | None = None
+    detail: Float[Tensor, "N 3"] | None = None
+    losses: Mapping[str, Number] = field(default_factory=dict)
+
+    def dense(self, like: Mapping[str, Tensor]) -> Grads:
+        """Every attribute with as many numbers as its parameter in `like`."""
+        g = Grads(self.grads)
+        if self.colour is not None:
+            rgb, Y = self.colour.rgb[:, None, :], self.colour.basis[..., None]
+            bands = like["shN"].shape[1]
+            shN = Y[:, 1 : bands + 1] * rgb
+            g["sh0"] = Y[:, :1] * rgb
+            g["shN"] = torch.cat((shN, shN.new_zeros(len(shN), bands - shN.shape[1], 3)), 1)
+        if self.detail is not None:
+            g["detail"] = self.detail
+        return Grads({name: value.view(like[name].shape) for name, value in g.items() if name in like})
+
+
+class InPlaceMerge:
+    """Merges in place for one conductor.
+
+    Attributes:
+        compiled: whether the strategies allow the compiled pass; the reason is logged where they do not.
+    """
+
+    def __init__(self, conductor: Conductor) -> None:
+        self.conductor = conductor
+        reason = next(_why_not(conductor), None)
+        if reason is not None:
+            _log.info("The merge takes the readable path, which is several times slower: %s.", reason)
+        self.compiled = reason is None
+        corrector = conductor.owner("correct")
+        self._rule: CorrectionRule | None = None if corrector is None else corrector.correction_rule()
+        self._regularizers = conductor.regularizers
+
+    def __call__(
+        self,
+        params: Mapping[str, Tensor],
+        hr: RoutedGradients | None,
+        t: int,
+        *,
+        before: Mapping[str, Tensor],
+        scale: float = 1.0,
+        must_be_finite: bool = True,
+    ) -> Mapping[str, Number]:
+        """Turn `.grad` of the parameters, before + scale · ∇(λ_LR L_LR), into before + scale · the merged gradient.
+
+        Args:
+            params: the leaves by gsplat's names; those without `.grad` are frozen and stay so, but for "detail".
+            before: `.grad` as it was when the backward pass began, by name, where it was there.
+            scale: of the loss: an AMP gradient scaler's, or 1 / the number of accumulated passes.
+
+        Returns:
+            The conflict ratios by group, before correction; {} without HR.
+
+        Raises:
+            DivergedError: a merged gradient in the CPU's memory is not finite, and `must_be_finite`: False for a trainer with an
+                AMP gradient scaler, which skips such a step.
+        """
+        trained = {name: p for name, p in params.items() if p.grad is not None or name == "detail"}
+        whole = [
+            p for p in trained.values() if p.dtype not in _HALF
+        ]  # half precision is merged in float32, float64 is not
+        merge = kernel.compiled(whole) if self.compiled and whole else None
+        if merge is None:
+            return self._merge_readably(trained, hr, t, before, scale)
+        λ = 0.0 if hr is None else self.conductor.objective.lambda_hr(t)
+        anchor = self._anchor(len(next(iter(trained.values()))))
+        rows = {name: self._rows(name, p, hr, before.get(name), anchor) for name, p in trained.items()}
+        rule = self._rule if λ > 0 else None
+        evidence = None if hr is None else hr.step.evidence
+        counts, finite = merge(
+            rows, rule, None if evidence is None else evidence.reliability, colour=None if hr is None else hr.colour,
+            lambda_hr=λ, scale=scale,
+        )  # fmt: skip
+        for name, p in trained.items():
+            _give(p, rows[name].out)
+        if must_be_finite and not finite and isinstance(finite, bool):
+            require_finite(f"t={t}: the merged gradient", {name: row.out for name, row in rows.items()})
+        if λ == 0:
+            return {}
+        groups = [group for group in CONFLICT_GROUPS if group in trained]
+        if rule is not None:
+            rule.report(counts, groups, evidence is not None)
+        return counts.ratios(groups)
+
+    def _rows(self, name: str, p: Tensor, hr: RoutedGradients | None, before: Tensor | None, anchor: Anchor) -> Rows:
+        lr = None if p.grad is None or name == "detail" else p.grad.detach().float().contiguous()
+        g_hr = None if hr is None else hr.detail if name == "detail" else hr.grads.get(name)
+        target = anchor.targets.get(name)
+        return Rows(
+            torch.empty_like(p, dtype=torch.float32, memory_format=torch.contiguous_format) if lr is None else lr,
+            lr,
+            None if before is None else before.float().contiguous(),
+            None if g_hr is None else g_hr.float().contiguous(),
+            None if target is None else p.detach().float().contiguous(),
+            target,
+            anchor.stiffness.get(name, 0.0),
+        )
+
+    def _anchor(self, n: int) -> Anchor:
+        anchor = self._regularizers[0].anchor(n) if self._regularizers else None
+        if self._regularizers and anchor is None:
+            self.conductor.work_log.skip("regularize", "no anchor yet")
+        return anchor or Anchor({}, {})
+
+    def _merge_readably(
+        self, trained: Mapping[str, Tensor], hr: RoutedGradients | None, t: int, before: Mapping[str, Tensor], scale: float
+    ) -> Mapping[str, Number]:  # fmt: skip
+        g_lr = Grads()
+        for name, p in trained.items():
+            if p.grad is not None and name != "detail":
+                new = p.grad - before[name] if name in before else p.grad
+                g_lr[name] = new if scale == 1 else new * (1 / scale)
+        values = {name: p.detach() for name, p in trained.items()}
+        if hr is None:
+            merged = self.conductor.merge(values, g_lr, None, t)
+        else:
+            dense = hr.dense(trained)
+            detail = dense.pop("detail", None)
+            merged = self.conductor.merge_routed(values, g_lr, dense, detail, hr.step, t)
+        for name, p in trained.items():
+            # Without HR the gradient of f_det is 0 and not None, so that its Adam counts every step.
+            g = merged.grads[name] if name in merged.grads else torch.zeros_like(p)
+            g = g if scale == 1 else g * scale
+            _give(p, g + before[name] if name in before else g)
+        return merged.conflict
+
+
+def _why_not(conductor: Conductor) -> Iterator[str]:
+    yield from not_stated_as_data(conductor.strategies)
+    if type(conductor) is not Conductor:
+        yield f"{type(conductor).__name__} may merge in another way than Conductor"
+
+
+def _give(p: Tensor, gradient: Tensor) -> None:
+    """Make a gradient that of a parameter, in the tensor that holds it already where there is one."""
+    if p.grad is None:
+        p.grad = gradient.to(p.dtype)
+    elif p.grad.data_ptr() != gradient.data_ptr() or p.grad.dtype != gradient.dtype:
+        p.grad.copy_(gradient)
