@@ -48,9 +48,6 @@ class Elsewhere:
             if x is not None:
                 x.copy_(self.there.pop(id(x))[1])
 
-    def compare(self):
-        return self.passes.compare()
-
     def step(self, attributes, rule, q, step):
         def brought(thing):
             return thing and replace(thing, **{f.name: self.bring(getattr(thing, f.name)) for f in fields(thing)})

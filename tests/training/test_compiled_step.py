@@ -269,8 +269,6 @@ def test_wrong_tensors_are_refused_at_the_border(passes):
         passes(drawn, {"basis": lr["basis"]}, None, None, 0.2)
     with pytest.raises(ValueError, match="hf needs base"):
         passes(drawn, lr, None, lr, 0.2)
-    with pytest.raises(ValueError, match="no HR gradient"):
-        passes(drawn, lr, None, None, 0.2).compare()
 
 
 def test_thirty_iterations_are_those_of_the_readable_path(passes):

@@ -26,11 +26,13 @@ from clear_strategies.kernels.gaussian_step.warp.conflict import (
     SH0,
     SHN,
     Corrected,
+    Counts,
     Products,
     Rule,
     Seven,
     Six,
     correct,
+    counted,
     rule_of,
 )
 from rasterizers.warp_runtime import array, on_stream, structure
@@ -40,8 +42,6 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 _LANES: Final = {"cuda": 128, "cpu": 1}  # threads per block; on a CPU, Warp's blocks have one
 _ORDER: Final = ("means", "quats", "scales", "opacities", "sh0", "shN", "detail")
 _ROWS: Final = ("out", "lr", "before", "hr", "p", "anchor")
-Counts: Final[Any] = wp.types.vector(length=26, dtype=wp.int32)
-"""Comparable and opposed Gaussians, [7] each; rows corrected, and with ω at its lower bound, [6] each."""
 
 
 @wp.struct
@@ -103,8 +103,8 @@ def products_of(
 ) -> wp.vec3d:
     total = wp.vec3d()
     for d in range(a.width):
-        l, h = wp.float64(low(a, i * a.width + d, o)), wp.float64(high(a, i, d, o, rgb, basis))
-        total += wp.vec3d(l * h, l * l, h * h)
+        g_lr, g_hr = wp.float64(low(a, i * a.width + d, o)), wp.float64(high(a, i, d, o, rgb, basis))
+        total += wp.vec3d(g_lr * g_hr, g_lr * g_lr, g_hr * g_hr)
     return total
 
 
@@ -134,18 +134,11 @@ def decide(
         p.dot = Seven(m[0], b[0], n[0], a[0], s[0], q[0], total[0])
         p.l2 = Seven(m[1], b[1], n[1], a[1], s[1], q[1], total[1])
         p.h2 = Seven(m[2], b[2], n[2], a[2], s[2], q[2], total[2])
-        for k in range(GROUPS + 1):
-            if p.l2[k] > wp.float64(0.0) and p.h2[k] > wp.float64(0.0):
-                tally[k] = 1
-                if p.dot[k] < wp.float64(0.0):
-                    tally[GROUPS + 1 + k] = 1
         change = Corrected()
         if o.corrects:
             change = correct(p, rule, reliability, i)
         omega = change.omega
-        for k in range(GROUPS):
-            tally[2 * (GROUPS + 1) + k] = (change.rows >> k) & 1
-            tally[2 * (GROUPS + 1) + GROUPS + k] = (change.at_lower_bound >> k) & 1
+        tally = counted(p, change)
         multiples[i] = change.multiple
     wp.tile_store(counts, wp.tile_sum(wp.tile(tally, preserve_type=True)), offset=(block,))
     wp.tile_store(omegas, wp.tile_sum(wp.tile(omega, preserve_type=True)), offset=(block,))
@@ -157,14 +150,14 @@ def write(
     basis: wp.array2d[wp.float32], finite: wp.array[wp.int32],
 ) -> None:  # fmt: skip
     at = i * a.width + d
-    l, h = low(a, at, o), high(a, i, d, o, rgb, basis)
+    g_lr, g_hr = low(a, at, o), high(a, i, d, o, rgb, basis)
     if multiple != wp.float64(0.0):
-        h = wp.float32(wp.float64(h) - wp.float64(l) * multiple)  # Eq. 7
-    total = h
+        g_hr = wp.float32(wp.float64(g_hr) - wp.float64(g_lr) * multiple)  # Eq. 7
+    total = g_hr
     if o.keeps_lr:
-        total = l
+        total = g_lr
         if o.lambda_hr > 0.0:
-            total = l + h * o.lambda_hr  # Eq. 8
+            total = g_lr + g_hr * o.lambda_hr  # Eq. 8
         if (a.has & 16) != 0:
             total += (a.p[at] - a.anchor[at]) * a.stiffness  # Eq. 16
         if o.scale != 1.0:
@@ -231,7 +224,7 @@ def merge(
         o.bases = basis.shape[1]
     lanes = _LANES[device.type]
     blocks = -(-n // lanes) if lambda_hr > 0 else 0
-    counts = like.new_empty(blocks, 26, dtype=torch.int32)
+    counts = like.new_empty(blocks, 27, dtype=torch.int32)
     omegas, multiples = (like.new_empty(k, 6, dtype=torch.float64) for k in (blocks, n if blocks else 0))
     finite = like.new_ones(1, dtype=torch.int32)
     reliability = None if q is None else q.float().contiguous()
@@ -250,7 +243,7 @@ def merge(
             inputs=[*rows, o, array(rgb), array(basis), array(multiples, Six), array(finite)],
         )  # fmt: skip
     seven, six = int(GROUPS) + 1, int(GROUPS)
-    sums = counts.sum(0).split_with_sizes([seven, seven, six, six])
+    sums = counts.sum(0).split_with_sizes([seven, seven, six, six, 1])[:4]
     comparable, opposed, corrected, at_lower_bound, omega = (x.unbind() for x in (*sums, omegas.sum(0)))
     return interface.Merged(ConflictCounts(comparable, opposed, corrected, omega, at_lower_bound), finite[0])
 

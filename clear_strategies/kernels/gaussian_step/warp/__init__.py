@@ -85,13 +85,13 @@ class WarpGaussianStep:
             )
         colours = self._like.new_empty(1 if self._one_basis else 2, self._n, 3)
         moving = self._like.new_empty(self._n, dtype=torch.bool)
-        counts, omegas = self._blocks(passes.Counts, torch.int32), self._blocks(conflict.Six, torch.float64)
+        counts, omegas = self._blocks(conflict.Counts, torch.int32), self._blocks(conflict.Six, torch.float64)
         adam_step = _adam(settings)
         with on_stream(self._like.device):
             self._launch_tiled(
-                passes.step, *self._gradients, conflict.rule_of(rule, q), array(q), _options(self._has_base and settings.lambda_hr > 0, rule is not None, settings),
-                adam_step, *parameters.values(), bands, array(colours), array(moving),
-                array(counts, passes.Counts), array(omegas, conflict.Six),
+                passes.step, *self._gradients, conflict.rule_of(rule, q), array(q),
+                _options(self._has_base, rule is not None, settings), adam_step, *parameters.values(), bands, array(colours), array(moving),
+                array(counts, conflict.Counts), array(omegas, conflict.Six),
             )  # fmt: skip
             wp.launch(
                 passes.step_bands, (self._n, settings.width), device=self._device, block_dim=self._lanes,
@@ -162,10 +162,10 @@ class WarpGaussianStep:
         return tensor
 
 
-def _options(compares: bool, corrects: bool, settings: StepSettings) -> Any:
+def _options(has_hr: bool, corrects: bool, settings: StepSettings) -> Any:
     out = passes.StepOptions()
     out.lambda_hr, out.skips, out.width = settings.lambda_hr, settings.skips, settings.width
-    out.compares, out.corrects = compares, corrects
+    out.compares, out.corrects = has_hr and settings.lambda_hr > 0, corrects
     return out
 
 

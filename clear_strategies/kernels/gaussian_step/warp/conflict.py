@@ -25,6 +25,8 @@ SMALLEST: Final = wp.constant(wp.float64(2.2250738585072014e-308))
 
 Six: Final[Any] = wp.types.vector(length=6, dtype=wp.float64)
 Seven: Final[Any] = wp.types.vector(length=7, dtype=wp.float64)
+Counts: Final[Any] = wp.types.vector(length=27, dtype=wp.int32)
+"""Comparable and opposed Gaussians, [7] each; rows corrected, and with ω at its lower bound, [6] each; still rows."""
 
 
 @wp.struct
@@ -137,6 +139,21 @@ def correct(p: Products, rule: Rule, reliability: wp.array[wp.float32], i: wp.in
     out.rows = rows
     out.at_lower_bound = at_bound
     return out
+
+
+@wp.func
+def counted(p: Products, change: Corrected) -> Counts:
+    """What one Gaussian adds to the counts; whether it is still is not known here."""
+    tally = Counts()
+    for k in range(GROUPS + 1):
+        if p.l2[k] > wp.float64(0.0) and p.h2[k] > wp.float64(0.0):
+            tally[k] = 1
+            if p.dot[k] < wp.float64(0.0):
+                tally[GROUPS + 1 + k] = 1
+    for k in range(GROUPS):
+        tally[14 + k] = (change.rows >> k) & 1
+        tally[20 + k] = (change.at_lower_bound >> k) & 1
+    return tally
 
 
 @wp.func

@@ -1,5 +1,5 @@
-"""The kernels of the step: `step` counts conflicts, merges, corrects, adds the anchor's gradient and applies Adam, and `step_bands`
-does this for the rows of shN.
+"""The kernels of the step: `step` counts conflicts, merges, corrects, adds the anchor's gradient and applies Adam, and
+`step_bands` does this for the rows of shN.
 
 `step` uses one thread per Gaussian. `step_bands` uses one per number, because shN has three quarters of all
 numbers and neighbouring threads then access neighbouring memory. `step` passes it a table of colours: the merged gradient
@@ -11,13 +11,10 @@ Blocks sum their counts, and torch sums over the blocks: every sum has a fixed o
 
 from __future__ import annotations
 
-from typing import Any, Final
-
 import warp as wp
 
 from clear_strategies.kernels.gaussian_step.warp.adam import AdamStep, Attribute, is_still, step_number
 from clear_strategies.kernels.gaussian_step.warp.conflict import (
-    GROUPS,
     MEANS,
     OPACITIES,
     QUATS,
@@ -25,10 +22,12 @@ from clear_strategies.kernels.gaussian_step.warp.conflict import (
     SH0,
     SHN,
     Corrected,
+    Counts,
     Rule,
     Six,
     correct,
     corrected3,
+    counted,
     group_products,
     merged1,
     merged3,
@@ -37,9 +36,6 @@ from clear_strategies.kernels.gaussian_step.warp.conflict import (
 from clear_strategies.kernels.gaussian_step.warp.raw_gradients import Activation, Gradient, View, load, route_of, size
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
-
-Counts: Final[Any] = wp.types.vector(length=27, dtype=wp.int32)
-"""Comparable and opposed Gaussians, [7] each; rows corrected, and with ω at its lower bound, [6] each; still rows."""
 
 
 @wp.struct
@@ -91,13 +87,9 @@ def step(
     change, tally = Corrected(), Counts()
     if options.compares:
         products = group_products(g_lr, g_hr, lr, base, view, i)
-        for k in range(GROUPS + 1):
-            if products.l2[k] > wp.float64(0.0) and products.h2[k] > wp.float64(0.0):
-                tally[k] = 1
-                if products.dot[k] < wp.float64(0.0):
-                    tally[GROUPS + 1 + k] = 1
         if options.corrects:
             change = correct(products, rule, reliability, i)
+        tally = counted(products, change)
 
     moves, λ = not still, options.lambda_hr
     d_means = merged3(g_lr.means, g_hr.means, change.multiple[MEANS], λ)
@@ -112,11 +104,8 @@ def step(
         rgb_lr, rgb_hr = corrected3(g_lr.rgb, g_lr.rgb, change.multiple[SHN] * wp.float64(λ)), g_hr.rgb * λ
 
     omega = change.omega
-    for k in range(GROUPS):
-        tally[2 * (GROUPS + 1) + k] = (change.rows >> k) & 1
-        tally[2 * (GROUPS + 1) + GROUPS + k] = (change.at_lower_bound >> k) & 1
     if still:
-        tally[2 * (GROUPS + 1) + 2 * GROUPS] = 1
+        tally[26] = 1
     if at >= view.n:
         tally, omega = Counts(), Six()
     wp.tile_store(counts, wp.tile_sum(wp.tile(tally, preserve_type=True)), offset=(block,))
