@@ -57,7 +57,7 @@ class ConductorSettings:
     """
 
     objective: Objective
-    skips: Skips = field(default_factory=Skips)
+    skips: Skips
     strategies: Mapping[str, Strategy] = field(default_factory=dict)
     decorators: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
     statistics_from: int | None = signature(Conductor).parameters["statistics_from"].default

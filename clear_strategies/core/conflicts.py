@@ -42,12 +42,14 @@ class GradientColumns:
     member: Float[Tensor, "D G"]
 
     @classmethod
-    def of(cls, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor]) -> GradientColumns:
-        """Raises ValueError where both have gradients, but none of the same group."""
-        names = [group for group in CONFLICT_GROUPS if group in lr and group in hr]
+    def of(
+        cls, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor], groups: Sequence[str] = CONFLICT_GROUPS
+    ) -> GradientColumns:
+        """The columns of these groups, in the order of `CONFLICT_GROUPS`. Raises ValueError where no two gradients are of one."""
+        names = [group for group in CONFLICT_GROUPS if group in groups and group in lr and group in hr]
         if not names:
             raise ValueError(
-                f"gradients are compared by the groups {', '.join(CONFLICT_GROUPS)}, and no two are of one: lr has "
+                f"it compares the groups {', '.join(groups)}, and no two gradients are of one: lr has "
                 f"{', '.join(lr) or 'none'}, hr has {', '.join(hr) or 'none'}. Name them so."
             )
         widths = tuple((name, lr[name].shape[1:].numel()) for name in names)
@@ -121,5 +123,9 @@ def _side_by_side(grads: Mapping[str, Tensor], names: Sequence[str]) -> Float[Te
 
 @lru_cache(maxsize=16)
 def _member(widths: tuple[tuple[str, int], ...], device: str) -> Float[Tensor, "D G"]:
-    groups = [CONFLICT_GROUPS.index(name) for name, width in widths for _ in range(width)]
-    return torch.eye(len(CONFLICT_GROUPS), dtype=torch.float64, device="cpu")[groups].to(device)
+    member = torch.zeros(sum(width for _, width in widths), len(CONFLICT_GROUPS), dtype=torch.float64, device=device)
+    first = 0
+    for name, width in widths:
+        member[first : first + width, CONFLICT_GROUPS.index(name)] = 1
+        first += width
+    return member

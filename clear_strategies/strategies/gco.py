@@ -100,7 +100,7 @@ class GCO(Strategy):
         """The same as equations, on any device: the specification of every compiled pass."""
         if not lr or not hr:
             return Grads(hr)
-        columns = GradientColumns.of({name: g for name, g in lr.items() if name in self.groups}, hr)
+        columns = GradientColumns.of(lr, hr, self.groups)
         p, τ = columns.products(), self.tolerance
         n = (p.l2 * p.h2).sqrt()
         c = torch.where(n > 0, p.dot / n.clamp_min(_TINY), 0.0)  # Eq. 6

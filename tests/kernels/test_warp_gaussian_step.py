@@ -110,7 +110,7 @@ def test_cuda_fields_without_warp_use_the_readable_path_and_log_why(adam_on_cuda
     with caplog.at_level("DEBUG"):
         assert compiled_step_for(Conductor(), adam_on_cuda) is None
     (message,) = caplog.messages
-    assert message.endswith("takes the readable path: the compiled pass needs NVIDIA Warp, which is not installed.")
+    assert message.endswith("slower: the compiled pass needs NVIDIA Warp, which is not installed.")
 
 
 @pytest.mark.slow

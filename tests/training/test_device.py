@@ -21,9 +21,9 @@ from clear_strategies import P2G, SVS, Conductor, SplatSuRe
 from clear_strategies.core import deferred
 from clear_strategies.core.gradients import Grads
 from clear_strategies.density.mcmc import MCMC, Sampler
+from clear_strategies.merging.skips import SkipPolicy, Skips
 from clear_strategies.training import checkpoint
 from clear_strategies.training.loop import iterate
-from clear_strategies.merging.skips import SkipPolicy, Skips
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Rendering, SplatGradients, Traits
 from tests.helpers import toy

@@ -8,76 +8,18 @@ CUDA; both share the source of the decisions with the per-Gaussian step of this 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable
 from functools import cache
-from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core.compiled_rules import CorrectionRule
-from clear_strategies.core.conflicts import ConflictCounts
-from clear_strategies.core.deferred import Number
+from clear_strategies.kernels.merge.interface import WIDEST, Colour, Merge, Merged, Rows
 from rasterizers.interface import BackendUnavailable
 from rasterizers.native import load_kernels
 from rasterizers.warp_runtime import require_warp
 
-WIDEST = 45
-"""Numbers of a Gaussian in one attribute, at most: three degrees of spherical harmonics."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Rows:
-    """One attribute's gradients, contiguous float32 [N, …]; None is 0.
-
-    Args:
-        out: receives the result; it may be `lr`.
-        lr: scale · g_LR + before. before: what the gradient was before this backward pass.
-        hr: g^HR. None for sh0 and shN: from the colour, if there is one.
-        p, anchor: θ and θ^a, for the pull of the anchor.
-    """
-
-    out: Tensor
-    lr: Tensor | None = None
-    before: Tensor | None = None
-    hr: Tensor | None = None
-    p: Tensor | None = None
-    anchor: Tensor | None = None
-    stiffness: float = 0.0
-
-
-class Colour(NamedTuple):
-    """g^HR of the spherical harmonics as its factors, Y ⊗ ∇rgb."""
-
-    rgb: Float[Tensor, "N 3"]
-    basis: Float[Tensor, "N B1"]
-
-
-class Merged(NamedTuple):
-    """What was counted, and whether every number of the result is finite; on a device it is not known yet."""
-
-    counts: ConflictCounts
-    finite: Number
-
-
-@runtime_checkable
-class Merge(Protocol):
-    """Merges the attributes, and writes `out` of each."""
-
-    def __call__(
-        self, attributes: Mapping[str, Rows], rule: CorrectionRule | None, q: Float[Tensor, " N"] | None, *,
-        colour: Colour | None = None, keeps_lr: bool = True, lambda_hr: float = 1.0, scale: float = 1.0,
-    ) -> Merged:  # fmt: skip
-        """
-        Args:
-            attributes: by gsplat's names, and "detail", which is compared with nothing.
-            rule: None: nothing is corrected. q: reliability; None: 0.
-            keeps_lr: False: out is ĝ_HR alone.
-            lambda_hr: 0: neither compared nor added.
-        """
-        ...
+__all__ = ["Colour", "Merge", "Merged", "Rows", "compiled"]
 
 
 def compiled(tensors: Iterable[Tensor]) -> Merge | None:

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from clear_strategies.core.compiled_rules import CorrectionRule
 from clear_strategies.core.conflicts import ConflictCounts
-from clear_strategies.kernels import merge as interface
 from clear_strategies.kernels.gaussian_step.warp.conflict import (
     GROUPS,
     MEANS,
@@ -35,6 +34,7 @@ from clear_strategies.kernels.gaussian_step.warp.conflict import (
     counted,
     rule_of,
 )
+from clear_strategies.kernels.merge import interface
 from rasterizers.warp_runtime import array, on_stream, structure
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})

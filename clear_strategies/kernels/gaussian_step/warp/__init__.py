@@ -90,8 +90,8 @@ class WarpGaussianStep:
         with on_stream(self._like.device):
             self._launch_tiled(
                 passes.step, *self._gradients, conflict.rule_of(rule, q), array(q),
-                _options(self._has_base, rule is not None, settings), adam_step, *parameters.values(), bands, array(colours), array(moving),
-                array(counts, conflict.Counts), array(omegas, conflict.Six),
+                _options(self._has_base, rule is not None, settings), adam_step, *parameters.values(), bands,
+                array(colours), array(moving), array(counts, conflict.Counts), array(omegas, conflict.Six),
             )  # fmt: skip
             wp.launch(
                 passes.step_bands, (self._n, settings.width), device=self._device, block_dim=self._lanes,
