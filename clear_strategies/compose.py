@@ -198,6 +198,13 @@ def _parts(option: str) -> list[str]:
     return [part for part in content.get("defaults", []) if isinstance(part, str)]
 
 
+def options(group: str) -> dict[str, Mapping[str, Any]]:
+    """The content of each file in a group of conf/ and of the folders that other packages bring, by its name."""
+    folders = (CONF, *(Path(_folder_of(point)) for point in entry_points(group=OPTIONS)))
+    files = [file for folder in folders for file in sorted((folder / group).glob("[!_]*.yaml"))]
+    return {file.stem: OmegaConf.to_container(OmegaConf.load(file)) for file in files}  # type: ignore[misc]
+
+
 class _ConfSource(FileConfigSource):
     """The files of conf/, each node with a `_target_` filled with the defaults of what it names."""
 

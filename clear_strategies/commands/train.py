@@ -9,6 +9,7 @@ import re
 import shlex
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Final
 
@@ -62,14 +63,11 @@ def overrides(arguments: Sequence[str]) -> list[str]:
             "train needs a folder of photos or a video first: clear-strategies train PHOTOS [setting=value …]."
         )
     path, rest = Path(arguments[0]), _settings(arguments[1:])
-    if path.name == "transforms.json":
-        path = path.parent
     if not path.is_dir() and not path.is_file():
         raise SettingError(f"train: {path} is not there. Name the folder of the photos or of the capture, or a video.")
     defaults = {"+strategy=best": CHOOSE_STRATEGIES, f"fit.iterations={_ITERATIONS}": _CHOOSE_ITERATIONS}
     used = [default for default, chosen in defaults.items() if not any(word.startswith(chosen) for word in rest)]
-    reader, root = detect(path) if path.is_dir() else ("photos", path)
-    return [*used, f"data={reader}", f"data.path={quoted(str(root))}", *rest]
+    return [*used, f"data={detect(path)}", f"data.path={quoted(str(path))}", *rest]
 
 
 def _settings(arguments: Sequence[str]) -> list[str]:
@@ -87,21 +85,17 @@ def _settings(arguments: Sequence[str]) -> list[str]:
     return settings
 
 
-def detect(folder: Path) -> tuple[str, Path]:
-    """The choice of conf/data for what lies in the folder, and the path that its reader takes."""
-    if (folder / "transforms_train.json").is_file():
-        return "blender", folder
-    if (folder / "transforms.json").is_file():
-        return "nerfstudio", folder
-    if (folder / "poses_bounds.npy").is_file():
-        return "llff", folder
-    for candidate in ("sparse/0", "sparse", "colmap/sparse/0", "."):
-        if any((folder / candidate / f"cameras.{ending}").is_file() for ending in ("bin", "txt")):
-            return "colmap", folder
-    from clear_strategies.data.photo_files import SUFFIXES
+def detect(path: Path) -> str:
+    """The option of conf/data whose reader knows what lies there best: `recognises`, beside the reader's function, returns how
+    well it does, 0 for not at all. One format's folder may hold files of another, as LLFF's a COLMAP model, so there is a rank.
+    """
+    from clear_strategies.compose import options
 
-    has_photos = any(file.suffix.lower() in SUFFIXES for file in folder.iterdir())
-    return "photos", folder / "images" if not has_photos and (folder / "images").is_dir() else folder
+    ranks = {}
+    for name, node in options("data").items():
+        module = import_module(node.get("reader", {}).get("_target_", __name__).rpartition(".")[0])
+        ranks[name] = module.recognises(path) if hasattr(module, "recognises") else 0
+    return max(sorted(ranks), key=lambda name: ranks[name])
 
 
 def quoted(value: str) -> str:

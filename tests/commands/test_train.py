@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from clear_strategies import compose
 from clear_strategies.commands import train
 from clear_strategies.compose import composed, tree
 from clear_strategies.errors import SettingError
@@ -19,17 +20,31 @@ from clear_strategies.errors import SettingError
 def test_the_reader_is_the_one_of_what_lies_in_the_folder(tmp_path, file, kind):
     (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / file).touch()
-    assert train.detect(tmp_path) == (kind, tmp_path)
+    assert train.detect(tmp_path) == kind
 
 
-def test_frames_are_a_setting_of_the_reader_and_photos_in_a_folder_called_images_are_found(tmp_path):
+def test_of_several_formats_the_one_that_may_hold_the_others_is_read(tmp_path):
+    for file, kind in (("cameras.bin", "colmap"), ("poses_bounds.npy", "llff"), ("transforms.json", "nerfstudio")):
+        (tmp_path / file).touch()
+        assert train.detect(tmp_path) == kind
+    assert train.detect(tmp_path / "transforms.json") == "nerfstudio"
+
+
+def test_a_reader_that_another_package_brings_is_found_by_its_yaml_alone(tmp_path, monkeypatch):
+    (tmp_path / "conf/data").mkdir(parents=True)
+    (tmp_path / "conf/data/mine.yaml").write_text("reader: {_target_: mine_reader.read}")
+    (tmp_path / "mine_reader.py").write_text("def recognises(path): return 9")
+    monkeypatch.setattr(compose, "CONF", tmp_path / "conf")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert train.detect(tmp_path) == "mine"
+
+
+def test_frames_are_a_setting_of_the_reader(tmp_path):
     (tmp_path / "clip.mp4").touch()
     for said in (["--frames", "24"], ["--frames=24"]):
         overrides = train.overrides([str(tmp_path / "clip.mp4"), *said, "fit.seed=3"])
         assert overrides[-2:] == ["data.reader.frames=24", "fit.seed=3"]
         assert "fit.iterations=1000" in overrides
-    (tmp_path / "images").mkdir()
-    assert train.detect(tmp_path) == ("photos", tmp_path / "images")
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,11 @@ _log = logging.getLogger(__name__)
 _WHITE: Final = (1.0, 1.0, 1.0)
 
 
+def recognises(path: Path) -> int:
+    """The rank of `clear_strategies.commands.train.detect`."""
+    return 4 * (path / "transforms_train.json").is_file()
+
+
 def read(
     root: str | Path,
     *,

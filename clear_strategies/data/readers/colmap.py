@@ -15,13 +15,18 @@ import torch
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import BLACK, Capture, Frame, SfmPoints, lens_notes, sorted_by_name
 from clear_strategies.data.photo_folders import by_stem, folder_note, image_folder, images_in, is_file, usable
-from clear_strategies.data.readers.colmap_model import Model, find_model, pose_of, read_model
+from clear_strategies.data.readers.colmap_model import Model, find_model, is_model, model_folders, pose_of, read_model
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
 _UNEVEN: Final = 1e-6  # a quaternion's length may differ from 1 by this much without a note
+
+
+def recognises(path: Path) -> int:
+    """The rank of `clear_strategies.commands.train.detect`."""
+    return 2 * any(map(is_model, model_folders(path)))
 
 
 def read(

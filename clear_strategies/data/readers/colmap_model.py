@@ -50,17 +50,22 @@ def find_model(root: Path) -> Path:
     """
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
-    for candidate in (root / "sparse" / "0", root / "sparse", root / "colmap" / "sparse" / "0", root):
-        if _is_model(candidate):
+    for candidate in model_folders(root):
+        if is_model(candidate):
             numbered = sorted(candidate.parent.glob("[1-9]*")) if candidate.name == "0" else []
-            return _largest(root, [candidate, *filter(_is_model, numbered)])
+            return _largest(root, [candidate, *filter(is_model, numbered)])
     raise DataError(
         root, "sparse model", "no cameras.bin or cameras.txt in sparse/0, sparse, colmap/sparse/0 or here",
         "run COLMAP first, or use data=photos for photos without poses",
     )  # fmt: skip
 
 
-def _is_model(folder: Path) -> bool:
+def model_folders(root: Path) -> tuple[Path, ...]:
+    """Where a scene's model may lie."""
+    return (root / "sparse" / "0", root / "sparse", root / "colmap" / "sparse" / "0", root)
+
+
+def is_model(folder: Path) -> bool:
     return any((folder / f"{name}{ending}").is_file() for name in ("cameras", "images") for ending in (".bin", ".txt"))
 
 

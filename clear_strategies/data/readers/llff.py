@@ -28,6 +28,11 @@ _COLUMNS: Final = 17
 _REMEDY: Final = "write it with LLFF's img2poses again"
 
 
+def recognises(path: Path) -> int:
+    """The rank of `clear_strategies.commands.train.detect`."""
+    return 3 * (path / "poses_bounds.npy").is_file()
+
+
 def read(
     root: str | Path,
     images: str | None = None,

@@ -36,6 +36,11 @@ class _Lists(msgspec.Struct):
     ply_file_path: str | None = None
 
 
+def recognises(path: Path) -> int:
+    """The rank of `clear_strategies.commands.train.detect`."""
+    return 4 * (path.name == "transforms.json" or (path / "transforms.json").is_file())
+
+
 def read(
     root: str | Path,
     *,

@@ -13,7 +13,7 @@ from typing import Final, Literal
 from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.photo_files import Exif, image_size, read_exif
-from clear_strategies.data.photo_folders import list_images, require_text, some, usable
+from clear_strategies.data.photo_folders import images_in, list_images, require_text, some, usable
 from clear_strategies.data.priors import cache_folder
 from clear_strategies.data.readers import colmap, sfm
 from clear_strategies.data.readers.colmap_model import read_model
@@ -26,6 +26,11 @@ _log = logging.getLogger(__name__)
 _HEIC: Final = (".heic", ".heif")
 _FEW: Final = 30  # photos, up to which precise=auto is true
 _STOPS: Final = 0.5  # larger differences of exposure give a warning
+
+
+def recognises(path: Path) -> int:
+    """The rank of `clear_strategies.commands.train.detect`: what no other reader knows are photos or a video, or are refused."""
+    return int(path.exists())
 
 
 def read(
@@ -44,7 +49,8 @@ def read(
     """Read a folder of photos of one scene, or a video. Poses are estimated from all of them and kept in a cache.
 
     Args:
-        root: the folder, or the file of a video: its sharpest frames, evenly spread over the camera's path, are the photos.
+        root: the folder; or one whose photos lie in its subfolder `images`; or the file of a video: its sharpest frames,
+            evenly spread over the camera's path, are the photos.
         cache: folder of the poses; None: ~/.cache/clear-strategies/sfm, or $CLEAR_CACHE/sfm. Not in the photos' folder.
         frames: of a video, how many are chosen; None: one for each eighth of the width that the picture moves, 12 to 40.
         max_side: features are extracted from photos reduced to this many pixels.
@@ -74,6 +80,8 @@ def read(
         video_note["photos"] = f"{video.name}: {(root / CHOICE).read_text()}"
     elif frames is not None:
         raise SettingError(f"data.reader.frames: {root} is no video. Leave frames out.")
+    elif (root / "images").is_dir() and not images_in(root):
+        root = root / "images"
     base = Path(cache) if cache is not None else cache_folder() / "sfm"
     if base.resolve().is_relative_to(root.resolve()):
         raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")

@@ -140,6 +140,14 @@ def test_the_others_are_refused_in_one_line_with_the_file_and_the_remedy(of_phot
         assert all(bool(frame.load().isfinite().all()) for frame in capture.frames)
 
 
+def test_photos_may_lie_in_the_folder_images(of_photos):
+    folder, _ = of_photos
+    (folder.parent / "scene").mkdir()
+    folder.rename(folder.parent / "scene" / "images")
+    capture = photos.read(folder.parent / "scene", folder.parent / "cache")
+    assert (capture.name, len(capture.frames)) == ("scene", 3)
+
+
 def test_photos_turned_by_exif_are_upright(of_photos):
     folder, read = of_photos
     for orientation in (3, 6, 8):
