@@ -1,6 +1,6 @@
 """`clear-splatfacto` in the real nerfstudio: its registry, its command line, its trainer, on a CPU.
 
-nerfstudio needs 3.5 GB, so this file is skipped where it is absent, as in CI. docs/how-to/host-nerfstudio.md shows the command.
+nerfstudio needs 3.5 GB, so this file is skipped where it is absent, as in CI. docs/how-to/each-host.md shows the command.
 
 Three things are not nerfstudio's own here: our rasterizer replaces gsplat's CUDA kernels (with gsplat 1.4's shapes, and |∇_u| as
 `absgrad`), `Tensor.cuda()` returns the tensor itself, and the LPIPS network, which would be downloaded, is a constant.
@@ -22,7 +22,7 @@ import torch
 from tests.helpers import toy
 
 if importlib.util.find_spec("nerfstudio") is None:
-    pytest.skip("nerfstudio is not installed: docs/how-to/host-nerfstudio.md", allow_module_level=True)
+    pytest.skip("nerfstudio is not installed: docs/how-to/each-host.md", allow_module_level=True)
 
 os.environ["TORCHDYNAMO_DISABLE"] = "1"
 import yaml
