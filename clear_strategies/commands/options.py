@@ -6,12 +6,9 @@ import argparse
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final, NoReturn
+from typing import NoReturn
 
 from clear_strategies.errors import SettingError
-
-STILLS: Final = ("train", "test")  # of render --path: cameras that pictures are taken from, without a video
-LONGEST: Final = 1280  # px, of a video where render --width asks for nothing
 
 
 class _Parser(argparse.ArgumentParser):

@@ -26,10 +26,9 @@ class RunSettings(FitSettings):
 
     Args:
         map_views: number of training views with maps of reliability and correction in maps/; 0: none.
-        video: number of frames of path.mp4 and path.gif, a loop through the training cameras, 24 a second; 0: none.
+        video: number of frames of path.mp4, a loop through the training cameras, 24 a second; 0: none.
         verbose: also show on the console the details that run.log holds; `-v` on the command line.
-        page: write splat.html, a page that shows the field in any browser, and what the photos see of it (coverage.html and
-            .png), if the field has at most this many Gaussians; 0: never.
+        page: write splat.html, which shows the field in any browser, if it has at most this many Gaussians; 0: never.
         log: tensorboard writes losses, PSNR, learning rates and a few pictures for TensorBoard; extra [log].
         viewer: look at the field in the browser while it trains; the address is logged. Extra [view].
         baseline: first train the same scene with the same settings, but without any strategy, into the folder baseline/ of

@@ -8,7 +8,7 @@ Five maps per view, in [0, 1] at each HR pixel:
 - `conflict`: 1 where g_LR and g_HR of a Gaussian point apart, else 0.  Eq. 6
 
 The last two render the Gaussians over black with that number as their grey. The strategies are copied, so that the run does not
-change. `maps_picture` draws the maps side by side, and the depth where it comes from dense stereo.
+change. maps.png shows the maps side by side, with the depth that dense stereo found, where it did.
 """
 
 from __future__ import annotations
@@ -33,15 +33,25 @@ from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.view_names import file_stem
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.outputs.maps_picture import write_depth, write_maps_picture
+from clear_strategies.outputs import figures
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.field import FieldShot, GaussianField
+from clear_strategies.viewing import film
 from clear_strategies.viewing.look import Painter
 from rasterizers.interface import Rasterizer
 
 _log = logging.getLogger(__name__)
 
+MAPS: Final = {
+    "reliability": "reliability R\nhow far the SR image agrees with the LR photo",
+    "demand": "demand A\nhow much detail is there to gain",
+    "weight": "weight w = R·A\nhow much the SR image's detail counts",
+    "conflict": "conflict\n1 where LR and HR gradients point apart",
+    "corrected": "corrected\nthe share of the HR gradient that was taken away",
+}
+"""The maps, and what they mean."""
+_COLUMNS: Final = 4  # of maps.png
 _NOTE: Final = (
     "reliability, demand, weight: means over pixels; corrected, conflict: means over the Gaussians that the view moves "
     "at both scales"
@@ -54,7 +64,7 @@ class ViewMaps:
     """The maps of one training view.
 
     Args:
-        maps: by the names in `viewing.points.MAPS`, at HR, in [0, 1]; "corrected" only where a strategy corrects, those of
+        maps: by the names in `MAPS`, at HR, in [0, 1]; "corrected" only where a strategy corrects, those of
             patch evidence only where a strategy has it.
         means: by the same names, over pixels for the patch maps and over Gaussians for the others.
     """
@@ -66,7 +76,7 @@ class ViewMaps:
 def write_maps(
     folder: Path, views: Sequence[View], painter: Painter, conductor: Conductor, rasterizer: Rasterizer, t: int
 ) -> None:
-    """Write maps.json and, for each view, a folder of 8-bit grey PNGs (value = 255 × number), its LR photo and its prior.
+    """Write maps.json and, for each view, a folder of 8-bit grey PNGs (value = 255 × number) and maps.png.
 
     Args:
         views: at least one. The other arguments are those of `view_maps`.
@@ -75,11 +85,9 @@ def write_maps(
     for view in views:
         view_folder, of_view = folder / file_stem(view.name), view_maps(painter, conductor, rasterizer, view, t)
         means[view.name] = of_view.means
-        for name, values in {**of_view.maps, "lr": view.lr.image, "prior": view.hr.image}.items():
+        for name, values in of_view.maps.items():
             write_png(view_folder / f"{name}.png", values)
-        write_maps_picture(view_folder / "maps.png", view, of_view.maps, of_view.means)
-        if view.depth is not None:
-            write_depth(view_folder / "depth.png", view.depth_photo, view.depth, f"{view.name}: depth by stereo")
+        _write_picture(view_folder / "maps.png", view, of_view)
     corrector = conductor.owner("correct")
     if corrector is None:
         _log.debug("maps: no strategy of this run corrects, so there is no corrected.png.")
@@ -109,6 +117,38 @@ def view_maps(painter: Painter, conductor: Conductor, rasterizer: Rasterizer, vi
     means = {name: float(patch.mean()) for name, patch in patches.items()}
     means |= {name: float(values[compared].mean()) for name, values in numbers.items()}
     return ViewMaps(maps, means)
+
+
+def _write_picture(path: Path, view: View, found: ViewMaps) -> None:
+    """Draw the LR photo, the SR image, the maps, and the depth and the confidence of stereo side by side; grey is unknown."""
+    panels: list[tuple[str, Tensor, str, tuple[float, float]]] = [
+        ("LR photo\nwhat the camera saw", view.lr.image, "", (0.0, 1.0)),
+        ("SR image\nwhat the prior made of it", view.hr.image, "", (0.0, 1.0)),
+    ]
+    for name in (name for name in MAPS if name in found.maps):
+        panels.append((f"{MAPS[name]} (mean {found.means[name]:.2f})", found.maps[name], "viridis", (0.0, 1.0)))
+    if (stereo := view.depth) is not None:
+        depth, confidence = (x.where(stereo.known, torch.nan) for x in (stereo.depth, stereo.confidence))
+        scale = film.DepthScale.spanning(depth)
+        title = f"depth by stereo, world units\nknown at {stereo.coverage:.0%}"
+        panels.append((title, depth, film.COLORS, (scale.near, scale.far)))
+        panels.append(("confidence of the depth", confidence, "viridis", (0.0, 1.0)))
+    columns = min(_COLUMNS, len(panels))
+    rows, height = -(-len(panels) // columns), 4 * view.hr.camera.height / view.hr.camera.width + 0.7
+    from matplotlib import colormaps
+
+    figure, axes = figures.new_figure(rows, columns, 4.5 * columns, rows * height + 0.4)
+    for axis in axes.flat:
+        axis.set_axis_off()
+    for axis, (title, image, colors, span) in zip(axes.flat, panels, strict=False):
+        axis.set_title(title, fontsize=9)
+        pixels = (image.clamp(0, 1) if not colors else image).detach().cpu().numpy()
+        shown = colormaps[colors or "gray"].with_extremes(bad=figures.RULE)
+        drawn = axis.imshow(pixels, cmap=shown, vmin=span[0], vmax=span[1], interpolation="nearest")
+        if colors:
+            figure.colorbar(drawn, ax=axis, shrink=0.8)
+    figures.set_title(figure, f"{view.name}: where the SR image is believed, and where the photo overrules it")
+    figures.save_png(figure, path)
 
 
 def _evidence(conductor: Conductor, view: View) -> tuple[Strategy, PatchMaps] | None:

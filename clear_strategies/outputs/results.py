@@ -15,41 +15,42 @@ from clear_strategies import files
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
 from clear_strategies.core.view import View
-from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.photo_files import read_image, write_png
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.view_names import file_stem
 from clear_strategies.errors import DataError
-from clear_strategies.outputs import coverage, metrics
+from clear_strategies.outputs import metrics
 from clear_strategies.outputs.baseline import Baseline
 from clear_strategies.outputs.contact_sheet import OWN_PHOTO, TRAINED_ON, SheetRow, write_contact_sheet
+from clear_strategies.outputs.coverage import write_coverage
 from clear_strategies.outputs.curves import write_curves
 from clear_strategies.outputs.figures import column_means, spaced
-from clear_strategies.outputs.fly_through import write_depths, write_loop, write_splat_page
 from clear_strategies.outputs.formats import export_ply
-from clear_strategies.outputs.maps import write_maps
+from clear_strategies.outputs.maps import MAPS, write_maps
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.plan import Chosen, marks
 from clear_strategies.outputs.provenance import provenance
 from clear_strategies.training import memory
 from clear_strategies.training.state import TrainState
-from clear_strategies.viewing import cameras, points
+from clear_strategies.viewing import FPS, cameras, film, paths, video
 from clear_strategies.viewing import page as splat_page
 from clear_strategies.viewing.look import Painter
-from rasterizers.interface import Rasterizer
+from rasterizers.interface import Camera, Color, Rasterizer
 
 _log = logging.getLogger(__name__)
 
 _METRICS: Final = "metrics.json"
+_COVERAGE: Final = "maps/coverage.png"
 _OF_RUN: Final = (
     "contact_sheet.png", "curves.png", "history.csv", "conflict.csv", "timing.csv", "point_cloud.ply", "path.mp4",
-    "path.gif", splat_page.FILE, coverage.PICTURE, coverage.PAGE, cameras.FILE, "maps/maps.json",
+    splat_page.FILE, cameras.FILE, "maps/maps.json", _COVERAGE,
 )  # fmt: skip
 _OF_VIEW: Final = (
-    "renders/{}.png", "depth/{}.png", f"{cameras.PHOTOS}/{{}}.jpg", *(f"views/{{}}_{k}.png" for k in ("lr", "prior", "truth")),
-    *(f"maps/{{}}/{name}.png" for name in (*points.MAPS, "lr", "prior", "maps", "depth")),
+    "renders/{}.png", f"{cameras.PHOTOS}/{{}}.jpg", *(f"views/{{}}_{k}.png" for k in ("lr", "prior", "truth")),
+    *(f"maps/{{}}/{name}.png" for name in (*MAPS, "maps")),
 )  # fmt: skip
-_SHEET_VIEWS: Final = 4  # test views on the contact sheet, in views/ and in depth/, at most
+_LONGEST: Final = 960  # px, of the video: a frame takes a fraction of a second, and the file a few MB
+_SHEET_VIEWS: Final = 4  # test views on the contact sheet and in views/, at most
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +58,9 @@ class Pictures:
     """The pictures of a run, besides the renders of its test views.
 
     Args:
-        map_views: how many training views get maps, at most.
+        map_views: how many training views get maps, at most; 0: there is no map of what the photos see either.
         video_frames: of the loop through the training cameras; 0: none.
-        page_gaussians: a field of more gets no pages, and no picture of what the photos see.
+        page_gaussians: a field of more gets no page; 0: none does.
     """
 
     map_views: int
@@ -105,11 +106,16 @@ def write_results(
         with work_log.stage("maps"):
             if mapped := spaced(state.views, pictures.map_views):
                 write_maps(folder / "maps", mapped, painter, state.conductor, rasterizer, state.t - 1)
+                write_coverage(folder / _COVERAGE, scene, painter, title)
         memory.release()  # the gradients that the maps are made of: several times the field
         with work_log.stage("contact sheet and curves"):
             _write_sheet(folder, scene, evaluation, title, baseline)
             write_curves(folder / "curves.png", history, marks(state), title)
-        _write_views(folder, scene, painter, pictures, work_log, title)
+        train = [view.hr.camera for view in scene.train]
+        with work_log.stage("video"):
+            _write_video(folder / "path.mp4", train, painter, pictures.video_frames)
+        with work_log.stage("page"):
+            _write_page(folder / splat_page.FILE, train, painter, pictures.page_gaussians, title, scene.background)
     _write_tables(folder, history, [*scene.work_log.rows(), *work_log.rows()])
     files.write_json(
         folder / _METRICS,
@@ -148,20 +154,34 @@ def remove_earlier(folder: Path, *, all_files: bool) -> None:
                 (folder / emptied).rmdir()
 
 
-def _write_views(
-    folder: Path, scene: Scene, painter: Painter, pictures: Pictures, work_log: WorkLog, title: str
+def _write_video(path: Path, train: Sequence[Camera], painter: Painter, frames: int) -> None:
+    """Write a loop through the training cameras. Without imageio-ffmpeg, log a message instead."""
+    if not frames:
+        return
+    if (missing := video.missing()) is not None:
+        _log.info("no video of the camera path is written: %s.", missing)
+        return
+    along = [cameras.at_most(camera, _LONGEST) for camera in paths.through(train, frames)]
+    video.write_videos([path], film.color_frames(painter, along), fps=FPS)
+
+
+def _write_page(
+    path: Path, train: Sequence[Camera], painter: Painter, most: int, title: str, background: Color
 ) -> None:
-    """The field from the cameras of the contact sheet, along a loop, and in a page."""
-    train = [view.hr.camera for view in scene.train]
-    with work_log.stage("depth pictures"):
-        write_depths(folder / "depth", _shown(scene), painter)
-    with work_log.stage("video"):
-        write_loop(folder, train, painter, pictures.video_frames)
-    with work_log.stage("page"):
-        write_splat_page(folder, train, painter, pictures.page_gaussians, title, scene.background)
-    if len(painter.field) <= pictures.page_gaussians:
-        with work_log.stage("coverage"):
-            coverage.write_coverage(folder, scene, painter, title)
+    """Write splat.html. Where the field has more Gaussians than `most`, or the page cannot be made, log why instead."""
+    count = len(painter.field)
+    if most == 0:
+        return
+    if (missing := splat_page.missing()) is not None:
+        _log.info("no %s is written: %s.", path.name, missing)
+        return
+    if count > most:
+        _log.info("no %s is written: there are %s Gaussians, fit.page is %s.", path.name, f"{count:,}", f"{most:,}")
+        return
+    try:
+        splat_page.write_page(path, painter.field.baked(), train, title, background)
+    except OSError as error:  # the other files of a run are worth more than its page
+        _log.warning("%s could not be written: %s.", path.name, error)
 
 
 def _write_sheet(folder: Path, scene: Scene, evaluation: Evaluation, title: str, baseline: Baseline | None) -> None:

@@ -24,10 +24,10 @@ from clear_strategies.data.strict_json import read_object
 from clear_strategies.data.view_names import file_stem
 from clear_strategies.errors import DataError
 from clear_strategies.outputs.figures import ERROR_MAX, spaced
+from clear_strategies.outputs.maps import MAPS
 from clear_strategies.report.runs import Run, skips
 from clear_strategies.report.table import Columns, Table
 from clear_strategies.viewing import page as splat_page
-from clear_strategies.viewing.points import MAPS
 
 _log = logging.getLogger(__name__)
 

@@ -1,9 +1,7 @@
-"""Pictures and videos along a list of cameras: in colour, and of the depth with a legend."""
+"""Pictures along a list of cameras: of the colours, and of the depth."""
 
 from __future__ import annotations
 
-import functools
-import io
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -23,9 +21,9 @@ from rasterizers.interface import Camera
 
 _SAMPLED: Final = 5  # cameras that the range of depths is taken from, about
 _EXTREMES: Final = (0.02, 0.98)  # quantiles of depth at the ends of the range
-_COLORS: Final = "viridis_r"
+COLORS: Final = "viridis_r"
+"""matplotlib's name of the colours of depth: near is bright."""
 _UNKNOWN: Final = 0.8  # grey
-_LEGEND: Final = 40  # px, height of the legend below a picture of depth
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,45 +48,19 @@ class DepthScale:
         near, far = (float(np.quantile(known, q)) for q in _EXTREMES)
         return cls(near, max(far, near * (1 + 1e-6) + 1e-6))
 
-    def picture(self, depth: Float[Tensor, "H W"], *, legend: bool = True) -> Frame:
-        """Depth in colours, grey where there is none, over a legend."""
+    def picture(self, depth: Float[Tensor, "H W"]) -> Frame:
+        """Depth in colours, grey where there is none."""
         from matplotlib import colormaps
 
         values = ((depth - self.near) / (self.far - self.near)).clamp(0, 1).numpy()
-        colored = colormaps[_COLORS](np.nan_to_num(values))[..., :3]
+        colored = colormaps[COLORS](np.nan_to_num(values))[..., :3]
         colored[~np.isfinite(values)] = _UNKNOWN
-        frame = np.asarray((colored * 255).round().astype(np.uint8))
-        return np.concatenate([frame, _legend(self, frame.shape[1])]) if legend else frame
-
-
-@functools.lru_cache(maxsize=8)
-def _legend(scale: DepthScale, width: int) -> Frame:
-    """The colours and their numbers, [_LEGEND, width]."""
-    from matplotlib import colormaps, colors
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width / 100, _LEGEND / 100), dpi=100)
-    axis = figure.add_axes((0.05, 0.62, 0.9, 0.28))
-    mapped = ScalarMappable(colors.Normalize(scale.near, scale.far), colormaps[_COLORS])
-    bar = figure.colorbar(mapped, cax=axis, orientation="horizontal")
-    label = "depth" if width < 300 else "depth, world units; grey: nothing there"
-    bar.set_label(label, fontsize=6.5, labelpad=1)
-    bar.ax.tick_params(labelsize=6.5, pad=1, length=2)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="rgba", dpi=100)
-    return np.frombuffer(buffer.getvalue(), np.uint8).reshape(_LEGEND, -1, 4)[:, :width, :3]
+        return np.asarray((colored * 255).round().astype(np.uint8))
 
 
 def color_frames(painter: Painter, cameras: Sequence[Camera], look: Look = AS_MEASURED) -> Iterator[Frame]:
     """The colours from each camera, 8 bits."""
     return (to_bytes(painter.color(camera, look)) for camera in cameras)
-
-
-def depth_frames(painter: Painter, cameras: Sequence[Camera], look: Look = AS_MEASURED) -> Iterator[Frame]:
-    """The depth from each camera, all in the same colours, with a legend below."""
-    scale = DepthScale.of(painter, cameras, look)
-    return (scale.picture(painter.depth(camera, look)) for camera in cameras)
 
 
 def saving(frames: Iterable[Frame], paths: Iterable[Path]) -> Iterator[Frame]:

@@ -19,7 +19,7 @@ from clear_strategies.viewing.cameras import SavedCamera
 from clear_strategies.viewing.look import Painter
 from rasterizers.interface import Camera
 
-MAPS: Final = ("reliability", "demand", "weight", "corrected", "conflict")
+_MAPS: Final = ("reliability", "demand", "weight", "corrected", "conflict")
 _UNSEEN: Final = 0.25  # grey of Gaussians that no map shows
 _BEHIND: Final = 0.05  # a Gaussian this share of its depth behind the surface is not on the map
 _TOP: Final = 0.98  # quantile of |f_det| at the end of its colours
@@ -27,7 +27,7 @@ _TOP: Final = 0.98  # quantile of |f_det| at the end of its colours
 
 def names(folder: Path | None) -> list[str]:
     """The names of `colors`: opacity, f_det, and the maps in a run's folder."""
-    maps = [name for name in MAPS if folder is not None and any(folder.glob(f"maps/*/{name}.png"))]
+    maps = [name for name in _MAPS if folder is not None and any(folder.glob(f"maps/*/{name}.png"))]
     return ["opacity", "f_det", *maps]
 
 

@@ -102,7 +102,7 @@ class Screen:
 
     def _picture(self, view: View, camera: Camera) -> Frame:
         if view.show == _DEPTH:
-            return self.depth_scale.picture(self.painter.depth(camera, view.look), legend=False)
+            return self.depth_scale.picture(self.painter.depth(camera, view.look))
         if view.show == _COVERAGE:
             ones = torch.ones(len(self.painter.field))
             return to_bytes(self.painter.numbers(camera, ones, view.look)[..., None].expand(-1, -1, 3))

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from clear_strategies.commands import render
-from clear_strategies.commands.path_cameras import cameras_of
 from clear_strategies.data.photo_files import image_size, read_image
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs.saved import open_splat
@@ -31,10 +30,10 @@ def test_a_loop_is_a_video_and_on_request_pictures_and_depth(run, tmp_path):
     folder, _ = run
     render.main([str(folder), "--frames", "3", "--depth", "--images", "--out", str(tmp_path)])
     frames = [f"{i:04d}.png" for i in range(3)]
-    videos = ["cameras.gif", "cameras.mp4", "cameras_depth.gif", "cameras_depth.mp4"]
+    videos = ["cameras.mp4", "cameras_depth.mp4"]
     assert files(tmp_path) == sorted([*frames, *(f"depth/{name}" for name in frames), *videos])
     assert image_size(tmp_path / "0000.png") == (96, 64)
-    assert image_size(tmp_path / "depth" / "0000.png") == (96, 104)
+    assert image_size(tmp_path / "depth" / "0000.png") == (96, 64)
 
 
 def test_test_views_are_what_was_evaluated(run, tmp_path):
@@ -62,7 +61,7 @@ def test_a_file_of_cameras_is_a_path(run, tmp_path):
     entry = {"camera_to_world": matrix.flatten().tolist(), "fov": 40, "aspect": 1.5}
     content = {"render_width": 60, "render_height": 40, "fps": 12, "camera_path": [entry] * 4}
     (tmp_path / "flight.json").write_text(json.dumps(content))
-    render.main([str(folder), "--path", str(tmp_path / "flight.json"), "--no-gif", "--out", str(tmp_path)])
+    render.main([str(folder), "--path", str(tmp_path / "flight.json"), "--out", str(tmp_path)])
     assert files(tmp_path) == ["flight.json", "flight.mp4"]
 
 
@@ -72,7 +71,7 @@ def test_frames_of_portrait_and_landscape_cameras_are_not_stretched(run, tmp_pat
     sizes = {"width": 60, "height": 40, "cx": 33, "cy": 20}, {"width": 40, "height": 60, "cx": 20, "cy": 33}
     (tmp_path / "path.json").write_text(json.dumps([{**entry, **size, "fx": 50, "fy": 50} for size in sizes]))
     options = render._parser().parse_args([str(folder), "--path", str(tmp_path / "path.json")])
-    _, (landscape, portrait), _ = cameras_of(open_splat(folder), options)
+    _, (landscape, portrait), _ = render.cameras_of(open_splat(folder), options)
     assert (landscape.width, landscape.height) == (portrait.width, portrait.height) == (60, 40)
     assert portrait.fx == portrait.fy == pytest.approx(50 * 40 / 60)  # its whole height, and more at both sides
     assert (portrait.cx, portrait.cy) == pytest.approx((30, 22))
@@ -87,7 +86,7 @@ def test_parts_of_a_ply_that_cannot_be_left_out_are_named(run, tmp_path, caplog)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--path", "nowhere"], "--path: must be cameras, ellipse, train, test or a file"),
+        (["--path", "nowhere"], "--path: must be cameras, train, test or a file"),
         (["--frames", "0"], "must be above 0"),
         (["--fps", "nan"], "must be above 0"),
         (["--typo"], "unrecognized arguments: --typo"),

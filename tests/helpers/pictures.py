@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-NAMES = ("write_curves", "write_contact_sheet", "write_depths")
+NAMES = ("write_curves", "write_contact_sheet", "write_coverage")
 
 
 @contextmanager

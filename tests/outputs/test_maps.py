@@ -20,13 +20,12 @@ from clear_strategies.core.gradients import Grads, conflict_ratio
 from clear_strategies.core.view import DepthMap, View
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.merging.objective import Objective
-from clear_strategies.outputs.maps import ViewMaps, view_maps, write_maps
+from clear_strategies.outputs.maps import MAPS, ViewMaps, view_maps, write_maps
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.state import TrainState
 from clear_strategies.viewing.look import Painter
-from clear_strategies.viewing.points import MAPS
 from tests.helpers import toy
 
 OBJECTIVE = Objective(lambda_hr=WarmupDecay(start=0, full=1), kernels="torch")
@@ -165,7 +164,7 @@ def test_a_folder_of_maps_is_complete(tmp_path: Path) -> None:
     assert set(content["views"]) == {view.name}
     assert set(content["views"][view.name]) == set(MAPS)
     files = {path.stem: path for path in (tmp_path / view.name).iterdir()}
-    assert set(files) == {*MAPS, "lr", "prior", "maps"}
+    assert set(files) == {*MAPS, "maps"}
     for name, values in maps_of(state).maps.items():
         assert float((read_image(files[name])[..., 0] - values).abs().max()) <= 0.5 / 255 + 1e-6
 
@@ -185,6 +184,7 @@ def test_views_with_stereo_show_their_depth_and_maps_that_no_strategy_makes_are_
     assert "no strategy of this run corrects" in caplog.text
     for view in views:
         assert set(content["views"][view.name]) == {"conflict"}
-        kinds = {"conflict", "lr", "prior", "maps"} | ({"depth"} if view.depth is not None else set())
-        assert {path.stem for path in (tmp_path / view.name).iterdir()} == kinds
-    assert read_image(tmp_path / "0" / "depth.png").shape[1] > 500
+        assert {path.stem for path in (tmp_path / view.name).iterdir()} == {"conflict", "maps"}
+    found, none, without = (read_image(tmp_path / name / "maps.png") for name in "012")
+    assert found.shape == none.shape  # with two panels more than there are without stereo
+    assert found.numel() > 1.3 * without.numel()

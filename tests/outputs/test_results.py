@@ -123,12 +123,11 @@ def test_a_run_without_test_views_shows_training_views_and_what_is_not_wanted_or
     with caplog.at_level("DEBUG"):
         write(tmp_path, state, scene=scene, pictures=Pictures(map_views=0, video_frames=2, page_gaussians=1))
     assert names(tmp_path / "renders") == {f"{view.name}.png" for view in SCENE.train}
-    assert names(tmp_path / "depth") == names(tmp_path / "renders")
     times = round(magnification(SCENE.train[0].hr.image.shape[1]))
     assert holds(read(tmp_path / "contact_sheet.png"), SCENE.train[0].hr.image.numpy(), times=times)
     assert "pip install imageio-ffmpeg" in caplog.text
     assert "no splat.html is written" in caplog.text
-    assert not names(tmp_path) & {"maps/", "path.mp4", "splat.html", "coverage.html", "coverage.png"}
+    assert not names(tmp_path) & {"maps/", "path.mp4", "splat.html"}
 
 
 def test_photos_of_two_cameras_with_one_file_name_have_files_of_their_own(tmp_path, state, monkeypatch):
@@ -141,10 +140,9 @@ def test_photos_of_two_cameras_with_one_file_name_have_files_of_their_own(tmp_pa
     write(tmp_path, state, scene=scene, pictures=Pictures(map_views=2, video_frames=0, page_gaussians=0))
     write_cameras(tmp_path, scene)
     stems = {"left_0000", "right_0000"}
-    for folder in ("renders", "depth"):
-        assert names(tmp_path / folder) == {f"{stem}.png" for stem in stems}
+    assert names(tmp_path / "renders") == {f"{stem}.png" for stem in stems}
     assert {name.rpartition("_")[0] for name in names(tmp_path / "views")} == stems
-    assert names(tmp_path / "maps") == {"maps.json", *(f"{stem}/" for stem in stems)}
+    assert names(tmp_path / "maps") == {"maps.json", "coverage.png", *(f"{stem}/" for stem in stems)}
     found = [camera for camera in read_cameras(tmp_path / "cameras.json") if camera.split == "train"]
     assert [camera.photo for camera in found] == [tmp_path / "cameras" / f"{stem}.jpg" for stem in sorted(stems)]
     assert len(points._maps(tmp_path, "conflict", found)) == 2
@@ -155,12 +153,12 @@ def test_photos_of_two_cameras_with_one_file_name_have_files_of_their_own(tmp_pa
 def test_an_earlier_run_goes_with_all_of_its_files_and_no_other(tmp_path: Path, state: TrainState) -> None:
     write(tmp_path, state, pictures=replace(PICTURES, video_frames=0, page_gaussians=0))
     write_cameras(tmp_path, SCENE)
-    kept = {tmp_path / "notes.txt", tmp_path / "depth" / "measured.png", tmp_path / "checkpoints" / "step_0000004"}
+    kept = {tmp_path / "notes.txt", tmp_path / "renders" / "measured.png", tmp_path / "checkpoints" / "step_0000004"}
     for path in kept:
         files.write_text(path, "mine")
     results.remove_earlier(tmp_path, all_files=True)
     assert {path for path in tmp_path.rglob("*") if path.is_file()} == kept
-    assert names(tmp_path) == {"notes.txt", "depth/", "checkpoints/"}
+    assert names(tmp_path) == {"notes.txt", "renders/", "checkpoints/"}
     for name in ("metrics.json", "curves.png"):  # of another program
         files.write_text(tmp_path / "other" / name, "{}")
     results.remove_earlier(tmp_path / "other", all_files=True)

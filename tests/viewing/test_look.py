@@ -62,11 +62,3 @@ def test_numbers_are_blended_over_black(field):
     assert float(ones.min()) >= 0
     assert float(ones.max()) <= 1 + 1e-6
     torch.testing.assert_close(painter.numbers(CAMERA, torch.full((len(field),), 0.5)), ones / 2)
-
-
-def test_the_colours_of_depth_have_a_legend():
-    scale = DepthScale(1.0, 3.0)
-    picture = scale.picture(torch.full((10, 200), 2.0))
-    assert picture.shape == (50, 200, 3)
-    assert len({tuple(pixel) for pixel in picture[:10].reshape(-1, 3)}) == 1
-    assert len({tuple(pixel) for pixel in picture[10:].reshape(-1, 3)}) > 50
