@@ -1,23 +1,28 @@
-"""PLY files: Gaussians in the standard layout of 3DGS and point clouds, in and out."""
+"""PLY files: Gaussians in the standard layout of 3DGS and point clouds, in and out.
+
+The reader is strict: counts are compared with the file's size before anything is allocated. (plyfile would make this shorter; its
+licence, GPL-3.0, does not go with this package's.)
+"""
 
 from __future__ import annotations
 
 import logging
+import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.lib.recfunctions import unstructured_to_structured
+from numpy.lib.recfunctions import structured_to_unstructured, unstructured_to_structured
 from torch import Tensor
 
 from clear_strategies.core.points import PointCloud
-from clear_strategies.data.ply_table import columns, names_of, read_vertices
 from clear_strategies.errors import DataError
-from clear_strategies.files import write_bytes
+from clear_strategies.files import read_bytes, write_bytes
 from rasterizers.geometry import SH_C0
 
 _log = logging.getLogger(__name__)
@@ -25,6 +30,19 @@ _log = logging.getLogger(__name__)
 _BANDS: Final = (0, 3, 8, 15)  # (degree + 1)² - 1
 _MIP: Final = "SplatRenderMode: mip"  # tells viewers to draw with opacity compensation
 _OPAQUE: Final = 16.0  # logit: sigmoid gives 1 as closely as float32 tells it from 1
+
+_TYPES: Final = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+_BYTE_ORDERS: Final[dict[str, Literal["=", "<", ">"]]] = {
+    "ascii": "=",
+    "binary_little_endian": "<",
+    "binary_big_endian": ">",
+}
+_LONGEST_HEADER: Final = 1 << 16  # bytes
+_COUNT: Final = re.compile(r"[0-9]{1,18}")
 
 _XYZ: Final = ("x", "y", "z")
 _NORMAL: Final = ("nx", "ny", "nz")
@@ -96,24 +114,22 @@ def read_gaussians(path: Path) -> GaussianPly:
     Raises:
         DataError: the file is damaged or truncated, or a property is missing or not finite.
     """
-    table = read_vertices(path)
-    rest = _rest_names(sum(name.startswith("f_rest_") for name in names_of(table)))
+    table, comments = _read_vertices(path)
+    rest = _rest_names(sum(name.startswith("f_rest_") for name in _names_of(table)))
     if len(rest) not in {3 * bands for bands in _BANDS}:
         raise DataError(path, "f_rest", f"has {len(rest)} properties where 0, 9, 24 or 45 belong", "export it again")
-    with path.open("rb") as file:
-        antialiased = _MIP.encode() in file.read(4096)
     layout = {*_XYZ, *_NORMAL, *_DC, *rest, "opacity", *_SCALE, *_ROTATION}
-    extra = [name for name in names_of(table) if name not in layout]
+    extra = [name for name in _names_of(table) if name not in layout]
     if extra:
         _log.warning("%s: %s: not in the 3DGS layout, not read.", path, ", ".join(extra))
     return GaussianPly(
-        means=columns(path, table, _XYZ),
-        sh0=columns(path, table, _DC)[:, None],
-        shN=columns(path, table, rest).view(len(table), 3, len(rest) // 3).transpose(1, 2).contiguous(),
-        opacities=columns(path, table, ("opacity",), infinite=_OPAQUE)[:, 0],
-        scales=columns(path, table, _SCALE),
-        quats=columns(path, table, _ROTATION),
-        antialiased=antialiased,
+        means=_columns(path, table, _XYZ),
+        sh0=_columns(path, table, _DC)[:, None],
+        shN=_columns(path, table, rest).view(len(table), 3, len(rest) // 3).transpose(1, 2).contiguous(),
+        opacities=_columns(path, table, ("opacity",), infinite=_OPAQUE)[:, 0],
+        scales=_columns(path, table, _SCALE),
+        quats=_columns(path, table, _ROTATION),
+        antialiased=_MIP in comments,
     )
 
 
@@ -147,7 +163,7 @@ def write_points(path: Path | str, means: Float[Tensor, "N 3"], colors: Float[Te
 def _write(path: Path, table: np.ndarray, comments: Sequence[str] = ()) -> None:
     """A structured array of floats and bytes as the vertices."""
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {' '.join(c.split())}" for c in comments)]
-    kinds = [(name, "float" if table.dtype[name].kind == "f" else "uchar") for name in names_of(table)]
+    kinds = [(name, "float" if table.dtype[name].kind == "f" else "uchar") for name in _names_of(table)]
     lines += [f"element vertex {len(table)}", *(f"property {kind} {name}" for name, kind in kinds), "end_header\n"]
     # Some readers expect ASCII headers.
     write_bytes(path, "\n".join(lines).encode("ascii", "replace") + table.tobytes())
@@ -159,13 +175,13 @@ def read_points(path: Path) -> PointCloud:
     Raises:
         DataError: the file is no PLY, is damaged or truncated, is not finite, or has colours out of range.
     """
-    table = read_vertices(path)
-    names = set(names_of(table))
-    means = columns(path, table, _XYZ)
+    table, _ = _read_vertices(path)
+    names = set(_names_of(table))
+    means = _columns(path, table, _XYZ)
     if names & set(_RGB):
         colors, how = _rgb(path, table), ""
     elif names & set(_DC):
-        colors, how = (columns(path, table, _DC) * SH_C0 + 0.5).clamp(0, 1), ", the centres of Gaussians"
+        colors, how = (_columns(path, table, _DC) * SH_C0 + 0.5).clamp(0, 1), ", the centres of Gaussians"
     else:
         colors, how = torch.full_like(means, 0.5), ", without colours"
         _log.warning("%s: no colours, so its points are grey.", path)
@@ -178,7 +194,7 @@ def _rest_names(count: int) -> tuple[str, ...]:
 
 def _rgb(path: Path, table: np.ndarray) -> Float[Tensor, "N 3"]:
     """Colours in [0, 1]; the full range of 8-bit or 16-bit unsigned integers is mapped to it."""
-    colors = columns(path, table, _RGB)
+    colors = _columns(path, table, _RGB)
     kinds = {table.dtype[name].str[1:] for name in _RGB}
     if kinds <= {"u1"} or kinds <= {"u2"}:
         return colors / (255 if kinds <= {"u1"} else 65535)
@@ -188,3 +204,87 @@ def _rgb(path: Path, table: np.ndarray) -> Float[Tensor, "N 3"]:
         problem = f"must lie in [0, 1] where they are floats, span [{colors.min():g}, {colors.max():g}]"
         raise DataError(path, "red, green, blue", problem, "scale the colours, or export them as uchar")
     return colors
+
+
+def _read_vertices(path: Path) -> tuple[np.ndarray, str]:
+    """The vertex element, the first of the file, as a structured array, and the header."""
+    data = read_bytes(path)
+    header, start = _split_header(path, data[:_LONGEST_HEADER])
+    form, count, row, alone = _parsed(path, header)
+    dtype = np.dtype(row).newbyteorder(_BYTE_ORDERS[form])
+    lines = [line for line in data[start:].decode("latin-1").splitlines() if line.strip()] if form == "ascii" else None
+    needed, left, unit = (
+        (count * dtype.itemsize, len(data) - start, "bytes") if lines is None else (count, len(lines), "rows")
+    )
+    if needed > left or (needed < left and alone):
+        problem = f"has a count of {count}, which needs {needed} {unit}, but {left} follow"
+        raise DataError(path, "element vertex", problem, "the file is truncated or damaged; write it again")
+    if lines is None:
+        return np.frombuffer(data, dtype, count, start), header
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # versions of numpy warn of a fraction where a whole number belongs
+            return np.loadtxt(lines[:count], dtype, comments=None, ndmin=1) if count else np.zeros(0, dtype), header
+    except (ValueError, OverflowError, Warning) as error:
+        problem = f"cannot be read ({str(error).partition(';')[0]})"
+        raise DataError(path, "element vertex", problem, "export it again") from error
+
+
+def _split_header(path: Path, head: bytes) -> tuple[str, int]:
+    """The lines between `ply` and `end_header`, and the offset behind them."""
+    first, _, lines = head.partition(b"\n")
+    if first.strip() != b"ply":
+        raise DataError(path, "header", "does not begin with a line `ply`", "give a .ply file")
+    at = 0
+    for line in lines.splitlines(keepends=True):
+        if line.strip() == b"end_header" and line.endswith(b"\n"):
+            return lines[:at].decode("latin-1"), len(first) + 1 + at + len(line)
+        at += len(line)
+    problem = f"has no line `end_header` in its first {_LONGEST_HEADER} bytes"
+    raise DataError(path, "header", problem, "the file is truncated; write it again")
+
+
+def _parsed(path: Path, header: str) -> tuple[str, int, list[tuple[str, str]], bool]:
+    """The format, the number of vertices, the name and type of each of their properties, and whether nothing follows them."""
+    form, counts, row = "", dict[str, int](), dict[str, str]()
+    for line in header.splitlines():
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                continue
+            case ["format", kind, "1.0"] if kind in _BYTE_ORDERS and not form:
+                form = kind
+            case ["element", name, count] if form and _COUNT.fullmatch(count) and name not in counts:
+                counts[name] = int(count)
+            case ["property", kind, name] if [*counts] == ["vertex"] and kind in _TYPES and name not in row:
+                row[name] = _TYPES[kind]
+            case ["property", *_] if len(counts) > 1:
+                continue  # of an element that is not read
+            case _:
+                problem = f"has a line that is not understood there: {line[:80]!r}"
+                raise DataError(path, "header", problem, "export it again: first the vertices, of plain numbers")
+    if not row:
+        raise DataError(path, "element vertex", "is missing or has no properties", "give a file of points")
+    return form, counts["vertex"], list(row.items()), len(counts) == 1
+
+
+def _names_of(table: np.ndarray) -> tuple[str, ...]:
+    return table.dtype.names or ()
+
+
+def _columns(
+    path: Path, table: np.ndarray, names: Sequence[str], *, infinite: float | None = None
+) -> Float[Tensor, "N C"]:
+    """Properties as float32; each must exist and be finite, unless this number stands for infinity."""
+    missing = [name for name in names if name not in _names_of(table)]
+    if missing:
+        problem = f"is missing from the vertices, which have {', '.join(_names_of(table))}"
+        raise DataError(path, missing[0], problem, "export it again, with this property")
+    with np.errstate(over="ignore"):  # overflow gives infinity
+        values = np.array(structured_to_unstructured(table[list(names)], np.float32))
+    if infinite is not None:
+        values = np.where(np.isinf(values), np.copysign(np.float32(infinite), values), values)
+    finite = np.isfinite(values)
+    if not finite.all():
+        i, k = np.argwhere(~finite)[0]
+        raise DataError(path, names[k], f"is not finite in vertex {i}", "remove the vertex, or export it again")
+    return torch.from_numpy(values)

@@ -88,7 +88,7 @@ RGB = tuple(f"property uchar {name}" for name in ("red", "green", "blue"))
 POINT = ("element vertex 1", *XYZ, *RGB)
 DOUBLES = ("element vertex 1", *(line.replace("float", "double") for line in XYZ), "property float nx",
            *(line.replace("uchar", "ushort") for line in RGB))  # fmt: skip
-AROUND = ("element camera 2", "property short id", *POINT, "element face 1", "property list uchar int vertex_indices")
+FOLLOWED = (*POINT, "element face 1", "property list uchar int vertex_indices")
 
 
 @pytest.mark.parametrize(
@@ -98,8 +98,8 @@ AROUND = ("element camera 2", "property short id", *POINT, "element face 1", "pr
         ("binary_big_endian", POINT, struct.pack(">3f3B", 1, 2, 3, 255, 0, 51)),
         ("ascii", POINT, b"1 2 3 255 0 51\n"),
         ("binary_little_endian", DOUBLES, struct.pack("<3df3H", 1, 2, 3, 9, 65535, 0, 13107)),
-        ("binary_little_endian", AROUND, struct.pack("<2h3f3BB3i", 8, 9, 1, 2, 3, 255, 0, 51, 3, 0, 0, 0)),
-        ("ascii", AROUND, b"8\n9\n1 2 3 255 0 51\n3 0 0 0\n"),
+        ("binary_little_endian", FOLLOWED, struct.pack("<3f3BB3i", 1, 2, 3, 255, 0, 51, 3, 0, 0, 0)),
+        ("ascii", FOLLOWED, b"1 2 3 255 0 51\n3 0 0 0\n"),
     ],
     ids=["little endian", "big endian", "ascii", "doubles and 16 bits", "other elements", "other elements in ascii"],
 )
