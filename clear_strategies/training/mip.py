@@ -13,8 +13,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.checks import require_choice, require_number, require_whole
+from clear_strategies.kernels.losses import cpp
 from clear_strategies.schedules import milestone
 from rasterizers.interface import Camera, RasterSettings
+from rasterizers.native import threads
 
 _log = logging.getLogger(__name__)
 
@@ -62,14 +64,7 @@ def filter_std(
     """
     if variance == 0 or not len(means):
         return means.new_zeros(len(means))
-    z_min = means.new_full((len(means),), torch.inf)
-    for camera in cameras:
-        pose = camera.world_to_camera.to(means)
-        x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        inside = (u >= -_MARGIN * camera.width) & (u <= (1 + _MARGIN) * camera.width)
-        inside &= (v >= -_MARGIN * camera.height) & (v <= (1 + _MARGIN) * camera.height)
-        z_min = torch.where((z > near) & inside, torch.minimum(z_min, z), z_min)
+    z_min = _nearest_depths(means, _as_rows(cameras).to(means), near)
     seen = z_min.isfinite()
     if not bool(seen.any()):
         _log.warning(
@@ -80,3 +75,28 @@ def filter_std(
     z_min = torch.where(seen, z_min, z_min[seen].max())
     std: Tensor = z_min * (math.sqrt(variance) / max(camera.fx for camera in cameras))
     return std
+
+
+def _as_rows(cameras: Sequence[Camera]) -> Float[Tensor, "V 20"]:
+    """The rows of [R | t], fx, fy, cx, cy, and the bounds of u and v, inside which a centre counts."""
+    low, high = -_MARGIN, 1 + _MARGIN
+    numbers = [
+        (c.fx, c.fy, c.cx, c.cy, low * c.width, high * c.width, low * c.height, high * c.height) for c in cameras
+    ]
+    poses = torch.stack([camera.world_to_camera for camera in cameras])[:, :3].flatten(1)
+    return torch.cat((poses, torch.tensor(numbers).to(poses)), dim=1)
+
+
+def _nearest_depths(means: Float[Tensor, "N 3"], cameras: Float[Tensor, "V 20"], near: float) -> Float[Tensor, " N"]:
+    """The smallest depth beyond `near` among the cameras that see each centre; infinite where none does."""
+    z_min = means.new_full((len(means),), torch.inf)
+    if means.device.type == "cpu" and means.dtype == torch.float32 and cpp.available():
+        cpp.native().nearest_depths(means.contiguous(), cameras, near, z_min, threads())
+        return z_min
+    for camera in cameras:
+        pose, (fx, fy, cx, cy, u_low, u_high, v_low, v_high) = camera[:12].view(3, 4), camera[12:]
+        x, y, z = (means @ pose[:, :3].T + pose[:, 3]).unbind(-1)
+        u, v = fx * x / z + cx, fy * y / z + cy
+        inside = (z > near) & (u >= u_low) & (u <= u_high) & (v >= v_low) & (v <= v_high)
+        z_min = torch.where(inside, torch.minimum(z_min, z), z_min)
+    return z_min

@@ -253,6 +253,14 @@ def test_the_3d_filter_by_hand_and_unseen_gaussians_take_the_largest():
     assert torch.allclose(filter_std(0.1 * means, [smaller], 0.2), 0.1 * filter_std(means, [camera], 0.2))
 
 
+def test_the_compiled_3d_filter_is_the_readable_one():
+    cameras = [toy.camera(0.1 * i) for i in range(-20, 20)]
+    means = torch.randn(1003, 3, generator=torch.Generator().manual_seed(0))
+    readable = filter_std(means.double(), cameras, 0.2)
+    assert len(readable.unique()) > 900
+    assert torch.allclose(filter_std(means, cameras, 0.2).double(), readable, rtol=1e-6)
+
+
 def test_filtered_opacity_sends_its_gradient_into_the_scales():
     scene = toy.scene(12)
     field = GaussianField.from_cloud(scene.cloud).double()

@@ -6,6 +6,7 @@
 #include "bind_losses.hpp"
 #include "bind_merge.hpp"
 #include "bind_step.hpp"
+#include "filter.hpp"
 #include "isa.hpp"
 
 NB_MODULE(CLEAR_MODULE, m) {
@@ -14,4 +15,5 @@ NB_MODULE(CLEAR_MODULE, m) {
   clear::bind_losses(m);
   clear::bind_merge(m);
   clear::bind_step(m);
+  clear::bind_filter(m);
 }
