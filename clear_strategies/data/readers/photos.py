@@ -109,9 +109,7 @@ def _capture(root: Path, photos: Mapping[Path, Exif], folder: Path) -> Capture:
     model, photo_of = read_model(folder), {sfm.copy_name(i): path for i, path in enumerate(photos)}
     posed = {image.name: photo_of[image.name] for image in model.images}
     capture = colmap.capture(root, model, root, posed, upright=True)
-    names = {copy: path.name for copy, path in photo_of.items()}
-    entries = read_object(folder / sfm.UNPLACED)
-    unplaced = {names[copy]: sfm.why_unplaced(entry, names) for copy, entry in entries.items()}
+    unplaced = read_object(folder / sfm.UNPLACED)
     sfm.warn_unplaced(root, unplaced, len(photos))
     notes = {
         **capture.notes,
@@ -154,7 +152,7 @@ def _exposure(photos: Mapping[Path, Exif]) -> dict[str, str]:
 
 
 def _key(paths: Sequence[Path], *settings: int) -> str:
-    digest = hashlib.sha256(repr(("upright copies, points of two views, guided, reasons", *settings)).encode())
+    digest = hashlib.sha256(repr(("upright copies, points of two views, guided, reasons in words", *settings)).encode())
     for path in paths:
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:24]

@@ -1,4 +1,4 @@
-"""Structure from motion on the CPU through pycolmap: a sparse model from photos alone, with bounded memory and progress.
+"""Structure from motion on the CPU through pycolmap: a sparse model from photos alone, with bounded memory.
 
 COLMAP reads copies of the photos: upright JPEG files, no larger than needed. Photos of the same size and the same focal length in
 EXIF share a camera, whose estimate starts at that focal length.
@@ -6,15 +6,13 @@ EXIF share a camera, whose estimate starts at that focal length.
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import logging
 import os
 import signal
-import sqlite3
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -23,7 +21,6 @@ from PIL import Image as Picture
 
 from clear_strategies import files
 from clear_strategies.core.images import to_bytes
-from clear_strategies.core.progress import EVERY, Progress
 from clear_strategies.data.photo_files import Exif, read_image
 from clear_strategies.errors import DataError
 
@@ -36,9 +33,8 @@ MORE_PHOTOS: Final = (
 MODEL: Final = "cameras.bin"
 """The file of a model that exists only if the model is complete."""
 UNPLACED: Final = "unplaced.json"
-"""A file in the model's folder: for each photo without a pose, by the name of its copy, how it is related to the others."""
+"""A file in the model's folder: why the pose is unknown, for each photo without one, by its name."""
 _DATABASE: Final = "database.db"
-_PAIR: Final = 2147483647  # COLMAP's id of a pair of images is this times the first id, plus the second
 _FEW_FEATURES: Final = 200  # a photo with fewer shows too little
 _LISTED: Final = 3  # photos without a pose in the warning, at most
 _MEGA: Final = 1 << 20
@@ -91,7 +87,8 @@ def reconstruct(root: Path, photos: Mapping[Path, Exif], folder: Path, settings:
             result.mkdir()
             models[0].write_binary(str(result))
             placed = {image.name for image in models[0].images.values()}
-            files.write_json(result / UNPLACED, _unplaced(Path(work) / _DATABASE, placed))
+            names = [path.name for path in photos]
+            files.write_json(result / UNPLACED, _unplaced(pycolmap, Path(work) / _DATABASE, names, placed))
             files.install(result, folder, MODEL)
     except RuntimeError as error:
         raise DataError(root, "poses", f"structure-from-motion failed ({error})", MORE_PHOTOS) from error
@@ -139,21 +136,21 @@ def _map(pycolmap: Any, photos: Mapping[Path, Exif], work: Path, settings: SfmSe
         extraction.num_threads, extraction.use_gpu = settings.threads, False
         extraction.sift.max_num_features = settings.max_features
         extraction.sift.estimate_affine_shape = extraction.sift.domain_size_pooling = settings.precise
-        with _progress(database, "keypoints", "features", "photos", count):
-            for (width, height, focal), names in groups.items():
-                reader = pycolmap.ImageReaderOptions()
-                if focal is not None:
-                    reader.camera_params = f"{focal},{width / 2},{height / 2},0"  # of SIMPLE_RADIAL, its default
-                pycolmap.extract_features(
-                    database, copies, image_names=names, camera_mode=pycolmap.CameraMode.SINGLE,
-                    reader_options=reader, extraction_options=extraction, device=pycolmap.Device.cpu,
-                )  # fmt: skip
-        _keep_coarsest(database, settings.max_features)
+        _log.info("features of %d photos.", count)
+        for (width, height, focal), names in groups.items():
+            reader = pycolmap.ImageReaderOptions()
+            if focal is not None:
+                reader.camera_params = f"{focal},{width / 2},{height / 2},0"  # of SIMPLE_RADIAL, its default
+            pycolmap.extract_features(
+                database, copies, image_names=names, camera_mode=pycolmap.CameraMode.SINGLE,
+                reader_options=reader, extraction_options=extraction, device=pycolmap.Device.cpu,
+            )  # fmt: skip
+        _keep_coarsest(pycolmap, database, settings.max_features)
         matching = pycolmap.FeatureMatchingOptions()
         matching.num_threads, matching.use_gpu = settings.matchers, False
         matching.guided_matching = settings.precise
-        with _progress(database, "two_view_geometries", "matching", "pairs", count * (count - 1) // 2):
-            pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
+        _log.info("matching %d pairs of photos.", count * (count - 1) // 2)
+        pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
         mapping = pycolmap.IncrementalPipelineOptions()
         mapping.num_threads, mapping.random_seed = settings.threads, settings.seed
         # COLMAP's thresholds are for hundreds of photos. Of ten photos around a table these place six where those place four.
@@ -161,29 +158,33 @@ def _map(pycolmap: Any, photos: Mapping[Path, Exif], work: Path, settings: SfmSe
         mapping.mapper.abs_pose_min_num_inliers = 15
         # Most points of few photos are seen by two photos only. With these points those six poses are four times more exact.
         mapping.triangulation.ignore_two_view_tracks = False
-        _log.debug("placing the photos.")
-        # COLMAP may start again from another pair, so attempts are counted; the first call follows a pair.
-        placed, progress = itertools.count(3), Progress("placing the photos", "photos", count)
-        models = pycolmap.incremental_mapping(
-            database, copies, work, options=mapping, next_image_callback=lambda: progress(next(placed))
-        )
+        _log.info("placing the photos.")
+        models = pycolmap.incremental_mapping(database, copies, work, options=mapping)
     finally:
         pycolmap.logging.minloglevel = level
     return list(models.values())
 
 
-def _keep_coarsest(database: Path, most: int) -> None:
+def _keep_coarsest(pycolmap: Any, database: Path, most: int) -> None:
     """Leave each photo at most that many features, those of the coarsest scales, which COLMAP writes first.
 
-    COLMAP's own limit counts points, and a point with several orientations is several features.
+    COLMAP's own limit is soft: of photos of 12 megapixels it left 21,609 features for 8192, and the memory of matching grows with
+    their square.
     """
-    with contextlib.closing(sqlite3.connect(database)) as connection, connection:
-        for table in ("keypoints", "descriptors"):
-            connection.execute(
-                f"UPDATE {table} SET data = substr(data, 1, :most * (length(data) / rows)), rows = :most "  # noqa: S608
-                "WHERE rows > :most",
-                {"most": most},
+    kind = pycolmap.FeatureExtractorType.SIFT
+    with pycolmap.Database.open(database) as opened:
+        kept = {
+            image.image_id: (
+                opened.read_keypoints(image.image_id)[:most].copy(),
+                opened.read_descriptors(image.image_id).data[:most].copy(),
             )
+            for image in opened.read_all_images()
+        }
+        opened.clear_keypoints()
+        opened.clear_descriptors()
+        for number, (keypoints, descriptors) in kept.items():
+            opened.write_keypoints(number, keypoints)
+            opened.write_descriptors(number, pycolmap.FeatureDescriptors(kind, descriptors))
 
 
 def _write_copies(
@@ -206,29 +207,6 @@ def _write_copies(
     return groups
 
 
-@contextlib.contextmanager
-def _progress(database: Path, table: str, what: str, unit: str, total: int) -> Iterator[None]:
-    """Log every few seconds how many rows a table of COLMAP's database has, because its calls return only at their end."""
-    done, progress = threading.Event(), Progress(what, unit, total)
-
-    def watch() -> None:
-        while not done.wait(EVERY / 4):
-            with (
-                contextlib.suppress(sqlite3.Error),
-                contextlib.closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as connection,
-            ):
-                rows = connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]  # noqa: S608
-                progress(rows)
-
-    thread = threading.Thread(target=watch, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join()
-
-
 def _pycolmap() -> Any:
     handler = signal.getsignal(signal.SIGTERM)
     try:
@@ -242,38 +220,32 @@ def _pycolmap() -> Any:
     return pycolmap
 
 
-def _unplaced(database: Path, placed: Set[str]) -> dict[str, dict[str, Any]]:
-    """For each photo without a pose: its features, the most matches with any placed photo, and that photo's name."""
-    with contextlib.closing(sqlite3.connect(database)) as connection:
-        names = dict(connection.execute("SELECT image_id, name FROM images"))
-        features = dict(connection.execute("SELECT image_id, rows FROM keypoints"))
-        pairs = connection.execute("SELECT pair_id, rows FROM two_view_geometries").fetchall()
-    unplaced = {
-        name: {"features": features.get(i, 0), "matches": 0, "with": ""}
-        for i, name in names.items()
-        if name not in placed
-    }
-    for pair, matches in pairs:
-        two = [names[i] for i in divmod(pair, _PAIR)]
-        for name, other in (two, two[::-1]):
-            if name in unplaced and other in placed and matches > unplaced[name]["matches"]:
-                unplaced[name] |= {"matches": matches, "with": other}
-    return unplaced
-
-
-def why_unplaced(entry: Mapping[str, Any], names: Mapping[str, str]) -> str:
-    """Why a photo has no pose.
+def _unplaced(pycolmap: Any, database: Path, names: Sequence[str], placed: Set[str]) -> dict[str, str]:
+    """Why each photo that is not placed has no pose: its features, or the placed photo that it has most in common with.
 
     Args:
-        entry: of the photo in `UNPLACED`.
-        names: the photos' names, by those of their copies.
+        names: of the photos, in the order of their copies.
+        placed: the names of the placed copies.
     """
-    if entry["features"] < _FEW_FEATURES:
-        return f"{entry['features']} features: blurred, dark, or without texture"
-    if not entry["matches"]:
+    with pycolmap.Database.open(database) as opened:
+        copies = {image.image_id: image.name for image in opened.read_all_images()}
+        features = {number: opened.num_keypoints_for_image(number) for number in copies}
+        pairs = list(zip(*opened.read_two_view_geometry_num_inliers(), strict=True))
+    name_of = {copy_name(i): name for i, name in enumerate(names)}
+    most = {number: (0, "") for number, copy in copies.items() if copy not in placed}
+    for pair, matches in pairs:
+        for number, other in itertools.permutations(pycolmap.pair_id_to_image_pair(pair)):
+            if number in most and copies[other] in placed:
+                most[number] = max(most[number], (matches, name_of[copies[other]]))
+    return {name_of[copies[number]]: _why(features[number], *best) for number, best in most.items()}
+
+
+def _why(features: int, matches: int, other: str) -> str:
+    if features < _FEW_FEATURES:
+        return f"{features} features: blurred, dark, or without texture"
+    if not matches:
         return "shares nothing with the placed photos: overlap by two thirds"
-    other = names[entry["with"]]
-    return f"{entry['matches']} features in common with {other}, less with every other photo: more overlap"
+    return f"{matches} features in common with {other}, less with every other photo: more overlap"
 
 
 def warn_unplaced(root: Path, unplaced: Mapping[str, str], count: int) -> None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import os
 import signal
-import sqlite3
 import subprocess
 import sys
 from pathlib import Path
@@ -93,20 +91,33 @@ def test_a_run_that_is_terminated_while_it_reads_photos_ends_without_a_stack_tra
     assert (ended.returncode, ended.stderr) == (-signal.SIGTERM, "")
 
 
+def database_of(
+    file: Path, features: dict[int, int], pairs: dict[tuple[int, int], int]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """COLMAP's database of photos, by their number of features and of matches in pairs; keypoints and descriptors of each."""
+    rng, kind = np.random.default_rng(0), pycolmap.FeatureExtractorType.SIFT
+    found = [(rng.random((n, 6), np.float32), rng.integers(0, 255, (n, 128), np.uint8)) for n in features.values()]
+    with pycolmap.Database.open(file) as database:
+        camera = database.write_camera(pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 50.0, 64, 48))
+        for number, (keypoints, descriptors) in zip(features, found, strict=True):
+            image = database.write_image(pycolmap.Image(sfm.copy_name(number), camera_id=camera))
+            database.write_keypoints(image, keypoints)
+            database.write_descriptors(image, pycolmap.FeatureDescriptors(kind, descriptors))
+        for (one, other), matches in pairs.items():
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.inlier_matches = np.zeros((matches, 2), np.uint32)
+            database.write_two_view_geometry(one + 1, other + 1, geometry)  # COLMAP counts from 1
+    return found
+
+
 def test_a_photo_without_a_pose_is_told_with_the_placed_photo_that_it_has_most_in_common_with(tmp_path: Path) -> None:
-    database, first = tmp_path / "database.db", 2147483647
-    with contextlib.closing(sqlite3.connect(database)) as connection, connection:
-        connection.execute("CREATE TABLE images (image_id, name)")
-        connection.executemany("INSERT INTO images VALUES (?, ?)", [(i, f"{i}.jpg") for i in (1, 2, 3, 4)])
-        connection.execute("CREATE TABLE keypoints (image_id, rows)")
-        connection.executemany("INSERT INTO keypoints VALUES (?, ?)", [(i, 1000) for i in (1, 2, 3, 4)])
-        connection.execute("CREATE TABLE two_view_geometries (pair_id, rows)")
-        pairs = [(1 * first + 2, 300), (1 * first + 3, 9), (2 * first + 3, 14), (3 * first + 4, 80)]
-        connection.executemany("INSERT INTO two_view_geometries VALUES (?, ?)", pairs)
-    entries = sfm._unplaced(database, {"1.jpg", "2.jpg"})
-    assert {name: sfm.why_unplaced(entry, {"2.jpg": "b.png"}) for name, entry in entries.items()} == {
-        "3.jpg": "14 features in common with b.png, less with every other photo: more overlap",
-        "4.jpg": "shares nothing with the placed photos: overlap by two thirds",
+    pairs = {(0, 1): 300, (0, 2): 9, (1, 2): 14, (2, 3): 80}
+    database_of(tmp_path / "database.db", {0: 1000, 1: 1000, 2: 1000, 3: 1000, 4: 7}, pairs)
+    names = ["a.png", "b.png", "c.png", "d.png", "e.png"]
+    assert sfm._unplaced(pycolmap, tmp_path / "database.db", names, {sfm.copy_name(0), sfm.copy_name(1)}) == {
+        "c.png": "14 features in common with b.png, less with every other photo: more overlap",
+        "d.png": "shares nothing with the placed photos: overlap by two thirds",
+        "e.png": "7 features: blurred, dark, or without texture",
     }
 
 
@@ -180,17 +191,9 @@ def test_the_memory_of_matching_is_bounded_on_machines_of_many_cores(monkeypatch
 
 
 def test_no_photo_has_more_features_than_asked_for(tmp_path: Path) -> None:
-    """COLMAP limits the points, not their orientations: of 12-megapixel photos it kept 21,609 instead of 8192."""
-    file, rng = tmp_path / "database.db", np.random.default_rng(0)
-    found = [(rng.random((n, 6), np.float32), rng.integers(0, 255, (n, 128), np.uint8)) for n in (3, 7)]
-    kind = pycolmap.FeatureExtractorType.SIFT
-    with pycolmap.Database.open(file) as database:
-        camera = database.write_camera(pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 50.0, 64, 48))
-        for keypoints, descriptors in found:
-            image = database.write_image(pycolmap.Image(f"{len(keypoints)}.jpg", camera_id=camera))
-            database.write_keypoints(image, keypoints)
-            database.write_descriptors(image, pycolmap.FeatureDescriptors(kind, descriptors))
-    sfm._keep_coarsest(file, 5)
+    file = tmp_path / "database.db"
+    found = database_of(file, {0: 3, 1: 7}, {})
+    sfm._keep_coarsest(pycolmap, file, 5)
     with pycolmap.Database.open(file) as database:
         for image, (keypoints, descriptors) in enumerate(found, start=1):
             assert np.array_equal(database.read_keypoints(image), keypoints[:5])
