@@ -27,10 +27,9 @@ _LARGEST: Final = 64 << 30
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write a file beside the target, flush it to disk, then rename it to the target."""
-    with replacing(path) as partial, partial.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+    with replacing(path) as partial:
+        partial.write_bytes(data)
+        flush(partial)
 
 
 @contextmanager
@@ -43,6 +42,15 @@ def replacing(path: Path) -> Iterator[Path]:
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)  # exists only after an exception or Ctrl-C
+
+
+def flush(path: Path) -> None:
+    """Have the system write a file, or the names in a folder, to disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def install(complete: Path, folder: Path, last: str) -> None:

@@ -37,7 +37,7 @@ def test_a_run_leaves_everything_it_promises(finished):
     assert 0 < metrics["conflict"]["gaussian"] < 1
     assert {"versions", "git", "seed", "backend", "plan"} <= set(metrics["provenance"])
     assert b"comment SplatRenderMode: mip" in (out / "point_cloud.ply").read_bytes()[:300]
-    assert (out / "checkpoints" / "step_0000013" / "manifest.json").is_file()
+    assert (out / "checkpoints" / "step_0000013.safetensors").is_file()
     header = (out / "conflict.csv").read_text().splitlines()[0]
     assert header.startswith("t,conflict,conflict_means")
     timing = (out / "timing.csv").read_text()

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
+
+import msgspec
 
 from clear_strategies.compose import flat
 from clear_strategies.errors import DataError
@@ -30,7 +31,7 @@ _NOT_COMPARED: Final = CHANGES_NO_RESULT | {"fit.device"}
 def comparable(values: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration, flat and JSON-ready, without what a resumed run may change."""
     compared = {key: value for key, value in flat(values).items() if key not in _NOT_COMPARED}
-    return dict(json.loads(json.dumps(compared)))  # as it comes back from a file
+    return dict(msgspec.json.decode(msgspec.json.encode(compared)))  # as it comes back from a file
 
 
 def finished(folder: Path, config: Mapping[str, Any]) -> Metrics | None:

@@ -71,7 +71,7 @@ def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
         DataError: nothing that can be drawn is there, or it is damaged.
         SettingError: there is no such rasterizer here.
     """
-    if path.is_file():
+    if path.is_file() and path.suffix != checkpoint.SUFFIX:
         return _of_ply(path, rasterizer)
     folder = folder_of(path)
     if checkpoint.saved(folder / CHECKPOINTS):

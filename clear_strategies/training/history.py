@@ -1,10 +1,14 @@
-"""The rows of a run's history: the newest are dicts, the others are packed, a tenth as large."""
+"""The rows of a run's history: the newest are dicts, the others are packed, a tenth as large; and the tensors of a checkpoint."""
 
 from __future__ import annotations
 
 from array import array
 from collections.abc import Iterable, Sequence
 from typing import Final, overload
+
+import torch
+from jaxtyping import Float64, Int32
+from torch import Tensor
 
 from clear_strategies.core.deferred import Number
 
@@ -56,3 +60,31 @@ class History(Sequence[dict[str, Number]]):
             return self._loose[at - packed]
         end, names = self._ends[at], self._names[self._kinds[at]]
         return dict(zip(names, self._numbers[end - len(names) : end], strict=True))
+
+
+def packed(rows: Iterable[dict[str, float]]) -> tuple[list[list[str]], Int32[Tensor, " T"], Float64[Tensor, " N"]]:
+    """Rows for a file: the sets of names that occur, which of them each row has, and all numbers one after the other."""
+    sets, kinds, numbers = dict[tuple[str, ...], int](), array("i"), array("d")
+    for row in rows:
+        kinds.append(sets.setdefault(tuple(row), len(sets)))
+        numbers.extend(row.values())
+    return (
+        [list(names) for names in sets],
+        torch.tensor(kinds, dtype=torch.int32),
+        torch.tensor(numbers, dtype=torch.float64),
+    )
+
+
+def unpacked(
+    sets: Sequence[Sequence[str]], kinds: Int32[Tensor, " T"], numbers: Float64[Tensor, " N"]
+) -> list[dict[str, float]]:
+    """The rows that `packed` was given.
+
+    Raises:
+        ValueError: the three do not belong together.
+    """
+    names = [sets[kind] if 0 <= kind < len(sets) else () for kind in kinds.tolist()]
+    if sum(map(len, names)) != len(numbers):
+        raise ValueError(f"the history has {len(numbers)} numbers for {sum(map(len, names))} names")
+    left = iter(numbers.tolist())
+    return [{name: next(left) for name in row} for row in names]

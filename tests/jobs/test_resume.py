@@ -47,6 +47,6 @@ def test_ctrl_c_after_training_names_the_checkpoint_that_was_saved(tmp_path: Pat
     monkeypatch.setattr(job.results, "write_results", stopped)
     with pytest.raises(Interrupted) as told:
         job.run(composed(*TINY, "+strategy=gco", "prior=bicubic", "fit.threads=1", "fit.iterations=3"), tmp_path)
-    saved = tmp_path / "checkpoints" / "step_0000004"
-    assert saved.is_dir()
+    saved = tmp_path / "checkpoints" / "step_0000004.safetensors"
+    assert saved.is_file()
     assert str(told.value) == f"stopped by SIGINT before the run was finished. Go on with fit.resume={saved}."

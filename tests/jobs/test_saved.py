@@ -32,7 +32,7 @@ def exact(field):
 
 def test_a_run_its_checkpoints_and_one_of_them_open_alike(run):
     folder, field = run
-    for path in (folder, folder / "checkpoints", folder / "checkpoints" / "step_0000001"):
+    for path in (folder, folder / "checkpoints", folder / "checkpoints" / "step_0000001.safetensors"):
         splat = open_splat(path)
         assert torch.equal(splat.painter.color(CAMERA), exact(field))
         assert [saved.split for saved in splat.cameras] == ["train"] * 3 + ["test"]

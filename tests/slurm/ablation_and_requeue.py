@@ -113,7 +113,7 @@ class Experiment:
         """As a failing node would: the process is gone without a word, and the job is started again."""
         process = self.start(*SLURM, *LONG, "hydra.sweep.dir=killed", name="killed")
         folder = self.folder / "killed" / "0"
-        wait_for(lambda: list(folder.glob("checkpoints/step_*/manifest.json")), 300, "a checkpoint")
+        wait_for(lambda: list(folder.glob("checkpoints/step_*.safetensors")), 300, "a checkpoint")
         job = self.ask("squeue", "-h", "-t", "R", "-o", "%i").split()[0]
         self.show("scancel", "--signal=KILL", "--full", job)
         wait_for(lambda: not self.ask("squeue", "-h", "-t", "R"), 300, "the job to end")

@@ -43,7 +43,7 @@ MEASUREMENTS: dict[str, Callable[[float, Path], Iterable[Row]]] = {
     "lifecycle": lambda share, folder: [lifecycle.measure(round(500 * share))],
     "faults": lambda share, folder: [faults.measure(folder)],
     "kills": lambda share, folder: [kills.measure(folder, round(200 * share))],
-    "integrity": lambda share, folder: [checkpoints.integrity(folder, round(4000 * share))],
+    "integrity": lambda share, folder: [checkpoints.integrity(folder, round(100_000 * share))],
     "inputs": lambda share, folder: [bad_inputs.measure(folder)],
     "fuzz": lambda share, folder: [
         fuzz.measure(targets, round(n * share), processes=os.cpu_count() or 1) for targets, n in _MUTANTS.items()

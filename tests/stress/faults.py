@@ -73,6 +73,20 @@ class _Disk:
 
         return call
 
+    def wrote_tensors(self, real: Callable) -> Callable:
+        """As safetensors, which may fail and then leave half of the bytes."""
+
+        def call(tensors, path, metadata):
+            try:
+                self.count("write")
+            except BaseException:
+                real(tensors, path, metadata)
+                os.truncate(path, path.stat().st_size // 2)
+                raise
+            real(tensors, path, metadata)
+
+        return call
+
     def remove_tree(self, path, ignore_errors=False, **_) -> None:
         """As shutil.rmtree, in operations that each may fail."""
         try:
@@ -114,11 +128,13 @@ def fault(at: int, make: Callable[[], BaseException]) -> Iterator[list[str]]:
     """Let the `at`-th operation on files fail. Yields the operations by name."""
     disk = _Disk(at, make)
     patched = [(Path, name) for name in ("mkdir", "rename", "replace", "unlink", "rmdir")] + [(os, "fsync")]
-    before = [(owner, name, getattr(owner, name)) for owner, name in (*patched, (io, "open"), (shutil, "rmtree"))]
-    for owner, name, real in before[:-2]:
+    own = [(io, "open"), (shutil, "rmtree"), (checkpoint, "save_file")]
+    before = [(owner, name, getattr(owner, name)) for owner, name in (*patched, *own)]
+    for owner, name, real in before[: -len(own)]:
         setattr(owner, name, disk.wrapped(name, real))
     io.open = disk.opened(io.open)  # what Path.open calls
     shutil.rmtree = disk.remove_tree
+    checkpoint.save_file = disk.wrote_tensors(checkpoint.save_file)
     try:
         yield disk.seen
     finally:
@@ -170,7 +186,7 @@ def _died(folder: Path) -> None:
     """A process died while it saved and while it exported."""
     _first(folder, exported=True)
     (folder / "checkpoints" / ".step_0000200.7.partial").mkdir()
-    (folder / "checkpoints" / ".step_0000200.7.partial" / "history.json").write_text("[")
+    (folder / "checkpoints" / ".step_0000200.7.partial" / ".tmpQ7").write_text("[")
     (folder / ".metrics.json.7.partial").write_text("{")
 
 

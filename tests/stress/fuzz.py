@@ -83,7 +83,6 @@ def binary(folder: Path) -> dict[str, Target]:
     bounds, cloud = table / "poses_bounds.npy", folder / "cloud.ply"
     ply.write_gaussians(cloud, _gaussians(20))
     saved = checkpoint.save(folder / "checkpoints", small(100, 1.0))
-    manifest, tensors = saved / "manifest.json", saved / "tensors.safetensors"
 
     def read_gaussians() -> None:
         found = ply.read_gaussians(cloud)
@@ -99,10 +98,7 @@ def binary(folder: Path) -> dict[str, Target]:
         "COLMAP points3D.bin": ([points], lambda: _require_points(colmap_model.read_points(points))),
         "poses_bounds.npy": ([bounds], lambda: _require(bool(np.isfinite(llff.read_bounds(bounds)).all()))),
         "PLY": ([cloud], read_gaussians),
-        "checkpoint manifest": ([manifest], read_checkpoint),
-        "checkpoint tensors": ([tensors], read_checkpoint),
-        # What a program with the manifest's hash at hand could have written.
-        "checkpoint tensors with their hash": ([tensors], lambda: checkpoint.tensors_of(tensors, tensors.read_bytes())),
+        "checkpoint": ([saved], read_checkpoint),
     }
 
 

@@ -1,159 +1,98 @@
-"""Checkpoints: files that are gone or not those of the manifest, and manifests with hashes that match and nonsense inside."""
+"""Checkpoints: files that are gone, damaged or of another program, and sound ones that do not belong to the run."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-import shutil
+import struct
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors.torch import load, save
 
 from clear_strategies.jobs import resume
 from clear_strategies.training import checkpoint
-from clear_strategies.training.checkpoint import Checkpoint
 from tests.helpers.short_run import start
 from tests.stress.bad_inputs import BadInput
 from tests.stress.faults import small
 
-_FILES = ("manifest.json", "tensors.safetensors", "history.json")
 
+def _rewritten(change: Callable[[bytes], bytes]) -> Callable[[Path], object]:
+    """Of the file's bytes."""
 
-def _load(spoil: Callable[[Path], object]) -> Callable[[Path], object]:
     def give(folder: Path) -> object:
         path = checkpoint.save(folder, small(100, 1.0))
-        spoil(path)
+        path.write_bytes(change(path.read_bytes()))
         return checkpoint.load(path)
 
     return give
 
 
-def _rewritten(name: str, change: Callable[[bytes], bytes]) -> Callable[[Path], object]:
-    return _load(lambda path: (path / name).write_bytes(change((path / name).read_bytes())))
+def _stated(text: str | None = None, *, sealed: bool = True, **changes: str) -> Callable[[Path], object]:
+    """Other metadata beside the same tensors: `text` with its seal, and changes of the entries."""
 
+    def change(data: bytes) -> bytes:
+        tensors, header = load(data), data[8 : 8 + struct.unpack("<Q", data[:8])[0]]
+        metadata: dict[str, str] = checkpoint.msgspec.json.decode(header)["__metadata__"]
+        if text is not None:
+            metadata["stated"] = text
+        if sealed:
+            metadata["sha256"] = checkpoint._seal(metadata["stated"], tensors)
+        return save(tensors, {**metadata, **changes})
 
-def _sealed(**changes: Any) -> Callable[[Path], object]:
-    """A manifest that was changed, and then given the hash of its new content; `...` takes an entry away."""
-
-    def change(manifest: dict[str, Any]) -> None:
-        manifest.update(changes)
-        for name in [name for name, value in changes.items() if value is ...]:
-            del manifest[name]
-
-    return _load(partial(_seal, change=change))
-
-
-def _seal(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    manifest = json.loads((path / "manifest.json").read_text())
-    manifest.pop("sha256_of_manifest")
-    change(manifest)
-    (path / "manifest.json").write_text(checkpoint._sealed(manifest))
-
-
-def _content(name: str, content: bytes) -> Callable[[Path], object]:
-    """A file's content in place of the one that was saved, with its hash in the manifest."""
-
-    def spoil(path: Path) -> None:
-        (path / name).write_bytes(content)
-        _seal(path, lambda manifest: manifest["sha256"].update({name: hashlib.sha256(content).hexdigest()}))
-
-    return _load(spoil)
-
-
-_history = partial(_content, "history.json")
-_tensors = partial(_content, "tensors.safetensors")
-
-
-def _swapped(name: str) -> Callable[[Path], object]:
-    def give(folder: Path) -> object:
-        mine, other = (
-            checkpoint.save(folder, replace(small(t, float(t)), history=[{"t": float(t)}])) for t in (100, 200)
-        )
-        shutil.copy(other / name, mine / name)
-        return checkpoint.load(mine)
-
-    return give
+    return _rewritten(change)
 
 
 def _restored(
-    change: Callable[[dict[str, torch.Tensor]], object] = lambda tensors: None, **facts: Any
+    change: Callable[[dict[str, torch.Tensor]], object] = lambda tensors: None, **stated: Any
 ) -> Callable[[Path], object]:
-    """A sound file whose tensors do not belong to the run that is resumed."""
+    """A sound file whose content does not belong to the run that is resumed."""
 
     def give(folder: Path) -> object:
-        state = start(("gco", "svs"))
-        saved = state.checkpoint({})
-        tensors = dict(saved.tensors)
+        saved = start(("gco", "svs")).checkpoint({})
+        tensors, facts = dict(saved.tensors), {**saved.facts, **stated.pop("facts", {})}
         change(tensors)
-        t = facts.pop("t", saved.t)
-        spoilt = Checkpoint(t, tensors, {}, {**saved.facts, **facts}, saved.history, saved.work_log, saved.device)
-        return resume.restore(start(("gco", "svs")), spoilt, folder, {})
+        path = checkpoint.save(folder, replace(saved, tensors=tensors, facts=facts, **stated))
+        return resume.restore(start(("gco", "svs")), checkpoint.load(path), path, {})
 
     return give
 
 
-def _nested(depth: int) -> bytes:
-    return b'{"a":' * depth + b"1" + b"}" * depth
+def _with_row_too_few(name: str) -> Callable[[Path], object]:
+    return _restored(lambda tensors: tensors.update({name: tensors[name][:-1]}))
 
 
-_FACTS = {"optimizer_steps": 100.0, "degree": 1.0}
+_HEADER = b'{"a":{"dtype":"F32","shape":[9],"data_offsets":[0,36]}}'.ljust(60)
 _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "absent": (lambda folder: checkpoint.load(folder / "none"), "checkpoint: no checkpoint is here"),
     "folder without checkpoints": (checkpoint.load, "checkpoint: no checkpoint is here"),
-    **{f"{name} gone": (_load(lambda path, name=name: (path / name).unlink()), "file: cannot be read|no checkpoint is here")
-       for name in _FILES},
-    **{f"{name} empty": (_rewritten(name, lambda data: b""), rf"{name}: (json|sha256)") for name in _FILES},
-    **{f"{name} cut in half": (_rewritten(name, lambda data: data[: len(data) // 2]), rf"{name}: (json|sha256)")
-       for name in _FILES},
-    **{f"{name} with a byte more": (_rewritten(name, lambda data: data + b" "), rf"{name}: sha256") for name in _FILES},
-    **{f"{name} of another checkpoint": (_swapped(name), r"sha256") for name in _FILES[1:]},
-    "manifest is a list": (_rewritten("manifest.json", lambda data: b"[]"), "json: must be an object, got a list"),
-    "manifest is a number": (_rewritten("manifest.json", lambda data: b"7"), "json: must be an object, got a int"),
-    "manifest nests 100,000 deep": (_rewritten("manifest.json", lambda data: _nested(100_000)), "json: is not valid JSON"),
-    "manifest is no UTF-8": (_rewritten("manifest.json", lambda data: b'{"a": "\xff"}'), "json: is not valid JSON"),
-    "number of 5,000 digits": (_rewritten("manifest.json", lambda data: b'{"t": ' + b"7" * 5000 + b"}"), "json: is not"),
-    "altered t": (_rewritten("manifest.json", lambda data: data.replace(b'"t": 100', b'"t": 999')), "sha256_of_manifest"),
-    "altered setting": (_rewritten("manifest.json", lambda data: data.replace(b'seed": 1', b'seed": 2')), "sha256_of_man"),
-    "format of an earlier version": (_sealed(format=1), "format: is 1, this version reads 2"),
-    "format of a later version": (_sealed(format=99), "format: is 99, this version reads 2"),
-    "format in words": (_sealed(format="two"), "format: is 'two'"),
-    "no format": (_sealed(format=...), "format: is None"),
-    **{f"{name} missing": (_sealed(**{name: ...}), name)
-       for name in ("t", "config", "facts", "work_log", "device", "sha256")},
-    **{f"t is {value!r}": (_sealed(t=value), r"manifest.json: t: must")
-       for value in (0, -5, 10**30, 1.5, "7", None, True, [], float("nan"), float("inf"))},
-    **{f"degree is {value!r}": (_sealed(facts={**_FACTS, "degree": value}), r"facts.degree: must")
-       for value in (7, -1, 0.5, float("inf"), "1")},
-    **{f"steps are {value!r}": (_sealed(facts={**_FACTS, "optimizer_steps": value}), r"facts.optimizer_steps: must")
-       for value in (-1, 10**12, float("nan"))},
-    "facts are a list": (_sealed(facts=[]), "facts: must"),
-    "config is a list": (_sealed(config=[]), "config: must"),
-    "device is a printer": (_sealed(device="printer"), "device: "),
-    "work log counts below 0": (
-        _sealed(work_log={"a": {"runs": -1, "seconds": 0, "skipped": {}}}), r"work_log\[...\].runs: must be",
+    "empty": (_rewritten(lambda data: b""), "is no whole checkpoint"),
+    "cut in half": (_rewritten(lambda data: data[: len(data) // 2]), "is no whole checkpoint"),
+    "with a byte more": (_rewritten(lambda data: data + b" "), "is no whole checkpoint"),
+    "a pickle": (_rewritten(lambda data: b"\x80\x04K\x01."), "is no whole checkpoint"),
+    "header asks for 2^60 bytes": (_rewritten(lambda data: (2**60).to_bytes(8, "little") + b"{}"), "is no whole"),
+    "offsets overlap nothing": (_rewritten(lambda data: (60).to_bytes(8, "little") + _HEADER), "is no whole"),
+    "tensors of another program": (_rewritten(lambda data: save(load(data))), "format: is None, this version reads '3'"),
+    "altered t": (_rewritten(lambda data: data.replace(b'\\"t\\":100', b'\\"t\\":999')), "sha256: .* was altered"),
+    "altered setting": (_rewritten(lambda data: data.replace(b'seed\\":1', b'seed\\":2')), "sha256: .* was altered"),
+    "altered number": (_rewritten(lambda data: data.replace(struct.pack("<f", 1), struct.pack("<f", 2))), "was altered"),
+    "format of a later version": (_stated(format="99"), "format: is '99', this version reads '3'"),
+    "no seal": (_stated(sealed=False, sha256=""), "sha256: .* was altered"),
+    "stated is no JSON": (_stated("{"), "is no whole checkpoint"),
+    "stated is a list": (_stated("[]"), "is no whole checkpoint"),
+    "stated lacks entries": (_stated('{"t":1}'), "is no whole checkpoint"),
+    "stated nests 100,000 deep": (_stated('{"a":' * 100_000), "is no whole checkpoint"),
+    "device is a printer": (
+        _stated('{"t":1,"config":{},"facts":{},"work_log":{},"device":"printer","columns":[]}'), "no whole checkpoint",
     ),
-    "hash is a number": (_sealed(sha256=dict.fromkeys(_FILES[1:], 7)), "sha256"),
-    "hash of another file alone": (_sealed(sha256={"a": "b"}), "sha256"),
-    "history is an object": (_history(b"{}"), "history.json: json: must be"),
-    "history of texts": (_history(b'["a"]'), r"history.json: \[0\]: must"),
-    "history with a text for a number": (_history(b'[{"t": "1"}]'), r"history.json: \[0\]\[...\]: must be"),
-    "history that is no JSON": (_history(b"[1,"), "history.json: json: is not valid JSON"),
-    "tensors are a pickle": (_tensors(b"\x80\x04K\x01."), "tensors.safetensors: tensors: are no safetensors"),
-    "tensors are nothing": (_tensors(b""), "tensors.safetensors: tensors: are no safetensors"),
-    "tensors' header asks for 2^60 bytes": (_tensors((2**60).to_bytes(8, "little") + b"{}"), "are no safetensors"),
-    "tensors' offsets overlap nothing": (
-        _tensors((60).to_bytes(8, "little") + b'{"a":{"dtype":"F32","shape":[9],"data_offsets":[0,36]}}'.ljust(60)),
-        "are no safetensors",
+    "history of other columns": (
+        _stated('{"t":1,"config":{},"facts":{},"work_log":{},"device":"cpu","columns":[["t"]]}'), "2 numbers for 1 names",
     ),
     "no means": (_restored(lambda tensors: tensors.pop("field/means")), "do not fit this run"),
     "no moments": (_restored(lambda tensors: tensors.pop("optimizer/first.means")), "do not fit this run"),
     "no statistics": (_restored(lambda tensors: tensors.pop("density/score")), "do not fit this run"),
-    **{f"{name} with a row too few": (
-        _restored(lambda tensors, name=name: tensors.update({name: tensors[name][:-1]})), "do not fit this run")
+    **{f"{name} with a row too few": (_with_row_too_few(name), "do not fit this run")
        for name in ("field/quats", "field/filter_3d", "optimizer/second.shN", "density/count")},
     "means in float64": (
         _restored(lambda tensors: tensors.update({"field/means": tensors["field/means"].double()})), "torch.float64",
@@ -164,7 +103,8 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "a strategy's tensors that is not in the run": (
         _restored(lambda tensors: tensors.update({"strategies/Other.rows": torch.zeros(3)})), "belongs to no strategy",
     ),
+    "t of 0": (_restored(t=0), "t=0"),
     "t beyond the run": (_restored(t=10_000), "t=10000"),
-    "degree beyond the run": (_restored(degree=4.0), "degree=4"),
+    "degree beyond the run": (_restored(facts={"degree": 4.0}), "degree=4"),
 }  # fmt: skip
 INPUTS = [BadInput("checkpoint", name, give, pattern) for name, (give, pattern) in _CASES.items()]
