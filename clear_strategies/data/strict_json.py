@@ -1,4 +1,4 @@
-"""JSON files, read strictly and checked against msgspec types, which ignore keys that they do not have:
+"""JSON files, checked against msgspec types, which ignore keys that they do not have:
 
     class Run(msgspec.Struct):
         iterations: Count
@@ -11,8 +11,6 @@ A value of another type is refused with its place in the file.
 
 from __future__ import annotations
 
-import json
-import math
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -33,37 +31,17 @@ _T = TypeVar("_T")
 
 
 def read(path: Path) -> Any:
-    """The content of a file. msgspec's own reader would accept a key that occurs twice.
+    """The content of a file.
 
     Raises:
-        DataError: it cannot be read, or has NaN, duplicate keys, deep nesting or numbers beyond a float.
+        DataError: it cannot be read, or is no JSON, which has neither NaN nor numbers beyond a float.
     """
-
-    def refuse_constant(name: str) -> Any:
-        raise ValueError(f"{name} is no JSON number")
-
-    def finite(digits: str) -> float:
-        value = float(digits)
-        if not math.isfinite(value):
-            raise ValueError(f"{digits[:40]} is beyond the range of a float")
-        return value
-
-    def refuse_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        value = dict(pairs)
-        if len(value) != len(pairs):
-            keys = [key for key, _ in pairs]
-            raise ValueError(f"the key {next(key for key in keys if keys.count(key) > 1)!r} occurs twice in one object")
-        return value
-
-    text = read_bytes(path, most=_LARGEST)
     try:
-        return json.loads(
-            text.decode(), parse_constant=refuse_constant, parse_float=finite, object_pairs_hook=refuse_duplicates
-        )
+        return msgspec.json.decode(read_bytes(path, most=_LARGEST))
     except RecursionError as error:
         raise DataError(path, "json", "is nested too deeply", "write it again") from error
-    except ValueError as error:
-        raise DataError(path, "json", f"is not valid ({str(error)[:120]})", "write it again") from error
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise DataError(path, "json", f"is not valid ({error})", "write it again") from error
 
 
 def read_object(path: Path) -> dict[str, Any]:
