@@ -8,8 +8,10 @@ from types import SimpleNamespace
 import pytest
 
 from clear_strategies import SVS, Conductor
+from clear_strategies.errors import SettingError
 from clear_strategies.strategies.base import Strategy
 from integration.densification import end_with_strategies, require_end
+from tests.helpers import gsplat_host
 
 
 @dataclass(frozen=True)
@@ -46,3 +48,15 @@ def test_without_such_a_strategy_nothing_changes(caplog):
 def test_what_a_strategy_never_allows_ends_at_once(caplog):
     require_end(Conductor(Late(0, 0)), 100, "until")
     assert "Late ends densification at 1. Lower until to that iteration" in caplog.text
+
+
+@pytest.mark.parametrize("host", ["gsplat", "inria"])
+def test_a_host_that_would_densify_after_the_anchor_is_refused_before_the_first_step(host, request):
+    early = SVS(anchor_start=5, anchor_strength=0.01)
+    if host == "gsplat":
+        strategy = SimpleNamespace(refine_stop_iter=24, grow_grad2d=2e-4)
+        with pytest.raises(SettingError, match=r"before the anchor is taken, got 24. Set refine_stop_iter=4"):
+            gsplat_host.started(early, strategy=strategy)
+    else:
+        with pytest.raises(SettingError, match=r"before the anchor is taken, got 24. Set densify_until_iter=5"):
+            request.getfixturevalue("inria_attached")(early, densify_until=24)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import rasterizers
-from clear_strategies import Conductor, FadingOpacity, SplatSuRe
+from clear_strategies import Conductor, FadingOpacity
 from clear_strategies.compose import conductor as composed_conductor
 from clear_strategies.data.priors import Bicubic
 from integration.gsplat import attach
@@ -170,15 +170,6 @@ def test_opacities_fade_in_a_gsplat_host():
         after[len(strategies)] = a_host.splats["opacities"].detach().sigmoid()
     assert after[1].mean() < 0.4 * after[0].mean()  # three steps, and what the optimizer gives back
     assert after[1].min() > 0.005
-
-
-def test_splatsure_follows_a_host_that_densifies():
-    pytest.importorskip("gsplat.strategy", reason="pip install gsplat")
-    conductor = Conductor(SplatSuRe(), objective=inria.HR_FROM_START)
-    a_host, _ = gsplat_host.densified(conductor)
-    n = len(a_host.splats["means"])
-    assert n != 40
-    assert {rows.shape for rows in conductor.state_dict().values()} == {(n,)}
 
 
 def test_views_that_were_made_without_a_decorator_are_warned_of(caplog):

@@ -247,15 +247,6 @@ def test_what_cannot_be_attached_or_drawn_is_refused():
         attach(host.splats, host.optimizers, scene.train, Conductor())
 
 
-def test_a_second_pass_over_the_view_can_stand_beside_it():
-    _, clear, render = started()
-    first = render(0)
-    with clear.rendering(None):
-        second = render(0)
-    (first.mean() + second.mean()).backward()
-    assert clear.attachment.counts["LR renders"] == clear.attachment.counts["merges"] == 1
-
-
 @pytest.mark.parametrize("last_one_has_backward", [True, False])
 def test_renderings_are_freed_after_their_step_and_with_the_loop(last_one_has_backward):
     def kept():

@@ -128,13 +128,17 @@ def test_a_loop_without_backward_is_refused():
         host.optimizers["means"].step()
 
 
-def test_a_second_pass_by_the_function_that_was_wrapped_stands_beside_the_photo():
+@pytest.mark.parametrize("named", [True, False], ids=["named as of no photo", "by the function that was wrapped"])
+def test_a_second_pass_stands_beside_the_photo(named):
     host, clear, render = started()
     with pytest.raises(HostError, match="its __wrapped__"):
         (render().mean() + render().mean()).backward()
     first = render()
-    host.rasterization = host.rasterization.__wrapped__
-    (first.mean() + render().mean()).backward()
+    if not named:
+        host.rasterization = host.rasterization.__wrapped__
+    with clear.rendering(None) if named else nullcontext():
+        second = render()
+    (first.mean() + second.mean()).backward()
     assert clear.attachment.counts["merges"] == 1
 
 

@@ -1,15 +1,55 @@
-"""The densification score at the scale of a host's threshold."""
+"""Densification scores in hosts: the tensor that holds them, their scale, and what a 3DGS-style densifier reads."""
 
 from __future__ import annotations
+
+import importlib
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from clear_strategies import GCO, P2G, Conductor
 from clear_strategies.errors import SettingError
 from integration.autograd_shot import ScreenGradientSlot
 from integration.host_score import ScoreScaler, score_for_host
+from integration.inria import attach
+from tests.helpers.inria import HR_FROM_START, WITHOUT_HR, N, options
+
+# ---- the tensor in which a host keeps the screen gradient
+
+
+def test_a_gradient_in_ndc_is_converted_to_pixels():
+    slot = ScreenGradientSlot(torch.zeros(2, 3), (200, 100), to_pixels=(2 / 200, 2 / 100))
+    gradient = slot.per_gaussian(torch.tensor([[4.0, 0.0, 9.0], [0.0, 3.0, 9.0]]), 2)
+    assert torch.allclose(gradient, torch.tensor([[0.04, 0.0], [0.0, 0.06]]))
+
+
+@pytest.mark.parametrize("to_pixels", [(1.0, 1.0), (2 / 200, 2 / 100)], ids=["gsplat", "inria"])
+def test_written_norms_are_in_ndc(to_pixels):
+    tensor = torch.zeros(1, 3, 2, requires_grad=True)
+    slot = ScreenGradientSlot(tensor, (200, 100), to_pixels)
+    slot.write(torch.tensor([0.5, 0.0, 2.0]))
+    pixels = slot.per_gaussian(tensor.grad, 3)
+    assert torch.allclose((pixels * torch.tensor([100.0, 50.0])).norm(dim=1), torch.tensor([0.5, 0.0, 2.0]))
+
+
+def test_packed_rows_are_those_of_their_gaussians():
+    tensor = torch.zeros(2, 2, requires_grad=True)
+    slot = ScreenGradientSlot(tensor, (2, 2), rows=torch.tensor([3, 1]))
+    assert slot.per_gaussian(torch.tensor([[1.0, 2.0], [3.0, 4.0]]), 4).tolist() == [[0, 0], [3, 4], [0, 0], [1, 2]]
+    slot.write(torch.tensor([9.0, 5.0, 9.0, 7.0]))
+    assert tensor.grad.tolist() == [[7, 0], [5, 0]]
+
+
+def test_gsplats_absolute_gradient_is_written_too():
+    tensor = torch.zeros(1, 2, 2, requires_grad=True)
+    tensor.absgrad = torch.ones(1, 2, 2)
+    ScreenGradientSlot(tensor, (2, 2)).write(torch.tensor([1.0, 2.0]))
+    assert tensor.absgrad[0, :, 0].tolist() == [1, 2]
+
+
+# ---- the score at the scale of a host's threshold
 
 
 def everyone(n):
@@ -77,3 +117,71 @@ def test_absolute_gradients_stay_without_a_score_and_decide_how_many_pass_with_o
 def test_settings_outside_their_range_are_refused(setting):
     with pytest.raises(SettingError, match="must be"):
         ScoreScaler(**setting)
+
+
+# ---- a 3DGS-style loop
+
+
+def screen_gradient(host, render, camera, gaussians, **settings):
+    """What the densifier reads after a step's backward pass."""
+    package = render(camera, gaussians, None, None, **settings)
+    host.photometric(package["render"], camera.original_image).backward()
+    return package["viewspace_points"].grad
+
+
+@pytest.mark.parametrize("strategies", [(), (GCO(),)], ids=["baseline", "gco"])
+def test_without_a_score_the_densifier_reads_its_own_statistic(strategies, inria_host, inria_attached):
+    """Its threshold is meant for the gradient of the photo; with HR's gradient added, every host would grow more."""
+    clear, gaussians, scene = inria_attached(*strategies)
+    renders = inria_host.render, clear.wrap(inria_host.render)
+    read = [screen_gradient(inria_host, render, scene.cameras[0], gaussians) for render in renders]
+    assert clear.attachment.counts["HR renders"] == 1
+    assert torch.equal(*read)
+
+
+def test_with_a_score_as_many_gaussians_pass_the_threshold_as_by_the_hosts_statistic(inria_host, inria_capture):
+    gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
+    own = screen_gradient(inria_host, inria_host.render, scene.cameras[0], gaussians)[:, :2].norm(dim=1)
+    threshold = float(own.sort(descending=True).values[6:8].mean())  # 7 of 24 pass
+    clear = attach(
+        gaussians, scene.cameras, Conductor(P2G(patch=4), objective=HR_FROM_START), sr=inria_capture / "sr",
+        threshold=threshold,
+    )  # fmt: skip
+    written = screen_gradient(inria_host, clear.wrap(inria_host.render), scene.cameras[0], gaussians)[:, :2].norm(dim=1)
+    assert int((written >= threshold).sum()) == int((own >= threshold).sum()) == 7
+    assert not torch.allclose(written, own)
+
+
+def test_mip_splattings_third_column_holds_the_score_too(inria_host, inria_attached, monkeypatch):
+    """It splits as many Gaussians by the largest absolute gradients as by the gradient, so it must rank by the score."""
+    monkeypatch.setattr(importlib.import_module("gaussian_renderer"), "ABSOLUTE", True)
+    clear, gaussians, scene = inria_attached(P2G(patch=4))
+    gaussians.xyz_gradient_accum_abs = torch.zeros(N, 1)
+    gradient = screen_gradient(inria_host, clear.wrap(inria_host.render), scene.cameras[0], gaussians)
+    assert torch.equal(gradient[:, 2], gradient[:, 0])
+    assert float(gradient[:, 2].max()) > 0
+
+
+def test_mip_splattings_filter_is_that_of_the_hr_cameras(inria_host, inria_capture, monkeypatch):
+    """With that of the LR cameras, no Gaussian could be as thin as what the SR images show."""
+    gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
+    widths = []
+    compute = lambda model, cameras: widths.append([camera.image_width for camera in cameras])  # noqa: E731
+    monkeypatch.setattr(type(gaussians), "compute_3D_filter", compute, raising=False)
+    clear = attach(gaussians, scene.cameras, Conductor(objective=HR_FROM_START), sr=inria_capture / "sr")
+    gaussians.compute_3D_filter(cameras=scene.cameras)
+    clear.remove()
+    gaussians.compute_3D_filter(scene.cameras)
+    attach(gaussians, scene.cameras, Conductor(objective=WITHOUT_HR))
+    gaussians.compute_3D_filter(scene.cameras)
+    assert widths == [[96] * 3, [24] * 3, [24] * 3]
+    assert scene.cameras[0].image_width == 24
+
+
+def test_absolute_gradients_stay_the_hosts_own(inria_host, caplog, inria_attached):
+    clear, gaussians, scene = inria_attached(P2G(patch=4))
+    renders = inria_host.render, clear.wrap(inria_host.render)
+    grads = [screen_gradient(inria_host, render, scene.cameras[0], gaussians, columns=4) for render in renders]
+    assert torch.equal(grads[0][:, 2:], grads[1][:, 2:])
+    assert not torch.equal(grads[0][:, :2], grads[1][:, :2])
+    assert "4 columns" in caplog.text

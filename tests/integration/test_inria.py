@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import logging
 import math
 from dataclasses import replace
 
@@ -151,28 +150,10 @@ def test_a_host_that_masks_its_rendering_in_place_trains(inria_host, inria_captu
     assert clear.attachment.counts["merges"] == 2
 
 
-def test_densification_after_the_anchor_is_refused_before_the_first_step(inria_host, inria_capture, caplog):
-    early = SVS(anchor_start=5, anchor_strength=0.01)
-    with pytest.raises(SettingError, match=r"must end before the anchor is taken, got 24. Set densify_until_iter=5"):
-        trained(inria_host, inria_capture, (early,))
-    with caplog.at_level(logging.WARNING):
-        trained(inria_host, inria_capture, (SVS(anchor_start=5),), iterations=1)  # which takes no anchor
-    assert "densifies until densify_until_iter=24, but SVS ends densification at 5" in caplog.text
-
-
 def test_a_host_that_densifies_after_the_anchor_nevertheless_is_stopped(inria_host, inria_capture, inria_attached):
     clear, gaussians, scene = inria_attached(SVS(anchor_start=5, anchor_strength=0.01))
     with pytest.raises(AnchorError, match=r"anchor was taken at t=5 for .* Inria: densify_until_iter\) or raise"):
         loop(inria_host, clear, options(inria_host, inria_capture), gaussians, scene)
-
-
-@pytest.mark.parametrize("name", ["_features_rest", "_xyz"])
-def test_a_parameter_that_the_host_does_not_train_gets_no_gradient(name, inria_host, inria_attached):
-    clear, gaussians, scene = inria_attached(GCO())
-    frozen = getattr(gaussians, name).requires_grad_(False)
-    clear.wrap(inria_host.render)(scene.cameras[1], gaussians, None, None)["render"].sum().backward()
-    assert frozen.grad is None
-    assert clear.attachment.counts["merges"] == 1
 
 
 @pytest.mark.parametrize("indices", [False, True])
@@ -234,15 +215,6 @@ def test_remove_restores_the_loop(inria_host, inria_capture):
         inria_host.loop(opt, *each)
     assert torch.equal(alone[0]._xyz, attached[0]._xyz)
     assert torch.equal(alone[0]._opacity, attached[0]._opacity)
-
-
-def test_without_the_detail_feature_the_other_gradients_are_the_same(inria_host, inria_capture, inria_attached):
-    _, _, with_detail = trained(inria_host, inria_capture, [GCO()], iterations=1)
-    clear, gaussians, scene = inria_attached(GCO(), detail=False)
-    package = clear.wrap(inria_host.render)(scene.cameras[1], gaussians, None, None)
-    inria_host.photometric(package["render"], scene.cameras[1].original_image).backward()
-    assert "detail" not in clear.params()
-    assert torch.equal(with_detail["means"], gaussians._xyz.grad)
 
 
 def test_a_renderer_that_does_not_read_the_getters_is_warned_of(inria_host, caplog, inria_attached):

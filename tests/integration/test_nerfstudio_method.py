@@ -35,7 +35,7 @@ from clear_strategies.errors import SettingError
 from clear_strategies.strategies import random_background
 from integration.nerfstudio import clear_splatfacto
 from integration.nerfstudio.data import stereo_cloud
-from integration.nerfstudio.datamanager import ClearDatamanager, ClearDatamanagerConfig
+from integration.nerfstudio.datamanager import ClearDatamanager
 from integration.nerfstudio.method import ClearSplatfactoModel, ClearSplatfactoModelConfig
 from rasterizers import autograd
 from rasterizers.geometry import SH_C0
@@ -216,11 +216,6 @@ def test_it_starts_from_the_data_sets_points_by_default_and_in_evaluation(captur
     assert len(config.pipeline.setup(device="cpu").model.gauss_params["means"]) == 40
     config.pipeline.datamanager.points = "stereo"  # a checkpoint's Gaussians are loaded there
     assert len(config.pipeline.setup(device="cpu", test_mode="test").model.gauss_params["means"]) == 40
-
-
-def test_points_are_own_or_stereo():
-    with pytest.raises(SettingError, match="points: must be own"):
-        ClearDatamanagerConfig(points="colmap")
 
 
 def test_with_hr_weight_0_it_is_splatfacto_to_the_bit(capture, tmp_path):

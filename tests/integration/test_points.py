@@ -20,7 +20,6 @@ from integration import points as initial
 from integration.gsplat import points as gsplat_points
 from integration.gsplat.data import photos_of as photos_of_dataset
 from integration.inria.__main__ import main as inria_main
-from integration.inria.cameras import photo_of
 from integration.inria.from_options import install as install_in_inria
 from integration.points import stereo_points
 from integration.views import HostPhoto
@@ -187,15 +186,6 @@ def test_gaussians_are_made_again_at_the_stereo_cloud(newer, inria_host, inria_c
     if newer:
         assert gaussians.exposed == [camera.image_name for camera in scene.cameras]
     clear.remove()
-
-
-def test_pixels_under_an_alpha_mask_give_no_points(inria_host, inria_capture):
-    _, scene, _ = own_gaussians(inria_host, inria_capture)
-    whole = stereo_points([photo_of(camera) for camera in scene.cameras])
-    for camera in scene.cameras:
-        camera.alpha_mask = torch.ones(1, 16, 24)
-        camera.alpha_mask[..., 12:] = 0
-    assert 0 < len(stereo_points([photo_of(camera) for camera in scene.cameras])) < 0.8 * len(whole)
 
 
 @pytest.mark.parametrize(
