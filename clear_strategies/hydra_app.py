@@ -13,7 +13,7 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,13 +24,15 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from clear_strategies import files
 from clear_strategies.compose import CONF, composed, flat, require_each_once
 from clear_strategies.errors import ClearError, SettingError
 from clear_strategies.jobs import exit_codes
-from clear_strategies.jobs.sweep import FAILED, LEFT, Sweep, Watch, stop_on_signals
 
 _log = logging.getLogger(__name__)
 
+FAILED: Final = "failed.txt"
+"""In the folder of a sweep's job: why it failed."""
 _VERBOSE: Final = "fit.verbose=true"
 _FLAGS: Final = (
     "--help", "--hydra-help", "--version", "--cfg", "--resolve", "--package", "--run", "--multirun", "--shell-completion",
@@ -85,79 +87,53 @@ def _no_such_setting(key: str) -> str:
 
 
 def job(config: DictConfig) -> float | None:
-    """One job of Hydra's. Returns what `jobs.job.run` does; in a sweep also None for a job that failed or did not start."""
-    hydra_config, sweep = HydraConfig.get(), _sweep()
-    if sweep is not None and _launcher(hydra_config) == "joblib" and not sweep.begun_here:
-        # A terminal sends Ctrl-C to joblib's workers too; one stop is enough, and it comes from the sweep.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if sweep is not None and sweep.stopped_by is not None:
-        _log.warning("job %s is not started: the sweep was stopped.", hydra_config.job.num)
-        return None
+    """One job of Hydra's. Returns what `jobs.job.run` does; in a sweep also None for a job that failed or is left to another."""
+    hydra_config = HydraConfig.get()
+    folder, overrides = Path(hydra_config.runtime.output_dir), list(hydra_config.overrides.task)
     try:
         from clear_strategies.jobs import job
 
-        overrides = list(hydra_config.overrides.task)
+        (folder / FAILED).unlink(missing_ok=True)
         require_each_once(overrides)
-        return job.run(config, Path(hydra_config.runtime.output_dir), _watch(), overrides)
+        return job.run(config, folder, overrides)
     except (Exception, KeyboardInterrupt) as error:
         if (ending := exit_codes.describe(error)) is None:
             raise
-        _end(error, ending, config, hydra_config, sweep)
+        _end(error, ending, folder, resumes=config.fit.get("resume") == "auto")
         return None
 
 
-def _end(
-    error: BaseException, ending: exit_codes.Ending, config: DictConfig, hydra_config: Any, sweep: Sweep | None
-) -> None:
-    """Log why a job ended, and exit; in a sweep only where the other jobs cannot continue."""
+def _end(error: BaseException, ending: exit_codes.Ending, folder: Path, *, resumes: bool) -> None:
+    """Log why a job ended, and exit; a job that fails in a sweep leaves a note instead, and the other jobs continue."""
     from clear_strategies.jobs.lock import HeldError
 
     code, message = ending
-    number, launcher = hydra_config.job.get("num"), _launcher(hydra_config)
-    if sweep is not None and isinstance(error, HeldError) and config.fit.get("resume") == "auto":
+    hydra_config = HydraConfig.get()
+    in_sweep = hydra_config.mode == RunMode.MULTIRUN
+    if in_sweep and resumes and isinstance(error, HeldError):
         _log.warning("left to the other process: %s", message)
-        sweep.note(LEFT, number, message)
         return
     _log.log(logging.INFO if code > exit_codes.SIGNALS else logging.ERROR, "%s", message)  # a stop is no error
-    if code > exit_codes.SIGNALS:
-        signum = code - exit_codes.SIGNALS
-        if sweep is not None and launcher == "joblib":
-            sweep.stop(signum)  # ending a worker would have joblib kill the others before they have saved
-            return
-        if signum not in (signal.SIGINT, signal.SIGTERM):
-            signal.raise_signal(signum)  # all is saved: now the launcher's handler may resubmit the job
-        sys.exit(code)
-    if sweep is None or (code == exit_codes.NO_DISK and launcher == "basic"):
-        sys.exit(code)
-    # The other jobs continue, and jobs on other machines may have another disk.
-    sweep.note(FAILED, number, message)
+    if in_sweep and code == exit_codes.UNUSABLE:
+        files.write_text(folder / FAILED, f"job {hydra_config.job.num}: {message}\n")
+        return
+    if code - exit_codes.SIGNALS not in (signal.SIGINT, signal.SIGTERM) and code > exit_codes.SIGNALS:
+        signal.raise_signal(code - exit_codes.SIGNALS)  # all is saved: now the launcher's handler may resubmit the job
+    sys.exit(code)
 
 
 class SweepCallback(Callback):
-    """Runs at the beginning and end of a sweep, in the process that was started; jobs may run in other processes.
-
-    Hydra pickles it for these processes, so it has no state.
-    """
+    """Runs at the beginning and end of a sweep, in the process that was started; jobs may run in other processes."""
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        sweep = Sweep.begin(Path(config.hydra.sweep.dir))
-        if _launcher(config.hydra) == "joblib":
-            stop_on_signals(sweep)
+        for note in Path(config.hydra.sweep.dir).rglob(FAILED):  # of an earlier sweep
+            note.unlink()
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        sweep = Sweep.current()
-        if sweep is None:
-            return
-        _report(Path(config.hydra.sweep.dir))
-        stopped, failed, left = sweep.stopped_by, sweep.notes(FAILED), sweep.notes(LEFT)
-        if left:
-            _log.warning("%d job(s) were left to other processes: %s", len(left), " | ".join(left))
-        if failed:
+        folder = Path(config.hydra.sweep.dir)
+        _report(folder)
+        if failed := sorted(note.read_text().strip() for note in folder.rglob(FAILED)):
             _log.error("%d job(s) failed: %s", len(failed), " | ".join(failed))
-        if stopped is not None:
-            _log.info("stopped by %s. With fit.resume=auto the same command goes on.", signal.Signals(stopped).name)
-            sys.exit(exit_codes.SIGNALS + stopped)
-        if failed:
             sys.exit(exit_codes.UNUSABLE)
 
 
@@ -169,20 +145,3 @@ def _report(folder: Path) -> None:
         _log.info("%s", report.write(report.collect([folder]), folder))
     except (ClearError, OSError) as error:  # nothing is finished, or a file is damaged or in the way; the jobs are well
         _log.warning("there is no report: %s", error)
-
-
-def _sweep() -> Sweep | None:
-    """The sweep of this job; a single run belongs to none, even if it was started from within a sweep."""
-    return Sweep.current() if HydraConfig.get().mode == RunMode.MULTIRUN else None
-
-
-def _launcher(hydra_config: Any) -> str:
-    """basic, joblib or submitit: the module of the launcher in Hydra's own configuration."""
-    target = str(hydra_config.launcher._target_)
-    return next((name for name in ("joblib", "submitit") if name in target), "basic")
-
-
-def _watch() -> Callable[[], None] | None:
-    """For joblib's jobs: checks after each iteration whether the sweep was stopped, by any process."""
-    sweep = _sweep()
-    return Watch(sweep) if sweep is not None and _launcher(HydraConfig.get()) == "joblib" else None

@@ -3,6 +3,7 @@
 A node is a dict of plain values. With the key `_target_`, the dotted name of a class or function, it describes one call:
 `defaults` fills in every argument that the node leaves out, from the signature itself, and `build` checks the node and
 makes the call. So each default is set in one place, the class, and no object is built from an unchecked setting.
+A `_target_` may name any class or function: a configuration is trusted as Hydra's is.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import functools
 import importlib
 import inspect
 import math
-import sys
 import types
 import typing
 import warnings
@@ -63,7 +63,7 @@ def with_defaults(node: Any) -> Any:
     if node.get(_RECURSIVE, True):
         node = {key: with_defaults(value) for key, value in node.items()}
     try:
-        if node.get(TARGET) is None or _foreign(node[TARGET]):
+        if node.get(TARGET) is None:
             return dict(node)
         return _merged(_defaults(_located(node[TARGET])), node)
     except (ImportError, AttributeError):
@@ -95,14 +95,12 @@ def build(node: Any, key: str = "") -> Any:
 
 def _called(node: Mapping[str, Any], key: str) -> Any:
     target = node[TARGET]
-    _require_name(target, key)
     try:
         function = _located(target)
     except (ImportError, AttributeError) as error:
         of_this_package = str(target).startswith(("clear_strategies.", "rasterizers."))
         remedy = "pip install 'clear-strategies[train]'" if of_this_package else "Correct its dotted name"
         raise SettingError(f"{key}: {target} cannot be imported ({one_line(error)}). {remedy}.") from error
-    _require_buildable(function, target, key)
     parameters, hints = _parameters(function), _hints(function)
     given = {name: value for name, value in node.items() if name not in _KEYWORDS}
     _refuse_unknown(given, parameters, key, str(target))
@@ -130,48 +128,6 @@ def _with_key(message: str, key: str, parameters: Mapping[str, Any]) -> str:
     if not key or message.startswith((f"{key}.", f"{key}:")):
         return message
     return f"{key}.{message}" if message.partition(" ")[0].rstrip(":") in parameters else f"{key}: {message}"
-
-
-# Libraries that the package itself uses. They hold nothing that a setting could stand for, and much that writes files or
-# runs programs.
-_LIBRARIES: Final = {
-    "PIL", "beartype", "cv2", "hydra", "jaxtyping", "jinja2", "joblib", "kornia", "matplotlib", "numpy", "omegaconf",
-    "open3d", "pandas", "pip", "pytest", "safetensors", "scipy", "setuptools", "skimage", "submitit", "torch", "torchvision",
-    "tqdm", "yaml",
-}  # fmt: skip
-_OWN: Final = ("clear_strategies", "rasterizers", "integration")
-_READERS: Final = "clear_strategies.data.readers."
-
-
-def _foreign(name: Any) -> bool:
-    """Whether a dotted name is Python's own or a library's, which is not even imported."""
-    root = str(name).partition(".")[0]
-    return root in sys.stdlib_module_names or root in _LIBRARIES or root == "builtins"
-
-
-def _require_name(target: Any, key: str) -> None:
-    if _foreign(target):
-        raise SettingError(
-            f"{key}: {TARGET} must name a class of this package or of a plug-in for it, got {str(target)[:80]}."
-        )
-
-
-def _require_buildable(function: Callable[..., Any], target: Any, key: str) -> None:
-    """Refuse what is no class, or no function that reads data, before it is called.
-
-    Raises:
-        SettingError: it is Python's own or a library's under another name, a method, or a function of this package that is
-            no reader.
-    """
-    home = str(getattr(function, "__module__", ""))
-    _require_name(home, key)
-    own = home.partition(".")[0] in _OWN
-    method = "." in getattr(function, "__qualname__", "").rpartition("<locals>.")[2]
-    plain = inspect.isfunction(function) and not method and (not own or home.startswith(_READERS))
-    if not (inspect.isclass(function) or plain):
-        raise SettingError(
-            f"{key}: {str(target)[:80]} is no class, and no function that reads data. Name one of these."
-        )
 
 
 def _located(target: Any) -> Callable[..., Any]:

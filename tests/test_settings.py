@@ -101,7 +101,7 @@ REFUSED = {
     "inner.size: must not be 8, got 8: size=7": {"share": 1, "inner": target(Inner, size=8)},
     "inner: it is too large.": {"share": 1, "inner": target(Inner, size=10)},
     "inner: nowhere.Mine cannot be imported": {"share": 1, "inner": {TARGET: "nowhere.Mine"}},
-    "inner: _target_ must name a class of this package": {"share": 1, "inner": {TARGET: "builtins.nothing"}},
+    "inner: builtins.nothing cannot be imported": {"share": 1, "inner": {TARGET: "builtins.nothing"}},
     "names: must be a list, each entry text or null, got [1]": {"share": 1, "names": [1]},
     "color: must be a list of 2 numbers, got [1]": {"share": 1, "color": [1]},
     "weights.x: must be a number, got 'y'": {"share": 1, "weights": {"x": "y"}},

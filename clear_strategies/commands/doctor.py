@@ -12,7 +12,6 @@ from clear_strategies import console
 from clear_strategies.commands.options import parser_of
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs.exit_codes import TRAIN
-from clear_strategies.jobs.sweep import cores
 from clear_strategies.outputs.provenance import origin
 
 # An extra of pyproject.toml: the modules that show that it is installed, and what it is for.
@@ -68,6 +67,8 @@ def _versions(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _machine(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    from clear_strategies.jobs.device import cores
+
     yield "processor", facts["platform"]
     yield "cores", str(cores())
     yield "disk", f"{shutil.disk_usage('.').free / 1e9:.0f} GB free in this folder"

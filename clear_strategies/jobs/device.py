@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, Literal
@@ -13,7 +14,6 @@ from hydra.core.hydra_config import HydraConfig
 
 import rasterizers
 from clear_strategies.errors import SettingError
-from clear_strategies.jobs import sweep
 from clear_strategies.settings import TARGET
 from rasterizers.interface import BackendUnavailable, Color, Rasterizer, RasterSettings
 
@@ -167,11 +167,40 @@ def threads(asked: int | None) -> tuple[int, str]:
     """How many threads a job has, and why."""
     if asked is not None:
         return asked, "fit.threads"
-    jobs, reason = jobs_at_once(), f"of {sweep.cores()} here"
-    return sweep.threads(jobs), reason if jobs == 1 else f"{reason}, hydra.launcher.n_jobs={jobs}"
+    jobs, reason = jobs_at_once(), f"of {cores()} here"
+    return threads_of_each(jobs), reason if jobs == 1 else f"{reason}, hydra.launcher.n_jobs={jobs}"
 
 
 def jobs_at_once() -> int:
     """How many jobs share this machine and its terminal, as joblib counts them; 1 for other launchers."""
     launcher = HydraConfig.get().launcher if HydraConfig.initialized() else None
     return int(launcher.n_jobs) if launcher is not None and "n_jobs" in launcher else 1
+
+
+def cores() -> int:
+    """The cores that this process may use: its affinity, and in a Slurm job no more than the job asked for."""
+    here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    for name in ("SLURM_CPUS_PER_TASK", "SLURM_CPUS_ON_NODE"):
+        if (given := os.environ.get(name, "")).isdecimal():
+            return max(1, min(here, int(given)))
+    return here
+
+
+def threads_of_each(jobs: int) -> int:
+    """Threads per job when `jobs` run at once on this machine; at most torch's own number, which OMP_NUM_THREADS sets.
+
+    Two jobs must not use the same core: OpenMP's threads wait by spinning, so two jobs of two threads on two cores are
+    tens of times slower than two jobs of one thread.
+
+    Args:
+        jobs: at once; a negative number counts as joblib does: -1 is one job per core, -2 one fewer.
+    """
+    here = cores()
+    at_once = jobs if jobs > 0 else max(1, here + 1 + jobs)
+    return max(1, min(_threads_of_torch(), here // at_once))
+
+
+@functools.cache
+def _threads_of_torch() -> int:
+    """As it was before the first job changed it; a process may do several jobs."""
+    return torch.get_num_threads()

@@ -49,13 +49,11 @@ class _Place:
 
     Args:
         scene: on the CPU. device_scene: the same scene on the device of `drawing`.
-        watch: called after each iteration.
     """
 
     scene: Scene
     device_scene: Scene
     drawing: device.Drawing
-    watch: Callable[[], None] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,15 +106,12 @@ class _Training:
         return state
 
 
-def run(
-    config: DictConfig, folder: Path, watch: Callable[[], None] | None = None, overrides: Sequence[str] | None = None
-) -> float | None:
+def run(config: DictConfig, folder: Path, overrides: Sequence[str] | None = None) -> float | None:
     """Run one job and write its files into `folder`.
 
     Every setting is checked before the folder is locked and before data is read.
 
     Args:
-        watch: called after each iteration.
         overrides: that the configuration was composed of, which the report names the run by.
 
     Returns:
@@ -143,7 +138,7 @@ def run(
     drawing = device.drawing(settings.rasterizer, fit.device)
     with hold(folder), signals.interrupted("before training began"):
         files.sweep(folder)
-        return _run(training, baseline, drawing, watch)
+        return _run(training, baseline, drawing)
 
 
 def _why_without_baseline(settings: JobSettings) -> str | None:
@@ -160,12 +155,7 @@ def _in_sweep() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
-def _run(
-    training: _Training,
-    baseline: _Training | None,
-    drawing: device.Drawing,
-    watch: Callable[[], None] | None,
-) -> float | None:
+def _run(training: _Training, baseline: _Training | None, drawing: device.Drawing) -> float | None:
     settings = training.settings
     if settings.fit.resume == resume.AUTO:
         finished = resume.finished(training.folder, training.compared)
@@ -180,7 +170,7 @@ def _run(
         return None
     device.log_choice(settings.rasterizer, drawing)
     drawing = drawing.over(scene.background)
-    place = _Place(scene, scene.to(drawing.device), drawing, watch)
+    place = _Place(scene, scene.to(drawing.device), drawing)
     state, baseline_state = _started(training, baseline, place)
     _announce(training, state, place, f"{threads} ({reason})")
     # In a sweep the console shows one line per job; the rest is in run.log.
@@ -249,10 +239,10 @@ def _train_baseline(training: _Training, state: TrainState | None, place: _Place
 @contextmanager
 def _watched(training: _Training, state: TrainState, place: _Place) -> Iterator[Callable[[], None]]:
     """Open the viewer (`fit.viewer`) and the log (`fit.log`), and yield a function to call after each iteration. It updates
-    both and calls the job's watch.
+    both.
     """
     fit_settings, painter = training.settings.fit, Painter(state.field, place.drawing.make)
-    calls = [] if place.watch is None else [place.watch]
+    calls = list[Callable[[], None]]()
     with ExitStack() as stack:
         if fit_settings.viewer:
             cameras, title = read_cameras(training.folder / CAMERAS), f"{place.scene.name} · {training.chosen.title}"

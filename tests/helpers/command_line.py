@@ -46,22 +46,18 @@ def stopped_by(*signals: int, after: int) -> str:
     """Code of a run that gets these signals after some iterations."""
     return (
         "import itertools, os\n"
-        "from clear_strategies import hydra_app\n"
         "from clear_strategies.run import main\n"
-        "done = itertools.count(1)\n"
-        "def watch():\n"
+        "from clear_strategies.training import loop\n"
+        "done, step = itertools.count(1), loop.iterate\n"
+        "def iterate(*arguments):\n"
+        "    update = step(*arguments)\n"
         f"    if next(done) == {after}:\n"
         f"        for number in {[int(number) for number in signals]}:\n"
         "            os.kill(os.getpid(), number)\n"
-        "hydra_app._watch = lambda: watch\n"
+        "    return update\n"
+        "loop.iterate = iterate\n"
         "main()\n"
     )
-
-
-def trains(folder: Path) -> bool:
-    """Whether a run has come to its first density round, so that it answers signals by saving, until it has trained."""
-    log = folder / "run.log"
-    return log.exists() and " cloned, " in log.read_text()
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 120, what: str = "it") -> None:

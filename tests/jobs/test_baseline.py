@@ -18,6 +18,7 @@ from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DataError
 from clear_strategies.jobs import job, scene
 from clear_strategies.outputs.score_table import OURS_MINUS_BASELINE
+from clear_strategies.training import loop
 from clear_strategies.training.signals import Interrupted
 from tests.helpers import pictures
 from tests.helpers.command_line import TINY
@@ -52,10 +53,19 @@ def logged(caplog: pytest.LogCaptureFixture) -> None:
 
 
 def train(
-    folder: Path, *overrides: str, strategy: str = "gco", watch: Callable[[], None] | None = None
+    folder: Path, *overrides: str, strategy: str = "gco", watch: Callable[[], None] = lambda: None
 ) -> float | None:
+    """Run a job; `watch` is called after each iteration."""
     chosen = [f"+strategy={strategy}", "fit.baseline=true", *SMALL, *overrides]
-    return job.run(composed(*chosen), folder, watch, chosen)
+
+    def iterate(*arguments: Any, step: Callable[..., object] = loop.iterate) -> object:
+        update = step(*arguments)
+        watch()
+        return update
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "iterate", iterate)
+        return job.run(composed(*chosen), folder, chosen)
 
 
 class Iterations:

@@ -12,17 +12,15 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from clear_strategies.hydra_app import SweepCallback
-from clear_strategies.jobs import sweep
-from clear_strategies.jobs.sweep import Sweep, Watch
+from clear_strategies.hydra_app import FAILED, SweepCallback
+from clear_strategies.jobs import device
 from clear_strategies.training import checkpoint
-from tests.helpers.command_line import TINY, run, started, stopped_by, trains, wait_for
+from tests.helpers.command_line import TINY, run, started, stopped_by, wait_for
 from tests.helpers.configs import composed
 from tests.helpers.finished_run import make_run
 
 AUTO = ["fit.resume=auto", *TINY]
 SWEEP = ["-m", "hydra.sweep.dir=all", *AUTO]
-LONG = ["fit.iterations=400"]  # two seconds: time enough for a signal
 DOOR = ["-m", "clear_strategies.run"]
 
 
@@ -85,17 +83,17 @@ def test_a_killed_run_goes_on_from_the_newest_whole_checkpoint_and_ends_the_same
 
 
 def test_torch_and_kernels_divide_the_cores_among_the_jobs(monkeypatch):
-    monkeypatch.setattr(sweep, "_threads_of_torch", lambda: 16)
+    monkeypatch.setattr(device, "_threads_of_torch", lambda: 16)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: set(range(12)), raising=False)
     for name in ("SLURM_CPUS_PER_TASK", "SLURM_CPUS_ON_NODE"):
         monkeypatch.delenv(name, raising=False)
-    assert [sweep.threads(jobs) for jobs in (1, 2, 5, 12, 40, -1, -2)] == [12, 6, 2, 1, 1, 1, 1]
+    assert [device.threads_of_each(jobs) for jobs in (1, 2, 5, 12, 40, -1, -2)] == [12, 6, 2, 1, 1, 1, 1]
     monkeypatch.setenv("SLURM_CPUS_ON_NODE", "8")
-    assert sweep.threads(1) == 8
+    assert device.threads_of_each(1) == 8
     monkeypatch.setenv("SLURM_CPUS_PER_TASK", "3")
-    assert sweep.threads(1) == 3
-    monkeypatch.setattr(sweep, "_threads_of_torch", lambda: 2)  # OMP_NUM_THREADS=2
-    assert sweep.threads(1) == 2
+    assert device.threads_of_each(1) == 3
+    monkeypatch.setattr(device, "_threads_of_torch", lambda: 2)  # OMP_NUM_THREADS=2
+    assert device.threads_of_each(1) == 2
 
 
 @pytest.mark.slow
@@ -108,10 +106,8 @@ def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, monkeypatch):
     said = result.stdout + result.stderr
     assert result.returncode == 0, said
     assert "left to the other process" in said
-    assert "1 job(s) were left to other processes: job 1" in said
     assert (tmp_path / "all" / "0" / "metrics.json").exists()
     assert not (tmp_path / "all" / "1" / "metrics.json").exists()
-    assert not list((tmp_path / "all").glob(".sweep_*"))
 
 
 joblib = pytest.mark.skipif(
@@ -135,34 +131,6 @@ def test_in_other_processes_a_failed_job_stops_no_other_and_is_told(tmp_path):
     assert "hydra.launcher.n_jobs=2" in (tmp_path / "all" / "1" / "run.log").read_text()
 
 
-@joblib
-@pytest.mark.slow
-@pytest.mark.parametrize("whom", ["parent", "group"])
-def test_a_stopped_joblib_sweep_saves_its_jobs_and_goes_on(tmp_path, whom):
-    """Ctrl-C reaches the workers too, SIGTERM only the process that was started; both save and begin no other job."""
-    sweep_of_three = [*SWEEP, *JOBLIB, "+strategy=baseline,gco,svs", *LONG]
-    process = started(*DOOR, *sweep_of_three, cwd=tmp_path, said=tmp_path / "said", session=True)
-    wait_for(lambda: all(trains(tmp_path / "all" / job) for job in ("0", "1")))
-    if whom == "group":
-        os.killpg(process.pid, signal.SIGINT)
-    else:
-        process.terminate()
-    code = process.wait()
-    text = (tmp_path / "said").read_text()
-    assert code == (130 if whom == "group" else 143), text
-    assert "the same command goes on" in text
-    assert "Traceback" not in text
-    saved = [checkpoint.saved(tmp_path / "all" / job / "checkpoints") for job in ("0", "1")]
-    assert all(saved), text
-    assert not (tmp_path / "all" / "2" / "metrics.json").exists()
-    if whom == "parent":
-        return  # going on is the same for both
-    again = run(*sweep_of_three, cwd=tmp_path)
-    assert again.returncode == 0, again.stdout + again.stderr
-    assert "resumed from" in (tmp_path / "all" / "1" / "run.log").read_text()
-    assert len(list(tmp_path.glob("all/*/metrics.json"))) == 3
-
-
 def test_a_clusters_announcement_saves_before_its_handler_acts(tmp_path):
     """SIGUSR2, as submitit handles it: what it would do at once is done after the checkpoint."""
     handler = (
@@ -181,10 +149,10 @@ def test_a_clusters_announcement_saves_before_its_handler_acts(tmp_path):
 
 def test_the_threads_of_one_job_are_not_those_of_the_next():
     """A process does several: fit.threads of one must not become the default of the other."""
-    before, default = torch.get_num_threads(), sweep.threads(1)
+    before, default = torch.get_num_threads(), device.threads_of_each(1)
     torch.set_num_threads(default + 1)
     try:
-        assert sweep.threads(1) == default
+        assert device.threads_of_each(1) == default
     finally:
         torch.set_num_threads(before)
 
@@ -206,34 +174,16 @@ def test_the_slurm_configuration_is_one_that_submitit_takes(tmp_path):
     assert launcher.max_num_timeout == 100
 
 
-def test_a_single_run_started_from_within_a_sweep_is_no_job_of_it(tmp_path, monkeypatch):
-    monkeypatch.setenv("CLEAR_SWEEP", str(tmp_path / ".sweep_1_x"))
-    result = run("strategies.gco.tolerance=7", "+strategy=gco", *TINY, cwd=tmp_path)
-    assert result.returncode == 2
-    assert not (tmp_path / ".sweep_1_x").exists()
-
-
-def test_a_stopped_sweep_signals_a_job_once_and_does_not_kill_one_that_is_saving(tmp_path, monkeypatch):
-    ours, raised = Sweep(tmp_path, 0), []
-    monkeypatch.setattr(signal, "raise_signal", raised.append)
-    ours.stop(signal.SIGINT)
-    before = signal.signal(signal.SIGTERM, lambda *_: None)  # as while training
-    try:
-        Watch(ours)()
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)  # as after the first signal
-        Watch(ours)()
-    finally:
-        signal.signal(signal.SIGTERM, before)
-    assert raised == [signal.SIGTERM]
-
-
-def test_failed_jobs_are_told_where_the_report_cannot_be_written(tmp_path, monkeypatch, caplog):
-    monkeypatch.setenv("CLEAR_SWEEP", "")  # restored afterwards
-    Sweep.begin(tmp_path).note(sweep.FAILED, 1, "no such photo")
+def test_failed_jobs_are_told_where_the_report_cannot_be_written(tmp_path, caplog):
+    callback, config = SweepCallback(), OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}})
     make_run(tmp_path / "0")
+    (tmp_path / "0" / FAILED).write_text("job 0: of an earlier sweep")
+    callback.on_multirun_start(config)
+    (tmp_path / "1").mkdir()
+    (tmp_path / "1" / FAILED).write_text("job 1: no such photo\n")
     (tmp_path / "report.md").mkdir()
     with pytest.raises(SystemExit) as ended:
-        SweepCallback().on_multirun_end(OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}}))
+        callback.on_multirun_end(config)
     assert ended.value.code == 2
     assert "1 job(s) failed: job 1: no such photo" in caplog.text
     assert "there is no report: [Errno" in caplog.text
