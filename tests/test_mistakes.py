@@ -38,7 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "empty": [], "one": [noise(0)], "two": [noise(0), noise(1)], "same": [noise(0)] * 4,
         "apart": [noise(i) for i in range(4)],
         "flat": [Image.new("RGB", (320, 240), (60 * i, 90, 90)) for i in range(4)],
-        "huge": [noise(0), noise(1), Image.new("RGB", (10_000, 10_000))],
+        "huge": [noise(0), noise(1), Image.new("RGB", (10_001, 10_000))],
     }  # fmt: skip
     for name, images in photos.items():
         (here / name).mkdir()
@@ -79,7 +79,9 @@ def test_a_mistake_is_told_with_its_remedy(row: dict[str, str], folder: Path) ->
         for line in (ended.stdout + ended.stderr).splitlines()
         if line and not line.startswith("clear-strategies +")
     ]
-    progress = r".*: estimating the poses|matching: |features: |SR |.*: \d+ of \d+ "  # the last on a slow machine
+    progress = (
+        r".*: estimating the poses|features of |matching |placing |SR |.*: \d+ of \d+ "  # the last on a slow machine
+    )
     error = [line for line in told if not re.match(progress, line)]
     assert 1 <= len(error) <= 3, told
     assert row["message"].replace("\\[", "[").strip() in " ".join(error)

@@ -11,7 +11,7 @@ import io
 import logging
 import math
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
+from PIL import Image, ImageOps
 from PIL.TiffImagePlugin import TiffImageFile
 from torch import Tensor
 
@@ -35,8 +35,6 @@ SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".heic", "
 _FORMATS: Final = ("PNG", "JPEG", "WEBP", "TIFF")
 _HEIF_BRANDS: Final = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1")  # bytes 8 to 12, behind "ftyp"
 _MAX_PIXELS: Final = 100_000_000
-_LARGE: Final = 1 << 24  # pixels; smaller images may be drawings, which compress without limit
-_BOMB: Final = 200
 PNG_LEVEL: Final = 3  # a third of the time of zlib's default, for 5 % more bytes
 _EXIF_ORIENTATION: Final = 0x0112
 _EXIF_PHOTO: Final = 0x8769
@@ -45,19 +43,7 @@ _F_NUMBER: Final = 0x829D
 _ISO: Final = 0x8827
 _FOCAL_35MM: Final = 0xA405
 _DIAGONAL_35MM: Final = math.hypot(36, 24)  # mm
-# What makes [H, W, C] pixels upright, by their EXIF orientation.
-_TURNS: Final[dict[int, Callable[[np.ndarray], np.ndarray]]] = {
-    1: lambda a: a,
-    2: lambda a: a[:, ::-1],
-    3: lambda a: a[::-1, ::-1],
-    4: lambda a: a[::-1],
-    5: lambda a: a.swapaxes(0, 1),
-    6: lambda a: a.swapaxes(0, 1)[:, ::-1],
-    7: lambda a: a[::-1, ::-1].swapaxes(0, 1),
-    8: lambda a: a.swapaxes(0, 1)[::-1],
-}
 _ON_THE_SIDE: Final = (5, 6, 7, 8)
-_BACK: Final = {6: 8, 8: 6}  # the turn that undoes a turn; all others undo themselves
 _TIFF_SIZE: Final = (256, 257)  # tags: the width and height that are stored
 
 
@@ -74,7 +60,7 @@ def read_image(
         background: RGB in [0, 1] behind (straight) alpha: rgb · alpha + background · (1 - alpha). None: black, logged.
         expect: (width, height) the image must have.
         turn: of an image that is stored turned by its EXIF block: True turns it upright, False keeps the stored pixels, None
-            refuses it.
+            refuses it. A TIFF is never kept as it is stored, and a PNG of 16 bits never turned: they are refused.
 
     Raises:
         DataError: the file is no PNG, JPEG, WebP, TIFF or HEIC, is damaged or too large, or the image is turned by EXIF, has
@@ -82,23 +68,26 @@ def read_image(
     """
     with _opened(path, turn) as image:
         sixteen_bits = ";16" in str(getattr(image, "tile", ""))  # the layout in the file, unknown after decoding
-        size = _size(image, turn)
-        if expect is not None and size != expect:
-            problem = f"is {size[0]}x{size[1]} where {expect[0]}x{expect[1]} is expected"
-            raise DataError(path, "size", problem, "use images of the size the cameras were made for")
-        undone = _orientation_of(image) if image.format == "TIFF" else 1  # PIL and OpenCV decode TIFF upright
+        # Pillow forgets the orientation of a TIFF as it decodes it, and decodes a PNG to find its EXIF block.
+        orientation = 1 if image.format == "PNG" else _orientation_of(image)
         try:
             image.load()
         except Exception as error:  # PIL's decoders raise many types of error on damaged bytes
             remedy = "replace the damaged file, or go on without it: data.reader.skip_faulty=true"
             raise DataError(path, "pixels", f"cannot be decoded ({error})", remedy) from error
-        if turn is None:
-            _refuse_turned(path, image)
+        if image.format == "PNG":
+            orientation = _orientation_of(image)
+        decoded_upright = image.format == "TIFF"  # by Pillow and by OpenCV
+        as_asked = {None: False, True: decoded_upright or not sixteen_bits, False: not decoded_upright}[turn]
+        if orientation != 1 and not as_asked:
+            raise _turned(path, orientation)
+        if orientation != 1 and turn and not decoded_upright:
+            ImageOps.exif_transpose(image, in_place=True)
         pixels = _to_float(path, image, sixteen_bits)
-        if turn and image.format != "TIFF":
-            pixels = _TURNS[_orientation_of(image)](pixels)
-        elif not turn:
-            pixels = _TURNS[_BACK.get(undone, undone)](pixels)
+    height, width = pixels.shape[:2]
+    if expect is not None and (width, height) != expect:
+        problem = f"is {width}x{height} where {expect[0]}x{expect[1]} is expected"
+        raise DataError(path, "size", problem, "use images of the size the cameras were made for")
     rgb, alpha = pixels[..., :3], pixels[..., 3:]
     if alpha.size and alpha.min() < 1:
         if background is None:
@@ -192,12 +181,8 @@ def _opened(path: Path, turn: bool | None) -> Iterator[Image.Image]:
         if image.width * image.height > _MAX_PIXELS:
             problem = f"{image.width}x{image.height} is more than {_MAX_PIXELS:,} pixels"
             raise DataError(path, "size", problem, "downsample the images before training")
-        if image.width * image.height > _LARGE and image.width * image.height * 3 > _BOMB * path.stat().st_size:
-            problem = f"{image.width}x{image.height} pixels are more than {_BOMB} times the file, as in no photo"
-            raise DataError(path, "size", problem, "use the camera's own file")
-        # A PNG may keep its EXIF block behind the pixels; `read_image` checks again after decoding them.
-        if turn is None and (image.format != "PNG" or "exif" in image.info):
-            _refuse_turned(path, image)
+        if turn is None and image.format != "PNG" and (orientation := _orientation_of(image)) != 1:
+            raise _turned(path, orientation)
         yield image
 
 
@@ -226,14 +211,13 @@ def _orientation_of(image: Image.Image) -> int:
     except Exception as error:  # PIL raises many types of error on damaged blocks
         _log.debug("%s: its EXIF block cannot be read (%s) and is not used.", image.filename, error)  # type: ignore[attr-defined]
         return 1
-    return orientation if orientation in _TURNS else 1
+    return orientation if orientation in range(1, 9) else 1
 
 
-def _refuse_turned(path: Path, image: Image.Image) -> None:
-    if (orientation := _orientation_of(image)) != 1:
-        problem = f"is {orientation}: the photo is stored turned, and its pose may not include that"
-        remedy = "turn the pixels first (e.g. with `mogrify -auto-orient`), then estimate poses from the result"
-        raise DataError(path, "EXIF orientation", problem, remedy)
+def _turned(path: Path, orientation: int) -> DataError:
+    problem = f"is {orientation}: the photo is stored turned, and its pose may not include that"
+    remedy = "turn the pixels first (e.g. with `mogrify -auto-orient`), then estimate poses from the result"
+    return DataError(path, "EXIF orientation", problem, remedy)
 
 
 def _size(image: Image.Image, turn: bool | None) -> tuple[int, int]:

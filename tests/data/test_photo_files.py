@@ -84,6 +84,10 @@ def test_a_turned_photo_is_read_as_it_is_stored_or_upright(ending: str, orientat
     path = save(tmp_path / f"a{ending}", left_above, exif=exif)
     upright = ImageOps.exif_transpose(Image.open(save(tmp_path / "turned.png", left_above, exif=exif)))
     for turn, expected in ((False, left_above), (True, np.asarray(upright))):
+        if ending == ".tiff" and orientation > 1 and not turn:  # Pillow knows its upright pixels alone
+            with pytest.raises(DataError, match=f"EXIF orientation: is {orientation}"):
+                photo_files.read_image(path, turn=turn)
+            continue
         found = photo_files.read_image(path, turn=turn, expect=(expected.shape[1], expected.shape[0]))
         assert np.array_equal(found.numpy() > 0.5, expected > 127)
         assert photo_files.image_size(path, turn=turn) == found.shape[1::-1]
@@ -124,8 +128,3 @@ def test_the_first_of_the_usual_folders_is_taken_and_named(tmp_path: Path) -> No
     assert photo_folders.image_folder(tmp_path, "images_8").name == "images_8"
     with pytest.raises(DataError, match="choose one of images_4, images_8"):
         photo_folders.image_folder(tmp_path, "images")
-
-
-def test_a_drawing_that_compresses_well_is_no_bomb(tmp_path: Path) -> None:
-    Image.new("L", (3_000, 2_000)).save(tmp_path / "drawing.png")
-    assert photo_files.image_size(tmp_path / "drawing.png") == (3_000, 2_000)
