@@ -3,8 +3,3 @@
 A question of the command line is the module of its name. `scenes` makes what is drawn; `timing` and `accuracy` take the
 measurements; `peers` wraps other rasterizers; `results` writes the files.
 """
-
-from importlib.util import find_spec
-
-if find_spec("pandas") is None:
-    raise ModuleNotFoundError("the benchmark needs pandas: pip install 'clear-strategies[bench]'")

@@ -27,7 +27,6 @@ EXTRAS: Final = {
     "warp": (("warp",), "the rasterizer on CUDA without a CUDA toolkit"),
     "open3d": (("open3d",), "a second way of averaging points in voxels"),
     "sweeps": (("hydra_plugins.hydra_joblib_launcher",), "many runs at once, on one machine or a cluster"),
-    "bench": (("pandas",), "python -m clear_strategies.bench"),
 }
 
 

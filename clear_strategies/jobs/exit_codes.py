@@ -32,6 +32,7 @@ TRAIN: Final = (
     "kornia",
     "matplotlib",
     "msgspec",
+    "pandas",
     "safetensors",
     "scipy",
     "skimage",

@@ -1,10 +1,10 @@
-"""`python -m clear_strategies.report DIR …`: runs as a table, comparisons and a page.
+"""`python -m clear_strategies.report DIR …`: runs as a table, pictures and a page.
 
 Every folder at or below DIR with a metrics.json is a run. Runs of a scene that differ only in their seed share a row. A
 baseline that trained beside runs (`fit.baseline`) counts once. Files:
 
 - report.md, report.csv: the table
-- report.html: the table, images, maps and charts, in one file that needs no network
+- report.html: the tables and pictures of all scenes; it needs the pictures beside it, and no network
 - comparison_SCENE.png: one test view of all methods, enlarged where they differ most
 - curves_SCENE.png: PSNR, conflict and number of Gaussians over iterations, and PSNR over training time
 """
@@ -16,27 +16,36 @@ import logging
 import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+import pandas as pd
 
 from clear_strategies import console, files
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.errors import ClearError, DataError
-from clear_strategies.outputs.figures import save_png
-from clear_strategies.report import charts, page
-from clear_strategies.report.comparison import write_comparison
+from clear_strategies.report.pictures import write_charts, write_comparison
 from clear_strategies.report.published import PAPER
-from clear_strategies.report.rows import Row, compare
 from clear_strategies.report.runs import Run, collect, history
-from clear_strategies.report.table import Table, aligned, layout, record
+from clear_strategies.report.table import compare, layout, markdown, notes
 
-__all__ = ["Row", "Run", "Table", "aligned", "collect", "compare", "layout", "main", "write"]
+__all__ = ["Run", "collect", "compare", "layout", "main", "markdown", "notes", "write"]
 
 _log = logging.getLogger(__name__)
 
 _LONGEST: Final = 60  # characters of a scene in the name of a file
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Section:
+    """A scene on the page, or the average over scenes, which has no pictures."""
+
+    title: str
+    cells: pd.DataFrame
+    notes: Sequence[str]
+    pictures: Sequence[str] = ()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -49,14 +58,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--paper", choices=sorted(PAPER), help="show the numbers of this table of the paper beside ours"
     )
-    parser.add_argument(
-        "--page-mb", type=float, default=page.BUDGET_MB, metavar="MB", help="size limit of report.html (%(default)s)"
-    )
     options = parser.parse_args(arguments)
     console.show()
     out = options.out or options.folders[0]
     try:
-        text = write(collect(options.folders), out, paper=options.paper, page_mb=options.page_mb)
+        text = write(collect(options.folders), out, paper=options.paper)
     except (ClearError, OSError) as error:
         _log.error("%s", error)
         return 2
@@ -65,42 +71,48 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def write(runs: Sequence[Run], out: Path, *, paper: str | None = None, page_mb: float = page.BUDGET_MB) -> str:
+def write(runs: Sequence[Run], out: Path, *, paper: str | None = None) -> str:
     """Write the files of a report into `out`; returns the text of report.md.
 
     Args:
         paper: a key of `PAPER`, whose table stands beside ours.
-        page_mb: size limit of report.html, 10⁶ bytes; the page shows fewer views where not all fit.
     """
     published = None if paper is None else PAPER[paper]
-    rows = compare(runs)
-
-    def table(shown: Sequence[Row], noted: Sequence[Row] = rows) -> Table:
-        if published is None:
-            return layout(shown)
-        return layout(shown, beside=published.columns(shown), notes=published.notes(noted))
-
-    text = table(rows).markdown
+    table = compare(runs)
+    beside = None if published is None else published.columns()
+    more = [] if published is None else published.notes(runs)
+    text = markdown(layout(table, beside), [*notes(table, runs), *more])
     files.write_text(out / "report.md", text)
-    records = [record(row) for row in rows]
+    records = table.drop(columns=["name", "baseline", "average", "run"])
     if published is not None:
-        records = [ours | theirs for ours, theirs in zip(records, published.records(rows), strict=True)]
-    files.write_csv(out / "report.csv", records, list(dict.fromkeys(key for line in records for key in line)))
+        records = records.join(published.numbers(table["name"]))
+    files.write_text(out / "report.csv", records.to_csv(index=False))
 
-    sections = []
-    if averages := [row for row in rows if row.is_average]:
-        sections.append(page.Section("average over scenes", table(averages)))
-    for scene, name in _file_names(run.scene for run in runs).items():
-        of_scene = [row for row in rows if row.scene == scene]
-        shown = {row.method: row.runs[0] for row in of_scene if not row.is_baseline}  # of several seeds the first
-        _compare_renders(out / f"comparison_{name}.png", scene, shown)
-        figure = charts.draw_runs({method: history(run.folder) for method, run in shown.items()}, scene)
-        save_png(figure, out / f"curves_{name}.png")
-        skipped = page.skipped_work(shown)
-        sections.append(page.Section(scene, table(of_scene, of_scene), shown, charts.as_svg(figure), skipped))
-    size = page.write_page(out / "report.html", sections, budget_mb=page_mb)
-    _log.info("report of %d runs: %s (report.html, %.1f MB, opens in any browser)", len(runs), out, size / 1e6)
+    sections: list[_Section] = []
+    for scene, name in _file_names(table["scene"]).items():
+        rows = table[table["scene"] == scene]
+        section = _Section(scene, layout(rows, beside).drop(columns="scene"), [*notes(rows, runs), *more])
+        if rows["average"].any():
+            sections.insert(0, section)
+            continue
+        methods = rows[~rows["baseline"]]
+        shown = dict(zip(methods["method"], methods["run"], strict=True))  # of several seeds the first
+        pictures = [f"{kind}_{name}.png" for kind in ("comparison", "curves")]
+        compared = _compare_renders(out / pictures[0], scene, shown)
+        write_charts(out / pictures[1], {method: history(run.folder) for method, run in shown.items()}, scene)
+        sections.append(_Section(scene, section.cells, section.notes, pictures[not compared :]))
+    _write_page(out / "report.html", sections)
+    _log.info("report of %d runs: %s (report.html opens in any browser)", len(runs), out)
     return text
+
+
+def _write_page(path: Path, sections: Sequence[_Section]) -> None:
+    from jinja2 import Environment, FileSystemLoader
+
+    environment = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True)
+    scenes = [section.title for section in sections if section.pictures]
+    title = f"Report: {', '.join(scenes) if len(scenes) < 4 else f'{len(scenes)} scenes'}"
+    files.write_text(path, environment.get_template("page.html.j2").render(title=title, sections=sections))
 
 
 def _file_names(scenes: Iterable[str]) -> dict[str, str]:
@@ -114,21 +126,31 @@ def _file_names(scenes: Iterable[str]) -> dict[str, str]:
     return words
 
 
-def _compare_renders(path: Path, scene: str, runs: Mapping[str, Run]) -> None:
-    """The comparison of a test view that all runs rendered."""
+def _compare_renders(path: Path, scene: str, runs: Mapping[str, Run]) -> bool:
+    """Draw a test view that all runs rendered, the truth beside it where it is known; returns whether there is one."""
     names = [{file.name for file in (run.folder / "renders").glob("*.png")} for run in runs.values()]
     shared = sorted(set.intersection(*names))
+    truths = {
+        name: file
+        for name in shared
+        for run in runs.values()
+        if (file := run.folder / "views" / f"{Path(name).stem}_truth.png").is_file()
+    }
+    shared = list(truths) or shared
     if not shared:
         _log.warning("%s: no render is common to all runs, so there is no comparison image.", scene)
-        return
+        return False
     view = shared[len(shared) // 2]
     try:
         tiles = {method: np.asarray(read_image(run.folder / "renders" / view)) for method, run in runs.items()}
+        truth = np.asarray(read_image(truths[view])) if view in truths else None
     except DataError as error:
         _log.warning("%s; there is no comparison image.", error)
-        return
-    if len({tile.shape for tile in tiles.values()}) > 1:
+        return False
+    shapes = {tile.shape for tile in tiles.values()} | (set() if truth is None else {truth.shape})
+    if len(shapes) > 1:
         _log.warning("%s: the runs rendered at different sizes, so there is no comparison image.", scene)
-        return
+        return False
     captions = {method: f"mean of its views: {run.scores['ours']['psnr']:.2f} dB" for method, run in runs.items()}
-    write_comparison(path, tiles, captions, f"{scene} · {Path(view).stem}")
+    write_comparison(path, tiles, captions, f"{scene} · {Path(view).stem}", truth)
+    return True

@@ -7,7 +7,6 @@ beside a line, whatever their other settings are. Published methods that no run 
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from collections.abc import Sequence
@@ -16,9 +15,9 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
-from clear_strategies.report.rows import Row
+import pandas as pd
+
 from clear_strategies.report.runs import Run
-from clear_strategies.report.table import Columns
 
 # Column of published.csv -> header, and how its numbers are written.
 _MEASURES: Final = {
@@ -46,27 +45,31 @@ class PaperTable:
     iterations: int = 10_000
 
     @property
-    def lines(self) -> dict[str, dict[str, str]]:
+    def lines(self) -> pd.DataFrame:
         """The table's lines of published.csv, by the paper's name of the method."""
-        return {line["method"]: line for line in _published() if line["table"] == self.key}
+        return _published().query("table == @self.key").set_index("method")
 
-    def columns(self, rows: Sequence[Row]) -> dict[str, Columns]:
-        """The paper's numbers, each right of ours; LPIPS, which we do not measure, right of SSIM."""
-        numbers = [self._numbers(row) for row in rows]
-        cells = {
-            measure: {f"{name}, paper": [format(n[measure], form) if measure in n else "" for n in numbers]}
-            for measure, (name, form) in _MEASURES.items()
-        }
-        cells["ssim"] |= {"LPIPS": ["–" for _ in rows], **cells.pop("lpips")}
+    def numbers(self, names: pd.Series[str]) -> pd.DataFrame:
+        """A line for each name of a method, for report.csv; nan where the paper has no number."""
+        return self._by_name().reindex(names)[list(_MEASURES)].add_prefix("paper_").set_index(names.index)
+
+    def columns(self) -> dict[str, dict[str, dict[str, str]]]:
+        """Quantity -> header -> name of a method -> the paper's number, to stand right of ours."""
+        cells: dict[str, dict[str, dict[str, str]]] = {}
+        for measure, (header, form) in _MEASURES.items():
+            numbers = self._by_name()[measure].dropna()
+            # We do not measure LPIPS: the paper's stands right of SSIM.
+            beside = cells.setdefault("ssim" if measure == "lpips" else measure, {})
+            beside[f"{header}, paper"] = {name: format(number, form) for name, number in numbers.items()}
         return cells
 
-    def records(self, rows: Sequence[Row]) -> list[dict[str, float]]:
-        """Plain numbers for report.csv."""
-        return [{f"paper_{m}": self._numbers(row).get(m, math.nan) for m in _MEASURES} for row in rows]
+    def _by_name(self) -> pd.DataFrame:
+        """The lines that our runs stand beside, by the name of the method."""
+        lines = self.lines.assign(ours=self.lines["ours"].str.split(";")).explode("ours").dropna(subset="ours")
+        return lines.set_index("ours")
 
-    def notes(self, rows: Sequence[Row]) -> list[str]:
+    def notes(self, runs: Sequence[Run]) -> list[str]:
         """What the numbers are means of, how our runs differ from the protocol, and what else was published."""
-        runs = [run for row in rows for run in row.runs]
         scenes = len({run.scene for run in runs})
         ours = f"each of our {scenes} scenes" if scenes > 1 else "our one scene"
         lines = [
@@ -75,24 +78,16 @@ class PaperTable:
         ]
         if differences := self._differences(runs):
             lines.append(f"Ours differs: {'; '.join(differences)}.")
-        matched = {self._method(row) for row in rows}
-        if missing := [name for name in self.lines if name not in matched]:
-            listed = [f"{name} {' / '.join(self._written(name))}" for name in missing]
+        run_here = self.lines["ours"].str.split(";").map(lambda names: any(run.name in names for run in runs), "ignore")
+        if len(missing := self.lines[run_here != True]):  # noqa: E712 - nan where none of ours stands beside it
+            forms = [form for _, form in _MEASURES.values()]
+            listed = [
+                f"{name} {' / '.join(format(x, f) for x, f in zip(row, forms, strict=True) if not math.isnan(x))}"
+                for name, *row in missing[list(_MEASURES)].itertuples(name=None)
+            ]
             head = "PSNR / SSIM / LPIPS" + " / conflict" * (self.key == "ablation")
             lines.append(f"Published, and not run here ({head}): {'; '.join(listed)}.")
         return lines
-
-    def _method(self, row: Row) -> str | None:
-        """The paper's name of the row's method; None where it has none."""
-        return next((name for name, line in self.lines.items() if row.name in line["ours"].split(";")), None)
-
-    def _written(self, method: str) -> list[str]:
-        return [text for measure in _MEASURES if (text := self.lines[method][measure])]
-
-    def _numbers(self, row: Row) -> dict[str, float]:
-        method = self._method(row)
-        line = {} if method is None else self.lines[method]
-        return {measure: float(line[measure]) for measure in _MEASURES if line.get(measure)}
 
     def _differences(self, runs: Sequence[Run]) -> list[str]:
         """Where our runs departed from the protocol, as far as the paper states it."""
@@ -116,9 +111,8 @@ class PaperTable:
 
 
 @cache
-def _published() -> list[dict[str, str]]:
-    with (Path(__file__).parent / "published.csv").open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+def _published() -> pd.DataFrame:
+    return pd.read_csv(Path(__file__).parent / "published.csv")
 
 
 _LLFF_PIXELS: Final = ("2016x1512", "1008x756")

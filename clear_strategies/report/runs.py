@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import logging
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
+
+import pandas as pd
 
 from clear_strategies.data.view_names import file_stem
 from clear_strategies.errors import DataError
@@ -36,7 +38,7 @@ class Run:
     Args:
         scene: its name, followed by the marks in parentheses.
         marks: that the prior is synthetic, that the scores are of training views, that they are against LR photos.
-        name: method or strategies as given on the command line ("clear"), else as metrics.json lists them ("gco + p2g").
+        name: method or strategies as given on the command line ("clear"), else as they are named in the run ("gco + p2g").
         settings: the other overrides, without the seed and those that change no result.
         scores: image ("ours", "bicubic", "prior") -> score -> mean over the test views; over the training views where
             there are no test views.
@@ -64,11 +66,11 @@ class Run:
         """Read a run's folder.
 
         Raises:
-            DataError: metrics.json is damaged, or .hydra/overrides.yaml where metrics.json holds no overrides.
+            DataError: metrics.json is damaged.
         """
         path = folder / "metrics.json"
         content = metrics.read(path, "train the run again")
-        overrides = _overrides_by_hydra(folder) if content.overrides is None else content.overrides
+        overrides = content.overrides or []
         part = content.shown
         marks = ["synthetic prior"] * content.synthetic_prior
         marks += [] if part is content.test else ["training views"]
@@ -158,38 +160,11 @@ def _owner(folder: Path) -> Path:
 def history(folder: Path) -> list[dict[str, float]]:
     """history.csv, one row per iteration; empty, with a warning, where it cannot be read."""
     try:
-        with (folder / "history.csv").open(newline="", encoding="utf-8") as file:
-            return [{key: float(cell) for key, cell in row.items() if cell} for row in csv.DictReader(file)]
-    except (OSError, ValueError, TypeError, csv.Error) as error:
+        table = pd.read_csv(folder / "history.csv", dtype=float)
+    except (OSError, ValueError) as error:
         _log.warning("%s: its history cannot be drawn (%s).", folder, error)
         return []
-
-
-def skips(folder: Path) -> list[dict[str, str]]:
-    """The rows of timing.csv about skipped work; empty, with a message, where it cannot be read."""
-    try:
-        with (folder / "timing.csv").open(newline="", encoding="utf-8") as file:
-            return [row for row in csv.DictReader(file) if row.get("why")]
-    except (OSError, ValueError, csv.Error) as error:
-        _log.info("%s: its skipped work cannot be shown (%s).", folder, error)
-        return []
-
-
-def _overrides_by_hydra(folder: Path) -> Sequence[str]:
-    """The overrides of a run whose metrics.json has none, from Hydra's file; empty where there is no such file. Of a baseline
-    beside a run they are the run's, without its strategies.
-    """
-    import yaml  # comes with Hydra
-
-    owner = _owner(folder)
-    path = owner / _HYDRA / "overrides.yaml"
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else []
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        problem = f"cannot be read ({str(error)[:120]})"
-        raise DataError(path, "overrides", problem, "remove it: the run is then named by its strategies") from error
-    overrides = tuple(map(str, content)) if isinstance(content, list) else ()
-    return overrides if owner == folder else baseline.overrides_of(overrides)
+    return [{name: x for name, x in row.items() if not math.isnan(x)} for row in table.to_dict("records")]
 
 
 def _is_setting(override: str) -> bool:

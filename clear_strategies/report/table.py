@@ -1,88 +1,104 @@
-"""Rows as a table: Markdown for readers, records for report.csv, cells for the page."""
+"""Runs as a table: which of them share a row, and how far each method is from the first.
+
+Differences are taken seed by seed where two methods share seeds: what a seed does to both methods is then no part of the
+error.
+"""
 
 from __future__ import annotations
 
 import html
+import logging
 import math
-import statistics
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any, Final
 
+import pandas as pd
+
 from clear_strategies.outputs.metrics import NOTE
-from clear_strategies.report.rows import Row, mean, shared_settings
+from clear_strategies.report.runs import BASELINES, SCORES, Run
+
+_log = logging.getLogger(__name__)
 
 # Quantity -> header of its column, and how its numbers are written.
-QUANTITIES: Final = {
-    "psnr": ("PSNR (dB) ↑", ".2f"),
-    "ssim": ("SSIM ↑", ".4f"),
-    "gmsd": ("GMSD ↓", ".4f"),
-    "blur": ("blur → 0", "+.4f"),
-    "conflict": ("conflict", ".3f"),
-    "gaussians": ("Gaussians", ",.0f"),
-    "seconds": ("seconds", ",.0f"),
-}
-
-Columns = dict[str, list[str]]
-"""header -> cells."""
+_QUANTITIES: Final = {
+    "psnr": ("PSNR (dB) ↑", ".2f"), "ssim": ("SSIM ↑", ".4f"), "gmsd": ("GMSD ↓", ".4f"), "blur": ("blur → 0", "+.4f"),
+    "conflict": ("conflict", ".3f"), "gaussians": ("Gaussians", ",.0f"), "seconds": ("seconds", ",.0f"),
+}  # fmt: skip
+# Overrides that choose what the baselines see.
+_INPUT: Final = ("data", "prior", "experiment", "protocol")
+_DECORATORS: Final = "decorators."
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Table:
-    """Columns without those that are empty throughout, and what a reader has to know about them."""
+def compare(runs: Sequence[Run]) -> pd.DataFrame:
+    """For each scene, in the order of the runs, its baselines and one row per method; then the averages over scenes.
 
-    columns: Columns
-    notes: Sequence[str] = field(default=())
+    Returns:
+        scene; method: its name, then the settings that not all runs of the scene share; name; baseline, average: what kind of
+        row it is; run: the first of a method; runs: how many; seeds. Of each quantity the mean, and over the seeds of a method
+        its standard deviation `_std`. Of PSNR also the best seed `_best`, and the difference from the first method of the
+        scene `_delta`, its standard error `_delta_error` and the number of its pairs `_delta_pairs`: runs of one seed, of an
+        average of one scene and seed.
+    """
+    single = pd.DataFrame([row for of_scene in _by_scene(runs).values() for row in _single(of_scene)])
+    tables = [_summary(rows) for _, rows in single.groupby("scene", sort=False)]
+    # Scores against LR photos, or of training views, are not averaged with others.
+    for marks, alike in single.groupby("marks", sort=False):
+        if (count := alike["scene"].nunique()) > 1:
+            tables.append(_average(alike, f"average of {count} scenes" + (f" ({marks})" if marks else "")))
+    return pd.concat(tables, ignore_index=True).astype({"psnr_delta_pairs": "Int64"})
 
-    @property
-    def markdown(self) -> str:
-        return "\n".join((*aligned(self.columns), "", *(html.escape(note, quote=False) for note in self.notes), ""))
+
+def shared_settings(runs: Sequence[Run]) -> list[str]:
+    """The settings that all runs have."""
+    return _in_all([run.settings for run in runs])
 
 
-def layout(rows: Sequence[Row], *, beside: Mapping[str, Columns] | None = None, notes: Sequence[str] = ()) -> Table:
-    """The table of these rows.
+def layout(table: pd.DataFrame, paper: Mapping[str, Mapping[str, Mapping[str, str]]] | None = None) -> pd.DataFrame:
+    """The rows of `compare` as text, without the columns that are empty throughout.
 
     Args:
-        beside: quantity -> columns that stand right of it.
-        notes: added to the table's own.
+        paper: quantity -> header -> name of a method -> cell, for columns right of that of the quantity.
     """
-    cells: Columns = {"scene": [row.scene for row in rows], "method": [row.method for row in rows]}
-    for quantity, (header, form) in QUANTITIES.items():
-        cells[header] = [_number(row, quantity, form) for row in rows]
-        if beside is not None:
-            cells |= beside.get(quantity, {})
+    cells: dict[str, Sequence[str]] = {"scene": list(table["scene"]), "method": list(table["method"])}
+    for quantity, (header, form) in _QUANTITIES.items():
+        cells[header] = _numbers(table[quantity], table[f"{quantity}_std"], form)
+        for name, by_method in (paper or {}).get(quantity, {}).items():
+            cells[name] = [by_method.get(method, "") for method in table["name"]]
         if quantity == "psnr":
-            several = any(row.delta is not None and abs(row.delta.mean) > 0 for row in rows)
-            cells["Δ"] = [str(row.delta) if several and row.delta is not None else "" for row in rows]
-            cells["best"] = [_best(row) for row in rows]
-    cells["seeds"] = [row.seeds for row in rows]
-    return Table({name: column for name, column in cells.items() if any(column)}, [*_notes(rows, cells), *notes])
+            several = bool((table["psnr_delta"].abs() > 0).any())
+            delta = _numbers(table["psnr_delta"], table["psnr_delta_error"], "+.2f")
+            cells["Δ"] = delta if several else [""] * len(table)
+            cells["best"] = _numbers(table["psnr_best"], None, form)
+    cells["seeds"] = list(table["seeds"])
+    return pd.DataFrame({name: column for name, column in cells.items() if any(column)})
 
 
-def record(row: Row) -> dict[str, Any]:
-    """A line of report.csv: plain numbers."""
-    line: dict[str, Any] = {"scene": row.scene, "method": row.method, "runs": len(row.runs), "seeds": row.seeds}
-    for quantity in QUANTITIES:
-        values = row.values.get(quantity, ())
-        line[quantity] = mean(values)
-        line[f"{quantity}_std"] = statistics.stdev(values) if row.runs and len(values) > 1 else math.nan
-        if quantity == "psnr":
-            line["psnr_best"] = max(values, default=math.nan) if row.runs else math.nan
-            line["psnr_delta"] = math.nan if row.delta is None else row.delta.mean
-            line["psnr_delta_error"] = math.nan if row.delta is None else row.delta.error
-            line["psnr_delta_pairs"] = "" if row.delta is None else row.delta.pairs
-    return line
+def notes(table: pd.DataFrame, runs: Sequence[Run]) -> list[str]:
+    """What a reader of the table has to know about it."""
+    lines = [f"{NOTE[0].upper()}{NOTE[1:]}."]
+    if (table["psnr_delta"].abs() > 0).any():
+        error = "; its ±: standard error of the differences seed by seed" * int(table["psnr_delta_error"].notna().any())
+        lines.append(f"Δ: PSNR over the scene's first method, dB{error}.")
+    if table["psnr_best"].notna().any():
+        lines.append("±: standard deviation over seeds; best: PSNR of the best seed.")
+    if table["average"].any():
+        lines.append("Averages are means of the scenes' means; their Δ is paired over scenes and seeds.")
+    for scene, of_scene in _by_scene(runs).items():
+        if scene in set(table["scene"]) and (shared := shared_settings(of_scene)):
+            lines.append(f"All runs of {scene}: `{' '.join(shared)}`.")
+    return lines
 
 
-def aligned(columns: Mapping[str, Sequence[str]]) -> list[str]:
-    """The lines of a Markdown table whose columns also align in a terminal."""
-    escaped = [[_plain(cell) for cell in (name, *cells)] for name, cells in columns.items()]
-    widths = [max(map(len, cells)) for cells in escaped]
-    lines = [
-        "| " + " | ".join(f"{cell:<{width}}" for cell, width in zip(cells, widths, strict=True)) + " |"
-        for cells in zip(*escaped, strict=True)
-    ]
-    return [lines[0], "|" + "|".join("-" * (width + 2) for width in widths) + "|", *lines[1:]]
+def markdown(cells: pd.DataFrame, lines: Sequence[str]) -> str:
+    """A Markdown table whose columns also align in a terminal, and the notes below it."""
+    columns = [[_plain(cell) for cell in (name, *cells[name])] for name in cells]
+    widths = [max(map(len, column)) for column in columns]
+    head, *rows = (
+        "| " + " | ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)) + " |"
+        for row in zip(*columns, strict=True)
+    )
+    rule = "|" + "|".join("-" * (width + 2) for width in widths) + "|"
+    return "\n".join((head, rule, *rows, "", *(html.escape(line, quote=False) for line in lines), ""))
 
 
 def _plain(cell: str) -> str:
@@ -90,33 +106,126 @@ def _plain(cell: str) -> str:
     return html.escape(" ".join(cell.split()), quote=False).replace("|", "\\|")
 
 
-def _notes(rows: Sequence[Row], cells: Columns) -> list[str]:
-    notes = [f"{NOTE[0].upper()}{NOTE[1:]}."]
-    if any(cells["Δ"]):
-        with_error = any(row.delta is not None and not math.isnan(row.delta.error) for row in rows)
-        how = "; its ±: standard error of the differences seed by seed" * with_error
-        notes.append(f"Δ: PSNR over the scene's first method, dB{how}.")
-    if any(cells["best"]):
-        notes.append("±: standard deviation over seeds; best: PSNR of the best seed.")
-    if any(row.is_average for row in rows):
-        notes.append("Averages are means of the scenes' means; their Δ is paired over scenes and seeds.")
-    for scene in dict.fromkeys(row.scene for row in rows if not row.is_average):
-        if shared := shared_settings([run for row in rows if row.scene == scene for run in row.runs]):
-            notes.append(f"All runs of {scene}: `{' '.join(shared)}`.")
-    return notes
+def _numbers(means: pd.Series[float], deviations: pd.Series[float] | None, form: str) -> list[str]:
+    """The means, ± the deviations that are known; empty where there is no mean."""
+    small = [math.nan] * len(means) if deviations is None else list(deviations)
+    return [
+        "" if math.isnan(mean) else f"{mean:{form}}" + ("" if math.isnan(s) else f" ± {s:{form.lstrip('+')}}")
+        for mean, s in zip(means, small, strict=True)
+    ]
 
 
-def _number(row: Row, quantity: str, form: str) -> str:
-    """The mean, ± the standard deviation over seeds. Scenes differ in difficulty, so an average has no ±."""
-    values = row.values.get(quantity, ())
-    if not values:
-        return ""
-    middle = format(mean(values), form)
-    if row.is_average or len(values) == 1:
-        return middle
-    return f"{middle} ± {statistics.stdev(values):{form.lstrip('+')}}"
+def _by_scene(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    return {scene: [run for run in runs if run.scene == scene] for scene in dict.fromkeys(run.scene for run in runs)}
 
 
-def _best(row: Row) -> str:
-    several_seeds = not row.is_average and not row.is_baseline and len(row.values["psnr"]) > 1
-    return f"{max(row.values['psnr']):.2f}" if several_seeds else ""
+def _single(runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """Of one scene: a row for each run of a method, after one for each baseline of each run.
+
+    `identity`, of an average: name and settings without the `data` settings that all runs of the scene share, which describe
+    the scene.
+    """
+    shared = shared_settings(runs)
+    of_scene = [s for s in shared if _is_input(s, ("data",))]
+
+    def row(run: Run, name: str, settings: Sequence[str], known: Sequence[str]) -> dict[str, Any]:
+        identity = (name, *sorted(s for s in settings if s not in of_scene))
+        facts = {"scene": run.scene, "marks": run.marks, "name": name, "seed": run.seed, "identity": identity}
+        facts["run"] = None if name in BASELINES else run
+        return {**facts, "method": _label(name, settings, known), "key": (name, *sorted(settings))}
+
+    rows = []
+    for baseline in BASELINES:
+        inputs = {run: _inputs(run, baseline) for run in runs if baseline in run.scores}
+        known = _in_all(list(inputs.values()))
+        rows += [
+            {**row(run, baseline, chosen, known), "baseline": True, **run.scores[baseline]}
+            for run, chosen in inputs.items()
+        ]
+    for run in runs:
+        rows.append({**row(run, run.name, run.settings, shared), "baseline": False, **run.scores["ours"], **run.facts})
+    return rows
+
+
+def _summary(single: pd.DataFrame) -> pd.DataFrame:
+    """Of one scene: a row for each baseline and method."""
+    # Runs with the same input have the same baseline, unless the prior depends on the seed.
+    repeated = single["baseline"] & single.duplicated(["key", *SCORES])
+    groups = single[~repeated].groupby("key", sort=False)
+    table = groups[["scene", "method", "name", "baseline", "run"]].first().assign(average=False, runs=groups.size())
+    for method, of_method in groups:
+        if of_method["baseline"].any():
+            continue
+        label = f"{table.loc[[method], 'scene'].iloc[0]}, {table.loc[[method], 'method'].iloc[0]}"
+        if of_method["seed"].duplicated().any():
+            _log.warning("%s: a row holds several runs with the same seed.", label)
+        if of_method["psnr"].isna().any():
+            _log.warning("%s: runs without a finite PSNR are left out of its mean.", label)
+    seeds = groups["seed"].agg(lambda seeds: ", ".join(map(str, sorted(set(seeds)))))
+    table["seeds"] = seeds.where(~table["baseline"], "")
+    for quantity in _QUANTITIES:
+        table[quantity], table[f"{quantity}_std"] = groups[quantity].mean(), groups[quantity].std()
+    table["psnr_best"] = groups["psnr"].max().where(~table["baseline"] & (groups["psnr"].count() > 1))
+    return table.join(_differences(single, "key", table["psnr"])).reset_index(drop=True)
+
+
+def _average(single: pd.DataFrame, title: str) -> pd.DataFrame:
+    """A row for each method that all scenes have."""
+    scenes = single["scene"].nunique()
+    of_scenes = single.groupby(["identity", "scene"], sort=False)
+    in_all = of_scenes.size().groupby("identity", sort=False).size() == scenes
+    if left_out := list(dict.fromkeys(single.loc[~single["identity"].map(in_all), "method"])):
+        _log.info("%s: left out, because not all scenes have it: %s.", title, "; ".join(left_out))
+    single = single[single["identity"].map(in_all)]
+    of_scenes = single.groupby(["identity", "scene"], sort=False)
+    quantities = [*_QUANTITIES]
+    means = of_scenes[quantities].mean().groupby("identity", sort=False)
+    table = single.groupby("identity", sort=False)[["name", "baseline"]].first().assign(average=True, runs=0, seeds="")
+    # A quantity that one scene lacks has no average.
+    table = table.join(means.mean().where(means.count() == scenes))
+    shared = _in_all([settings for (name, *settings) in table.index[~table["baseline"]]])
+    table["method"] = [_label(name, settings, shared) for (name, *settings) in table.index]
+    table = table.join(_differences(single, "identity", table["psnr"])).assign(scene=title)
+    return table.sort_values("baseline", ascending=False, kind="stable").reset_index(drop=True)
+
+
+def _differences(single: pd.DataFrame, key: str, means: pd.Series[float]) -> pd.DataFrame:
+    """PSNR of each method minus that of the first: over the pairs of one scene and seed, or, with fewer than two pairs, the
+    difference of the two means, without an error.
+    """
+    methods = single[~single["baseline"]]
+    # A method whose PSNR is never finite has a column as well.
+    by_seed = methods.groupby([key, "scene", "seed"], sort=False)["psnr"].mean().unstack(key, sort=False)
+    first: Hashable = methods[key].iloc[0]
+    pairs = by_seed.sub(by_seed[first], axis=0)
+    table = pd.DataFrame(
+        {"psnr_delta": pairs.mean(), "psnr_delta_error": pairs.sem(), "psnr_delta_pairs": pairs.count()}
+    )
+    few = table["psnr_delta_pairs"] < 2
+    table.loc[few, "psnr_delta"] = means[few[few].index] - means[[first]].iloc[0]
+    table.loc[table.index == first, ["psnr_delta", "psnr_delta_error"]] = 0.0, math.nan
+    return table
+
+
+def _in_all(lists: Sequence[Sequence[str]]) -> list[str]:
+    """What every list holds, in the order of the first."""
+    return [setting for setting in lists[0] if all(setting in other for other in lists)] if lists else []
+
+
+def _inputs(run: Run, baseline: str) -> list[str]:
+    """What the images of a baseline depend on: the settings of data and prior; for the SR images also their decorators,
+    which a strategy may bring.
+    """
+    inputs = [s for s in run.settings if _is_input(s)]
+    if baseline != "prior":
+        return inputs
+    decorators = {key.split(".")[1] for key in run.config if key.startswith(_DECORATORS)}
+    return [*inputs, *sorted(decorators), *(s for s in run.settings if _is_input(s, (_DECORATORS,)))]
+
+
+def _is_input(setting: str, groups: tuple[str, ...] = _INPUT) -> bool:
+    return setting.lstrip("+~").startswith(groups)
+
+
+def _label(name: str, settings: Sequence[str], shared: Sequence[str]) -> str:
+    return ", ".join((name, *(s for s in settings if s not in shared)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import torch
 
 from clear_strategies import files, report
@@ -25,37 +26,33 @@ def make_run(
         "scene": scene, "strategies": ["gco"], "seed": seed, "iterations": 100, "gaussians": 1200, "seconds": 61.7,
         "conflict": {"gaussian": 0.25, "means": 0.3}, "synthetic_prior": False,
         "test": {"against": "HR photos", "views": {"view.png": {"ours": scores(psnr)}}, "mean": mean},
-        "train": {"against": "HR photos", "views": {}, "mean": mean}, "provenance": {}, **facts,
+        "train": {"against": "HR photos", "views": {}, "mean": mean}, "provenance": {},
+        "overrides": [*overrides, f"fit.seed={seed}"], **facts,
     }  # fmt: skip
     files.write_json(folder / "metrics.json", content)
-    overrides = (*overrides, f"fit.seed={seed}")
-    files.write_text(folder / ".hydra" / "overrides.yaml", "".join(f"- {o!r}\n" for o in overrides))
+    (folder / ".hydra").mkdir(exist_ok=True)
     rows = [{"t": t, "psnr_test": 15 + t, "n_gaussians": 1000 + t, "seconds": t / 2} for t in range(1, 6)]
     files.write_csv(folder / "history.csv", rows, ["t", "psnr_test", "n_gaussians", "seconds", "conflict"])
     write_png(folder / "renders" / "view.png", torch.rand(24, 32, 3, generator=torch.Generator().manual_seed(seed)))
-    shade = torch.linspace(0, 1, 32).expand(24, 32)
-    for kind, image in {
-        "lr": shade[::4, ::4, None].expand(6, 8, 3),
-        "prior": shade[..., None].expand(24, 32, 3),
-    }.items():
-        write_png(folder / "views" / f"view_{kind}.png", image)
-        write_png(folder / "maps" / "train" / f"{kind}.png", image)
     write_png(folder / "views" / "view_truth.png", torch.full((24, 32, 3), 0.5))
-    for name in ("reliability", "demand", "weight", "corrected", "conflict"):
-        write_png(folder / "maps" / "train" / f"{name}.png", shade * 0.2)
-    files.write_json(folder / "maps" / "maps.json", {"views": {"train.png": {"reliability": 0.75}}})
-    timing = {"stage": "backward HR", "seconds_saved": 1.5, "why": "lambda_HR = 0 (75x)"}
-    files.write_csv(folder / "timing.csv", [timing], list(timing))
     return folder
 
 
-def rows_of(*folders: Path) -> dict[str, report.Row]:
-    return {row.method: row for row in report.compare(report.collect(folders))}
+def rows_of(*folders: Path) -> dict[str, pd.Series]:
+    """The rows of the table by their method."""
+    return {row["method"]: row for _, row in report.compare(report.collect(folders)).iterrows()}
+
+
+def averages_of(folder: Path) -> pd.DataFrame:
+    table = report.compare(report.collect([folder]))
+    return table[table["average"]].set_index("method")
 
 
 def table_of(folder: Path) -> str:
     """The table of all runs in the folder, as Markdown."""
-    return report.layout(report.compare(report.collect([folder]))).markdown
+    runs = report.collect([folder])
+    table = report.compare(runs)
+    return report.markdown(report.layout(table), report.notes(table, runs))
 
 
 def cells(text: str) -> list[dict[str, str]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 import statistics
 import subprocess
 import sys
@@ -31,6 +32,21 @@ def test_a_report_has_a_table_records_a_page_and_images(tmp_path: Path) -> None:
     assert float(records["gco"]["gaussians"]) == 1200
     assert float(records["clear"]["psnr_delta"]) == 1.25
     assert (records["bicubic"]["conflict"], records["bicubic"]["psnr_delta"]) == ("", "")
+
+
+def test_the_page_shows_every_table_note_and_picture_as_text_and_refers_to_files_beside_it(tmp_path: Path) -> None:
+    for scene in ("fern", "horns"):
+        for job, strategy in enumerate(("baseline", "<b>clear</b>")):
+            make_run(tmp_path / f"{scene}{job}", f"+strategy={strategy}", "data=llff", scene=scene)
+    report.write(report.collect([tmp_path]), tmp_path)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<b>clear" not in page
+    assert page.count("&lt;b&gt;clear&lt;/b&gt;") == 3  # two scenes and their average
+    assert "All runs of fern: `data=llff`." in page
+    pictures = set(re.findall(r'src="([^"]+)"', page))
+    assert pictures == {f"{kind}_{scene}.png" for kind in ("comparison", "curves") for scene in ("fern", "horns")}
+    assert all((tmp_path / picture).is_file() for picture in pictures)
+    assert not re.search("http:|https:|<script", page)
 
 
 def test_scenes_whose_names_differ_by_a_sign_or_are_long_have_pictures_of_their_own() -> None:

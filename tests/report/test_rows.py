@@ -9,15 +9,14 @@ import pytest
 
 from clear_strategies import report
 from clear_strategies.settings import CHANGES_NO_RESULT
-from tests.helpers.finished_run import cells, make_run, rows_of, scores, table_of
+from tests.helpers.finished_run import averages_of, cells, make_run, rows_of, scores, table_of
 
 
 def test_runs_that_differ_in_their_seed_share_a_row(tmp_path: Path) -> None:
     for seed, psnr in enumerate((20.0, 21.0, 25.0)):
         make_run(tmp_path / str(seed), "+strategy=clear", seed=seed, psnr=psnr)
-    row = rows_of(tmp_path)["clear"]
-    assert row.values["psnr"] == [20.0, 21.0, 25.0]
-    (line,) = (c for c in cells(report.layout([row]).markdown) if c["method"] == "clear")
+    assert rows_of(tmp_path)["clear"]["psnr"] == 22.0
+    (line,) = (c for c in cells(table_of(tmp_path)) if c["method"] == "clear")
     assert line["PSNR (dB) ↑"] == "22.00 ± 2.65"  # deviations -2, -1, 3: sqrt(14 / 2)
     assert (line["best"], line["seeds"], line["Gaussians"]) == ("25.00", "0, 1, 2", "1,200 ± 0")
 
@@ -43,13 +42,13 @@ def test_runs_that_differ_in_a_setting_have_rows_that_name_it(tmp_path: Path, se
 def test_what_changes_no_result_does_not_separate_runs(tmp_path: Path, settings: list[str], others: list[str]) -> None:
     make_run(tmp_path / "0", "+method=srgs", *settings)
     make_run(tmp_path / "1", "+method=srgs", *others, seed=1)
-    assert rows_of(tmp_path)["srgs"].seeds == "0, 1"
+    assert rows_of(tmp_path)["srgs"]["seeds"] == "0, 1"
 
 
 def test_one_seed_twice_and_a_score_that_is_not_finite_give_a_warning(tmp_path, caplog):
     for i, psnr in enumerate((20.0, 20.0, None)):
         make_run(tmp_path / str(i), "+strategy=gco", psnr=psnr)
-    assert rows_of(tmp_path)["gco"].values["psnr"] == [20.0, 20.0]
+    assert rows_of(tmp_path)["gco"]["psnr"] == 20.0
     assert "demo, gco: a row holds several runs with the same seed" in caplog.text
     assert "demo, gco: runs without a finite PSNR are left out of its mean" in caplog.text
 
@@ -60,8 +59,8 @@ def test_baselines_of_different_inputs_have_rows_of_their_own(tmp_path: Path, ke
     make_run(tmp_path / "1", "+strategy=clear", f"{key}=one")
     make_run(tmp_path / "2", "+strategy=gco", f"{key}=other", bicubic=17.0)
     rows = rows_of(tmp_path)
-    assert rows[f"prior, {key}=one"].values["psnr"] == [19.0]
-    assert rows[f"bicubic, {key}=other"].values["psnr"] == [17.0]
+    assert rows[f"prior, {key}=one"]["psnr"] == 19.0
+    assert rows[f"bicubic, {key}=other"]["psnr"] == 17.0
 
 
 def test_sr_images_that_a_strategy_changes_have_a_row_of_their_own(tmp_path: Path) -> None:
@@ -69,10 +68,11 @@ def test_sr_images_that_a_strategy_changes_have_a_row_of_their_own(tmp_path: Pat
         make_run(tmp_path / f"{scene}0", "+strategy=clear", scene=scene)
         back_projected = {"decorators.back_projected.rounds": 10, "decorators.back_projected.down": "bicubic"}
         make_run(tmp_path / f"{scene}1", "+strategy=best", scene=scene, bicubic=20.0, config=back_projected)
-    averages = {row.method: row for row in report.compare(report.collect([tmp_path])) if not row.runs}
-    for rows in (rows_of(tmp_path / "fern0", tmp_path / "fern1"), averages):
-        assert {19.0} == set(rows["prior"].values["psnr"])
-        assert {21.0} == set(rows["prior, back_projected"].values["psnr"])
+    for psnr in (
+        {name: row["psnr"] for name, row in rows_of(tmp_path / "fern0", tmp_path / "fern1").items()},
+        averages_of(tmp_path)["psnr"],
+    ):
+        assert (psnr["prior"], psnr["prior, back_projected"]) == (19.0, 21.0)
 
 
 def test_scores_of_training_views_or_against_lr_photos_are_marked(tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_scores_of_training_views_or_against_lr_photos_are_marked(tmp_path: Path
     nothing: dict[str, Any] = {"against": "nothing", "views": {}, "mean": {}}
     make_run(tmp_path / "a", test=lr, scene="a")
     make_run(tmp_path / "b", test=nothing, train=lr, scene="b")
-    scenes = {row.scene for row in report.compare(report.collect([tmp_path]))}
+    scenes = set(report.compare(report.collect([tmp_path]))["scene"])
     assert scenes == {"a (against LR photos)", "b (training views, against LR photos)"}
 
 
@@ -102,10 +102,10 @@ def test_differences_are_paired_by_seed(tmp_path: Path) -> None:
     for seed, (first, second) in enumerate(((20.0, 20.5), (22.0, 22.25), (21.0, 22.5))):
         make_run(tmp_path / f"a{seed}", "+strategy=baseline", seed=seed, psnr=first)
         make_run(tmp_path / f"b{seed}", "+strategy=gco", seed=seed, psnr=second)
-    delta = rows_of(tmp_path)["gco"].delta
+    gco = rows_of(tmp_path)["gco"]
     # Differences 0.5, 0.25, 1.5: mean 0.75, deviations -0.25, -0.5, 0.75, so √(0.875 / 2) / √3.
-    assert (delta.mean, delta.pairs) == (0.75, 3)
-    assert delta.error == pytest.approx((0.875 / 2 / 3) ** 0.5)
+    assert (gco["psnr_delta"], gco["psnr_delta_pairs"]) == (0.75, 3)
+    assert gco["psnr_delta_error"] == pytest.approx((0.875 / 2 / 3) ** 0.5)
     lines = {line["method"]: line for line in cells(table_of(tmp_path))}
     assert (lines["baseline"]["Δ"], lines["gco"]["Δ"]) == ("+0.00", "+0.75 ± 0.38")
 
@@ -116,14 +116,14 @@ def test_averages_are_means_of_scene_means_with_paired_differences(tmp_path: Pat
             psnr = 20.0 + offset + seed
             make_run(tmp_path / f"{scene}a{seed}", "+strategy=baseline", seed=seed, psnr=psnr, scene=scene)
             make_run(tmp_path / f"{scene}b{seed}", "+strategy=gco", seed=seed, psnr=psnr + 1 + offset, scene=scene)
-    rows = [row for row in report.compare(report.collect([tmp_path])) if not row.runs]
-    assert {row.scene for row in rows} == {"average of 2 scenes"}
-    assert [row.method for row in rows] == ["bicubic", "prior", "baseline", "gco"]
-    baseline, gco = rows[2:]
-    assert baseline.values["psnr"] == [21.0, 24.0]  # each scene counts once, however many seeds it has
-    assert (gco.delta.mean, gco.delta.pairs) == (2.0, 4)  # 1, 1, 1, 5
-    assert gco.delta.error == pytest.approx(1.0)  # s = 2
-    line = cells(report.layout(rows).markdown)[3]
+    averages = averages_of(tmp_path)
+    assert set(averages["scene"]) == {"average of 2 scenes"}
+    assert list(averages.index) == ["bicubic", "prior", "baseline", "gco"]
+    assert averages.loc["baseline", "psnr"] == 22.5  # 21 and 24: each scene counts once, however many seeds it has
+    gco = averages.loc["gco"]
+    assert (gco["psnr_delta"], gco["psnr_delta_pairs"]) == (2.0, 4)  # 1, 1, 1, 5
+    assert gco["psnr_delta_error"] == pytest.approx(1.0)  # s = 2
+    line = cells(table_of(tmp_path))[-1]
     assert (line["PSNR (dB) ↑"], line["Δ"]) == ("25.50", "+2.00 ± 1.00")
 
 
@@ -132,5 +132,4 @@ def test_scenes_with_different_data_settings_are_averaged(tmp_path: Path) -> Non
         for job, strategy in enumerate(("baseline", "gco")):
             make_run(tmp_path / f"{scene}{job}", f"+strategy={strategy}", f"data.views.shrink={shrink}", scene=scene)
     make_run(tmp_path / "only_here", "+strategy=gco", "density.threshold=1", "data.views.shrink=2", scene="fern")
-    averages = [row.method for row in report.compare(report.collect([tmp_path])) if not row.runs]
-    assert averages == ["bicubic", "prior", "baseline", "gco"]
+    assert list(averages_of(tmp_path).index) == ["bicubic", "prior", "baseline", "gco"]

@@ -5,7 +5,9 @@ from __future__ import annotations
 import html
 from pathlib import Path
 
-from clear_strategies.report.table import Table, aligned
+import pandas as pd
+
+from clear_strategies import report
 from tests.helpers.finished_run import make_run, table_of
 
 
@@ -25,8 +27,10 @@ def test_settings_that_all_runs_share_are_noted_once(tmp_path: Path) -> None:
 
 
 def test_a_name_is_text_and_no_markup() -> None:
-    rows = "\n".join(aligned({"scene": ["<script>alert(1)</script>"], "method": ["a|b\nc"]}))
-    assert "<script>" not in rows
-    assert html.escape("<script>") in rows
-    assert "a\\|b c" in rows
-    assert "<img" not in Table({"scene": ["x"]}, ["All runs of x: `<img src=y>`."]).markdown
+    text = report.markdown(
+        pd.DataFrame({"scene": ["<script>alert(1)</script>"], "method": ["a|b\nc"]}), ["All runs of x: `<img src=y>`."]
+    )
+    assert "<script>" not in text
+    assert html.escape("<script>") in text
+    assert "a\\|b c" in text
+    assert "<img" not in text
