@@ -61,7 +61,7 @@ def main(arguments: Sequence[str]) -> None:
             collections.deque(frames, maxlen=0)
         else:
             written.append(out / f"{'_'.join(part for part in (Path(options.path).stem, kind) if part)}.mp4")
-            video.write_videos(written[-1:], frames, fps=fps)
+            video.write_video(written[-1], frames, fps=fps)
     shown = written if len(written) <= 4 else [*written[:2], *written[-2:]]
     _log.info("%s", "\n".join(f"  {path}" for path in shown))
     _log.info("%d views, %d files in %.1f s", len(where) * len(kinds), len(written), time.perf_counter() - began)

@@ -162,7 +162,7 @@ def _write_video(path: Path, train: Sequence[Camera], painter: Painter, frames: 
         _log.info("no video of the camera path is written: %s.", missing)
         return
     along = [cameras.at_most(camera, _LONGEST) for camera in paths.through(train, frames)]
-    video.write_videos([path], film.color_frames(painter, along), fps=FPS)
+    video.write_video(path, film.color_frames(painter, along), fps=FPS)
 
 
 def _write_page(

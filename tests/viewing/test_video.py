@@ -22,20 +22,17 @@ def read(path):
     return np.stack([np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in reader])
 
 
-def test_an_mp4_holds_the_frames_and_a_gif_is_written_beside_it_in_a_folder_that_looks_like_a_protocol(
-    tmp_path, monkeypatch
-):
+def test_an_mp4_holds_the_frames_in_a_folder_that_looks_like_a_protocol(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    video.write_videos([Path("10:30/a.mp4"), Path("10:30/a.gif")], iter(FRAMES), fps=10)
+    video.write_video(Path("10:30/a.mp4"), iter(FRAMES), fps=10)
     found = read(tmp_path / "10:30" / "a.mp4")
     assert found.shape == (10, 32, 48, 3)
     assert np.abs(found.mean((1, 2, 3)) - np.arange(10) * 20).max() < 4
-    assert Path("10:30/a.gif").read_bytes()[:6] == b"GIF89a"
-    assert {path.name for path in Path("10:30").iterdir()} == {"a.mp4", "a.gif"}
+    assert [path.name for path in Path("10:30").iterdir()] == ["a.mp4"]
 
 
 def test_an_mp4_says_by_which_matrix_its_colours_are_made(tmp_path):
-    video.write_videos([tmp_path / "a.mp4"], [np.full((32, 48, 3), (30, 180, 30), np.uint8)] * 2, fps=10)
+    video.write_video(tmp_path / "a.mp4", [np.full((32, 48, 3), (30, 180, 30), np.uint8)] * 2, fps=10)
     command = [ffmpeg.get_ffmpeg_exe(), "-i", tmp_path / "a.mp4"]
     assert "bt709" in subprocess.run(command, check=False, capture_output=True, text=True).stderr
     assert read(tmp_path / "a.mp4")[0].mean((0, 1)) == pytest.approx((30, 180, 30), abs=4)
@@ -47,17 +44,17 @@ def test_a_video_that_breaks_leaves_nothing(tmp_path):
         raise RuntimeError
 
     with pytest.raises(RuntimeError):
-        video.write_videos([tmp_path / "a.mp4"], broken(), fps=10)
+        video.write_video(tmp_path / "a.mp4", broken(), fps=10)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
     ("name", "frames", "message"),
-    [("a.avi", FRAMES, "a video must be .mp4 or .gif"), ("a.mp4", [], "needs at least 1 frame")],
+    [("a.avi", FRAMES, "a video must be .mp4"), ("a.mp4", [], "needs at least 1 frame")],
 )
 def test_what_gives_no_video_is_refused(tmp_path, name, frames, message):
     with pytest.raises(SettingError, match=message):
-        video.write_videos([tmp_path / name], frames, fps=10)
+        video.write_video(tmp_path / name, frames, fps=10)
 
 
 def test_a_missing_program_and_a_missing_library_are_named(monkeypatch, tmp_path):
@@ -66,7 +63,7 @@ def test_a_missing_program_and_a_missing_library_are_named(monkeypatch, tmp_path
 
     monkeypatch.setattr(ffmpeg, "get_ffmpeg_exe", nowhere)
     with pytest.raises(SettingError, match="does not run here: install ffmpeg"):
-        video.write_videos([tmp_path / "a.mp4"], FRAMES, fps=10)
+        video.write_video(tmp_path / "a.mp4", FRAMES, fps=10)
     monkeypatch.setattr(video, "find_spec", lambda _: None)
     with pytest.raises(SettingError, match="pip install imageio-ffmpeg"):
-        video.write_videos([tmp_path / "a.mp4"], FRAMES, fps=10)
+        video.write_video(tmp_path / "a.mp4", FRAMES, fps=10)

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import subprocess
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+from PIL import Image
 
 from clear_strategies import files
 from clear_strategies.core.progress import Progress
@@ -32,11 +32,9 @@ _FEWEST, _MOST = 12, 40  # frames that are chosen by default
 _STILL: Final = 0.002  # of the width: a frame that moves less shows the same as the one before
 _BLURRED: Final = 0.5  # of the median sharpness around it
 _AROUND: Final = 15  # frames before and after that the median is taken of
-# Readers of JPEG files assume BT.601; videos are mostly BT.709, which ffmpeg would keep.
-_AS_JPEG: Final = "scale=out_color_matrix=bt601:out_range=full"
 _REMEDY: Final = "name a video of the scene, or the folder of its photos"
 
-Grey = UInt8[np.ndarray, "h w"]
+Pixels = UInt8[np.ndarray, "h w c"]
 
 
 def frames_of(path: Path, count: int | None) -> Path:
@@ -86,13 +84,12 @@ def _write_chosen(path: Path, count: int | None, folder: Path) -> None:
     with tempfile.TemporaryDirectory(prefix=f"{folder.name}.", dir=folder.parent) as work:
         frames = Path(work) / "frames"
         frames.mkdir()
-        pattern = str(frames / f"{path.stem.replace('%', '_')}_%03d.jpg")
-        command = [*_ffmpeg(path, f"select={_any_of(chosen.tolist())},{_AS_JPEG}"), "-q:v", "1", pattern]
-        ended = subprocess.run(command, check=False, stdin=subprocess.DEVNULL)  # noqa: S603 - ffmpeg, by arguments
-        written = len(list(frames.iterdir()))
-        if ended.returncode != 0 or written != len(chosen):
-            problem = f"ffmpeg wrote {written} of the {len(chosen)} chosen frames (exit code {ended.returncode})"
-            raise DataError(path, "video", problem, f"see what it says above, and the space left in {folder.parent}")
+        pixels = _frames(path, f"select={_any_of(chosen.tolist())}", "rgb24")
+        written = 0
+        for written, frame in enumerate(pixels, start=1):
+            Image.fromarray(frame).save(frames / f"{path.stem}_{written:03d}.jpg", quality=95, subsampling=0)
+        if written != len(chosen):
+            raise DataError(path, "video", f"gives {written} of the {len(chosen)} chosen frames", _REMEDY)
         (frames / CHOICE).write_text(summary)
         files.install(frames, folder, CHOICE)
 
@@ -113,7 +110,8 @@ def _scores(path: Path) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"
     sharpness, movement = [], []
     last: Any = None
     progress = Progress(f"{path.name}: looking for sharp frames", "frames", total=1 << 30)
-    for frame in _small_frames(path):
+    for pixels in _frames(path, f"scale={_WIDTH}:-2", "gray"):
+        frame = pixels[..., 0]
         sharpness.append(float(cv2.Laplacian(frame, cv2.CV_32F).var()) / max(float(frame.var()), 1.0))
         flow = np.zeros((1, 1, 2)) if last is None else flow_of.calc(last, frame, None)
         movement.append(float(np.median(np.hypot(flow[..., 0], flow[..., 1]))) / frame.shape[1])
@@ -124,36 +122,32 @@ def _scores(path: Path) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"
     return np.array(sharpness), np.array(movement)
 
 
-def _small_frames(path: Path) -> Iterator[Grey]:
-    """Every frame, upright, grey and `_WIDTH` wide: ffmpeg writes them as PGM, each with its size."""
-    command = [*_ffmpeg(path, f"scale={_WIDTH}:-2,format=gray"), "-f", "image2pipe", "-c:v", "pgm", "-"]
-    with subprocess.Popen(  # noqa: S603 - ffmpeg, by arguments
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
-    ) as process:
-        if process.stdout is None:
-            return
-        while process.stdout.readline().strip() == b"P5":
-            width, height = (int(word) for word in process.stdout.readline().split())
-            process.stdout.readline()  # the largest value
-            data = process.stdout.read(width * height)
-            if len(data) < width * height:
-                return
-            yield np.frombuffer(data, np.uint8).reshape(height, width)
+def _frames(path: Path, filters: str, layout: Literal["gray", "rgb24"]) -> Iterator[Pixels]:
+    """The frames of a video behind ffmpeg's filters, upright; none where ffmpeg cannot read it.
 
-
-def _ffmpeg(path: Path, filters: str) -> list[str]:
-    """The start of a command that filters a video's frames; a DataError if imageio-ffmpeg is not installed."""
+    Raises:
+        DataError: imageio-ffmpeg is not installed.
+    """
     try:
         import imageio_ffmpeg
     except ImportError as error:
         raise DataError("video", "ffmpeg", "is not installed", "pip install 'clear-strategies[train]'") from error
-    ffmpeg = str(imageio_ffmpeg.get_ffmpeg_exe())
-    file = f"file:{path}"  # without "file:", the part before a colon, as in 10:30.mp4, is a protocol
-    return [ffmpeg, "-v", "error", "-i", file, "-vf", filters, "-fps_mode", "passthrough"]
+    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # it warns of frames of another size than the file's
+    channels = {"gray": 1, "rgb24": 3}[layout]
+    reader = imageio_ffmpeg.read_frames(
+        f"file:{path}",  # without "file:", the part before a colon, as in 10:30.mp4, is a protocol
+        layout, bits_per_pixel=8 * channels, output_params=["-vf", filters, "-fps_mode", "passthrough"],
+    )  # fmt: skip
+    try:
+        width, height = next(reader)["size"]
+        for data in reader:
+            yield np.frombuffer(data, np.uint8).reshape(height, width, channels)
+    except (OSError, RuntimeError) as error:
+        _log.debug("%s: %s", path, error)
 
 
 def _key(path: Path, count: int | None) -> str:
-    digest = hashlib.sha256(repr(("all frames by path and sharpness, BT.601", count, path.stem)).encode())
+    digest = hashlib.sha256(repr(("all frames by path and sharpness, by Pillow", count, path.stem)).encode())
     with path.open("rb") as file:
         while block := file.read(1 << 20):
             digest.update(block)
