@@ -29,7 +29,7 @@ from clear_strategies.data import ply
 from clear_strategies.data.cameras import Lens
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.photo_files import read_image
-from clear_strategies.data.readers import colmap, colmap_files, colmap_model, llff, nerfstudio
+from clear_strategies.data.readers import colmap, colmap_model, llff, nerfstudio
 from clear_strategies.errors import DataError
 from clear_strategies.training import checkpoint
 from tests.helpers.captures import GOOD
@@ -148,7 +148,7 @@ def _require_lenses(lenses: Iterable[Lens]) -> None:
         _require(all(map(math.isfinite, (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion))))
 
 
-def _require_images(images: Sequence[colmap_files.Image]) -> None:
+def _require_images(images: Sequence[colmap_model.Image]) -> None:
     for image in images:
         _require(all(map(math.isfinite, image.translation)) and 0.5 < math.hypot(*image.quat) < 2)
     _require(len({image.id for image in images}) == len(images))

@@ -1,12 +1,18 @@
-"""COLMAP's sparse models, read strictly: every number must be finite and every id known."""
+"""COLMAP's sparse models, binary (.bin) or text (.txt), read strictly: every number must be finite and every id known.
+
+pycolmap is no substitute: it reads a points3D.bin that is cut in half without an error.
+"""
 
 from __future__ import annotations
 
+import io
 import logging
 import math
-from collections.abc import Sequence
+import struct
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -14,12 +20,37 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from clear_strategies.data.cameras import FARTHEST, Lens
-from clear_strategies.data.readers import colmap_files
-from clear_strategies.data.readers.colmap_files import Camera, Image, damaged
 from clear_strategies.errors import DataError
+from clear_strategies.files import read_bytes
 from rasterizers.geometry import rotation_matrix
 
 _log = logging.getLogger(__name__)
+
+# name -> COLMAP's number for the model, and how many parameters it has.
+_MODELS: Final = {
+    "SIMPLE_PINHOLE": (0, 3), "PINHOLE": (1, 4), "SIMPLE_RADIAL": (2, 4), "RADIAL": (3, 5), "OPENCV": (4, 8),
+    "OPENCV_FISHEYE": (5, 8), "FULL_OPENCV": (6, 12), "SIMPLE_RADIAL_FISHEYE": (8, 4), "RADIAL_FISHEYE": (9, 5),
+}  # fmt: skip
+_MODEL_OF_NUMBER: Final = {number: name for name, (number, _) in _MODELS.items()}
+_TWO_FOCAL_LENGTHS: Final = ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
+_LONGEST_NAME: Final = 4096
+
+_T = TypeVar("_T")
+_Number = TypeVar("_Number", int, float)
+
+
+class Image(NamedTuple):
+    """A registered image: world-to-camera as (w, x, y, z) and translation, its camera's id, and its file name."""
+
+    id: int
+    quat: tuple[float, ...]
+    translation: tuple[float, ...]
+    camera: int
+    name: str
+
+
+_Point = tuple[int, Sequence[float], Sequence[int], np.ndarray]
+"""Id, position, 8-bit colour, and the ids of the images that observe it; a plain tuple, because there may be millions."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,24 +73,6 @@ class Model:
     points: Points
 
 
-def find_model(root: Path) -> Path:
-    """The folder of the sparse model; of the several that COLMAP's mapper may leave in `sparse`, the one with most photos.
-
-    Raises:
-        DataError: there is none, or one of several cannot be read.
-    """
-    if not root.is_dir():
-        raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
-    for candidate in model_folders(root):
-        if is_model(candidate):
-            numbered = sorted(candidate.parent.glob("[1-9]*")) if candidate.name == "0" else []
-            return _largest(root, [candidate, *filter(is_model, numbered)])
-    raise DataError(
-        root, "sparse model", "no cameras.bin or cameras.txt in sparse/0, sparse, colmap/sparse/0 or here",
-        "run COLMAP first, or use data=photos for photos without poses",
-    )  # fmt: skip
-
-
 def model_folders(root: Path) -> tuple[Path, ...]:
     """Where a scene's model may lie."""
     return (root / "sparse" / "0", root / "sparse", root / "colmap" / "sparse" / "0", root)
@@ -69,9 +82,24 @@ def is_model(folder: Path) -> bool:
     return any((folder / f"{name}{ending}").is_file() for name in ("cameras", "images") for ending in (".bin", ".txt"))
 
 
-def _largest(root: Path, models: Sequence[Path]) -> Path:
+def find_model(root: Path) -> Path:
+    """The folder of the sparse model; of the several that COLMAP's mapper may leave in `sparse`, the one with most photos.
+
+    Raises:
+        DataError: there is none, or one of several cannot be read.
+    """
+    if not root.is_dir():
+        raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
+    folder = next(filter(is_model, model_folders(root)), None)
+    if folder is None:
+        raise DataError(
+            root, "sparse model", "no cameras.bin or cameras.txt in sparse/0, sparse, colmap/sparse/0 or here",
+            "run COLMAP first, or use data=photos for photos without poses",
+        )  # fmt: skip
+    numbered = sorted(folder.parent.glob("[1-9]*")) if folder.name == "0" else []
+    models = [folder, *filter(is_model, numbered)]
     if len(models) == 1:
-        return models[0]
+        return folder
     photos = {model: len(read_images(model / f"images{_ending(model)}")) for model in models}
     largest = max(models, key=lambda model: photos[model])
     others = ", ".join(f"{model.name} with {photos[model]}" for model in models if model != largest)
@@ -80,11 +108,6 @@ def _largest(root: Path, models: Sequence[Path]) -> Path:
         root, len(models), largest.name, photos[largest], others,
     )  # fmt: skip
     return largest
-
-
-def _ending(folder: Path) -> str:
-    """The ending of a model's files. If there is any binary file, text files are ignored."""
-    return ".bin" if any((folder / f"{name}.bin").exists() for name in ("cameras", "images", "points3D")) else ".txt"
 
 
 def read_model(folder: Path) -> Model:
@@ -100,57 +123,31 @@ def read_model(folder: Path) -> Model:
         raise DataError(listing, "images", "there is none", "run COLMAP's mapper to its end")
     for image in images:
         if image.camera not in lenses:
-            raise damaged(listing, image.name, f"has the unknown camera {image.camera}")
+            raise _damaged(listing, image.name, f"has the unknown camera {image.camera}")
     points = read_points(points3d)
     unknown = np.setdiff1d(points.track[:, 1], [image.id for image in images])
     if len(unknown):
-        raise damaged(points3d, "track", f"names the unknown image {unknown[0]}")
+        raise _damaged(points3d, "track", f"names the unknown image {unknown[0]}")
     return Model(folder, ending, lenses, images, points)
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:
-    """The lens of each camera, by its id."""
-    lenses: dict[int, Lens] = {}
-    for camera in colmap_files.cameras(path):
-        lens = _lens(camera).check(path, camera.where)
-        _require_new(path, camera.id, lenses)
-        lenses[camera.id] = lens
-    return lenses
+    """The lens of each camera, by its id; the DataErrors of `read_model`."""
+    return _by_id(path, _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path))
 
 
 def read_images(path: Path) -> list[Image]:
-    images: dict[int, Image] = {}
-    for image in colmap_files.images(path):
+    """The registered images of a file, in its order; the DataErrors of `read_model`."""
+    records = _binary_images(path) if path.suffix == ".bin" else _text_images(path)
+    images = _by_id(path, ((image.id, image) for image in records))
+    for image in images.values():
         where = image.name or f"image {image.id}"
         if not all(abs(x) < FARTHEST for x in (*image.quat, *image.translation)):
-            raise damaged(path, where, "has a pose that is not finite")
+            raise _damaged(path, where, "has a pose that is not finite")
         norm = math.hypot(*image.quat)
         if not 0.5 < norm < 2:
-            raise damaged(path, where, f"has a rotation quaternion of length {norm:.3g}")
-        _require_new(path, image.id, images)
-        images[image.id] = image
+            raise _damaged(path, where, f"has a rotation quaternion of length {norm:.3g}")
     return list(images.values())
-
-
-def read_points(path: Path) -> Points:
-    """The points with their tracks; none where there is no file."""
-    if not path.exists():
-        _log.debug("%s has no %s: the capture has no points.", path.parent, path.name)
-        records = []
-    else:
-        records = list(colmap_files.points(path))
-    if not records:
-        return Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 2), np.int64))
-    ids, positions, colors, tracks = zip(*records, strict=True)
-    if len(set(ids)) != len(ids):
-        raise damaged(path, "point id", "occurs twice")
-    means = np.array(positions)
-    near = np.abs(means) < FARTHEST
-    if not near.all():
-        raise DataError(path, f"point {np.argwhere(~near)[0, 0]}", "is not finite", "remove the point")
-    point = np.repeat(np.arange(len(means)), [len(images) for images in tracks])
-    track = np.stack((point, np.concatenate(tracks).astype(np.int64)), axis=1)
-    return Points(means, np.array(colors, np.uint8), track)
 
 
 def pose_of(image: Image) -> Float[Tensor, "4 4"]:
@@ -161,16 +158,199 @@ def pose_of(image: Image) -> Float[Tensor, "4 4"]:
     return pose
 
 
-def _lens(camera: Camera) -> Lens:
-    fisheye = camera.model.endswith("_FISHEYE")
-    if camera.model in ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"):
-        fx, fy, cx, cy, *distortion = camera.parameters
+def _ending(folder: Path) -> str:
+    """The ending of a model's files. If there is any binary file, text files are ignored."""
+    return ".bin" if any((folder / f"{name}.bin").exists() for name in ("cameras", "images", "points3D")) else ".txt"
+
+
+def read_points(path: Path) -> Points:
+    """The points with their tracks; none where there is no file."""
+    records: list[_Point] = []
+    if path.exists():
+        records = list(_binary_points(path) if path.suffix == ".bin" else _text_points(path))
+    if not records:
+        return Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 2), np.int64))
+    ids, positions, colors, tracks = zip(*records, strict=True)
+    if len(set(ids)) != len(ids):
+        raise _damaged(path, "point id", "occurs twice")
+    means = np.array(positions)
+    near = np.abs(means) < FARTHEST
+    if not near.all():
+        raise DataError(path, f"point {np.argwhere(~near)[0, 0]}", "is not finite", "remove the point")
+    point = np.repeat(np.arange(len(means)), [len(images) for images in tracks])
+    track = np.stack((point, np.concatenate(tracks).astype(np.int64)), axis=1)
+    return Points(means, np.array(colors, np.uint8), track)
+
+
+def _by_id(path: Path, records: Iterable[tuple[int, _T]]) -> dict[int, _T]:
+    found: dict[int, _T] = {}
+    for number, record in records:
+        if number in found:
+            raise _damaged(path, f"id {number}", "occurs twice")
+        found[number] = record
+    return found
+
+
+def _lens(path: Path, where: str, model: str, size: tuple[int, int], parameters: Sequence[float]) -> Lens:
+    if model in _TWO_FOCAL_LENGTHS:
+        fx, fy, cx, cy, *distortion = parameters
     else:
-        fx, cx, cy, *distortion = camera.parameters  # one focal length, and k1, k2 if the model has them
+        fx, cx, cy, *distortion = parameters  # one focal length, and k1, k2 if the model has them
         fy = fx
-    return Lens(camera.width, camera.height, fx, fy, cx, cy, tuple(distortion), fisheye)
+    return Lens(*size, fx, fy, cx, cy, tuple(distortion), model.endswith("_FISHEYE")).check(path, where)
 
 
-def _require_new(path: Path, number: int, known: dict[int, Lens] | dict[int, Image]) -> None:
-    if number in known:
-        raise damaged(path, f"id {number}", "occurs twice")
+def _parameters_of(path: Path, model: str) -> int:
+    if model not in _MODELS:
+        remedy = "undistort with `colmap image_undistorter` first"
+        raise DataError(path, "camera model", f"{model[:40]} is not supported", remedy)
+    return _MODELS[model][1]
+
+
+def _damaged(path: Path, where: str, problem: str) -> DataError:
+    """The error for a file that is not as COLMAP writes it."""
+    return DataError(path, where, problem, "export the model again")
+
+
+class _Bytes:
+    """A file's bytes, read from front to back. Each count is compared with the bytes left before anything is allocated."""
+
+    def __init__(self, path: Path) -> None:
+        self.data, self.path, self.at = read_bytes(path), path, 0
+
+    @property
+    def left(self) -> int:
+        return len(self.data) - self.at
+
+    def take(self, layout: str, field: str) -> tuple[Any, ...]:
+        size = struct.calcsize(layout)
+        if size > self.left:
+            raise _damaged(self.path, field, f"needs {size} bytes, {self.left} are left: truncated")
+        values = struct.unpack_from(layout, self.data, self.at)
+        self.at += size
+        return values
+
+    def count(self, field: str, record: int) -> int:
+        """A 64-bit count of records of at least `record` bytes each."""
+        (n,) = self.take("<Q", field)
+        if n * record > self.left:
+            problem = f"is {n}, of {record} bytes or more each, but {self.left} bytes are left"
+            raise _damaged(self.path, field, problem)
+        return int(n)
+
+    def text(self, field: str) -> str:
+        end = self.data.find(b"\0", self.at, self.at + _LONGEST_NAME)
+        if end < 0:
+            raise _damaged(self.path, field, "is no text that ends")
+        raw, self.at = self.data[self.at : end], end + 1
+        try:
+            return raw.decode()
+        except UnicodeDecodeError as error:
+            raise _damaged(self.path, field, "is no UTF-8 text") from error
+
+    def finish(self) -> None:
+        if self.left:
+            raise _damaged(self.path, "end", f"{self.left} bytes are left over")
+
+
+def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+    file = _Bytes(path)
+    for i in range(file.count("number of cameras", 24 + 3 * 8)):
+        number, kind, *size = file.take("<iiQQ", f"camera {i}")
+        model = _MODEL_OF_NUMBER.get(kind, f"number {kind}")
+        parameters = file.take(f"<{_parameters_of(path, model)}d", f"parameters of camera {i}")
+        yield number, _lens(path, f"camera {number}", model, (size[0], size[1]), parameters)
+    file.finish()
+
+
+def _binary_images(path: Path) -> Iterator[Image]:
+    file = _Bytes(path)
+    for i in range(file.count("number of images", 4 + 7 * 8 + 4 + 1 + 8)):
+        number, *pose, camera = file.take("<i7di", f"image {i}")
+        name = file.text(f"name of image {i}")
+        seen = file.count(f"2D points of {name!r}", 24)
+        file.at += 24 * seen
+        yield Image(number, tuple(pose[:4]), tuple(pose[4:]), camera, name)
+    file.finish()
+
+
+def _binary_points(path: Path) -> Iterator[_Point]:
+    file = _Bytes(path)
+    for i in range(file.count("number of points", 8 + 24 + 3 + 8 + 8)):
+        record = file.take("<Q3d3Bd", f"point {i}")  # id, position, colour, error
+        length = file.count(f"track of point {i}", 8)
+        track = np.frombuffer(file.data, "<i4", 2 * length, file.at)[::2]
+        file.at += 8 * length
+        yield record[0], record[1:4], record[4:7], track
+    file.finish()
+
+
+def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+    for line, cells in _rows(path):
+        if len(cells) < 4:
+            raise _damaged(path, f"line {line}", f"has {len(cells)} of at least 5 columns")
+        number, width, height = _numbers(path, line, (cells[0], *cells[2:4]), _whole)
+        expected = _parameters_of(path, cells[1])
+        if len(cells) != 4 + expected:
+            problem = f"has {len(cells) - 4} parameters, {cells[1]} has {expected}"
+            raise _damaged(path, f"line {line}", problem)
+        yield number, _lens(path, f"line {line}", cells[1], (width, height), _numbers(path, line, cells[4:], float))
+
+
+def _text_images(path: Path) -> Iterator[Image]:
+    """Two lines per image: its pose, then its 2D points, which are not used and may be none."""
+    lines = iter(_lines(path))
+    for line, text in lines:
+        if not text.strip() or text.startswith("#"):
+            continue
+        cells = text.split(maxsplit=9)
+        if len(cells) != 10:
+            raise _damaged(path, f"line {line}", f"has {len(cells)} of 10 columns")
+        number, camera = _numbers(path, line, (cells[0], cells[8]), _whole)
+        pose = _numbers(path, line, cells[1:8], float)
+        yield Image(number, tuple(pose[:4]), tuple(pose[4:]), camera, cells[9].strip())
+        second = next(lines, None)
+        if second is None or len(second[1].split()) % 3 or second[1].startswith("#"):
+            problem = "is no line of 2D points (X Y POINT3D_ID, or empty) for the image above it"
+            raise _damaged(path, f"line {line + 1}", problem)
+
+
+def _text_points(path: Path) -> Iterator[_Point]:
+    for line, cells in _rows(path):
+        if len(cells) < 8 or len(cells) % 2:
+            raise _damaged(path, f"line {line}", f"has {len(cells)} columns where 8 and pairs belong")
+        color = _numbers(path, line, cells[4:7], _whole)
+        if not all(0 <= c <= 255 for c in color):
+            raise DataError(path, f"line {line}", f"has the colour {color}", "colours lie in 0..255")
+        track = np.array(_numbers(path, line, cells[8::2], _whole), np.int64)
+        yield _numbers(path, line, cells[:1], _whole)[0], _numbers(path, line, cells[1:4], float), color, track
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    try:
+        text = io.StringIO(read_bytes(path).decode(), newline=None).read()  # with every line break as \n
+    except UnicodeDecodeError as error:
+        raise _damaged(path, "file", "is no UTF-8 text") from error
+    if text.startswith("\ufeff"):
+        raise DataError(path, "line 1", "starts with a byte-order mark", "save it as UTF-8 without one")
+    return list(enumerate(text.split("\n"), start=1))
+
+
+def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    for line, text in _lines(path):
+        if text.strip() and not text.startswith("#"):
+            yield line, text.split()
+
+
+def _numbers(path: Path, line: int, cells: Sequence[str], kind: Callable[[str], _Number]) -> list[_Number]:
+    try:
+        return [kind(cell) for cell in cells]
+    except ValueError as error:
+        comma = "; write a decimal point, not a comma" if any("," in cell for cell in cells) else ""
+        raise _damaged(path, f"line {line}", f"is not numeric ({str(error)[:80]}){comma}") from error
+
+
+def _whole(cell: str) -> int:
+    if not -(1 << 63) <= (number := int(cell)) < 1 << 63:
+        raise ValueError(f"{cell[:40]} has more than 64 bits")
+    return number

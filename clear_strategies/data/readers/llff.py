@@ -10,7 +10,6 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Float
-from numpy.lib import format as npy_format
 
 from clear_strategies.core.checks import as_color, require_choice
 from clear_strategies.data.cameras import Lens, rigid_inverse
@@ -129,28 +128,21 @@ def _ids_by_order(model: Model | None, n: int) -> list[int | None]:
 def read_bounds(file: Path) -> Float[np.ndarray, "N 17"]:
     """poses_bounds.npy: per image a 3 x 5 matrix [R | t | height width focal], then the near and far bounds.
 
-    The header is held against the file's size before anything is allocated.
-
     Raises:
         DataError: the file is no such table of finite numbers.
     """
-    data = read_bytes(file)
-    stream = io.BytesIO(data)
+    stream = io.BytesIO(read_bytes(file))
     try:
-        version = npy_format.read_magic(stream)
-        reader = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}[version]
-        shape, fortran, dtype = reader(stream)
-    except Exception as error:  # numpy's parser raises many types of error on damaged headers
-        raise DataError(file, "header", f"is no .npy header ({str(error)[:80]})", _REMEDY) from error
-    if dtype.kind != "f":
-        raise DataError(file, "header", f"has the type {dtype}, not floating point", _REMEDY)
-    if len(shape) != 2 or shape[1] != _COLUMNS or not 0 < shape[0] < 1 << 20:
-        raise DataError(file, "header", f"has the shape {shape}, not (images, {_COLUMNS})", _REMEDY)
-    needed, left = shape[0] * _COLUMNS * dtype.itemsize, len(data) - stream.tell()
-    if needed != left:
-        raise DataError(file, "size", f"the header asks for {needed} bytes, {left} follow it", _REMEDY)
-    table = np.frombuffer(data, dtype, shape[0] * _COLUMNS, stream.tell())
-    table = table.reshape(shape, order="F" if fortran else "C").astype(np.float64)
+        table = np.load(stream)  # no pickle, by numpy's default
+    except Exception as error:  # numpy's parser raises many types of error on damaged files
+        raise DataError(file, "table", f"is no .npy of numbers ({str(error)[:80]})", _REMEDY) from error
+    if stream.read(1):
+        raise DataError(file, "size", "bytes follow the table", _REMEDY)
+    if not isinstance(table, np.ndarray) or table.dtype.kind != "f":
+        raise DataError(file, "table", "is not one of floating-point numbers", _REMEDY)
+    if table.ndim != 2 or table.shape[1] != _COLUMNS or len(table) == 0:
+        raise DataError(file, "table", f"has the shape {table.shape}, not (images, {_COLUMNS})", _REMEDY)
+    table = table.astype(np.float64)
     if not np.isfinite(table).all() or np.abs(table).max() > 1e12:
         raise DataError(file, "values", "are not all finite", _REMEDY)
     return table

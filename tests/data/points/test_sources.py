@@ -7,8 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clear_strategies.data.points import CloudSettings, initial_points
-from clear_strategies.data.points.sources import from_tracks, random_cloud
+from clear_strategies.data.points import CloudSettings, from_tracks, initial_points, random_cloud
 from clear_strategies.errors import DataError
 from tests.helpers.planes import photo, sfm
 
