@@ -15,7 +15,7 @@ import torch
 
 from clear_strategies import GCO, P2G, Conductor
 from clear_strategies.data.cameras import pose_from_opengl
-from clear_strategies.data.photo_files import read_image, write_png
+from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.priors import Bicubic, Cached, Images
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.geometry import stereo
@@ -91,12 +91,6 @@ def test_sr_images_are_found_by_the_photos_stem(tmp_path):
         assert view.hr.image.unique().tolist() == pytest.approx([0.2 * i])
     with pytest.raises(DataError, match="96x64, but 2 times"):
         views_from_datamanager(DataManager(), prior(tmp_path), 2)
-
-
-def test_saved_lr_photos_are_the_training_photos(tmp_path):
-    manager = DataManager()
-    save_photos(photos_of(manager), tmp_path)
-    assert torch.equal((read_image(tmp_path / "1.png") * 255).round().byte(), manager.photos[1]["image"])
 
 
 def test_the_sr_setting_chooses_the_prior(tmp_path):

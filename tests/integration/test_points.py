@@ -188,29 +188,26 @@ def test_gaussians_are_made_again_at_the_stereo_cloud(newer, inria_host, inria_c
     clear.remove()
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ("no function", "has no create_from_pcd, which a GaussianModel has"),
-        ("another signature", r"must take pcd, and .* got \(pcd, octree, spatial_lr_scale\)"),
-        ("no type", "has no BasicPointCloud"),
-        ("no extent", "has no cameras_extent"),
-    ],
-)
-def test_a_fork_of_another_shape_is_refused_with_the_file_as_remedy(
-    change, message, inria_host, inria_capture, monkeypatch
-):
+OTHER_SHAPES = {
+    "has no create_from_pcd, which a GaussianModel has": lambda patch, model: patch.delattr(model, "create_from_pcd"),
+    r"must take pcd, and .* got \(pcd, octree, spatial_lr_scale\)": lambda patch, model: patch.setattr(
+        model.create_from_pcd,
+        "__signature__",
+        inspect.signature(lambda self, pcd, octree, spatial_lr_scale: 0),
+        raising=False,
+    ),
+    "has no BasicPointCloud": lambda patch, model: patch.delattr(sys.modules[model.__module__], "BasicPointCloud"),
+    "has no cameras_extent": None,
+}
+
+
+@pytest.mark.parametrize("message", OTHER_SHAPES)
+def test_a_fork_of_another_shape_is_refused_with_the_file_as_remedy(message, inria_host, inria_capture, monkeypatch):
     gaussians, scene, opt = own_gaussians(inria_host, inria_capture)
-    model = type(gaussians)
-    if change == "no function":
-        monkeypatch.delattr(model, "create_from_pcd")
-    elif change == "another signature":
-        other = inspect.signature(lambda self, pcd, octree, spatial_lr_scale: None)
-        monkeypatch.setattr(model.create_from_pcd, "__signature__", other, raising=False)
-    elif change == "no type":
-        monkeypatch.delattr(sys.modules[model.__module__], "BasicPointCloud")
-    else:
+    if (change := OTHER_SHAPES[message]) is None:
         del scene.cameras_extent, gaussians.spatial_lr_scale
+    else:
+        change(monkeypatch, type(gaussians))
     with pytest.raises(HostError, match=message) as refused:
         install_stereo(gaussians, scene, opt, inria_capture)
     assert "docs/how-to/stereo.md" in str(refused.value)
