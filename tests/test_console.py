@@ -68,11 +68,10 @@ def test_by_default_the_console_has_the_plan_the_bar_the_result_and_where_to_loo
     assert lines[0].split()[0] == "scene"
     done = next(i for i, line in enumerate(lines) if line.startswith("done in"))
     assert lines[done].endswith(" s: quiet")
-    *plan, remark = lines[:done]
+    plan = lines[:done]
     result = lines[done + 1 :]
     assert len(plan) <= 15
     assert all(line.startswith(("  ", "warning: ")) for line in plan), quiet.stdout
-    assert remark.startswith("GCO was inactive")
     assert result[-1] == "  look next: quiet/contact_sheet.png, or clear-strategies view quiet"
     assert sum("GMSD, the error of edges" in line for line in result) == 1
     assert not any(detail in quiet.stdout for detail in DETAILS)

@@ -26,18 +26,8 @@ SIGNALS: Final = 128
 
 # What the extra [train] brings beside the core, by the names that are imported.
 TRAIN: Final = (
-    "cv2",
-    "filelock",
-    "jinja2",
-    "kornia",
-    "matplotlib",
-    "msgspec",
-    "pandas",
-    "safetensors",
-    "scipy",
-    "skimage",
-    "tqdm",
-)
+    "cv2", "filelock", "jinja2", "kornia", "matplotlib", "msgspec", "pandas", "safetensors", "scipy", "skimage", "tqdm",
+)  # fmt: skip
 
 
 class Ending(NamedTuple):

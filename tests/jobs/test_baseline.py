@@ -143,13 +143,6 @@ def test_a_run_is_the_same_with_and_without_its_baseline_which_has_its_other_ove
     assert (ours[0], ours[1:]) == ("+strategy=gco", beside)
 
 
-def test_a_finished_run_is_not_trained_again_with_auto(whole, caplog):
-    watch = Iterations()
-    psnr = train(whole, "fit.resume=auto", watch=watch)
-    assert (watch.done, psnr) == (0, json.loads((whole / "metrics.json").read_text())["test"]["mean"]["ours"]["psnr"])
-    assert "nothing is trained" in caplog.text
-
-
 @pytest.mark.parametrize("after", [5, ITERATIONS + 5], ids=["in its baseline", "after its baseline"])
 @pytest.mark.parametrize("leads_to", ["auto", *(pytest.param(s, marks=SLOW) for s in ("run", "folder", "checkpoint"))])
 def test_a_run_that_was_stopped_goes_on_where_it_stopped(whole, cut, tmp_path, after, leads_to, caplog):

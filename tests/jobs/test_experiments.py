@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import torch
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
@@ -18,7 +17,7 @@ from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.errors import SettingError
 from clear_strategies.schedules import scaled
 from clear_strategies.settings import CHANGES_NO_RESULT, build
-from clear_strategies.training.loop import fit, iterate
+from clear_strategies.training.loop import fit
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
@@ -74,26 +73,6 @@ def test_every_method_trains(name, fused):
     assert all(math.isfinite(loss) for loss in losses)
     assert sum(losses[-6:]) < sum(losses[:6])
     assert float(state.field.detail.data.abs().max()) == 0  # no baseline has the detail feature
-
-
-@pytest.mark.parametrize(("lambda_lr", "lr_from"), [(0.6, "hr"), (0.0, "lr"), (0.6, "lr")])
-def test_the_compiled_pass_sees_the_same_gradients(lambda_lr, lr_from):
-    """Adam's first moments after one step are a tenth of the merged gradient."""
-    moments = []
-    for fused in ("off", "auto"):
-        config = composed("+strategy=clear", f"objective.lambda_lr={lambda_lr}", f"objective.lr_from={lr_from}",
-                          "objective.lambda_hr.start=0", "objective.lambda_hr.full=0")  # fmt: skip
-        settings = FitSettings(iterations=1, max_degree=1, probe_every=0, checkpoint_every=0, fused=fused)
-        strategies, objective, density, rates, mip = pieces(config)
-        conductor = Conductor(*strategies, objective=objective)
-        state = TrainState.start(toy.scene(), conductor, settings=settings, density=density, rates=rates, mip=mip)
-        if fused == "auto" and state.compiled_step is None:
-            pytest.skip("the kernels are not installed")
-        iterate(state, toy.RASTERIZER)
-        moments.append(state.optimizer.first)
-    for name, readable in moments[0].items():
-        assert torch.allclose(readable, moments[1][name], rtol=1e-4, atol=1e-5 * float(readable.abs().max())), name
-    assert float(moments[0]["means"].abs().max()) > 0
 
 
 def test_what_the_methods_are():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 from importlib.util import find_spec
@@ -73,13 +72,10 @@ def test_a_killed_run_goes_on_from_the_newest_whole_checkpoint_and_ends_the_same
     assert "is no whole checkpoint" in said
     assert f"resumed from {before}" in said
     assert (tmp_path / "here" / "point_cloud.ply").read_bytes() == (whole / "point_cloud.ply").read_bytes()
-    timing = (tmp_path / "here" / "timing.csv").read_text()
-    assert [line.split(",")[1] for line in timing.splitlines() if line.startswith("losses LR")] == ["40"], timing
     history = [line.split(",") for line in (tmp_path / "here" / "history.csv").read_text().splitlines()]
     seconds = [float(row[history[0].index("seconds")]) for row in history[1:]]
     assert len(seconds) == 40
     assert seconds == sorted(seconds)
-    assert json.loads((tmp_path / "here" / "metrics.json").read_text())["seconds"] >= seconds[-1]
 
 
 def test_torch_and_kernels_divide_the_cores_among_the_jobs(monkeypatch):

@@ -1,10 +1,9 @@
 """The ablation through a real Slurm, then jobs that are taken away: `python -m tests.slurm.ablation_and_requeue FOLDER`.
 
-Starts a cluster of this one machine in FOLDER, runs the four rows of the ablation on the tiny demo with
-`hydra/launcher=submitit_slurm`, the same again, and a sweep with a job that fails. Then one longer run four times:
-undisturbed and without Slurm; as a job that `scontrol requeue` takes away; as one that is killed; as one that runs into
-its time limit. All must leave the same point cloud, byte for byte. What happens is told on standard output and in
-FOLDER/log.txt, which docs/how-to/cluster.md quotes.
+Starts a cluster of this one machine in FOLDER and runs the four rows of the ablation on the tiny demo with
+`hydra/launcher=submitit_slurm`. Then one longer run four times: undisturbed and without Slurm; as a job that `scontrol requeue`
+takes away; as one that is killed; as one that runs into its time limit. All must leave the same point cloud, byte for byte. What
+happens is printed, also to FOLDER/log.txt.
 """
 
 from __future__ import annotations
@@ -69,27 +68,8 @@ class Experiment:
         wait_for(lambda: self.ask("squeue", "-h", "-t", "R").count("\n") >= 1, 300, "two jobs to run")
         self.show("squeue")
         self.finish(process, "ablation")
-        threads = re.findall(r"threads +(.*)", (self.folder / "ablation" / "0" / "run.log").read_text())
-        _log.info("the plan of job 0, threads: %s", threads[-1])
-        report = [sys.executable, "-m", "clear_strategies.report", "ablation"]
-        _log.info("$ python -m clear_strategies.report ablation\n%s", self.ask(*report).split("\n\n")[0])
-
-    def rerun(self) -> None:
-        """The same command again trains nothing."""
-        before = (self.folder / "ablation" / "3" / "metrics.json").stat().st_mtime_ns
-        self.finish(self.start(*ABLATION, name="again"), "again")
-        _tell(self.folder / "ablation" / "3" / "run.log", r"nothing is trained")
-        if (self.folder / "ablation" / "3" / "metrics.json").stat().st_mtime_ns != before:
-            raise AssertionError("a finished run was written again")
-
-    def failed(self) -> None:
-        """A job with a setting out of range: the other runs, and the exit code tells."""
-        process = self.start(*SLURM, "+strategy=gco", "strategies.gco.tolerance=7,0.1", "hydra.sweep.dir=failed",
-                             "fit.iterations=10", *DEMO, name="failed")  # fmt: skip
-        self.finish(process, "failed", expected=2)
-        _tell(self.folder / "failed.txt", r"job\(s\) failed")
-        if not (self.folder / "failed" / "1" / "metrics.json").exists():
-            raise AssertionError("the other job did not finish")
+        if len(list(self.folder.glob("ablation/*/metrics.json"))) != 4:
+            raise AssertionError("not every job of the ablation finished")
 
     def undisturbed(self) -> bytes:
         process = self.start("hydra.run.dir=undisturbed", *LONG, "fit.threads=1", name="undisturbed")
@@ -159,8 +139,6 @@ def main(folder: Path) -> None:
         experiment.show("sbatch", "--version")
         experiment.show("sinfo")
         experiment.ablation()
-        experiment.rerun()
-        experiment.failed()
         expected = experiment.undisturbed()
         experiment.requeued(expected)
         experiment.killed(expected)
