@@ -48,13 +48,12 @@ def without(monkeypatch: pytest.MonkeyPatch, *modules: str) -> None:
         monkeypatch.setitem(sys.modules, module, None)
 
 
-@pytest.mark.parametrize("fill", [True, False])
-def test_the_cloud_of_the_demo_is_the_trainers_to_the_bit(fill: bool) -> None:
+def test_the_cloud_of_the_demo_is_the_trainers_to_the_bit() -> None:
     frames = demo.read(width=64, height=48, views=6, train=3).frames[:3]
     photos = [Photo(frame.camera, frame.load()) for frame in frames]
-    trained = initial_points(CloudSettings(init="stereo", densify=fill), photos)
+    trained = initial_points(CloudSettings(init="stereo", densify=True), photos)
     assert same(
-        reconstruct(photos, settings=None, fill=fill),
+        reconstruct(photos, settings=None),
         Stereo(trained.depths, trained.cloud.means, trained.cloud.colors, ""),
     )
 
@@ -93,21 +92,19 @@ def test_pixels_of_the_background_get_no_points() -> None:
     assert not any(depth.known[:10].any() for depth in reconstruct(photos, background=(1, 1, 1)).depths)
 
 
-@pytest.mark.parametrize("fill", [True, False])
-def test_hidden_pixels_give_no_points_and_their_colours_do_not_matter(fill: bool) -> None:
+def test_hidden_pixels_give_no_points_and_their_colours_do_not_matter(plane: Stereo) -> None:
     photos = plane_photos(3, 64, 48)
+    assert same(reconstruct(photos, masks=[None] * 3), plane)
     masks = [torch.ones(48, 64), None, torch.ones(48, 64)]
     masks[0][:, :32] = masks[2][20:] = 0
-    result = reconstruct(photos, masks=masks, fill=fill)
+    result = reconstruct(photos, masks=masks)
     assert not result.depths[0].known[:, :32].any()
     assert not result.depths[2].known[20:].any()
     assert result.depths[0].known[:, 32:].any()
     photos[0].image[:, :32], photos[2].image[20:] = 0.3, torch.rand(28, 64, 3)
-    assert same(reconstruct(photos, masks=masks, fill=fill), result)
-    everywhere = reconstruct(photos, masks=[None] * 3, fill=fill)
-    assert same(everywhere, reconstruct(photos, fill=fill))
+    assert same(reconstruct(photos, masks=masks), result)
     with pytest.raises(DataError, match="confirms no depth"):
-        reconstruct(photos, masks=[torch.zeros(48, 64)] * 3, fill=fill)
+        reconstruct(photos, masks=[torch.zeros(48, 64)] * 3)
 
 
 def test_no_filled_point_is_hidden_in_the_only_photo_that_sees_it() -> None:
