@@ -45,6 +45,7 @@ PYTHON = [
 # Commands of other programs: nothing of them is checked, but that extras exist.
 FOREIGN = r"(python3? -m (venv|pip|build)|cibuildwheel|\.|pip install|for|done|wait|ns-train|mkdocs|pre-commit|tensorboard|cd) ?"
 
+TAKEN: set[str] = set()  # words that chose a file for a job of a sweep, of any command
 READ_BY_ARGPARSE = ("render", "export", "view", "doctor")  # subcommands; the others read Hydra's words
 
 
@@ -84,11 +85,10 @@ def require_composable(arguments: list[str]) -> None:
     if "-m" not in flags and whole.hydra.mode != RunMode.MULTIRUN:
         require_conductor(loader().load_configuration("config", overrides, run_mode=RunMode.RUN))
         return
-    chosen: set[str] = set()
-    for job in jobs_of(whole, overrides):
+    for i, job in enumerate(jobs_of(whole, overrides)):
         files = {word for word in job if (CONF / word.lstrip("+").split("=")[0]).is_dir()}
-        if not chosen or files - chosen:  # the first job, and each that takes a file that no job before it took
-            chosen |= {*files, ""}
+        if i == 0 or files - TAKEN:  # the first job, and each that takes a file that no job before it took
+            TAKEN.update(files)
             require_conductor(loader().load_sweep_config(whole, list(job)))
 
 

@@ -113,7 +113,8 @@ def test_beyond_2e_7_of_the_margin_both_paths_decide_the_same(passes, beyond):
 
 @pytest.mark.parametrize("names", [s for k in range(4) for s in itertools.combinations((GCO, P2G, SVS), k)], ids=str)
 def test_every_subset_of_strategies_with_and_without_hr(passes, names):
-    for hr, anchored, hf in itertools.product(HR_COTANGENTS, (False, True), (0.2, 1.0)):
+    weights = [*itertools.product(HR_COTANGENTS, (False, True), (0.2,)), ("both", False, 1.0)]
+    for hr, anchored, hf in weights:
         c = case(100, kind="random", evidence=P2G in names)
         readable, compiled = conductors(*names, anchored=c.fields[0] if anchored else None, hf=hf)
         expected, conflict, found, found_conflict = both_ways(passes, c, readable, compiled, hr)
@@ -155,7 +156,9 @@ def assert_same_state(c: Case, adams, rates: LearningRates):
 @pytest.mark.parametrize("kind", ["random", "sparse", "zero"])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_a_step_is_adams(passes, degree, kind):
-    sizes = (0, 1, 15, 16, 17) if passes is CppGaussianStep else (0, 17)  # C++ takes sixteen at a time
+    sizes = (17,)
+    if (degree, kind) == (3, "random"):
+        sizes = (0, 1, 15, 16, 17) if passes is CppGaussianStep else (0, 17)  # C++ takes sixteen at a time
     for n, hr in itertools.product(sizes, HR_COTANGENTS):
         c = case(n, degree, kind)
         rates = LearningRates(detail_decay=0.1, means=LogLinear(end=10))
@@ -271,24 +274,31 @@ def test_wrong_tensors_are_refused_at_the_border(passes):
         passes(drawn, lr, None, lr, 0.2)
 
 
-def test_thirty_iterations_are_those_of_the_readable_path(passes):
-    scene = toy.scene(16, seed=2, train=3, test=1)
-    states = {}
-    for mode in ("off", "auto"):
-        svs = ANCHORING(dropout=Ramp(full=30), anchor_start=20)
-        objective = Objective(lambda_hr=WarmupDecay(start=3, full=10, decay_from=20, end=30))
-        states[mode] = TrainState.start(
-            scene, Conductor(GCO(), P2G(), svs, objective=objective, statistics_from=1),
-            settings=FitSettings(iterations=30, scale_schedule=False, degree_every=6, fused=mode),
-            density=DensitySettings(start=1, stop=19, statistics_from=1, every=9, min_gaussians=2, max_gaussians=40),
-            rates=LearningRates(means=LogLinear(end=30), detail_decay=0.01), mip=MipFilter(every=7, last=1),
-        )  # fmt: skip
-        if mode == "auto":
-            states[mode].compiled_step = CompiledStep(states[mode].conductor, states[mode].optimizer, passes=passes)
-        for _ in range(30):
-            iterate(states[mode], toy.RASTERIZER)
-        deferred.resolve(states[mode].history)
-    readable, compiled = states["off"], states["auto"]
+def thirty_iterations(passes) -> TrainState:
+    """With `passes`, or by the readable path where there are none."""
+    svs = ANCHORING(dropout=Ramp(full=30), anchor_start=20)
+    objective = Objective(lambda_hr=WarmupDecay(start=3, full=10, decay_from=20, end=30))
+    state = TrainState.start(
+        toy.scene(16, seed=2, train=3, test=1), Conductor(GCO(), P2G(), svs, objective=objective, statistics_from=1),
+        settings=FitSettings(iterations=30, scale_schedule=False, degree_every=6, fused="auto" if passes else "off"),
+        density=DensitySettings(start=1, stop=19, statistics_from=1, every=9, min_gaussians=2, max_gaussians=40),
+        rates=LearningRates(means=LogLinear(end=30), detail_decay=0.01), mip=MipFilter(every=7, last=1),
+    )  # fmt: skip
+    if passes:
+        state.compiled_step = CompiledStep(state.conductor, state.optimizer, passes=passes)
+    for _ in range(30):
+        iterate(state, toy.RASTERIZER)
+    deferred.resolve(state.history)
+    return state
+
+
+@pytest.fixture(scope="module")
+def readable() -> TrainState:
+    return thirty_iterations(None)
+
+
+def test_thirty_iterations_are_those_of_the_readable_path(passes, readable):
+    compiled = thirty_iterations(passes)
     assert readable.compiled_step is None
     assert len(readable.field) == len(compiled.field)
     for a, b in zip(readable.history, compiled.history, strict=True):
