@@ -13,6 +13,7 @@ metrics.json: {"scene", "method", "strategies", "overrides", "seed", "iterations
   scores, "train": scores}, the means of its renders. A part without views is not there.
 - "against" says what they are compared with: "HR photos"; "LR photos", after D, where the HR photos are unknown; "HR and
   LR photos" where that differs between views.
+- The training TABLE has another key, "of": the number of training views, of which at most 50 are scored.
 - A number that is not finite is null.
 """
 
@@ -23,7 +24,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
-from itertools import repeat
 from pathlib import Path
 from typing import Any, Final
 
@@ -38,7 +38,7 @@ from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.strict_json import Count, Positive, read_object, typed
 from clear_strategies.outputs.figures import spaced
-from clear_strategies.outputs.image_scores import ImageScores, mean_scores, score
+from clear_strategies.outputs.image_scores import ImageScores, Truth, mean_scores
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
@@ -48,6 +48,7 @@ NOTE: Final = (
     "that photo allows, not what view synthesis can reach"
 )
 
+MOST_TRAIN: Final = 50  # training views that are scored; of more, those spaced evenly
 TRAIN_RENDERS: Final = 4  # training views whose renders are kept where there are no test views
 
 
@@ -122,14 +123,18 @@ Table = dict[str, dict[str, ImageScores]]
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """Scores of all views, what each part was compared with, and the renders of the test views; where there are none, those of
+    """Scores of the views, what each part was compared with, and the renders of the test views; where there are none, those of
     a few training views.
+
+    Args:
+        train: of at most `MOST_TRAIN` of the training views, whose number is `train_views`.
     """
 
     test: Table
     train: Table
     against: Mapping[str, str]
     renders: Mapping[str, Float[Tensor, "H W 3"]]
+    train_views: int
 
     def mean(self, part: str, image: str = "ours") -> ImageScores | None:
         """Mean over the views of a part ("test", "train") that have this image."""
@@ -143,12 +148,16 @@ class Evaluation:
 def evaluate(
     scene: Scene, render: Callable[[Camera], Float[Tensor, "H W 3"]], *, down: DownKernel = "bicubic"
 ) -> Evaluation:
-    """Render and score every view. Where the HR photo is unknown, D of the render is compared with the LR photo."""
+    """Render and score the views, of many training views a sample.
+
+    Where the HR photo is unknown, D of the render is compared with the LR photo.
+    """
     renders: dict[str, Tensor] = {}
     tables: dict[str, Table] = {"test": {}, "train": {}}
     against = {"test": _against(scene.test), "train": _against(scene.train)}
-    kept = {view.name for view in scene.test or spaced(scene.train, TRAIN_RENDERS)}
-    for part, views in (("test", scene.test), ("train", scene.train)):
+    train = spaced(scene.train, MOST_TRAIN)
+    kept = {view.name for view in scene.test or spaced(train, TRAIN_RENDERS)}
+    for part, views in (("test", scene.test), ("train", train)):
         for view in views:
             image = render(view.hr.camera).clamp(0, 1)
             if not bool(image.isfinite().all()):
@@ -158,7 +167,7 @@ def evaluate(
             tables[part][view.name] = _scores_of(view, image, down)
         if "LR" in against[part]:
             _log.debug("%s views: HR is unknown; images reduced by %s were compared with the LR photos.", part, down)
-    return Evaluation(tables["test"], tables["train"], against, renders)
+    return Evaluation(tables["test"], tables["train"], against, renders, len(scene.train))
 
 
 def to_json(evaluation: Evaluation, **facts: Any) -> dict[str, Any]:
@@ -173,6 +182,7 @@ def to_json(evaluation: Evaluation, **facts: Any) -> dict[str, Any]:
             "views": {view: {image: asdict(s) for image, s in row.items()} for view, row in table.items()},
             "mean": {image: asdict(mean) for image, mean in means.items() if mean is not None},
         }
+    content["train"]["of"] = evaluation.train_views
     return content
 
 
@@ -189,5 +199,6 @@ def _scores_of(view: View, image: Float[Tensor, "H W 3"], down: DownKernel) -> d
         shown = {name: images.downsample(i, view.factor, down) for name, i in shown.items()}
     elif not view.hr_is_photo:  # else no SR has a part
         shown |= {"bicubic": images.upsample(view.lr.image, view.factor), "prior": view.hr.image}
+    scored_against = Truth(truth)
     with ThreadPoolExecutor(torch.get_num_threads()) as threads:
-        return dict(zip(shown, threads.map(score, shown.values(), repeat(truth)), strict=True))
+        return dict(zip(shown, threads.map(scored_against.score, shown.values()), strict=True))

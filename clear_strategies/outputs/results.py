@@ -14,7 +14,6 @@ from torch import Tensor
 from clear_strategies import files
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
-from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import read_image, write_png
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.view_names import file_stem
@@ -186,7 +185,8 @@ def _write_page(
 
 def _write_sheet(folder: Path, scene: Scene, evaluation: Evaluation, title: str, baseline: Baseline | None) -> None:
     rows, part = [], evaluation.test if scene.test else evaluation.train
-    for view in _shown(scene):
+    rendered = [view for view in scene.test or scene.train if view.name in evaluation.renders]
+    for view in spaced(rendered, _SHEET_VIEWS):
         for kind, shown in {"lr": view.lr.image, "prior": view.hr.image, "truth": view.truth}.items():
             if shown is not None:
                 write_png(folder / "views" / f"{file_stem(view.name)}_{kind}.png", shown)
@@ -203,11 +203,6 @@ def _write_sheet(folder: Path, scene: Scene, evaluation: Evaluation, title: str,
         rows.append(SheetRow(view.name, columns, view.truth, captions))
     note = TRAINED_ON if not scene.test else "" if scene.test[0].hr_is_photo else OWN_PHOTO
     write_contact_sheet(folder / "contact_sheet.png", rows, title, note)
-
-
-def _shown(scene: Scene) -> Sequence[View]:
-    """The views on the contact sheet."""
-    return spaced(scene.test, _SHEET_VIEWS) if scene.test else spaced(scene.train, metrics.TRAIN_RENDERS)
 
 
 def _write_tables(

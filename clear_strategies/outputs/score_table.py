@@ -33,6 +33,10 @@ def describe(folder: Path, evaluation: Evaluation, seconds: float, baseline: Bas
         lines.append(f"  {NOTE}.")
     if unknown := " and ".join(part for part in ("test", "train") if evaluation.against_lr(part)):
         lines.append(f"  {unknown}: the HR photos are unknown, so reduced images are compared with the LR photos.")
+    if evaluation.train and len(evaluation.train) < evaluation.train_views:
+        lines.append(
+            f"  train: {len(evaluation.train)} of the {evaluation.train_views} views, evenly spaced, are scored."
+        )
     page = f"{folder / 'splat.html'} in a browser, " if (folder / "splat.html").exists() else ""
     look = f"{page}{folder / 'contact_sheet.png'}, or clear-strategies view {shlex.quote(str(folder))}"
     return "\n".join([*lines, f"  look next: {look}"])

@@ -47,6 +47,14 @@ def test_each_view_is_scored_by_method_and_the_mean_is_over_views_if_there_are_a
     assert metrics.to_json(without)["test"] == {"against": "nothing", "views": {}, "mean": {}}
 
 
+def test_of_many_training_views_a_sample_is_scored(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metrics, "MOST_TRAIN", 3)
+    views = tuple(view(str(i), noise(i, 48, 64)) for i in range(7))
+    evaluation = metrics.evaluate(scene(views, ()), lambda camera: torch.zeros(48, 64, 3))
+    assert list(evaluation.train) == list(evaluation.renders) == ["0", "3", "6"]
+    assert metrics.to_json(evaluation)["train"]["of"] == 7
+
+
 def test_where_hr_is_unknown_the_reduced_render_is_compared_with_lr() -> None:
     truth = noise(2, 48, 64)
     known, unknown = view("known", truth), view("unknown", truth, known=False)

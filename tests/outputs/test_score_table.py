@@ -23,7 +23,7 @@ def rows(text: str) -> dict[str, str]:
 
 
 def test_the_baseline_and_the_difference_stand_beside_ours() -> None:
-    text = describe(Path("run"), Evaluation(TABLE, {}, {}, {}), 12.7, BASELINE)
+    text = describe(Path("run"), Evaluation(TABLE, {}, {}, {}, 0), 12.7, BASELINE)
     assert text.startswith("done in 13 s (the baseline in 11 s): run\n")
     found = rows(text)
     assert list(found)[:5] == [f"test   {n}" for n in ("baseline", "ours", "ours − baseline", "bicubic", "prior")]
@@ -38,7 +38,7 @@ def test_the_baseline_and_the_difference_stand_beside_ours() -> None:
 
 def test_what_is_missing_has_no_row_and_no_note() -> None:
     def told(*tables: Table, against: str = "HR photos", baseline: Baseline | None = None) -> str:
-        return describe(Path("run"), Evaluation(*tables, {"train": against}, {}), 12.7, baseline)
+        return describe(Path("run"), Evaluation(*tables, {"train": against}, {}, 200), 12.7, baseline)
 
     def images(text: str) -> list[str]:
         return [line.split()[1] for line in text.splitlines() if line.startswith("  train ")]
@@ -52,6 +52,7 @@ def test_what_is_missing_has_no_row_and_no_note() -> None:
     assert images(reduced) == ["ours"]
     assert NOTE not in reduced
     assert "train: the HR photos are unknown" in reduced
+    assert "train: 1 of the 200 views" in reduced
 
 
 @pytest.mark.parametrize(("means", "said"), [({"test": THEIRS}, ", test views 23.09 dB"), ({}, "")])

@@ -5,6 +5,7 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/pair.h>
 
+#include <algorithm>
 #include <stdexcept>
 #include <utility>
 
@@ -38,6 +39,16 @@ inline void bind_losses(nanobind::module_& m) {
       },
       "x"_a.noconvert(), "y"_a.noconvert(), "gradient"_a.noconvert(), "l1"_a, "dssim"_a, "threads"_a,
       "Writes the gradient of l1 * mean|x - y| + dssim * (1 - SSIM); returns (mean|x - y|, 1 - SSIM).");
+  m.def(
+      "mean_ssim",
+      [](const ImageIn& x, const ImageIn& y, int threads) {
+        if (x.shape(0) != y.shape(0) || x.shape(1) != y.shape(1) || std::min(x.shape(0), x.shape(1)) < ssim::kTaps)
+          throw std::invalid_argument("the images must have the same size, at least 11 pixels.");
+        ImagePair images{x.data(), y.data(), nullptr, int(x.shape(0)), int(x.shape(1)) * kChannels};
+        nb::gil_scoped_release free;
+        return mean_ssim(images, threads);
+      },
+      "x"_a.noconvert(), "y"_a.noconvert(), "threads"_a, "Returns the mean SSIM over the windows inside the images.");
   m.def(
       "haar_l1",
       [](const ImageIn& x, const ImageIn& y, const ImageOut& gradient, int levels, int threads) {

@@ -38,24 +38,39 @@ inline double l1_with_gradient(const ImagePair& im, float weight, int threads) {
   return all / double(n);
 }
 
+// The sums of task(tile) over the tiles of an image without `inset` pixels at each side. Tiles depend only on the image's size,
+// and so the sums do not depend on the threads.
+template <class Task>
+PhotometricMeans sum_tiles(const ImagePair& im, int inset, int threads, Task&& task) {
+  const int height = im.height - 2 * inset, row = im.row - 2 * inset * kChannels;
+  const int down = (height + ssim::kTileHeight - 1) / ssim::kTileHeight, across = ssim::tiles_across(row);
+  auto border = [](int inset, int size, int tiles, int i) { return inset + int(std::int64_t(size) * i / tiles); };
+  std::vector<PhotometricMeans> sums(std::size_t(across) * down);
+  Pool::instance().run(threads, std::int64_t(sums.size()), [&](std::int64_t i) {
+    const int x = int(i) % across, y = int(i) / across, left = inset * kChannels;
+    sums[i] = task(ssim::Tile{border(inset, height, down, y), border(inset, height, down, y + 1), border(left, row, across, x),
+                              border(left, row, across, x + 1)});
+  });
+  PhotometricMeans all{0, 0};
+  for (const PhotometricMeans& part : sums) all.l1 += part.l1, all.dssim += part.dssim;
+  return all;
+}
+
 // Writes the gradient of l1 · mean |x - y| + dssim · (1 - SSIM) with respect to x; returns both means. With dssim = 0 no
 // SSIM is computed, and its mean is 0.
 inline PhotometricMeans photometric(const ImagePair& im, PhotometricWeights weights, int threads) {
   if (weights.dssim == 0) return {l1_with_gradient(im, weights.l1, threads), 0};
-  // Tiles depend only on the image's size, and so the sums do not depend on the threads.
-  const int down = (im.height + ssim::kTileHeight - 1) / ssim::kTileHeight, across = ssim::tiles_across(im.row);
-  auto border = [](int size, int tiles, int i) { return int(std::int64_t(size) * i / tiles); };
-  std::vector<PhotometricMeans> sums(std::size_t(across) * down);
-  Pool::instance().run(threads, std::int64_t(sums.size()), [&](std::int64_t i) {
-    const int x = int(i) % across, y = int(i) / across;
-    const ssim::Tile tile{border(im.height, down, y), border(im.height, down, y + 1), border(im.row, across, x),
-                          border(im.row, across, x + 1)};
-    sums[i] = ssim::TileRun(im, tile, weights).run();
-  });
-  PhotometricMeans means{0, 0};
-  for (const PhotometricMeans& part : sums) means.l1 += part.l1, means.dssim += part.dssim;
+  auto [l1, dssim] = sum_tiles(im, 0, threads, [&](const ssim::Tile& tile) { return ssim::TileRun(im, tile, weights).run(); });
   double n = double(im.height) * im.row;
-  return {means.l1 / n, means.dssim / n};
+  return {l1 / n, dssim / n};
+}
+
+// The mean SSIM over the windows that lie inside the image, as scikit-image has it; the gradient is not written.
+inline double mean_ssim(const ImagePair& im, int threads) {
+  PhotometricMeans sums = sum_tiles(im, ssim::kReach, threads, [&](const ssim::Tile& tile) {
+    return PhotometricMeans{0, ssim::TileRun(im, tile, {}).dissimilarity()};
+  });
+  return 1 - sums.dssim / (double(im.height - 2 * ssim::kReach) * (im.row - 2 * ssim::kReach * kChannels));
 }
 
 }  // namespace clear

@@ -124,6 +124,16 @@ class TileRun {
     return totals_;
   }
 
+  // Σ (1 - SSIM) of the tile's numbers, without a gradient.
+  double dissimilarity() {
+    for (int r = tile_.top - kReach; r < tile_.top + kReach; ++r) read(r);
+    for (int q = tile_.top; q < tile_.bottom; q += kDown) {
+      for (int r = 0; r < kDown; ++r) read(q + kReach + r);
+      forward(q);
+    }
+    return totals_.dssim;
+  }
+
  private:
   static int segment_length(const ImagePair& im, const Tile& t) {
     const int numbers = std::min(im.row, t.right + kMargin) - std::max(0, t.left - kMargin);
