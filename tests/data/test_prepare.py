@@ -176,14 +176,6 @@ def test_saved_lr_images_are_those_of_their_views_when_they_are_read(tmp_path):
         check_headers(rig().frames, papers(lr_folder=str(tmp_path)))
 
 
-def test_ready_made_lr_images_may_be_links_as_sr_images_may(tmp_path):
-    write_png(tmp_path / "elsewhere.png", torch.zeros(10, 14, 3))
-    (tmp_path / "lr").mkdir()
-    (tmp_path / "lr/0000.png").symlink_to(tmp_path / "elsewhere.png")
-    found = check_headers(undecodable(1).frames, papers(lr_folder=str(tmp_path / "lr")))
-    assert found == {"0000.png": tmp_path / "lr/0000.png"}
-
-
 def test_two_photos_that_differ_by_their_ending_are_not_saved_as_one(tmp_path):
     both = [replace(frame, name=name) for frame, name in zip(capture(2).frames, ("a.png", "a.jpg"), strict=True)]
     scene = prepare(Capture("twins", tuple(both)), papers(train=2, test_every=0), Bicubic(), POINTS)

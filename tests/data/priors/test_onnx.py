@@ -36,13 +36,6 @@ def test_onnx_computes_what_torch_computes(network: Path) -> None:
     assert torch.equal(sr, images.quantize(sr))
 
 
-def test_a_network_with_another_channel_order_gives_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    path = tmp_path / "bgr.onnx"
-    path.write_bytes(onnx_bytes(upscaling_weight().flip(1)))
-    Onnx(str(path))("view", photo(8, 12), 4)
-    assert "check that it shows this view, and is RGB in [0, 1]" in caplog.text
-
-
 def test_a_good_network_logs_model_size_and_time_and_no_warning(network, caplog):
     with caplog.at_level("DEBUG"):
         Onnx(str(network))("view", photo(8, 12), 4)

@@ -14,19 +14,13 @@ from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.priors import Bicubic, Images, Onnx
 from clear_strategies.data.priors.interface import super_resolved
 from clear_strategies.errors import DataError, SettingError
-from tests.helpers.networks import photo, psnr
+from tests.helpers.networks import psnr
 
 
 @pytest.mark.parametrize("prior", [Images, Onnx])
 def test_a_prior_without_its_path_is_refused_at_construction(prior: type[Images | Onnx]) -> None:
     with pytest.raises(SettingError, match=r"prior\.path: must be .*, got ''"):
         prior()
-
-
-def test_a_model_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    for path in (tmp_path / "absent", tmp_path):
-        with pytest.raises(DataError, match=r"file: is not there: set prior\.path"):
-            Onnx(str(path))("view", photo(8, 12), 4)
 
 
 def test_real_networks_do_on_fern_what_is_known_of_them(shared_data: Path, caplog: pytest.LogCaptureFixture) -> None:

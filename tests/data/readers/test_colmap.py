@@ -106,14 +106,6 @@ def test_a_missing_file_of_points_and_a_quaternion_of_another_length_are_noted(t
     assert capture.notes["rotations"].startswith("1 quaternions")
 
 
-def test_the_scene_folder_is_not_written_to(tmp_path: Path) -> None:
-    tiny.colmap_bin(tmp_path)
-    before = sorted((p, p.stat().st_mtime_ns) for p in tmp_path.rglob("*"))
-    for frame in colmap.read(tmp_path).frames:
-        frame.load()
-    assert sorted((p, p.stat().st_mtime_ns) for p in tmp_path.rglob("*")) == before
-
-
 LENSES = [
     Lens(160, 120, 150.0, 140.0, 82.0, 57.0, (-0.2, 0.05, 0.002, -0.001)),
     Lens(160, 120, 150.0, 150.0, 80.0, 60.0, (0.15, 0.0, 0.0, 0.0)),

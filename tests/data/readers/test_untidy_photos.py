@@ -120,8 +120,6 @@ REFUSED = {
     ),
     "two files of one name": Refusal(lambda f: image_of(f / "a.png").save(f / "a.jpg"), ("'a' has several files", "keep one")),
     "two photos": Refusal(lambda f: (f / "b.png").unlink(), ("there are 2, poses need at least 3", "take more photos")),
-    "no photo": Refusal(lambda f: [(f / name).unlink() for name in NAMES], ("holds no image", "check the path")),
-    "no folder": Refusal(shutil.rmtree, ("is not there", "check the path")),
 }  # fmt: skip
 
 

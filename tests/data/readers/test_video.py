@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import skimage.data
 
-from clear_strategies.commands.train import overrides
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.readers import photos, video
@@ -110,10 +109,6 @@ def test_photos_of_a_video_are_its_frames_and_the_scene_has_its_name(clip, monke
     monkeypatch.setattr(photos, "_capture", lambda root, *_: Capture(root.name, (), None))
     assert photos.read(clip, frames=6).name == clip.name
     assert [path.name for path in seen] == [f"around the room_{k:03d}.jpg" for k in range(1, 7)]
-
-
-def test_train_takes_a_video(clip):
-    assert "data=photos" in overrides([str(clip), "data.reader.frames=9"])
 
 
 @pytest.mark.parametrize("content", [b"", b"no video at all", b"\0\0\0\x18ftypmp42"])

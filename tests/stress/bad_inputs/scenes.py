@@ -15,7 +15,7 @@ from PIL import Image
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.readers import blender, colmap, llff, nerfstudio
 from tests.helpers import captures as tiny
-from tests.stress.bad_inputs import BadInput, Canary, bomb
+from tests.stress.bad_inputs import BadInput, Canary
 
 READERS: dict[str, Callable[[Path], Capture]] = {
     "colmap": colmap.read,
@@ -138,12 +138,6 @@ def turned(root: Path) -> None:
     Image.new("RGB", (tiny.WIDTH, tiny.HEIGHT)).save(root / "images/b.png", format="JPEG", exif=exif)
 
 
-def truncated_jpeg(root: Path) -> None:
-    pixels = np.random.default_rng(0).integers(0, 256, (tiny.HEIGHT, tiny.WIDTH, 3), np.uint8)
-    Image.fromarray(pixels).save(root / "images/b.png", format="JPEG", quality=95)
-    cut("images/b.png", -200)(root)
-
-
 def two_images_of_one_name(root: Path) -> None:
     file = root / "sparse/0/images.bin"
     file.write_bytes(file.read_bytes().replace(b"b.png\0", b"a.png\0"))
@@ -179,7 +173,6 @@ INPUTS = [
     case("quaternion of length 2", "colmap",
          patch(IMAGES, QUATERNION_AT, "<4d", 1.969615506024416, 0, 0.34729635533386066, 0), r"of length 2:"),
     case("NaN pose", "colmap", patch(IMAGES, QUATERNION_AT, "<d", float("nan")), r"images\.bin: a\.png: .*finite"),
-    case("infinite translation", "colmap", patch(IMAGES, QUATERNION_AT + 32, "<d", float("inf")), r"a\.png: .*finite"),
     case("NaN point", "colmap", patch(POINTS, 16, "<d", float("nan")), r"points3D\.bin: point 0: .*finite"),
     case("point beyond float32", "colmap", patch(POINTS, 16, "<d", 1e300), r"points3D\.bin: point 0: .*finite"),
     case("unknown camera id", "colmap", patch(IMAGES, NAME_AT - 4, "<i", 9), r"images\.bin: a\.png: .*camera 9"),
@@ -193,16 +186,8 @@ INPUTS = [
     case("principal point far away", "colmap", patch(CAMERAS, 48, "<d", 1e6), r"cameras\.bin: .*principal point"),
     case("name is no UTF-8", "colmap", patch(IMAGES, NAME_AT, "<B", 0xFF), r"images\.bin: name of image 0: .*UTF-8"),
     case("name without end", "colmap", name_without_end, r"images\.bin: name of image 0: is no text"),
-    case("images of another shape", "colmap", save_image("images/b.png", size=(16, 9)), r"b\.png: size: is 16x9"),
     case("symlink in a circle", "colmap", link_in_circle("images/b.png"), r"images\.bin: .*b\.png"),
-    case("image bomb", "colmap", write("images/b.png", bomb(60000, 60000)), r"b\.png: (size|file): .*(pixels|Bomb)"),
-    case("text named .png", "colmap", write("images/b.png", b"not a picture\n" * 9), r"b\.png: file: is no readable"),
-    case("GIF named .png", "colmap", save_image("images/b.png", format="GIF", mode="L"), r"b\.png: file: is no read"),
-    case("empty photo", "colmap", write("images/b.png", b""), r"b\.png: file: is no readable"),
-    case("photo truncated", "colmap", cut("images/b.png", -60), r"b\.png: pixels: cannot be decoded"),
-    case("JPEG truncated", "colmap", truncated_jpeg, r"b\.png: pixels: cannot be decoded"),
     case("photo upside down by EXIF", "colmap", turned, r"b\.png: EXIF orientation: is 3.*auto-orient"),
-    case("CMYK photo", "colmap", save_image("images/b.png", format="TIFF", mode="CMYK"), r"b\.png: colour mode: is CM"),
     # COLMAP, text
     case("txt beside broken bin", "colmap_txt", write(CAMERAS, b"\1"), r"cameras\.bin: number of cameras"),
     case("txt byte-order mark", "colmap_txt", replace(CAMERAS_TXT, "#", "\ufeff#"), r"cameras\.txt: line 1: .*byte-order"),
@@ -210,7 +195,6 @@ INPUTS = [
     case("txt NaN", "colmap_txt", replace(POINTS_TXT, "3.0", "nan"), r"points3D\.txt: point 0: is not finite"),
     case("txt 1e999", "colmap_txt", replace(CAMERAS_TXT, "20.0", "1e999"), r"cameras\.txt: line 2: .*finite"),
     case("txt too few parameters", "colmap_txt", replace(CAMERAS_TXT, " 8 6", " 8"), r"cameras\.txt: line 2: has 3 param"),
-    case("txt column missing", "colmap_txt", replace(IMAGES_TXT, " 1 a.png", " a.png"), r"images\.txt: line 3: has 9"),
     case("txt second line missing", "colmap_txt", replace(IMAGES_TXT, "a.png\n\n", "a.png\n"), r"images\.txt: line 4"),
     case("txt last line missing", "colmap_txt", replace(IMAGES_TXT, "c.png\n8.0 6.0 -1\n", "c.png"), r"images\.txt: line 8"),
     case("txt odd track", "colmap_txt", replace(POINTS_TXT, "0.5 1 0", "0.5 1"), r"points3D\.txt: line 2: has 11 col"),
@@ -227,7 +211,6 @@ INPUTS = [
     case("npy header asks TiB", "llff",
          write("poses_bounds.npy", npy_header("{'descr': '<f8', 'fortran_order': False, 'shape': (999999, 17), }")),
          r"table: is no \.npy of numbers"),
-    case("npy header nests", "llff", write("poses_bounds.npy", npy_header("-" * 100)), r"table: is no \.npy of numbers"),
     case("npy wrong columns", "llff", save_table(lambda t: t[:, :15]), r"table: has the shape \(3, 15\)"),
     case("npy whole numbers", "llff", save_table(lambda t: t.astype(np.int64)), r"table: is not one of floating"),
     case("npy too few rows", "llff", save_table(lambda t: t[:2]), r"poses_bounds\.npy: rows: there are 2"),
@@ -240,8 +223,6 @@ INPUTS = [
     case("no JSON", "blender", write(TRAIN, b"{'a': 1}"), r"transforms_train\.json: json: is not valid"),
     case("JSON list", "blender", write(TRAIN, b"[]"), r"transforms_train\.json: json: is a list"),
     case("deep JSON", "blender", write(TRAIN, b"[" * 100_000), r"transforms_train\.json: json: .*deep"),
-    case("JSON not UTF-8", "blender", write(TRAIN, b'{"a": "\xff"}'), r"transforms_train\.json: json"),
-    case("5000 digits", "blender", write(TRAIN, b'{"camera_angle_x": ' + b"7" * 5000 + b"}"), r"json: is not valid"),
     case("no frames", "blender", edit(TRAIN, lambda v: v.update(frames=[])), r"transforms_train\.json: frames"),
     case("no angle", "blender", edit(TRAIN, lambda v: v.pop("camera_angle_x")), r"fl_x: is missing.*camera_angle_x"),
     case("angle beyond pi", "blender", edit(TRAIN, lambda v: v.update(camera_angle_x=4)), r"camera_angle_x: is 4"),
@@ -251,10 +232,8 @@ INPUTS = [
     case("path of 5000 letters", "blender", edit_frame(TRAIN, file_path="x" * 5000), r"photos: 1 of 2 .* x{80}: "),
     # nerfstudio
     case("NaN constant", "nerfstudio", replace(SHARED, '"fl_x": 20.0', '"fl_x": NaN'), r"json: is not valid \(JSON is malformed"),
-    case("1e999", "nerfstudio", replace(SHARED, '"fl_x": 20.0', '"fl_x": 1e999'), r"json: is not valid \(Number out of range"),
     case("number of 100 digits", "nerfstudio", edit(SHARED, lambda v: v.update(fl_x=10**100)), r"fl_x: must be"),
     case("text for a number", "nerfstudio", edit(SHARED, lambda v: v.update(cx="8")), r"frames\[0\]\.cx: must be"),
-    case("true for a number", "nerfstudio", edit(SHARED, lambda v: v.update(cx=True)), r"frames\[0\]\.cx: must be"),
     case("no intrinsics", "nerfstudio", edit(SHARED, lambda v: v.pop("fl_x")), r"frames\[0\]\.fl_x: is missing"),
     case("360 degree camera", "nerfstudio", edit(SHARED, lambda v: v.update(camera_model="EQUIRECTANGULAR")),
          r"frames\[0\]\.camera_model: is 'EQUIRECTANGULAR'"),
@@ -267,8 +246,6 @@ INPUTS = [
     case("matrix missing", "nerfstudio", edit(SHARED, lambda v: v["frames"][1].pop("transform_matrix")),
          r"frames\[1\]\.transform_matrix: is no 3x4"),
     case("matrix mirrors", "nerfstudio", edit_frame(SHARED, transform_matrix=np.diag([1.0, 1, -1, 1]).tolist()),
-         r"frames\[1\]\.transform_matrix: holds no rotation"),
-    case("matrix scales", "nerfstudio", edit_frame(SHARED, transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()),
          r"frames\[1\]\.transform_matrix: holds no rotation"),
     case("matrix last row", "nerfstudio", edit_frame(SHARED, transform_matrix=np.diag([1.0, 1, 1, 2]).tolist()),
          r"frames\[1\]\.transform_matrix: has the last row"),
