@@ -127,6 +127,26 @@ def test_in_other_processes_a_failed_job_stops_no_other_and_is_told(tmp_path):
     assert "hydra.launcher.n_jobs=2" in (tmp_path / "all" / "1" / "run.log").read_text()
 
 
+@joblib
+@pytest.mark.slow
+def test_a_stopped_joblib_sweep_leaves_no_worker(tmp_path):
+    sweep = [*SWEEP, *JOBLIB, "+strategy=baseline,gco", "fit.iterations=100_000"]
+    process = started(*DOOR, *sweep, cwd=tmp_path, said=tmp_path / "said", session=True)
+    wait_for(lambda: all((tmp_path / "all" / job / "cameras.json").exists() for job in ("0", "1")))
+    process.terminate()
+    assert process.wait() == 130, (tmp_path / "said").read_text()
+
+    def gone() -> bool:
+        try:
+            os.killpg(process.pid, 0)
+        except ProcessLookupError:
+            return True
+        return False
+
+    wait_for(gone, 30, "the workers to end")
+    assert "Traceback" not in (tmp_path / "said").read_text()
+
+
 def test_a_clusters_announcement_saves_before_its_handler_acts(tmp_path):
     """SIGUSR2, as submitit handles it: what it would do at once is done after the checkpoint."""
     handler = (
@@ -170,7 +190,8 @@ def test_the_slurm_configuration_is_one_that_submitit_takes(tmp_path):
     assert launcher.max_num_timeout == 100
 
 
-def test_failed_jobs_are_told_where_the_report_cannot_be_written(tmp_path, caplog):
+def test_failed_jobs_are_told_where_the_report_cannot_be_written(tmp_path, caplog, monkeypatch):
+    monkeypatch.setattr(signal, "signal", lambda *_: None)  # of this process
     callback, config = SweepCallback(), OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}})
     make_run(tmp_path / "0")
     (tmp_path / "0" / FAILED).write_text("job 0: of an earlier sweep")
