@@ -67,7 +67,7 @@ def _require_known_flags(arguments: Sequence[str]) -> None:
     for word in arguments:
         flag = word.partition("=")[0]
         if flag.startswith("--") and flag != "--verbose" and not any(known.startswith(flag) for known in _FLAGS):
-            remedy = "A setting is written name=value, and clear-strategies settings lists all of them."
+            remedy = "A setting is written name=value, and clear-strategies --cfg job prints all of them."
             raise SettingError(f"{flag}: there is no such flag. {remedy}")
 
 
@@ -82,7 +82,7 @@ def _no_such_setting(key: str) -> str:
         near = difflib.get_close_matches(key, flat(settings), 1, 0.8)
     except SettingError:  # another override is wrong as well
         near = []
-    remedy = f"Did you mean {near[0]}?" if near else "clear-strategies settings lists all."
+    remedy = f"Did you mean {near[0]}?" if near else "clear-strategies --cfg job prints all of them."
     return f"{key}: there is no such setting. {remedy}"
 
 

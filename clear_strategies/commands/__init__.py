@@ -37,10 +37,9 @@ class Command(NamedTuple):
 COMMANDS: Final = {
     "train": Command("PHOTOS [setting=value …]", "from photos, a video or a capture to a splat and pictures"),
     "render": Command("RUN", "pictures and a video of a saved run or a PLY file, along any camera path"),
-    "export": Command("RUN --to FORMAT", "a saved run as a file for viewers: ply, glb, splat, spz or sog"),
+    "export": Command("RUN --to FORMAT", "a saved run as a file for viewers: ply, spz or sog"),
     "view": Command("RUN", "an interactive viewer in the browser of a saved run or a PLY file"),
     "doctor": Command("", "what this machine has, what works, and what is missing"),
-    "settings": Command("[setting=value …]", "every setting of a run with its value, and the choices of each group"),
 }
 
 

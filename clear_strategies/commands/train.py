@@ -30,7 +30,7 @@ The command trains +strategy=best on all photos for fit.iterations={_ITERATIONS}
   clear-strategies train photos/ data.reader.skip_faulty=true         go on without photos that cannot be read
   clear-strategies train photos/ fit.log=tensorboard -v           curves while it trains; every detail on the console
 
-`clear-strategies settings data=photos` lists all settings.
+`clear-strategies data=photos --cfg job` prints all settings.
 """
 # What decides which strategies train, and for how long, so that the defaults must not.
 CHOOSE_STRATEGIES: Final = ("+strategy=", "+method=", "experiment=", "+experiment=")

@@ -7,13 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 import torch
 
 from clear_strategies import files
 from clear_strategies.data.ply import GaussianPly, write_gaussians
 from clear_strategies.errors import SettingError
-from clear_strategies.outputs.gltf import glb_bytes
 from clear_strategies.training.field import GaussianField
 from rasterizers.geometry import SH_C0, spherical_harmonics
 
@@ -22,17 +20,13 @@ _DIRECTION: Final = (1.0, 2.0, 4.0)  # in which no spherical harmonic is 0
 
 
 def write_format(path: Path, g: GaussianPly, form: str) -> None:
-    """Write the Gaussians as one of `format_names.FORMATS`, atomically.
+    """Write the Gaussians as ply, spz or sog, atomically.
 
     Raises:
         SettingError: gaussforge is not installed, or refuses the splat.
     """
     if form == "ply":
         write_gaussians(path, g)
-    elif form == "splat":
-        files.write_bytes(path, splat_bytes(g))
-    elif form == "glb":
-        files.write_bytes(path, glb_bytes(g))
     else:
         files.write_bytes(path, _packed_bytes(g, form))
 
@@ -65,29 +59,12 @@ def gaussians_of(field: GaussianField, *, antialiased: bool) -> GaussianPly:
     )
 
 
-def splat_bytes(g: GaussianPly) -> bytes:
-    """The .splat file: position and scales as float32, RGBA and quaternion as bytes; the most visible Gaussians first."""
-    alpha = g.opacities.sigmoid()
-    order = (alpha.log() + g.scales.sum(1)).argsort(descending=True, stable=True)
-    rgba = torch.cat([g.sh0[:, 0] * SH_C0 + 0.5, alpha[:, None]], dim=1)
-    quats = torch.nn.functional.normalize(g.quats, dim=1)
-    table = np.zeros(len(g), [("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
-    for name, values in (
-        ("means", g.means),
-        ("scales", g.scales.exp()),
-        ("rgba", (rgba.clamp(0, 1) * 255).round()),
-        ("quats", (quats * 128 + 128).round().clamp(0, 255)),
-    ):
-        table[name] = values[order].cpu().numpy()
-    return table.tobytes()
-
-
 def _packed_bytes(g: GaussianPly, form: str) -> bytes:
     """The .spz or .sog file, by gaussforge."""
     try:
         import gaussforge
     except ImportError as error:
-        remedy = "pip install 'clear-strategies[export]', or choose --to ply, --to glb or --to splat"
+        remedy = "pip install 'clear-strategies[export]', or choose --to ply"
         raise SettingError(f"--to {form} needs gaussforge, which is not installed: {remedy}.") from error
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "splat.ply"

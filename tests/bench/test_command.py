@@ -35,16 +35,6 @@ def test_rasterizers_writes_every_stage_both_errors_a_figure_and_the_machine(tmp
     assert "forward_ms" in capsys.readouterr().out
 
 
-def test_stereo_measures_the_demos_depth(tmp_path, capsys):
-    smaller = ["data.reader.width=96", "data.reader.height=72"]
-    assert main(["stereo", *smaller, "--out", str(tmp_path)]) == 0
-    table = pd.read_csv(tmp_path / "stereo.csv").set_index("view")
-    assert list(table.columns) == ["coverage", "points", "known", "within 3%", "within 10%"]
-    assert len(table) == 4
-    assert table.loc["all", "within 10%"] > 0.7
-    assert "depth in" in capsys.readouterr().out
-
-
 NO_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 
 
@@ -56,7 +46,6 @@ NO_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
         (["iteration", "--scene", "nowhere"], "nowhere: is no scene"),
         (["seconds", "fit.seed=3", "--variant"], "fit.seed=3: is set by the benchmark"),
         (["seconds", "--probes", "30001", "--variant"], "30001: lies outside 1 to"),
-        (["stereo", "data=nowhere"], "data=nowhere"),
         (["errors", "nowhere"], "has neither a checkpoint nor a point_cloud.ply"),
         pytest.param(["rasterizers", "--device", "cuda"], "no such device", marks=NO_GPU),
     ],

@@ -11,7 +11,6 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 
 from clear_strategies import commands, hydra_app
-from clear_strategies.commands import settings
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs import exit_codes
 from tests.helpers.command_line import ROOT
@@ -39,7 +38,6 @@ def test_overrides_and_flags_are_hydras(first):
     [
         ("trian", "Did you mean train?"),
         ("Train", "Did you mean train?"),
-        ("setting", "Did you mean settings?"),
         ("photos/", "Did you mean clear-strategies train photos/?"),
         ("my photos/", "Did you mean clear-strategies train 'my photos/'?"),
         ("views", "Did you mean clear-strategies train views?"),  # a folder that is there
@@ -90,23 +88,11 @@ def hydra_undone(monkeypatch) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("hydra_undone")
-def test_settings_lists_groups_choices_and_values(capsys):
-    """Hydra's help of the application, with the overrides behind the word."""
-    with pytest.raises(SystemExit) as ended:
-        settings.main(["+strategy=gco", "strategies.gco.tolerance=0.25"])
-    said = capsys.readouterr().out
-    assert ended.value.code in (0, None)
-    assert "clear-strategies is powered by Hydra" in said
-    assert "rasterizer: auto, cpp, gsplat, torch, warp" in said
-    assert "tolerance: 0.25" in said
-
-
-@pytest.mark.usefixtures("hydra_undone")
 @pytest.mark.parametrize(
     ("word", "message"),
     [
         *((f"{group}=clear", rf"^{group}: .* it is added: \+{group}=") for group in ("strategy", "method", "readings")),
-        ("fit.nothing_like_it=1", r"fit\.nothing_like_it: there is no such setting\. clear-strategies se"),
+        ("fit.nothing_like_it=1", r"fit\.nothing_like_it: there is no such setting\. clear-strategies --cfg job"),
         ("fit.iteration=1", r"fit\.iteration: there is no such setting\. Did you mean fit\.iterations\?"),
         ("--multrun", r"--multrun: there is no such flag\. A setting is written name=value"),
     ],
