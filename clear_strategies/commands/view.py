@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import socket
 import webbrowser
@@ -34,18 +33,16 @@ def main(arguments: Sequence[str]) -> None:
     if not 0 <= options.port <= _LAST_PORT:
         raise SettingError(f"--port: must be 0 to {_LAST_PORT}, got {options.port}.")
     from clear_strategies.jobs.saved import open_splat
-    from clear_strategies.viewing import live, points
+    from clear_strategies.viewing import live
 
     live.require_viewer()
     splat = open_splat(options.run, options.rasterizer)
     _log.info("%s", splat.source)
     from clear_strategies.viewing.server import Screen, SplatViewer
 
-    run = None if splat.baked else splat.folder
-    colors = functools.cache(lambda: points.colors(splat.painter, run, splat.cameras))
     viewer = SplatViewer(
-        Screen(splat.painter, splat.cameras, colors), title=splat.name, names=points.names(run), port=options.port,
-        host=options.host, out=splat.folder / "rendered",
+        Screen(splat.painter, splat.cameras), title=splat.name, port=options.port, host=options.host,
+        out=splat.folder / "rendered",
     )  # fmt: skip
     _log.info("%s (Ctrl-C ends it)", viewer.address)
     if not options.no_browser:

@@ -38,7 +38,6 @@ BLUE, RED, GREEN, YELLOW, CYAN, PURPLE, GREY = (
 
 
 Item = TypeVar("Item")
-Span = tuple[float, float]
 
 
 def spaced(items: Sequence[Item], count: int) -> Sequence[Item]:
@@ -134,22 +133,11 @@ class PixelPage:
         self.figure = NewFigure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
         self.text(GAP, 1.5 * LINE, title, size=12)
 
-    def image(
-        self, x: int, y: int, pixels: np.ndarray, times: float, *, colors: str = "magma", span: Span = (0, ERROR_MAX)
-    ) -> FigureImage:
-        """Draw RGB, or numbers in colours, `times` larger, with the top left corner at (x, y).
-
-        Args:
-            colors: matplotlib's name of the colours of numbers; by default those of an error map.
-            span: the numbers at which the colours begin and end. Grey shows nan.
-        """
-        from matplotlib import colormaps
-
+    def image(self, x: int, y: int, pixels: np.ndarray, times: float) -> FigureImage:
+        """Draw RGB, or an error map in colours, `times` larger, with the top left corner at (x, y)."""
         height, width = (round(size * times) for size in pixels.shape[:2])
-        shown = colormaps[colors].with_extremes(bad=RULE)
-        return self.figure.figimage(
-            _resized(pixels, height, width), x, self.height - y - height, cmap=shown, vmin=span[0], vmax=span[1]
-        )
+        resized, below = _resized(pixels, height, width), self.height - y - height
+        return self.figure.figimage(resized, x, below, cmap="magma", vmin=0, vmax=ERROR_MAX)
 
     def frame(self, x: float, y: float, width: float, height: float, color: str) -> None:
         """Draw the outline of a rectangle whose top left corner is at (x, y)."""
@@ -158,16 +146,10 @@ class PixelPage:
         corner, size = (x / self.width, 1 - (y + height) / self.height), (width / self.width, height / self.height)
         self.figure.add_artist(Rectangle(corner, *size, fill=False, color=color, linewidth=1))
 
-    def colour_bar(
-        self, x: int, y: int, height: int, drawn: FigureImage, label: str, *, extend: Literal["max", "neither"] = "max"
-    ) -> None:
-        """The colours of an image of numbers, 12 px wide, with its numbers to the right.
-
-        Args:
-            extend: "max": an arrow says that larger numbers have the last colour.
-        """
+    def colour_bar(self, x: int, y: int, height: int, drawn: FigureImage, label: str) -> None:
+        """The colours of an error map, 12 px wide, with its numbers to the right; larger ones have the last colour."""
         place = (x / self.width, 1 - (y + height) / self.height, 12 / self.width, height / self.height)
-        bar = self.figure.colorbar(drawn, cax=self.figure.add_axes(place), extend=extend, extendfrac=0.03)
+        bar = self.figure.colorbar(drawn, cax=self.figure.add_axes(place), extend="max", extendfrac=0.03)
         bar.set_label(label, fontsize=8, color=INK)
         bar.ax.tick_params(labelsize=8, colors=INK)
         bar.outline.set_visible(False)

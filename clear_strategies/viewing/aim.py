@@ -1,10 +1,10 @@
-"""Cameras in viser's terms: where a page begins, and cameras in the scene."""
+"""Cameras in viser's terms, for the viewer and the page of a splat."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
@@ -29,7 +29,7 @@ def aim(server: viser.ViserServer, cameras: Sequence[Camera]) -> None:
     start.position = tuple(first.center.tolist())
     start.look_at = tuple((first.center.double() + distance * first.world_to_camera[2, :3].double()).tolist())
     start.up = tuple((-first.world_to_camera[1, :3]).tolist())
-    start.fov = 2 * math.atan(first.height / 2 / first.fy)
+    start.fov = vertical_fov(first)
 
 
 def drawn_length(cameras: Sequence[Camera]) -> float:
@@ -38,20 +38,13 @@ def drawn_length(cameras: Sequence[Camera]) -> float:
     return _LENGTH * float(np.mean([np.linalg.norm(camera.center.double().numpy() - focus) for camera in cameras]))
 
 
+def vertical_fov(camera: Camera) -> float:
+    """Radians."""
+    return 2 * math.atan(camera.height / 2 / camera.fy)
+
+
 def wxyz(camera: Camera) -> tuple[float, float, float, float]:
     """Its rotation, camera to world, as a quaternion."""
     rotation = viser.transforms.SO3.from_matrix(camera.world_to_camera[:3, :3].double().T.numpy())
     w, x, y, z = (float(value) for value in rotation.wxyz)
     return w, x, y, z
-
-
-def add_camera(server: viser.ViserServer, name: str, camera: Camera, length: float, **look: Any) -> Any:
-    """Draw a camera in the scene.
-
-    Args:
-        look: colour, image and visibility, as viser's `add_camera_frustum` takes them.
-    """
-    return server.scene.add_camera_frustum(
-        name, fov=2 * math.atan(camera.height / 2 / camera.fy), aspect=camera.width / camera.height, scale=length,
-        wxyz=wxyz(camera), position=tuple(camera.center.tolist()), **look,
-    )  # fmt: skip

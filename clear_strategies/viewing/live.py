@@ -1,60 +1,19 @@
-"""The viewer of a run that trains: the training thread draws its pictures, between two iterations."""
+"""The viewer of a run that trains: nerfview draws its pictures between two iterations."""
 
 from __future__ import annotations
 
-import queue
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future
 from contextlib import contextmanager
 from importlib.util import find_spec
-from typing import Any, Final
+from typing import Final
 
 from clear_strategies.errors import SettingError
 from clear_strategies.viewing.cameras import SavedCamera
 from clear_strategies.viewing.look import Painter
 
-_PATIENCE: Final = 0.02  # seconds between looks at the queue while the run is paused
-
-
-class Turns:
-    """Runs functions of other threads in the training thread, when that calls `serve`; after `close`, in their own.
-
-    The field is thus never drawn while an iteration changes it, and the run's bits are those of a run without a viewer.
-    """
-
-    def __init__(self) -> None:
-        self._calls: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
-        self._closed = threading.Event()
-
-    def ask(self, function: Callable[[], Any]) -> Any:
-        """Called by another thread: wait until the training thread has called the function, and return its result."""
-        if self._closed.is_set():
-            return function()
-        result: Future[Any] = Future()
-        self._calls.put((function, result))
-        while not result.done():
-            if self._closed.is_set():
-                self.serve()
-            time.sleep(0.002)
-        return result.result()
-
-    def serve(self) -> None:
-        """Called by the training thread: call the functions that wait."""
-        while True:
-            try:
-                function, result = self._calls.get_nowait()
-            except queue.Empty:
-                return
-            try:
-                result.set_result(function())
-            except Exception as error:  # raised in the thread that waits
-                result.set_exception(error)
-
-    def close(self) -> None:
-        """Called when training has ended and the field no longer changes."""
-        self._closed.set()
+_PATIENCE: Final = 0.02  # seconds between looks at the button while the run is paused
+_TURN: Final = 0.002  # seconds that the lock is free after an iteration, so that a thread that waits for it gets it
 
 
 def require_viewer() -> None:
@@ -69,26 +28,36 @@ def watched(
 ) -> Iterator[Callable[[int], None]]:
     """A viewer while a run trains. Yields a function to call after each iteration, with its number.
 
+    The caller holds nerfview's lock, except in that function: the field is never drawn while an iteration changes it, and the
+    run's bits are those of a run without a viewer.
+
     Args:
         report: called with the viewer's address.
     """
-    from clear_strategies.viewing import points
     from clear_strategies.viewing.server import Screen, SplatViewer
 
-    turns = Turns()
-    screen = Screen(painter, cameras, lambda: points.colors(painter, None, ()))
-    viewer = SplatViewer(screen, title=title, names=points.names(None), live=True, around=turns.ask)
+    viewer = SplatViewer(Screen(painter, cameras), title=title, mode="training")
     report(viewer.address)
+    viewer.lock.acquire()
+    began = time.monotonic()
 
     def after_step(iteration: int) -> None:
-        turns.serve()
-        while viewer.paused:
-            turns.serve()
-            time.sleep(_PATIENCE)
-        viewer.show_progress(iteration)
+        nonlocal began
+        # nerfview shares the time between both by the pixels of each a second: an iteration counts as one.
+        viewer.render_tab_state.num_train_rays_per_sec = 1 / max(time.monotonic() - began, 1e-9)
+        viewer.lock.release()
+        try:
+            viewer.update(iteration, 1)
+            if viewer.server.get_clients():
+                time.sleep(_TURN)
+            while viewer.state == "paused":
+                time.sleep(_PATIENCE)
+        finally:
+            viewer.lock.acquire()
+        began = time.monotonic()
 
     try:
         yield after_step
     finally:
-        turns.close()
+        viewer.lock.release()
         viewer.close()

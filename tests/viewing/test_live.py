@@ -1,10 +1,9 @@
-"""While a run trains, pictures are drawn between its iterations by its own thread."""
+"""While a run trains, its pictures are drawn between its iterations."""
 
 from __future__ import annotations
 
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 from urllib.request import urlopen
 
 import pytest
@@ -12,34 +11,7 @@ import pytest
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs.saved import open_splat
 from clear_strategies.viewing import live
-from clear_strategies.viewing.live import Turns
 from tests.helpers import saved_run
-
-
-@pytest.fixture
-def other():
-    with ThreadPoolExecutor(1) as thread:
-        yield thread
-
-
-def test_what_another_thread_asks_for_is_done_by_the_training_thread_and_errors_are_raised_where_it_asked(other):
-    turns = Turns()
-    ident, error = (other.submit(turns.ask, function) for function in (threading.get_ident, lambda: 1 / 0))
-    time.sleep(0.05)
-    assert not ident.done()
-    while not error.done():
-        turns.serve()
-    assert ident.result() == threading.get_ident()
-    with pytest.raises(ZeroDivisionError):
-        error.result()
-
-
-def test_after_training_it_is_done_at_once(other):
-    turns = Turns()
-    early = other.submit(turns.ask, lambda: "asked while training")
-    turns.close()
-    assert early.result(5) == "asked while training"
-    assert other.submit(turns.ask, threading.get_ident).result(5) == other.submit(threading.get_ident).result()
 
 
 def test_missing_libraries_are_named(monkeypatch):
@@ -48,13 +20,36 @@ def test_missing_libraries_are_named(monkeypatch):
         live.require_viewer()
 
 
-def test_a_viewer_is_there_while_a_run_trains(tmp_path):
-    pytest.importorskip("clear_strategies.viewing.server", exc_type=ImportError)
+def test_a_viewer_is_there_while_a_run_trains_and_draws_between_two_iterations_alone(tmp_path, monkeypatch):
+    server = pytest.importorskip("clear_strategies.viewing.server", exc_type=ImportError)
+    viewers, drawn = [], threading.Event()
+    opened = server.SplatViewer
+
+    def remembered(*arguments, **options):
+        viewers.append(opened(*arguments, **options))
+        return viewers[-1]
+
+    monkeypatch.setattr(server, "SplatViewer", remembered)
     saved_run.write(tmp_path)
     splat, addresses = open_splat(tmp_path), []
+
+    def draw() -> None:  # as nerfview's threads do
+        with viewers[0].lock:
+            drawn.set()
+
     with live.watched(splat.painter, splat.cameras, "toy", addresses.append) as after_step:
         after_step(1)
         assert b"<html" in urlopen(addresses[0], timeout=20).read()  # noqa: S310 - our own address
+        threading.Thread(target=draw).start()
+        assert not drawn.wait(0.2)  # an iteration is under way
+        monkeypatch.setattr(viewers[0].server, "get_clients", lambda: {0: None})
+        monkeypatch.setattr(live, "_TURN", 0.5)
         after_step(2)
+        assert drawn.is_set()
+        viewers[0].state = "paused"
+        threading.Timer(0.3, lambda: setattr(viewers[0], "state", "training")).start()
+        began = time.monotonic()
+        after_step(3)
+        assert time.monotonic() - began > 0.25
     with pytest.raises(OSError, match="refused"):
         urlopen(addresses[0], timeout=20)  # noqa: S310
