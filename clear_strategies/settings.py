@@ -140,6 +140,10 @@ def _located(target: Any) -> Callable[..., Any]:
     function = getattr(importlib.import_module(module), name)
     if not callable(function):
         raise ImportError("it is neither a class nor a function")
+    try:
+        inspect.signature(function)
+    except ValueError as error:  # of some that are built in
+        raise ImportError("its parameters are not known") from error
     return typing.cast("Callable[..., Any]", function)
 
 

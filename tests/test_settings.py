@@ -102,6 +102,10 @@ REFUSED = {
     "inner: it is too large.": {"share": 1, "inner": target(Inner, size=10)},
     "inner: nowhere.Mine cannot be imported": {"share": 1, "inner": {TARGET: "nowhere.Mine"}},
     "inner: builtins.nothing cannot be imported": {"share": 1, "inner": {TARGET: "builtins.nothing"}},
+    "inner: builtins.type cannot be imported (its parameters are not known)": {
+        "share": 1,
+        "inner": {TARGET: "builtins.type"},
+    },
     "names: must be a list, each entry text or null, got [1]": {"share": 1, "names": [1]},
     "color: must be a list of 2 numbers, got [1]": {"share": 1, "color": [1]},
     "weights.x: must be a number, got 'y'": {"share": 1, "weights": {"x": "y"}},
