@@ -15,7 +15,7 @@ from typing import Final
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from clear_strategies.data.cameras import Lens
+from clear_strategies.data.lenses import Lens
 from clear_strategies.data.photo_files import has_alpha, image_size, read_image
 from clear_strategies.data.priors.interface import Prior
 from clear_strategies.errors import DataError

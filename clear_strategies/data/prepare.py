@@ -22,10 +22,10 @@ from clear_strategies.core.checks import refuse
 from clear_strategies.core.progress import Progress
 from clear_strategies.core.view import Photo, View
 from clear_strategies.core.work_log import WorkLog
-from clear_strategies.data.cameras import forget_maps
 from clear_strategies.data.capture import Capture, Frame
+from clear_strategies.data.cloud import CloudSettings, initial_points, require_source
+from clear_strategies.data.lenses import forget_maps
 from clear_strategies.data.photo_files import image_size, read_image
-from clear_strategies.data.points import CloudSettings, initial_points, require_source
 from clear_strategies.data.priors import Bicubic, Prior, SuperResolved, super_resolved
 from clear_strategies.data.priors.cache import kept_network_of
 from clear_strategies.data.priors.interface import warn_if_far_from_lr

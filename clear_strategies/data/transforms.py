@@ -9,8 +9,8 @@ from typing import Any, Final
 
 import msgspec
 
-from clear_strategies.data.cameras import Lens, pose_from_opengl
 from clear_strategies.data.capture import Frame
+from clear_strategies.data.lenses import Lens, pose_from_opengl
 from clear_strategies.data.photo_files import image_size
 from clear_strategies.data.photo_folders import usable
 from clear_strategies.data.strict_json import Number, typed

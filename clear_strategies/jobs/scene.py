@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from typing import Any, Final, cast
 
 from clear_strategies.data.capture import Capture
+from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.hr_limit import within_limit
 from clear_strategies.data.photo_folders import require_text
-from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.prepare import at_hr, prepare
 from clear_strategies.data.priors import Bicubic, Ncnn, Prior, cached, network_of
 from clear_strategies.data.priors.ncnn import factors, missing_packages

@@ -22,7 +22,7 @@ from torch import Tensor
 from clear_strategies import files
 from clear_strategies.core import images
 from clear_strategies.data import strict_json
-from clear_strategies.data.cameras import pose_from_opengl, rigid_inverse
+from clear_strategies.data.lenses import pose_from_opengl, rigid_inverse
 from clear_strategies.data.photo_files import jpeg
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.strict_json import Number, typed

@@ -16,7 +16,7 @@ from torch import Tensor
 from clear_strategies.core.images import to_bytes
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.viewing.look import AS_MEASURED, Look, Painter
-from clear_strategies.viewing.video import Frame
+from clear_strategies.viewing.video import Pixels
 from rasterizers.interface import Camera
 
 _SAMPLED: Final = 5  # cameras that the range of depths is taken from, about
@@ -48,7 +48,7 @@ class DepthScale:
         near, far = (float(np.quantile(known, q)) for q in _EXTREMES)
         return cls(near, max(far, near * (1 + 1e-6) + 1e-6))
 
-    def picture(self, depth: Float[Tensor, "H W"]) -> Frame:
+    def picture(self, depth: Float[Tensor, "H W"]) -> Pixels:
         """Depth in colours, grey where there is none."""
         from matplotlib import colormaps
 
@@ -58,12 +58,12 @@ class DepthScale:
         return np.asarray((colored * 255).round().astype(np.uint8))
 
 
-def color_frames(painter: Painter, cameras: Sequence[Camera], look: Look = AS_MEASURED) -> Iterator[Frame]:
+def color_frames(painter: Painter, cameras: Sequence[Camera], look: Look = AS_MEASURED) -> Iterator[Pixels]:
     """The colours from each camera, 8 bits."""
     return (to_bytes(painter.color(camera, look)) for camera in cameras)
 
 
-def saving(frames: Iterable[Frame], paths: Iterable[Path]) -> Iterator[Frame]:
+def saving(frames: Iterable[Pixels], paths: Iterable[Path]) -> Iterator[Pixels]:
     """Yield the frames, and write each as a PNG."""
     for frame, path in zip(frames, paths, strict=True):
         write_png(path, torch.from_numpy(frame) / 255)

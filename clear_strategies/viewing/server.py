@@ -32,7 +32,7 @@ from clear_strategies.viewing.aim import aim, drawn_length, vertical_fov, wxyz
 from clear_strategies.viewing.cameras import SavedCamera, at_most
 from clear_strategies.viewing.film import DepthScale
 from clear_strategies.viewing.look import AS_MEASURED, Look, Painter
-from clear_strategies.viewing.video import Frame
+from clear_strategies.viewing.video import Pixels
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
@@ -59,7 +59,7 @@ class Screen:
     painter: Painter
     cameras: Sequence[SavedCamera]
 
-    def draw(self, view: View, pose: Float[np.ndarray, "4 4"], fov: float, size: tuple[int, int]) -> Frame:
+    def draw(self, view: View, pose: Float[np.ndarray, "4 4"], fov: float, size: tuple[int, int]) -> Pixels:
         """The picture of `size` (width, height) pixels.
 
         Args:
@@ -166,7 +166,7 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         )  # fmt: skip
         self._rendering_tab_handles.update(handles)
 
-    def _render(self, state: Any, tab: Any) -> Frame:
+    def _render(self, state: Any, tab: Any) -> Pixels:
         """Called by nerfview in a thread of each browser, which ends the process on an error: so none may pass."""
         size = (tab.render_width, tab.render_height) if tab.preview_render else (tab.viewer_width, tab.viewer_height)
         try:

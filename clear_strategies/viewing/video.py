@@ -17,7 +17,7 @@ _QUALITY: Final = "20"  # x264's CRF: 18 cannot be told from the frames, 23 is i
 # Without a word in the file, players guess BT.709 for large pictures and BT.601 for small ones; ffmpeg itself makes BT.601.
 _HD: Final = "scale=out_color_matrix=bt709:out_range=tv,setparams=color_primaries=bt709:color_trc=bt709"
 
-Frame = UInt8[np.ndarray, "_ _ 3"]
+Pixels = UInt8[np.ndarray, "_ _ 3"]
 
 
 def missing() -> str | None:
@@ -33,7 +33,7 @@ def missing() -> str | None:
     return None
 
 
-def write_video(path: Path, frames: Iterable[Frame], *, fps: float) -> None:
+def write_video(path: Path, frames: Iterable[Pixels], *, fps: float) -> None:
     """Write the frames into an MP4 file while they come; the file takes its name when it is whole.
 
     Args:

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from clear_strategies.data.capture import Capture
+from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.hr_limit import within_limit
-from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.prepare import prepare
 from clear_strategies.data.priors import Bicubic
 from clear_strategies.data.view_settings import ViewSettings

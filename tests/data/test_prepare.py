@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from clear_strategies.data.capture import Capture, Frame
+from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.photo_files import write_png
-from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.prepare import check_headers, prepare, save_lr
 from clear_strategies.data.priors import Bicubic
 from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split

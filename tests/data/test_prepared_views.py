@@ -13,7 +13,7 @@ from PIL import Image
 from clear_strategies.core import images
 from clear_strategies.core.view import DepthMap
 from clear_strategies.data.capture import Capture
-from clear_strategies.data.points import CloudSettings
+from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.prepare import prepare
 from clear_strategies.data.priors import BackProjected, Bicubic, Cached, DemoPrior
 from clear_strategies.data.readers import blender, demo
@@ -82,7 +82,7 @@ def test_depth_is_that_of_the_hr_side_where_it_is_photos_and_else_of_lr(
         asked.append(stereo.window)
         return [DepthMap(torch.full(p.image.shape[:2], 4.0), torch.ones(p.image.shape[:2])) for p in photos]
 
-    monkeypatch.setattr("clear_strategies.data.points.compared.depth_maps", depth_maps)
+    monkeypatch.setattr("clear_strategies.data.cloud.compared.depth_maps", depth_maps)
     cloud = CloudSettings(init="stereo", stereo=StereoSettings(max_pixels=max_pixels))
     scene = prepare(ROOM, ViewSettings(photos_are=photos_are, train=2), Bicubic(), cloud)
     assert asked == windows

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from clear_strategies.core.view import Photo
-from clear_strategies.data.points import CloudSettings, initial_points
+from clear_strategies.data.cloud import CloudSettings, initial_points
 from clear_strategies.data.readers import demo
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.geometry import Stereo, StereoSettings, depth_maps, stereo

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from clear_strategies.data.capture import Capture
-from clear_strategies.data.points import CloudSettings
+from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.view_settings import ViewSettings
 from tests.helpers.captures import in_a_row
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from clear_strategies import GCO, P2G, Conductor
-from clear_strategies.data.cameras import pose_from_opengl
+from clear_strategies.data.lenses import pose_from_opengl
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.priors import Bicubic, Cached, Images
 from clear_strategies.errors import DataError, SettingError

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from clear_strategies.compose import tree
-from clear_strategies.data.points import CloudSettings
+from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.priors import Bicubic, Corrupted, DemoPrior, Ncnn, ncnn
 from clear_strategies.data.readers import blender, colmap, demo, llff, nerfstudio
 from clear_strategies.data.scene import Scene

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from clear_strategies import PseudoViews
-from clear_strategies.data.points import CloudSettings
+from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.prepare import prepare
 from clear_strategies.data.priors import Bicubic
 from clear_strategies.data.readers import demo

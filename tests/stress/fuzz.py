@@ -26,8 +26,8 @@ import numpy as np
 import torch
 
 from clear_strategies.data import ply
-from clear_strategies.data.cameras import Lens
 from clear_strategies.data.capture import Capture
+from clear_strategies.data.lenses import Lens
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.readers import colmap, colmap_model, llff, nerfstudio
 from clear_strategies.errors import DataError

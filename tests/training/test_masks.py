@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from clear_strategies.core.view import Photo, View
-from clear_strategies.data.cameras import Lens
 from clear_strategies.data.capture import Capture, Frame
+from clear_strategies.data.cloud import CloudSettings, initial_points
+from clear_strategies.data.lenses import Lens
 from clear_strategies.data.photo_files import write_png
-from clear_strategies.data.points import CloudSettings, initial_points
 from clear_strategies.data.prepare import prepare
 from clear_strategies.data.priors import Bicubic
 from clear_strategies.data.view_settings import ViewSettings

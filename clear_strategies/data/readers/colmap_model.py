@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from clear_strategies.data.cameras import FARTHEST, Lens
+from clear_strategies.data.lenses import FARTHEST, Lens
 from clear_strategies.errors import DataError
 from clear_strategies.files import read_bytes
 from rasterizers.geometry import rotation_matrix

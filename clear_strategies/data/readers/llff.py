@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from clear_strategies.core.checks import as_color, require_choice
-from clear_strategies.data.cameras import Lens, rigid_inverse
 from clear_strategies.data.capture import BLACK, Capture, Frame, lens_notes, sorted_by_name
+from clear_strategies.data.lenses import Lens, rigid_inverse
 from clear_strategies.data.photo_folders import folder_note, image_folder, list_images, usable
 from clear_strategies.data.readers import colmap
 from clear_strategies.data.readers.colmap_model import Model, find_model, read_model

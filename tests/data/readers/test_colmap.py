@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from clear_strategies.data import photo_files
-from clear_strategies.data.cameras import Lens
+from clear_strategies.data.lenses import Lens
 from clear_strategies.data.readers import colmap
 from tests.helpers import captures as tiny
 

@@ -10,9 +10,9 @@ import torch
 
 from clear_strategies.core import images
 from clear_strategies.core.view import Photo
+from clear_strategies.data.cloud import CloudSettings, from_tracks, initial_points, random_cloud
+from clear_strategies.data.cloud.compared import compared_at
 from clear_strategies.data.ply import write_points
-from clear_strategies.data.points import CloudSettings, from_tracks, initial_points, random_cloud
-from clear_strategies.data.points.compared import compared_at
 from clear_strategies.data.readers import llff
 from clear_strategies.data.view_settings import ViewSettings, split
 from clear_strategies.errors import DataError
@@ -69,7 +69,7 @@ def test_sr_images_of_few_photos_only_are_compared(monkeypatch) -> None:
         compared.append(photos[0].camera.width)
         return depth_maps(photos, *arguments)
 
-    monkeypatch.setattr("clear_strategies.data.points.compared.depth_maps", recorded)
+    monkeypatch.setattr("clear_strategies.data.cloud.compared.depth_maps", recorded)
     for n in (5, 6):
         initial_points(CloudSettings(init="stereo", densify=False), lr[:n], hr=hr[:n])
     assert compared == [32, 64, 32]

@@ -17,8 +17,8 @@ from clear_strategies.core.checks import refuse, require_choice, require_number,
 from clear_strategies.core.points import MAX_POINTS, PointCloud
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.capture import SfmPoints
+from clear_strategies.data.cloud.compared import blackened, compared_at, shown_pixels
 from clear_strategies.data.ply import read_points
-from clear_strategies.data.points.compared import blackened, compared_at, shown_pixels
 from clear_strategies.errors import DataError
 from clear_strategies.geometry.cameras import common_box
 from clear_strategies.geometry.cleaning import OUTLIER_NEIGHBOURS, OUTLIER_RATIO, voxel_grid, without_outliers
