@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from clear_strategies import GCO, P2G, SplatSuRe
+from clear_strategies import SplatSuRe
 from clear_strategies.core.checks import as_color, require_choice, require_number, require_whole
 from clear_strategies.data.readers import blender, colmap, demo, llff, nerfstudio, photos
 from clear_strategies.errors import SettingError
 from clear_strategies.geometry import StereoSettings
 from clear_strategies.geometry.sift import TriangulationSettings
-from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
+from clear_strategies.schedules import LogLinear, WarmupDecay
 
 
 @pytest.mark.parametrize("value", [2.5, 4.0, True, None, "4", math.nan, 0])
@@ -87,11 +87,8 @@ REFUSED: dict[Callable[..., object], dict[str, object]] = {
         "enlarge": 0, "max_features": 0, "contrast": 0.0, "ratio": 1.1, "epipolar": -1.0, "reprojection": math.nan, "angle": 0.0,
     },
     SplatSuRe: {"ratio": 0.9, "softness": 0.0, "min_views": 0},
-    GCO: {"groups": (), "weight_min": 0.9},
-    P2G: {"reliability_scale": "relative:0"},
-    WarmupDecay: {"start": 4_000, "peak": -1.0},
-    Ramp: {"maximum": 1.0},
-    LogLinear: {"initial": 0.0, "final": 101.0},
+    WarmupDecay: {"peak": -1.0},
+    LogLinear: {"final": 101.0},
 }  # fmt: skip
 
 

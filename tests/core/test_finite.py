@@ -93,21 +93,8 @@ def test_a_gradient_that_is_not_finite_is_named_before_the_step(begun, name, bad
 def test_a_run_that_meets_nan_saves_the_state_before_and_says_where(tmp_path):
     state = start(NAMES)
     state.views = without_a_pixel(float("nan"), "hr").train
-    with pytest.raises(DivergedError, match=r"first pixel \(5, 3\). The state before that step is .*step_\d+. Check"):
+    with pytest.raises(DivergedError, match=r"first pixel \(5, 3\). The state before that step is .*step_\d+\.safetensors. Check"):
         fit(state, SCENE, toy.RASTERIZER, checkpoints=tmp_path)
     saved = checkpoint.load(tmp_path)
     assert saved.t == state.t == len(saved.history) + 1
     assert_same(dict(saved.tensors), tensors(state))
-
-
-def test_what_is_not_finite_is_named_before_a_save_and_before_densification():
-    """`tests.stress.lifecycle` damages every tensor."""
-    state = start(())
-    state.field.opacities.data[3] = state.optimizer.second["scales"][4, 1] = float("inf")
-    with pytest.raises(DivergedError, match="before t=1: opacities is not finite for 1 Gaussians, first Gaussian 3"):
-        state.checkpoint({})
-    with pytest.raises(DivergedError, match=r"before densification, the parameter of opacities .* first Gaussian 3"):
-        state.density.restructure(state.field, state.optimizer, 5)
-    state.field.opacities.data[3] = 0.0
-    with pytest.raises(DivergedError, match="second moment of scales is not finite for 1 Gaussians, first Gaussian 4"):
-        state.checkpoint({})

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from tests.helpers.backends import CLEAN, EVERY, why_not
-from tests.stress import bad_inputs, checkpoints, faults, fuzz, gco, kills, lifecycle, projection, sanitizers, soak
+from tests.stress import bad_inputs, checkpoints, faults, fuzz, gco, kills, lifecycle, projection, soak
 from tests.stress.rows import HEADER, Row
 
 _log = logging.getLogger("tests.stress")
@@ -30,13 +30,6 @@ def _projection(share: float, _: Path) -> Iterator[Row]:
     return projection.measure(drawing, every=round(1 / share))
 
 
-def _sanitizers(_: float, folder: Path) -> Iterable[Row]:
-    if reason := sanitizers.why_not():
-        _log.info("sanitizers: left out, %s", reason)
-        return []
-    return sanitizers.measure(folder)
-
-
 MEASUREMENTS: dict[str, Callable[[float, Path], Iterable[Row]]] = {
     "projection": _projection,
     "gco": lambda share, folder: gco.measure(),
@@ -49,7 +42,6 @@ MEASUREMENTS: dict[str, Callable[[float, Path], Iterable[Row]]] = {
         fuzz.measure(targets, round(n * share), processes=os.cpu_count() or 1) for targets, n in _MUTANTS.items()
     ],
     "soak": lambda share, folder: soak.measure(round(10_000 * share)),
-    "sanitizers": _sanitizers,
 }
 
 

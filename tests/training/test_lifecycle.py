@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clear_strategies import SVS, Conductor, Update
+from clear_strategies import SVS, Update
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import Photo
@@ -170,18 +170,6 @@ def test_an_error_names_each_setting_that_pruned_too_many(prune_world):
     with pytest.raises(DensityError, match=r"leave 0 of 12 .* Lower density.prune_opacity=0.99") as error:
         density.restructure(field, optimizer, 10)
     assert ("raise density.prune_world=1e-06" in str(error.value)) is (prune_world is not None)
-
-
-def test_an_anchor_follows_a_reordering_of_its_gaussians():
-    svs = SVS(anchor_start=1, anchor_strength=0.01)
-    conductor = Conductor(svs)
-    conductor.on_fit_start(3, 0)
-    field, _, _ = tagged()
-    conductor.after_step(field.raw(), toy.step(1))
-    order = torch.randperm(12, generator=torch.Generator().manual_seed(0))
-    field.take(order, torch.zeros(12, dtype=torch.bool))
-    conductor.on_resize(order)
-    assert all(not g.any() for g in svs.regularize(field.raw(), 2).values())
 
 
 def test_adam_is_torchs_adam():
