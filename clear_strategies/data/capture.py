@@ -181,6 +181,8 @@ def _load(path: Path, lens: Lens, pinhole: Lens, background: Color | None, turn:
 
 
 def _mask_of(path: Path, photos: Path) -> Path | None:
+    if not path.is_relative_to(photos):
+        return None
     folder = photos.parent / "masks" / path.parent.relative_to(photos)
     return next((m for m in (folder / f"{path.stem}.png", folder / f"{path.name}.png") if m.is_file()), None)
 

@@ -119,7 +119,7 @@ def frames_of(
     photos: Sequence[tuple[str, Path, str | None]],
     folder: Path | None = None,
     *,
-    background: Color | None,
+    background: Color,
     skip_faulty: bool,
 ) -> list[Frame]:
     """The frames of a file whose photos can be used.
