@@ -32,8 +32,8 @@ def project(camera: Camera, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor,
 
 def inside_of(camera: Camera, pixels: Float[Tensor, "N 2"], depth: Float[Tensor, " N"]) -> Bool[Tensor, " N"]:
     """Whether points that project to these pixels, at these depths, lie in the camera's image."""
-    size = torch.tensor([camera.width, camera.height])
-    return (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
+    x, y = pixels.unbind(dim=1)  # by column: `all` along rows of two takes twice as long
+    return (depth > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
 
 
 def seen_pixels(
