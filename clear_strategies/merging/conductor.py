@@ -66,6 +66,7 @@ class Conductor:
         self.skips = SkipPolicy(skips)
         self.decorated = not self.decorators
         self.work_log = WorkLog()
+        self._hr_cotangents: Tensor | None = None
         self._owner = dict.fromkeys(_ONE_ANSWER, Strategy())  # its hooks hold where no strategy overrides them
         for hook in _ONE_ANSWER:
             owners = [s for s in strategies if overrides(s, hook)]
@@ -332,7 +333,9 @@ class Conductor:
         stage = self.work_log.stage
         with stage("losses HR"):
             sr = step.view.hr.over(self.background(step.t), step.view.background)
-            losses = self.objective.hr(hr.image.detach(), sr.image, sr.shown)  # Eq. 5
+            # The memory is kept: an allocator maps tens of megabytes afresh each time, at a page fault for every 4 KB.
+            losses = self.objective.hr(hr.image.detach(), sr.image, sr.shown, reuse=self._hr_cotangents)  # Eq. 5
+            self._hr_cotangents = losses.cotangents
         require_finite_losses(
             _where(step.view, step.t), losses.values, {"the SR image": sr.image, "the HR render": hr.image}
         )

@@ -93,11 +93,21 @@ class Objective:
         return self._losses({"lr": loss}, image, cotangents, shown)
 
     def hr(
-        self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None = None
+        self,
+        image: Float[Tensor, "H W 3"],
+        target: Float[Tensor, "H W 3"],
+        shown: Bool[Tensor, "H W"] | None = None,
+        reuse: Float[Tensor, "K h w 3"] | None = None,
     ) -> Losses:
-        """L_base and L_HF, two cotangents; L_base alone where λ_HF = 0. `shown` as for `lr`."""
+        """L_base and L_HF, two cotangents; L_base alone where λ_HF = 0. `shown` as for `lr`.
+
+        Args:
+            reuse: cotangents of an earlier call that are needed no more; their memory is taken where it fits.
+        """
         (compared, target), use = self._compared(image, target, shown), self.kernels
-        cotangents = compared.new_empty(2 if self.lambda_hf > 0 else 1, *compared.shape)
+        cotangents: Tensor = compared.new_empty(2 if self.lambda_hf > 0 else 1, *compared.shape)
+        if reuse is not None and all(getattr(reuse, a) == getattr(cotangents, a) for a in ("shape", "dtype", "device")):
+            cotangents = reuse
         base = kernels.photometric(compared, target, self.lambda_ssim_hr, kernels=use, out=cotangents[0])  # Eq. 5
         losses = {"base": base}
         if self.lambda_hf > 0:

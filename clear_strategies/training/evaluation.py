@@ -40,11 +40,9 @@ def loss_of_views(state: TrainState, rasterizer: Rasterizer) -> Number:
     """
     objective, losses = state.conductor.objective, []
     for view in state.views[:_VIEWS_OF_LOSS]:
+        shown, compare, name = view.lr, objective.lr, "lr"
         if objective.lambda_hr(state.t) > 0:
-            shown = state.conductor.skips.view(view, state.t).hr
-            compare, name = objective.hr, "base"
-        else:
-            shown, compare, name = view.lr, objective.lr, "lr"
+            shown, compare, name = state.conductor.skips.view(view, state.t).hr, objective.hr, "base"
         image = state.field.render(rasterizer, shown.camera)
         losses.append(compare(image, shown.image, shown.shown).values[name])
     return sum(losses) / len(losses)

@@ -193,6 +193,16 @@ def test_without_lr_photos_only_the_reference_moves_gaussians(drawn):
     assert update.losses["lr"] > 0  # measured, for the log
 
 
+def test_cotangents_take_the_memory_of_earlier_ones_of_their_shape_alone(drawn):
+    _, view, lr, hr = drawn
+    objective = Objective(lambda_hr=ALWAYS)
+    fresh = objective.hr(hr.image, view.hr.image).cotangents
+    for held, reused in ((torch.full_like(fresh, torch.nan), True), (fresh[:1].float(), False)):
+        again = objective.hr(hr.image, view.hr.image, reuse=held).cotangents
+        assert torch.equal(again, fresh)
+        assert (again.data_ptr() == held.data_ptr()) == reused
+
+
 def test_a_scale_that_the_objective_needs_is_asked_for(drawn):
     field, view, lr, hr = drawn
     with pytest.raises(ValueError, match="needs the HR scale"):
