@@ -69,8 +69,8 @@ def _descriptor() -> Any:
 
 @lru_cache(maxsize=4096)
 def structure(owner: str, kind: Any, fields: tuple[tuple[str, int, int], ...], device: str) -> Any:
-    """A Warp structure of float32 arrays given by (name, address, length), cached because describing a tensor to Warp takes longer
-    than launching a kernel. `owner` keeps structures over the same addresses apart. A launch copies the structure.
+    """A Warp structure of float32 arrays given by (name, address, length), cached because describing a tensor to Warp takes
+    longer than launching a kernel. `owner` keeps structures over the same addresses apart. A launch copies the structure.
     """
     import warp as wp
 

@@ -93,7 +93,9 @@ def test_a_gradient_that_is_not_finite_is_named_before_the_step(begun, name, bad
 def test_a_run_that_meets_nan_saves_the_state_before_and_says_where(tmp_path):
     state = start(NAMES)
     state.views = without_a_pixel(float("nan"), "hr").train
-    with pytest.raises(DivergedError, match=r"first pixel \(5, 3\). The state before that step is .*step_\d+\.safetensors. Check"):
+    with pytest.raises(
+        DivergedError, match=r"first pixel \(5, 3\). The state before that step is .*step_\d+\.safetensors. Check"
+    ):
         fit(state, SCENE, toy.RASTERIZER, checkpoints=tmp_path)
     saved = checkpoint.load(tmp_path)
     assert saved.t == state.t == len(saved.history) + 1

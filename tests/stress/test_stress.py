@@ -20,7 +20,7 @@ from tests.stress.__main__ import main
 from tests.stress.bad_inputs import BadInput
 from tests.stress.rows import Worst
 
-MUTANTS = {fuzz.binary: 10_000, fuzz.text: 1_000, fuzz.scenes: 100}  # of each file
+MUTANTS = {fuzz.binary: 5_000, fuzz.text: 500, fuzz.scenes: 50}  # of each file
 
 
 def test_single_gaussians_agree_with_float64() -> None:

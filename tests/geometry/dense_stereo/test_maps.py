@@ -46,7 +46,7 @@ def test_a_few_points_choose_the_photos_that_all_points_would_choose(monkeypatch
 
 @pytest.mark.slow
 def test_the_bits_do_not_depend_on_the_number_of_threads() -> None:
-    photos, threads = photos_of(bump, 2, (200, 170)), torch.get_num_threads()
+    photos, threads = photos_of(bump, 2, (100, 85)), torch.get_num_threads()
     settings = StereoSettings(max_planes=8, speckle=0)  # so few planes give speckles alone
     result = []
     try:
