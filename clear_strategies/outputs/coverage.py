@@ -51,7 +51,7 @@ def write_coverage(path: Path, scene: Scene, painter: Painter, title: str) -> No
     flat, centers, ahead = (x.numpy() @ plane for x in (points.double(), places, poses[:, 2]))
     for seen in reversed(range(_ENOUGH + 1)):
         x, y = flat[(times == seen).numpy()].T
-        axis.scatter(x, y, s=2, color=_COLORS[seen], linewidths=0)
+        axis.scatter(x, y, s=4, color=_COLORS[seen], linewidths=0)
     axis.quiver(*centers.T, *ahead.T, color=figures.INK, angles="xy", scale=18, width=0.005)
     low, high = np.quantile(flat, (_CROP, 1 - _CROP), axis=0) if len(flat) else (centers.min(0), centers.max(0))
     low, high = np.minimum(low, centers.min(0)), np.maximum(high, centers.max(0))

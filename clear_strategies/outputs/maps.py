@@ -126,7 +126,8 @@ def _write_picture(path: Path, view: View, found: ViewMaps) -> None:
         ("SR image\nwhat the prior made of it", view.hr.image, "", (0.0, 1.0)),
     ]
     for name in (name for name in MAPS if name in found.maps):
-        panels.append((f"{MAPS[name]} (mean {found.means[name]:.2f})", found.maps[name], "viridis", (0.0, 1.0)))
+        title = MAPS[name].replace("\n", f", mean {found.means[name]:.2f}\n")
+        panels.append((title, found.maps[name], "viridis", (0.0, 1.0)))
     if (stereo := view.depth) is not None:
         depth, confidence = (x.where(stereo.known, torch.nan) for x in (stereo.depth, stereo.confidence))
         scale = film.DepthScale.spanning(depth)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import html
 import logging
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import pandas as pd
@@ -122,17 +122,17 @@ def _by_scene(runs: Sequence[Run]) -> dict[str, list[Run]]:
 def _single(runs: Sequence[Run]) -> list[dict[str, Any]]:
     """Of one scene: a row for each run of a method, after one for each baseline of each run.
 
-    `identity`, of an average: name and settings without the `data` settings that all runs of the scene share, which describe
-    the scene.
+    `key` is name and settings, a line each; `identity`, the key of an average, leaves out the `data` settings that all runs of
+    the scene share, which describe the scene.
     """
     shared = shared_settings(runs)
     of_scene = [s for s in shared if _is_input(s, ("data",))]
 
     def row(run: Run, name: str, settings: Sequence[str], known: Sequence[str]) -> dict[str, Any]:
-        identity = (name, *sorted(s for s in settings if s not in of_scene))
+        identity = "\n".join((name, *sorted(s for s in settings if s not in of_scene)))
         facts = {"scene": run.scene, "marks": run.marks, "name": name, "seed": run.seed, "identity": identity}
         facts["run"] = None if name in BASELINES else run
-        return {**facts, "method": _label(name, settings, known), "key": (name, *sorted(settings))}
+        return {**facts, "method": _label(name, settings, known), "key": "\n".join((name, *sorted(settings)))}
 
     rows = []
     for baseline in BASELINES:
@@ -183,8 +183,8 @@ def _average(single: pd.DataFrame, title: str) -> pd.DataFrame:
     table = single.groupby("identity", sort=False)[["name", "baseline"]].first().assign(average=True, runs=0, seeds="")
     # A quantity that one scene lacks has no average.
     table = table.join(means.mean().where(means.count() == scenes))
-    shared = _in_all([settings for (name, *settings) in table.index[~table["baseline"]]])
-    table["method"] = [_label(name, settings, shared) for (name, *settings) in table.index]
+    shared = _in_all([identity.split("\n")[1:] for identity in table.index[~table["baseline"]]])
+    table["method"] = [_label(name, settings, shared) for name, *settings in table.index.str.split("\n")]
     table = table.join(_differences(single, "identity", table["psnr"])).assign(scene=title)
     return table.sort_values("baseline", ascending=False, kind="stable").reset_index(drop=True)
 
@@ -196,7 +196,7 @@ def _differences(single: pd.DataFrame, key: str, means: pd.Series[float]) -> pd.
     methods = single[~single["baseline"]]
     # A method whose PSNR is never finite has a column as well.
     by_seed = methods.groupby([key, "scene", "seed"], sort=False)["psnr"].mean().unstack(key, sort=False)
-    first: Hashable = methods[key].iloc[0]
+    first = methods[key].iloc[0]
     pairs = by_seed.sub(by_seed[first], axis=0)
     table = pd.DataFrame(
         {"psnr_delta": pairs.mean(), "psnr_delta_error": pairs.sem(), "psnr_delta_pairs": pairs.count()}
