@@ -193,7 +193,7 @@ class Sampler:
 
 
 def _turned(w: Float[Tensor, "N 1"], u: Float[Tensor, "N 3"], v: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    """v turned by the unit quaternion (w, u), in a third of the time of its matrix: v + 2 (w u × v + u × (u × v))."""
+    """V turned by the unit quaternion (w, u), in a third of the time of its matrix: v + 2 (w u × v + u × (u × v))."""
     across = torch.linalg.cross(u, v)
     return v + 2 * (w * across + torch.linalg.cross(u, across))
 

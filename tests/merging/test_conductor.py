@@ -194,7 +194,7 @@ def test_without_lr_photos_only_the_reference_moves_gaussians(drawn):
 
 
 def test_cotangents_take_the_memory_of_earlier_ones_of_their_shape_alone(drawn):
-    _, view, lr, hr = drawn
+    _, view, _, hr = drawn
     objective = Objective(lambda_hr=ALWAYS)
     fresh = objective.hr(hr.image, view.hr.image).cotangents
     for held, reused in ((torch.full_like(fresh, torch.nan), True), (fresh[:1].float(), False)):
