@@ -15,8 +15,9 @@ from torch import Tensor
 
 import rasterizers
 from clear_strategies import GCO, P2G, SVS, Conductor, RandomBackground
+from clear_strategies.core.conflicts import conflict_ratio
 from clear_strategies.core.evidence import PatchMaps
-from clear_strategies.core.gradients import Grads, conflict_ratio
+from clear_strategies.core.gradients import Grads
 from clear_strategies.core.view import DepthMap, View
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.merging.objective import Objective
