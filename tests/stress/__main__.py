@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
@@ -38,9 +37,7 @@ MEASUREMENTS: dict[str, Callable[[float, Path], Iterable[Row]]] = {
     "kills": lambda share, folder: [kills.measure(folder, round(200 * share))],
     "integrity": lambda share, folder: [checkpoints.integrity(folder, round(100_000 * share))],
     "inputs": lambda share, folder: [bad_inputs.measure(folder)],
-    "fuzz": lambda share, folder: [
-        fuzz.measure(targets, round(n * share), processes=os.cpu_count() or 1) for targets, n in _MUTANTS.items()
-    ],
+    "fuzz": lambda share, folder: [fuzz.measure(targets, round(n * share)) for targets, n in _MUTANTS.items()],
     "soak": lambda share, folder: soak.measure(round(10_000 * share)),
 }
 

@@ -1,8 +1,4 @@
-"""Random damage to the files that are read: what comes back is sound or a DataError, at once and in little memory.
-
-Mutants come in blocks, each with a seed of its own, so that any number of processes makes the same ones: `mutants("PLY", 3,
-good)` gives those of the format's fourth block again.
-"""
+"""Random damage to the files that are read: what comes back is sound or a DataError, at once and in little memory."""
 
 from __future__ import annotations
 
@@ -38,7 +34,6 @@ from tests.stress.rows import Row
 
 _SECONDS = 0.1  # that one input may take
 _MEMORY = 2**30  # bytes beyond those of before
-_BLOCK = 10_000  # mutants
 _EXTREMES = (b"\0", b"\x7f", b"\x80", b"\xff")
 _LONGEST = 8  # bytes of one edit
 
@@ -48,9 +43,9 @@ Targets = Callable[[Path], dict[str, Target]]
 """Writes good files to a folder: format -> target."""
 
 
-def mutants(name: str, block: int, good: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
-    """(which of the `good` files, its damaged content), without end."""
-    rng = random.Random(f"{name} {block}")  # noqa: S311 - no secret
+def mutants(name: str, good: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
+    """(which of the `good` files, its damaged content), without end; the same ones each time."""
+    rng = random.Random(name)  # noqa: S311 - no secret
     while True:
         which = int(rng.random() * len(good))
         yield which, _mutant(good[which], rng.random)
@@ -169,39 +164,30 @@ def _require_capture(capture: Capture) -> None:
         _require(set(capture.points.track_image.tolist()) <= {frame.sfm_id for frame in capture.frames})
 
 
-def measure(targets: Targets, count: int, *, only: Sequence[str] | None = None, processes: int = 0) -> Row:
-    """How many of the first `count` mutants of each file gave an unsound result, another error, or took too much.
+def measure(targets: Targets, count: int) -> Row:
+    """How many of the first `count` mutants of each format gave an unsound result, another error, or took too much.
 
-    Args:
-        only: some of the files; None: all. processes: that share the mutants; 0: this one reads them.
+    Each format is read in a process of its own, without the checks of types that tests run with.
     """
-    names = list(_written(targets)[1]) if only is None else only
-    failed, first = 0, "none"
-    with ExitStack() as stack:
-        spread: Callable[..., Iterable[tuple[int, str]]] = map
-        if processes:
-            spawn = multiprocessing.get_context("spawn")
-            spread = stack.enter_context(ProcessPoolExecutor(processes, mp_context=spawn)).map
-        for name in names:
-            starts = range(0, count, _BLOCK)
-            counts = [min(_BLOCK, count - start) for start in starts]
-            for n, where in spread(_block, repeat(targets), repeat(name), range(len(starts)), counts):
-                failed, first = failed + n, f"{name}: {where}" if n and not failed else first
+    names, failed, first = list(_written(targets)[1]), 0, "none"
+    with ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn")) as pool:
+        for name, (n, where) in zip(names, pool.map(damaged, repeat(targets), names, repeat(count)), strict=True):
+            failed, first = failed + n, f"{name}: {where}" if n and not failed else first
     what = f"damaged files, {targets.__name__}: unsound, untyped or slow"
     return Row(what, "all", count * len(names), float(failed), 0, first)
 
 
-def _block(targets: Targets, name: str, block: int, count: int) -> tuple[int, str]:
-    """How many of a block's first `count` mutants failed, and which was the first."""
+def damaged(targets: Targets, name: str, count: int) -> tuple[int, str]:
+    """How many of a format's first `count` mutants failed, and which was the first."""
     paths, read = _written(targets)[1][name]
     read()  # the first call imports and allocates what later ones do not
     good, failed, first = [path.read_bytes() for path in paths], 0, "none"
     with _bounded_memory(), _without_messages(), ExitStack() as stack:
         files = [stack.enter_context(path.open("r+b", buffering=0)) for path in paths]
-        for i, (which, data) in enumerate(islice(mutants(name, block, good), count)):
+        for i, (which, data) in enumerate(islice(mutants(name, good), count)):
             _replace(files[which], data)
             if _fails(read):
-                failed, first = failed + 1, f"mutant {i} of block {block}" if failed == 0 else first
+                failed, first = failed + 1, f"mutant {i}" if failed == 0 else first
             _replace(files[which], good[which])
     return failed, first
 
