@@ -31,20 +31,21 @@ from jaxtyping import Int
 from torch import Tensor
 
 from clear_strategies.core import deferred
-from clear_strategies.core.gradients import Grads, conflict_columns
+from clear_strategies.core.gradients import conflict_columns
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
 from clear_strategies.errors import HostError, SettingError
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.merging.iteration import HrGradients, only
-from integration.autograd_shot import HostOutput, RenderAt
+from clear_strategies.merging.in_place import InPlaceMerge, RoutedGradients
+from clear_strategies.merging.iteration import HrGradients
+from integration.autograd_shot import AutogradShot, DrawnGradients, HostOutput, RenderAt
 from integration.extra_steps import ExtraSteps
 from integration.host_score import ScoreScaler, write_score
 from integration.views import by_name, enlarged_mask
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
-_LOGGED_EVERY: Final = 500  # merges between two lines of the log
+_LOGGED_EVERY: Final = 100  # merges between two lines of the log
 _PATIENCE: Final = 10  # steps with a gradient of f_det, before a warning that none was made on it
 
 
@@ -63,6 +64,7 @@ class Attachment:
         accumulation: backward passes per optimizer step, each of 1/accumulation of the loss.
         masks: [h, w] by the name of a view, what the host multiplies its LR image by; the HR image is multiplied here.
         own_background: the host chooses the colour behind its renderings; `background` then counts for nothing.
+        reads_score: the host's densifier reads the screen gradient.
 
     Attributes:
         t: the current iteration, from 1.
@@ -84,11 +86,12 @@ class Attachment:
         accumulation: int = 1,
         masks: Mapping[str, Tensor] | None = None,
         own_background: bool = True,
+        reads_score: bool = True,
     ) -> None:
         _require_supported(conductor, accumulation)
         self._views = by_name(views)
         self.conductor, self.params, self.accumulation = conductor, params, accumulation
-        self._masks, self._own_background = dict(masks or {}), own_background
+        self._masks, self._own_background, self._reads_score = dict(masks or {}), own_background, reads_score
         self.t = 1
         self.counts: Counter[str] = Counter()
         self.removed = False
@@ -98,7 +101,9 @@ class Attachment:
         self._passes = 0  # backward passes of this iteration
         self._merges_before_step = 0  # at the host's last step
         self._detail_gradients = 0
-        self._pending: tuple[int, HostOutput, HrGradients[Grads] | None] | None = None  # rendered, not merged yet
+        # What is rendered and not merged yet.
+        self._pending: tuple[int, HostOutput, HrGradients[DrawnGradients] | None, RoutedGradients | None] | None = None
+        self._merge_in_place = InPlaceMerge(conductor)
         self._step: Step | None = None  # of the rendering, until `after_step`
         self._extra = ExtraSteps(conductor, params)
         self._grads_before: dict[str, Tensor] = {}  # .grad when the backward pass began
@@ -116,24 +121,29 @@ class Attachment:
         z = conductor.gate(t, self._n)
         if z is not None:
             z = z.to(means)
-        hr_grads = None
+        hr = routed = None
         if conductor.wants_hr(t):
             self.counts["HR renders"] += 1
+            view = conductor.skips.view(view, t)
             with _random_state_kept(means.device):
-                shot = render_at("hr", z).shot
+                shot = render_at("hr", z, view).shot
             if (mask := self._masks.get(view.name)) is not None:
                 shot = replace(shot, image=shot.image * enlarged_mask(mask.to(shot.image), view.factor)[..., None])
-            hr_grads = conductor.hr_gradients(shot, view, t)
-        self._step = Step(t, view) if hr_grads is None else hr_grads.step
+            hr = conductor.hr_gradients(
+                shot, view, t, AutogradShot.gradients, apart=shot.drawing is not None or "detail" in shot.params
+            )
+            if conductor.objective.lambda_hr(t) > 0:
+                routed = shot.routed(hr, conductor.objective.lambda_hf)
+        self._step = Step(t, view) if hr is None else hr.step
         if self._passes == 0:  # one step of the host, however many passes it accumulates
             self._extra.forget()
             if extra_views := conductor.extra_views(t):
                 with _random_state_kept(means.device):
-                    self._extra.render(extra_views, t, lambda camera: render_at(camera, None).shot)
-        output = render_at("lr", z)
+                    self._extra.render(extra_views, t, lambda camera: render_at(camera, None, view).shot)
+        output = render_at("lr", z, view)
         self.counts["LR renders"] += 1
         if output.hooked.requires_grad:
-            self._pending = (nth := self.counts["LR renders"]), output, hr_grads
+            self._pending = (nth := self.counts["LR renders"]), output, hr, routed
             output.hooked.register_hook(_called_at(WeakMethod(self._on_backward), nth))  # type: ignore[no-untyped-call]
         return output.returned
 
@@ -180,7 +190,7 @@ class Attachment:
     @property
     def log(self) -> dict[str, float]:
         """Scalars of the last iteration. On a device, reading them waits for the device."""
-        return deferred.resolve([self._logged])[0]
+        return deferred.resolve([self._logged | self.conductor.logs()])[0]
 
     def remove(self) -> None:
         """Stop: the host's renderings pass through, and the gradients of one that is still pending stay unmerged."""
@@ -255,11 +265,12 @@ class Attachment:
         self._versions_before = self._grad_versions()
         centres = self._pending[1].shot.gradient_slot.tensor
         screen_gradients: list[Tensor] = []
-        if centres.requires_grad:
+        hook: Any = None
+        if self._reads_score and centres.requires_grad:
             hook = centres.register_hook(screen_gradients.append)  # type: ignore[no-untyped-call]
 
         def on_backward_end() -> None:
-            if centres.requires_grad:
+            if hook is not None:
                 hook.remove()
             self._merge(screen_gradients[0] if screen_gradients else None)
 
@@ -273,32 +284,30 @@ class Attachment:
         """
         if self._pending is None or ((versions := self._grad_versions()) and versions == self._versions_before):
             return
-        (_, output, hr_grads), self._pending = self._pending, None
-        grad_scale = (self._loss_scale() if self._loss_scale is not None else 1.0) / self.accumulation
-        trained = {name: p for name, p in self.params().items() if p.grad is not None or name == "detail"}
-        g_lr = Grads({
-            name: self._grad_of_this_pass(name, p.grad) * (1 / grad_scale) for name, p in trained.items() if p.grad is not None
-        })  # fmt: skip
-        values = {name: p.detach() for name, p in trained.items()}
-        hr_trained = None if hr_grads is None else only(hr_grads, trained)
-        merged = self.conductor.merge(values, g_lr, hr_trained, self.t)
-        if "detail" in merged.grads:
-            self._decay_detail(trained["detail"])
-        for name, p in trained.items():
-            # Without HR the gradient of f_det is 0 and not None, so that its Adam counts every step.
-            g = merged.grads[name] * grad_scale if name in merged.grads else torch.zeros_like(p)
-            p.grad = (g + self._grads_before[name] if name in self._grads_before else g).to(p)
-        if screen_gradient is not None and hr_grads is not None:
-            scores = partial(self.conductor.scores, hr=hr_grads, t=self.t)
-            if write_score(output.shot, screen_gradient / grad_scale, scores, self._scaler, grad_scale):
+        (_, output, hr, routed), self._pending = self._pending, None
+        params = self.params()
+        for name, p in params.items():
+            if p.grad is not None and p.grad.is_sparse:
+                raise HostError(
+                    f"{name}.grad is sparse, but the gradients of all Gaussians are merged. In gsplat: "
+                    "rasterization(sparse_grad=False)."
+                )
+        scale = (self._loss_scale() if self._loss_scale is not None else 1.0) / self.accumulation
+        conflict = self._merge_in_place(
+            params, routed, self.t, before=self._grads_before, scale=scale, must_be_finite=self._loss_scale is None
+        )
+        if "detail" in params and hr is not None and hr.hf is not None:
+            self._decay_detail(params["detail"])
+        if screen_gradient is not None and hr is not None:
+            scores = partial(self.conductor.scores, hr=hr, t=self.t)
+            if write_score(output.shot, screen_gradient / scale, scores, self._scaler, scale):
                 self.counts["scores written"] += 1
         self._grads_before = {}
         self._passes += 1
         self.counts["merges"] += 1
         λ = self.conductor.objective.lambda_hr(self.t)
-        losses = {} if hr_grads is None else hr_grads.losses
-        self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **self.conductor.logs()}
-        self._logged |= conflict_columns(merged.conflict)
+        losses = {} if hr is None else hr.losses
+        self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **conflict_columns(conflict)}
         if self.counts["merges"] % _LOGGED_EVERY == 0:
             now = self.log
             losses_now = ", ".join(f"L_{name} {now[name]:.4f}" for name in losses) or "no HR"
@@ -321,14 +330,6 @@ class Attachment:
         """What changes with every gradient of the Gaussians; empty where all of them are frozen."""
         trained = [p.grad for name, p in self.params().items() if p.requires_grad and name != "detail"]
         return [(0, 0) if g is None else (id(g), g._version) for g in trained]
-
-    def _grad_of_this_pass(self, name: str, grad: Tensor) -> Tensor:
-        if grad.is_sparse:
-            raise HostError(
-                f"{name}.grad is sparse, but the gradients of all Gaussians are merged. In gsplat: "
-                "rasterization(sparse_grad=False)."
-            )
-        return grad - self._grads_before[name] if name in self._grads_before else grad
 
 
 def _require_supported(conductor: Conductor, accumulation: int) -> None:
@@ -359,6 +360,8 @@ def _announce(conductor: Conductor, views: Sequence[View], *, own_background: bo
             "%s has no effect: the views were made without it. Make them with sr=conductor.prior(sr).",
             ", ".join(getattr(getattr(d, "func", d), "__name__", str(d)) for d in conductor.decorators),
         )
+    for phrase in conductor.skips.descriptions(views, in_host=True):
+        _log.info("Skipped: %s.", phrase)
     for hook, reason in {
         "densifier": "keeps its own density control",
         **({"background": "chooses its background itself"} if own_background else {}),

@@ -1,16 +1,22 @@
-"""What a host renders, as a `Shot`: gradients come from `torch.autograd.grad` through the host's own graph."""
+"""What a host renders, as a `Shot`: gradients come through the host's own autograd graph."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from clear_strategies.core.gradients import Grads
+from clear_strategies.core.gradients import Grads, scale_rows
+from clear_strategies.core.view import View
+from clear_strategies.kernels.merge import Colour
+from clear_strategies.merging.in_place import RoutedGradients, dense
+from clear_strategies.merging.iteration import HrGradients
+from rasterizers.autograd import Drawing
+from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera
 
 
@@ -62,8 +68,26 @@ class ScreenGradientSlot:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class DrawnGradients:
+    """∇ of one cotangent with respect to what the rasterizer was given.
+
+    Args:
+        values: by the names of `AutogradShot.drawn`; of this package's rasterizers means, quats, scales, opacities and rgb.
+        screen: the screen gradient, 1/pixel. basis: Y, where the gradient of the spherical harmonics is Y ⊗ rgb.
+    """
+
+    values: dict[str, Tensor]
+    screen: Float[Tensor, "N 2"]
+    basis: Float[Tensor, "N B1"] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class AutogradShot:
     """A rendering by a host, differentiable by autograd.
+
+    Gradients are taken in two parts: from the image to what the rasterizer was given, which costs a backward pass of the
+    rasterizer, and from there through the host's activations to the raw parameters. Since both parts are linear and each Gaussian
+    is activated by itself, cotangents are weighted by Gaussian between the two, and the second is passed once.
 
     Args:
         image: a function of `params` and of the tensor that holds the screen gradient.
@@ -71,6 +95,8 @@ class AutogradShot:
         visible: Gaussians that contribute to the image.
         params: raw parameters by gsplat's names. A parameter that the image does not depend on has gradient 0.
         slot: where the host keeps the screen gradient; None: the image is a function of `means2d` itself.
+        drawn: means, quats, scales, opacities and colors that the rasterizer was given; None: the raw parameters.
+        drawing: of this package's rasterizer, which takes all cotangents in one pass; None: another's.
     """
 
     image: Float[Tensor, "H W 3"]
@@ -78,6 +104,8 @@ class AutogradShot:
     visible: Bool[Tensor, " N"]
     params: Mapping[str, Tensor]
     slot: ScreenGradientSlot | None = None
+    drawn: Mapping[str, Tensor] | None = None
+    drawing: Drawing | None = None
 
     @property
     def gradient_slot(self) -> ScreenGradientSlot:
@@ -85,20 +113,151 @@ class AutogradShot:
         return self.slot or ScreenGradientSlot(self.means2d, (self.image.shape[1], self.image.shape[0]))
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
-        """One backward pass through the host's graph per cotangent; the graph is kept. Frozen parameters have gradient 0."""
-        slot, trained = self.gradient_slot, {name: p for name, p in self.params.items() if p.requires_grad}
-        frozen = {name: torch.zeros_like(p) for name, p in self.params.items() if name not in trained}
+        """∇θ of every cotangent, each with `.screen`; the graph is kept. Frozen parameters have gradient 0."""
+        results = []
+        for g in self.gradients(cotangents):
+            values, colour = self._raw(g.values, g.basis)
+            detail = self._detail(g.values)
+            if detail is not None:
+                values["detail"] = detail
+            known = dense(values, colour, self.params)
+            zeros = {name: torch.zeros_like(p) for name, p in self.params.items() if name not in known}
+            results.append(Grads(zeros | known, screen=g.screen))
+        return results
+
+    def gradients(self, cotangents: Float[Tensor, "K H W 3"]) -> list[DrawnGradients]:
+        """The first part, for every cotangent."""
+        if self.drawing is not None:
+            g = self.drawing.rendering.vjp(self._at_drawing(cotangents))
+            rows = {"means": g.means, "quats": g.quats, "scales": g.scales, "opacities": g.opacities, "rgb": g.rgb}
+            return [
+                DrawnGradients({name: x[k] for name, x in rows.items()}, g.screen[k], g.basis)
+                for k in range(len(cotangents))
+            ]
+        slot = self.gradient_slot
+        tensors = {name: x for name, x in (self.drawn or self.params).items() if x.requires_grad}
         projected = [slot.tensor] if slot.tensor.requires_grad else []  # gsplat's 3DGUT draws without projected centres
         results = []
         for cotangent in cotangents:
             gradients = torch.autograd.grad(
-                self.image, [*trained.values(), *projected], cotangent, retain_graph=True, allow_unused=True,
+                self.image, [*tensors.values(), *projected], cotangent, retain_graph=True, allow_unused=True,
                 materialize_grads=True,
             )  # fmt: skip
-            values = frozen | dict(zip(trained, gradients, strict=False))
             screen = gradients[-1] if projected else torch.zeros_like(slot.tensor)
-            results.append(Grads(values, screen=slot.per_gaussian(screen, len(self.visible))))
+            values = dict(zip(tensors, gradients, strict=False))
+            results.append(DrawnGradients(values, slot.per_gaussian(screen, len(self.visible))))
         return results
+
+    def routed(self, hr: HrGradients[DrawnGradients], lambda_hf: float) -> RoutedGradients:
+        """g^HR of the raw parameters, and the gradient of f_det."""
+        g, detail = hr.base.values, None
+        if hr.hf is not None:
+            weight = hr.m * lambda_hf  # of each Gaussian
+            detail = self._detail(hr.hf.values)
+            detail = None if detail is None else scale_rows(detail, weight)  # m ∇L_HF        Eq. 12
+            g = {
+                name: _plus_rows(value, hr.hf.values[name], weight) for name, value in g.items()
+            }  # g^HR           Eq. 13
+        values, colour = self._raw(g, hr.base.basis)
+        return RoutedGradients(values, hr.step, colour, detail)
+
+    def _raw(
+        self, g: Mapping[str, Tensor], basis: Float[Tensor, "N B1"] | None
+    ) -> tuple[dict[str, Tensor], Colour | None]:
+        """The second part: from what was drawn to the raw parameters without f_det; sh0 and shN as factors where the colours are
+        these two, side by side.
+        """
+        drawn, colour = dict(self.drawn or self.params), None
+        if self.drawing is not None and basis is not None:
+            splats, rgb = self.drawing.splats, g["rgb"]
+            drawn = {name: getattr(splats, name) for name in ("means", "quats", "scales", "opacities")}
+            if are_bands(splats.sh0, splats.shN, self.params):
+                colour = Colour(rgb, basis)
+            else:
+                drawn |= {"sh0": splats.sh0, "shN": splats.shN}
+                bands = Colour(rgb, basis).bands()
+                g = {**g, "sh0": bands[:, :1], "shN": bands[:, 1:]}
+        raw = {name: p for name, p in self.params.items() if p.requires_grad and name != "detail"}
+        direct = {name: g[name] for name, p in raw.items() if drawn.get(name) is p}
+        graph = {name: x for name, x in drawn.items() if name in g and name not in direct and x.requires_grad}
+        if not graph:
+            return direct, colour
+        rest = {name: p for name, p in raw.items() if colour is None or name not in ("sh0", "shN")}
+        through = torch.autograd.grad(
+            list(graph.values()), list(rest.values()), [g[name] for name in graph], retain_graph=True, allow_unused=True
+        )
+        values = dict(direct)
+        for name, value in zip(rest, through, strict=True):
+            if value is not None:
+                values[name] = values[name] + value if name in values else value
+        return values, colour
+
+    def _detail(self, g: Mapping[str, Tensor]) -> Float[Tensor, "N 3"] | None:
+        """The gradient of f_det, which is that of the colour."""
+        if "detail" not in self.params:
+            return None
+        if "colors" in g:
+            return g["colors"] if g["colors"].dim() == 2 else g["colors"][:, 0] / SH_C0
+        return g.get("rgb", g.get("detail"))
+
+    def _at_drawing(self, cotangents: Float[Tensor, "K H W 3"]) -> Float[Tensor, "K H W 3"]:
+        """The cotangents of what the rasterizer drew; the host may have changed it into `image`."""
+        image, drawn = self.image, self.drawing.image  # type: ignore[union-attr]
+        if image.data_ptr() == drawn.data_ptr() and image.shape == drawn.shape and image.stride() == drawn.stride():
+            return cotangents  # a view of all of it
+        return torch.stack([torch.autograd.grad(image, drawn, c, retain_graph=True)[0] for c in cotangents])
+
+
+def _plus_rows(
+    a: Float[Tensor, "N ..."], b: Float[Tensor, "N ..."], weight: float | Float[Tensor, " N"]
+) -> Float[Tensor, "N ..."]:
+    """A + weight · b, row by row."""
+    if not isinstance(weight, Tensor):
+        return torch.add(a, b, alpha=weight)
+    return torch.addcmul(a, b, weight.to(b).view(-1, *[1] * (b.dim() - 1)))
+
+
+def only_one(drawings: Sequence[Drawing]) -> Drawing | None:
+    """The drawing, where a host's render function drew once by a rasterizer of this package."""
+    return drawings[0] if len(drawings) == 1 else None
+
+
+_VIEWS: Final = frozenset(
+    {"UnsqueezeBackward0", "SqueezeBackward1", "ViewBackward0", "UnsafeViewBackward0", "ReshapeAliasBackward0"}
+)
+_SECOND: Final = (1, 2**64 - 2)  # the dimension of bands, as autograd stores 1 and -2
+
+
+def are_bands(sh0: Tensor, shN: Tensor, params: Mapping[str, Tensor]) -> bool:
+    """Whether these colours are the raw sh0, or it with an offset, and the first bands of the raw shN, so that their gradients are those
+    of the parameters. Read from the autograd graph: slices of cat((sh0, shN), 1).
+    """
+    nodes = [_sliced(x.grad_fn, start) for x, start in ((sh0, 0), (shN, 1))]
+    cat = nodes[0]
+    if cat is None or cat is not nodes[1] or cat.name() != "CatBackward0" or cat._saved_dim not in _SECOND:
+        return False
+    parts = [node for node, _ in cat.next_functions]
+    if len(parts) != 2:
+        return False
+    constant = parts[0]
+    if constant is not None and constant.name() == "AddBackward0":
+        constant = next((node for node, _ in constant.next_functions if _leaf(node) is params["sh0"]), None)
+    return _leaf(constant) is params["sh0"] and _leaf(parts[1]) is params["shN"]
+
+
+def _sliced(node: Any, start: int) -> Any:
+    """The node of x, where `node` is that of x[:, start:…]."""
+    if node is None or node.name() != "SliceBackward0" or node._saved_dim != 1 or node._saved_start != start:
+        return None
+    return node.next_functions[0][0]
+
+
+def _leaf(node: Any) -> Tensor | None:
+    """The parameter that a node is a view of, all of it and in its order."""
+    while node is not None and node.name() in _VIEWS:
+        node = node.next_functions[0][0]
+    leaf: Tensor | None = getattr(node, "variable", None)
+    return leaf
 
 
 Target = Literal["lr", "hr"] | Camera
@@ -119,5 +278,7 @@ class HostOutput:
     returned: Any
 
 
-RenderAt = Callable[[Target, Float[Tensor, " N"] | None], HostOutput]
-"""Renders by the host's own renderer, opacities multiplied by the gate: with f_det at HR, without it for any other target."""
+RenderAt = Callable[[Target, Float[Tensor, " N"] | None, View], HostOutput]
+"""Renders by the host's own renderer, opacities multiplied by the gate: with f_det at HR, without it for any other target. The view
+is that of the iteration, with an SR image of the size that is due.
+"""

@@ -1,13 +1,15 @@
 """Rasterizers as differentiable torch functions.
 
 `draw` returns a rendering that is part of the autograd graph. `rasterization` has the signature of gsplat's function, so
-that a loop written for gsplat runs on a CPU. Each backward pass handles one cotangent; `Rendering.vjp` handles several.
+that a loop written for gsplat runs on a CPU. Each backward pass handles one cotangent; `Rendering.vjp` handles several, and
+`recorded` gives it to callers of code that draws.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
 from enum import Enum
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
@@ -46,6 +48,33 @@ class Drawn(NamedTuple):
     depth: Float[Tensor, "H W"] | None = None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawing:
+    """What `draw` drew.
+
+    Args:
+        splats: as `draw` was given them, and image: as it returned it, both in the autograd graph.
+    """
+
+    rendering: Rendering
+    splats: Splats
+    image: Float[Tensor, "H W 3"]
+
+
+_recordings: Final[list[list[Drawing]]] = []
+
+
+@contextmanager
+def recorded() -> Iterator[list[Drawing]]:
+    """What is drawn with gradients inside, by whichever code: its VJP takes several cotangents in one pass, and stops at the splats."""
+    drawings: list[Drawing] = []
+    _recordings.append(drawings)
+    try:
+        yield drawings
+    finally:
+        _recordings.remove(drawings)
+
+
 def draw(
     rasterizer: Rasterizer, splats: Splats, camera: Camera, means2d: Tensor | None = None, *, depth: bool = False
 ) -> Drawn:
@@ -73,6 +102,8 @@ def draw(
         means2d = splats.means.new_zeros(len(splats), 2).requires_grad_()
     tensors = [getattr(splats, field.name) for field in fields(Splats)]
     image, alpha, visible, expected = _Draw.apply(rasterizer, camera, depth, means2d, *tensors)  # type: ignore[no-untyped-call]
+    for drawings in _recordings if image.grad_fn is not None else ():
+        drawings.append(Drawing(image.grad_fn.rendering, splats, image))
     return Drawn(image, alpha, means2d, visible, expected)
 
 
@@ -148,6 +179,7 @@ def rasterization(
     absgrad: bool = False,
     rasterize_mode: str = "classic",
     backend: str = "auto",
+    rgb_offset: Float[Tensor, "N 3"] | None = None,
     **more: Any,
 ) -> tuple[Float[Tensor, "C H W D"], Float[Tensor, "C H W 1"], dict[str, Any]]:
     """Stands in for gsplat's `rasterization` with a backend of this package: pinhole cameras, RGB and expected depth.
@@ -160,6 +192,7 @@ def rasterization(
         packed: has no effect; `info` is always unpacked.
         more: gsplat's other arguments. Those that change only how it computes (sparse_grad, tile_size …) have no effect.
         backend: a name of `rasterizers.load`.
+        rgb_offset: added to the colours before their clamp at 0, with `sh_degree` only; gsplat has no such argument.
 
     Returns:
         images, alphas, and what gsplat's strategies read: `means2d` [C, N, 2] (`retain_grad` works),
@@ -171,44 +204,52 @@ def rasterization(
     """
     _require_supported(render_mode, rasterize_mode, absgrad, more)
     _require_shapes(len(means), colors, viewmats, Ks, backgrounds, sh_degree)
-    if backgrounds is None:
-        backgrounds = colors.new_zeros(len(viewmats), 3)
-    low, span = (0.0, 1.0) if sh_degree is not None else _low_and_span(colors, backgrounds)
+    behind = [[0.0] * 3] * len(viewmats) if backgrounds is None else backgrounds.tolist()
+    low, span = (0.0, 1.0) if sh_degree is not None else _low_and_span(colors, behind)
+    if sh_degree is None and rgb_offset is not None:
+        raise ValueError(
+            "rgb_offset is an offset of spherical harmonics, give sh_degree; RGB takes it as colors + rgb_offset."
+        )
     if sh_degree is None:
         colors, sh_degree = ((colors - low) / span - 0.5)[:, None] / SH_C0, 0
-    splats = Splats(means, quats, scales, opacities, colors[:, :1], colors[:, 1 : (sh_degree + 1) ** 2])
+    splats = Splats(means, quats, scales, opacities, colors[:, :1], colors[:, 1 : (sh_degree + 1) ** 2], rgb_offset)
     means2d = means.new_zeros(len(viewmats), len(means), 2).requires_grad_()
     views = []
-    for i, (pose, K) in enumerate(zip(viewmats, Ks, strict=True)):
-        background = tuple((x - low) / span for x in backgrounds[i].tolist())
+    for i, (pose, K, over_color) in enumerate(zip(viewmats, Ks, behind, strict=True)):
+        background = tuple((x - low) / span for x in over_color)
         rasterizer = over(
             _loaded(backend, means.device.type, near_plane, eps2d, rasterize_mode == "antialiased"), background
         )
         (fx, _, cx), (_, fy, cy), _ = K.tolist()
         camera = Camera(pose, fx, fy, cx, cy, width, height)
         views.append(draw(rasterizer, splats, camera, means2d[i], depth=render_mode == "RGB+ED"))
-    visible = torch.stack([view.visible for view in views])
+    visible = _stacked([view.visible for view in views])
     info = {
         "means2d": means2d, "radii": visible[..., None].expand(-1, -1, 2).int(), "gaussian_ids": None,
         "width": width, "height": height, "n_cameras": len(views),
     }  # fmt: skip
-    images, alphas = torch.stack([view.image for view in views]), torch.stack([view.alpha for view in views])[..., None]
+    images, alphas = _stacked([view.image for view in views]), _stacked([view.alpha for view in views])[..., None]
     if (low, span) != (0.0, 1.0):
         images = low + span * images
-    if backgrounds.requires_grad:  # adds 0, whose gradient is the background's
+    if backgrounds is not None and backgrounds.requires_grad:  # adds 0, whose gradient is the background's
         images = images + (1 - alphas.detach()) * (backgrounds - backgrounds.detach())[:, None, None]
     depths = [view.depth for view in views if view.depth is not None]
     return torch.cat((images, torch.stack(depths)[..., None]), -1) if depths else images, alphas, info
 
 
-def _low_and_span(colors: Float[Tensor, "N 3"], backgrounds: Float[Tensor, "C 3"]) -> tuple[float, float]:
+def _stacked(tensors: Sequence[Tensor]) -> Tensor:
+    """One tensor of all; a single one is not copied."""
+    return tensors[0][None] if len(tensors) == 1 else torch.stack(list(tensors))
+
+
+def _low_and_span(colors: Float[Tensor, "N 3"], backgrounds: Sequence[Sequence[float]]) -> tuple[float, float]:
     """RGB in any range is drawn as (RGB - low) / span, with colours >= 0 over backgrounds in [0, 1].
 
     The weights of a pixel's colours and background sum to 1, so the image is low + span times what is drawn.
     """
-    finite = torch.cat((colors, backgrounds)).detach().nan_to_num(0, 0, 0)  # NaN is refused by the rasterizer
-    low = min(0.0, float(finite.min()))
-    return low, max(1.0, float(finite[len(colors) :].max()) - low)
+    finite = colors.detach().nan_to_num(0, 0, 0)  # NaN is refused by the rasterizer
+    low = min(0.0, float(finite.min()) if len(finite) else 0.0, *map(min, backgrounds))
+    return low, max(1.0, max(map(max, backgrounds)) - low)
 
 
 def _require_shapes(

@@ -18,6 +18,7 @@ import math
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Final, Protocol, cast, runtime_checkable
 
 import torch
@@ -61,8 +62,8 @@ class Camera:
     def __post_init__(self) -> None:
         if self.world_to_camera.shape != (4, 4):
             raise ValueError(f"world_to_camera must be 4x4, got {tuple(self.world_to_camera.shape)}.")
-        intrinsics = (self.fx, self.fy, self.cx, self.cy)
-        if not (all(map(math.isfinite, intrinsics)) and bool(self.world_to_camera.isfinite().all())):
+        pose = self.world_to_camera.detach().tolist()
+        if not all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy, *chain.from_iterable(pose)))):
             raise ValueError(f"a camera's numbers must be finite, got {self!r}.")
         for name in ("width", "height"):
             size = getattr(self, name)
@@ -70,7 +71,7 @@ class Camera:
                 object.__setattr__(self, name, operator.index(size))  # numpy's and torch's integers are no int
             except TypeError:
                 raise ValueError(f"{name} must be a whole number of pixels, an int, got {size!r}.") from None
-        if not _is_rigid(self.world_to_camera):
+        if not _is_rigid(pose):
             raise ValueError(
                 "world_to_camera must be a rotation and a translation, without scale or reflection, and its last row "
                 f"0 0 0 1, got {self.world_to_camera.tolist()}."
@@ -110,9 +111,9 @@ class Camera:
         )
 
 
-def _is_rigid(world_to_camera: Float[Tensor, "4 4"]) -> bool:
+def _is_rigid(world_to_camera: list[list[float]]) -> bool:
     """Whether R Rᵀ = I, det R = 1 and the last row is (0, 0, 0, 1). Without tensors, which would take five times as long."""
-    *rows, last = world_to_camera.detach().double().tolist()
+    *rows, last = world_to_camera
     a, b, c = (row[:3] for row in rows)
 
     def dot(u: list[float], v: list[float]) -> float:

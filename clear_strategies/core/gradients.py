@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final, Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -87,9 +88,9 @@ def conflict_columns(conflict: Mapping[str, Number]) -> dict[str, Number]:
 
 def to_ndc(screen: Float[Tensor, "N 2"], size: tuple[int, int]) -> Float[Tensor, "N 2"]:
     """∇_u in NDC from ∇_u in pixels of an image of `size` (width, height)."""
-    ndc = screen.clone()
+    ndc = torch.empty_like(screen)
     for axis, pixels in enumerate(size):
-        ndc[:, axis] *= pixels / 2
+        torch.mul(screen[:, axis], pixels / 2, out=ndc[:, axis])
     return ndc
 
 

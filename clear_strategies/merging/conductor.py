@@ -199,14 +199,22 @@ class Conductor:
         return Update(step, grads, score, ordinary, conflict, {**l_lr.values, **losses}, self.logs())
 
     def hr_gradients(
-        self, hr: Shot, view: View, t: int, vjp: Callable[[Any, Tensor], Sequence[Any]] | None = None
+        self,
+        hr: Shot,
+        view: View,
+        t: int,
+        vjp: Callable[[Any, Tensor], Sequence[Any]] | None = None,
+        *,
+        apart: bool = True,
     ) -> HrGradients[Any]:
         """Compare Î_HR with the SR image, backpropagate both losses in one pass, and ask for the evidence.
 
         Args:
             vjp: maps a shot and K cotangents to K gradients, each with `.screen`; None: `Shot.vjp`.
+            apart: False: the gradient of L_base + λ_HF L_HF as `base`, where no strategy routes or scores by the two apart.
         """
-        return self._backward_hr(hr, Step(t, view, hr.visible), vjp or _vjp)[1]
+        apart = apart or self.owner("route") is not None or self.owner("score") is not None
+        return self._backward_hr(hr, Step(t, view, hr.visible), vjp or _vjp, apart=apart)[1]
 
     def extra_views(self, t: int) -> list[ExtraView]:
         """The pictures that the field should match at t besides the view; each gets a step on `extra_loss`."""
@@ -319,7 +327,7 @@ class Conductor:
 
     def logs(self) -> dict[str, Number]:
         """The scalars that the strategies logged in the last iteration."""
-        return {name: value for s in self.strategies for name, value in s.logs.items()}
+        return {name: x() if callable(x) else x for s in self.strategies for name, x in s.logs.items()}
 
     def forget_logs(self) -> None:
         """Before an iteration: what the strategies log from now on belongs to it."""
@@ -327,7 +335,12 @@ class Conductor:
             s.logs.clear()
 
     def _backward_hr(
-        self, hr: Shot, step: Step, vjp: Callable[..., Sequence[Any]], lr_cotangents: Tensor | None = None
+        self,
+        hr: Shot,
+        step: Step,
+        vjp: Callable[..., Sequence[Any]],
+        lr_cotangents: Tensor | None = None,
+        apart: bool = True,
     ) -> tuple[Any | None, HrGradients[Any]]:
         """∇(λ_LR L_LR) where its cotangents [1, H, W, 3] are given, and the gradients of the HR losses."""
         stage = self.work_log.stage
@@ -340,7 +353,10 @@ class Conductor:
             _where(step.view, step.t), losses.values, {"the SR image": sr.image, "the HR render": hr.image}
         )
         with stage("backward HR"):  # one pass for all cotangents
-            both = losses.cotangents if lr_cotangents is None else torch.cat((lr_cotangents, losses.cotangents))
+            of_hr = losses.cotangents
+            if not apart and len(of_hr) == 2:
+                of_hr = torch.add(of_hr[:1], of_hr[1:], alpha=self.objective.lambda_hf)
+            both = of_hr if lr_cotangents is None else torch.cat((lr_cotangents, of_hr))
             gradients = list(vjp(hr, both))
         g_lr = None if lr_cotangents is None else gradients.pop(0)
         base, hf = gradients if len(gradients) > 1 else (gradients[0], None)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import torch
@@ -38,26 +38,22 @@ class RoutedGradients:
         grads: by attribute, without f_det, and without sh0 and shN where `colour` has them.
         colour: the gradient of sh0 and shN as its factors, for shN of as many bands as the basis has, or more.
         detail: m λ_HF ∇L_HF of f_det; None: there is no f_det, or no L_HF.
+        step: the iteration, with the evidence.
     """
 
     grads: Mapping[str, Tensor]
     step: Step
     colour: Colour | None = None
     detail: Float[Tensor, "N 3"] | None = None
-    losses: Mapping[str, Number] = field(default_factory=dict)
 
-    def dense(self, like: Mapping[str, Tensor]) -> Grads:
-        """Every attribute with as many numbers as its parameter in `like`."""
-        g = Grads(self.grads)
-        if self.colour is not None:
-            rgb, Y = self.colour.rgb[:, None, :], self.colour.basis[..., None]
-            bands = like["shN"].shape[1]
-            shN = Y[:, 1 : bands + 1] * rgb
-            g["sh0"] = Y[:, :1] * rgb
-            g["shN"] = torch.cat((shN, shN.new_zeros(len(shN), bands - shN.shape[1], 3)), 1)
-        if self.detail is not None:
-            g["detail"] = self.detail
-        return Grads({name: value.view(like[name].shape) for name, value in g.items() if name in like})
+
+def dense(grads: Mapping[str, Tensor], colour: Colour | None, like: Mapping[str, Tensor]) -> Grads:
+    """The same with every number of the spherical harmonics, in the shapes of `like` and for its attributes alone."""
+    g = Grads(grads)
+    if colour is not None:
+        bands, more = colour.bands(), like["shN"].shape[1] + 1 - colour.basis.shape[1]
+        g["sh0"], g["shN"] = bands[:, :1], torch.nn.functional.pad(bands[:, 1:], (0, 0, 0, more))
+    return Grads({name: value.reshape(like[name].shape) for name, value in g.items() if name in like})
 
 
 class InPlaceMerge:
@@ -160,9 +156,8 @@ class InPlaceMerge:
         if hr is None:
             merged = self.conductor.merge(values, g_lr, None, t)
         else:
-            dense = hr.dense(trained)
-            detail = dense.pop("detail", None)
-            merged = self.conductor.merge_routed(values, g_lr, dense, detail, hr.step, t)
+            g_hr = dense(hr.grads, hr.colour, trained)
+            merged = self.conductor.merge_routed(values, g_lr, g_hr, hr.detail, hr.step, t)
         for name, p in trained.items():
             # Without HR the gradient of f_det is 0 and not None, so that its Adam counts every step.
             g = merged.grads[name] if name in merged.grads else torch.zeros_like(p)

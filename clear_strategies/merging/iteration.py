@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from jaxtyping import Float
@@ -38,15 +38,6 @@ class HrGradients(Generic[G]):
     step: Step
     m: float | Float[Tensor, " N"] = 1.0
     losses: Mapping[str, Scalar] = field(default_factory=dict)
-
-
-def only(hr: HrGradients[Grads], names: Collection[str]) -> HrGradients[Grads]:
-    """The gradients of these attributes, e.g. of those that a host optimizes."""
-
-    def chosen(g: Grads) -> Grads:
-        return Grads({name: value for name, value in g.items() if name in names}, screen=g.screen)
-
-    return replace(hr, base=chosen(hr.base), hf=None if hr.hf is None else chosen(hr.hf))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,7 +8,7 @@ correct, score.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -59,7 +59,7 @@ class Strategy:
 
     state: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
     cache: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
-    logs: dict[str, Number] = field(default_factory=dict, init=False, repr=False, compare=False)
+    logs: dict[str, Number | Callable[[], Number]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     # ---- hooks: the trainer or the host calls them in this order ----------------------------------------------------
 
@@ -195,8 +195,10 @@ class Strategy:
 
     # ---- for subclasses ---------------------------------------------------------------------------------------------
 
-    def log(self, name: str, value: Number) -> None:
-        """Log a scalar of this iteration. A 0-dim tensor on a device is read later, see `core.deferred`."""
+    def log(self, name: str, value: Number | Callable[[], Number]) -> None:
+        """Log a scalar of this iteration, or what computes it where it is asked for before the next one: a host asks for it in
+        every hundredth. A 0-dim tensor on a device is read later, see `core.deferred`.
+        """
         self.logs[name] = value
 
     def to(self, device: torch.device | str) -> None:

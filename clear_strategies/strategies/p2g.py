@@ -69,11 +69,10 @@ class P2G(Strategy):
     def observe(self, step: Step, hr: Shot) -> Evidence:
         """q_i and a_i of every Gaussian that is visible in this view."""
         view = step.view
-        maps = torch.stack(self._cached_patches(view))  # R, A
-        q, a = lift(maps, hr.means2d, hr.visible, self.patch * view.factor)
-        visible = hr.visible.sum()
-        self.log("mean_q", deferred.scalar(q.sum() / visible))  # both are 0 where a Gaussian is invisible
-        self.log("mean_w", deferred.scalar((q * a).sum() / visible))
+        q, a = lift(self._cached_patches(view), hr.means2d, hr.visible, self.patch * view.factor)
+        # Both are 0 where a Gaussian is invisible.
+        self.log("mean_q", lambda: deferred.scalar(q.sum() / hr.visible.sum()))
+        self.log("mean_w", lambda: deferred.scalar((q * a).sum() / hr.visible.sum()))
         return Evidence(q, a)
 
     def route(self, step: Step) -> Float[Tensor, " N"]:
@@ -136,17 +135,19 @@ class P2G(Strategy):
         A = (patch_means(residual, self.patch * factor) / (2 * residual.mean() + self.detail_eps)).clamp(0, 1)
         return R, A
 
-    def _cached_patches(self, view: View) -> tuple[Tensor, Tensor]:
+    def _cached_patches(self, view: View) -> Float[Tensor, "2 ph pw"]:
+        """R and A."""
         key = (view.name, view.factor)
         if key not in self.cache:
             maps = self.patch_maps(view)
-            R, A = self.cache[key] = maps.reliability, maps.demand
+            R, A = maps.reliability, maps.demand
+            self.cache[key] = torch.stack((R, A))
             _log.debug(
                 "%s: reliability R %.2f..%.2f (mean %.3f), detail demand A mean %.3f over %dx%d patches.",
                 view.name, float(R.min()), float(R.max()), float(R.mean()), float(A.mean()), R.shape[1], R.shape[0],
             )  # fmt: skip
-        R, A = self.cache[key]
-        return R, A
+        maps_of_view: Tensor = self.cache[key]
+        return maps_of_view
 
 
 # Rounding to 8 bits changes an image by a quarter of a grey level on average; a smaller scale would measure rounding.

@@ -6,8 +6,10 @@ import functools
 import inspect
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import cache
 from typing import Any, Final
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -18,12 +20,13 @@ from clear_strategies.errors import HostError
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment
-from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot, Target
+from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot, Target, only_one
 from integration.densification import require_end
 from integration.detail import detail_adam, sh0_offset
 from integration.host_score import warn_if_score_is_unused
 from integration.lineage import RowNumbers
 from integration.replacing import replace_everywhere
+from rasterizers.autograd import recorded
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera
 
@@ -88,10 +91,12 @@ class Attached:
         self._rows = RowNumbers(
             params if state is None else state, lambda: params[self._names["means"]], as_parameter=state is None
         )
-        self._poses = torch.stack([view.lr.camera.world_to_camera for view in self._views]).to(means)
+        self._poses = torch.stack([view.lr.camera.world_to_camera for view in self._views]).double().cpu().numpy()
         self._found_by_pose = True  # else renderings are those of `_named`, see `rendering`
         self._named: View | None = None
         self._has_drawn_bands = False  # after a call with spherical harmonics, one without them draws no colours
+        self._product: tuple[Tensor, Tensor, Tensor] | None = None  # see `_gated`
+        self._takes_offset = False  # the wrapped function is this package's, see `wrap`
         self._undo = ExitStack()
         stop, threshold = (getattr(strategy, name, None) for name in ("refine_stop_iter", "grow_grad2d"))
         require_end(conductor, stop, "refine_stop_iter", first=0)
@@ -99,7 +104,7 @@ class Attached:
         self.attachment = Attachment(
             conductor, self.params, views=self._views, seed=seed, loss_scale=loss_scale, accumulation=accumulation,
             poll_parents=self._poll_parents, restart_parents=self._rows.restart, threshold=threshold, masks=masks,
-            own_background=own_background,
+            own_background=own_background, reads_score=threshold is not None,
         )  # fmt: skip
         self.attachment.hook(self._optimizers_of_gaussians())
 
@@ -120,6 +125,8 @@ class Attached:
                 "function that takes them by name."
             )
 
+        self._takes_offset = "rgb_offset" in signature.parameters
+
         @functools.wraps(rasterization)
         def wrapped(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
             call = signature.bind(*args, **kwargs).arguments
@@ -133,8 +140,8 @@ class Attached:
             if view is None:  # a viewer, a camera without a photo
                 return rasterization(**self._with_detail(call, trained=False))
 
-            def render_at(target: Target, gate: Tensor | None) -> HostOutput:
-                return self._render(rasterization, call, view, target, gate)
+            def render_at(target: Target, gate: Tensor | None, sized: View) -> HostOutput:
+                return self._render(rasterization, call, sized, target, gate)
 
             return self.attachment.render_view(view, render_at)  # type: ignore[no-any-return]
 
@@ -191,14 +198,14 @@ class Attached:
         return as_bands or not (self._has_drawn_bands or of_no_photo)
 
     def _find_view(self, viewmats: Float[Tensor, "*C 4 4"]) -> View | None:
-        poses = viewmats.detach().reshape(-1, 4, 4)
+        poses = viewmats.detach().reshape(-1, 4, 4).cpu().numpy()  # compared in numpy: a step has few torch operations
         if len(poses) != 1:
             raise HostError(
                 f"only one view per step is supported, got {len(poses)}. Set batch_size=1, or call joint_loss for each view "
                 "and average."
             )
-        distances = (self._poses - poses).abs().amax((1, 2)).tolist()
-        tolerance = _SAME_POSE * max(1.0, float(poses.abs().max()))
+        distances = np.abs(self._poses - poses).max((1, 2)).tolist()
+        tolerance = _SAME_POSE * max(1.0, float(np.abs(poses).max()))
         near = sorted((distance, i) for i, distance in enumerate(distances) if distance <= tolerance)
         if len(near) > 1 and near[1][0] <= _POSE_RATIO * near[0][0]:
             names = " and ".join(self._views[i].name for _, i in near[:2])
@@ -215,10 +222,10 @@ class Attached:
                 "which. Render all of them, or for a pass that shows a part: with clear.rendering(None): …"
             )
         if gate is not None:
-            call["opacities"] = call["opacities"] * gate.to(call["opacities"])
+            call["opacities"] = self._gated(call["opacities"], gate)
         if target == "hr":
             call, factor = self._with_detail(call, trained=True), view.factor
-            call["Ks"] = call["Ks"] * call["Ks"].new_tensor([[factor], [factor], [1]])
+            call["Ks"] = call["Ks"] * _enlargement(factor, call["Ks"].dtype, str(call["Ks"].device))
             call |= {"width": call["width"] * factor, "height": call["height"] * factor, "render_mode": "RGB"}
         else:
             params.pop("detail", None)
@@ -240,30 +247,48 @@ class Attached:
                 )
         return self._drawn(rasterization, call, params, gate)
 
+    def _gated(self, opacities: Float[Tensor, " N"], gate: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+        """Their product, made once for both scales."""
+        if self._product is None or self._product[0] is not opacities or self._product[1] is not gate:
+            self._product = opacities, gate, opacities * gate.to(opacities)
+        return self._product[2]
+
     def _drawn(
         self, rasterization: Rasterization, call: Mapping[str, Any], params: Mapping[str, Tensor], gate: Tensor | None
     ) -> HostOutput:
         """One rendering. Gaussians that the gate drops are marked as not visible in its `info`."""
-        if len(result := rasterization(**call)) != 3:
+        with recorded() as drawings:
+            result = rasterization(**call)
+        if len(result) != 3:
             raise HostError(
                 f"the wrapped function returns {len(result)} values, gsplat's rasterization returns 3: colours, alphas and info. "
                 "2DGS draws other primitives and is not supported."
             )
         renders, alphas, info = result
         size, n, packed = (call["width"], call["height"]), len(params["means"]), info["means2d"].dim() == 2
-        rows = info["gaussian_ids"] if packed else None
-        visible = _visible(info["radii"], packed)
-        if gate is not None:
-            kept = (gate > 0)[rows] if rows is not None else gate > 0
-            visible = visible & kept
-            radii = info["radii"]
-            info["radii"] = radii * kept.view(*kept.shape, *[1] * (radii.dim() - (1 if packed else 2))).to(radii)
-        means2d, visible = info["means2d"].detach().reshape(-1, 2), visible.reshape(-1)
-        if rows is not None:
-            means2d = means2d.new_zeros(n, 2).index_copy_(0, rows, means2d)
-            visible = torch.zeros(n, dtype=torch.bool, device=rows.device).index_copy_(0, rows, visible)
+        rows, drawing = info.get("gaussian_ids") if packed else None, only_one(drawings)
+        means2d = info["means2d"].detach().reshape(-1, 2)
+        if drawing is not None:  # what the gate drops is not visible in it
+            means2d, visible = drawing.rendering.means2d, drawing.rendering.visible
+        else:
+            visible = _visible(info["radii"], packed)
+            if gate is not None:
+                kept = (gate > 0)[rows] if rows is not None else gate > 0
+                visible = visible & kept
+                radii = info["radii"]
+                info["radii"] = radii * kept.view(*kept.shape, *[1] * (radii.dim() - (1 if packed else 2))).to(radii)
+            visible = visible.reshape(-1)
+            if rows is not None:
+                means2d = means2d.new_zeros(n, 2).index_copy_(0, rows, means2d)
+                visible = torch.zeros(n, dtype=torch.bool, device=rows.device).index_copy_(0, rows, visible)
         image = renders[..., :3].reshape(size[1], size[0], 3)
-        shot = AutogradShot(image, means2d, visible, params, ScreenGradientSlot(info["means2d"], size, rows=rows))
+        drawn = {
+            name: call[name]
+            for name in ("means", "quats", "scales", "opacities", "colors")
+            if call.get(name) is not None
+        }
+        slot = ScreenGradientSlot(info["means2d"], size, rows=rows)
+        shot = AutogradShot(image, means2d, visible, params, slot, drawn, drawing)
         return HostOutput(shot, renders, (renders, alphas, info))
 
     def _background(self, call: Mapping[str, Any]) -> dict[str, Tensor]:
@@ -282,12 +307,20 @@ class Attached:
         detail = (self._params["detail"] if trained else self._params["detail"].detach()).to(colors)
         if call.get("sh_degree") is None:
             call["colors"] = colors + detail
+        elif self._takes_offset:
+            call["rgb_offset"] = detail
         else:
             call["colors"] = torch.cat((colors[..., :1, :] + detail[:, None] / SH_C0, colors[..., 1:, :]), -2)
         return call
 
 
 attach = Attached
+
+
+@cache
+def _enlargement(factor: int, dtype: torch.dtype, device: str) -> Float[Tensor, "3 1"]:
+    """What makes Ks those of an image `factor` times as large."""
+    return torch.tensor([[factor], [factor], [1]], dtype=dtype, device=device)
 
 
 def _visible(radii: Tensor, packed: bool) -> Bool[Tensor, "*shape"]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import inspect
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, Literal
 
@@ -19,12 +19,13 @@ from clear_strategies.core.view import View
 from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment
-from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot, Target
+from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot, Target, only_one
 from integration.detail import sh0_offset
 from integration.host_score import warn_if_score_is_unused
 from integration.inria.cameras import enlarged_camera, replaced_camera
 from integration.inria.detail import DetailFeature
 from integration.inria.rows import CarriedRows
+from rasterizers.autograd import recorded
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
@@ -167,17 +168,19 @@ class AttachedModel:
             render: the host's function of a model and a camera; the third argument is what is drawn.
         """
 
-        def render_at(target: Target, gate: Tensor | None) -> HostOutput:
+        def render_at(target: Target, gate: Tensor | None, sized_view: View) -> HostOutput:
             if target == "lr":
-                sized, pinhole = camera, view.lr.camera
+                sized, pinhole = camera, sized_view.lr.camera
             elif target == "hr":
-                sized, pinhole = enlarged_camera(camera, view.factor), view.hr.camera
+                sized, pinhole = enlarged_camera(camera, sized_view.factor), sized_view.hr.camera
             else:
                 sized, pinhole = replaced_camera(camera, target), target
             params = self.params() if target == "hr" else self._host_params()
             overrides = Overrides(gate, params.get("detail"))
-            result = render(proxy(self._model, overrides, self._roles), sized, target)
-            return self._output(result, overrides, pinhole, params)
+            with recorded() as drawings:
+                result = render(proxy(self._model, overrides, self._roles), sized, target)
+            output = self._output(result, overrides, pinhole, params)
+            return replace(output, shot=replace(output.shot, drawing=only_one(drawings)))
 
         return self.attachment.render_view(view, render_at)
 

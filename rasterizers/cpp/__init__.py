@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from itertools import chain
 from typing import Final
 
 import torch
@@ -92,7 +93,7 @@ class _Frame:
         kernels = importlib.import_module(f"{__name__}._float64") if double else load_kernels(__name__, settings.isa)
         self.native = kernels.Frame(
             **{field.name: getattr(settings, field.name) for field in fields(RasterSettings)},
-            world_to_camera=camera.world_to_camera.double().flatten().tolist(),
+            world_to_camera=[*chain.from_iterable(camera.world_to_camera.tolist())],
             budget=settings.memory << 20,
         )
         self.means2d = [self.empty(n, 2) for _ in jobs]

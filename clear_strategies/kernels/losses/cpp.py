@@ -8,9 +8,7 @@ from __future__ import annotations
 
 from types import ModuleType
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
+import numpy as np
 
 from clear_strategies.kernels.losses.images import ImagePair
 from rasterizers.interface import BackendUnavailable
@@ -31,12 +29,12 @@ def native() -> ModuleType:
     return load_kernels("clear_strategies.kernels")
 
 
-def photometric(images: ImagePair, l1: float, dssim: float) -> Float[Tensor, ""]:
+def photometric(images: ImagePair, l1: float, dssim: float) -> float:
     """The value l1 · mean |x - y| + dssim · (1 - SSIM), in one pass; with dssim = 0 no SSIM is computed."""
     l1_mean, dissimilarity = native().photometric(*images, l1, dssim, threads())
-    return torch.tensor(l1 * l1_mean + dssim * dissimilarity, dtype=torch.float32, device="cpu")
+    return float(np.float32(l1 * l1_mean + dssim * dissimilarity))
 
 
-def haar_l1(images: ImagePair, levels: int) -> Float[Tensor, ""]:
+def haar_l1(images: ImagePair, levels: int) -> float:
     """The mean |detail| of each level, averaged over the levels."""
-    return torch.tensor(native().haar_l1(*images, levels, threads()), dtype=torch.float32, device="cpu")
+    return float(np.float32(native().haar_l1(*images, levels, threads())))

@@ -10,6 +10,7 @@
 #include "isa.hpp"
 
 NB_MODULE(CLEAR_MODULE, m) {
+  nanobind::set_leak_warnings(false);  // a script that ends while it holds a rendering has done nothing wrong
   m.attr("isa") = CLEAR_NAME;
   m.def("instruction_sets", &clear::instruction_sets);
   clear::bind_losses(m);

@@ -150,6 +150,7 @@ void bind_frame(nb::module_& m) {
 }  // namespace clear
 
 NB_MODULE(CLEAR_MODULE, m) {
+  nanobind::set_leak_warnings(false);  // a script that ends while it holds a rendering has done nothing wrong
   m.attr("isa") = CLEAR_NAME;
   m.def("instruction_sets", &clear::instruction_sets);
   nb::exception<clear::OverBudget>(m, "OverBudget", PyExc_MemoryError);
