@@ -7,9 +7,10 @@ that a loop written for gsplat runs on a CPU. Each backward pass handles one cot
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import Enum
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
@@ -75,6 +76,56 @@ def recorded() -> Iterator[list[Drawing]]:
         _recordings.remove(drawings)
 
 
+class _Ahead(threading.local):
+    """One image that is drawn together with another, before it is asked for.
+
+    Attributes:
+        wanted: (fx, fy, cx, cy, width, height) of the image that the next drawing brings along.
+        kept: that image, and what it shows.
+    """
+
+    wanted: tuple[float, float, float, float, int, int] | None = None
+    kept: tuple[tuple[Any, ...], Rendering] | None = None
+
+    def draw(self, rasterizer: Rasterizer, splats: Splats, camera: Camera) -> Rendering:
+        """The image, from `kept` where it lies there."""
+        if self.kept is not None and self.kept[0] == _shown(rasterizer, splats, camera):
+            rendering, self.kept = self.kept[1], None
+            return rendering
+        if self.wanted is None:
+            return rasterizer(splats, camera)
+        (fx, fy, cx, cy, width, height), self.wanted = self.wanted, None
+        other = replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+        plain = replace(splats, rgb_offset=None)
+        ahead, rendering = rasterizer.render_scales([(plain, other), (splats, camera)])
+        self.kept = _shown(rasterizer, plain, other), ahead
+        return rendering
+
+
+_ahead: Final = _Ahead()
+
+
+def _shown(rasterizer: Rasterizer, splats: Splats, camera: Camera) -> tuple[Any, ...]:
+    """What an image shows: equal for equal images, as long as the tensors are alive."""
+    tensors = (getattr(splats, field.name) for field in fields(Splats))
+    memory = [None if x is None else (x.data_ptr(), x.shape, x.stride(), x._version) for x in tensors]
+    numbers = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+    return rasterizer, memory, numbers, camera.world_to_camera.tolist()
+
+
+@contextmanager
+def drawing_ahead(K: Float[Tensor, "3 3"], width: int, height: int) -> Iterator[None]:
+    """The first drawing inside brings along another of the same splats from the same pose, by K and without `rgb_offset`. A later `draw`
+    of just that, here or after the block, takes it: the two share projection, colour and depth order.
+    """
+    (fx, _, cx), (_, fy, cy), _ = K.tolist()
+    _ahead.wanted, _ahead.kept = (fx, fy, cx, cy, width, height), None
+    try:
+        yield
+    finally:
+        _ahead.wanted = None
+
+
 def draw(
     rasterizer: Rasterizer, splats: Splats, camera: Camera, means2d: Tensor | None = None, *, depth: bool = False
 ) -> Drawn:
@@ -115,7 +166,7 @@ class _Draw(torch.autograd.Function):
         ctx.rasterizer, ctx.camera = rasterizer, camera
         ctx.save_for_backward(*tensors)
         splats = _detached(tensors)
-        ctx.rendering = rasterizer(splats, camera, depth=True) if depth else rasterizer(splats, camera)
+        ctx.rendering = rasterizer(splats, camera, depth=True) if depth else _ahead.draw(rasterizer, splats, camera)
         means2d.data.copy_(ctx.rendering.means2d)
         ctx.mark_non_differentiable(visible := ctx.rendering.visible.data)
         ctx.set_materialize_grads(False)

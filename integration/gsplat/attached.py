@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from functools import cache
 from typing import Any, Final
 
@@ -26,7 +26,7 @@ from integration.detail import detail_adam, sh0_offset
 from integration.host_score import warn_if_score_is_unused
 from integration.lineage import RowNumbers
 from integration.replacing import replace_everywhere
-from rasterizers.autograd import recorded
+from rasterizers.autograd import drawing_ahead, recorded
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera
 
@@ -96,7 +96,7 @@ class Attached:
         self._named: View | None = None
         self._has_drawn_bands = False  # after a call with spherical harmonics, one without them draws no colours
         self._product: tuple[Tensor, Tensor, Tensor] | None = None  # see `_gated`
-        self._takes_offset = False  # the wrapped function is this package's, see `wrap`
+        self._is_ours = False  # the wrapped function is this package's, see `wrap`
         self._undo = ExitStack()
         stop, threshold = (getattr(strategy, name, None) for name in ("refine_stop_iter", "grow_grad2d"))
         require_end(conductor, stop, "refine_stop_iter", first=0)
@@ -125,7 +125,7 @@ class Attached:
                 "function that takes them by name."
             )
 
-        self._takes_offset = "rgb_offset" in signature.parameters
+        self._is_ours = "rgb_offset" in signature.parameters
 
         @functools.wraps(rasterization)
         def wrapped(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
@@ -223,7 +223,10 @@ class Attached:
             )
         if gate is not None:
             call["opacities"] = self._gated(call["opacities"], gate)
+        together: AbstractContextManager[None] = nullcontext()
         if target == "hr":
+            if self._is_ours:  # the LR image comes next
+                together = drawing_ahead(call["Ks"].detach().reshape(3, 3), call["width"], call["height"])
             call, factor = self._with_detail(call, trained=True), view.factor
             call["Ks"] = call["Ks"] * _enlargement(factor, call["Ks"].dtype, str(call["Ks"].device))
             call |= {"width": call["width"] * factor, "height": call["height"] * factor, "render_mode": "RGB"}
@@ -245,7 +248,8 @@ class Attached:
                     f"{view.lr.camera.width}x{view.lr.camera.height} pixels. Train at one resolution (nerfstudio: "
                     "num_downscales=0)."
                 )
-        return self._drawn(rasterization, call, params, gate)
+        with together:
+            return self._drawn(rasterization, call, params, gate)
 
     def _gated(self, opacities: Float[Tensor, " N"], gate: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
         """Their product, made once for both scales."""
@@ -307,7 +311,7 @@ class Attached:
         detail = (self._params["detail"] if trained else self._params["detail"].detach()).to(colors)
         if call.get("sh_degree") is None:
             call["colors"] = colors + detail
-        elif self._takes_offset:
+        elif self._is_ours:
             call["rgb_offset"] = detail
         else:
             call["colors"] = torch.cat((colors[..., :1, :] + detail[:, None] / SH_C0, colors[..., 1:, :]), -2)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -23,20 +24,32 @@ def merge(
     colour: Colour | None = None, keeps_lr: bool = True, lambda_hr: float = 1.0, scale: float = 1.0,
 ) -> Merged:  # fmt: skip
     """See `kernels.merge.Merge`."""
-    tables = [
-        {
-            "out": rows.out, "lr": _whole(rows.lr), "before": _whole(rows.before), "hr": _whole(rows.hr), "p": _whole(rows.p),
-            "anchor": _whole(rows.anchor), "stiffness": rows.stiffness, "width": rows.out.shape[1:].numel(),
-            "group": GROUPS[name], "first_band": FIRST_BANDS.get(name, -1) if colour is not None else -1,
-        }
-        for name, rows in attributes.items()
-    ]  # fmt: skip
-    factors = None if colour is None else {
-        "rgb": colour.rgb.contiguous(), "basis": colour.basis.contiguous(), "bases": colour.basis.shape[1]
-    }  # fmt: skip
-    n = len(next(iter(attributes.values())).out)
+    n, kept = len(next(iter(attributes.values())).out), []
+
+    def address(x: Tensor | None, numbers: int) -> int:
+        """Of the tensor's numbers, or of a contiguous copy's; the kernel takes no other."""
+        if x is None:
+            return 0
+        if x.dtype != torch.float32 or x.device.type != "cpu" or x.numel() != n * numbers:
+            raise ValueError(
+                f"the merge takes float32 [{n}, …] of {numbers} numbers a row on the CPU, got {x.dtype} {list(x.shape)}."
+            )
+        kept.append(x.contiguous())
+        return kept[-1].data_ptr()
+
+    tuples = []
+    for name, rows in attributes.items():
+        width, first_band = rows.out.shape[1:].numel(), FIRST_BANDS.get(name, -1) if colour is not None else -1
+        if not rows.out.is_contiguous():
+            raise ValueError(f"the merged gradient of {name} must be contiguous, got strides {rows.out.stride()}.")
+        tensors = (rows.out, rows.lr, rows.before, rows.hr, rows.p, rows.anchor)
+        tuples.append((*(address(x, width) for x in tensors), rows.stiffness, width, GROUPS[name], first_band))
+    factors = (0, 0, 1)
+    if colour is not None:
+        bases = colour.basis.shape[1]
+        factors = address(colour.rgb, 3), address(colour.basis, bases), bases
     kernels: Any = load_kernels("clear_strategies.kernels")
-    counts, finite = kernels.merge(n, tables, factors, correction_table(rule, q), keeps_lr, lambda_hr, scale, threads())
+    counts, finite = kernels.merge(n, tuples, factors, correction_table(rule, q), keeps_lr, lambda_hr, scale, threads())
     return Merged(ConflictCounts(*counts), finite)
 
 
@@ -48,7 +61,3 @@ def correction_table(rule: CorrectionRule | None, q: Float[Tensor, " N"] | None)
         "groups": rule.corrects, "tolerance": rule.tolerance, "weight_min": rule.weight_min, "weight_max": rule.weight_max,
         "rotation_noise": ROTATION_NOISE, "reliability": None if q is None else q.float().contiguous(),
     }  # fmt: skip
-
-
-def _whole(x: Tensor | None) -> Tensor | None:
-    return None if x is None else x.detach().contiguous()

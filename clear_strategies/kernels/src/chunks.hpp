@@ -26,7 +26,7 @@ CLEAR_INLINE void each_sixteen(std::int64_t n, std::int64_t number, Task&& task)
 // and overlaps the previous one; all are read before any is written, so the overlap is written twice with the same values.
 struct RowPlan {
   int sixteens, width, offset[3];
-  std::int32_t channel[3][kLanes], band[3][kLanes], constant[kLanes] = {};  // constant: the band of sh0
+  std::int32_t channel[3][kLanes], band[3][kLanes];
 
   explicit RowPlan(int width) : sixteens((width + kLanes - 1) / kLanes), width(width) {
     for (int k = 0; k < sixteens; ++k) {

@@ -19,18 +19,22 @@ CLEAR_INLINE const float* block_of(const float* rows, std::int64_t i, int count,
 
 // Sixteen rows of Y ⊗ colour: band `first_band` + j / 3 and channel j % 3 for number j.
 CLEAR_INLINE void expand(const Merge& m, const MergedRows& a, const RowPlan& plan, std::int64_t i, int count, float* to) {
-  std::fill_n(to, kLanes * a.width, 0.0f);
+  if (count < kLanes) std::fill_n(to, kLanes * a.width, 0.0f);
+  if (a.first_band == 0) {
+    Floats rgb[3], Y0[1];
+    load_columns(m.colour + 3 * i, count, rgb), load_columns(m.basis + m.bases * i, count, Y0, m.bases);
+    for (Floats& channel : rgb) channel *= Y0[0];
+    join_rows(to, rgb);
+    return;
+  }
   float colour[4 * kLanes] = {};  // padded, because reads are sixteen wide
   std::copy_n(m.colour + 3 * i, 3 * count, colour);
-  for (int k = 0; k < count; ++k) {
+  for (int k = 0; k < count; ++k, to += a.width) {
     Floats Y = load_some(m.basis + m.bases * (i + k), m.bases), rgb = Floats::load(colour + 3 * k);
-    float numbers[3 * kLanes];
-    if (a.first_band == 0) {
-      (pick(Y, plan.constant) * pick(rgb, plan.channel[0])).store(numbers);
-    } else {
-      for (int v = 0; v < plan.sixteens; ++v) (pick(Y, plan.band[v]) * pick(rgb, plan.channel[v])).store(numbers + plan.offset[v]);
-    }
-    std::copy_n(numbers, a.width, to + a.width * k);
+    float few[kLanes];  // of a row of less than sixteen numbers
+    float* row = a.width < kLanes ? few : to;
+    for (int v = 0; v < plan.sixteens; ++v) (pick(Y, plan.band[v]) * pick(rgb, plan.channel[v])).store(row + plan.offset[v]);
+    if (a.width < kLanes) std::copy_n(few, a.width, to);
   }
 }
 
