@@ -174,9 +174,9 @@ class AutogradShot:
             if are_bands(splats.sh0, splats.shN, self.params):
                 colour = Colour(rgb, basis)
             else:
-                drawn |= {"sh0": splats.sh0, "shN": splats.shN}
-                bands = Colour(rgb, basis).bands()
-                g = {**g, "sh0": bands[:, :1], "shN": bands[:, 1:]}
+                bands = {"sh0": splats.sh0, "shN": splats.shN}
+                drawn |= bands
+                g = {**g, **dense({}, Colour(rgb, basis), bands)}
         raw = {name: p for name, p in self.params.items() if p.requires_grad and name != "detail"}
         direct = {name: g[name] for name, p in raw.items() if drawn.get(name) is p}
         graph = {name: x for name, x in drawn.items() if name in g and name not in direct and x.requires_grad}

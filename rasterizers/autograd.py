@@ -276,7 +276,7 @@ def rasterization(
         views.append(draw(rasterizer, splats, camera, means2d[i], depth=render_mode == "RGB+ED"))
     visible = _stacked([view.visible for view in views])
     info = {
-        "means2d": means2d, "radii": visible[..., None].expand(-1, -1, 2).int(), "gaussian_ids": None,
+        "means2d": means2d, "radii": visible.int()[..., None].expand(-1, -1, 2), "gaussian_ids": None,
         "width": width, "height": height, "n_cameras": len(views),
     }  # fmt: skip
     images, alphas = _stacked([view.image for view in views]), _stacked([view.alpha for view in views])[..., None]

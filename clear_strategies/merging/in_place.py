@@ -51,8 +51,10 @@ def dense(grads: Mapping[str, Tensor], colour: Colour | None, like: Mapping[str,
     """The same with every number of the spherical harmonics, in the shapes of `like` and for its attributes alone."""
     g = Grads(grads)
     if colour is not None:
-        bands, more = colour.bands(), like["shN"].shape[1] + 1 - colour.basis.shape[1]
-        g["sh0"], g["shN"] = bands[:, :1], torch.nn.functional.pad(bands[:, 1:], (0, 0, 0, more))
+        rgb, Y, bands = colour.rgb[:, None], colour.basis[..., None], like["shN"].shape[1]
+        g["sh0"], shN = Y[:, :1] * rgb, Y[:, 1:] * rgb  # contiguous each, since optimizers read them
+        inactive = bands - shN.shape[1]
+        g["shN"] = torch.nn.functional.pad(shN, (0, 0, 0, inactive)) if inactive else shN
     return Grads({name: value.reshape(like[name].shape) for name, value in g.items() if name in like})
 
 

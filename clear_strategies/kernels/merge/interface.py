@@ -43,10 +43,6 @@ class Colour(NamedTuple):
     rgb: Float[Tensor, "N 3"]
     basis: Float[Tensor, "N B1"]
 
-    def bands(self) -> Float[Tensor, "N B1 3"]:
-        """Their product: the gradient of every band."""
-        return self.basis[..., None] * self.rgb[:, None]
-
 
 class Merged(NamedTuple):
     """What was counted, and whether every number of the result is finite; on a device it is not known yet."""
