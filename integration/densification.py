@@ -37,7 +37,7 @@ def require_end(conductor: Conductor, until: int | None, name: str, first: int =
     """
     if until is None or (end := _end_of_densification(conductor, until, first)) >= until:
         return
-    if any("anchor" in strategy.marks() for strategy in conductor.strategies):
+    if any(getattr(s, "anchor_strength", 0.0) > 0 for s in conductor.strategies):  # SVS keeps a copy of every row
         raise SettingError(
             f"{name}: densification must end before the anchor is taken, got {until}. Set {name}={end}, or raise "
             "strategies.svs.anchor_start."

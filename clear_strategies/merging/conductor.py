@@ -96,7 +96,7 @@ class Conductor:
         for s in self.strategies:
             s.on_fit_start(n_views, seed)
             s.to(device)
-            if s.wants_views():
+            if overrides(s, "on_views"):
                 with self.work_log.stage("views prepared"):
                     s.on_views(views)
 

@@ -70,7 +70,7 @@ class Strategy:
         self.logs.clear()
 
     def on_views(self, views: Sequence[View]) -> None:
-        """Look at all training views once, after `on_fit_start`; only called where `wants_views` is true.
+        """Look at all training views once, after `on_fit_start`.
 
         Args:
             views: on the device of the field; empty where the training loop does not have them all at the start.
@@ -156,30 +156,6 @@ class Strategy:
             lambda_hf: the share of the high-frequency loss in it.
         """
         return None
-
-    def wants_views(self) -> bool:
-        """Whether these settings need all training views at the start, see `on_views`."""
-        return False
-
-    def skipped(self) -> Sequence[str]:
-        """The parts of the strategy that its settings switch off, a phrase each."""
-        return ()
-
-    def in_hindsight(self, means: Mapping[str, float]) -> str | None:
-        """What a finished run shows of the strategy, one sentence; None: nothing worth a line.
-
-        Args:
-            means: of the run's history, by column.
-        """
-        return None
-
-    def keeps(self) -> Sequence[str]:
-        """The attributes of which the strategy keeps a copy in its `state`, for the prediction of memory."""
-        return ()
-
-    def marks(self) -> Mapping[str, int]:
-        """Iterations worth a mark on a training curve, by name."""
-        return {}
 
     def patch_maps(self, view: View) -> PatchMaps | None:
         """The patch evidence that the strategy works with for this view; None: it uses none.  Eq. 9"""

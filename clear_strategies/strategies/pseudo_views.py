@@ -76,9 +76,6 @@ class PseudoViews(Strategy):
         super().on_fit_start(n_views, seed)
         self.cache.update(seed=seed, views=(), borders=())
 
-    def wants_views(self) -> bool:
-        return True
-
     def on_views(self, views: Sequence[View]) -> None:
         """Make the pseudo views: a function of the views and the seed. None are made, and a message says why, where they
         would be of no use.

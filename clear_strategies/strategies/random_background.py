@@ -51,9 +51,6 @@ class RandomBackground(Strategy):
         reason: str = self.cache.get("reason", "")
         return f"none, {reason}" if reason else f"another colour in each of the first {self.until:,} iterations"
 
-    def wants_views(self) -> bool:
-        return True
-
     def on_views(self, views: Sequence[View]) -> None:
         if views:  # else the answer for their number stays
             self.cache["reason"] = self._reason_to_keep(len(views), views)

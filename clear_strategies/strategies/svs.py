@@ -7,7 +7,7 @@ disagree. Once the structure has settled, an anchor pulls the field towards its 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
@@ -114,22 +114,19 @@ class SVS(Strategy):
             return f"it drops nothing and anchors nothing, and only ends densification at t={self.anchor_start}"
         return None
 
-    def skipped(self) -> Sequence[str]:
-        return () if self.anchor_strength > 0 else ("anchor (anchor_strength = 0)",)
-
-    def keeps(self) -> Sequence[str]:
-        return [name for name, w in self.anchor_weights.items() if w > 0] if self.anchor_strength > 0 else ()
-
-    def marks(self) -> Mapping[str, int]:
-        return {"anchor": self.anchor_start} if self.anchor_strength > 0 else {}
-
     def may_densify(self, t: int) -> bool:
         return t < self.anchor_start
 
     def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
         """θ^a = sg(θ(t_a)); the last structural change was at t < t_a."""
         if step.t >= self.anchor_start and self.anchor_strength > 0 and not self.state:  # skips may jump over t_a
-            self.state.update({name: params[name].detach().clone() for name in self.keeps() if name in params})
+            self.state.update(
+                {
+                    name: params[name].detach().clone()
+                    for name, weight in self.anchor_weights.items()
+                    if weight > 0 and name in params
+                }
+            )
             self.cache.pop("extent", None)
 
     def on_resize(self, parents: Tensor) -> None:

@@ -90,9 +90,6 @@ def step(t: int = 1, evidence: Evidence | None = None, visible: Tensor | None = 
 class ShowsDark(Strategy):
     """Shows the field a black picture at every iteration, by a camera that no photo has: moved, turned, off its centre."""
 
-    def wants_views(self) -> bool:
-        return True
-
     def on_views(self, views: Sequence[View]) -> None:
         camera, a = views[0].lr.camera, 0.05
         moved = torch.eye(4)

@@ -1,0 +1,206 @@
+"""The merge in place against `Conductor.merge` in float64, by every pass that runs here."""
+
+from __future__ import annotations
+
+from collections import Counter
+from functools import partial
+
+import pytest
+import torch
+from helpers import toy
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from clear_strategies.core import deferred
+from clear_strategies.core.evidence import Evidence
+from clear_strategies.core.gradients import Grads
+from clear_strategies.errors import DivergedError
+from clear_strategies.kernels import merge as kernel
+from clear_strategies.kernels.merge import Colour
+from clear_strategies.merging import in_place
+from clear_strategies.merging.conductor import Conductor
+from clear_strategies.merging.in_place import InPlaceMerge, RoutedGradients, dense
+from clear_strategies.merging.objective import Objective
+from clear_strategies.schedules import WarmupDecay
+from clear_strategies.strategies.gco import GCO
+from clear_strategies.strategies.svs import SVS
+from rasterizers.interface import BackendUnavailable
+from rasterizers.warp_runtime import require_warp
+
+T, N = 50, 1003  # N: a last block of sixteen that is not full, and more than one chunk of 1,024 numbers
+SHAPES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (15, 3), "detail": (3,)}
+RULES = {"means": 1e-5, "quats": 1e-6, "scales": 1e-5, "opacities": 1e-4, "sh0": 1e-5, "shN": 1e-6, "detail": 1e-5}
+
+
+@pytest.fixture(params=["cpp", "warp", "torch"])
+def passes(request, monkeypatch):
+    """The pass for float32 in the CPU's memory."""
+    if request.param == "torch":
+        monkeypatch.setattr(in_place.kernel, "compiled", lambda tensors: None)
+        monkeypatch.setattr("clear_strategies.strategies.gco.merge.compiled", lambda tensors: None)
+    elif request.param == "warp":
+        try:
+            require_warp("the merge", "cpu", "")
+        except BackendUnavailable as reason:
+            pytest.skip(str(reason))
+        from clear_strategies.kernels.merge import warp
+
+        monkeypatch.setattr(in_place.kernel, "compiled", lambda tensors: warp.merge)
+    elif kernel.compiled([torch.zeros(1)]) is None:
+        pytest.skip("the kernels are not compiled")
+    return request.param
+
+
+def drawn(seed: int, names, n: int = N, dtype=torch.float32) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    return {
+        name: (torch.randn(n, *SHAPES[name], generator=generator, dtype=torch.float64) * RULES[name]).to(dtype)
+        for name in names
+    }
+
+
+def conductor(*, anchored: bool = False, start: int = 0) -> Conductor:
+    strategies = [GCO(), SVS(anchor_strength=0.01 if anchored else 0.0, anchor_start=1)]
+    made = Conductor(*strategies, objective=Objective(lambda_hr=WarmupDecay(start=start, full=start + 1)))
+    made.on_fit_start(3, seed=0)
+    return made
+
+
+def setting(dtype, *, names=tuple(SHAPES), n: int = N, accumulated: bool, factors: bool, scale: float):
+    """Parameters with `.grad`, the gradients of before, and g^HR; the same numbers in every dtype that holds them."""
+    values, lr, hr = (drawn(seed, names, n) for seed in (1, 2, 3))
+    earlier = drawn(4, names, n) if accumulated else {}
+    q = torch.rand(n, generator=torch.Generator().manual_seed(5))
+    basis = torch.rand(n, 9, generator=torch.Generator().manual_seed(6)) - 0.5
+    rgb = drawn(7, ["means"], n)["means"]
+    params = {name: torch.nn.Parameter((1e5 * value).to(dtype)) for name, value in values.items()}
+    for name, p in params.items():
+        if name != "detail":
+            p.grad = (scale * lr[name] + earlier.get(name, 0.0)).to(dtype)
+    before = {name: g.to(dtype) for name, g in earlier.items() if name != "detail"}
+    grads = {
+        name: g.to(dtype) for name, g in hr.items() if name != "detail" and not (factors and name.startswith("sh"))
+    }
+    step = toy.step(T, Evidence(q, torch.ones(n)))
+    colour = Colour(rgb.to(dtype), basis.to(dtype)) if factors else None
+    return params, before, RoutedGradients(grads, step, colour, hr["detail"].to(dtype) if "detail" in names else None)
+
+
+def anchor(made: Conductor, params) -> None:
+    made.after_step({name: p.detach() * 0.9 for name, p in params.items()}, toy.step(1))
+
+
+@pytest.mark.parametrize("accumulated", [False, True])
+@pytest.mark.parametrize("factors", [False, True])
+@pytest.mark.parametrize(("anchored", "scale"), [(False, 1.0), (True, 0.5)])
+def test_every_pass_agrees_with_the_conductor_in_float64(passes, accumulated, factors, anchored, scale):
+    results, conflicts = [], []
+    for dtype in (torch.float32, torch.float64):
+        made = conductor(anchored=anchored)
+        params, before, hr = setting(dtype, accumulated=accumulated, factors=factors, scale=scale)
+        if anchored:
+            anchor(made, params)
+        conflicts.append(deferred.resolve([dict(InPlaceMerge(made)(params, hr, T, before=before, scale=scale))])[0])
+        results.append({name: p.grad.double() for name, p in params.items()})
+        assert deferred.read([made.logs()["corrected"]])[0] > 0.1
+    for name, exact in results[1].items():
+        error = (results[0][name] - exact).flatten(1 if exact.dim() > 1 else 0).abs().max()
+        assert error <= 4e-6 * exact.abs().max(), name
+    assert conflicts[0] == pytest.approx(conflicts[1], abs=1e-9)
+
+
+@pytest.mark.parametrize("names", [("means",), ("opacities", "sh0", "shN"), ("means", "quats", "scales", "detail")])
+def test_frozen_attributes_stay_frozen(passes, names):
+    made = conductor()
+    params, before, hr = setting(torch.float32, names=names, accumulated=False, factors=False, scale=1.0)
+    frozen = torch.nn.Parameter(torch.zeros(N, 2), requires_grad=False)
+    ratios = InPlaceMerge(made)({**params, "frozen": frozen}, hr, T, before=before)
+    assert frozen.grad is None
+    assert set(ratios) == {*names} - {"detail"} | {"gaussian"}
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in params.values())
+
+
+def test_without_hr_the_authentic_gradient_passes_and_that_of_f_det_is_zero(passes):
+    params, before, _ = setting(torch.float32, accumulated=False, factors=False, scale=1.0)
+    expected = {name: p.grad.clone() for name, p in params.items() if name != "detail"}
+    assert InPlaceMerge(conductor())(params, None, T, before=before) == {}
+    assert all(torch.equal(params[name].grad, g) for name, g in expected.items())
+    assert not params["detail"].grad.any()
+
+
+def test_half_precision_is_merged_in_float32(passes):
+    merged = []
+    for dtype in (torch.float16, torch.float32):
+        params, before, hr = setting(torch.float32, accumulated=False, factors=True, scale=1.0)
+        g = params["shN"].grad.mul(2e4).to(torch.float16)
+        params["shN"] = torch.nn.Parameter(params["shN"].detach().to(dtype))
+        params["shN"].grad = g.to(dtype)
+        InPlaceMerge(conductor())(params, hr, T, before=before)
+        merged.append(params["shN"].grad)
+    assert merged[0].dtype == torch.float16
+    assert torch.allclose(merged[0].float(), merged[1], rtol=2e-3, atol=1e-6)
+
+
+def test_what_is_not_finite_is_refused_but_under_a_gradient_scaler():
+    params, before, hr = setting(torch.float32, accumulated=False, factors=False, scale=1.0)
+    params["scales"].grad[17, 1] = torch.nan
+    run = partial(InPlaceMerge(conductor()), params, hr, T, before=before)
+    run(must_be_finite=False)
+    if kernel.compiled([torch.zeros(1)]) is not None:
+        with pytest.raises(
+            DivergedError, match=r"merged gradient of scales is not finite for 1 Gaussians, first Gaussian 17"
+        ):
+            run()
+
+
+class Count(TorchDispatchMode):
+    """Operations that are no views, by name."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.operations: Counter[str] = Counter()
+
+    def __torch_dispatch__(self, operation, types, arguments=(), keywords=None):
+        if not operation.is_view:
+            self.operations[operation.overloadpacket.__name__] += 1
+        return operation(*arguments, **(keywords or {}))
+
+
+def operations(n: int, device: str = "cpu") -> Counter[str]:
+    params, before, hr = setting(torch.float32, n=n, accumulated=False, factors=True, scale=1.0)
+    if device != "cpu":
+        params = {name: torch.nn.Parameter(p.detach().to(device)) for name, p in params.items()}
+        for name, p in params.items():
+            p.grad = None if name == "detail" else torch.empty_like(p)
+        grads = {name: g.to(device) for name, g in hr.grads.items()}
+        evidence = Evidence(*(x.to(device) for x in (hr.step.evidence.reliability, hr.step.evidence.demand)))
+        hr = RoutedGradients(
+            grads, toy.step(T, evidence), Colour(*(x.to(device) for x in hr.colour)), hr.detail.to(device)
+        )
+    merge = InPlaceMerge(conductor())
+    merge(params, hr, T, before=before)
+    with Count() as count:
+        merge(params, hr, T, before=before)
+    return count.operations
+
+
+def test_the_number_of_operations_does_not_depend_on_that_of_gaussians(passes):
+    few, many = operations(500), operations(20_000)
+    assert few == many
+    assert few.total() <= {"cpp": 2, "warp": 16, "torch": 110}[passes]
+
+
+def test_on_a_device_nothing_is_read():
+    found = operations(500, "meta")
+    assert not found["_local_scalar_dense"]
+    assert not found["nonzero"]
+    assert found.total() <= 110
+
+
+def test_dense_gradients_are_the_factors_product():
+    like = {name: torch.zeros(N, *SHAPES[name]) for name in ("sh0", "shN", "means")}
+    colour = Colour(torch.rand(N, 3), torch.rand(N, 9))
+    g = dense({"means": torch.ones(N, 3), "quats": torch.ones(N, 4)}, colour, like)
+    assert isinstance(g, Grads)
+    assert set(g) == set(like)
+    assert torch.equal(g["shN"][:, :8], colour.basis[:, 1:, None] * colour.rgb[:, None])
+    assert not g["shN"][:, 8:].any()
