@@ -229,8 +229,8 @@ _SECOND: Final = (1, 2**64 - 2)  # the dimension of bands, as autograd stores 1 
 
 
 def are_bands(sh0: Tensor, shN: Tensor, params: Mapping[str, Tensor]) -> bool:
-    """Whether these colours are the raw sh0, or it with an offset, and the first bands of the raw shN, so that their gradients are those
-    of the parameters. Read from the autograd graph: slices of cat((sh0, shN), 1).
+    """Whether these colours are the raw sh0, or it with an offset, and the first bands of the raw shN, so that their gradients
+    are those of the parameters. Read from the autograd graph: slices of cat((sh0, shN), 1).
     """
     nodes = [_sliced(x.grad_fn, start) for x, start in ((sh0, 0), (shN, 1))]
     cat = nodes[0]
@@ -279,6 +279,6 @@ class HostOutput:
 
 
 RenderAt = Callable[[Target, Float[Tensor, " N"] | None, View], HostOutput]
-"""Renders by the host's own renderer, opacities multiplied by the gate: with f_det at HR, without it for any other target. The view
-is that of the iteration, with an SR image of the size that is due.
+"""Renders by the host's own renderer, opacities multiplied by the gate: with f_det at HR, without it for any other target. The
+view is that of the iteration, with an SR image of the size that is due.
 """

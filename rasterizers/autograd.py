@@ -67,7 +67,7 @@ _recordings: Final[list[list[Drawing]]] = []
 
 @contextmanager
 def recorded() -> Iterator[list[Drawing]]:
-    """What is drawn with gradients inside, by whichever code: its VJP takes several cotangents in one pass, and stops at the splats."""
+    """What is drawn with gradients inside, by whichever code. Its VJP takes several cotangents in one pass and stops at the splats."""
     drawings: list[Drawing] = []
     _recordings.append(drawings)
     try:
@@ -115,8 +115,9 @@ def _shown(rasterizer: Rasterizer, splats: Splats, camera: Camera) -> tuple[Any,
 
 @contextmanager
 def drawing_ahead(K: Float[Tensor, "3 3"], width: int, height: int) -> Iterator[None]:
-    """The first drawing inside brings along another of the same splats from the same pose, by K and without `rgb_offset`. A later `draw`
-    of just that, here or after the block, takes it: the two share projection, colour and depth order.
+    """The first drawing inside brings along another of the same splats from the same pose, by K and without `rgb_offset`.
+
+    A later `draw` of just that, here or after the block, takes it: the two share projection, colour and depth order.
     """
     (fx, _, cx), (_, fy, cy), _ = K.tolist()
     _ahead.wanted, _ahead.kept = (fx, fy, cx, cy, width, height), None

@@ -44,7 +44,11 @@ def passes(request, monkeypatch):
             pytest.skip(str(reason))
         from clear_strategies.kernels.merge import warp
 
-        monkeypatch.setattr(in_place.kernel, "compiled", lambda tensors: warp.merge)
+        monkeypatch.setattr(
+            in_place.kernel,
+            "compiled",
+            lambda tensors: warp.merge if all(x.dtype == torch.float32 for x in tensors) else None,
+        )
     elif kernel.compiled([torch.zeros(1)]) is None:
         pytest.skip("the kernels are not compiled")
     return request.param
