@@ -62,10 +62,6 @@ QUESTIONS: Final[Mapping[str, tuple[str, Options]]] = {
         "--out": {**_COMMON["--out"], "default": Path("outputs/seconds"),
                   "help": "holds tables and trainings; finished trainings are kept (default: %(default)s)"},
     }),
-    "errors": ("where a run's error on its test views lies", {
-        "run": {"type": Path, "metavar": "RUN", "help": "the folder of a finished run"},
-        "--reference": {"type": Path, "metavar": "RUN", "help": "another run of the same scene, beside it"},
-    }),
 }  # fmt: skip
 
 

@@ -7,7 +7,7 @@ the cut-offs too.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
@@ -18,9 +18,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 import rasterizers
-from clear_strategies.bench import accuracy, peers, scenes
+from clear_strategies.bench import accuracy, scenes
 from clear_strategies.bench.accuracy import NO_CUT_OFFS, Drawn, affordable
-from clear_strategies.bench.peers import Peer
 from clear_strategies.bench.results import Results, line_chart
 from clear_strategies.bench.scenes import SETTINGS, Workload
 from clear_strategies.bench.timing import interleaved, medians, milliseconds
@@ -36,19 +35,17 @@ SAME, NONE = "same cut-offs", "no cut-offs"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contestant:
-    """A backend, or a peer, at a preset on a scene.
+    """A backend at a preset on a scene.
 
     Args:
         names: the columns that say what a row of a table measured.
         render: draws the scene.
         stages: times more stages than forward and backward.
-        rules: settings that differ from `SETTINGS`.
     """
 
     names: Mapping[str, str]
     render: Callable[[], Any]
-    stages: Callable[[WorkLog], None] = lambda work_log: None
-    rules: Mapping[str, Any] = field(default_factory=dict)
+    stages: Callable[[WorkLog], None]
 
     @property
     def label(self) -> str:
@@ -69,13 +66,11 @@ def measure(
     require_device(device)
     backends, truth = usable(backend, device, results.note), accuracy.truth_backend()
     workloads = [scenes.load(name).to(device) for name in scene]
-    others = peers.available(results.note) if device == "cuda" and peers.PRESET in preset else []
     times, errors, turns = list[dict[str, Any]](), list[dict[str, Any]](), list[pd.DataFrame]()
     for workload in workloads:
         results.log(f"{workload.name}: {len(workload.splats):,} Gaussians")
         affordable_here = [b for b in backends if affordable(b, workload, b, results.note)]
-        contestants = [backend_on(workload, b, p) for b in affordable_here for p in preset]
-        contestants += [peer_on(workload, peer) for peer in others]
+        contestants = [backend_on(workload, b, p) for b in affordable_here for p in preset if p in presets_of(b)]
         if not contestants:
             continue
         contenders = {c.label: partial(turn, c, random_cotangents(workload)) for c in contestants}
@@ -90,7 +85,6 @@ def measure(
     if errors:
         results.tables["rasterizers_error"] = pd.DataFrame(errors)
         results.figures["time_against_error"] = figure(pd.DataFrame(times), pd.DataFrame(errors))
-    results.notes += [f"{peer.name}: {peer.differences}" for peer in others]
 
 
 def figure(time: pd.DataFrame, error: pd.DataFrame) -> Figure:
@@ -116,9 +110,7 @@ def usable(asked: Sequence[str], device: str, note: Callable[[str], None]) -> li
         if name not in reasons:
             raise DataError("--backend", name, "is no backend", f"choose from {', '.join(reasons)}")
     for name in dict.fromkeys(asked or reasons):
-        if reasons[name] is None and name == "gsplat":
-            reasons[name] = "measured as a peer on CUDA"
-        elif reasons[name] is None and name == "warp" and device == "cpu" and not asked:
+        if reasons[name] is None and name == "warp" and device == "cpu" and not asked:
             reasons[name] = "made for CUDA; name it with --backend to measure it on a CPU"
         elif reasons[name] is None and device not in rasterizers.load(name).traits.devices:
             reasons[name] = f"it does not run on {device}"
@@ -128,6 +120,11 @@ def usable(asked: Sequence[str], device: str, note: Callable[[str], None]) -> li
     if not names:
         raise DataError("--backend", ", ".join(asked), "cannot run here", "see the lines above")
     return names
+
+
+def presets_of(backend: str) -> Sequence[str]:
+    """The presets that a backend draws at: gsplat's cut-offs are fixed."""
+    return ["fast"] if backend == "gsplat" else list(PRESETS)
 
 
 def turn(contestant: Contestant, cotangents: Float[Tensor, "K H W 3"]) -> dict[str, float]:
@@ -151,7 +148,7 @@ def random_cotangents(workload: Workload) -> Float[Tensor, "K H W 3"]:
 
 
 def backend_on(workload: Workload, backend: str, preset: str) -> Contestant:
-    """One of our backends, with the stages that peers lack: both scales together."""
+    """A backend; it also times both scales, together and one after the other."""
     rasterizer = rasterizers.load(backend, preset=preset, **SETTINGS)
     splats, camera = workload.splats, workload.camera
     lr = camera.scaled(1 / workload.lr_factor)
@@ -164,15 +161,8 @@ def backend_on(workload: Workload, backend: str, preset: str) -> Contestant:
             rasterizer(splats, camera)
 
     module = getattr(rasterizer, "module", "")  # the instruction set of the compiled backend
-    return Contestant(_names(workload, backend, module, preset), lambda: rasterizer(splats, camera), stages)
-
-
-def peer_on(workload: Workload, peer: Peer) -> Contestant:
-    return Contestant(_names(workload, peer.name, "", peers.PRESET), lambda: peer.render(workload), rules=peer.rules)
-
-
-def _names(workload: Workload, backend: str, module: str, preset: str) -> dict[str, str]:
-    return {"scene": workload.name, "backend": backend, "module": module, "preset": preset}
+    names = {"scene": workload.name, "backend": backend, "module": module, "preset": preset}
+    return Contestant(names, lambda: rasterizer(splats, camera), stages)
 
 
 def peak_on_cuda(c: Contestant, cotangents: Float[Tensor, "K H W 3"]) -> float:
@@ -206,8 +196,7 @@ def _error_rows(workload: Workload, contestants: Sequence[Contestant], backend: 
     for c in contestants:
         drawn = accuracy.draw(c.render, cotangent)
         for against, cut_offs in ((SAME, PRESETS[c.names["preset"]]), (NONE, NO_CUT_OFFS)):
-            rules = {**c.rules, **cut_offs}
-            key = tuple(sorted(rules.items()))
+            key = tuple(sorted(cut_offs.items()))
             if key not in truths:
-                truths[key] = accuracy.truth(backend, workload, cotangent, rules)
+                truths[key] = accuracy.truth(backend, workload, cotangent, cut_offs)
             yield {**c.names, "truth": against, **accuracy.errors(drawn, truths[key])}

@@ -9,26 +9,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from clear_strategies.geometry.projection import back_project, inside_of, project, seen_pixels
+from clear_strategies.geometry.projection import inside_of, project, seen_pixels
 from rasterizers.interface import Camera
 
 _TOLERANCE: Final = 0.03  # a camera sees a point whose depth there exceeds the camera's own by at most this share of it
-
-
-def seen_by(
-    camera: Camera, depth: Float[Tensor, "H W"], others: Sequence[tuple[Camera, Float[Tensor, "h w"]]]
-) -> Int[Tensor, "H W"]:
-    """In how many other cameras the surface behind each pixel is inside the image and not hidden.
-
-    Args:
-        depth: z in world units, nan where there is no surface; the count is 0 there.
-        others: cameras, each with its own depth.
-    """
-    rows, columns = torch.nonzero(depth.isfinite(), as_tuple=True)
-    surface = back_project(camera, torch.stack((columns, rows), dim=1) + 0.5, depth[rows, columns])
-    seen = torch.zeros(depth.shape, dtype=torch.long)
-    seen[rows, columns] = times_seen(surface, others)
-    return seen
 
 
 def times_seen(

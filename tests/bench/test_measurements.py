@@ -67,10 +67,10 @@ def test_the_reference_takes_no_part_in_large_scenes():
 
 
 def test_unavailable_backends_are_noted(monkeypatch):
-    monkeypatch.setattr(rasterizers, "available", lambda: {"quick": "no compiler", "gsplat": None, "torch": None})
+    monkeypatch.setattr(rasterizers, "available", lambda: {"quick": "no compiler", "torch": None})
     notes = []
     assert drawing.usable([], "cpu", notes.append) == ["torch"]
-    assert notes == ["quick: no compiler", "gsplat: measured as a peer on CUDA"]
+    assert notes == ["quick: no compiler"]
     with pytest.raises(DataError, match="cannot run here"):
         drawing.usable(["quick"], "cpu", notes.append)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from clear_strategies.geometry.projection import sample_colors
-from clear_strategies.geometry.visibility import seen_by
+from clear_strategies.geometry.visibility import times_seen
 from rasterizers.interface import Camera
 from tests.helpers import planes
 
@@ -21,12 +21,11 @@ def camera(x: float) -> Camera:
     return planes.camera(x, 10, 10, 10.0)
 
 
-def test_a_pixel_is_seen_where_its_surface_is_inside_another_camera_and_not_hidden():
+def test_a_point_is_seen_where_it_is_inside_a_camera_and_not_hidden():
     wall = torch.full((10, 10), 1.0)
-    beside = seen_by(camera(0.0), wall, [(camera(0.5), wall), (camera(0.0), wall)])  # 5 pixels aside
-    assert beside[:, :5].unique().tolist() == [1]
-    assert beside[:, 5:].unique().tolist() == [2]
-    assert seen_by(camera(0.0), wall, [(camera(0.0), wall * 0.5)]).max() == 0  # something stands before it
-    assert seen_by(camera(0.0), wall, [(camera(0.0), wall * 2)]).min() == 1
-    assert seen_by(camera(0.0), torch.full((10, 10), torch.nan), [(camera(0.0), wall)]).max() == 0
-    assert seen_by(camera(0.0), wall, [(camera(0.0), torch.full((10, 10), torch.nan))]).max() == 0
+    across = torch.arange(10) / 10 - 0.45  # the centres of a row of pixels at a depth of 1
+    points = torch.stack((across, torch.zeros(10) + 0.05, torch.ones(10)), dim=1)
+    beside = times_seen(points, [(camera(0.5), wall), (camera(0.0), wall)])  # 5 pixels aside
+    assert beside.tolist() == [1] * 5 + [2] * 5
+    for depth, seen in ((wall * 0.5, 0), (wall * 2, 1), (wall * torch.nan, 0)):  # before, behind, unknown
+        assert times_seen(points, [(camera(0.0), depth)]).unique().tolist() == [seen]
