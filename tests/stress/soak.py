@@ -56,7 +56,7 @@ def run(iterations: int) -> list[Row]:
         for t in range(1, iterations + 1):
             iterate(state, rasterizer)
             bad += not all(math.isfinite(float(x)) for name, x in state.history[-1].items() if name.startswith("loss"))
-            if t % max(1, iterations // 40) == 0:
+            if t % max(10, iterations // 40) == 0:
                 evaluate(state, scene, rasterizer, t)
                 checkpoint.save(Path(folder), state.checkpoint({}))
                 gc.collect()
