@@ -10,9 +10,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.geometry.dense_stereo.image import Grey
+from clear_strategies.kernels.losses import cpp
+from rasterizers.native import threads
 
 _VARIANCE_FLOOR: Final = 1e-5  # of grey in [0, 1]: windows with less contrast than noise correlate with nothing
-_UNSEEN: Final = 0.5  # cost of a plane that a photo does not see: that of unrelated windows
 _BLOCK: Final = 1 << 19  # pixels times planes that are compared at once: they stay in a processor's cache
 
 
@@ -22,16 +23,16 @@ def cost_volume(
     """(1 - ZNCC) / 2 in [0, 1], the mean over the better half of the other photos: the worse half may be occluded.
 
     ZNCC is the correlation of two windows, E[(a - E a)(b - E b)] / (σ_a σ_b), of the photo and of the other photo drawn
-    through the plane.
+    through the plane; a plane that a photo does not see costs as unrelated windows do, 0.5.
     """
     height, width = photo.image.shape
     volume = photo.image.new_empty(height, width, len(inverse_depths))
-    reference = _Windows(photo.image[None], window)
+    reference = _Windows(photo.image.contiguous(), window)
     swept = [_Swept(photo, other) for other in others]
     at_once = max(1, _BLOCK // (height * width))
     for first in range(0, len(inverse_depths), at_once):
         planes = slice(first, first + at_once)
-        costs = (_cost(reference, other, inverse_depths[planes], window) for other in swept)
+        costs = (_cost(reference, other, inverse_depths[planes]) for other in swept)
         volume[:, :, planes] = mean_of_lowest(costs, (len(others) + 1) // 2).permute(1, 2, 0)
     return volume
 
@@ -54,10 +55,9 @@ def mean_of_lowest(values: Iterator[Tensor], count: int) -> Tensor:
 class _Windows:
     """Mean and standard deviation of each pixel's window."""
 
-    def __init__(self, images: Float[Tensor, "P H W"], window: int) -> None:
-        self.images = images
-        self.mean = box_mean(images, window)
-        variance = box_mean(images * images, window) - self.mean * self.mean
+    def __init__(self, image: Float[Tensor, "H W"], window: int) -> None:
+        self.image, self.window = image, window
+        self.mean, variance = _moments(image[None], window)
         self.deviation = (variance.clamp_min(0) + _VARIANCE_FLOOR).sqrt()
 
 
@@ -67,7 +67,7 @@ class _Swept:
     def __init__(self, photo: Grey, other: Grey) -> None:
         rotated, self.shift = photo.towards(other)
         self.rotated = rotated.permute(2, 0, 1).contiguous()
-        self.image = other.image
+        self.image = other.image.contiguous()
 
     def through(self, inverse_depths: Float[Tensor, " P"]) -> tuple[Float[Tensor, "P H W"], Bool[Tensor, "P H W"]]:
         """(the other photo drawn through each plane, whether the pixel lies inside it).
@@ -85,14 +85,33 @@ class _Swept:
         return drawn[:, 0], seen
 
 
-def _cost(
-    reference: _Windows, other: _Swept, inverse_depths: Float[Tensor, " P"], window: int
-) -> Float[Tensor, "P H W"]:
+def _cost(reference: _Windows, other: _Swept, inverse_depths: Float[Tensor, " P"]) -> Float[Tensor, "P H W"]:
+    covariance, variance = _compared(reference, other, inverse_depths)
+    deviation = variance.clamp_min_(0).add_(_VARIANCE_FLOOR).sqrt_()
+    return (1 - covariance.div_(deviation.mul_(reference.deviation))).div_(2)
+
+
+def _compared(
+    reference: _Windows, other: _Swept, inverse_depths: Float[Tensor, " P"]
+) -> tuple[Float[Tensor, "P H W"], Float[Tensor, "P H W"]]:
+    """(covariance with the windows of the other photo drawn through each plane, 0 where it does not see them; their variance)."""
+    image, window = reference.image, reference.window
+    if image.device.type == "cpu" and image.dtype == torch.float32 and cpp.available():
+        covariance, variance = image.new_empty(2, len(inverse_depths), *image.shape)
+        cpp.native().sweep(
+            image, reference.mean[0], other.rotated, other.shift, other.image, inverse_depths, window,
+            covariance, variance, threads(),
+        )  # fmt: skip
+        return covariance, variance
     drawn, seen = other.through(inverse_depths)
-    windows = _Windows(drawn, window)
-    covariance = box_mean(reference.images * drawn, window) - reference.mean * windows.mean
-    correlation = covariance / (reference.deviation * windows.deviation)
-    return torch.where(seen, (1 - correlation) / 2, _UNSEEN)
+    mean, variance = _moments(drawn, window)
+    return torch.where(seen, box_mean(image * drawn, window) - reference.mean * mean, 0.0), variance
+
+
+def _moments(images: Float[Tensor, "P H W"], window: int) -> tuple[Float[Tensor, "P H W"], Float[Tensor, "P H W"]]:
+    """(mean, variance) of each pixel's window."""
+    mean = box_mean(images, window)
+    return mean, box_mean(images * images, window) - mean * mean
 
 
 def box_mean(images: Float[Tensor, "P H W"], window: int) -> Float[Tensor, "P H W"]:

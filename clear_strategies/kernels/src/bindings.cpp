@@ -8,6 +8,7 @@
 #include "bind_step.hpp"
 #include "filter.hpp"
 #include "isa.hpp"
+#include "sweep.hpp"
 
 NB_MODULE(CLEAR_MODULE, m) {
   nanobind::set_leak_warnings(false);  // a script that ends while it holds a rendering has done nothing wrong
@@ -17,4 +18,5 @@ NB_MODULE(CLEAR_MODULE, m) {
   clear::bind_merge(m);
   clear::bind_step(m);
   clear::bind_filter(m);
+  clear::bind_sweep(m);
 }

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
+from clear_strategies.geometry.dense_stereo import cost
 from clear_strategies.geometry.dense_stereo.cost import cost_volume
 from clear_strategies.geometry.dense_stereo.image import Grey
 from clear_strategies.geometry.dense_stereo.smoothing import smooth
@@ -27,6 +29,17 @@ def test_the_true_plane_costs_next_to_nothing_whatever_the_brightness() -> None:
         assert seen[..., 1].mean() < 0.03
         assert (seen[..., 0] > seen[..., 1]).float().mean() > 0.95
         assert torch.equal(cost[:, :10, 1], torch.full_like(cost[:, :10, 1], 0.5))  # not in the other photo
+
+
+@pytest.mark.parametrize("window", [3, 7])
+def test_the_compiled_sweep_is_the_readable_one(window: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = (Grey(p.camera, p.image.mean(2)) for p in plane_photos(2, 77, 71))
+    planes = torch.tensor([1 / 8, 1 / 4.1, 1 / 3, 3.0])
+    compiled = cost_volume(first, [second], planes, window)
+    monkeypatch.setattr(cost.cpp, "available", lambda: False)
+    difference = (cost_volume(first, [second], planes, window) - compiled).abs()
+    assert difference.median() < 1e-6
+    assert difference.max() < 0.01  # where there is next to no contrast
 
 
 def test_smoothing_agrees_with_the_recursion_written_out() -> None:
