@@ -67,7 +67,7 @@ _recordings: Final[list[list[Drawing]]] = []
 
 @contextmanager
 def recorded() -> Iterator[list[Drawing]]:
-    """What is drawn with gradients inside, by whichever code. Its VJP takes several cotangents in one pass and stops at the splats."""
+    """What is drawn with gradients inside, by any code. Its VJP takes several cotangents in one pass and stops at the splats."""
     drawings: list[Drawing] = []
     _recordings.append(drawings)
     try:
