@@ -51,6 +51,13 @@ QUESTIONS: Final[Mapping[str, tuple[str, Options]]] = {
         "--backend": {"metavar": "NAME", "help": "default: the fastest that runs here"},
         **_TURNS,
     }),
+    "host": ("what the strategies cost in another trainer's loop", {
+        "--strategies": {"nargs": "+", "default": ["gco", "p2g", "svs", "clear", "clear skips=none", "best"],
+                         "metavar": "NAME", "help": "as in `conductor`, with overrides after a space"},
+        "--gaussians": {"type": positive(int), "default": 46_000, "metavar": "N", "help": "default 46000"},
+        "--width": {"type": positive(int), "default": 128, "metavar": "PX", "help": "of the LR photos (default 128)"},
+        **_TURNS, "--repeats": {**_TURNS["--repeats"], "default": 20},
+    }),
     "seconds": ("seconds until a variant is as good as the reference at its end", {
         "overrides": {**_OVERRIDES, "help": "of all trainings, as for a run (default: the demo)"},
         "--scene": {**_MANY, "metavar": "SCENE", "help": "of conf/scene, one after the other"},
@@ -83,7 +90,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if results.out is not None:  # a folder that cannot be made is known before the measuring
             results.out.mkdir(parents=True, exist_ok=True)
-        import_module(f"clear_strategies.bench.{question}").measure(results, **options)
+        module = "integration.bench" if question == "host" else f"clear_strategies.bench.{question}"
+        import_module(module).measure(results, **options)
         sys.stdout.write(results.text())
         results.write(question, {k: options[k] for k in ("device", "repeats", "seeds") if k in options})
         return 0

@@ -75,3 +75,15 @@ def test_the_page_links_to_every_published_table_and_a_figure_is_drawn_from_them
     time, error = (pd.read_csv(data / f"rasterizers_{table}.csv") for table in ("time", "error"))
     figure = rasterizers.figure(time, error)
     assert [axis.get_title() for axis in figure.axes] == ["small", "s100k", "s100k-lr", "garden", "s500k"]
+
+
+@pytest.mark.slow
+def test_host_measures_a_loop_alone_and_with_a_strategy(tmp_path):
+    asked = ["host", "--strategies", "clear", "--gaussians", "300", "--width", "16", "--repeats", "2", "--threads", "1"]
+    assert main([*asked, "--out", str(tmp_path)]) == 0
+    host, error = (pd.read_csv(tmp_path / f"{name}.csv").set_index("loop") for name in ("host", "host_error"))
+    assert list(host.index) == ["alone", "clear"]
+    assert host["operations"]["clear"] - host["operations"]["alone"] <= 60
+    assert host["reads"]["clear"] == host["reads"]["alone"]
+    assert host["merge_ms"]["clear"] > 0
+    assert error.loc["clear", ["means", "quats", "scales", "opacities", "sh0", "shN"]].max() < 1e-3
