@@ -33,9 +33,9 @@ def main(arguments: Sequence[str]) -> None:
     if not 0 <= options.port <= _LAST_PORT:
         raise SettingError(f"--port: must be 0 to {_LAST_PORT}, got {options.port}.")
     from clear_strategies.jobs.saved import open_splat
-    from clear_strategies.viewing import live
+    from clear_strategies.viewing import require_viewer
 
-    live.require_viewer()
+    require_viewer()
     splat = open_splat(options.run, options.rasterizer)
     _log.info("%s", splat.source)
     from clear_strategies.viewing.server import Screen, SplatViewer

@@ -16,7 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from clear_strategies import files
+from clear_strategies import files, viewing
 from clear_strategies.compose import tree
 from clear_strategies.data.prepare import save_lr
 from clear_strategies.data.scene import Scene
@@ -35,7 +35,6 @@ from clear_strategies.training import memory, signals
 from clear_strategies.training.checkpoint import CHECKPOINTS
 from clear_strategies.training.loop import fit
 from clear_strategies.training.state import TrainState
-from clear_strategies.viewing import live
 from clear_strategies.viewing.cameras import FILE as CAMERAS
 from clear_strategies.viewing.cameras import read_cameras, write_cameras
 from clear_strategies.viewing.look import Painter
@@ -127,7 +126,7 @@ def run(config: DictConfig, folder: Path, overrides: Sequence[str] | None = None
     settings = settings_of(values)
     fit = settings.fit
     if fit.viewer:
-        live.require_viewer()
+        viewing.require_viewer()
     if fit.log == "tensorboard":
         tensorboard.require_tensorboard()
     training, baseline = _Training.of(settings, values, folder, overrides), None
@@ -247,7 +246,9 @@ def _watched(training: _Training, state: TrainState, place: _Place) -> Iterator[
         if fit_settings.viewer:
             cameras, title = read_cameras(training.folder / CAMERAS), f"{place.scene.name} · {training.chosen.title}"
             tell = functools.partial(_log.info, "look while it trains: %s")
-            turn = stack.enter_context(live.watched(painter, cameras, title, tell))
+            from clear_strategies.viewing.server import watched
+
+            turn = stack.enter_context(watched(painter, cameras, title, tell))
             calls.append(lambda: turn(state.t - 1))
         if fit_settings.log == "tensorboard":
             calls.append(stack.enter_context(tensorboard.logged(training.folder, state, place.scene, painter)))

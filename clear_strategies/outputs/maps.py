@@ -37,8 +37,7 @@ from clear_strategies.outputs import figures
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.field import FieldShot, GaussianField
-from clear_strategies.viewing import film
-from clear_strategies.viewing.look import Painter
+from clear_strategies.viewing.look import DEPTH_COLORS, DepthScale, Painter
 from rasterizers.interface import Rasterizer
 
 _log = logging.getLogger(__name__)
@@ -130,9 +129,9 @@ def _write_picture(path: Path, view: View, found: ViewMaps) -> None:
         panels.append((title, found.maps[name], "viridis", (0.0, 1.0)))
     if (stereo := view.depth) is not None:
         depth, confidence = (x.where(stereo.known, torch.nan) for x in (stereo.depth, stereo.confidence))
-        scale = film.DepthScale.spanning(depth)
+        scale = DepthScale.spanning(depth)
         title = f"depth by stereo, world units\nknown at {stereo.coverage:.0%}"
-        panels.append((title, depth, film.COLORS, (scale.near, scale.far)))
+        panels.append((title, depth, DEPTH_COLORS, (scale.near, scale.far)))
         panels.append(("confidence of the depth", confidence, "viridis", (0.0, 1.0)))
     columns = min(_COLUMNS, len(panels))
     rows, height = -(-len(panels) // columns), 4 * view.hr.camera.height / view.hr.camera.width + 0.7

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from torch import Tensor
 
-from clear_strategies import files
+from clear_strategies import files, viewing
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
 from clear_strategies.data.photo_files import read_image, write_png
@@ -31,7 +31,7 @@ from clear_strategies.outputs.plan import Chosen, marks
 from clear_strategies.outputs.provenance import provenance
 from clear_strategies.training import memory
 from clear_strategies.training.state import TrainState
-from clear_strategies.viewing import FPS, cameras, film, paths, video
+from clear_strategies.viewing import cameras, paths, video
 from clear_strategies.viewing import page as splat_page
 from clear_strategies.viewing.look import Painter
 from rasterizers.interface import Camera, Color, Rasterizer
@@ -161,7 +161,7 @@ def _write_video(path: Path, train: Sequence[Camera], painter: Painter, frames: 
         _log.info("no video of the camera path is written: %s.", missing)
         return
     along = [cameras.at_most(camera, _LONGEST) for camera in paths.through(train, frames)]
-    video.write_video(path, film.color_frames(painter, along), fps=FPS)
+    video.write_video(path, (images.to_bytes(painter.color(camera)) for camera in along), fps=viewing.FPS)
 
 
 def _write_page(
@@ -171,7 +171,7 @@ def _write_page(
     count = len(painter.field)
     if most == 0:
         return
-    if (missing := splat_page.missing()) is not None:
+    if (missing := viewing.missing()) is not None:
         _log.info("no %s is written: %s.", path.name, missing)
         return
     if count > most:

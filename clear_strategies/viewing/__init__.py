@@ -1,7 +1,22 @@
-"""Showing a field: its rendering, cameras and paths, and pictures, videos, pages and a viewer."""
+"""Showing a field: its rendering, the cameras of a run and a path through them, a video, a page and a viewer."""
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import Final
 
+from clear_strategies.errors import SettingError
+
 FPS: Final = 24.0  # of a video along a path
+
+
+def missing() -> str | None:
+    """Why no viewer and no page can be shown, with the remedy; None where the extra [view] is installed."""
+    lacks = [name for name in ("viser", "nerfview", "splines") if find_spec(name) is None]
+    return f"the viewer needs {' and '.join(lacks)}: pip install 'clear-strategies[view]'" if lacks else None
+
+
+def require_viewer() -> None:
+    """Raise a SettingError where one of the viewer's libraries is not installed."""
+    if (problem := missing()) is not None:
+        raise SettingError(f"{problem}.")

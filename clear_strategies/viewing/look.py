@@ -1,13 +1,15 @@
-"""Rendering of a field for display, by the run's rasterizer, with parts of the model switched off on request."""
+"""Pictures of a field by the run's rasterizer, with parts of the model switched off on request, and depth in colours."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from clear_strategies.training.field import GaussianField
@@ -17,6 +19,11 @@ from rasterizers.interface import Camera, Rasterizer, Splats
 _WITHOUT_MIP: Final[Mapping[str, Any]] = {"kernel": 0.3, "antialiased": False}
 """The 2D filter of 3DGS: a blur of 0.3 px² without compensation."""
 _SOLID: Final = 0.5  # a pixel has a depth where the Gaussians cover at least this share of it
+_SAMPLED: Final = 5  # cameras that the range of depths is taken from, about
+_EXTREMES: Final = (0.02, 0.98)  # quantiles of depth at the ends of the range
+DEPTH_COLORS: Final = "viridis_r"
+"""matplotlib's name of the colours of depth: near is bright."""
+_UNKNOWN: Final = 0.8  # grey
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,11 +76,6 @@ class Painter:
         """A number >= 0 per Gaussian, blended as colours are; 0 where nothing is."""
         return self._numbers(camera, values[:, None].expand(-1, 3).to(self.field.means), look)[..., 0].cpu()
 
-    @torch.no_grad()
-    def points(self, camera: Camera, rgb: Float[Tensor, "N 3"], look: Look = AS_MEASURED) -> Float[Tensor, "H W 3"]:
-        """The Gaussians in other colours, RGB in [0, 1], over black."""
-        return self._numbers(camera, rgb.to(self.field.means), look).clamp(0, 1).cpu()
-
     def _numbers(self, camera: Camera, rgb: Float[Tensor, "N 3"], look: Look) -> Float[Tensor, "H W 3"]:
         """Render the Gaussians with these colours over black."""
         splats = self._splats(look)
@@ -89,3 +91,35 @@ class Painter:
             settings = {} if look.mip else _WITHOUT_MIP
             self._made[key] = self.make(**settings, **({"background": (0.0, 0.0, 0.0)} if black else {}))
         return self._made[key]
+
+
+@dataclass(frozen=True, slots=True)
+class DepthScale:
+    """The range of depths that the colours span, world units."""
+
+    near: float
+    far: float
+
+    @classmethod
+    def of(cls, painter: Painter, cameras: Sequence[Camera], look: Look = AS_MEASURED) -> DepthScale:
+        """From the depths that a few of the cameras see."""
+        sampled = cameras[:: math.ceil(len(cameras) / _SAMPLED)]
+        return cls.spanning(torch.cat([painter.depth(camera, look).flatten() for camera in sampled]))
+
+    @classmethod
+    def spanning(cls, depth: Float[Tensor, "*shape"]) -> DepthScale:
+        """From depths; those that are not finite are left out. 0 to 1 where none is finite."""
+        known = depth[depth.isfinite()].cpu().numpy()  # torch's own quantile takes 16 million numbers at most
+        if not len(known):
+            return cls(0.0, 1.0)
+        near, far = (float(np.quantile(known, q)) for q in _EXTREMES)
+        return cls(near, max(far, near * (1 + 1e-6) + 1e-6))
+
+    def picture(self, depth: Float[Tensor, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
+        """Depth in colours, grey where there is none."""
+        from matplotlib import colormaps
+
+        values = ((depth - self.near) / (self.far - self.near)).clamp(0, 1).numpy()
+        colored = colormaps[DEPTH_COLORS](np.nan_to_num(values))[..., :3]
+        colored[~np.isfinite(values)] = _UNKNOWN
+        return np.asarray((colored * 255).round().astype(np.uint8))

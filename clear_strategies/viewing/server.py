@@ -12,7 +12,7 @@ import logging
 import math
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -23,25 +23,24 @@ import torch
 import viser
 import viser.transforms
 from jaxtyping import Float
-from nerfview.render_panel import populate_general_render_tab
-from torch import Tensor
 
 from clear_strategies.core.images import to_bytes
 from clear_strategies.data.photo_files import read_image
-from clear_strategies.viewing.aim import aim, drawn_length, vertical_fov, wxyz
+from clear_strategies.viewing import paths
 from clear_strategies.viewing.cameras import SavedCamera, at_most
-from clear_strategies.viewing.film import DepthScale
-from clear_strategies.viewing.look import AS_MEASURED, Look, Painter
+from clear_strategies.viewing.look import AS_MEASURED, DepthScale, Look, Painter
 from clear_strategies.viewing.video import Pixels
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
-_COLOR, _DEPTH, _COVERAGE, _OPACITY, _DETAIL = SHOWN = ("color", "depth", "coverage", "opacity", "f_det")
+_COLOR, _DEPTH = SHOWN = ("color", "depth")
 _SMALL: Final = 96  # px, longest edge of the pictures that the colours of depth are chosen by
-_LARGEST: Final = 2048  # px, longest edge of a picture
+_SIZE: Final = 1024  # px, longest edge of a picture at first
 _MOST_FRUSTUMS: Final = 200
-_TOP: Final = 0.98  # quantile of |f_det| at the end of its colours
+_LENGTH: Final = 0.12  # of a camera in the scene, in mean distances from the cameras to what they look at
+_PATIENCE: Final = 0.02  # seconds between looks at the button while the run is paused
+_TURN: Final = 0.002  # seconds that the lock is free after an iteration, so that a thread that waits for it gets it
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,22 +69,7 @@ class Screen:
         camera = Camera(torch.from_numpy(world_to_camera), focal, focal, width / 2, height / 2, width, height)
         if view.show == _DEPTH:
             return self.depth_scale.picture(self.painter.depth(camera, view.look))
-        if view.show == _COVERAGE:
-            ones = torch.ones(len(self.painter.field))
-            return to_bytes(self.painter.numbers(camera, ones, view.look)[..., None].expand(-1, -1, 3))
-        if view.show == _COLOR:
-            return to_bytes(self.painter.color(camera, view.look))
-        return to_bytes(self.painter.points(camera, self.colors(view.show), view.look))
-
-    def colors(self, show: str) -> Float[Tensor, "N 3"]:
-        """The Gaussians by their opacity from 0 to 1, or by |f_det| up to its 98 % quantile, in viridis."""
-        from matplotlib import colormaps
-
-        field = self.painter.field
-        values = field.filtered_opacities().data.cpu() if show == _OPACITY else field.detail.data.norm(dim=1).cpu()
-        if show == _DETAIL and len(values):
-            values = values / max(float(np.quantile(values.numpy(), _TOP)), 1e-9)
-        return torch.from_numpy(colormaps["viridis"](values.clamp(0, 1).numpy())[:, :3]).float()
+        return to_bytes(self.painter.color(camera, view.look))
 
     @functools.cached_property
     def depth_scale(self) -> DepthScale:
@@ -139,7 +123,7 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
             self.server.stop()
 
     def _populate_rendering_tab(self) -> None:
-        """Ours, then nerfview's own without its scale of the world, so that saved paths are in the run's."""
+        """Ours, then nerfview's own."""
         gui = self.server.gui
         with gui.add_folder("Look", order=0):
             self._switches: dict[str, Any] = {
@@ -151,20 +135,9 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
             }  # fmt: skip
             for handle in self._switches.values():
                 handle.on_update(self.rerender)
-            resolution = gui.add_slider("Longest edge, px", min=128, max=_LARGEST, step=64, initial_value=1024)
-            self.render_tab_state.viewer_res = resolution.value
-
-            def resize(event: Any) -> None:
-                self.render_tab_state.viewer_res = int(resolution.value)
-                self.rerender(event)
-
-            resolution.on_update(resize)
+        super()._populate_rendering_tab()
+        self._rendering_tab_handles["viewer_res_slider"].value = self.render_tab_state.viewer_res = _SIZE
         self._rendering_folder.expand_by_default = False
-        handles = populate_general_render_tab(
-            self.server, output_dir=self.output_dir, folder=self._rendering_folder, render_tab_state=self.render_tab_state,
-            extra_handles=self._training_tab_handles if self.mode == "training" else {}, scale_ratio=1.0,
-        )  # fmt: skip
-        self._rendering_tab_handles.update(handles)
 
     def _render(self, state: Any, tab: Any) -> Pixels:
         """Called by nerfview in a thread of each browser, which ends the process on an error: so none may pass."""
@@ -181,7 +154,9 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         """Draw the training cameras, each of which a click goes to, and a switch that shows them."""
         if not train:
             return
-        length = drawn_length([saved.camera for saved in train])
+        focus = paths.look_at([saved.camera for saved in train])
+        distances = [np.linalg.norm(saved.camera.center.double().numpy() - focus) for saved in train]
+        length = _LENGTH * float(np.mean(distances))
         frustums = []
         for saved in train:
             camera = saved.camera
@@ -207,3 +182,75 @@ def _go_to(camera: Camera, event: Any) -> None:
         event.client.camera.wxyz = wxyz(camera)
         event.client.camera.position = tuple(camera.center.tolist())
         event.client.camera.fov = vertical_fov(camera)
+
+
+@contextlib.contextmanager
+def watched(
+    painter: Painter, cameras: Sequence[SavedCamera], title: str, report: Callable[[str], None]
+) -> Iterator[Callable[[int], None]]:
+    """A viewer while a run trains. Yields a function to call after each iteration, with its number.
+
+    The caller holds nerfview's lock, except in that function: the field is never drawn while an iteration changes it, and the
+    run's bits are those of a run without a viewer.
+
+    Args:
+        report: called with the viewer's address.
+    """
+    viewer = SplatViewer(Screen(painter, cameras), title=title, mode="training")
+    report(viewer.address)
+    viewer.lock.acquire()
+    began = time.monotonic()
+
+    def after_step(iteration: int) -> None:
+        nonlocal began
+        # nerfview shares the time between both by the pixels of each a second: an iteration counts as one.
+        viewer.render_tab_state.num_train_rays_per_sec = 1 / max(time.monotonic() - began, 1e-9)
+        viewer.lock.release()
+        try:
+            viewer.update(iteration, 1)
+            if viewer.server.get_clients():
+                time.sleep(_TURN)
+            while viewer.state == "paused":
+                time.sleep(_PATIENCE)
+        finally:
+            viewer.lock.acquire()
+        began = time.monotonic()
+
+    try:
+        yield after_step
+    finally:
+        viewer.lock.release()
+        viewer.close()
+
+
+def aim(server: viser.ViserServer, cameras: Sequence[Camera], scale: float = 1.0) -> None:
+    """Look from the first camera at the distance of the point that all of them look at; without cameras, do nothing.
+
+    Args:
+        scale: of what the server shows, in world units of the cameras.
+    """
+    if not cameras:
+        return
+    axes = torch.stack([camera.world_to_camera[:3, :3].double() for camera in cameras])
+    up = -axes[:, 1].mean(0)
+    server.scene.set_up_direction(tuple((up / up.norm().clamp_min(1e-9)).tolist()))
+    first = cameras[0]
+    distance = float(np.linalg.norm(paths.look_at(cameras) - first.center.double().numpy()))
+    start = server.initial_camera
+    start.position = tuple((scale * first.center).tolist())
+    focus = first.center.double() + distance * first.world_to_camera[2, :3].double()
+    start.look_at = tuple((scale * focus).tolist())
+    start.up = tuple((-first.world_to_camera[1, :3]).tolist())
+    start.fov = vertical_fov(first)
+
+
+def vertical_fov(camera: Camera) -> float:
+    """Radians."""
+    return 2 * math.atan(camera.height / 2 / camera.fy)
+
+
+def wxyz(camera: Camera) -> tuple[float, float, float, float]:
+    """Its rotation, camera to world, as a quaternion."""
+    rotation = viser.transforms.SO3.from_matrix(camera.world_to_camera[:3, :3].double().T.numpy())
+    w, x, y, z = (float(value) for value in rotation.wxyz)
+    return w, x, y, z

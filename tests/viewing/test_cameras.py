@@ -1,9 +1,8 @@
-"""Cameras as files: what a run writes is what is read, and other programs' paths are understood."""
+"""Cameras as files: what a run writes is what is read."""
 
 from __future__ import annotations
 
 import json
-import math
 
 import numpy as np
 import pytest
@@ -46,28 +45,6 @@ def test_inrias_cameras_are_read(tmp_path):
     assert found.camera.center.tolist() == [0, 0, -4]
 
 
-@pytest.mark.parametrize("flat", [True, False])
-def test_the_path_of_a_viewer_is_read(tmp_path, flat):
-    # OpenGL: x right, y up, z back; four units in front of the origin.
-    matrix = np.diag([1.0, -1.0, -1.0, 1.0])
-    matrix[2, 3] = -4
-    entry = {"camera_to_world": matrix.flatten().tolist() if flat else matrix.tolist(), "fov": 90, "aspect": 2}
-    content = {"render_width": 96, "render_height": 64, "fps": 12, "camera_path": [entry, entry]}
-    (tmp_path / "path.json").write_text(json.dumps(content))
-    found, fps = cameras.read_path(tmp_path / "path.json", (10, 10))
-    assert (len(found), fps) == (2, 12)
-    torch.testing.assert_close(found[0].world_to_camera.float(), toy.camera(0.0).world_to_camera)
-    assert found[0].fy == pytest.approx(32)
-
-
-def test_a_transforms_file_is_a_path(tmp_path):
-    content = {"camera_angle_x": math.pi / 2, "frames": [{"transform_matrix": np.eye(4).tolist()}]}
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
-    (found,), fps = cameras.read_path(tmp_path / "transforms.json", (100, 50))
-    assert fps is None
-    assert (found.fx, found.width, found.height) == (pytest.approx(50), 100, 50)
-
-
 TURNED = [{"width": 4, "height": 4, "fx": 4, "fy": 4, "rotation": [[1, 0], [0, 1]], "position": [0, 0, 0]}]
 
 
@@ -75,16 +52,15 @@ TURNED = [{"width": 4, "height": 4, "fx": 4, "fy": 4, "rotation": [[1, 0], [0, 1
     ("content", "message"),
     [
         (None, "cannot be read"), ("", "is not valid"), ("[{", "is not valid"), ("[]", "is an empty list"),
-        ("[1]", "must be"), ("[{}]", "is missing"), ("{}", "is no camera path"), ('{"frames": []}', "frames"),
-        ('{"camera_path": []}', "camera_path"), ('{"camera_path": [{"fov": 50}]}', "is missing"),
+        ("[1]", "must be"), ("[{}]", "is missing"), ("{}", "must be `array`"),
         (json.dumps(TURNED), r"\[0\].rotation: must be a 3x3 matrix"),
     ],
 )  # fmt: skip
-def test_what_is_no_path_is_refused_in_one_line(tmp_path, content, message):
+def test_what_holds_no_cameras_is_refused_in_one_line(tmp_path, content, message):
     if content is not None:
         (tmp_path / "path.json").write_text(content)
     with pytest.raises(DataError, match=rf"path\.json: .*{message}"):
-        cameras.read_path(tmp_path / "path.json", (100, 50))
+        cameras.read_cameras(tmp_path / "path.json")
 
 
 @pytest.mark.parametrize(("longest", "size"), [(None, (96, 64)), (48, (48, 32)), (31, (32, 20)), (1000, (96, 64))])

@@ -10,14 +10,14 @@ import pytest
 
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs.saved import open_splat
-from clear_strategies.viewing import live
+from clear_strategies import viewing
 from tests.helpers import saved_run
 
 
 def test_missing_libraries_are_named(monkeypatch):
-    monkeypatch.setattr(live, "find_spec", lambda name: None if name == "viser" else object())
+    monkeypatch.setattr(viewing, "find_spec", lambda name: None if name == "viser" else object())
     with pytest.raises(SettingError, match=r"the viewer needs viser: pip install 'clear-strategies\[view\]'"):
-        live.require_viewer()
+        viewing.require_viewer()
 
 
 def test_a_viewer_is_there_while_a_run_trains_and_draws_between_two_iterations_alone(tmp_path, monkeypatch):
@@ -37,13 +37,13 @@ def test_a_viewer_is_there_while_a_run_trains_and_draws_between_two_iterations_a
         with viewers[0].lock:
             drawn.set()
 
-    with live.watched(splat.painter, splat.cameras, "toy", addresses.append) as after_step:
+    with server.watched(splat.painter, splat.cameras, "toy", addresses.append) as after_step:
         after_step(1)
         assert b"<html" in urlopen(addresses[0], timeout=20).read()  # noqa: S310 - our own address
         threading.Thread(target=draw).start()
         assert not drawn.wait(0.2)  # an iteration is under way
         monkeypatch.setattr(viewers[0].server, "get_clients", lambda: {0: None})
-        monkeypatch.setattr(live, "_TURN", 0.5)
+        monkeypatch.setattr(server, "_TURN", 0.5)
         after_step(2)
         assert drawn.is_set()
         viewers[0].state = "paused"

@@ -9,8 +9,7 @@ import torch
 
 import rasterizers
 from clear_strategies.training.field import GaussianField
-from clear_strategies.viewing.film import DepthScale
-from clear_strategies.viewing.look import Look, Painter
+from clear_strategies.viewing.look import DepthScale, Look, Painter
 from tests.helpers import saved_run, toy, wall
 
 CAMERA = toy.camera(0.2)

@@ -40,18 +40,9 @@ def close(found, exact):
 
 @pytest.mark.parametrize("look", [Look(), Look(detail=False, sh=False)])
 def test_the_window_shows_what_is_measured_and_switches_reach_the_picture(screen, splat, look):
-    found = screen.draw(server.View(look=look), POSE, FOV, (96, 64))
-    close(found, to_bytes(splat.painter.color(CAMERA, look)))
-
-
-def test_depth_and_coverage_are_pictures_and_the_gaussians_are_coloured_by_what_is_known_of_them(screen, splat):
-    for show in ("depth", "coverage"):
-        assert screen.draw(server.View(show=show), POSE, FOV, (96, 64)).shape == (64, 96, 3)
-    for show in ("opacity", "f_det"):
-        colors = screen.colors(show)
-        assert len(colors.unique(dim=0)) > 10
-        found = screen.draw(server.View(show=show), POSE, FOV, (96, 64))
-        close(found, to_bytes(splat.painter.points(CAMERA, colors)))
+    close(screen.draw(server.View(look=look), POSE, FOV, (96, 64)), to_bytes(splat.painter.color(CAMERA, look)))
+    depth = screen.depth_scale.picture(splat.painter.depth(CAMERA, look))
+    close(screen.draw(server.View("depth", look), POSE, FOV, (96, 64)), depth)
 
 
 def test_the_viewer_opens_and_closes(splat, screen):
