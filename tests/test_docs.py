@@ -172,7 +172,6 @@ NOT_RUN = {
     "an environment": r"^\. ",
     "waits for a browser": r"^clear-strategies view",
     "a video whose poses take a minute; tests/data/readers/test_video.py reads one": r"^clear-strategies train clip\.mp4",
-    "needs the extra export": r" --to (spz|sog)",
     "takes minutes, or a file that the viewer saves": r"--frames 240|flight\.json",
     "a class that the reader names": r"YourStrategy",
     "a wheel's first run, in the gate": r"^clear-strategies \+strategy=clear fit.iterations=10$",

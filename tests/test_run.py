@@ -133,7 +133,7 @@ def test_lr_images_are_written_for_an_external_model_whose_results_come_back(tmp
     assert "images sr" in result.stdout + result.stderr
 
 
-HEAVY = {"cv2", "scipy", "skimage", "kornia", "matplotlib", "open3d"}
+HEAVY = {"cv2", "scipy", "skimage", "kornia", "matplotlib"}
 
 
 @pytest.mark.slow

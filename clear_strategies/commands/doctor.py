@@ -21,11 +21,9 @@ EXTRAS: Final = {
     "colmap": (("pycolmap",), "poses for photos without any (data=photos)"),
     "heic": (("pillow_heif",), "photos as iPhones save them (HEIC)"),
     "view": (("viser", "nerfview"), "clear-strategies view, and the splat in a page"),
-    "export": (("gaussforge",), "export --to spz and --to sog"),
     "log": (("tensorboard",), "fit.log=tensorboard: curves and pictures while a run trains"),
     "gsplat": (("gsplat",), "gsplat's rasterizer on CUDA"),
     "warp": (("warp",), "the rasterizer on CUDA without a CUDA toolkit"),
-    "open3d": (("open3d",), "a second way of averaging points in voxels"),
     "sweeps": (("hydra_plugins.hydra_joblib_launcher",), "many runs at once, on one machine or a cluster"),
 }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -15,6 +15,7 @@ from clear_strategies.errors import SettingError
 
 if TYPE_CHECKING:
     from clear_strategies.jobs.saved import SavedSplat
+    from clear_strategies.viewing.video import Pixels
     from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
@@ -49,7 +50,7 @@ def main(arguments: Sequence[str]) -> None:
         where = {name: resized(c, width, max(1, round(c.height * width / c.width))) for name, c in where.items()}
     if options.path == _LOOP:
         where = {name: at_most(c, None if width is not None else _LONGEST) for name, c in where.items()}
-    kinds = {"": lambda camera: to_bytes(painter.color(camera, look))}
+    kinds: dict[str, Callable[[Camera], Pixels]] = {"": lambda camera: to_bytes(painter.color(camera, look))}
     if options.depth:
         scale = DepthScale.of(painter, list(where.values()), look)
         _log.info("depth: %.3g (bright) to %.3g (dark) world units, grey where nothing is", scale.near, scale.far)

@@ -1,13 +1,9 @@
-"""Cleaning a cloud: outliers are removed, voxels averaged, both as Open3D defines it.
-
-Outliers are SciPy's work, because most runs remove them and importing Open3D takes two seconds. Voxels are Open3D's where it
-is installed, else numpy's; the points are the same.
-"""
+"""Cleaning a cloud: outliers are removed, as Open3D's `remove_statistical_outlier` defines them."""
 
 from __future__ import annotations
 
 import logging
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
@@ -21,8 +17,6 @@ _log = logging.getLogger(__name__)
 OUTLIER_NEIGHBOURS: Final = 16
 OUTLIER_RATIO: Final = 3.0
 """The defaults of `without_outliers`' settings."""
-
-_LARGEST_CELL: Final = np.iinfo(np.int32).max  # Open3D counts voxels along an axis in an int
 
 
 def without_outliers(cloud: PointCloud, neighbours: int, ratio: float) -> PointCloud:
@@ -67,51 +61,3 @@ def remove_outliers(means: Float[Tensor, "N 3"], neighbours: int, ratio: float) 
     average = measure.sum() / n
     deviation = np.sqrt(np.square(measure[apart] - average).sum() / (n - 1))
     return torch.from_numpy(np.flatnonzero(apart & (measure < average + ratio * deviation)))
-
-
-def voxel_grid(
-    means: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"], edge: float
-) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
-    """One point per occupied cube: the averages of its positions and colours, ordered by cube.
-
-    Args:
-        edge: of a cube, world units, > 0. The grid starts half a cube below the smallest coordinates.
-
-    Raises:
-        ValueError: edge is so small that the number of cubes overflows.
-    """
-    points = means.detach().double().cpu().numpy()
-    if len(points) == 0:
-        return means, colors
-    origin = points.min(axis=0) - edge / 2
-    if float(np.ptp(points, axis=0).max()) >= edge * _LARGEST_CELL:
-        raise ValueError(f"edge must be at least the cloud's extent / {_LARGEST_CELL}, got {edge}. Enlarge the voxel.")
-    shades = colors.detach().double().cpu().numpy()
-    open3d = _open3d()
-    if open3d is not None:
-        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
-        cloud.colors = open3d.utility.Vector3dVector(shades)
-        merged = cloud.voxel_down_sample(edge)
-        both = np.concatenate((np.asarray(merged.points), np.asarray(merged.colors)), axis=1)
-        # Open3D returns the order of a hash map; here it is that of the cubes.
-        both = both[np.lexsort(np.floor((both[:, 2::-1] - origin[::-1]) / edge).T)]
-    else:
-        cubes = np.floor((points - origin) / edge).astype(np.int64)
-        order = np.lexsort(cubes.T[::-1])  # several times as fast as np.unique of rows
-        owner = np.empty(len(points), np.int64)
-        owner[order] = np.cumsum(np.diff(cubes[order], axis=0, prepend=cubes[order[:1]]).any(axis=1))
-        columns = np.concatenate((points, shades), axis=1).T
-        both = np.stack([np.bincount(owner, column) for column in columns], axis=1) / np.bincount(owner)[:, None]
-    averages = torch.from_numpy(both)
-    return averages[:, :3].to(means), averages[:, 3:].to(colors)
-
-
-def _open3d() -> Any:
-    """The module, or None where it is not installed or its system libraries are missing."""
-    try:
-        import open3d
-    except (ImportError, OSError) as reason:
-        _log.debug("voxels by numpy: open3d (extra [open3d]) cannot be imported (%s).", " ".join(str(reason).split()))
-        return None
-    _log.debug("voxels by open3d %s.", open3d.__version__)
-    return open3d

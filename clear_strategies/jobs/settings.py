@@ -29,7 +29,7 @@ class RunSettings(FitSettings):
         video: number of frames of path.mp4, a loop through the training cameras, 24 a second; 0: none.
         verbose: also show on the console the details that run.log holds; `-v` on the command line.
         page: write splat.html, which shows the field in any browser, if it has at most this many Gaussians; 0: never.
-        log: tensorboard writes losses, PSNR, learning rates and a few pictures for TensorBoard; extra [log].
+        log: tensorboard writes the numbers of history.csv and a render for TensorBoard; extra [log].
         viewer: look at the field in the browser while it trains; the address is logged. Extra [view].
         baseline: first train the same scene with the same settings, but without any strategy, into the folder baseline/ of
             the run. The contact sheet and the scores then show both. Without effect in a sweep, for a run that has no

@@ -23,8 +23,8 @@ from clear_strategies.outputs.baseline import Baseline
 from clear_strategies.outputs.contact_sheet import OWN_PHOTO, TRAINED_ON, SheetRow, write_contact_sheet
 from clear_strategies.outputs.coverage import write_coverage
 from clear_strategies.outputs.curves import write_curves
+from clear_strategies.outputs.export import export_ply
 from clear_strategies.outputs.figures import column_means, spaced
-from clear_strategies.outputs.formats import export_ply
 from clear_strategies.outputs.maps import MAPS, write_maps
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.plan import Chosen, marks

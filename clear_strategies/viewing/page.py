@@ -29,7 +29,9 @@ def write_page(path: Path, splats: Splats, cameras: Sequence[Camera], title: str
     Raises:
         OSError: the file cannot be written, or this machine has no loopback address.
     """
-    from clear_strategies.viewing.server import aim, viser
+    import viser
+
+    from clear_strategies.viewing.server import aim
 
     scale = _DISTANCE / max(float((cameras[0].center.double().cpu() - torch.from_numpy(look_at(cameras))).norm()), 1e-9)
     axes = rotation_matrix(splats.quats) * (scale * splats.scales)[:, None]

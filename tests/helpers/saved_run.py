@@ -9,7 +9,7 @@ import torch
 from clear_strategies import GCO, Conductor
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.merging.objective import Objective
-from clear_strategies.outputs.formats import export_ply
+from clear_strategies.outputs.export import export_ply
 from clear_strategies.training import checkpoint
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.mip import MipFilter

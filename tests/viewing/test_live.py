@@ -8,9 +8,9 @@ from urllib.request import urlopen
 
 import pytest
 
+from clear_strategies import viewing
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs.saved import open_splat
-from clear_strategies import viewing
 from tests.helpers import saved_run
 
 

@@ -143,7 +143,6 @@ _REFUSED: dict[str, str] = {
     "data.cloud.max_points=-1": "at least 1",
     "data.cloud.outlier_neighbours=1": "0 or at least 2",
     "data.cloud.outlier_ratio=.nan": "finite",
-    "data.cloud.voxel=0": "> 0",
     "data.cloud.box=.inf": "finite",
 }  # fmt: skip
 
