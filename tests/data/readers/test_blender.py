@@ -20,15 +20,6 @@ def test_splits_are_those_of_the_files(tmp_path: Path) -> None:
     assert capture.background == (1.0, 1.0, 1.0)
 
 
-def test_transparent_pixels_are_white(tmp_path: Path) -> None:
-    tiny.blender(tmp_path)
-    Image.new("RGBA", (tiny.WIDTH, tiny.HEIGHT), (0, 0, 0, 51)).save(tmp_path / "train/a.png")
-    image = blender.read(tmp_path).frames[0].load()
-    torch.testing.assert_close(image, torch.full((tiny.HEIGHT, tiny.WIDTH, 3), 0.8))
-    black = blender.read(tmp_path, background=(0.0, 0.0, 0.0)).frames[0].load()
-    assert black.max() == 0
-
-
 def test_the_order_is_that_of_the_file_and_endings_may_be_given(tmp_path: Path) -> None:
     tiny.blender(tmp_path)
     for i, name in enumerate(("r_2", "r_10")):

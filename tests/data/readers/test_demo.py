@@ -14,8 +14,7 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.readers import demo
-from clear_strategies.data.readers.demo.room import room
-from clear_strategies.data.readers.demo.surfaces import Ball, Finish, Panel, Texture
+from clear_strategies.data.readers.demo.surfaces import Texture
 from clear_strategies.errors import SettingError
 
 WIDTH, HEIGHT, FACTOR = 128, 96, 4
@@ -53,12 +52,6 @@ def test_photos_fit_their_cameras_are_eight_bit_and_fill_the_picture() -> None:
         assert demo.depth(frame.camera).isfinite().all()
         assert 0.3 < photo.mean() < 0.6
         assert (photo == 1).float().mean() < 0.02
-
-
-def test_a_photo_is_cast_once_and_is_the_same_whenever_it_is_cast() -> None:
-    frame = demo.read(width=32, height=24).frames[3]
-    assert frame.load() is frame.load()
-    assert torch.equal(frame.load(), demo.render(frame.camera))
 
 
 def test_cameras_look_at_the_room_upright_from_different_places() -> None:
@@ -112,55 +105,3 @@ def test_photos_are_free_of_aliasing(monkeypatch: pytest.MonkeyPatch) -> None:
 
     assert rms(photo) < 3 / 255
     assert rms(aliased) > 5 * rms(photo)
-
-
-def test_lr_has_features_that_triangulate_onto_the_surfaces() -> None:
-    import cv2
-
-    a, b = (demo.read(width=256, height=192).frames[i] for i in (2, 6))
-    sift = cv2.SIFT_create(contrastThreshold=0.01)  # type: ignore[attr-defined]
-    found = []
-    for frame in (a, b):
-        lr = (images.downsample(frame.load(), FACTOR) * 255).round().byte().numpy()
-        found.append(sift.detectAndCompute(cv2.resize(lr, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), None))
-    (keys_a, codes_a), (keys_b, codes_b) = found
-    pairs = [m for m, n in cv2.BFMatcher().knnMatch(codes_a, codes_b, k=2) if m.distance < 0.7 * n.distance]
-    projections = [(f.camera.world_to_camera[:3].numpy(), f.camera.scaled(1 / FACTOR)) for f in (a, b)]
-    matrices = [np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]]) @ pose for pose, c in projections]
-    # Keypoint coordinates have pixel centres at whole numbers of the enlarged image.
-    x = (np.array([keys_a[m.queryIdx].pt for m in pairs]) + 0.5) / 2
-    y = (np.array([keys_b[m.trainIdx].pt for m in pairs]) + 0.5) / 2
-    points = cv2.triangulatePoints(*matrices, x.T, y.T)
-    z = (matrices[0] @ (points / points[3]))[2]
-    true = demo.depth(a.camera).numpy()[(x[:, 1] * FACTOR).astype(int), (x[:, 0] * FACTOR).astype(int)]
-    assert len(pairs) > 60
-    assert np.median(np.abs(z / true - 1)) < 0.05
-
-
-def test_charts_invert_and_normals_have_unit_length() -> None:
-    for k, surface in enumerate(room()):
-        at = np.random.default_rng(k).uniform(0.05, 0.95, (50, 2))
-        points = surface.points(at)
-        assert np.allclose(surface.chart(points), at, atol=1e-4)
-        assert np.allclose(np.linalg.norm(surface.normal(points), axis=-1), 1)
-
-
-def test_shadows_fall_behind_what_stands_in_the_light() -> None:
-    ball = Ball(Finish("moon"), center=(0.0, 0.0, 0.0), radius=1.0)
-    panel = Panel(Finish("brick"), center=(0.0, 0.0, 0.0), right=(1.0, 0.0, 0.0), down=(0.0, 1.0, 0.0))
-    points = np.array([[0, 0, 3], [0.5, 0, 3], [1.5, 0, 3], [3, 0, 0], [0, 0, -1.5], [0, 0, 0.0]])
-    lamp = np.array([0.0, 0.0, -3.0])
-    # Halfway between lamp and z = 3 the line passes the plane z = 0 at half the x.
-    assert panel.blocks(points, lamp).tolist() == [True, True, True, False, False, False]
-    assert ball.blocks(points, lamp)[:5].tolist() == [True, True, True, False, False]
-    assert not panel.blocks(np.array([[2.5, 0, 3.0]]), lamp)[0]
-
-
-def test_textures_are_means_at_coarser_levels_and_mirrored_when_repeated() -> None:
-    image = np.arange(64, dtype=np.float32).reshape(8, 8, 1)
-    texture = Texture.of(image)
-    assert texture.widths.tolist() == [8, 4]
-    middle = np.array([[0.5, 0.5]], np.float32)
-    assert texture.sample(middle, np.array([2.0], np.float32)) == pytest.approx(31.5)
-    corner = np.array([[1 / 16, 1 / 16], [2 - 1 / 16, 1 / 16], [-1 / 16, 2 + 1 / 16]], np.float32)
-    assert np.allclose(texture.sample(corner, np.ones(3, np.float32)), 0)

@@ -64,14 +64,6 @@ def flat_photos(folder: Path, count: int) -> Path:
     return folder
 
 
-def test_photos_that_show_nothing_are_refused_with_what_to_do(tmp_path: Path) -> None:
-    folder = flat_photos(tmp_path / "photos", 3)
-    with pytest.raises(DataError, match="take more photos that overlap") as refusal:
-        photos.read(folder, tmp_path / "cache", threads=1)
-    assert "\n" not in str(refusal.value)
-    assert list((tmp_path / "cache").iterdir()) == []
-
-
 def test_what_can_be_known_is_refused_before_the_long_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = flat_photos(tmp_path / "photos", 3)
     with pytest.raises(DataError, match="lies among the photos"):

@@ -111,14 +111,6 @@ def test_photos_of_a_video_are_its_frames_and_the_scene_has_its_name(clip, monke
     assert [path.name for path in seen] == [f"around the room_{k:03d}.jpg" for k in range(1, 7)]
 
 
-@pytest.mark.parametrize("content", [b"", b"no video at all", b"\0\0\0\x18ftypmp42"])
-def test_what_is_no_video_is_refused_in_one_line(tmp_path, content):
-    path = tmp_path / "clip.mp4"
-    path.write_bytes(content)
-    with pytest.raises(DataError, match=r"ffmpeg finds 0 frames in it.*or the folder of its photos"):
-        frames_of(path, None)
-
-
 def test_frames_are_of_a_video(tmp_path):
     with pytest.raises(SettingError, match=r"data\.reader\.frames: .* is no video"):
         photos.read(tmp_path, frames=5)
