@@ -27,47 +27,21 @@ def test_a_run_leaves_everything_it_promises(finished):
     out = finished / "here"
     for name in ("metrics.json", "conflict.csv", "timing.csv", "history.csv", "contact_sheet.png", "curves.png"):
         assert (out / name).stat().st_size > 0, name
-    assert len(list((out / "renders").glob("*.png"))) == 3
     metrics = json.loads((out / "metrics.json").read_text())
-    assert metrics["strategies"] == ["gco", "p2g", "svs"]
-    assert metrics["overrides"][0] == "+strategy=clear"
+    assert (metrics["strategies"], metrics["overrides"][0]) == (["gco", "p2g", "svs"], "+strategy=clear")
     assert metrics["synthetic_prior"] is True
     assert set(metrics["test"]["mean"]) == {"ours", "bicubic", "prior"}
-    assert set(metrics["test"]["mean"]["ours"]) == {"psnr", "ssim", "gmsd", "blur"}
     assert 0 < metrics["conflict"]["gaussian"] < 1
     assert {"versions", "git", "seed", "backend", "plan"} <= set(metrics["provenance"])
     assert b"comment SplatRenderMode: mip" in (out / "point_cloud.ply").read_bytes()[:300]
     assert (out / "checkpoints" / "step_0000013.safetensors").is_file()
-    header = (out / "conflict.csv").read_text().splitlines()[0]
-    assert header.startswith("t,conflict,conflict_means")
     timing = (out / "timing.csv").read_text()
     assert "skipped" in timing
     stages = [line.split(",")[0] for line in timing.splitlines()[1:]]
     assert stages[:2] == ["photos and SR images", "initial points"]
     assert {"maps", "contact sheet and curves"} <= set(stages)
-    assert len(list((out / "views").glob("*_truth.png"))) == 3
-    assert len(list((out / "maps").glob("*/corrected.png"))) == 2
-    assert "points use test views" in (out / "run.log").read_text()
-
-
-def test_the_exported_ply_looks_as_it_was_measured(finished):
-    """Rendering the file with the filter off gives the test render: everything was folded in."""
-    import torch
-
-    import rasterizers
-    from clear_strategies.data.photo_files import read_image
-    from clear_strategies.data.ply import read_gaussians
-    from clear_strategies.data.readers import demo
-    from rasterizers import Splats
-
-    g = read_gaussians(finished / "here" / "point_cloud.ply")
-    splats = Splats(g.means, g.quats, g.scales.exp(), g.opacities.sigmoid(), g.sh0, g.shN)
-    capture = demo.read(width=64, height=48, views=5, train=2)
-    frame = next(f for f in capture.frames if f.split == "test")
-    image = rasterizers.load("torch", near=0.01)(splats, frame.camera).image.clamp(0, 1)
-    saved = read_image(finished / "here" / "renders" / f"{frame.name}.png")
-    assert float((image - saved).abs().max()) < 0.01
-    assert torch.isfinite(image).all()
+    pictures = [len(list(out.glob(kind))) for kind in ("renders/*.png", "views/*_truth.png", "maps/*/corrected.png")]
+    assert pictures == [3, 3, 2]
 
 
 @pytest.mark.slow
@@ -107,30 +81,6 @@ def test_a_strategy_of_another_package(tmp_path):
     # `python -m` puts the current folder on the path, as a user expects.
     assert result.returncode == 0, result.stderr
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["strategies"] == ["p2g", "mine"]
-    clash = run("+strategy=gco", "+strategies.mine._target_=theirs.Mine", *TINY, cwd=tmp_path)
-    assert clash.returncode == 2
-    assert "GCO and Mine both implement correct()" in clash.stdout + clash.stderr
-
-
-@pytest.mark.slow
-def test_lr_images_are_written_for_an_external_model_whose_results_come_back(tmp_path):
-    """data.save_lr writes and stops; whatever enlarges those files is then a prior."""
-    from PIL import Image
-
-    from clear_strategies.data.photo_folders import list_images
-
-    written = run("data.save_lr=lr", *TINY, cwd=tmp_path)
-    assert written.returncode == 0, written.stderr
-    assert not list(tmp_path.glob("outputs/**/metrics.json"))
-    (tmp_path / "sr").mkdir()
-    for path in list_images(tmp_path / "lr"):
-        with Image.open(path) as image:
-            image.resize((image.width * 4, image.height * 4), Image.Resampling.LANCZOS).save(
-                tmp_path / "sr" / f"{path.stem}_x4.png"
-            )
-    result = run("prior=images", "prior.path=sr", "prior.suffix=_x4", "hydra.run.dir=out", *TINY, cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
-    assert "images sr" in result.stdout + result.stderr
 
 
 HEAVY = {"cv2", "scipy", "skimage", "kornia", "matplotlib"}

@@ -96,12 +96,6 @@ def test_finished_trainings_are_kept_and_a_variant_that_fails_leaves_the_others(
         measured(tmp_path, ("optim.no=1",), ())
 
 
-@pytest.mark.parametrize("override", ["fit.seed=3", "+scene=fern", "hydra.run.dir=x", "fit.probe_every=7"])
-def test_settings_of_the_benchmark_are_refused(tmp_path, override):
-    with pytest.raises(DataError, match="is set by the benchmark"):
-        measured(tmp_path, (), (override,))
-
-
 @pytest.mark.slow
 def test_the_command_trains_a_tiny_demo_and_writes_its_tables(tmp_path, caplog, monkeypatch):
     monkeypatch.setenv("CLEAR_CACHE", str(tmp_path / "cache"))

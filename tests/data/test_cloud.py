@@ -75,19 +75,6 @@ def test_sr_images_of_few_photos_only_are_compared(monkeypatch) -> None:
     assert compared == [32, 64, 32]
 
 
-def test_sr_images_beyond_the_limit_are_compared_at_a_whole_part_of_their_size() -> None:
-    hr = plane_photos(3, 128, 96)
-    lr = [photo.reduced(4) for photo in hr]
-
-    def sizes(max_pixels: int) -> tuple[int, int]:
-        compared = compared_at(lr, hr, hr_is_photo=False, settings=StereoSettings(max_pixels=max_pixels))
-        return compared.images[0].camera.width, compared.reduction
-
-    assert sizes(128 * 96) == (128, 4)
-    assert sizes(128 * 96 - 1) == (64, 2)
-    assert sizes(64 * 48 - 1) == (32, 1)
-
-
 def test_sr_images_of_an_object_before_a_plain_background_are_not_compared() -> None:
     hr = plane_photos(3, 128, 96)
     for one in hr:
@@ -214,8 +201,3 @@ def test_points_fill_the_given_box_with_near_grey() -> None:
     one, other = (random_cloud([photo()], 10_000, seed, 1.3).means for seed in (0, 1))
     assert torch.equal(one, cloud.means)
     assert not torch.equal(other, cloud.means)
-
-
-def test_nothing_is_removed_from_or_added_to_random_points() -> None:
-    settings = CloudSettings(init="random", random_points=777, outlier_ratio=0.1)
-    assert len(initial_points(settings, [photo()]).cloud) == 777

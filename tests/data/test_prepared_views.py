@@ -21,7 +21,9 @@ from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.strategies.p2g import P2G
 from tests.helpers import captures as tiny
-from tests.helpers.blank_photos import POINTS, capture, papers
+from tests.helpers.captures import POINTS_AT_RANDOM as POINTS
+from tests.helpers.captures import alike as capture
+from tests.helpers.captures import papers
 from tests.helpers.networks import Counting
 
 ROOM = demo.read(width=64, height=48, views=5, train=2)

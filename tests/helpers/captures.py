@@ -10,12 +10,15 @@ import math
 import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from PIL import Image
 
 from clear_strategies.data.capture import Capture, Frame
+from clear_strategies.data.cloud import CloudSettings
+from clear_strategies.data.view_settings import ViewSettings
 from rasterizers import Camera
 
 WIDTH, HEIGHT = 16, 12
@@ -64,6 +67,20 @@ def in_a_row(*sizes: tuple[int, int], image: torch.Tensor | None = None) -> Capt
         )
         frames.append(Frame(f"{i:04d}.png", camera, lambda shown=shown: shown))
     return Capture("made up", tuple(frames))
+
+
+POINTS_AT_RANDOM = CloudSettings(init="random", random_points=50)
+"""Initial points of photos that show nothing."""
+
+
+def papers(**settings: Any) -> ViewSettings:
+    """The papers' protocols: conf/protocol/_papers.yaml."""
+    return ViewSettings(**{"train": 3, "test_every": 8, "photos_are": "hr", **settings})
+
+
+def alike(n: int = 3, width: int = 16, height: int = 16, image: torch.Tensor | None = None) -> Capture:
+    """Photos of one size, in a row."""
+    return in_a_row(*[(width, height)] * n, image=image)
 
 
 def write_photos(folder: Path, size: tuple[int, int] = (WIDTH, HEIGHT), mode: str = "RGB") -> None:

@@ -62,7 +62,7 @@ def stored(results):
 
 
 @pytest.mark.parametrize("densifier", ["default", "mcmc"])
-def test_it_trains_densifies_evaluates_and_saves(host, scene, tmp_path, densifier):
+def test_it_trains_densifies_evaluates_and_saves_what_its_own_evaluation_reads(host, scene, tmp_path, densifier):
     threshold = {"strategy.grow-grad2d": 1e-5} if densifier == "default" else {}
     said = launched(host, scene, tmp_path / "run", densifier, **threshold)
     assert "refine_stop_iter=14 instead of 25" in said  # SVS ends densification at half of max_steps
@@ -74,6 +74,9 @@ def test_it_trains_densifies_evaluates_and_saves(host, scene, tmp_path, densifie
     assert len(splats["means"]) > 60
     written = read_gaussians(next((tmp_path / "run" / "ply").glob("*.ply")))
     assert torch.allclose(written.sh0, splats["sh0"], atol=1e-6)  # f_base + f_det in both
+    file = next((tmp_path / "run" / "ckpts").glob("*.pt"))
+    again = training(scene, tmp_path / "again")
+    assert "PSNR" in start(host, "simple_trainer.py", densifier, *again, "--ckpt", file)
 
 
 def test_it_starts_from_stereo_between_its_photos(host, scene, tmp_path):
@@ -88,13 +91,6 @@ def test_it_starts_from_stereo_between_its_photos(host, scene, tmp_path):
         host, scene, tmp_path / "random", "default", "--init-type", "random", points="stereo", **{"init-num-pts": 80}
     )
     assert "points=stereo has no effect with init_type=random" in random
-
-
-def test_its_own_evaluation_reads_the_checkpoint(host, scene, tmp_path):
-    launched(host, scene, tmp_path / "run")
-    file = next((tmp_path / "run" / "ckpts").glob("*.pt"))
-    again = training(scene, tmp_path / "again")
-    assert "PSNR" in start(host, "simple_trainer.py", "default", *again, "--ckpt", file)
 
 
 def test_one_line_does_the_same_as_none(host, scene, tmp_path):

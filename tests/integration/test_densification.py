@@ -45,11 +45,6 @@ def test_without_such_a_strategy_nothing_changes(caplog):
     assert not caplog.text
 
 
-def test_what_a_strategy_never_allows_ends_at_once(caplog):
-    require_end(Conductor(Late(0, 0)), 100, "until")
-    assert "Late ends densification at 1. Lower until to that iteration" in caplog.text
-
-
 @pytest.mark.parametrize("host", ["gsplat", "inria"])
 def test_a_host_that_would_densify_after_the_anchor_is_refused_before_the_first_step(host, request):
     early = SVS(anchor_start=5, anchor_strength=0.01)

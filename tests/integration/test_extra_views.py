@@ -132,24 +132,6 @@ def test_a_scaler_of_losses_leaves_the_extra_step_of_a_fused_adam_as_it_is():
         assert torch.allclose(p, scaled[0][name], rtol=0, atol=1e-6), name
 
 
-@pytest.mark.parametrize("step_first", [False, True], ids=["densify, step", "step, densify"])
-def test_an_inria_style_host_draws_it_and_steps_on_it_whenever_it_densifies(
-    step_first, inria_host, inria_capture, drawn
-):
-    gaussians, clear, grads = trained_inria(
-        inria_host, inria_capture, [toy.ShowsDark()], iterations=26, step_first=step_first
-    )
-    assert len(gaussians._xyz) > inria.N
-    counts = clear.attachment.counts
-    assert counts["merges"] == len(drawn) == 26
-    assert 0 < counts["extra views"] <= 26
-    assert (
-        counts["extra views"] == 26
-    ) == step_first  # else 3DGS throws away the gradients of a step that it densifies before
-    assert counts["steps of the host alone"] == 0
-    assert all(bool(g.isfinite().all()) for g in grads.values())
-
-
 def test_an_inria_style_host_draws_any_camera(inria_host, inria_capture, drawn):
     opt = inria.options(inria_host, inria_capture, iterations=1)
     _, clear, _ = trained_inria(inria_host, inria_capture, [toy.ShowsDark()], iterations=1)

@@ -20,14 +20,6 @@ from tests.helpers import gsplat_host, toy
 from tests.helpers.gsplat_host import Host, started
 
 
-def test_a_function_is_wrapped_again_once_the_attachment_that_wrapped_it_is_removed():
-    host, first, _ = started()
-    first.remove()
-    _, second, render = started(host=host)
-    render().mean().backward()
-    assert (first.attachment.counts["merges"], second.attachment.counts["merges"]) == (0, 1)
-
-
 def with_detail():
     """A host whose function draws depths, too, and whose f_det is 0.2; that function, CLEAR, and what renders a photo."""
 

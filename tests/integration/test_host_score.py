@@ -19,12 +19,6 @@ from tests.helpers.inria import HR_FROM_START, WITHOUT_HR, N, options
 # ---- the tensor in which a host keeps the screen gradient
 
 
-def test_a_gradient_in_ndc_is_converted_to_pixels():
-    slot = ScreenGradientSlot(torch.zeros(2, 3), (200, 100), to_pixels=(2 / 200, 2 / 100))
-    gradient = slot.per_gaussian(torch.tensor([[4.0, 0.0, 9.0], [0.0, 3.0, 9.0]]), 2)
-    assert torch.allclose(gradient, torch.tensor([[0.04, 0.0], [0.0, 0.06]]))
-
-
 @pytest.mark.parametrize("to_pixels", [(1.0, 1.0), (2 / 200, 2 / 100)], ids=["gsplat", "inria"])
 def test_written_norms_are_in_ndc(to_pixels):
     tensor = torch.zeros(1, 3, 2, requires_grad=True)
@@ -96,11 +90,6 @@ def test_a_restored_factor_continues():
     ]
     assert torch.equal(*last)
     assert resumed.factor != 1
-
-
-def test_the_ordinary_statistic_is_not_scaled():
-    ordinary, slot = torch.rand(5), ScreenGradientSlot(torch.zeros(1, 5, 2), (2, 2))
-    assert score_for_host(slot, ordinary, ordinary, everyone(5), ScoreScaler(1.0)) is ordinary
 
 
 def test_absolute_gradients_stay_without_a_score_and_decide_how_many_pass_with_one():

@@ -67,14 +67,6 @@ def test_the_detail_feature_is_added_to_the_constant_band():
     assert bool((difference[:, 1:] == 0).all())
 
 
-def test_a_proxy_shares_the_models_attributes():
-    model = Model()
-    changed = proxy(model, Overrides(), ROLES)
-    changed.active_sh_degree = 2
-    assert model.active_sh_degree == 2
-    assert changed.get_opacity.equal(model.get_opacity)
-
-
 def test_an_attribute_that_the_model_lacks_is_still_missing():
     with pytest.raises(AttributeError, match="Model has no shs_dc"):
         _ = proxy(Model(), Overrides(), (("shs_dc", "detail"),)).shs_dc

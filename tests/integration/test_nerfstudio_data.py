@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import functools
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 
 from clear_strategies import GCO, P2G, Conductor
-from clear_strategies.data.lenses import pose_from_opengl
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.priors import Bicubic, Cached, Images
 from clear_strategies.errors import DataError, SettingError
@@ -27,7 +25,6 @@ from integration.nerfstudio.data import (
     seed_with_stereo,
     stereo_cloud,
     views_from_datamanager,
-    world_to_camera,
 )
 from integration.views import save_photos
 from tests.helpers import gsplat_host, toy
@@ -59,16 +56,6 @@ class DataManager:
     def cached_train(self):
         self.lens = self._corrected
         return self.photos
-
-
-def test_poses_are_converted_from_opengl_to_opencv():
-    straight = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4]])  # at (0, 0, 4), looks at the origin
-    turned = torch.tensor([[0.0, 0, -1, 4], [0, 1, 0, 5], [1, 0, 0, 6]])  # at (4, 5, 6), looks along +x
-    poses = world_to_camera(torch.stack((straight, turned)))
-    assert (poses[0] @ torch.tensor([1.0, 2, 3, 1])).tolist() == [1, -2, 1, 1]  # y down, one unit in front
-    assert (poses[1] @ torch.tensor([6.0, 5, 6, 1])).tolist() == [0, 0, 2, 1]
-    for pose, given in zip(poses, (straight, turned), strict=True):
-        assert torch.allclose(pose.double(), pose_from_opengl(Path("transforms.json"), "frame", given.tolist()))
 
 
 def test_views_are_the_photos_that_splatfacto_trains_on():

@@ -12,13 +12,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from clear_strategies.errors import DataError
 from clear_strategies.geometry import stereo
 from clear_strategies.geometry.projection import intrinsics
 from integration import HostError
 from integration import points as initial
 from integration.gsplat import points as gsplat_points
-from integration.gsplat.data import photos_of as photos_of_dataset
 from integration.inria.__main__ import main as inria_main
 from integration.inria.from_options import install as install_in_inria
 from integration.points import stereo_points
@@ -72,12 +70,6 @@ def test_one_line_says_what_was_found_and_a_large_cloud_is_reduced(monkeypatch, 
     assert torch.equal(few.means, stereo_points(photos).means)
 
 
-def test_too_few_photos_are_refused():
-    for photos in ([], host_photos()[:1]):
-        with pytest.raises(DataError, match="images: must be at least 2 photos"):
-            stereo_points(photos)
-
-
 # ---- gsplat's simple_trainer
 
 
@@ -122,25 +114,6 @@ def test_splats_start_at_the_hosts_own_points_by_default_and_where_they_are_rand
         assert torch.equal(p, own[name])
     warned = "points=stereo has no effect with init_type=random. Set init_type=sfm." in caplog.text
     assert warned == (points == "stereo")
-
-
-def test_the_hidden_half_of_a_photo_of_the_dataset_gives_no_points(trainer):
-    class Masked(trainer.Dataset):
-        def __getitem__(self, item):
-            return super().__getitem__(item) | {"mask": mask}
-
-    mask = torch.ones(16, 24, dtype=torch.bool)
-    dataset = Masked(trainer.Parser(toy.scene(N)))
-    assert len(stereo_points(photos_of_dataset(dataset))) == len(expected().means)
-    mask[:, 12:] = False
-    cloud = stereo_points(photos_of_dataset(dataset))
-    seen = torch.zeros(len(cloud), dtype=torch.bool)
-    for view in toy.scene(N).train:
-        camera = view.lr.camera
-        at = cloud.means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        seen |= at[:, 0] / at[:, 2] * camera.fx + camera.cx < 12.5
-    assert len(cloud) < len(expected().means)
-    assert seen.all()
 
 
 def test_a_script_without_the_hosts_functions_is_refused(trainer):

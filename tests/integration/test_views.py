@@ -1,4 +1,4 @@
-"""A host's photos as views: what a mask hides, and what is refused."""
+"""A host's photos as views: what a mask hides, what is refused, and the demo for a host's loop."""
 
 from __future__ import annotations
 
@@ -6,10 +6,16 @@ import pytest
 import torch
 
 from clear_strategies import P2G
+from clear_strategies.core.points import PointCloud
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.geometry.projection import intrinsics
+from clear_strategies.training.field import GaussianField
+from integration.examples.demo import load_demo, splats_with_optimizers
 from integration.views import by_name, view
 from tests.helpers import toy
+
+# ---- A host's photos as views: what a mask hides, and what is refused
+
 
 PHOTO = toy.scene(20).train[0].lr
 
@@ -61,3 +67,33 @@ def test_a_photo_mask_or_K_of_another_shape_or_range_is_refused(wrong, message):
 def test_two_views_of_one_name_are_refused():
     with pytest.raises(SettingError, match=r"'0001\.png' is the name of several"):
         by_name([of_host("0001.png"), of_host("0002.png"), of_host("0001.png")])
+
+
+# ---- the demo as the loop of a host needs it
+
+
+def test_the_demo_has_photos_cameras_and_sr_images_that_fit():
+    demo = load_demo(width=64, height=48)
+    assert demo.images.shape == (3, 12, 16, 3)
+    assert len(demo.tests) == 9
+    for photo in zip(demo.names, demo.images, demo.viewmats, demo.Ks, strict=True):
+        one = view(*photo, sr=demo.prior)
+        assert one.hr.image.shape == (48, 64, 3)
+    assert demo.psnr(lambda viewmat, K, w, h: torch.zeros(h, w, 3)) < 15
+    truths = iter([truth for _, _, truth in demo.tests])
+    assert demo.psnr(lambda viewmat, K, w, h: next(truths) + 0.01) == pytest.approx(40, abs=1)
+
+
+def test_splats_start_as_those_of_the_trainer():
+    points = torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
+    splats, optimizers = splats_with_optimizers(points, points.flip(0))
+    start = GaussianField.from_cloud(PointCloud(points, points.flip(0), "test")).raw()
+    assert set(splats) == set(optimizers) == set(start) - {"detail"}
+    for name, p in splats.items():
+        assert torch.allclose(p, start[name], atol=2e-3), name
+        assert optimizers[name].param_groups[0]["params"][0] is p
+
+
+def test_a_single_point_has_a_size():
+    splats, _ = splats_with_optimizers(torch.zeros(1, 3), torch.zeros(1, 3))
+    assert splats["scales"].isfinite().all()

@@ -220,15 +220,6 @@ def test_each_job_has_a_folder_of_its_own_whatever_path_or_number_of_settings_na
             assert len(name.encode()) <= 255
 
 
-def test_an_ablation_of_other_data():
-    found, composed_job = jobs("experiment=ablation", "protocol=blender_x4", "data.root=here", "fit.seed=0")
-    assert [job["data.scene"] for job in found[::4]] == SCENES["blender_x4"].split()
-    assert composed_job(found[-1]).data.path == "here/ship"
-    own, composed_job = jobs("experiment=ablation", "~protocol", "data=colmap", "data.path=mine", "fit.seed=0")
-    assert [job["+strategy"] for job in own] == list(ROWS["ablation"])
-    assert (composed_job(own[0]).data.path, composed_job(own[0]).data.views.shrink) == ("mine", 1)
-
-
 @pytest.mark.slow
 def test_one_command_runs_all_its_report_tells_the_rows_apart_and_a_rerun_trains_nothing(tmp_path: Path):
     tiny = ["experiment=ablation", "~protocol", "fit.seed=0", *TINY, "fit.iterations=3"]

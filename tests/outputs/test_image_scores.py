@@ -6,7 +6,6 @@ import inspect
 import math
 from dataclasses import astuple, replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from clear_strategies.core import images
-from clear_strategies.data.photo_files import read_image
 from clear_strategies.outputs.image_scores import PSNR_CAP, ImageScores, score
 from tests.helpers.image_files import noise
 
@@ -133,17 +131,3 @@ def test_blur_and_gmsd_tell_blur_invented_texture_and_displaced_structure_apart(
     displaced = score(photograph.roll(2, dims=1), photograph)
     assert abs(displaced.blur) < 0.01
     assert displaced.gmsd > score(enlarged(photograph, 2), photograph).gmsd
-
-
-@pytest.mark.parametrize("capture", ["fern", "kitchen360", "strecha_fountain", "real_room"])
-def test_real_photographs_rank_truth_network_bicubic_x4_bicubic_x8(shared_data: Path, capture: str) -> None:
-    cv2 = pytest.importorskip("cv2")
-    photos = sorted(p for p in (shared_data / capture).rglob("*") if p.suffix.lower() in {".png", ".jpg"})
-    image = read_image(photos[len(photos) // 2])
-    top, left = (image.shape[0] - 256) // 2, (image.shape[1] - 256) // 2
-    truth = image[top : top + 256, left : left + 256]
-    network = cv2.dnn.readNetFromONNX(str(shared_data / "sr_weights" / "span_x4.onnx"))
-    network.setInput(images.downsample(truth, 4).permute(2, 0, 1)[None].numpy())
-    enhanced = torch.from_numpy(network.forward()[0]).permute(1, 2, 0)
-    candidates = (truth, enhanced, enlarged(truth, 4), enlarged(truth, 8))
-    assert_ranked(*(score(candidate, truth) for candidate in candidates))

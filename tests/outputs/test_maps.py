@@ -16,7 +16,6 @@ from torch import Tensor
 import rasterizers
 from clear_strategies import GCO, P2G, SVS, Conductor, RandomBackground
 from clear_strategies.core.conflicts import conflict_ratio
-from clear_strategies.core.evidence import PatchMaps
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.view import DepthMap, View
 from clear_strategies.data.photo_files import read_image
@@ -97,24 +96,6 @@ def test_conflict_is_the_ratio_that_training_logs() -> None:
     g_base, g_hf = hr.vjp(OBJECTIVE.hr(hr.image, view.hr.image).cotangents)
     assert found.means["conflict"] == pytest.approx(conflict_ratio(g_lr, g_base + g_hf * 0.2)["gaussian"])
     assert 0 < found.means["conflict"] < 1
-
-
-class OwnPatches(Strategy):
-    """Has patch evidence, and is no P2G."""
-
-    def observe(self, view: View, hr: object) -> None:
-        return None
-
-    def patch_maps(self, view: View) -> PatchMaps:
-        return PatchMaps(torch.full((2, 3), 0.5), torch.full((2, 3), 0.25), patch=8)
-
-
-def test_any_strategy_can_have_patch_maps(tmp_path: Path) -> None:
-    state = trained(OwnPatches())
-    content = written(tmp_path, state, state.views[:1])
-    means = content["views"][state.views[0].name]
-    assert content["evidence"] == "OwnPatches"
-    assert (means["reliability"], means["demand"], means["weight"]) == (0.5, 0.25, 0.125)
 
 
 class Halve(Strategy):

@@ -1,20 +1,28 @@
-"""The plan names what a run does and skips."""
+"""What a run says of itself: the plan, the progress bar, the provenance."""
 
 from __future__ import annotations
 
+import json
+import subprocess
+from importlib import metadata
 from typing import Any
 
 import pytest
+import torch
 
 from clear_strategies import GCO, P2G, SVS, Strategy
 from clear_strategies.core.gradients import Grads
 from clear_strategies.merging.objective import Objective
 from clear_strategies.outputs import plan
 from clear_strategies.outputs.progress import progress_bar
+from clear_strategies.outputs.provenance import provenance
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
+
+# ---- the plan names what a run does and skips
+
 
 SCENE = toy.scene()
 
@@ -62,15 +70,6 @@ def test_a_strategy_without_effect_is_warned_of(caplog: pytest.LogCaptureFixture
     assert "HR scale throughout (lambda_HR = 0)" in found["skipped"]
 
 
-def test_the_console_gets_what_a_user_decides_on_and_run_log_the_rest() -> None:
-    found = plan.describe(SCENE, started(GCO()), plan.Chosen(None, ["gco"]), {"rasterizer": "torch", "threads": "1"})
-    short, details = found.short.splitlines(), found.details.splitlines()
-    assert len(short) <= 15
-    assert not set(short) & set(details)
-    assert any("milestones" in line for line in details)
-    assert short[-1].split(maxsplit=1) == ["more", f"{len(details)} lines in run.log, or here with -v"]
-
-
 def test_the_progress_bar_counts_iterations(capsys: pytest.CaptureFixture[str]) -> None:
     state, steps = started(), []
     with progress_bar(state, lambda: steps.append(state.t)) as update:
@@ -79,3 +78,32 @@ def test_the_progress_bar_counts_iterations(capsys: pytest.CaptureFixture[str]) 
             update(state)
     assert steps == list(range(2, 12))
     assert "10/10" in capsys.readouterr().err
+
+
+# ---- provenance holds what can be found out, and never fails
+
+
+def test_provenance_holds_versions_machine_and_the_facts_of_the_run() -> None:
+    found = provenance(seed=3, backend="torch")
+    assert torch.__version__.startswith(found["versions"]["torch"])  # which leaves out +cu130 in PyPI's wheel
+    assert found["threads"] == torch.get_num_threads()
+    assert (found["seed"], found["backend"]) == (3, "torch")
+    assert found["date"].endswith("+00:00")
+    assert json.loads(json.dumps(found)) == found
+
+
+@pytest.mark.parametrize("failure", [FileNotFoundError("git"), subprocess.TimeoutExpired("git", 10)])
+def test_without_git_the_commit_is_unknown(monkeypatch: pytest.MonkeyPatch, failure: Exception) -> None:
+    def fails(*arguments: object, **options: object) -> None:
+        raise failure
+
+    monkeypatch.setattr(subprocess, "run", fails)
+    assert provenance()["git"] in {"unknown", "no checkout"}
+
+
+def test_a_package_that_is_not_installed_is_not_listed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(name: str) -> str:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "version", absent)
+    assert provenance()["versions"] == {"clear-strategies": "source checkout"}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -29,13 +28,6 @@ def test_an_mp4_holds_the_frames_in_a_folder_that_looks_like_a_protocol(tmp_path
     assert found.shape == (10, 32, 48, 3)
     assert np.abs(found.mean((1, 2, 3)) - np.arange(10) * 20).max() < 4
     assert [path.name for path in Path("10:30").iterdir()] == ["a.mp4"]
-
-
-def test_an_mp4_says_by_which_matrix_its_colours_are_made(tmp_path):
-    video.write_video(tmp_path / "a.mp4", [np.full((32, 48, 3), (30, 180, 30), np.uint8)] * 2, fps=10)
-    command = [ffmpeg.get_ffmpeg_exe(), "-i", tmp_path / "a.mp4"]
-    assert "bt709" in subprocess.run(command, check=False, capture_output=True, text=True).stderr
-    assert read(tmp_path / "a.mp4")[0].mean((0, 1)) == pytest.approx((30, 180, 30), abs=4)
 
 
 def test_a_video_that_breaks_leaves_nothing(tmp_path):

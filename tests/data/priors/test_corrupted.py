@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from clear_strategies.core import images
-from clear_strategies.data.priors import Bicubic, Cached, Corrupted, DemoPrior
+from clear_strategies.data.priors import Cached, Corrupted, DemoPrior
 from clear_strategies.data.readers import demo
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.settings import build
@@ -51,12 +51,6 @@ def test_errors_differ_between_views_and_seeds():
     assert not torch.equal(one, other)
     a, b = ((Corrupted(Sharp(), patch=16)(name, lr, 4) - Sharp()(name, lr, 4)).abs() for name in "ab")
     assert not torch.equal(images.patch_means(a, 16) > 0, images.patch_means(b, 16) > 0)
-
-
-def test_labels_say_that_it_is_synthetic():
-    errors = "seeded errors in 30% of the patches)"
-    assert Corrupted(Bicubic()).label == f"bicubic (no detail beyond LR) (synthetic: {errors}"
-    assert DemoPrior({}).label == f"demo (synthetic: truth with {errors}"
 
 
 def test_a_network_inside_is_cached_and_the_config_builds_it(tmp_path):

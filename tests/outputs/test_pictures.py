@@ -1,0 +1,141 @@
+"""Figures, curves, maps of coverage and the contact sheet show what they are given and nothing else."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from clear_strategies.outputs import coverage, figures
+from clear_strategies.outputs.contact_sheet import OWN_PHOTO, SheetRow, write_contact_sheet
+from clear_strategies.outputs.curves import write_curves
+from clear_strategies.outputs.figures import PixelPage
+from tests.helpers import wall
+from tests.helpers.image_files import holds, random_image, read
+
+# ---- what the figures share
+
+
+def test_error_is_the_mean_difference_over_rgb() -> None:
+    image = np.array([[[0.5, 0.5, 0.5], [1.0, 0.0, 0.0]]])
+    truth = np.array([[[0.5, 0.5, 0.5], [0.4, 0.3, 0.0]]])
+    assert figures.error_map(image, truth) == pytest.approx(np.array([[0.0, 0.3]]))
+
+
+@pytest.mark.parametrize(
+    ("count", "expected"),
+    [(0, []), (1, [0]), (3, [0, 4, 8]), (4, [0, 3, 6, 9]), (10, [*range(10)]), (99, [*range(10)])],
+)
+def test_spaced_items_are_at_most_as_many_as_asked_for(count: int, expected: list[int]) -> None:
+    assert list(figures.spaced(range(10), count)) == expected
+    assert list(figures.spaced([], count)) == []
+
+
+# ---- curves show everything that was measured and nothing else
+
+
+def history(n: int = 100, **columns: float) -> list[dict[str, float]]:
+    return [{"t": float(t), **{name: value + 0.1 * t / n for name, value in columns.items()}} for t in range(1, n + 1)]
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [], history(1, loss_lr=0.1), history(loss_lr=0.1), history(loss_lr=0.0, conflict=math.nan),
+        history(loss_lr=0.1, loss_base=0.2, loss_hf=0.05, conflict=0.3, conflict_means=0.2, mean_q=0.9, corrected=0.1),
+        [*history(5, loss_lr=0.1), {"t": 6.0, "loss_lr": math.inf, "psnr_test": 20.0, "n_gaussians": 100.0}],
+    ],
+    ids=["nothing", "one iteration", "LR alone", "zeros and NaN", "everything", "an infinity"],
+)  # fmt: skip
+@pytest.mark.filterwarnings("error", "ignore::DeprecationWarning")
+def test_curves_draw_whatever_was_measured(tmp_path: Path, rows: list[dict[str, float]]) -> None:
+    marks = {"HR from": 5, "HR full": 30, "opacity reset": 30, "anchor": 50}
+    write_curves(tmp_path / "curves.png", rows, marks, "scene · strategy")
+    assert read(tmp_path / "curves.png").shape == (800, 1500, 3)
+
+
+def test_a_measured_column_is_drawn_and_an_unknown_one_is_not(tmp_path: Path) -> None:
+    histories = {
+        "plain": history(loss_lr=0.1),
+        "measured": history(loss_lr=0.1, conflict=0.4),
+        "unknown": history(loss_lr=0.1, weather=0.4),
+    }
+    for name, rows in histories.items():
+        write_curves(tmp_path / f"{name}.png", rows, {}, "scene")
+    plain, measured, unknown = (read(tmp_path / f"{name}.png") for name in ("plain", "measured", "unknown"))
+    assert not np.array_equal(plain, measured)
+    assert np.array_equal(plain, unknown)
+
+
+# ---- maps/coverage.png: how many photos see each point, and photos without a pose
+
+
+SCENE = wall.scene(-1.0, 0.0, 1.0)
+
+
+def test_a_point_is_seen_by_the_photos_whose_frame_it_lies_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    points, times = coverage.coverage_of(SCENE, wall.painter())
+    inside = sum((abs(points[:, 0] - x) < 2.3) & (abs(points[:, 1]) < 1.5) for x in (-1.0, 0.0, 1.0))
+    outside = sum((abs(points[:, 0] - x) < 2.5) & (abs(points[:, 1]) < 1.7) for x in (-1.0, 0.0, 1.0))
+    assert bool(((inside <= times) & (times <= outside)).all())
+    assert set(times.tolist()) == {0, 1, 2, 3}
+    monkeypatch.setattr(coverage, "_MOST_POINTS", 5)
+    assert 0 < len(coverage.coverage_of(SCENE, wall.painter())[0]) <= 5
+
+
+def test_the_map_has_the_colours_of_its_legend_and_dollars_are_no_mathematics(tmp_path: Path) -> None:
+    scene = replace(SCENE, unplaced={"b$1_$.jpg": "12 features: blurred, dark, or without texture"})
+    coverage.write_coverage(tmp_path / "coverage.png", scene, wall.painter(), "toy $20_$")
+    drawn = torch.from_numpy(read(tmp_path / "coverage.png").copy()).flatten(0, 1)
+    for color in coverage._COLORS:
+        assert int((drawn == torch.tensor(list(bytes.fromhex(color[1:])))).all(1).sum()) > 50
+
+
+# ---- the contact sheet shows what it is given, pixel for pixel
+
+
+def row(name: str, seed: int, *, truth: bool = True, size: tuple[int, int] = (40, 60)) -> SheetRow:
+    shown = {"LR, enlarged": random_image(seed, *size), "ours": random_image(seed + 1, *size)}
+    return SheetRow(name, shown, random_image(seed + 2, *size) if truth else None, {"ours": "20.00 dB, SSIM 0.500"})
+
+
+def test_huge_images_are_reduced_and_dollars_in_names_are_no_mathematics(tmp_path: Path) -> None:
+    write_contact_sheet(tmp_path / "sheet.png", [row("a$1_$.png", 0, size=(90, 2000))], "scan $20_$")
+    assert read(tmp_path / "sheet.png").shape[1] < 4 * 700
+
+
+def test_truth_and_error_are_shown_where_they_are_known(tmp_path: Path) -> None:
+    for name, rows in {
+        "none": [row("a", 0, truth=False)],
+        "some": [row("a", 0, truth=False), row("b", 10)],
+        "all": [row("a", 0), row("b", 10)],
+    }.items():
+        write_contact_sheet(tmp_path / f"{name}.png", rows, "scene")
+    none, some, both = (read(tmp_path / f"{name}.png") for name in ("none", "some", "all"))
+    assert none.shape[1] < some.shape[1] == both.shape[1]
+    truth = row("b", 10).truth
+    assert holds(some, truth.numpy(), times=4)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "times"), [([(30, 250), (80, 100)], 1), ([(40, 60)], 4)], ids=["pixel for pixel", "to reach 240"]
+)
+def test_images_of_any_size_are_shown_at_a_whole_multiple(tmp_path, sizes, times):
+    rows = [row("a", 10 * i, size=size) for i, size in enumerate(sizes)]
+    write_contact_sheet(tmp_path / "sheet.png", rows, "scene")
+    sheet = read(tmp_path / "sheet.png")
+    for shown in rows:
+        assert all(holds(sheet, image.numpy(), times=times) for image in (*shown.images.values(), shown.truth))
+
+
+def test_every_caption_and_the_small_print_are_on_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words: list[str] = []
+    monkeypatch.setattr(PixelPage, "text", lambda page, x, y, text, **style: words.append(text))
+    shown = {name: torch.rand(40, 60, 3) for name in ("baseline", "ours")}
+    row = SheetRow("a", shown, None, {"baseline": "20.00 dB", "ours": "21.00 dB"})
+    write_contact_sheet(tmp_path / "sheet.png", [row], "scene · strategy")
+    assert {"scene · strategy", "a", "baseline", "ours", "20.00 dB", "21.00 dB", OWN_PHOTO} <= set(words)
