@@ -133,14 +133,3 @@ def test_scenes_with_different_data_settings_are_averaged(tmp_path: Path) -> Non
             make_run(tmp_path / f"{scene}{job}", f"+strategy={strategy}", f"data.views.shrink={shrink}", scene=scene)
     make_run(tmp_path / "only_here", "+strategy=gco", "density.threshold=1", "data.views.shrink=2", scene="fern")
     assert list(averages_of(tmp_path).index) == ["bicubic", "prior", "baseline", "gco"]
-
-
-def test_methods_that_each_have_one_setting_of_their_own_are_paired_and_averaged(tmp_path: Path) -> None:
-    for scene in ("fern", "horns"):
-        for seed in (0, 1):
-            make_run(tmp_path / f"{scene}a{seed}", "+strategy=gco", "mip.every=1", seed=seed, scene=scene)
-            make_run(
-                tmp_path / f"{scene}b{seed}", "+strategy=clear", "mip.every=2", seed=seed, scene=scene, psnr=20 + seed
-            )
-    gco, clear = (averages_of(tmp_path).loc[name] for name in ("gco, mip.every=1", "clear, mip.every=2"))
-    assert (gco["psnr_delta"], clear["psnr_delta"], clear["psnr_delta_pairs"]) == (0.0, 0.5, 4)
