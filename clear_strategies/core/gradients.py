@@ -44,6 +44,13 @@ class Grads(dict[str, Tensor]):
             total[name] = total[name] + value if name in total else value
         return total
 
+    def plus(self, other: Mapping[str, Tensor], factor: float) -> Grads:
+        """The sum with `factor` times another."""
+        total = Grads(self)
+        for name, value in other.items():
+            total[name] = torch.add(total[name], value, alpha=factor) if name in total else value * factor
+        return total
+
     def __mul__(self, weight: float | Float[Tensor, " N"]) -> Grads:
         return Grads({name: scale_rows(value, weight) for name, value in self.items()})
 

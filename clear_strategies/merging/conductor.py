@@ -263,7 +263,7 @@ class Conductor:
         if λ > 0:
             conflict = conflict_ratio(g_lr, g_hr)  # before correction
             corrected = self._owner["correct"].correct(g_lr, g_hr, step)  # ĝ^HR           Eq. 6, 7, 11
-        g = g_lr + corrected * λ  # Eq. 8
+        g = g_lr.plus(corrected, λ)  # Eq. 8
         if detail is not None:
             g["detail"] = detail * λ
         return Merged(g + self._regularize(params, t), g_hr, corrected, conflict)  # Eq. 16
