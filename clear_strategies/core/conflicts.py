@@ -25,7 +25,8 @@ class Products:
 
     def whole(self) -> Products:
         """The same, and in a last column those of the groups together, as if they were one vector."""
-        return Products(*(torch.cat((x, x.sum(1, keepdim=True)), 1) for x in (self.dot, self.l2, self.h2)))
+        three = torch.stack((self.dot, self.l2, self.h2))
+        return Products(*torch.cat((three, three.sum(2, keepdim=True)), 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -45,7 +45,7 @@ def is_immediate(x: Tensor) -> bool:
 
 def scalar(x: Tensor) -> Scalar:
     """A 0-dim tensor as a float where it is read at once, else itself."""
-    return float(x) if is_immediate(x) else x
+    return float(x.detach().numpy()) if is_immediate(x) else x
 
 
 def defer(recipe: Callable[..., float], *numbers: Number) -> Number:

@@ -132,8 +132,4 @@ class Objective:
             cotangents *= shown[..., None]
         if self.clamp_render:
             cotangents *= (image >= 0) & (image <= 1)
-        return Losses({name: _scalar(loss.value) for name, loss in losses.items()}, cotangents)
-
-
-def _scalar(value: float | Tensor) -> Scalar:
-    return value if isinstance(value, float) else deferred.scalar(value)
+        return Losses({name: deferred.scalar(loss.value) for name, loss in losses.items()}, cotangents)

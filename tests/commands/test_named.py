@@ -55,7 +55,7 @@ def test_another_word_is_refused_with_what_was_meant(word, meant, tmp_path, monk
 
 QUICK = {
     "": 0, "--help": 0, **{f"{name} --help": 0 for name in commands.COMMANDS}, "trian kit": 2, "photos/": 2,
-    "train nowhere": 2, "render": 2, "export run --to nothing": 2,
+    "train nowhere": 2, "render": 2, "export run --sh nothing": 2,
 }  # fmt: skip
 REPORTED = f"""
 import sys

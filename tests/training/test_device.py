@@ -114,7 +114,7 @@ def cache_evidence(state: TrainState) -> None:
     """P2G's evidence is computed once a view, at either size of its SR image; here it is there already."""
     for p2g in (s for s in state.conductor.strategies if isinstance(s, P2G)):
         for view, divisor in itertools.product(state.views, (1, 2)):
-            p2g.cache[view.name, view.factor // divisor] = (view.lr.image.new_zeros(2, 2),) * 2
+            p2g.cache[view.name, view.factor // divisor] = view.lr.image.new_zeros(2, 2, 2)
 
 
 def on_meta(monkeypatch, names: tuple[str, ...]) -> TrainState:

@@ -9,6 +9,9 @@ from __future__ import annotations
 from types import ModuleType
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from clear_strategies.kernels.losses.images import ImagePair
 from rasterizers.interface import BackendUnavailable
@@ -29,12 +32,17 @@ def native() -> ModuleType:
     return load_kernels("clear_strategies.kernels")
 
 
-def photometric(images: ImagePair, l1: float, dssim: float) -> float:
+def photometric(images: ImagePair, l1: float, dssim: float) -> Float[Tensor, ""]:
     """The value l1 · mean |x - y| + dssim · (1 - SSIM), in one pass; with dssim = 0 no SSIM is computed."""
     l1_mean, dissimilarity = native().photometric(*images, l1, dssim, threads())
-    return float(np.float32(l1 * l1_mean + dssim * dissimilarity))
+    return _scalar(l1 * l1_mean + dssim * dissimilarity)
 
 
-def haar_l1(images: ImagePair, levels: int) -> float:
+def haar_l1(images: ImagePair, levels: int) -> Float[Tensor, ""]:
     """The mean |detail| of each level, averaged over the levels."""
-    return float(np.float32(native().haar_l1(*images, levels, threads())))
+    return _scalar(native().haar_l1(*images, levels, threads()))
+
+
+def _scalar(value: float) -> Float[Tensor, ""]:
+    """By numpy: `torch.tensor` is an operation of its own."""
+    return torch.from_numpy(np.asarray(value, np.float32))

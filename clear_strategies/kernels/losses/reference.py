@@ -22,7 +22,7 @@ _C2: Final = 0.03**2
 class LossAndGradient(NamedTuple):
     """A loss, and its gradient with respect to the first image."""
 
-    value: float | Float[Tensor, ""]
+    value: Float[Tensor, ""]
     gradient: Float[Tensor, "H W C"]
 
 
