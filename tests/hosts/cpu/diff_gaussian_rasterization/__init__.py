@@ -44,5 +44,6 @@ class GaussianRasterizer(torch.nn.Module):
             return image, radii
         z = (means3D @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3])[:, 2:].clamp_min(0.2)
         value = (1 / z if HOST == "3dgs" else z).expand(-1, 3)
-        depth = draw((value[:, None] - 0.5) / SH_C0, shs[:, 1:1]).image.permute(2, 0, 1)[:1]
+        with torch.set_grad_enabled(HOST == "fsgs"):  # 3DGS's loss reads it only where a scene has depth maps
+            depth = draw((value[:, None] - 0.5) / SH_C0, shs[:, 1:1]).image.permute(2, 0, 1)[:1]
         return (image, radii, depth, drawn.alpha[None]) if HOST == "fsgs" else (image, radii, depth)
