@@ -18,7 +18,8 @@ def detail_adam(detail: torch.nn.Parameter, rates: DetailRates) -> torch.optim.A
     """An Adam for f_det that steps all Gaussians. A loop may pass it the visible ones, as gsplat's SelectiveAdam takes them: the
     argument is dropped, since others are visible at HR.
     """
-    adam = torch.optim.Adam([detail], lr=rates.rate, eps=_EPS, fused=True)  # one operation
+    fused = detail.device.type in ("cpu", "cuda")  # one operation
+    adam = torch.optim.Adam([detail], lr=rates.rate, eps=_EPS, fused=fused)
     adam.register_step_pre_hook(lambda _, args, kwargs: (
         tuple(value for value in args if not isinstance(value, Tensor)),
         {name: value for name, value in kwargs.items() if name != "visibility"},

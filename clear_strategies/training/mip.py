@@ -84,7 +84,7 @@ def _as_rows(cameras: Sequence[Camera]) -> Float[Tensor, "V 20"]:
         (c.fx, c.fy, c.cx, c.cy, low * c.width, high * c.width, low * c.height, high * c.height) for c in cameras
     ]
     poses = torch.stack([camera.world_to_camera for camera in cameras])[:, :3].flatten(1)
-    return torch.cat((poses, torch.tensor(numbers).to(poses)), dim=1)
+    return torch.cat((poses, poses.new_tensor(numbers)), dim=1)
 
 
 def _nearest_depths(means: Float[Tensor, "N 3"], cameras: Float[Tensor, "V 20"], near: float) -> Float[Tensor, " N"]:

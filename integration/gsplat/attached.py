@@ -6,7 +6,6 @@ import functools
 import inspect
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -228,7 +227,7 @@ class Attached:
             if self._is_ours:  # the LR image comes next
                 together = drawing_ahead(call["Ks"].detach().reshape(3, 3), call["width"], call["height"])
             call, factor = self._with_detail(call, trained=True), view.factor
-            call["Ks"] = call["Ks"] * _enlargement(factor, call["Ks"].dtype, str(call["Ks"].device))
+            call["Ks"] = call["Ks"] * call["Ks"].new_tensor([[factor], [factor], [1]])
             call |= {"width": call["width"] * factor, "height": call["height"] * factor, "render_mode": "RGB"}
         else:
             params.pop("detail", None)
@@ -319,12 +318,6 @@ class Attached:
 
 
 attach = Attached
-
-
-@cache
-def _enlargement(factor: int, dtype: torch.dtype, device: str) -> Float[Tensor, "3 1"]:
-    """What makes Ks those of an image `factor` times as large."""
-    return torch.tensor([[factor], [factor], [1]], dtype=dtype, device=device)
 
 
 def _visible(radii: Tensor, packed: bool) -> Bool[Tensor, "*shape"]:

@@ -84,6 +84,6 @@ def test_host_measures_a_loop_alone_and_with_a_strategy(tmp_path):
     host, error = (pd.read_csv(tmp_path / f"{name}.csv").set_index("loop") for name in ("host", "host_error"))
     assert list(host.index) == ["alone", "clear"]
     assert host["operations"]["clear"] - host["operations"]["alone"] <= 60
-    assert host["reads"]["clear"] == host["reads"]["alone"]
+    assert host["reads"]["clear"] < host["reads"]["alone"] + 0.5  # whether f_det is stepped on is looked at once
     assert host["merge_ms"]["clear"] > 0
     assert error.loc["clear", ["means", "quats", "scales", "opacities", "sh0", "shN"]].max() < 1e-3
