@@ -27,7 +27,7 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.strategies.base import not_stated_as_data
 
 _log = logging.getLogger(__name__)
-_HALF: Final = (torch.float16, torch.bfloat16)
+_HALF: Final = (torch.float16, torch.bfloat16)  # merged in float32; float64 is not
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,9 +100,7 @@ class InPlaceMerge:
                 AMP gradient scaler, which skips such a step.
         """
         trained = {name: p for name, p in params.items() if p.grad is not None or name == "detail"}
-        whole = [
-            p for p in trained.values() if p.dtype not in _HALF
-        ]  # half precision is merged in float32, float64 is not
+        whole = [p for p in trained.values() if p.dtype not in _HALF]
         merge = kernel.compiled(whole) if self.compiled and whole else None
         if merge is None:
             return self._merge_readably(trained, hr, t, before, scale)

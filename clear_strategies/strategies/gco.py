@@ -23,9 +23,8 @@ from clear_strategies.core.step import Step
 from clear_strategies.kernels import merge
 from clear_strategies.strategies.base import Strategy
 
-_AT_LOWER_BOUND: Final = (
-    "omega_at_lower_bound"  # the column of their share of the corrections: near 1, the prior agrees with LR
-)
+# The column of the share of corrections with ω at its lower bound: near 1, the prior agrees with LR.
+_AT_LOWER_BOUND: Final = "omega_at_lower_bound"
 _SCALES: Final = CONFLICT_GROUPS.index("scales")
 _QUATS: Final = CONFLICT_GROUPS.index("quats")
 _TINY: Final = torch.finfo(torch.float64).tiny
@@ -89,9 +88,14 @@ class GCO(Strategy):
         lr, hr = ({name: g for name, g in grads.items() if g is not None} for grads in (lr, hr))
         q = None if step is None or step.evidence is None else step.evidence.reliability
         both = [group for group in self.groups if group in lr and group in hr]
-        if not both or (compiled := merge.compiled(hr[name] for name in both)) is None:
+        if not both or (compiled := merge.compiled(g[name] for name in both for g in (lr, hr))) is None:
             return self.correct_in_torch(lr, hr, step)
-        rows = {name: merge.Rows(torch.empty_like(hr[name]), lr=lr[name], hr=hr[name]) for name in both}
+        rows = {
+            name: merge.Rows(
+                torch.empty_like(hr[name], memory_format=torch.contiguous_format), lr=lr[name], hr=hr[name]
+            )
+            for name in both
+        }
         counts, _ = compiled(rows, self.correction_rule(), q, keeps_lr=False)
         self.report(counts, both, q is not None)
         return Grads(hr | {name: row.out for name, row in rows.items()})

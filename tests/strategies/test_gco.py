@@ -115,3 +115,15 @@ def test_a_prior_that_agrees_with_lr_leaves_omega_at_its_lower_bound():
     assert gco.logs["omega_at_lower_bound"] == 1
     gco.correct(lr, hr, toy.step(evidence=Evidence(torch.zeros(200), torch.ones(200))))
     assert gco.logs["omega_at_lower_bound"] < 0.9
+
+
+def test_gradients_of_any_layout_and_of_two_types_are_corrected():
+    lr, hr = random_pair(9)
+    expected = GCO().correct(lr, hr)["means"]
+    for dtype in (torch.float32, torch.float64):
+        low, high = ({"means": g["means"].to(dtype)} for g in (lr, hr))
+        turned = {"means": high["means"].T.contiguous().T}
+        assert torch.equal(GCO().correct(low, turned)["means"], GCO().correct(low, high)["means"])
+    mixed = GCO().correct({"means": lr["means"].double()}, {"means": hr["means"].float()})["means"]
+    assert mixed.dtype == torch.float32
+    assert torch.allclose(mixed.double(), expected.double(), rtol=1e-5)
