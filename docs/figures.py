@@ -1,7 +1,7 @@
 """The pictures of the documentation.
 
 python docs/figures.py                     those of docs/explanation/evidence-sparse.md, from its CSV files
-python docs/figures.py demo [OVERRIDE …]   the README's, docs/images/demo.png: trains the demo as its first command does
+python docs/figures.py demo [OVERRIDE …]   the README's, docs/images/demo.png: trains the demo without strategies and with clear
 python docs/figures.py notebook            runs docs/tutorial/notebook.ipynb and keeps the outputs of its cells
 python docs/figures.py pages RUN           a run's splat.html and the viewer, in Chromium
 """
@@ -112,18 +112,19 @@ PART: Final = (10, 24, 122, 108)
 
 
 def demo(folder: Path, *overrides: str) -> None:
-    with tempfile.TemporaryDirectory() as run:
-        command = [sys.executable, "-m", "clear_strategies.run", "+strategy=clear", *overrides, f"hydra.run.dir={run}"]
+    with tempfile.TemporaryDirectory() as runs:
+        into = [f"hydra.sweep.dir={runs}", "hydra.sweep.subdir=${hydra.job.num}"]
+        command = [sys.executable, "-m", "clear_strategies.run", "-m", "+strategy=baseline,clear", *overrides, *into]
         subprocess.run(command, cwd=DOCS.parent, check=True)  # noqa: S603 - this interpreter
-        readme_picture(Path(run), folder / "demo.png")
+        readme_picture(Path(runs) / "0", Path(runs) / "1", folder / "demo.png")
 
 
-def readme_picture(run: Path, out: Path) -> None:
-    """One test view of a run and of its baseline, whole and a part, beside its LR photo, its SR image and the truth."""
+def readme_picture(baseline: Path, run: Path, out: Path) -> None:
+    """One test view of a run and of a baseline, whole and a part, beside its LR photo, its SR image and the truth."""
     panels = {
         "LR photo": run / "views" / f"{VIEW}_lr.png",
         "SR image": run / "views" / f"{VIEW}_prior.png",
-        "baseline": run / "baseline" / "renders" / f"{VIEW}.png",
+        "baseline": baseline / "renders" / f"{VIEW}.png",
         "CLEAR": run / "renders" / f"{VIEW}.png",
         "truth": run / "views" / f"{VIEW}_truth.png",
     }

@@ -32,7 +32,7 @@ from clear_strategies.training.loop import kernel_threads
 _WIDTH, _GAUSSIANS = 504, 100_000  # where the other size varies
 _MIB: Final = 1024 if sys.platform != "darwin" else 1 << 20  # units of ru_maxrss
 _RUN: Final = (
-    "data.reader.width=128", "data.reader.height=96", "fit.baseline=false", "fit.map_views=0", "fit.video=0", "fit.page=0",
+    "data.reader.width=128", "data.reader.height=96", "fit.map_views=0", "fit.video=0", "fit.page=0",
 )  # fmt: skip
 
 

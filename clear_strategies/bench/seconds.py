@@ -39,7 +39,7 @@ _COMMON: Final = (
     "fit.probe_views=1000000", "fit.checkpoint_every=0", "fit.map_views=0", "fit.video=0", "fit.page=0",
 )  # fmt: skip
 _RESERVED: Final = {
-    "scene", "fit.probe_every", "fit.seed", "fit.threads", "fit.resume", "fit.baseline",
+    "scene", "fit.probe_every", "fit.seed", "fit.threads", "fit.resume",
     *(override.partition("=")[0] for override in _COMMON),
 }  # fmt: skip
 
@@ -48,7 +48,7 @@ Row = dict[str, Any]
 
 def train(folder: Path, overrides: Sequence[str]) -> str | None:
     """Train in a process of its own; returns the line of its output that explains a failure, else None."""
-    program = [sys.executable, "-m", "clear_strategies.run", "fit.baseline=false"]
+    program = [sys.executable, "-m", "clear_strategies.run"]
     child = subprocess.run(  # noqa: S603 - this interpreter
         [*program, *overrides, f"hydra.run.dir={quoted(str(folder.resolve()))}"],
         capture_output=True, text=True, errors="replace", check=False,

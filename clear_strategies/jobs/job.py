@@ -7,7 +7,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,6 @@ from clear_strategies.jobs.lock import hold
 from clear_strategies.jobs.settings import JobSettings, settings_of
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.outputs import plan, results, score_table, tensorboard
-from clear_strategies.outputs.baseline import FOLDER as BASELINE
-from clear_strategies.outputs.baseline import Baseline, overrides_of
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.progress import progress_bar
 from clear_strategies.schedules import scaled
@@ -44,7 +42,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """What the trainings of a job share.
+    """The scene and the machine of a job.
 
     Args:
         scene: on the CPU. device_scene: the same scene on the device of `drawing`.
@@ -57,13 +55,12 @@ class _Place:
 
 @dataclass(frozen=True, slots=True)
 class _Training:
-    """One training of a job: the run itself, or its baseline.
+    """The training of a job.
 
     Args:
         compared: the configuration from `resume.comparable`, which a resumed run must have in common.
         folder: for its files.
         overrides: of the command line, for the report; None: unknown.
-        pictures: that it writes; None for a baseline, since the run's own pictures show it.
     """
 
     settings: JobSettings
@@ -71,26 +68,13 @@ class _Training:
     compared: Mapping[str, Any]
     folder: Path
     overrides: Sequence[str] | None
-    pictures: results.Pictures | None = None
-
-    @classmethod
-    def of(
-        cls, settings: JobSettings, values: Mapping[str, Any], folder: Path, overrides: Sequence[str] | None
-    ) -> _Training:
-        """The training with these settings, built from the configuration `values`."""
-        conductor = settings.conductor(settings.fit.stretch)
-        return cls(settings, conductor, resume.comparable(values), folder, overrides)
 
     @property
     def chosen(self) -> plan.Chosen:
         return plan.Chosen(self.settings.method, list(self.settings.strategies), self.overrides)
 
-    def start(self, place: _Place, source: str | None) -> TrainState:
-        """The state that training starts from: the initial one, or the checkpoint that `source` names.
-
-        Args:
-            source: a value of `fit.resume`.
-        """
+    def start(self, place: _Place) -> TrainState:
+        """The state that training starts from: the initial one, or the checkpoint that `fit.resume` names."""
         settings, stretch = self.settings, self.settings.fit.stretch
         state = TrainState.start(
             place.device_scene,
@@ -101,7 +85,7 @@ class _Training:
             mip=scaled(settings.mip, stretch),
             near=place.drawing.near,
         )
-        resume.resume(state, source, self.folder, self.compared)
+        resume.resume(state, settings.fit.resume, self.folder, self.compared)
         return state
 
 
@@ -129,32 +113,18 @@ def run(config: DictConfig, folder: Path, overrides: Sequence[str] | None = None
         viewing.require_viewer()
     if fit.log == "tensorboard":
         tensorboard.require_tensorboard()
-    training, baseline = _Training.of(settings, values, folder, overrides), None
-    training = replace(training, pictures=results.Pictures(fit.map_views, fit.video, fit.page))
-    if fit.baseline and _why_without_baseline(settings) is None:
-        alone, others = replace(settings, strategies={}), None if overrides is None else overrides_of(overrides)
-        baseline = _Training.of(alone, {**values, "strategies": {}}, folder / BASELINE, others)
+    training = _Training(settings, settings.conductor(fit.stretch), resume.comparable(values), folder, overrides)
     drawing = device.drawing(settings.rasterizer, fit.device)
     with hold(folder), signals.interrupted("before training began"):
         files.sweep(folder)
-        return _run(training, baseline, drawing)
-
-
-def _why_without_baseline(settings: JobSettings) -> str | None:
-    if settings.method is not None:
-        return f"since +method={settings.method} is one itself"
-    if not settings.strategies:
-        return "since it has no strategy and is the baseline itself"
-    if _in_sweep():
-        return "since it is a job of a sweep, whose report compares the jobs"
-    return None
+        return _run(training, drawing)
 
 
 def _in_sweep() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
-def _run(training: _Training, baseline: _Training | None, drawing: device.Drawing) -> float | None:
+def _run(training: _Training, drawing: device.Drawing) -> float | None:
     settings = training.settings
     if settings.fit.resume == resume.AUTO:
         finished = resume.finished(training.folder, training.compared)
@@ -170,35 +140,17 @@ def _run(training: _Training, baseline: _Training | None, drawing: device.Drawin
     device.log_choice(settings.rasterizer, drawing)
     drawing = drawing.over(scene.background)
     place = _Place(scene, scene.to(drawing.device), drawing)
-    state, baseline_state = _started(training, baseline, place)
+    state = training.start(place)
     _announce(training, state, place, f"{threads} ({reason})")
     # In a sweep the console shows one line per job; the rest is in run.log.
     level = logging.DEBUG if _in_sweep() else logging.INFO
-    if settings.fit.baseline and baseline is None:
-        _log.log(level, "fit.baseline: no baseline trains beside this run, %s.", _why_without_baseline(settings))
     results.remove_earlier(training.folder, all_files=state.t == 1)
-    if baseline is None and state.t == 1:
-        results.remove_earlier(training.folder / BASELINE, all_files=True)
-    trained = None if baseline is None else _train_baseline(baseline, baseline_state, place)
-    baseline_state = None  # its memory is for what trains now
-    evaluation, seconds = _train(training, state, place, trained)
-    _log.log(level, "%s", score_table.describe(training.folder, evaluation, seconds, trained))
+    evaluation, seconds = _train(training, state, place)
+    _log.log(level, "%s", score_table.describe(training.folder, evaluation, seconds))
     if _in_sweep():
         _log.info("%s", score_table.describe_job(HydraConfig.get().job.num, training.folder, evaluation, seconds))
     mean = evaluation.mean("test") or evaluation.mean("train")
     return None if mean is None else mean.psnr
-
-
-def _started(training: _Training, baseline: _Training | None, place: _Place) -> tuple[TrainState, TrainState | None]:
-    """The states of the run and of its baseline, made before either trains, so that an error does not come after the first has
-    trained. The baseline's is None where there is none, or where it is finished.
-    """
-    source, state = training.settings.fit.resume, None
-    if baseline is not None:
-        source, baseline_source = resume.sources(source, training.compared, baseline.compared)
-        if baseline_source != resume.AUTO or resume.finished(baseline.folder, baseline.compared) is None:
-            state = baseline.start(place, baseline_source)
-    return training.start(place, source), state
 
 
 def _announce(training: _Training, state: TrainState, place: _Place, threads: str) -> None:
@@ -215,24 +167,6 @@ def _announce(training: _Training, state: TrainState, place: _Place, threads: st
     idle = [override for override in training.overrides or () if override.lstrip("+").startswith("density.")]
     if idle and not isinstance(state.density.settings, type(training.settings.density)):
         _log.warning("%s has no effect: %s densifies in place of it.", ", ".join(idle), state.density.name)
-
-
-def _train_baseline(training: _Training, state: TrainState | None, place: _Place) -> Baseline:
-    """Train the baseline and read its results.
-
-    Args:
-        state: to train from; None if the baseline is finished, so that its files are only read.
-    """
-    if state is not None:
-        _log.info(
-            "the baseline trains first: no strategy, all else as above (fit.baseline=false leaves it out): %s",
-            training.folder,
-        )
-        results.remove_earlier(training.folder, all_files=state.t == 1)
-        _train(training, state, place)
-    baseline = Baseline.read(training.folder)
-    _log.info("%s", score_table.describe_baseline(baseline))
-    return baseline
 
 
 @contextmanager
@@ -260,14 +194,8 @@ def _watched(training: _Training, state: TrainState, place: _Place) -> Iterator[
         yield after_step
 
 
-def _train(
-    training: _Training, state: TrainState, place: _Place, baseline: Baseline | None = None
-) -> tuple[Evaluation, float]:
-    """Train to the end and write the files; return the scores and the seconds of training.
-
-    Args:
-        baseline: the finished baseline, to show next to the run's results.
-    """
+def _train(training: _Training, state: TrainState, place: _Place) -> tuple[Evaluation, float]:
+    """Train to the end and write the files; return the scores and the seconds of training."""
     settings, rasterizer, alone = training.settings, place.drawing.rasterizer, device.jobs_at_once() == 1
     began = time.perf_counter() - state.seconds  # with what a resumed run took before
     with signals.interrupted("before the run was finished", lambda: resume.newest(training.folder)):
@@ -282,7 +210,8 @@ def _train(
         evaluation = results.write_results(
             training.folder, place.scene, state, rasterizer, training.chosen,
             backend=place.drawing.name, down=settings.data.views.downsample,
-            painter=Painter(state.field, place.drawing.make), pictures=training.pictures, seconds=seconds,
-            config=training.compared, antialiased=place.drawing.antialiased, baseline=baseline,
+            painter=Painter(state.field, place.drawing.make), seconds=seconds, config=training.compared,
+            pictures=results.Pictures(settings.fit.map_views, settings.fit.video, settings.fit.page),
+            antialiased=place.drawing.antialiased,
         )  # fmt: skip
     return evaluation, seconds

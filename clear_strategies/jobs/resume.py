@@ -12,7 +12,6 @@ import msgspec
 from clear_strategies.compose import flat
 from clear_strategies.errors import DataError
 from clear_strategies.outputs import metrics
-from clear_strategies.outputs.baseline import FOLDER as BASELINE
 from clear_strategies.outputs.metrics import Metrics
 from clear_strategies.settings import CHANGES_NO_RESULT
 from clear_strategies.training import checkpoint
@@ -76,33 +75,6 @@ def resume(state: TrainState, source: str | None, folder: Path, config: Mapping[
         return
     if checkpoints:
         _log.warning("%s: no checkpoint is whole; the run starts from the beginning.", folder / CHECKPOINTS)
-
-
-def sources(source: str | None, run: Mapping[str, Any], baseline: Mapping[str, Any]) -> tuple[str | None, str | None]:
-    """`fit.resume` of a run, and of the baseline beside it, which trains first.
-
-    A path leads to the run, or, of a run that was stopped while its baseline trained, to that baseline; the run itself
-    then starts from the beginning.
-
-    Args:
-        run, baseline: the configuration of each.
-
-    Raises:
-        DataError: no checkpoint is there, it is damaged, or it is another configuration's.
-    """
-    if source is None or source == AUTO:
-        return source, source
-    path = Path(source)
-    folder = folder_of(path)
-    baseline_folder = folder / BASELINE
-    begun = bool(checkpoint.saved(baseline_folder / CHECKPOINTS))
-    if begun and not checkpoint.saved(folder / CHECKPOINTS):
-        return None, str(baseline_folder)
-    saved = checkpoint.load(path)
-    if saved.config == baseline:
-        return None, source
-    _require_same(path, saved.config, run)  # now, not after the baseline has trained
-    return source, str(baseline_folder) if begun else None
 
 
 def folder_of(source: Path) -> Path:

@@ -31,12 +31,9 @@ class RunSettings(FitSettings):
         page: write splat.html, which shows the field in any browser, if it has at most this many Gaussians; 0: never.
         log: tensorboard writes the numbers of history.csv and a render for TensorBoard; extra [log].
         viewer: look at the field in the browser while it trains; the address is logged. Extra [view].
-        baseline: first train the same scene with the same settings, but without any strategy, into the folder baseline/ of
-            the run. The contact sheet and the scores then show both. Without effect in a sweep, for a run that has no
-            strategy, and with +method=NAME.
         resume: a run's folder or one of its checkpoints: continue from there, bit for bit. auto: look into the run's own
             folder. If the run is finished, train nothing; if it has checkpoints, continue from the newest one; else start
-            from the beginning. Both apply to the baseline, too.
+            from the beginning.
         device: cpu or cuda: where field, views and optimizer are. None: cuda if torch finds it and the rasterizer draws
             there, else cpu. A run may be resumed on another device; its bits then differ.
         threads: number of threads of torch and the kernels. None: all cores, divided by the jobs that run at once (joblib,
@@ -49,7 +46,6 @@ class RunSettings(FitSettings):
     log: Literal["tensorboard"] | None = None
     verbose: bool = False
     viewer: bool = False
-    baseline: bool = False
     resume: str | None = None
     device: Device | None = None
     threads: int | None = None

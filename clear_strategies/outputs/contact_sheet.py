@@ -1,4 +1,4 @@
-"""contact_sheet.png: a few views of one run beside the LR photo, the prior, the baseline, the truth and the error.
+"""contact_sheet.png: a few views of one run beside the LR photo, the prior, the truth and the error.
 
 Images are laid out in whole pixels: a render is shown pixel for pixel, a small one at a whole multiple, because a resized
 image does not show the detail that this library is about.

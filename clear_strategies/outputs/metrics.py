@@ -1,7 +1,7 @@
 """Scores of a whole scene, and the content of metrics.json.
 
 metrics.json: {"scene", "method", "strategies", "overrides", "seed", "iterations", "gaussians", "seconds", "conflict",
-"synthetic_prior", "baseline", "config", "provenance", "note", "test": TABLE, "train": TABLE}, where TABLE is {"against", "views":
+"synthetic_prior", "config", "provenance", "note", "test": TABLE, "train": TABLE}, where TABLE is {"against", "views":
 {view: {image: scores}}, "mean": {image: scores}}.
 
 - "method" is the name of a published baseline (`+method=`), null where none was chosen.
@@ -9,8 +9,6 @@ metrics.json: {"scene", "method", "strategies", "overrides", "seed", "iterations
   a later command rewrites it even where that command is refused.
 - The images are "ours", "bicubic" (U of the view's own LR photo) and "prior" (the view's SR image). "bicubic" is missing where
   the HR photo is unknown, both where the HR side is photos (`photos_are=both`).
-- "baseline" is the one that trained beside the run (`fit.baseline`), null where none did: {"folder", "seconds", "test":
-  scores, "train": scores}, the means of its renders. A part without views is not there.
 - "against" says what they are compared with: "HR photos"; "LR photos", after D, where the HR photos are unknown; "HR and
   LR photos" where that differs between views.
 - The training TABLE has another key, "of": the number of training views, of which at most 50 are scored.

@@ -14,12 +14,11 @@ from torch import Tensor
 from clear_strategies import files, viewing
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
-from clear_strategies.data.photo_files import read_image, write_png
+from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.view_names import file_stem
 from clear_strategies.errors import DataError
 from clear_strategies.outputs import metrics
-from clear_strategies.outputs.baseline import Baseline
 from clear_strategies.outputs.contact_sheet import OWN_PHOTO, TRAINED_ON, SheetRow, write_contact_sheet
 from clear_strategies.outputs.coverage import write_coverage
 from clear_strategies.outputs.curves import write_curves
@@ -77,11 +76,10 @@ def write_results(
     backend: str,
     down: DownKernel,
     painter: Painter,
-    pictures: Pictures | None,
+    pictures: Pictures,
     seconds: float,
     config: Mapping[str, Any],
     antialiased: bool,
-    baseline: Baseline | None = None,
 ) -> Evaluation:
     """Evaluate a finished run and write its files; returns its scores.
 
@@ -89,9 +87,7 @@ def write_results(
         scene: on the CPU, wherever the field is.
         down: D, by which the LR images were made.
         painter: of the state's field, for depth and video.
-        pictures: None: none but the renders, which another run's contact sheet needs.
         antialiased: the rasterizer compensates opacities, see `RasterSettings`.
-        baseline: the one that trained beside it.
     """
     field, work_log, history = state.field, state.conductor.work_log, state.history_as_floats()
     with work_log.stage("evaluate"):
@@ -101,28 +97,26 @@ def write_results(
     export_ply(folder / "point_cloud.ply", field, antialiased=antialiased)
     synthetic = " · SYNTHETIC prior" * scene.synthetic_prior
     title = f"{scene.name} · {chosen.title} · {state.t - 1} iterations · seed {state.settings.seed}{synthetic}"
-    if pictures is not None:
-        with work_log.stage("maps"):
-            if mapped := spaced(state.views, pictures.map_views):
-                write_maps(folder / "maps", mapped, painter, state.conductor, rasterizer, state.t - 1)
-                write_coverage(folder / _COVERAGE, scene, painter, title)
-        memory.release()  # the gradients that the maps are made of: several times the field
-        with work_log.stage("contact sheet and curves"):
-            _write_sheet(folder, scene, evaluation, title, baseline)
-            write_curves(folder / "curves.png", history, marks(state), title)
-        train = [view.hr.camera for view in scene.train]
-        with work_log.stage("video"):
-            _write_video(folder / "path.mp4", train, painter, pictures.video_frames)
-        with work_log.stage("page"):
-            _write_page(folder / splat_page.FILE, train, painter, pictures.page_gaussians, title, scene.background)
+    with work_log.stage("maps"):
+        if mapped := spaced(state.views, pictures.map_views):
+            write_maps(folder / "maps", mapped, painter, state.conductor, rasterizer, state.t - 1)
+            write_coverage(folder / _COVERAGE, scene, painter, title)
+    memory.release()  # the gradients that the maps are made of: several times the field
+    with work_log.stage("contact sheet and curves"):
+        _write_sheet(folder, scene, evaluation, title)
+        write_curves(folder / "curves.png", history, marks(state), title)
+    train = [view.hr.camera for view in scene.train]
+    with work_log.stage("video"):
+        _write_video(folder / "path.mp4", train, painter, pictures.video_frames)
+    with work_log.stage("page"):
+        _write_page(folder / splat_page.FILE, train, painter, pictures.page_gaussians, title, scene.background)
     _write_tables(folder, history, [*scene.work_log.rows(), *work_log.rows()])
     files.write_json(
         folder / _METRICS,
         metrics.to_json(
             evaluation, scene=scene.name, **asdict(chosen), seed=state.settings.seed, iterations=state.t - 1,
             gaussians=len(field), seconds=seconds, conflict=_mean_conflict(history), synthetic_prior=scene.synthetic_prior,
-            baseline=None if baseline is None else baseline.to_json(), config=config,
-            provenance=provenance(seed=state.settings.seed, backend=backend, plan=scene.notes),
+            config=config, provenance=provenance(seed=state.settings.seed, backend=backend, plan=scene.notes),
         ),
     )  # fmt: skip
     return evaluation
@@ -183,7 +177,7 @@ def _write_page(
         _log.warning("%s could not be written: %s.", path.name, error)
 
 
-def _write_sheet(folder: Path, scene: Scene, evaluation: Evaluation, title: str, baseline: Baseline | None) -> None:
+def _write_sheet(folder: Path, scene: Scene, evaluation: Evaluation, title: str) -> None:
     rows, part = [], evaluation.test if scene.test else evaluation.train
     rendered = [view for view in scene.test or scene.train if view.name in evaluation.renders]
     for view in spaced(rendered, _SHEET_VIEWS):
@@ -194,12 +188,8 @@ def _write_sheet(folder: Path, scene: Scene, evaluation: Evaluation, title: str,
         if not view.hr_is_photo:
             columns["LR, enlarged"] = images.upsample(view.lr.image, view.factor, "nearest")
             columns["SR prior"] = view.hr.image
-        scores = {"ours": part[view.name]["ours"]}
-        if baseline is not None and view.name in baseline.views:
-            columns["baseline"] = read_image(baseline.render_of(view.name))
-            scores["baseline"] = baseline.views[view.name]
-        columns["ours"] = evaluation.renders[view.name]
-        captions = {column: f"{s.psnr:.2f} dB, SSIM {s.ssim:.3f}" for column, s in scores.items()}
+        columns["ours"], score = evaluation.renders[view.name], part[view.name]["ours"]
+        captions = {"ours": f"{score.psnr:.2f} dB, SSIM {score.ssim:.3f}"}
         rows.append(SheetRow(view.name, columns, view.truth, captions))
     note = TRAINED_ON if not scene.test else "" if scene.test[0].hr_is_photo else OWN_PHOTO
     write_contact_sheet(folder / "contact_sheet.png", rows, title, note)

@@ -1,7 +1,7 @@
 """`python -m clear_strategies.report DIR …`: runs as a table, pictures and a page.
 
-Every folder at or below DIR with a metrics.json is a run. Runs of a scene that differ only in their seed share a row. A
-baseline that trained beside runs (`fit.baseline`) counts once. Files:
+Every folder at or below DIR with a metrics.json is a run. Runs of a scene that differ only in their seed share a row.
+Files:
 
 - report.md, report.csv: the table
 - report.html: the tables and pictures of all scenes; it needs the pictures beside it, and no network

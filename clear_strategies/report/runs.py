@@ -14,7 +14,7 @@ import pandas as pd
 
 from clear_strategies.data.view_names import file_stem
 from clear_strategies.errors import DataError
-from clear_strategies.outputs import baseline, metrics
+from clear_strategies.outputs import metrics
 from clear_strategies.settings import CHANGES_NO_RESULT
 
 _log = logging.getLogger(__name__)
@@ -100,9 +100,8 @@ class Run:
 
 
 def collect(folders: Iterable[Path]) -> list[Run]:
-    """Every finished run at or below the folders and the links in them: the jobs of a sweep by number, other runs by path. A
-    baseline that trained beside a run (`fit.baseline`) comes before it, and once: it is left out, with a message, where another
-    run of the same configuration is there. Unfinished and damaged runs are logged and left out.
+    """Every finished run at or below the folders and the links in them: the jobs of a sweep by number, other runs by path.
+    Unfinished and damaged runs are logged and left out.
 
     Raises:
         DataError: there is no finished run.
@@ -112,13 +111,9 @@ def collect(folders: Iterable[Path]) -> list[Run]:
     finished: dict[Path, None] = {}
     for folder in folders:
         in_folder = _sorted(path.parent for path in folder.rglob("metrics.json"))
-        owners = [_owner(run) for run in in_folder]
-        sweeps = [owner.parent for owner in owners]
-        order = [
-            (sweeps.index(owner.parent), _job(owner), owners.index(owner), run == owner)
-            for run, owner in zip(in_folder, owners, strict=True)
-        ]
-        finished |= dict.fromkeys(run.resolve() for _, run in sorted(zip(order, in_folder, strict=True)))
+        sweeps = [run.parent for run in in_folder]
+        in_order = sorted(in_folder, key=lambda run: (sweeps.index(run.parent), _job(run), in_folder.index(run)))
+        finished |= dict.fromkeys(run.resolve() for run in in_order)
     for unfinished in _sorted(path.parent for folder in folders for path in folder.rglob(_HYDRA)):
         if unfinished.resolve() not in finished:
             _log.warning("%s: left out, it has no metrics.json: the run did not finish.", unfinished)
@@ -128,33 +123,10 @@ def collect(folders: Iterable[Path]) -> list[Run]:
             runs.append(Run.read(folder))
         except DataError as error:
             _log.warning("%s; left out.", error)
-    runs = _each_baseline_once(runs)
     if not runs:
         names = ", ".join(map(str, folders))
         raise DataError(names, "runs", "there is no finished run here", "give the folder of a run or of a sweep")
     return runs
-
-
-def _each_baseline_once(runs: Sequence[Run]) -> list[Run]:
-    """Leave out a baseline beside a run where another run has its configuration: one on its own, else an earlier baseline."""
-    alone = [run for run in runs if _owner(run.folder) == run.folder]
-    kept: list[Run] = []
-    for run in runs:
-        same = [other for other in (*alone, *kept) if other.config and other.config == run.config]
-        if same and run not in alone:
-            _log.info("%s: left out, it is the same training as %s.", run.folder, same[0].folder)
-        else:
-            kept.append(run)
-    return kept
-
-
-def _owner(folder: Path) -> Path:
-    """The folder of the run that a baseline trained beside; of any other run, its own. A baseline beside a run has no files of
-    Hydra's, and a run from Python has none either.
-    """
-    in_run = any((folder.parent / name).exists() for name in (_HYDRA, "metrics.json"))
-    beside = folder.name == baseline.FOLDER and not (folder / _HYDRA).is_dir() and in_run
-    return folder.parent if beside else folder
 
 
 def history(folder: Path) -> list[dict[str, float]]:

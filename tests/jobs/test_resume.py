@@ -12,7 +12,7 @@ from clear_strategies.errors import DataError
 from clear_strategies.jobs import job, resume
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.signals import Interrupted
-from tests.helpers import toy
+from tests.helpers import pictures, toy
 from tests.helpers.command_line import TINY
 from tests.helpers.configs import composed
 from tests.helpers.short_run import start
@@ -50,3 +50,18 @@ def test_ctrl_c_after_training_names_the_checkpoint_that_was_saved(tmp_path: Pat
     saved = tmp_path / "checkpoints" / "step_0000004.safetensors"
     assert saved.is_file()
     assert str(told.value) == f"stopped by SIGINT before the run was finished. Go on with fit.resume={saved}."
+
+
+def test_a_setting_of_density_has_no_effect_beside_a_strategy_that_densifies(tmp_path: Path, caplog):
+    for strategy in ("mcmc", "gco"):
+        chosen = [
+            *TINY,
+            f"+strategy={strategy}",
+            "prior=bicubic",
+            "fit.threads=1",
+            "fit.iterations=3",
+            "density.every=50",
+        ]
+        with pictures.not_drawn():
+            job.run(composed(*chosen, "fit.scale_schedule=false"), tmp_path / strategy, chosen)
+    assert caplog.text.count("density.every=50 has no effect: MCMC densifies in place of it.") == 1

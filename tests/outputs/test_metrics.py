@@ -1,4 +1,4 @@
-"""What is measured: metrics.json, the table at the end of a run, and the baseline beside it."""
+"""What is measured: metrics.json, and the table at the end of a run."""
 
 from __future__ import annotations
 
@@ -16,14 +16,11 @@ from clear_strategies.core import images
 from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.scene import Scene
-from clear_strategies.errors import DataError
 from clear_strategies.outputs import metrics
-from clear_strategies.outputs.baseline import Baseline
 from clear_strategies.outputs.image_scores import PSNR_CAP, ImageScores, score
 from clear_strategies.outputs.metrics import NOTE, Evaluation, Table
-from clear_strategies.outputs.score_table import describe, describe_baseline
+from clear_strategies.outputs.score_table import describe
 from rasterizers.interface import Camera
-from tests.helpers.finished_run import make_run
 from tests.helpers.image_files import noise
 
 # ---- scores of a scene, and metrics.json
@@ -96,25 +93,30 @@ def test_a_render_that_is_not_finite_has_a_warning_and_null_in_the_file(tmp_path
 # ---- the table of scores at the end of a run
 
 
-OURS, THEIRS, BICUBIC = (
-    ImageScores(23.5, 0.7, 0.1, 0.01), ImageScores(23.09, 0.687, 0.12, -0.02), ImageScores(22.0, 0.5, 0.16, 0.2),
-)  # fmt: skip
+OURS, BICUBIC = ImageScores(23.5, 0.7, 0.1, 0.01), ImageScores(22.0, 0.5, 0.16, 0.2)
 TABLE: Table = {"view": {"ours": OURS, "bicubic": BICUBIC, "prior": BICUBIC}}
-BASELINE = Baseline(Path("run/baseline"), {"test": THEIRS}, {"view": THEIRS}, 11.2)
 
 
 def rows(text: str) -> dict[str, str]:
-    return {line[:25].strip(): line[25:].strip() for line in text.splitlines()[1:]}
+    return {line[:16].strip(): line[16:].strip() for line in text.splitlines()[1:]}
 
 
-def test_the_baseline_and_the_difference_stand_beside_ours() -> None:
-    text = describe(Path("run"), Evaluation(TABLE, {}, {}, {}, 0), 12.7, BASELINE)
-    assert text.startswith("done in 13 s (the baseline in 11 s): run\n")
+def test_the_images_that_ours_is_compared_with_stand_below_it() -> None:
+    text = describe(Path("run"), Evaluation(TABLE, {}, {}, {}, 0), 12.7)
+    assert text.startswith("done in 13 s: run\n")
     found = rows(text)
-    assert list(found)[:5] == [f"test   {n}" for n in ("baseline", "ours", "ours − baseline", "bicubic", "prior")]
-    assert found["test   ours − baseline"].split() == [
-        "PSNR", "+0.41", "dB", "SSIM", "+0.0130", "GMSD", "-0.0200", "blur", "+0.0300",
-    ]  # fmt: skip
+    assert list(found)[:3] == [f"test   {name}" for name in ("ours", "bicubic", "prior")]
+    assert found["test   ours"].split() == [
+        "PSNR",
+        "23.50",
+        "dB",
+        "SSIM",
+        "0.7000",
+        "GMSD",
+        "0.1000",
+        "blur",
+        "+0.0100",
+    ]
     *_, meanings, note, look_next = text.splitlines()
     assert "GMSD" in meanings
     assert note == f"  {NOTE}."
@@ -122,15 +124,13 @@ def test_the_baseline_and_the_difference_stand_beside_ours() -> None:
 
 
 def test_what_is_missing_has_no_row_and_no_note() -> None:
-    def told(*tables: Table, against: str = "HR photos", baseline: Baseline | None = None) -> str:
-        return describe(Path("run"), Evaluation(*tables, {"train": against}, {}, 200), 12.7, baseline)
+    def told(*tables: Table, against: str = "HR photos") -> str:
+        return describe(Path("run"), Evaluation(*tables, {"train": against}, {}, 200), 12.7)
 
     def images(text: str) -> list[str]:
         return [line.split()[1] for line in text.splitlines() if line.startswith("  train ")]
 
-    # Of the baseline only test views are known.
-    assert images(told({}, TABLE, baseline=BASELINE)) == ["ours", "bicubic", "prior"]
-    assert "baseline" not in told(TABLE, {})
+    assert images(told({}, TABLE)) == ["ours", "bicubic", "prior"]
     assert NOTE not in told({"view": {"ours": OURS}}, {})
     # An SR image is not compared with the photo that it is made of.
     reduced = told({}, TABLE, against="LR photos")
@@ -138,42 +138,3 @@ def test_what_is_missing_has_no_row_and_no_note() -> None:
     assert NOTE not in reduced
     assert "train: the HR photos are unknown" in reduced
     assert "train: 1 of the 200 views" in reduced
-
-
-@pytest.mark.parametrize(("means", "said"), [({"test": THEIRS}, ", test views 23.09 dB"), ({}, "")])
-def test_the_baseline_is_told_in_one_line(means: dict[str, ImageScores], said: str) -> None:
-    told = describe_baseline(Baseline(Path("run/baseline"), means, {}, 11.2))
-    assert told == f"the baseline: done in 11 s{said}: run/baseline"
-
-
-# ---- A baseline beside a run is read from its folder; what is not whole is refused
-
-
-def test_its_scores_and_its_renders_are_those_of_its_files(tmp_path: Path) -> None:
-    baseline = Baseline.read(make_run(tmp_path, psnr=21.5))
-    assert (baseline.means["test"].psnr, baseline.means["train"].ssim, baseline.seconds) == (21.5, 0.5, 61.7)
-    assert baseline.views["view.png"].psnr == 21.5
-    assert baseline.render_of("view.png") == tmp_path / "renders" / "view.png"
-    assert baseline.to_json()["test"] == {"psnr": 21.5, "ssim": 0.5, "gmsd": 0.1, "blur": 0.2}
-
-
-def test_a_number_that_was_not_finite_is_nan_and_a_part_without_views_has_no_mean(tmp_path: Path) -> None:
-    baseline = Baseline.read(make_run(tmp_path, psnr=None, test={"against": "nothing", "views": {}, "mean": {}}))
-    assert math.isnan(baseline.means["train"].psnr)
-    assert set(baseline.means) == {"train"}
-    assert "test" not in baseline.to_json()
-
-
-@pytest.mark.parametrize("key", ["seconds", "test", "train"])
-def test_damaged_metrics_are_refused_with_the_remedy(tmp_path: Path, key: str) -> None:
-    path = make_run(tmp_path) / "metrics.json"
-    content = json.loads(path.read_text())
-    files.write_json(path, {name: value for name, value in content.items() if name != key})
-    with pytest.raises(DataError, match=r"metrics\.json: .*remove this baseline's metrics.json: it is then"):
-        Baseline.read(tmp_path)
-
-
-def test_a_missing_render_is_refused_before_the_run_trains(tmp_path: Path) -> None:
-    (make_run(tmp_path) / "renders" / "view.png").unlink()
-    with pytest.raises(DataError, match=r"view\.png: file: is not there"):
-        Baseline.read(tmp_path)

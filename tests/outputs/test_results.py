@@ -9,16 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from clear_strategies import GCO, P2G, files, report
 from clear_strategies.core.view import View
-from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.data.scene import Scene
 from clear_strategies.merging.objective import Objective
 from clear_strategies.outputs import results
-from clear_strategies.outputs.baseline import Baseline
 from clear_strategies.outputs.figures import magnification
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.plan import Chosen
@@ -44,14 +41,14 @@ def state() -> TrainState:
     return state
 
 
-def write(
-    folder: Path, state: TrainState, baseline: Baseline | None = None, *, scene: Scene = SCENE,
-    pictures: Pictures | None = PICTURES,
-) -> Evaluation:  # fmt: skip
+NO_PICTURES = Pictures(map_views=0, video_frames=0, page_gaussians=0)
+
+
+def write(folder: Path, state: TrainState, *, scene: Scene = SCENE, pictures: Pictures = PICTURES) -> Evaluation:
     return write_results(
         folder, scene, state, toy.RASTERIZER, Chosen(None, ["gco", "p2g"]), backend="torch", down="bicubic",
         painter=Painter(state.field, lambda **_: toy.RASTERIZER), pictures=pictures, seconds=1.5, config={"fit": {"seed": 0}},
-        baseline=baseline, antialiased=False,
+        antialiased=False,
     )  # fmt: skip
 
 
@@ -59,28 +56,8 @@ def names(folder: Path) -> set[str]:
     return {path.name + "/" * path.is_dir() for path in folder.iterdir()}
 
 
-@pytest.mark.slow
-def test_the_baseline_beside_a_run_is_shown_and_its_means_are_kept(tmp_path: Path, state: TrainState) -> None:
-    write(tmp_path / "run" / "baseline", state, pictures=None)
-    scores = {"renders/", "point_cloud.ply", "history.csv", "conflict.csv", "timing.csv", "metrics.json"}
-    assert names(tmp_path / "run" / "baseline") == scores
-    baseline = Baseline.read(tmp_path / "run" / "baseline")
-    (view,) = SCENE.test
-    marked = torch.rand(view.hr.image.shape, generator=torch.Generator().manual_seed(0)).mul(255).round() / 255
-    write_png(baseline.render_of(view.name), marked)
-    write(tmp_path / "run", state, baseline=baseline)
-    content = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert content["baseline"] == {
-        "folder": "baseline", "seconds": 1.5, **{part: content[part]["mean"]["ours"] for part in ("test", "train")},
-    }  # fmt: skip
-    times = round(magnification(marked.shape[1]))
-    assert holds(read(tmp_path / "run" / "contact_sheet.png"), marked.numpy(), times=times)
-    write(tmp_path / "alone", state)
-    assert not holds(read(tmp_path / "alone" / "contact_sheet.png"), marked.numpy(), times=times)
-
-
 def test_conflict_csv_holds_columns_of_history_csv_and_the_ply_says_how_it_was_drawn(tmp_path, state) -> None:
-    evaluation = write(tmp_path, state, pictures=None)
+    evaluation = write(tmp_path, state, pictures=NO_PICTURES)
     history, conflict = (
         list(csv.DictReader((tmp_path / f"{name}.csv").open(newline=""))) for name in ("history", "conflict")
     )
@@ -90,7 +67,7 @@ def test_conflict_csv_holds_columns_of_history_csv_and_the_ply_says_how_it_was_d
     content = json.loads((tmp_path / "metrics.json").read_text())
     assert content["conflict"]["gaussian"] == pytest.approx(mean)
     assert content["test"]["mean"]["ours"] == pytest.approx(asdict(evaluation.mean("test")))
-    assert (content["scene"], content["config"], content["baseline"]) == ("toy", {"fit": {"seed": 0}}, None)
+    assert (content["scene"], content["config"]) == ("toy", {"fit": {"seed": 0}})
     assert not read_gaussians(tmp_path / "point_cloud.ply").antialiased
 
 
@@ -124,8 +101,7 @@ def test_photos_of_two_cameras_with_one_file_name_have_files_of_their_own(tmp_pa
     assert names(tmp_path / "maps") == {"maps.json", "coverage.png", *(f"{stem}/" for stem in stems)}
     found = [camera for camera in read_cameras(tmp_path / "cameras.json") if camera.split == "train"]
     assert [camera.photo for camera in found] == [tmp_path / "cameras" / f"{stem}.jpg" for stem in sorted(stems)]
-    baseline = Baseline.read(tmp_path)
-    assert {baseline.render_of(view).stem for view in baseline.views} == set(report.Run.read(tmp_path).views) == stems
+    assert set(report.Run.read(tmp_path).views) == stems
 
 
 def test_an_earlier_run_goes_with_all_of_its_files_and_no_other(tmp_path: Path, state: TrainState) -> None:
@@ -151,7 +127,7 @@ def test_the_sheet_of_photos_at_hr_shows_no_sr(tmp_path, state, monkeypatch):
     monkeypatch.setattr(results, "write_curves", lambda *_: None)
     monkeypatch.setattr(results, "write_contact_sheet", lambda path, rows, title, note: sheets.append((rows, note)))
     scene = replace(SCENE, train=tuple(map(photos, SCENE.train)), test=tuple(map(photos, SCENE.test)))
-    write(tmp_path, state, scene=scene, pictures=Pictures(map_views=0, video_frames=0, page_gaussians=0))
+    write(tmp_path, state, scene=scene, pictures=NO_PICTURES)
     (((row,), note),) = sheets
     assert list(row.images) == ["ours"]
     assert note == ""
@@ -163,5 +139,5 @@ def test_metrics_json_is_missing_where_another_file_could_not_be_written(tmp_pat
 
     monkeypatch.setattr(files, "write_csv", full)
     with pytest.raises(OSError, match="No space left"):
-        write(tmp_path, state, pictures=None)
+        write(tmp_path, state, pictures=NO_PICTURES)
     assert not (tmp_path / "metrics.json").exists()
