@@ -13,17 +13,18 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from enum import Enum
 from functools import lru_cache
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 import rasterizers
 from rasterizers.checks import require_depth
 from rasterizers.geometry import SH_C0
-from rasterizers.interface import Camera, Rasterizer, Rendering, Splats, over
+from rasterizers.interface import Camera, Rasterizer, RasterSettings, Rendering, Splats, over
+from rasterizers.reference.projection import footprints
 
 # Arguments of gsplat 1.5 that change its speed, or leave out Gaussians that are too small or too far to matter.
 _WITHOUT_EFFECT: Final = {
@@ -143,6 +144,21 @@ def draw(
         NotImplementedError: in `backward`, if the loss depends on the depth.
         RuntimeError: in `backward`, if the loss depends on these gradients, e.g. by a gradient penalty.
     """
+    rendered = _render(rasterizer, splats, camera, depth=depth)
+    if means2d is None:
+        means2d = rendered.rendering.means2d.clone().requires_grad_()
+    else:
+        means2d.data.copy_(rendered.rendering.means2d)
+    return _in_graph(rendered, splats, means2d)
+
+
+class _Rendered(NamedTuple):
+    rendering: Rendering
+    rasterizer: Rasterizer
+    camera: Camera
+
+
+def _render(rasterizer: Rasterizer, splats: Splats, camera: Camera, *, depth: bool) -> _Rendered:
     if depth:
         require_depth(rasterizer)
     if torch.is_grad_enabled() and camera.world_to_camera.requires_grad:  # silence would leave the pose as it is
@@ -150,30 +166,33 @@ def draw(
             "poses have no gradient in this package, and camera.world_to_camera (viewmats) requires one; detach it, or draw "
             "with gsplat's own rasterization on a GPU."
         )
-    if means2d is None:
-        means2d = splats.means.new_zeros(len(splats), 2).requires_grad_()
+    splats = _detached([getattr(splats, field.name) for field in fields(Splats)])
+    with torch.no_grad():
+        rendering = rasterizer(splats, camera, depth=True) if depth else _ahead.draw(rasterizer, splats, camera)
+    return _Rendered(rendering, rasterizer, camera)
+
+
+def _in_graph(
+    rendered: _Rendered, splats: Splats, means2d: Float[Tensor, "M 2"], rows: Int[Tensor, " M"] | None = None
+) -> Drawn:
+    """What was rendered, as a function of the splats and of the projected centres, those of all or of these rows."""
     tensors = [getattr(splats, field.name) for field in fields(Splats)]
-    image, alpha, visible, expected = _Draw.apply(rasterizer, camera, depth, means2d, *tensors)  # type: ignore[no-untyped-call]
+    image, alpha, visible, depth = _Draw.apply(rendered, rows, means2d, *tensors)  # type: ignore[no-untyped-call]
     for drawings in _recordings if image.grad_fn is not None else ():
-        drawings.append(Drawing(image.grad_fn.rendering, splats, image))
-    return Drawn(image, alpha, means2d, visible, expected)
+        drawings.append(Drawing(rendered.rendering, splats, image))
+    return Drawn(image, alpha, means2d, visible, depth)
 
 
 class _Draw(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, rasterizer: Rasterizer, camera: Camera, depth: bool, means2d: Tensor, *tensors: Tensor | None
-    ) -> Any:
-        ctx.rasterizer, ctx.camera = rasterizer, camera
+    def forward(ctx: Any, rendered: _Rendered, rows: Tensor | None, means2d: Tensor, *tensors: Tensor | None) -> Any:
+        ctx.rendered, ctx.rows, rendering = rendered, rows, rendered.rendering
         ctx.save_for_backward(*tensors)
-        splats = _detached(tensors)
-        ctx.rendering = rasterizer(splats, camera, depth=True) if depth else _ahead.draw(rasterizer, splats, camera)
-        means2d.data.copy_(ctx.rendering.means2d)
-        ctx.mark_non_differentiable(visible := ctx.rendering.visible.data)
+        ctx.mark_non_differentiable(visible := rendering.visible.data)
         ctx.set_materialize_grads(False)
         # Other tensors over the same memory: an output that ctx holds would hold ctx in turn, and nothing would free either.
-        depth_map = None if ctx.rendering.depth is None else ctx.rendering.depth.data
-        return ctx.rendering.image.data, ctx.rendering.alpha.data, visible, depth_map
+        depth = None if rendering.depth is None else rendering.depth.data
+        return rendering.image.data, rendering.alpha.data, visible, depth
 
     @staticmethod
     @once_differentiable  # a second derivative would silently be 0
@@ -183,22 +202,24 @@ class _Draw(torch.autograd.Function):
                 "the loss depends on a rendered depth, which has no gradient in this package; detach it, or draw with "
                 "gsplat's own rasterization on a GPU."
             )
+        rendering, rasterizer, camera = ctx.rendered
         splats = _detached(ctx.saved_tensors)  # raises if one was changed in place since it was drawn
         if d_image is None:
-            d_image = torch.zeros_like(ctx.rendering.image)
+            d_image = torch.zeros_like(rendering.image)
         if d_alpha is None or not bool(d_alpha.any()):
-            gradients = _gradients(ctx.rendering, d_image)
+            gradients = _gradients(rendering, d_image)
         else:
             # With C the colour and T = 1 - alpha, I(b) = C + T b. The difference of two backgrounds has the gradient of T.
-            b = ctx.rasterizer.background
+            b = rasterizer.background
             other = (0.0 if b[0] > 0.5 else 1.0, *b[1:])
             d_red = torch.zeros_like(d_image)
             d_red[..., 0] = d_alpha / (other[0] - b[0])
-            over_other = over(ctx.rasterizer, other)(splats, ctx.camera)
-            both = _gradients(ctx.rendering, d_image + d_red), _gradients(over_other, -d_red)
+            over_other = over(rasterizer, other)(splats, camera)
+            both = _gradients(rendering, d_image + d_red), _gradients(over_other, -d_red)
             gradients = [g + h for g, h in zip(*both, strict=True)]
-        *others, rgb = gradients
-        return None, None, None, *others, None if splats.rgb_offset is None else rgb
+        screen, *others, rgb = gradients
+        screen = screen if ctx.rows is None else screen[ctx.rows]
+        return None, None, screen, *others, None if splats.rgb_offset is None else rgb
 
 
 def _detached(tensors: Sequence[Tensor | None]) -> Splats:
@@ -241,14 +262,17 @@ def rasterization(
             any range, e.g. normals, if `sh_degree` is None.
         render_mode: "RGB", or "RGB+ED" with the expected depth as a fourth channel of the images, to look at: a loss of
             it raises `NotImplementedError` in `backward`.
-        packed: has no effect; `info` is always unpacked.
+        packed: `info` is that of the visible Gaussians of each camera, one after the other. gsplat's default is True, and here
+            False, since on a CPU its ellipses take half as long as the image.
         more: gsplat's other arguments. Those that change only how it computes (sparse_grad, tile_size …) have no effect.
         backend: a name of `rasterizers.load`.
         rgb_offset: added to the colours before their clamp at 0, with `sh_degree` only; gsplat has no such argument.
 
     Returns:
         images, alphas, and what gsplat's strategies read: `means2d` [C, N, 2] (`retain_grad` works),
-        `radii` [C, N, 2] (1 for the visible, 0 for the others), `width`, `height`, `n_cameras`, `gaussian_ids`.
+        `radii` [C, N, 2] (1 for the visible, 0 for the others), `width`, `height`, `n_cameras`. Packed, of M visible Gaussians:
+        `means2d` [M, 2], `gaussian_ids`, `camera_ids` and `batch_ids` [M], and in the graph of what they depend on, `depths` [M],
+        `conics` [M, 3] and `opacities` [M], times the factor of `rasterize_mode="antialiased"`; `radii` [M, 2] in pixels.
 
     Raises:
         ValueError: a mode or an argument that only gsplat supports, poses that require a gradient, or a wrong shape.
@@ -265,21 +289,18 @@ def rasterization(
     if sh_degree is None:
         colors, sh_degree = ((colors - low) / span - 0.5)[:, None] / SH_C0, 0
     splats = Splats(means, quats, scales, opacities, colors[:, :1], colors[:, 1 : (sh_degree + 1) ** 2], rgb_offset)
-    means2d = means.new_zeros(len(viewmats), len(means), 2).requires_grad_()
-    views = []
-    for i, (pose, K, over_color) in enumerate(zip(viewmats, Ks, behind, strict=True)):
+    each = []
+    for pose, K, over_color in zip(viewmats, Ks, behind, strict=True):
         background = tuple((x - low) / span for x in over_color)
         rasterizer = over(
             _loaded(backend, means.device.type, near_plane, eps2d, rasterize_mode == "antialiased"), background
         )
         (fx, _, cx), (_, fy, cy), _ = K.tolist()
         camera = Camera(pose, fx, fy, cx, cy, width, height)
-        views.append(draw(rasterizer, splats, camera, means2d[i], depth=render_mode == "RGB+ED"))
-    visible = _stacked([view.visible for view in views])
-    info = {
-        "means2d": means2d, "radii": visible.int()[..., None].expand(-1, -1, 2), "gaussian_ids": None,
-        "width": width, "height": height, "n_cameras": len(views),
-    }  # fmt: skip
+        each.append(_render(rasterizer, splats, camera, depth=render_mode == "RGB+ED"))
+    info, centres, rows = _packed_info(each, splats) if packed else _info(each)
+    info |= {"width": width, "height": height, "n_cameras": len(each)}
+    views = [_in_graph(rendered, splats, u, i) for rendered, u, i in zip(each, centres, rows, strict=True)]
     images, alphas = _stacked([view.image for view in views]), _stacked([view.alpha for view in views])[..., None]
     if (low, span) != (0.0, 1.0):
         images = low + span * images
@@ -287,6 +308,37 @@ def rasterization(
         images = images + (1 - alphas.detach()) * (backgrounds - backgrounds.detach())[:, None, None]
     depths = [view.depth for view in views if view.depth is not None]
     return torch.cat((images, torch.stack(depths)[..., None]), -1) if depths else images, alphas, info
+
+
+def _info(each: Sequence[_Rendered]) -> tuple[dict[str, Any], Sequence[Tensor], Sequence[None]]:
+    """What gsplat's strategies read, and the centres of each image."""
+    means2d = torch.stack([rendering.means2d for rendering, *_ in each]).requires_grad_()
+    radii = _stacked([rendering.visible for rendering, *_ in each]).int()[..., None].expand(-1, -1, 2)
+    return {"means2d": means2d, "radii": radii, "gaussian_ids": None}, means2d.unbind(), [None] * len(each)
+
+
+def _packed_info(
+    each: Sequence[_Rendered], splats: Splats
+) -> tuple[dict[str, Any], Sequence[Tensor], Sequence[Tensor]]:
+    """The same of the visible alone, and which these are."""
+    rows = [rendering.visible.nonzero()[:, 0] for rendering, *_ in each]
+    columns = []
+    for i, (rendering, rasterizer, camera) in zip(rows, each, strict=True):
+        settings = cast(RasterSettings, rasterizer)  # `over` has checked it
+        f = footprints(splats.means[i], splats.quats[i], splats.scales[i], camera, settings.kernel)
+        opacities = splats.opacities[i] * f.compensation if settings.antialiased else splats.opacities[i]
+        with torch.no_grad():  # where alpha falls below what is drawn
+            radii = (2 * (opacities / settings.alpha_min).log()).clamp_min(0).sqrt()[:, None] * f.deviations
+        columns.append((rendering.means2d[i], radii.ceil().clamp_min(1).int(), f.depths, f.conics, opacities))
+    means2d, radii, depths, conics, opacities = map(torch.cat, zip(*columns, strict=True))
+    means2d.requires_grad_()
+    ids = torch.cat(rows)
+    camera_ids = torch.cat([torch.full_like(i, camera) for camera, i in enumerate(rows)])
+    info = {
+        "means2d": means2d, "radii": radii, "depths": depths, "conics": conics, "opacities": opacities,
+        "gaussian_ids": ids, "camera_ids": camera_ids, "batch_ids": torch.zeros_like(ids),
+    }  # fmt: skip
+    return info, torch.split(means2d, [len(i) for i in rows]), rows
 
 
 def _stacked(tensors: Sequence[Tensor]) -> Tensor:

@@ -229,6 +229,7 @@ class Attached:
             call, factor = self._with_detail(call, trained=True), view.factor
             call["Ks"] = call["Ks"] * call["Ks"].new_tensor([[factor], [factor], [1]])
             call |= {"width": call["width"] * factor, "height": call["height"] * factor, "render_mode": "RGB"}
+            call |= {"packed": False} if self._is_ours else {}  # nobody reads its `info`
         else:
             params.pop("detail", None)
         if isinstance(target, Camera):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -77,10 +78,57 @@ class Projection:
         return SplatGradients(means, quats, scales, opacities, screen, rgb, basis=self.scatter(self.basis))
 
 
+class Footprints(NamedTuple):
+    """What M Gaussians cover of an image, in the order of their rows.
+
+    Args:
+        means2d: centre, px. conics: (A, B, C) of ½(A dx² + 2B dx dy + C dy²), 1/px².
+        deviations: standard deviations along x and y, px.
+        compensation: the opacity's factor, where Mip's antialiasing is on.
+    """
+
+    means2d: Float[Tensor, "M 2"]
+    depths: Float[Tensor, " M"]
+    conics: Float[Tensor, "M 3"]
+    deviations: Float[Tensor, "M 2"]
+    compensation: Float[Tensor, " M"]
+
+
+def footprints(
+    means: Float[Tensor, "M 3"],
+    quats: Float[Tensor, "M 4"],
+    scales: Float[Tensor, "M 3"],
+    camera: Camera,
+    kernel: float,
+) -> Footprints:
+    """Σ' = J W Σ Wᵀ Jᵀ + kernel·I and u = π(μ), of Gaussians in front of the camera."""
+    pose = camera.world_to_camera.to(means)
+    x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
+    means2d = torch.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), dim=-1)
+
+    # T = J W R(q) diag(s): the two rows of a 2 x 3 factor of Σ'.
+    axes = pose[:3, :3] @ (rotation_matrix(quats) * scales[:, None, :])
+    limits_x, limits_y = tangent_limits(camera)
+    jx, jy = -camera.fx * (x / z).clamp(*limits_x), -camera.fy * (y / z).clamp(*limits_y)  # times z
+    row_x = (camera.fx * axes[:, 0] + jx[:, None] * axes[:, 2]) / z[:, None]
+    row_y = (camera.fy * axes[:, 1] + jy[:, None] * axes[:, 2]) / z[:, None]
+
+    # Lengths in units of the larger of T's largest entry and √kernel, so that fourth powers neither over- nor underflow.
+    # The unit cancels, so it needs no gradient.
+    unit = torch.cat((row_x, row_y), dim=-1).detach().abs().amax(-1).clamp_min(math.sqrt(kernel))
+    tx, ty, k = row_x / unit[:, None], row_y / unit[:, None], kernel / unit / unit
+    a, b, c = (tx * tx).sum(-1), (tx * ty).sum(-1), (ty * ty).sum(-1)
+    area = torch.linalg.vector_norm(torch.linalg.cross(tx, ty), dim=-1)  # √det(T Tᵀ), det = Σ minors²
+    blur = k * (a + c) + k * k
+    det = area * area + blur  # det Σ'
+    conics = torch.stack((c + k, -b, a + k), dim=-1) / (det * unit * unit)[:, None]
+    deviations = torch.stack((a + k, c + k), dim=-1).sqrt() * unit[:, None]
+    return Footprints(means2d, z, conics, deviations, _compensation(area, blur))
+
+
 def project(splats: Splats, camera: Camera, settings: RasterSettings, *, depth: bool) -> Projection:
-    """Σ' = J W Σ Wᵀ Jᵀ + kernel·I and u = π(μ), for every Gaussian that can contribute."""
-    pose = camera.world_to_camera.to(splats.means)
-    rows = _candidates(splats, pose, settings)
+    """Footprints and colours of every Gaussian that can contribute."""
+    rows = _candidates(splats, camera, settings)
     means, quats, scales, opacities = leaves = (
         splats.means.detach()[rows].requires_grad_(),
         splats.quats.detach()[rows].requires_grad_(),
@@ -88,27 +136,9 @@ def project(splats: Splats, camera: Camera, settings: RasterSettings, *, depth: 
         splats.opacities.detach()[rows].requires_grad_(),
     )
     with torch.enable_grad():
-        x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
-        means2d = torch.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), dim=-1)
-
-        # T = J W R(q) diag(s): the two rows of a 2 x 3 factor of Σ'.
-        axes = pose[:3, :3] @ (rotation_matrix(quats) * scales[:, None, :])
-        limits_x, limits_y = tangent_limits(camera)
-        jx, jy = -camera.fx * (x / z).clamp(*limits_x), -camera.fy * (y / z).clamp(*limits_y)  # times z
-        row_x = (camera.fx * axes[:, 0] + jx[:, None] * axes[:, 2]) / z[:, None]
-        row_y = (camera.fy * axes[:, 1] + jy[:, None] * axes[:, 2]) / z[:, None]
-
-        # Lengths in units of the larger of T's largest entry and √kernel, so that fourth powers neither over- nor underflow.
-        # The unit cancels, so it needs no gradient.
-        unit = torch.cat((row_x, row_y), dim=-1).detach().abs().amax(-1).clamp_min(math.sqrt(settings.kernel))
-        tx, ty, k = row_x / unit[:, None], row_y / unit[:, None], settings.kernel / unit / unit
-        a, b, c = (tx * tx).sum(-1), (tx * ty).sum(-1), (ty * ty).sum(-1)
-        area = torch.linalg.vector_norm(torch.linalg.cross(tx, ty), dim=-1)  # √det(T Tᵀ), det = Σ minors²
-        blur = k * (a + c) + k * k
-        det = area * area + blur  # det Σ'
-        conics = torch.stack((c + k, -b, a + k), dim=-1) / (det * unit * unit)[:, None]
+        f = footprints(means, quats, scales, camera, settings.kernel)
         if settings.antialiased:
-            opacities = opacities * _compensation(area, blur)
+            opacities = opacities * f.compensation
 
         offset = means - camera.center.to(means)
         direction = offset / torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
@@ -125,14 +155,27 @@ def project(splats: Splats, camera: Camera, settings: RasterSettings, *, depth: 
     with torch.no_grad():
         # alpha >= alpha_min  <=>  exponent <= power_max, with a margin; `blend` applies the exact cut-off per pixel.
         power_max = (opacities / settings.alpha_min).log() * (1 + 1e-3) + 1e-3
-        half = torch.sqrt(2 * power_max.clamp_min(0)[:, None] * torch.stack((a + k, c + k), dim=-1)) * unit[:, None]
+        half = torch.sqrt(2 * power_max.clamp_min(0))[:, None] * f.deviations
     return Projection(
-        len(splats), rows, means2d, conics, opacities, rgb, z, half, power_max, leaves, raw_rgb, basis.detach(), depth
+        len(splats),
+        rows,
+        f.means2d,
+        f.conics,
+        opacities,
+        rgb,
+        f.depths,
+        half,
+        power_max,
+        leaves,
+        raw_rgb,
+        basis.detach(),
+        depth,
     )
 
 
-def _candidates(splats: Splats, pose: Float[Tensor, "4 4"], settings: RasterSettings) -> Int[Tensor, " M"]:
+def _candidates(splats: Splats, camera: Camera, settings: RasterSettings) -> Int[Tensor, " M"]:
     """The Gaussians to project. The conditions say which are kept, because NaN fails each of them."""
+    pose = camera.world_to_camera.to(splats.means)
     depth = splats.means.detach() @ pose[2, :3] + pose[2, 3]
     keep: Tensor = (depth > settings.near) & (splats.opacities.detach() >= settings.alpha_min)
     return torch.nonzero(keep)[:, 0]

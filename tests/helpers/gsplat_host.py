@@ -31,9 +31,17 @@ class Host:
     """Parameters, optimizers and LR photos (name -> camera and image) of a gsplat-style trainer."""
 
     def __init__(
-        self, scene, extent=1.0, strategy=None, scaler=None, accumulation=1, eps=1e-15, rasterization=rasterization
+        self,
+        scene,
+        extent=1.0,
+        strategy=None,
+        scaler=None,
+        accumulation=1,
+        eps=1e-15,
+        rasterization=rasterization,
+        packed=False,
     ):
-        self.rasterization = rasterization
+        self.rasterization, self.packed = rasterization, packed
         self.photos = {v.name: v.lr for v in scene.train}
         raw = GaussianField.from_cloud(scene.cloud).raw()
         self.splats = {k: torch.nn.Parameter(p.clone()) for k, p in raw.items() if k != "detail"}
@@ -48,7 +56,7 @@ class Host:
         self.degree = lambda step: min(3, step)
 
     def render(self, camera, step=0):
-        return drawn(self.rasterization, self.splats, camera, sh_degree=self.degree(step), packed=False)
+        return drawn(self.rasterization, self.splats, camera, sh_degree=self.degree(step), packed=self.packed)
 
     def train(self, names, between=lambda: None):
         """The order of gsplat's simple_trainer: backward, step, densify."""
@@ -67,7 +75,9 @@ class Host:
                 if self.scaler:
                     self.scaler.update()
             if self.strategy is not None:
-                self.strategy.step_post_backward(self.splats, self.optimizers, self.state, step, info, packed=False)
+                self.strategy.step_post_backward(
+                    self.splats, self.optimizers, self.state, step, info, packed=self.packed
+                )
             between()
 
 
@@ -99,7 +109,7 @@ def started(*strategies, host=None, scene=None, **settings):
 
 
 def densified(
-    conductor: Conductor, strategy=None, steps: int = 30, *, colors_stay: bool = False
+    conductor: Conductor, strategy=None, steps: int = 30, *, colors_stay: bool = False, packed: bool = False
 ) -> tuple[Host, Attached]:
     """A host on the toy scene of 40 Gaussians, trained with CLEAR while gsplat's default strategy, or another, densifies.
 
@@ -113,7 +123,7 @@ def densified(
     )
     torch.manual_seed(0)
     scene = toy.scene(40)
-    host = Host(scene, extent=4.0, strategy=strategy)
+    host = Host(scene, extent=4.0, strategy=strategy, packed=packed)
     if colors_stay:
         host.optimizers["sh0"].param_groups[0]["lr"] = 0.0
     names = [scene.train[i % 3].name for i in range(steps)]

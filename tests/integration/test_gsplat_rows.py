@@ -72,6 +72,18 @@ def test_all_parameters_and_states_follow_the_densifier(gsplat_strategies):
     assert float(host.splats["detail"].abs().max()) > 0
 
 
+def test_a_packed_loop_trains_and_densifies_as_another(gsplat_strategies):
+    followed = GCO(), P2G(patch=4), SVS(dropout=Ramp(full=50), anchor_start=25, anchor_strength=0.01)
+    (one, _), (packed, clear) = (
+        gsplat_host.densified(Conductor(*copy.deepcopy(followed), objective=HR_FROM_START), packed=packed)
+        for packed in (False, True)
+    )
+    assert clear.attachment.counts["scores written"] == 30
+    assert clear.attachment.counts["structure changes"] >= 3
+    for name, p in one.splats.items():
+        assert torch.equal(packed.splats[name], p), name
+
+
 def test_an_anchor_is_taken_once_mcmc_has_ended(gsplat_strategies):
     anchored = SVS(anchor_start=26, anchor_strength=0.01)
     conductor = Conductor(anchored, objective=HR_FROM_START)

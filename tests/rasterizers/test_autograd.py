@@ -178,6 +178,66 @@ def test_gsplats_own_defaults_are_drawn():
     assert stand_in(**defaults)[0].shape == (1, 30, 40, 3)
 
 
+def test_gsplats_strategy_reads_the_packed_info():
+    """Of two cameras, one of which sees a part of the scene."""
+    strategies = pytest.importorskip("gsplat").strategy
+    first = camera(40, 30).world_to_camera.float()
+    aside = first.clone()
+    aside[0, 3] += 3
+    viewmats = torch.stack((first, aside))
+    infos, states = [], []
+    for packed in (False, True):
+        splats = replace(leaves(scene(60)), rgb_offset=None)
+        strategy = strategies.DefaultStrategy(verbose=False)
+        params, state = {"means": splats.means}, strategy.initialize_state()
+        Ks = intrinsics(camera(40, 30)).float().expand(2, 3, 3)
+        images, _, info = stand_in(splats, packed=packed, viewmats=viewmats, Ks=Ks)
+        strategy.step_pre_backward(params, {}, state, 1, info)
+        images.square().sum().backward()
+        strategy.step_post_backward(params, {}, state, 1, info, packed=packed)
+        infos.append(info)
+        states.append(state)
+    unpacked, packed = infos
+    ids = packed["camera_ids"], packed["gaussian_ids"]
+    assert 0 < len(ids[0]) < 2 * 60
+    assert torch.equal(torch.stack(ids, 1), (unpacked["radii"] > 0).all(-1).nonzero())
+    assert torch.equal(packed["means2d"], unpacked["means2d"][ids])
+    assert torch.equal(packed["means2d"].grad, unpacked["means2d"].grad[ids])
+    assert {name: info.shape[1:] for name, info in packed.items() if torch.is_tensor(info)} == {
+        "means2d": (2,), "radii": (2,), "depths": (), "conics": (3,), "opacities": (), "gaussian_ids": (), "camera_ids": (),
+        "batch_ids": (),
+    }  # fmt: skip
+    for name in ("grad2d", "count"):
+        assert torch.allclose(states[0][name], states[1][name]), name
+
+
+@pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
+def test_packed_ellipses_are_those_of_the_projection_and_have_gradients(rasterize_mode):
+    torch_impl = pytest.importorskip("gsplat.cuda._torch_impl")
+    splats, view = leaves(scene(60, dtype=torch.float64)), camera(40, 30)
+    info = stand_in(splats, packed=True, rasterize_mode=rasterize_mode)[2]
+    i, pose = info["gaussian_ids"], view.world_to_camera.double()[None]
+    covariances, _ = torch_impl._quat_scale_to_covar_preci(splats.quats, splats.scales, True, False)
+    radii, means2d, depths, conics, compensations = torch_impl._fully_fused_projection(
+        splats.means, covariances, pose, intrinsics(view).double()[None], 40, 30, calc_compensations=True
+    )
+    factor = compensations[0, i] if rasterize_mode == "antialiased" else 1
+    expected = {
+        "means2d": means2d[0, i],
+        "depths": depths[0, i],
+        "conics": conics[0, i],
+        "opacities": splats.opacities[i] * factor,
+    }
+    for name, value in expected.items():
+        assert torch.allclose(info[name], value, rtol=1e-6), name
+    assert (info["radii"] <= radii[0, i] + 1).all()  # they reach as far as the opacity lets them
+    gradients = [
+        torch.autograd.grad(x.sum(), splats.means)
+        for x in (info["depths"] * info["conics"].sum(-1), (depths * conics.sum(-1))[0, i])
+    ]
+    assert torch.allclose(*(g for (g,) in gradients), rtol=1e-6)
+
+
 def stand_in(s=None, **arguments):
     """Splats, of the same 60 Gaussians unless given, by gsplat's arguments."""
     s, view = s or scene(60), camera(40, 30)
