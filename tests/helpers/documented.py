@@ -43,7 +43,7 @@ def follow(words: list[str]) -> None:
     if words[:3] == ["python", "-m", "clear_strategies.run"]:
         words = ["clear-strategies", *words[3:]]
     if words[0] == "clear-strategies":
-        if words[1] not in ("render", "export"):
+        if words[1] not in ("render", "export") and "--cfg" not in words:
             demo = words[1] != "train" and not any(word.startswith("data=") for word in words)
             named = {word.split("=")[0] for word in words}
             words = [*words, *(w for w in TINY + OF_DEMO * demo if w.split("=")[0] not in named)]
