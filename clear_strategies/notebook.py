@@ -103,10 +103,10 @@ class Run:
 
 
 def train(photos: str | Path | None = None, *settings: str, folder: str | Path | None = None) -> Run:
-    """Train on photos, a video or a capture, as `clear-strategies train` does, and return the finished run.
+    """Train on photos or a capture, as `clear-strategies train` does, and return the finished run.
 
     Args:
-        photos: a folder of photos or of a capture, or a video; None: the demo scene.
+        photos: a folder of photos or of a capture; None: the demo scene.
         settings: as on the command line: "fit.iterations=3000", "+strategy=clear".
         folder: for the run's files; None: outputs/<name>/<time>.
 

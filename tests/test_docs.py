@@ -43,7 +43,7 @@ PYTHON = [
     if block != README_LOOP  # has a test of its own
 ]
 # Commands of other programs: nothing of them is checked, but that extras exist.
-FOREIGN = r"(python3? -m (venv|pip|build)|cibuildwheel|\.|pip install|for|done|wait|ns-train|mkdocs|pre-commit|tensorboard|cd) ?"
+FOREIGN = r"(python3? -m (venv|pip|build)|cibuildwheel|\.|pip install|for|done|wait|ns-train|mkdocs|pre-commit|cd) ?"
 
 TAKEN: set[str] = set()  # words that chose a file for a job of a sweep, of any command
 READ_BY_ARGPARSE = ("render", "export", "view", "doctor")  # subcommands; the others read Hydra's words
@@ -168,10 +168,9 @@ NOT_RUN = {
     "the reader's scenes": r"FOLDER|scenes/|multirun/",
     "another trainer": r"-m integration\.(gsplat|inria) |^ns-train",
     "installation, the gate": r"^(python3? -m (venv|build|pytest)|cibuildwheel|pip install)\b",
-    "other programs": r"^(for|done|wait|tensorboard)\b",
+    "other programs": r"^(for|done|wait)\b",
     "an environment": r"^\. ",
     "waits for a browser": r"^clear-strategies view",
-    "a video whose poses take a minute; tests/data/readers/test_video.py reads one": r"^clear-strategies train clip\.mp4",
     "takes minutes, or a file that the viewer saves": r"--frames 240|flight\.json",
     "a class that the reader names": r"YourStrategy",
     "a wheel's first run, in the gate": r"^clear-strategies \+strategy=clear fit.iterations=10$",

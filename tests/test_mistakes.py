@@ -48,13 +48,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for i in range(3):
         (here / "text" / f"{i}.jpg").write_text("no photo")
     (here / "file").write_text("no folder")
-    (here / "half.mp4").write_bytes(b"\0\0\0\x20ftypisom" + bytes(2_000))
+    (here / "clip.mp4").write_text("no folder")
     (here / "damaged.ply").write_text("ply\nformat ascii 1.0\n")
     return here
 
 
 def test_the_table_has_its_rows() -> None:
-    assert len(ROWS) >= 20
+    assert len(ROWS) >= 19
     assert len({row["command"] for row in ROWS}) == len(ROWS)
 
 

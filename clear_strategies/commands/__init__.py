@@ -35,7 +35,7 @@ class Command(NamedTuple):
 
 
 COMMANDS: Final = {
-    "train": Command("PHOTOS [setting=value …]", "from photos, a video or a capture to a splat and pictures"),
+    "train": Command("PHOTOS [setting=value …]", "from photos or a capture to a splat and pictures"),
     "render": Command("RUN", "a video of a saved run or a PLY file, or pictures from given cameras"),
     "export": Command("RUN", "a saved run as a PLY file for viewers"),
     "view": Command("RUN", "an interactive viewer in the browser of a saved run or a PLY file"),

@@ -1,4 +1,4 @@
-"""`clear-strategies train PHOTOS`: a run on photos, a video or a capture, by the same configuration as every other.
+"""`clear-strategies train PHOTOS`: a run on photos or a capture, by the same configuration as every other.
 
 The reader is the one of what lies in the folder. Everything behind the folder goes to Hydra unchanged.
 """
@@ -19,16 +19,14 @@ from clear_strategies.errors import SettingError
 _ITERATIONS: Final = 1000
 _USAGE: Final = f"""clear-strategies train PHOTOS [setting=value …]
 
-PHOTOS is a folder of photos, a video of a still scene, or a capture: COLMAP's sparse/, a transforms.json, a poses_bounds.npy
-or a Blender scene in the folder.
+PHOTOS is a folder of photos, or of a capture: COLMAP's sparse/, a transforms.json, a poses_bounds.npy or a Blender scene.
 The command trains +strategy=best on all photos for fit.iterations={_ITERATIONS}. Settings change that:
 
   clear-strategies train photos/ fit.iterations=3000
   clear-strategies train photos/ data.views.test_every=8          every 8th photo is kept for testing
   clear-strategies train photos/ data.views.max_hr_megapixels=8   sharper, slower, more memory
-  clear-strategies train clip.mp4 --frames 24                     24 of its sharpest frames
   clear-strategies train photos/ data.reader.skip_faulty=true         go on without photos that cannot be read
-  clear-strategies train photos/ fit.log=tensorboard -v           curves while it trains; every detail on the console
+  clear-strategies train photos/ fit.viewer=true -v               look while it trains; every detail on the console
 
 `clear-strategies data=photos --cfg job` prints all settings.
 """
@@ -36,7 +34,6 @@ The command trains +strategy=best on all photos for fit.iterations={_ITERATIONS}
 CHOOSE_STRATEGIES: Final = ("+strategy=", "+method=", "experiment=", "+experiment=")
 _PLAIN: Final = re.compile(r"(/|\./|(\.\./)+)?[A-Za-z_][\w./-]*", re.ASCII)  # needs no quotes, for Hydra or a shell
 _NO_TEXT: Final = ("null", "true", "false", "nan", "inf")
-_FLAGS: Final = {"--frames": "data.reader.frames"}
 _CHOOSE_ITERATIONS: Final = ("fit.iterations=", "experiment=", "+experiment=", "+protocol=", "+scene=")
 
 
@@ -44,7 +41,7 @@ def main(arguments: list[str]) -> None:
     """Train on what the first argument names.
 
     Raises:
-        SettingError: there is no first argument, it is neither a folder nor a video, or a flag has no value.
+        SettingError: there is no first argument, or nothing is there.
     """
     if "--help" in arguments or "-h" in arguments:
         sys.stdout.write(_USAGE)
@@ -59,30 +56,13 @@ def main(arguments: list[str]) -> None:
 def overrides(arguments: Sequence[str]) -> list[str]:
     """The arguments of the command as Hydra's; the SettingErrors as of `main`."""
     if not arguments or arguments[0].startswith(("-", "+", "~")):
-        raise SettingError(
-            "train needs a folder of photos or a video first: clear-strategies train PHOTOS [setting=value …]."
-        )
-    path, rest = Path(arguments[0]), _settings(arguments[1:])
-    if not path.is_dir() and not path.is_file():
-        raise SettingError(f"train: {path} is not there. Name the folder of the photos or of the capture, or a video.")
+        raise SettingError("train needs a folder of photos first: clear-strategies train PHOTOS [setting=value …].")
+    path, rest = Path(arguments[0]), arguments[1:]
+    if not path.exists():
+        raise SettingError(f"train: {path} is not there. Name the folder of the photos or of the capture.")
     defaults = {"+strategy=best": CHOOSE_STRATEGIES, f"fit.iterations={_ITERATIONS}": _CHOOSE_ITERATIONS}
     used = [default for default, chosen in defaults.items() if not any(word.startswith(chosen) for word in rest)]
     return [*used, f"data={detect(path)}", f"data.path={quoted(str(path))}", *rest]
-
-
-def _settings(arguments: Sequence[str]) -> list[str]:
-    """Hydra's overrides: `--frames N` and `--frames=N` are one of them."""
-    settings, rest = list[str](), iter(arguments)
-    for word in rest:
-        name, equals, value = word.partition("=")
-        if name not in _FLAGS:
-            settings.append(word)
-            continue
-        value = value if equals else next(rest, "")
-        if not value or value.startswith("-"):
-            raise SettingError(f"{name} needs a number: {name} 24.")
-        settings.append(f"{_FLAGS[name]}={value}")
-    return settings
 
 
 def detect(path: Path) -> str:

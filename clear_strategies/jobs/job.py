@@ -6,7 +6,7 @@ import functools
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from clear_strategies.jobs import scene as scenes
 from clear_strategies.jobs.lock import hold
 from clear_strategies.jobs.settings import JobSettings, settings_of
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.outputs import plan, results, score_table, tensorboard
+from clear_strategies.outputs import plan, results, score_table
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.progress import progress_bar
 from clear_strategies.schedules import scaled
@@ -111,8 +111,6 @@ def run(config: DictConfig, folder: Path, overrides: Sequence[str] | None = None
     fit = settings.fit
     if fit.viewer:
         viewing.require_viewer()
-    if fit.log == "tensorboard":
-        tensorboard.require_tensorboard()
     training = _Training(settings, settings.conductor(fit.stretch), resume.comparable(values), folder, overrides)
     drawing = device.drawing(settings.rasterizer, fit.device)
     with hold(folder), signals.interrupted("before training began"):
@@ -170,28 +168,17 @@ def _announce(training: _Training, state: TrainState, place: _Place, threads: st
 
 
 @contextmanager
-def _watched(training: _Training, state: TrainState, place: _Place) -> Iterator[Callable[[], None]]:
-    """Open the viewer (`fit.viewer`) and the log (`fit.log`), and yield a function to call after each iteration. It updates
-    both.
-    """
-    fit_settings, painter = training.settings.fit, Painter(state.field, place.drawing.make)
-    calls = list[Callable[[], None]]()
-    with ExitStack() as stack:
-        if fit_settings.viewer:
-            cameras, title = read_cameras(training.folder / CAMERAS), f"{place.scene.name} · {training.chosen.title}"
-            tell = functools.partial(_log.info, "look while it trains: %s")
-            from clear_strategies.viewing.server import watched
+def _watched(training: _Training, state: TrainState, place: _Place) -> Iterator[Callable[[], None] | None]:
+    """Open the viewer if `fit.viewer` asks for it, and yield a function to call after each iteration."""
+    if not training.settings.fit.viewer:
+        yield None
+        return
+    from clear_strategies.viewing.server import watched
 
-            turn = stack.enter_context(watched(painter, cameras, title, tell))
-            calls.append(lambda: turn(state.t - 1))
-        if fit_settings.log == "tensorboard":
-            calls.append(stack.enter_context(tensorboard.logged(training.folder, state, place.scene, painter)))
-
-        def after_step() -> None:
-            for call in calls:
-                call()
-
-        yield after_step
+    painter, cameras = Painter(state.field, place.drawing.make), read_cameras(training.folder / CAMERAS)
+    tell = functools.partial(_log.info, "look while it trains: %s")
+    with watched(painter, cameras, f"{place.scene.name} · {training.chosen.title}", tell) as turn:
+        yield lambda: turn(state.t - 1)
 
 
 def _train(training: _Training, state: TrainState, place: _Place) -> tuple[Evaluation, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 from clear_strategies.compose import ConductorSettings
 from clear_strategies.core.checks import require_whole
@@ -29,7 +29,6 @@ class RunSettings(FitSettings):
         video: number of frames of path.mp4, a loop through the training cameras, 24 a second; 0: none.
         verbose: also show on the console the details that run.log holds; `-v` on the command line.
         page: write splat.html, which shows the field in any browser, if it has at most this many Gaussians; 0: never.
-        log: tensorboard writes the numbers of history.csv and a render for TensorBoard; extra [log].
         viewer: look at the field in the browser while it trains; the address is logged. Extra [view].
         resume: a run's folder or one of its checkpoints: continue from there, bit for bit. auto: look into the run's own
             folder. If the run is finished, train nothing; if it has checkpoints, continue from the newest one; else start
@@ -43,7 +42,6 @@ class RunSettings(FitSettings):
     map_views: int = 3
     video: int = 72
     page: int = 500_000
-    log: Literal["tensorboard"] | None = None
     verbose: bool = False
     viewer: bool = False
     resume: str | None = None

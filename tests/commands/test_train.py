@@ -39,14 +39,6 @@ def test_a_reader_that_another_package_brings_is_found_by_its_yaml_alone(tmp_pat
     assert train.detect(tmp_path) == "mine"
 
 
-def test_frames_are_a_setting_of_the_reader(tmp_path):
-    (tmp_path / "clip.mp4").touch()
-    for said in (["--frames", "24"], ["--frames=24"]):
-        overrides = train.overrides([str(tmp_path / "clip.mp4"), *said, "fit.seed=3"])
-        assert overrides[-2:] == ["data.reader.frames=24", "fit.seed=3"]
-        assert "fit.iterations=1000" in overrides
-
-
 @pytest.mark.parametrize(
     "name",
     [

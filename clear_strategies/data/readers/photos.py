@@ -17,9 +17,8 @@ from clear_strategies.data.photo_folders import images_in, list_images, require_
 from clear_strategies.data.priors import cache_folder
 from clear_strategies.data.readers import colmap, sfm
 from clear_strategies.data.readers.colmap_model import read_model
-from clear_strategies.data.readers.video import CHOICE, frames_of
 from clear_strategies.data.strict_json import read_object
-from clear_strategies.errors import DataError, SettingError
+from clear_strategies.errors import DataError
 
 _log = logging.getLogger(__name__)
 
@@ -29,7 +28,7 @@ _STOPS: Final = 0.5  # larger differences of exposure give a warning
 
 
 def recognises(path: Path) -> int:
-    """The rank of `clear_strategies.commands.train.detect`: what no other reader knows are photos or a video, or are refused."""
+    """The rank of `clear_strategies.commands.train.detect`: what no other reader knows are photos, or are refused."""
     return int(path.exists())
 
 
@@ -37,7 +36,6 @@ def read(
     root: str | Path,
     cache: str | Path | None = None,
     *,
-    frames: int | None = None,
     max_side: int = 1600,
     max_features: int = 8192,
     precise: bool | Literal["auto"] = "auto",
@@ -46,13 +44,11 @@ def read(
     seed: int = 0,
     skip_faulty: bool = False,
 ) -> Capture:
-    """Read a folder of photos of one scene, or a video. Poses are estimated from all of them and kept in a cache.
+    """Read a folder of photos of one scene. Poses are estimated from all of them and kept in a cache.
 
     Args:
-        root: the folder; or one whose photos lie in its subfolder `images`; or the file of a video: its sharpest frames,
-            evenly spread over the camera's path, are the photos.
+        root: the folder; or one whose photos lie in its subfolder `images`.
         cache: folder of the poses; None: ~/.cache/clear-strategies/sfm, or $CLEAR_CACHE/sfm. Not in the photos' folder.
-        frames: of a video, how many are chosen; None: one for each eighth of the width that the picture moves, 12 to 40.
         max_side: features are extracted from photos reduced to this many pixels.
         max_features: of a photo, those of the coarsest scales; memory and time of matching grow with its square.
         precise: features that follow a surface's tilt (affine shape, domain-size pooling), matched once more along the
@@ -72,15 +68,11 @@ def read(
     require_number("data.reader.least_placed", least_placed, above=0, most=1)
     require_whole("data.reader.threads", threads, least=-1)
     require_whole("data.reader.seed", seed, least=0)
-    if frames is not None:
-        require_whole("data.reader.frames", frames, least=sfm.FEWEST)
-    root, name, video_note = Path(root), Path(root).resolve().name, {}
+    root, name = Path(root), Path(root).resolve().name
     if root.is_file():
-        video, root = root, frames_of(root, frames)
-        video_note["photos"] = f"{video.name}: {(root / CHOICE).read_text()}"
-    elif frames is not None:
-        raise SettingError(f"data.reader.frames: {root} is no video. Leave frames out.")
-    elif (root / "images").is_dir() and not images_in(root):
+        frames = "ffmpeg -i VIDEO -vf thumbnail=15 -fps_mode passthrough -q:v 2 FOLDER/%03d.jpg"
+        raise DataError(root, "photos", "is a file", f"give a folder of photos; of a video: {frames}")
+    if (root / "images").is_dir() and not images_in(root):
         root = root / "images"
     base = Path(cache) if cache is not None else cache_folder() / "sfm"
     if base.resolve().is_relative_to(root.resolve()):
@@ -101,7 +93,7 @@ def read(
         sfm.reconstruct(root, photos, folder, sfm.SfmSettings(max_side, max_features, precise, threads, seed))
     capture = _capture(root, photos, folder)
     sfm.require_placed(root, len(capture.frames), len(paths), least_placed)
-    return replace(capture, name=name, notes={**capture.notes, **video_note})
+    return replace(capture, name=name)
 
 
 def _capture(root: Path, photos: Mapping[Path, Exif], folder: Path) -> Capture:
