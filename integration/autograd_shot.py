@@ -96,7 +96,7 @@ class AutogradShot:
         params: raw parameters by gsplat's names. A parameter that the image does not depend on has gradient 0.
         slot: where the host keeps the screen gradient; None: the image is a function of `means2d` itself.
         drawn: means, quats, scales, opacities and colors that the rasterizer was given; None: the raw parameters.
-        drawing: of this package's rasterizer, which takes all cotangents in one pass; None: another's.
+        drawings: by this package's rasterizers, for this image; a single one takes all cotangents in one pass.
     """
 
     image: Float[Tensor, "H W 3"]
@@ -105,7 +105,12 @@ class AutogradShot:
     params: Mapping[str, Tensor]
     slot: ScreenGradientSlot | None = None
     drawn: Mapping[str, Tensor] | None = None
-    drawing: Drawing | None = None
+    drawings: Sequence[Drawing] = ()
+
+    @property
+    def drawing(self) -> Drawing | None:
+        """The only one of `drawings`; None: another rasterizer drew the image, or it was put together of several."""
+        return self.drawings[0] if len(self.drawings) == 1 else None
 
     @property
     def gradient_slot(self) -> ScreenGradientSlot:
@@ -215,11 +220,6 @@ def _plus_rows(
     if not isinstance(weight, Tensor):
         return torch.add(a, b, alpha=weight)
     return torch.addcmul(a, b, weight.to(b).view(-1, *[1] * (b.dim() - 1)))
-
-
-def only_one(drawings: Sequence[Drawing]) -> Drawing | None:
-    """The drawing, where a host's render function drew once by a rasterizer of this package."""
-    return drawings[0] if len(drawings) == 1 else None
 
 
 _VIEWS: Final = frozenset(

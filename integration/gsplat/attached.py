@@ -19,7 +19,7 @@ from clear_strategies.errors import HostError
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment
-from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot, Target, only_one
+from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot, Target
 from integration.densification import require_end
 from integration.detail import detail_adam, sh0_offset
 from integration.host_score import warn_if_score_is_unused
@@ -270,10 +270,10 @@ class Attached:
             )
         renders, alphas, info = result
         size, n, packed = (call["width"], call["height"]), len(params["means"]), info["means2d"].dim() == 2
-        rows, drawing = info.get("gaussian_ids") if packed else None, only_one(drawings)
+        rows = info.get("gaussian_ids") if packed else None
         means2d = info["means2d"].detach().reshape(-1, 2)
-        if drawing is not None:  # what the gate drops is not visible in it
-            means2d, visible = drawing.rendering.means2d, drawing.rendering.visible
+        if len(drawings) == 1:  # what the gate drops is not visible in it
+            means2d, visible = drawings[0].rendering.means2d, drawings[0].rendering.visible
         else:
             visible = _visible(info["radii"], packed)
             if gate is not None:
@@ -292,7 +292,7 @@ class Attached:
             if call.get(name) is not None
         }
         slot = ScreenGradientSlot(info["means2d"], size, rows=rows)
-        shot = AutogradShot(image, means2d, visible, params, slot, drawn, drawing)
+        shot = AutogradShot(image, means2d, visible, params, slot, drawn, drawings)
         return HostOutput(shot, renders, (renders, alphas, info))
 
     def _background(self, call: Mapping[str, Any]) -> dict[str, Tensor]:

@@ -19,7 +19,7 @@ from clear_strategies.core.view import View
 from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment
-from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot, Target, only_one
+from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot, Target
 from integration.detail import sh0_offset
 from integration.host_score import warn_if_score_is_unused
 from integration.inria.cameras import enlarged_camera, replaced_camera
@@ -180,7 +180,7 @@ class AttachedModel:
             with recorded() as drawings:
                 result = render(proxy(self._model, overrides, self._roles), sized, target)
             output = self._output(result, overrides, pinhole, params)
-            return replace(output, shot=replace(output.shot, drawing=only_one(drawings)))
+            return replace(output, shot=replace(output.shot, drawings=drawings))
 
         return self.attachment.render_view(view, render_at)
 

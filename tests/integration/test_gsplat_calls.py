@@ -134,6 +134,28 @@ def test_a_second_pass_stands_beside_the_photo(named):
     assert clear.attachment.counts["merges"] == 1
 
 
+@pytest.mark.parametrize("looked_at", [True, False])
+def test_a_host_that_draws_twice_for_one_rendering_has_the_same_gradients_and_is_told_what_it_costs(looked_at, caplog):
+    caplog.set_level("INFO")
+
+    @functools.wraps(autograd.rasterization)
+    def twice(**call):
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not looked_at):
+            gsplat_host.rasterization(**call)
+        return gsplat_host.rasterization(**call)
+
+    gradients = []
+    for rasterization in (gsplat_host.rasterization, twice):
+        host, clear, render = started(host=Host(toy.scene(20), rasterization=rasterization))
+        for i in range(2):
+            render(i).mean().backward()
+        gradients.append({name: p.grad for name, p in host.splats.items() if p.grad is not None})
+    assert caplog.text.count("The host draws 2 times for one rendering") == (0 if looked_at else 1)
+    assert clear.attachment.counts["HR renders in parts"] == (0 if looked_at else 2)
+    for name, g in gradients[0].items():
+        assert torch.allclose(gradients[1][name], g, rtol=1e-4, atol=1e-7), name
+
+
 @pytest.mark.parametrize("stepped", [True, False])
 def test_a_detail_feature_that_no_optimizer_steps_on_gives_a_warning(stepped, caplog):
     host, _, render = started()
