@@ -22,7 +22,6 @@ _log = logging.getLogger(__name__)
 
 _LOOP: Final = "cameras"  # the --path that is a video
 _LONGEST: Final = 1280  # px, of a video where --width asks for nothing
-_PARTS: Final = ("sh", "detail", "filter_3d", "mip")  # of `Look`
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -37,24 +36,22 @@ def main(arguments: Sequence[str]) -> None:
     from clear_strategies.jobs.saved import open_splat
     from clear_strategies.viewing import FPS, video
     from clear_strategies.viewing.cameras import at_most
-    from clear_strategies.viewing.look import DepthScale, Look
+    from clear_strategies.viewing.look import DepthScale
 
     began = time.perf_counter()
     splat = open_splat(options.run, options.rasterizer)
     _log.info("%s", splat.source)
-    painter, look = splat.painter, Look(**dict.fromkeys(options.without, False))
-    if splat.baked and not (look.detail and look.filter_3d):
-        _log.warning("--without detail and filter_3d have no effect: a PLY file holds f_det and the filter.")
+    painter = splat.painter
     where, width = cameras_of(splat, options.path, options.frames), options.width
     if width is not None:
         where = {name: resized(c, width, max(1, round(c.height * width / c.width))) for name, c in where.items()}
     if options.path == _LOOP:
         where = {name: at_most(c, None if width is not None else _LONGEST) for name, c in where.items()}
-    kinds: dict[str, Callable[[Camera], Pixels]] = {"": lambda camera: to_bytes(painter.color(camera, look))}
+    kinds: dict[str, Callable[[Camera], Pixels]] = {"": lambda camera: to_bytes(painter.color(camera))}
     if options.depth:
-        scale = DepthScale.of(painter, list(where.values()), look)
+        scale = DepthScale.of(painter, list(where.values()))
         _log.info("depth: %.3g (bright) to %.3g (dark) world units, grey where nothing is", scale.near, scale.far)
-        kinds["depth"] = lambda camera: scale.picture(painter.depth(camera, look))
+        kinds["depth"] = lambda camera: scale.picture(painter.depth(camera))
     out = options.out or splat.folder / "rendered"
     for kind, draw in kinds.items():
         if options.path == _LOOP:
@@ -100,6 +97,4 @@ def _parser() -> argparse.ArgumentParser:
     width = f"width of the pictures (default: that of the HR camera, of a video at most {_LONGEST})"
     parser.add_argument("--width", type=positive(int), metavar="PX", help=width)
     parser.add_argument("--depth", action="store_true", help="depth as well, in colours")
-    without = "parts of the model: colour by direction, f_det, the 3D and the 2D filter of Mip-Splatting"
-    parser.add_argument("--without", nargs="+", choices=_PARTS, default=[], metavar="PART", help=f"{without} {_PARTS}")
     return parser

@@ -38,10 +38,10 @@ def main(arguments: Sequence[str]) -> None:
     require_viewer()
     splat = open_splat(options.run, options.rasterizer)
     _log.info("%s", splat.source)
-    from clear_strategies.viewing.server import Screen, SplatViewer
+    from clear_strategies.viewing.server import SplatViewer
 
     viewer = SplatViewer(
-        Screen(splat.painter, splat.cameras), title=splat.name, port=options.port, host=options.host,
+        splat.painter, [saved.camera for saved in splat.cameras], title=splat.name, port=options.port, host=options.host,
         out=splat.folder / "rendered",
     )  # fmt: skip
     _log.info("%s (Ctrl-C ends it)", viewer.address)

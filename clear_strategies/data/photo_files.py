@@ -157,13 +157,6 @@ def write_png(path: Path, image: Float[Tensor, "H W 3"] | Float[Tensor, "H W"]) 
     write_bytes(path, buffer.getvalue())
 
 
-def jpeg(image: Float[Tensor, "H W 3"], quality: int = 90) -> bytes:
-    """A small file of an image in [0, 1], for display and not for measurements."""
-    buffer = io.BytesIO()
-    Image.fromarray(to_bytes(image)).save(buffer, format="JPEG", quality=quality, subsampling=0)
-    return buffer.getvalue()
-
-
 @contextmanager
 def _opened(path: Path, turn: bool | None) -> Iterator[Image.Image]:
     require_regular(path)

@@ -33,8 +33,7 @@ from clear_strategies.training import memory, signals
 from clear_strategies.training.checkpoint import CHECKPOINTS
 from clear_strategies.training.loop import fit
 from clear_strategies.training.state import TrainState
-from clear_strategies.viewing.cameras import FILE as CAMERAS
-from clear_strategies.viewing.cameras import read_cameras, write_cameras
+from clear_strategies.viewing.cameras import write_cameras
 from clear_strategies.viewing.look import Painter
 
 _log = logging.getLogger(__name__)
@@ -175,7 +174,7 @@ def _watched(training: _Training, state: TrainState, place: _Place) -> Iterator[
         return
     from clear_strategies.viewing.server import watched
 
-    painter, cameras = Painter(state.field, place.drawing.make), read_cameras(training.folder / CAMERAS)
+    painter, cameras = Painter(state.field, place.drawing.make), [view.hr.camera for view in place.scene.train]
     tell = functools.partial(_log.info, "look while it trains: %s")
     with watched(painter, cameras, f"{place.scene.name} · {training.chosen.title}", tell) as turn:
         yield lambda: turn(state.t - 1)

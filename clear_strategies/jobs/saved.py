@@ -44,7 +44,6 @@ class SavedSplat:
         source: what was opened, for messages.
         cameras: of the run; empty where none are known.
         antialiased: it was trained with opacity compensation.
-        baked: it comes from a PLY file, whose colours and scales include f_det and the 3D filter.
     """
 
     folder: Path
@@ -53,7 +52,6 @@ class SavedSplat:
     painter: Painter
     cameras: Sequence[SavedCamera]
     antialiased: bool
-    baked: bool
 
     def poses(self) -> list[Camera]:
         """The training cameras, or, where none are known, one that sees the whole splat."""
@@ -115,7 +113,7 @@ def _of_checkpoint(path: Path, folder: Path, rasterizer: str | None) -> SavedSpl
     source = f"{folder}, {saved.t - 1} iterations, {len(field):,} Gaussians"
     painter = _painter(field, _drawing(settings, rasterizer), cameras)
     antialiased = bool(settings.get("antialiased", True))
-    return SavedSplat(folder, _name(folder), source, painter, cameras, antialiased, baked=False)
+    return SavedSplat(folder, _name(folder), source, painter, cameras, antialiased)
 
 
 def _of_ply(path: Path, rasterizer: str | None) -> SavedSplat:
@@ -128,7 +126,7 @@ def _of_ply(path: Path, rasterizer: str | None) -> SavedSplat:
     drawing = _drawing({} if g.antialiased else {"kernel": 0.3, "antialiased": False}, rasterizer)
     source = f"{path}, {len(field):,} Gaussians"
     name = _name(path.parent) if path.name == PLY else path.stem
-    return SavedSplat(path.parent, name, source, _painter(field, drawing, cameras), cameras, g.antialiased, baked=True)
+    return SavedSplat(path.parent, name, source, _painter(field, drawing, cameras), cameras, g.antialiased)
 
 
 def _name(folder: Path) -> str:

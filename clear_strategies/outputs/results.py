@@ -44,7 +44,7 @@ _OF_RUN: Final = (
     splat_page.FILE, cameras.FILE, "maps/maps.json", _COVERAGE,
 )  # fmt: skip
 _OF_VIEW: Final = (
-    "renders/{}.png", f"{cameras.PHOTOS}/{{}}.jpg", *(f"views/{{}}_{k}.png" for k in ("lr", "prior", "truth")),
+    "renders/{}.png", *(f"views/{{}}_{k}.png" for k in ("lr", "prior", "truth")),
     *(f"maps/{{}}/{name}.png" for name in (*MAPS, "maps")),
 )  # fmt: skip
 _LONGEST: Final = 960  # px, of the video: a frame takes a fraction of a second, and the file a few MB

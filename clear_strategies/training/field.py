@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -138,17 +138,9 @@ class GaussianField(nn.Module):
         """Π_k s_k / √(s_k² + f²): a filtered Gaussian is larger, and its opacity lower by this factor."""
         return self._activate(None).coefficient
 
-    def baked(self, *, detail: bool = True, filtered: bool = True, degree: int | None = None) -> Splats:
-        """Splats for exports and viewers: the filter in scales and opacities, f_det in the colour.
-
-        Args:
-            detail, filtered: whether f_det and the 3D filter take part. degree: of the colour, at most; None: the active one.
-        """
-        active = self._activate(None)
-        splats = active.splats(detail=detail)
-        if not filtered:
-            splats = replace(splats, scales=active.scales, opacities=active.sigmoid)
-        return splats if degree is None else replace(splats, shN=splats.shN[:, : (degree + 1) ** 2 - 1])
+    def baked(self) -> Splats:
+        """Splats for exports and viewers: the filter in scales and opacities, f_det in the colour."""
+        return self._activate(None).splats(detail=True)
 
     def _activate(self, gate: Tensor | None) -> Activation:
         raw = self.raw()

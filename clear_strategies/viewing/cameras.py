@@ -1,13 +1,12 @@
 """The cameras of a run as a file.
 
 A run writes `cameras.json` in the layout of Inria's 3DGS, which SuperSplat and SIBR open: a list of {"id", "img_name",
-"width", "height", "position", "rotation" (camera to world, OpenCV axes), "fx", "fy"}. Ours adds "cx", "cy", "scale" (HR pixels
-per LR pixel), "split" ("train", "test"), "background" (RGB) and "photo", a small picture beside the file.
+"width", "height", "position", "rotation" (camera to world, OpenCV axes), "fx", "fy"}. Ours adds "cx", "cy", "split" ("train",
+"test") and "background" (RGB).
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -17,21 +16,15 @@ import numpy as np
 import torch
 
 from clear_strategies import files
-from clear_strategies.core import images
 from clear_strategies.data import strict_json
 from clear_strategies.data.lenses import rigid_inverse
-from clear_strategies.data.photo_files import jpeg
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.strict_json import Number, typed
-from clear_strategies.data.view_names import file_stem
 from clear_strategies.data.view_settings import resized
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera, Color
 
 FILE: Final = "cameras.json"
-PHOTOS: Final = "cameras"
-"""The folder of the small pictures, beside the file."""
-_PHOTO_WIDTH: Final = 320  # px, at most; photos are reduced by a whole number
 
 Split = Literal["train", "test"]
 
@@ -41,35 +34,27 @@ class SavedCamera:
     """A camera of a run.
 
     Args:
-        camera: at HR. scale: HR pixels per LR pixel.
-        photo: a small picture of its LR photo, if there is one.
+        camera: at HR.
         background: behind the Gaussians, RGB in [0, 1].
     """
 
     name: str
     camera: Camera
     split: Split = "train"
-    scale: int = 1
-    photo: Path | None = None
     background: Color = (0.0, 0.0, 0.0)
 
 
 def write_cameras(folder: Path, scene: Scene) -> None:
-    """Write `cameras.json`, and the small pictures of the training views."""
-    entries: list[dict[str, Any]] = []
+    """Write `cameras.json`."""
+    entries = []
     for number, view in enumerate((*scene.train, *scene.test)):
         camera = view.hr.camera
-        entry: dict[str, Any] = {
+        entry = {
             "id": number, "img_name": view.name, "width": camera.width, "height": camera.height,
             "position": camera.center.tolist(), "rotation": camera.world_to_camera.double()[:3, :3].T.tolist(),
-            "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, "scale": view.factor,
+            "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
             "split": "train" if number < len(scene.train) else "test", "background": list(scene.background),
         }  # fmt: skip
-        if entry["split"] == "train":
-            entry["photo"] = f"{PHOTOS}/{file_stem(view.name)}.jpg"
-            photo = view.lr.image.cpu()
-            small = images.area_mean(photo, math.ceil(photo.shape[1] / _PHOTO_WIDTH))
-            files.write_bytes(folder / entry["photo"], jpeg(small, quality=80))
         entries.append(entry)
     files.write_json(folder / FILE, entries)
 
@@ -101,8 +86,6 @@ class _Entry(msgspec.Struct):
     cy: Number | None = None
     img_name: str | None = None
     split: str = "train"
-    scale: Number = 1
-    photo: str | None = None
     background: Color = (0.0, 0.0, 0.0)
 
 
@@ -119,12 +102,9 @@ def _saved_camera(path: Path, i: int, entry: _Entry) -> SavedCamera:
         camera = Camera(pose.to(torch.float64), entry.fx, entry.fy, cx, cy, width, height)
     except ValueError as error:
         raise DataError(path, f"[{i}]", str(error), "correct the camera") from error
-    photo = None if entry.photo is None else path.parent / entry.photo
     return SavedCamera(
         name=str(i) if entry.img_name is None else entry.img_name,
         camera=camera,
         split="test" if entry.split == "test" else "train",
-        scale=max(1, round(entry.scale)),
-        photo=photo if photo is not None and photo.is_file() else None,
         background=entry.background,
     )

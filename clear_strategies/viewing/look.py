@@ -1,11 +1,12 @@
-"""Pictures of a field by the run's rasterizer, with parts of the model switched off on request, and depth in colours."""
+"""Pictures of a field by the run's rasterizer, and depth in colours."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final
 
 import numpy as np
 import torch
@@ -14,10 +15,8 @@ from torch import Tensor
 
 from clear_strategies.training.field import GaussianField
 from rasterizers.geometry import SH_C0
-from rasterizers.interface import Camera, Rasterizer, Splats
+from rasterizers.interface import Camera, Rasterizer
 
-_WITHOUT_MIP: Final[Mapping[str, Any]] = {"kernel": 0.3, "antialiased": False}
-"""The 2D filter of 3DGS: a blur of 0.3 px² without compensation."""
 _SOLID: Final = 0.5  # a pixel has a depth where the Gaussians cover at least this share of it
 _SAMPLED: Final = 5  # cameras that the range of depths is taken from, about
 _EXTREMES: Final = (0.02, 0.98)  # quantiles of depth at the ends of the range
@@ -26,25 +25,7 @@ DEPTH_COLORS: Final = "viridis_r"
 _UNKNOWN: Final = 0.8  # grey
 
 
-@dataclass(frozen=True, slots=True)
-class Look:
-    """Which parts of the model take part in a picture. The defaults are what the metrics see.
-
-    Args:
-        sh: colour depends on the direction. detail: f_det is added (HR renders have it, LR renders do not).
-        filter_3d: the 3D filter of Mip-Splatting. mip: its 2D filter; without it, 3DGS's blur of 0.3 px².
-    """
-
-    sh: bool = True
-    detail: bool = True
-    filter_3d: bool = True
-    mip: bool = True
-
-
-AS_MEASURED: Final = Look()
-
-
-@dataclass(slots=True, eq=False)
+@dataclass(eq=False)
 class Painter:
     """Draws a field.
 
@@ -54,43 +35,40 @@ class Painter:
 
     field: GaussianField
     make: Callable[..., Rasterizer]
-    _made: dict[tuple[bool, bool], Rasterizer] = field(default_factory=dict)
 
     @torch.no_grad()
-    def color(self, camera: Camera, look: Look = AS_MEASURED) -> Float[Tensor, "H W 3"]:
+    def color(self, camera: Camera) -> Float[Tensor, "H W 3"]:
         """The picture, in [0, 1], on the CPU."""
-        image = self._rasterizer(look)(self._splats(look), camera).image
+        image = self._as_measured(self.field.baked(), camera).image
         return image.clamp(0, 1).nan_to_num().cpu()
 
     @torch.no_grad()
-    def depth(self, camera: Camera, look: Look = AS_MEASURED) -> Float[Tensor, "H W"]:
+    def depth(self, camera: Camera) -> Float[Tensor, "H W"]:
         """Mean depth z of what a pixel shows, world units; nan where less than half of it is covered."""
         pose = camera.world_to_camera.to(self.field.means)
         z = (self.field.means.data @ pose[2, :3]) + pose[2, 3]
-        drawn = self._numbers(camera, torch.stack([z, torch.ones_like(z), torch.zeros_like(z)], dim=1), look)
+        drawn = self._numbers(camera, torch.stack([z, torch.ones_like(z), torch.zeros_like(z)], dim=1))
         z_sum, alpha = drawn[..., 0], drawn[..., 1]
         return torch.where(alpha >= _SOLID, z_sum / alpha.clamp_min(_SOLID), torch.nan).cpu()
 
     @torch.no_grad()
-    def numbers(self, camera: Camera, values: Float[Tensor, " N"], look: Look = AS_MEASURED) -> Float[Tensor, "H W"]:
+    def numbers(self, camera: Camera, values: Float[Tensor, " N"]) -> Float[Tensor, "H W"]:
         """A number >= 0 per Gaussian, blended as colours are; 0 where nothing is."""
-        return self._numbers(camera, values[:, None].expand(-1, 3).to(self.field.means), look)[..., 0].cpu()
+        return self._numbers(camera, values[:, None].expand(-1, 3).to(self.field.means))[..., 0].cpu()
 
-    def _numbers(self, camera: Camera, rgb: Float[Tensor, "N 3"], look: Look) -> Float[Tensor, "H W 3"]:
+    def _numbers(self, camera: Camera, rgb: Float[Tensor, "N 3"]) -> Float[Tensor, "H W 3"]:
         """Render the Gaussians with these colours over black."""
-        splats = self._splats(look)
+        splats = self.field.baked()
         colored = replace(splats, sh0=((rgb - 0.5) / SH_C0)[:, None], shN=splats.shN[:, :0], rgb_offset=None)
-        return self._rasterizer(look, black=True)(colored, camera).image
+        return self._over_black(colored, camera).image
 
-    def _splats(self, look: Look) -> Splats:
-        return self.field.baked(detail=look.detail, filtered=look.filter_3d, degree=None if look.sh else 0)
+    @cached_property
+    def _as_measured(self) -> Rasterizer:
+        return self.make()
 
-    def _rasterizer(self, look: Look, *, black: bool = False) -> Rasterizer:
-        key = (look.mip, black)
-        if key not in self._made:
-            settings = {} if look.mip else _WITHOUT_MIP
-            self._made[key] = self.make(**settings, **({"background": (0.0, 0.0, 0.0)} if black else {}))
-        return self._made[key]
+    @cached_property
+    def _over_black(self) -> Rasterizer:
+        return self.make(background=(0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,10 +79,10 @@ class DepthScale:
     far: float
 
     @classmethod
-    def of(cls, painter: Painter, cameras: Sequence[Camera], look: Look = AS_MEASURED) -> DepthScale:
+    def of(cls, painter: Painter, cameras: Sequence[Camera]) -> DepthScale:
         """From the depths that a few of the cameras see."""
         sampled = cameras[:: math.ceil(len(cameras) / _SAMPLED)]
-        return cls.spanning(torch.cat([painter.depth(camera, look).flatten() for camera in sampled]))
+        return cls.spanning(torch.cat([painter.depth(camera).flatten() for camera in sampled]))
 
     @classmethod
     def spanning(cls, depth: Float[Tensor, "*shape"]) -> DepthScale:

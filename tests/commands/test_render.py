@@ -55,19 +55,12 @@ def test_a_file_of_cameras_gives_a_picture_of_each_and_of_its_depth(run, tmp_pat
     assert image_size(tmp_path / "out" / "depth" / "b.png") == (96, 64)
 
 
-def test_parts_of_a_ply_that_cannot_be_left_out_are_named(run, tmp_path, caplog):
-    folder, _ = run
-    render.main([str(folder / "point_cloud.ply"), "--path", "test", "--without", "detail", "--out", str(tmp_path)])
-    assert "--without detail and filter_3d have no effect" in caplog.text
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--path", "nowhere"], "--path: must be cameras, train, test or a file"),
         (["--frames", "0"], "must be above 0"),
         (["--width", "0"], "must be above 0"),
-        (["--without", "colour"], "invalid choice"),
         (["--typo"], "unrecognized arguments: --typo"),
     ],
 )

@@ -37,7 +37,6 @@ def test_a_run_its_checkpoints_and_one_of_them_open_alike(run):
         assert torch.equal(splat.painter.color(CAMERA), exact(field))
         assert [saved.split for saved in splat.cameras] == ["train"] * 3 + ["test"]
         assert splat.folder == folder
-        assert not splat.baked
         assert len(splat.poses()) == 3
 
 
@@ -54,7 +53,6 @@ def test_a_ply_file_looks_the_same(run):
     folder, field = run
     splat = open_splat(folder / "point_cloud.ply", "torch")
     torch.testing.assert_close(splat.painter.color(CAMERA), exact(field), atol=2e-5, rtol=0)
-    assert splat.baked
     assert len(splat.cameras) == 4
 
 

@@ -74,7 +74,7 @@ def opened(**context):
 def test_the_viewer_shows_the_splat_and_a_drag_turns_it(tmp_path):
     saved_run.write(tmp_path)
     splat = open_splat(tmp_path)
-    viewer = server.SplatViewer(server.Screen(splat.painter, splat.cameras), title="toy", port=8421, out=tmp_path)
+    viewer = server.SplatViewer(splat.painter, [], title="toy", port=8421, out=tmp_path)
     try:
         with opened() as page:
             page.goto(viewer.address)

@@ -37,7 +37,7 @@ def test_a_viewer_is_there_while_a_run_trains_and_draws_between_two_iterations_a
         with viewers[0].lock:
             drawn.set()
 
-    with server.watched(splat.painter, splat.cameras, "toy", addresses.append) as after_step:
+    with server.watched(splat.painter, splat.poses(), "toy", addresses.append) as after_step:
         after_step(1)
         assert b"<html" in urlopen(addresses[0], timeout=20).read()  # noqa: S310 - our own address
         threading.Thread(target=draw).start()

@@ -11,7 +11,6 @@ from clear_strategies.commands import view
 from clear_strategies.core.images import to_bytes
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs.saved import open_splat
-from clear_strategies.viewing.look import Look
 from tests.helpers import saved_run, toy
 
 server = pytest.importorskip("clear_strategies.viewing.server", exc_type=ImportError)
@@ -21,37 +20,20 @@ POSE = np.linalg.inv(CAMERA.world_to_camera.double().numpy())
 FOV = 2 * math.atan(CAMERA.height / 2 / CAMERA.fy)
 
 
-@pytest.fixture(scope="module")
-def splat(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("run")
-    saved_run.write(folder)
-    return open_splat(folder)
-
-
-@pytest.fixture
-def screen(splat):
-    return server.Screen(splat.painter, splat.cameras)
-
-
 def close(found, exact):
     assert found.shape == exact.shape
     assert np.abs(found.astype(int) - exact).max() <= 1
 
 
-@pytest.mark.parametrize("look", [Look(), Look(detail=False, sh=False)])
-def test_the_window_shows_what_is_measured_and_switches_reach_the_picture(screen, splat, look):
-    close(screen.draw(server.View(look=look), POSE, FOV, (96, 64)), to_bytes(splat.painter.color(CAMERA, look)))
-    depth = screen.depth_scale.picture(splat.painter.depth(CAMERA, look))
-    close(screen.draw(server.View("depth", look), POSE, FOV, (96, 64)), depth)
-
-
-def test_the_viewer_opens_and_closes(splat, screen):
-    viewer = server.SplatViewer(screen, title="toy", port=8321, out=splat.folder)
+def test_the_viewer_shows_what_is_measured_or_its_depth_and_closes(tmp_path):
+    saved_run.write(tmp_path)
+    splat = open_splat(tmp_path)
+    viewer = server.SplatViewer(splat.painter, splat.poses(), title="toy", port=8321, out=tmp_path)
     try:
         assert viewer.address.startswith("http://127.0.0.1:")
-        assert viewer.view() == server.View()
-        viewer._switches["detail"].value = False
-        assert not viewer.view().look.detail
+        close(viewer.draw(POSE, FOV, (96, 64)), to_bytes(splat.painter.color(CAMERA)))
+        viewer._depth.value = True
+        close(viewer.draw(POSE, FOV, (96, 64)), viewer.depth_scale.picture(splat.painter.depth(CAMERA)))
     finally:
         viewer.close()
 
