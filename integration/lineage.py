@@ -55,8 +55,8 @@ class RowNumbers:
     """Row numbers that clone, split, prune, relocation and MCMC's sampling gather, since they gather every entry.
 
     Args:
-        entries: the host's parameters, which may hold one that is not trained; or the `state` of gsplat 1.4's strategies, whose
-            parameters may not.
+        entries: the host's parameters, which may hold one that is not trained; or other tensors that follow them: the `state` of
+            gsplat 1.4's strategies, whose parameters may not, or the `signal` of gsplat 1.6's scene, which its events change.
         means: returns the current positions.
         as_parameter: whether the numbers must be a parameter.
     """
@@ -83,7 +83,7 @@ class RowNumbers:
         rows = torch.arange(1, len(means) + 1, device=means.device)
         self._numbered = len(means)
         self._put(rows)
-        self._unchanged = self._entries[ROWS]
+        self._unchanged = self._entries[ROWS], self._entries[ROWS]._version
 
     def poll(self) -> Change | None:
         """The change since the last call; None: there was none.
@@ -98,7 +98,8 @@ class RowNumbers:
                 f"the densifier changed the number of Gaussians from {len(rows):,} to {n:,} without the parameter {ROWS}. It "
                 "must treat every entry of the parameters alike."
             )
-        if rows is self._unchanged or len(rows) != n:
+        of, version = self._unchanged
+        if (rows is of and rows._version == version) or len(rows) != n:  # a scene moves Gaussians in place
             return None
         if bool((rows == 0).any()):
             raise HostError("gsplat 1.4 does not say where relocated Gaussians come from. Update it to 1.5 or later.")

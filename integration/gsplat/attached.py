@@ -43,7 +43,8 @@ class Attached:
         params: gsplat's dict of leaves. optimizers: one for each of them.
         views: all training views. A rendering is that of the view named by `rendering`, else of the one with its pose.
         strategy: gsplat's densification strategy, whose threshold scales P2G's score; None: a loop without one.
-        state: of gsplat 1.4's strategy, in which every change of structure is recorded; later versions record it in `params`.
+        state: where changes of structure are recorded, in place of `params`: the state of gsplat 1.4's strategy, or `signal` of
+            the scene that gsplat 1.6's strategy is given.
         detail: add the detail feature f_det as `params["detail"]`, with an Adam of its own. gsplat's strategies clone,
             split and prune it like any other parameter.
         names: gsplat's parameter name -> the host's, where they differ (nerfstudio: sh0 is features_dc).

@@ -129,8 +129,9 @@ class _Installed:
         rendering = sys.modules["gsplat.rendering"]
         self.views, self._splats = views, runner.splats
         self.attached = Attached(
-            runner.splats, runner.optimizers, views, chosen, strategy=runner.cfg.strategy, seed=seed, masks=masks
-        )
+            runner.splats, runner.optimizers, views, chosen, strategy=runner.cfg.strategy, seed=seed, masks=masks,
+            state=getattr(getattr(runner, "scene", None), "signal", None),
+        )  # fmt: skip
         self.attached.replace_everywhere(rendering.rasterization)
         self._undo = ExitStack()
         export = getattr(sys.modules["gsplat"], "export_splats", None)

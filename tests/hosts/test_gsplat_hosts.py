@@ -112,6 +112,14 @@ def test_a_view_is_recognised_while_its_pose_moves(host, scene, tmp_path):
     assert counts(said)["merges"] == STEPS
 
 
+def test_colours_in_float16_train(host, scene, tmp_path):
+    if host.name == "gsplat-1.5.3":
+        pytest.skip("since 1.6.0")
+    said = launched(host, scene, tmp_path / "run", "default", "--sh-fp16")
+    assert counts(said)["merges"] == STEPS
+    assert {p.dtype for p in stored(tmp_path / "run").values()} == {torch.float32}
+
+
 def test_3dgut_trains_without_a_score(host, scene, tmp_path):
     said = launched(host, scene, tmp_path / "run", "mcmc", "--with-ut", "--with-eval3d")
     assert counts(said)["merges"] == STEPS

@@ -114,6 +114,17 @@ def test_the_state_of_gsplat_1_4_carries_the_rows_and_must_know_their_origin():
         render()
 
 
+def test_the_signals_of_a_scene_carry_the_rows_and_may_change_in_place():
+    """A scene of gsplat 1.6 replaces them where Gaussians are added or removed, and writes into them where one is moved."""
+    signal, recorder = {}, toy.Recorder()
+    _, _, render = gsplat_host.started(recorder, state=signal)
+    signal[ROWS][2] = signal[ROWS][7]
+    render()
+    assert recorder.changes[0].tolist() == [0, 1, 7, *range(3, 20)]
+    render()
+    assert len(recorder.changes) == 1
+
+
 def test_checkpoints_and_later_loops_know_nothing_of_the_rows():
     scene = toy.scene(20)
     host = Host(scene)
