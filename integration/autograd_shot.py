@@ -225,6 +225,7 @@ def _plus_rows(
 _VIEWS: Final = frozenset(
     {"UnsqueezeBackward0", "SqueezeBackward1", "ViewBackward0", "UnsafeViewBackward0", "ReshapeAliasBackward0"}
 )
+_CAST: Final = "ToCopyBackward0"  # to another type, e.g. spherical harmonics in float16
 _SECOND: Final = (1, 2**64 - 2)  # the dimension of bands, as autograd stores 1 and -2
 
 
@@ -232,9 +233,11 @@ def are_bands(sh0: Tensor, shN: Tensor, params: Mapping[str, Tensor]) -> bool:
     """Whether these colours are the raw sh0, or it with an offset, and the first bands of the raw shN, so that their gradients
     are those of the parameters. Read from the autograd graph: slices of cat((sh0, shN), 1).
     """
-    nodes = [_sliced(x.grad_fn, start) for x, start in ((sh0, 0), (shN, 1))]
-    cat = nodes[0]
-    if cat is None or cat is not nodes[1] or cat.name() != "CatBackward0" or cat._saved_dim not in _SECOND:
+    cat, also = (_sliced(x.grad_fn, start) for x, start in ((sh0, 0), (shN, 1)))
+    if cat is None or cat is not also:
+        return False
+    cat = cat.next_functions[0][0] if cat.name() == _CAST else cat
+    if cat is None or cat.name() != "CatBackward0" or cat._saved_dim not in _SECOND:
         return False
     parts = [node for node, _ in cat.next_functions]
     if len(parts) != 2:
@@ -253,8 +256,8 @@ def _sliced(node: Any, start: int) -> Any:
 
 
 def _leaf(node: Any) -> Tensor | None:
-    """The parameter that a node is a view of, all of it and in its order."""
-    while node is not None and node.name() in _VIEWS:
+    """The parameter that a node is a view of, all of it and in its order, in any type."""
+    while node is not None and node.name() in (*_VIEWS, _CAST):
         node = node.next_functions[0][0]
     leaf: Tensor | None = getattr(node, "variable", None)
     return leaf

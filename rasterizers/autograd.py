@@ -288,6 +288,7 @@ def rasterization(
         )
     if sh_degree is None:
         colors, sh_degree = ((colors - low) / span - 0.5)[:, None] / SH_C0, 0
+    colors = colors.to(means.dtype)  # gsplat takes spherical harmonics in float16, too
     splats = Splats(means, quats, scales, opacities, colors[:, :1], colors[:, 1 : (sh_degree + 1) ** 2], rgb_offset)
     each = []
     for pose, K, over_color in zip(viewmats, Ks, behind, strict=True):

@@ -55,6 +55,7 @@ class Attached:
 
     Raises:
         ValueError: there is no view, or a parameter is missing.
+        HostError: a network makes the colours.
         SettingError: densification outlasts the anchor.
     """
 
@@ -81,6 +82,7 @@ class Attached:
             )
         self._names = {name: name for name in PARAMETERS} | dict(names or {})
         self._params, self._optimizers, self._views = params, optimizers, tuple(views)
+        require_bands(params)
         if missing := [name for name in self._names.values() if name not in params]:
             raise ValueError(f"params must hold {', '.join(self._names.values())}; {missing[0]} is missing.")
         means = params[self._names["means"]]
@@ -309,17 +311,28 @@ class Attached:
         if "detail" not in self._params or len(call["means"]) != len(self._params["detail"]):
             return call  # only a part of the scene is rendered, and it is unknown which
         colors = call["colors"]
-        detail = (self._params["detail"] if trained else self._params["detail"].detach()).to(colors)
+        detail = self._params["detail"] if trained else self._params["detail"].detach()
         if call.get("sh_degree") is None:
-            call["colors"] = colors + detail
+            call["colors"] = colors + detail.to(colors)
         elif self._is_ours:
             call["rgb_offset"] = detail
         else:
-            call["colors"] = torch.cat((colors[..., :1, :] + detail[:, None] / SH_C0, colors[..., 1:, :]), -2)
+            constant = colors[..., :1, :] + (detail[:, None] / SH_C0).to(colors)
+            call["colors"] = torch.cat((constant, colors[..., 1:, :]), -2)
         return call
 
 
 attach = Attached
+
+
+def require_bands(params: Mapping[str, Any] | torch.nn.ParameterDict) -> None:
+    """Raise a HostError where a network makes the colours."""
+    if "features" in params and "sh0" not in params:
+        raise HostError(
+            "the splats hold features in place of sh0 and shN, of gsplat's harmonic textures or of an appearance model. The "
+            "strategies merge gradients of spherical harmonics: train with simple_trainer.py in place of simple_trainer_nht.py, "
+            "without app_opt."
+        )
 
 
 def _visible(radii: Tensor, packed: bool) -> Bool[Tensor, "*shape"]:

@@ -17,7 +17,7 @@ from clear_strategies.console import show_in_host
 from clear_strategies.errors import HostError, SettingError
 from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
-from integration.gsplat.attached import Attached
+from integration.gsplat.attached import Attached, require_bands
 from integration.gsplat.data import photos_of
 from integration.gsplat.points import start_from_stereo
 from integration.points import Points, wants_stereo
@@ -86,6 +86,7 @@ def install(
     def train_with_clear(runner: Any) -> Any:
         nonlocal last
         require_supported(runner.cfg, runner.world_size)
+        require_bands(runner.splats)
         chosen = conductor(strategies, *overrides, iterations=runner.cfg.max_steps)
         end_with_strategies(chosen, runner.cfg.strategy, "refine_stop_iter", first=0)
         source, scale = sr_source(sr, chosen, factor, suffix)

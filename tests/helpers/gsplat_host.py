@@ -19,10 +19,11 @@ from tests.helpers.inria import HR_FROM_START
 rasterization = functools.partial(autograd.rasterization, backend="torch")
 
 
-def drawn(function, splats, camera, **settings):
+def drawn(function, splats, camera, sh_fp16=False, **settings):
     """Six tensors of gsplat's names, drawn by a function like gsplat's `rasterization`."""
     p = splats
-    activated = p["scales"].exp(), p["opacities"].sigmoid(), torch.cat([p["sh0"], p["shN"]], 1)
+    bands = [p[name].half() if sh_fp16 else p[name] for name in ("sh0", "shN")]
+    activated = p["scales"].exp(), p["opacities"].sigmoid(), torch.cat(bands, 1)
     view = camera.world_to_camera[None], intrinsics(camera)[None], camera.width, camera.height
     return function(p["means"], p["quats"], *activated, *view, **{"sh_degree": 3, **settings})
 
@@ -39,9 +40,9 @@ class Host:
         accumulation=1,
         eps=1e-15,
         rasterization=rasterization,
-        packed=False,
+        **call,
     ):
-        self.rasterization, self.packed = rasterization, packed
+        self.rasterization, self.call = rasterization, {"packed": False, **call}
         self.photos = {v.name: v.lr for v in scene.train}
         raw = GaussianField.from_cloud(scene.cloud).raw()
         self.splats = {k: torch.nn.Parameter(p.clone()) for k, p in raw.items() if k != "detail"}
@@ -56,7 +57,7 @@ class Host:
         self.degree = lambda step: min(3, step)
 
     def render(self, camera, step=0):
-        return drawn(self.rasterization, self.splats, camera, sh_degree=self.degree(step), packed=self.packed)
+        return drawn(self.rasterization, self.splats, camera, sh_degree=self.degree(step), **self.call)
 
     def train(self, names, between=lambda: None):
         """The order of gsplat's simple_trainer: backward, step, densify."""
@@ -76,7 +77,7 @@ class Host:
                     self.scaler.update()
             if self.strategy is not None:
                 self.strategy.step_post_backward(
-                    self.splats, self.optimizers, self.state, step, info, packed=self.packed
+                    self.splats, self.optimizers, self.state, step, info, packed=self.call["packed"]
                 )
             between()
 

@@ -173,6 +173,11 @@ def test_a_pose_that_two_views_share_is_refused_unless_the_view_is_named():
     assert clear.attachment.counts["HR renders"] == 1
 
 
+def gsplats(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **call):
+    """A function of gsplat's signature, without `rgb_offset`."""
+    return autograd.rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **call)
+
+
 def with_info(change):
     """`rasterization` with other entries in its `info`."""
 
@@ -202,6 +207,20 @@ def test_radii_of_gsplat_1_4_are_supported():
         assert torch.equal(old[name], g), name
 
 
+@pytest.mark.parametrize("function", [autograd.rasterization, gsplats], ids=["ours", "gsplat's"])
+def test_colours_in_float16_have_the_gradients_of_float32(function):
+    """`sh_fp16` of gsplat 1.6 casts what is drawn; the parameters stay float32."""
+    scene, found = toy.scene(30), []
+    for half in (False, True):
+        host = Host(scene, rasterization=functools.partial(function, backend="torch"), sh_fp16=half)
+        host.degree = lambda _: 3
+        trained(host, scene, Conductor(*subset("clear"), objective=HR_FROM_START), [scene.train[0].name])
+        found.append(host.grads)
+    for name in ("means", "scales", "opacities", "sh0", "shN", "detail"):  # round Gaussians have none of their quats
+        g, in_half = (grads[name] for grads in found)
+        assert float((in_half - g).norm()) < 0.01 * float(g.norm()), name
+
+
 def test_what_cannot_be_attached_or_drawn_is_refused():
     host, clear, render = started()
     scene = toy.scene(20)
@@ -221,6 +240,9 @@ def test_what_cannot_be_attached_or_drawn_is_refused():
         attach(host.splats, host.optimizers, (), Conductor())
     del host.splats["sh0"]
     with pytest.raises(ValueError, match="sh0 is missing"):
+        attach(host.splats, host.optimizers, scene.train, Conductor())
+    host.splats["features"] = host.splats.pop("shN")
+    with pytest.raises(HostError, match=r"harmonic textures.* train with simple_trainer\.py"):
         attach(host.splats, host.optimizers, scene.train, Conductor())
 
 
