@@ -1,20 +1,17 @@
-"""Train and look from Python: `run = clear_strategies.train("photos")`, and `run` in a notebook shows what came of it.
+"""Train from Python: `run = clear_strategies.train("photos")`.
 
 The command line composes the same configuration and calls the same job (`clear-strategies train`, `clear_strategies.jobs.job`).
 """
 
 from __future__ import annotations
 
-import base64
-import html
-import io
 import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -34,12 +31,10 @@ from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
-_SHEET_WIDTH: Final = 1200  # px of the contact sheet in a notebook, at most
-
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run. In a notebook it shows its scores, its contact sheet and a flight through its cameras.
+    """A finished run.
 
     Args:
         folder: of its files, which `docs/reference/files.md` lists.
@@ -85,22 +80,6 @@ class Run:
     def _splat(self) -> SavedSplat:
         return open_splat(self.folder)
 
-    def _repr_html_(self) -> str:
-        facts = self.metrics
-        scores = "".join(
-            f"<tr><td>{part}</td><td>{mean['psnr']:.2f} dB</td><td>{mean['ssim']:.3f}</td></tr>"
-            for part in ("test", "train")
-            if (mean := facts[part]["mean"].get("ours")) is not None
-        )
-        line = f"{facts['scene']}: {facts['gaussians']:,} Gaussians, {facts['iterations']} iterations, {facts['seconds']:.0f} s"
-        page = self.folder / "splat.html"
-        link = f' · <a href="{html.escape(str(page))}">turn it in the browser</a>' if page.is_file() else ""
-        return (
-            f"<p><b>{html.escape(line)}</b>{link}</p>"
-            f"<table><tr><th>views</th><th>PSNR</th><th>SSIM</th></tr>{scores}</table>"
-            f"{_picture(self.folder / 'contact_sheet.png')}{_film(self.folder / 'path.mp4')}"
-        )
-
 
 def train(photos: str | Path | None = None, *settings: str, folder: str | Path | None = None) -> Run:
     """Train on photos or a capture, as `clear-strategies train` does, and return the finished run.
@@ -139,23 +118,3 @@ def train(photos: str | Path | None = None, *settings: str, folder: str | Path |
         torch.set_num_threads(threads)
     _log.info("%s", into)
     return Run(into)
-
-
-def _picture(path: Path) -> str:
-    if not path.is_file():
-        return ""
-    from PIL import Image
-
-    with Image.open(path) as image:
-        shown = image.convert("RGB")
-        shown.thumbnail((_SHEET_WIDTH, 10 * _SHEET_WIDTH))
-        data = io.BytesIO()
-        shown.save(data, "JPEG", quality=80)
-    return f'<img style="max-width:100%" src="data:image/jpeg;base64,{base64.b64encode(data.getvalue()).decode()}"/>'
-
-
-def _film(path: Path) -> str:
-    if not path.is_file():
-        return ""
-    data = base64.b64encode(path.read_bytes()).decode()
-    return f'<video autoplay loop muted controls style="max-width:60%" src="data:video/mp4;base64,{data}"></video>'

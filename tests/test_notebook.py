@@ -1,16 +1,12 @@
-"""Training from Python: what `train` returns, and what a notebook shows of it."""
+"""Training from Python: what `train` returns."""
 
 from __future__ import annotations
 
-import base64
-import io
-import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from PIL import Image
 
 import clear_strategies as cs
 from clear_strategies.errors import DataError, SettingError
@@ -43,15 +39,6 @@ def test_it_renders_what_the_run_rendered_and_from_anywhere_else(run: cs.Run) ->
     pose[0, 3] += 0.3
     moved = run.render(replace(camera, world_to_camera=pose))
     assert not torch.equal(moved, picture)
-
-
-def test_a_notebook_shows_its_scores_and_its_contact_sheet(run: cs.Run) -> None:
-    shown = run._repr_html_()
-    assert f"{run.metrics['test']['mean']['ours']['psnr']:.2f} dB" in shown
-    (data,) = re.findall(r"data:image/jpeg;base64,([^\"]+)", shown)
-    with Image.open(io.BytesIO(base64.b64decode(data))) as sheet, Image.open(run.folder / "contact_sheet.png") as file:
-        assert sheet.width / sheet.height == pytest.approx(file.width / file.height, rel=0.01)
-    assert "<video" not in shown  # none was asked for
 
 
 def test_a_folder_without_a_finished_run_and_a_wrong_setting_are_told(tmp_path: Path) -> None:

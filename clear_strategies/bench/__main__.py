@@ -69,13 +69,6 @@ QUESTIONS: Final[Mapping[str, tuple[str, Options]]] = {
         "--out": {**_COMMON["--out"], "default": Path("outputs/seconds"),
                   "help": "holds tables and trainings; finished trainings are kept (default: %(default)s)"},
     }),
-    "scale": ("how time and memory grow with Gaussians, pixels and photos", {
-        "--gaussians": {"nargs": "*", "type": positive(int), "default": [1_000, 10_000, 100_000, 1_000_000], "metavar": "N"},
-        "--widths": {"nargs": "*", "type": positive(int), "default": [252, 504, 1008, 2016], "metavar": "PX"},
-        "--photos": {"nargs": "*", "type": positive(int), "default": [10, 50, 200], "metavar": "N"},
-        "--iterations": {"type": positive(int), "default": 200, "metavar": "N", "help": "of a run (default 200)"},
-        "--repeats": _TURNS["--repeats"],
-    }),
 }  # fmt: skip
 
 

@@ -7,7 +7,7 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 import torch
@@ -77,7 +77,7 @@ def column_means(history: History) -> dict[str, float]:
     return {name: sum(values) / len(values) for name, values in columns.items() if values}
 
 
-def finish(axis: Axes, *, legend: Literal["best", "upper right"] | None = "best") -> None:
+def finish(axis: Axes) -> None:
     """Style the axes so that the data stands out; axes without data say "not measured"."""
     axis.title.set_fontsize(10)
     axis.title.set_color(INK)
@@ -90,8 +90,6 @@ def finish(axis: Axes, *, legend: Literal["best", "upper right"] | None = "best"
         axis.set_yticks([])
         return
     axis.grid(alpha=0.25, linewidth=0.5)
-    if legend is not None and axis.get_legend_handles_labels()[0]:
-        axis.legend(fontsize=8, loc=legend, framealpha=0.8, edgecolor="none")
 
 
 AS_WRITTEN: Final[dict[str, Any]] = {"parse_math": False}

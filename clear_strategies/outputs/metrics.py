@@ -75,7 +75,6 @@ class Provenance(msgspec.Struct):
     """The facts of `provenance` that are read again."""
 
     date: str = "an unknown date"
-    plan: dict[str, Any] = msgspec.field(default_factory=dict)
 
 
 class Metrics(msgspec.Struct):

@@ -67,7 +67,7 @@ def describe(scene: Scene, state: TrainState, chosen: Chosen, machine: Mapping[s
         **machine,
         "per-Gaussian pass": "readable" if state.compiled_step is None else "compiled",
         "iterations": f"{settings.iterations}, seed {settings.seed}",
-        "milestones": _listed(marks(state)),
+        "milestones": _listed(_marks(state)),
     }
     if iterations := milestones(state.density.settings):
         lines[f"milestones of {state.density.name}"] = _listed(iterations)
@@ -119,8 +119,8 @@ def _device_name(device: torch.device) -> str:
     return f"{device.type}, {torch.cuda.get_device_name(device)}" if device.type == "cuda" else device.type
 
 
-def marks(state: TrainState) -> dict[str, int]:
-    """The iterations that curves.png marks, by name: of λ_HR, of densification and of the strategies."""
+def _marks(state: TrainState) -> dict[str, int]:
+    """Iterations by name: of λ_HR, of densification and of the strategies."""
     hr = state.conductor.objective.lambda_hr
     at = {"HR from": hr.start, "HR full": hr.full, **state.density.marks}
     if hr.final != hr.peak:

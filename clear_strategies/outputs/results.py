@@ -26,7 +26,7 @@ from clear_strategies.outputs.export import export_ply
 from clear_strategies.outputs.figures import column_means, spaced
 from clear_strategies.outputs.maps import MAPS, write_maps
 from clear_strategies.outputs.metrics import Evaluation
-from clear_strategies.outputs.plan import Chosen, marks
+from clear_strategies.outputs.plan import Chosen
 from clear_strategies.outputs.provenance import provenance
 from clear_strategies.training import memory
 from clear_strategies.training.state import TrainState
@@ -104,7 +104,7 @@ def write_results(
     memory.release()  # the gradients that the maps are made of: several times the field
     with work_log.stage("contact sheet and curves"):
         _write_sheet(folder, scene, evaluation, title)
-        write_curves(folder / "curves.png", history, marks(state), title)
+        write_curves(folder / "curves.png", {chosen.title: history}, title)
     train = [view.hr.camera for view in scene.train]
     with work_log.stage("video"):
         _write_video(folder / "path.mp4", train, painter, pictures.video_frames)

@@ -6,7 +6,7 @@ Files:
 - report.md, report.csv: the table
 - report.html: the tables and pictures of all scenes; it needs the pictures beside it, and no network
 - comparison_SCENE.png: one test view of all methods, enlarged where they differ most
-- curves_SCENE.png: PSNR, conflict and number of Gaussians over iterations, and PSNR over training time
+- curves_SCENE.png: what history.csv holds of them, over iterations and over training time
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ import pandas as pd
 from clear_strategies import console, files
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.errors import ClearError, DataError
-from clear_strategies.report.pictures import write_charts, write_comparison
-from clear_strategies.report.published import PAPER
+from clear_strategies.outputs.curves import write_curves
+from clear_strategies.report.pictures import write_comparison
 from clear_strategies.report.runs import Run, collect, history
 from clear_strategies.report.table import compare, layout, markdown, notes
 
@@ -55,14 +55,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("folders", nargs="+", type=Path, metavar="DIR", help="a run's folder, or a folder of runs")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="where the report goes (default: the first DIR)")
-    parser.add_argument(
-        "--paper", choices=sorted(PAPER), help="show the numbers of this table of the paper beside ours"
-    )
     options = parser.parse_args(arguments)
     console.show()
     out = options.out or options.folders[0]
     try:
-        text = write(collect(options.folders), out, paper=options.paper)
+        text = write(collect(options.folders), out)
     except (ClearError, OSError) as error:
         _log.error("%s", error)
         return 2
@@ -71,27 +68,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def write(runs: Sequence[Run], out: Path, *, paper: str | None = None) -> str:
-    """Write the files of a report into `out`; returns the text of report.md.
-
-    Args:
-        paper: a key of `PAPER`, whose table stands beside ours.
-    """
-    published = None if paper is None else PAPER[paper]
+def write(runs: Sequence[Run], out: Path) -> str:
+    """Write the files of a report into `out`; returns the text of report.md."""
     table = compare(runs)
-    beside = None if published is None else published.columns()
-    more = [] if published is None else published.notes(runs)
-    text = markdown(layout(table, beside), [*notes(table, runs), *more])
+    text = markdown(layout(table), notes(table, runs))
     files.write_text(out / "report.md", text)
     records = table.drop(columns=["name", "baseline", "average", "run"])
-    if published is not None:
-        records = records.join(published.numbers(table["name"]))
     files.write_text(out / "report.csv", records.to_csv(index=False))
 
     sections: list[_Section] = []
     for scene, name in _file_names(table["scene"]).items():
         rows = table[table["scene"] == scene]
-        section = _Section(scene, layout(rows, beside).drop(columns="scene"), [*notes(rows, runs), *more])
+        section = _Section(scene, layout(rows).drop(columns="scene"), notes(rows, runs))
         if rows["average"].any():
             sections.insert(0, section)
             continue
@@ -99,7 +87,7 @@ def write(runs: Sequence[Run], out: Path, *, paper: str | None = None) -> str:
         shown = dict(zip(methods["method"], methods["run"], strict=True))  # of several seeds the first
         pictures = [f"{kind}_{name}.png" for kind in ("comparison", "curves")]
         compared = _compare_renders(out / pictures[0], scene, shown)
-        write_charts(out / pictures[1], {method: history(run.folder) for method, run in shown.items()}, scene)
+        write_curves(out / pictures[1], {method: history(run.folder) for method, run in shown.items()}, scene)
         sections.append(_Section(scene, section.cells, section.notes, pictures[not compared :]))
     _write_page(out / "report.html", sections)
     _log.info("report of %d runs: %s (report.html opens in any browser)", len(runs), out)

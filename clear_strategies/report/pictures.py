@@ -1,4 +1,4 @@
-"""The pictures of a report: one test view of all methods of a scene, and their curves."""
+"""The picture of a report: one test view of all methods of a scene."""
 
 from __future__ import annotations
 
@@ -11,21 +11,10 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from clear_strategies.outputs import figures
-from clear_strategies.outputs.figures import GAP, LINE, History, PixelPage, magnification, save_png
+from clear_strategies.outputs.figures import GAP, LINE, PixelPage, magnification, save_png
 
 _ABREAST: Final = 6  # runs in one line
 _CROP: Final = 4  # the enlarged window is this many times smaller than the image, on each side
-_COLOURS: Final = (figures.BLUE, figures.RED, figures.GREEN, figures.YELLOW, figures.CYAN, figures.PURPLE)
-_DASHES: Final = ("-", "--", ":")
-# Title, column of history.csv, what it is drawn over, whether as a running mean.
-_CHARTS: Final = (
-    ("PSNR of test views, dB", "psnr_test", "t", False),
-    ("PSNR of test views, dB", "psnr_test", "seconds", False),
-    ("share of Gaussians in conflict, before correction (running mean)", "conflict", "t", True),
-    ("number of Gaussians", "n_gaussians", "t", False),
-)
-_AXIS: Final = {"t": "iteration", "seconds": "training time, s"}
 
 
 def write_comparison(
@@ -64,36 +53,6 @@ def write_comparison(
         page.image(x, y + cell_h + GAP, pixels[window], enlarged)
         page.text(x + cell_w / 2, y + cell_h + GAP + enlarged_h + LINE, captions.get(name, ""), ha="center")
     save_png(page.figure, path)
-
-
-def write_charts(path: Path, histories: Mapping[str, History], title: str) -> None:
-    """Draw four charts with one line per run, and one legend below them."""
-    figure, axes = figures.new_figure(2, 2, 12, 8)
-    known = {}
-    for axis, (name, column, over, smooth) in zip(axes.flatten(), _CHARTS, strict=True):
-        axis.set_title(name)
-        axis.set_xlabel(_AXIS[over], fontsize=8, color=figures.FAINT)
-        for i, (run, history) in enumerate(histories.items()):
-            x, y = figures.curve(history, column, over=over, smooth=smooth)
-            if len(x):
-                (known[run],) = axis.plot(
-                    x, y, color=_COLOURS[i % len(_COLOURS)], linewidth=1.4,
-                    linestyle=_DASHES[i // len(_COLOURS) % len(_DASHES)],
-                    marker="o" if column == "psnr_test" else None, markersize=3.5,
-                )  # fmt: skip
-        if axis.lines:
-            axis.set_xlim(left=0)
-        figures.finish(axis, legend=None)
-    if known:
-        names = [textwrap.fill(run, width=60) for run in known]
-        legend = figure.legend(
-            known.values(), names, fontsize=9, frameon=False, loc="outside lower center", labelcolor=figures.INK,
-            ncols=min(3, len(known)),
-        )  # fmt: skip
-        for text in legend.get_texts():
-            text.set(**figures.AS_WRITTEN)
-    figures.set_title(figure, title)
-    save_png(figure, path)
 
 
 def _where_they_differ(stack: Float[np.ndarray, "K H W 3"]) -> tuple[slice, slice]:

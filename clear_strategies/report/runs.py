@@ -44,7 +44,6 @@ class Run:
             there are no test views.
         views: view -> PSNR of ours, dB, by the names of the files in renders/.
         facts: the numbers in `FACTS`; NaN where unknown.
-        plan: what the run printed about its input, by label.
         config: the configuration, flat, without what changes no result.
     """
 
@@ -58,7 +57,6 @@ class Run:
     scores: Mapping[str, Mapping[str, float]]
     views: Mapping[str, float]
     facts: Mapping[str, float]
-    plan: Mapping[str, str]
     config: Mapping[str, Any]
 
     @classmethod
@@ -92,7 +90,6 @@ class Run:
                     "gaussians": content.gaussians,
                     "seconds": content.seconds,
                 },
-                plan={label: str(fact) for label, fact in content.provenance.plan.items()},
                 config=content.config,
             )
         except KeyError as error:

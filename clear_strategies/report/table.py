@@ -9,7 +9,7 @@ from __future__ import annotations
 import html
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
 import pandas as pd
@@ -53,17 +53,11 @@ def shared_settings(runs: Sequence[Run]) -> list[str]:
     return _in_all([run.settings for run in runs])
 
 
-def layout(table: pd.DataFrame, paper: Mapping[str, Mapping[str, Mapping[str, str]]] | None = None) -> pd.DataFrame:
-    """The rows of `compare` as text, without the columns that are empty throughout.
-
-    Args:
-        paper: quantity -> header -> name of a method -> cell, for columns right of that of the quantity.
-    """
+def layout(table: pd.DataFrame) -> pd.DataFrame:
+    """The rows of `compare` as text, without the columns that are empty throughout."""
     cells: dict[str, Sequence[str]] = {"scene": list(table["scene"]), "method": list(table["method"])}
     for quantity, (header, form) in _QUANTITIES.items():
         cells[header] = _numbers(table[quantity], table[f"{quantity}_std"], form)
-        for name, by_method in (paper or {}).get(quantity, {}).items():
-            cells[name] = [by_method.get(method, "") for method in table["name"]]
         if quantity == "psnr":
             several = bool((table["psnr_delta"].abs() > 0).any())
             delta = _numbers(table["psnr_delta"], table["psnr_delta_error"], "+.2f")
