@@ -7,13 +7,13 @@ that a loop written for gsplat runs on a CPU. Each backward pass handles one cot
 
 from __future__ import annotations
 
+import functools
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from enum import Enum
-from functools import lru_cache
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple, ParamSpec, TypeVar, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -128,6 +128,24 @@ def drawing_ahead(K: Float[Tensor, "3 3"], width: int, height: int) -> Iterator[
         _ahead.wanted = None
 
 
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+def uncompiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """The function, which `torch.compile` leaves as it is where compiled code calls it: the kernels take memory, not traces."""
+
+    @functools.wraps(function)
+    def called(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        if torch.compiler.is_compiling():
+            apart: Callable[_P, _R] = torch.compiler.disable(function)  # type: ignore[no-untyped-call]
+            return apart(*args, **kwargs)  # made here, since at import it would take a second
+        return function(*args, **kwargs)
+
+    return called
+
+
+@uncompiled
 def draw(
     rasterizer: Rasterizer, splats: Splats, camera: Camera, means2d: Tensor | None = None, *, depth: bool = False
 ) -> Drawn:
@@ -232,6 +250,7 @@ def _gradients(rendering: Rendering, cotangent: Float[Tensor, "H W 3"]) -> list[
     return [x[0] for x in (g.screen, g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN, g.rgb)]
 
 
+@uncompiled
 def rasterization(
     means: Float[Tensor, "N 3"],
     quats: Float[Tensor, "N 4"],
@@ -400,7 +419,7 @@ def _require_supported(render_mode: str, rasterize_mode: str, absgrad: bool, mor
         )
 
 
-@lru_cache(maxsize=8)
+@functools.lru_cache(maxsize=8)
 def _loaded(name: str, device: str, near: float, kernel: float, antialiased: bool) -> Rasterizer:
     name = rasterizers.fastest(device) if name == "auto" else name
     return rasterizers.load(name, near=near, kernel=kernel, antialiased=antialiased)

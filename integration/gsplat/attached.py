@@ -25,7 +25,7 @@ from integration.detail import detail_adam, sh0_offset
 from integration.host_score import warn_if_score_is_unused
 from integration.lineage import RowNumbers
 from integration.replacing import replace_everywhere
-from rasterizers.autograd import drawing_ahead, recorded
+from rasterizers.autograd import drawing_ahead, recorded, uncompiled
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera
 
@@ -130,6 +130,7 @@ class Attached:
         self._is_ours = "rgb_offset" in signature.parameters
 
         @functools.wraps(rasterization)
+        @uncompiled
         def wrapped(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
             call = signature.bind(*args, **kwargs).arguments
             for name in var_keyword:

@@ -22,6 +22,7 @@ from integration.inria.model_proxy import AttachedModel, Role
 from integration.inria.rows import CarriedRows
 from integration.replacing import replace_everywhere, replace_methods, replaced_attribute
 from integration.views import SuperResolve, sr_source
+from rasterizers.autograd import uncompiled
 
 _log = logging.getLogger(__name__)
 
@@ -114,6 +115,7 @@ class Attached:
         signature = inspect.signature(render)
 
         @functools.wraps(render)
+        @uncompiled
         def wrapped(viewpoint_camera: Any, pc: Any, *args: Any, **kwargs: Any) -> Any:
             other_colors = kwargs.get("override_color") is not None  # depth, normals: no photo
             if self.attachment.removed or pc is not self._model or other_colors:

@@ -17,6 +17,7 @@ from integration import HostError
 from integration.gsplat import attach
 from rasterizers import autograd
 from tests.helpers import gsplat_host, toy
+from tests.helpers.backends import needs
 from tests.helpers.gsplat_host import Host, started
 
 
@@ -132,6 +133,30 @@ def test_a_second_pass_stands_beside_the_photo(named):
         second = render()
     (first.mean() + second.mean()).backward()
     assert clear.attachment.counts["merges"] == 1
+
+
+@pytest.mark.parametrize("backend", ["torch", pytest.param("cpp", marks=needs("cpp"))])
+def test_a_compiled_loop_has_the_same_gradients(backend, recwarn):
+    """`torch.compile` breaks its graph where the loop draws, at either scale."""
+    function, gradients = functools.partial(autograd.rasterization, backend=backend), []
+    cameras = [view.lr.camera for view in toy.scene(20).train]
+    viewmats, Ks = (torch.stack([f(c).float() for c in cameras]) for f in (lambda c: c.world_to_camera, intrinsics))
+    for compiled in (False, True):
+        host, clear, _ = started(host=Host(toy.scene(20), rasterization=function))
+        p, draw = host.splats, host.rasterization
+
+        def loss(i, p=p, draw=draw):
+            activated = p["scales"].exp(), p["opacities"].sigmoid(), torch.cat([p["sh0"], p["shN"]], 1)
+            image = draw(p["means"], p["quats"], *activated, viewmats[i, None], Ks[i, None], 24, 16, sh_degree=3)[0]
+            return (image * 2).sigmoid().mean()
+
+        loss = torch.compile(loss, backend="eager") if compiled else loss
+        for t in range(10):
+            loss(t % 3).backward()
+        assert clear.attachment.counts["merges"] == 10
+        gradients.append({name: p.grad for name, p in host.splats.items() if p.grad is not None})
+    assert all(torch.equal(g, gradients[1][name]) for name, g in gradients[0].items())
+    assert not [warning for warning in recwarn if "ynamo" in str(warning.message)]
 
 
 @pytest.mark.parametrize("looked_at", [True, False])
