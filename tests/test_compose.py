@@ -112,7 +112,7 @@ def test_clear_on_the_command_line_is_clear_in_python():
     kinds = {"optim": run.optim, "mip": run.mip, "cloud": run.data.cloud}
     assert kinds == {k: type(v)() for k, v in kinds.items()}
     assert run.data.views == ViewSettings(photos_are="hr")  # the demo's
-    assert run.fit == RunSettings(iterations=850, baseline=True)  # the demo's
+    assert run.fit == RunSettings(iterations=850)  # the demo's
 
 
 def test_the_two_sets_of_readings_differ_where_they_say():

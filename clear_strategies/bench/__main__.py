@@ -37,7 +37,6 @@ _TURNS: Final[Options] = {
     "--device": {"default": "cpu", "choices": ["cpu", "cuda"], "help": "default: cpu"},
 }
 _MANY: Final = {"nargs": "+", "default": []}
-_OVERRIDES: Final = {"nargs": "*", "metavar": "OVERRIDE"}
 
 QUESTIONS: Final[Mapping[str, tuple[str, Options]]] = {
     "rasterizers": ("time, memory and error of every backend and preset", {
@@ -58,17 +57,6 @@ QUESTIONS: Final[Mapping[str, tuple[str, Options]]] = {
         "--width": {"type": positive(int), "default": 128, "metavar": "PX", "help": "of the LR photos (default 128)"},
         **_TURNS, "--repeats": {**_TURNS["--repeats"], "default": 20},
     }),
-    "seconds": ("seconds until a variant is as good as the reference at its end", {
-        "overrides": {**_OVERRIDES, "help": "of all trainings, as for a run (default: the demo)"},
-        "--scene": {**_MANY, "metavar": "SCENE", "help": "of conf/scene, one after the other"},
-        "--variant": {**_OVERRIDES, "action": "append", "required": True, "dest": "variants",
-                      "help": "its own overrides, none: the defaults; once for each variant, the reference first"},
-        "--seeds": {"nargs": "+", "type": int, "default": [0, 1], "metavar": "SEED", "help": "default: 0 1"},
-        "--probes": {"type": positive(int), "default": 20, "metavar": "N",
-                     "help": "evaluations of the test views in a run (default 20)"},
-        "--out": {**_COMMON["--out"], "default": Path("outputs/seconds"),
-                  "help": "holds tables and trainings; finished trainings are kept (default: %(default)s)"},
-    }),
 }  # fmt: skip
 
 
@@ -86,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         module = "integration.bench" if question == "host" else f"clear_strategies.bench.{question}"
         import_module(module).measure(results, **options)
         sys.stdout.write(results.text())
-        results.write(question, {k: options[k] for k in ("device", "repeats", "seeds") if k in options})
+        results.write(question, {k: options[k] for k in ("device", "repeats")})
         return 0
     except (ClearError, BackendUnavailable) as error:
         _log.error("%s", error)

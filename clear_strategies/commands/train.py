@@ -19,7 +19,7 @@ from clear_strategies.errors import SettingError
 _ITERATIONS: Final = 1000
 _USAGE: Final = f"""clear-strategies train PHOTOS [setting=value …]
 
-PHOTOS is a folder of photos, or of a capture: COLMAP's sparse/, a transforms.json, a poses_bounds.npy or a Blender scene.
+PHOTOS is a folder of photos, or of a capture: COLMAP's sparse/, a transforms.json or a Blender scene.
 The command trains +strategy=best on all photos for fit.iterations={_ITERATIONS}. Settings change that:
 
   clear-strategies train photos/ fit.iterations=3000

@@ -178,12 +178,8 @@ def jobs_at_once() -> int:
 
 
 def cores() -> int:
-    """The cores that this process may use: its affinity, and in a Slurm job no more than the job asked for."""
-    here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    for name in ("SLURM_CPUS_PER_TASK", "SLURM_CPUS_ON_NODE"):
-        if (given := os.environ.get(name, "")).isdecimal():
-            return max(1, min(here, int(given)))
-    return here
+    """The cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def threads_of_each(jobs: int) -> int:

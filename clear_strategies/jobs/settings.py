@@ -35,8 +35,7 @@ class RunSettings(FitSettings):
             from the beginning.
         device: cpu or cuda: where field, views and optimizer are. None: cuda if torch finds it and the rasterizer draws
             there, else cpu. A run may be resumed on another device; its bits then differ.
-        threads: number of threads of torch and the kernels. None: all cores, divided by the jobs that run at once (joblib,
-            Slurm).
+        threads: number of threads of torch and the kernels. None: all cores, divided by the jobs that run at once (joblib).
     """
 
     map_views: int = 3

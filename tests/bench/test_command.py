@@ -44,8 +44,6 @@ NO_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
         (["rasterizers", "--scene", "nowhere"], "nowhere: is no scene"),
         (["rasterizers", "--scene", "tiny", "--backend", "cuda"], "cuda: is no backend"),
         (["iteration", "--scene", "nowhere"], "nowhere: is no scene"),
-        (["seconds", "fit.seed=3", "--variant"], "fit.seed=3: is set by the benchmark"),
-        (["seconds", "--probes", "30001", "--variant"], "30001: lies outside 1 to"),
         pytest.param(["rasterizers", "--device", "cuda"], "no such device", marks=NO_GPU),
     ],
 )

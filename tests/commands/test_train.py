@@ -13,7 +13,7 @@ from clear_strategies.errors import SettingError
 @pytest.mark.parametrize(
     ("file", "kind"),
     [
-        ("transforms_train.json", "blender"), ("transforms.json", "nerfstudio"), ("poses_bounds.npy", "llff"),
+        ("transforms_train.json", "blender"), ("transforms.json", "nerfstudio"),
         ("sparse/0/cameras.bin", "colmap"), ("sparse/cameras.txt", "colmap"), ("photo.jpg", "photos"),
     ],
 )  # fmt: skip
@@ -24,7 +24,7 @@ def test_the_reader_is_the_one_of_what_lies_in_the_folder(tmp_path, file, kind):
 
 
 def test_of_several_formats_the_one_that_may_hold_the_others_is_read(tmp_path):
-    for file, kind in (("cameras.bin", "colmap"), ("poses_bounds.npy", "llff"), ("transforms.json", "nerfstudio")):
+    for file, kind in (("cameras.bin", "colmap"), ("transforms.json", "nerfstudio")):
         (tmp_path / file).touch()
         assert train.detect(tmp_path) == kind
     assert train.detect(tmp_path / "transforms.json") == "nerfstudio"

@@ -10,7 +10,7 @@ import pytest
 
 from clear_strategies import SplatSuRe
 from clear_strategies.core.checks import as_color, require_choice, require_number, require_whole
-from clear_strategies.data.readers import blender, colmap, demo, llff, nerfstudio, photos
+from clear_strategies.data.readers import blender, colmap, demo, nerfstudio, photos
 from clear_strategies.errors import SettingError
 from clear_strategies.geometry import StereoSettings
 from clear_strategies.geometry.sift import TriangulationSettings
@@ -72,7 +72,6 @@ def test_colours_are_three_numbers_between_0_and_1(value: object) -> None:
         (lambda: photos.read("nowhere", threads=-2), "threads"),
         (lambda: blender.read("nowhere", background=(2.0, 0.0, 0.0)), "background"),
         (lambda: colmap.read(Path("nowhere"), background=(-1.0, 0.0, 0.0)), "background"),
-        (lambda: llff.read("nowhere", background=(0.0, math.nan, 0.0)), "background"),
         (lambda: nerfstudio.read("nowhere", background=(0.0, 0.0, 1.5)), "background"),
     ],
 )

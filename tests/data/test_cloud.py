@@ -13,7 +13,7 @@ from clear_strategies.core.view import Photo
 from clear_strategies.data.cloud import CloudSettings, from_tracks, initial_points, random_cloud
 from clear_strategies.data.cloud.compared import compared_at
 from clear_strategies.data.ply import write_points
-from clear_strategies.data.readers import llff
+from clear_strategies.data.readers import colmap
 from clear_strategies.data.view_settings import ViewSettings, split
 from clear_strategies.errors import DataError
 from clear_strategies.geometry import StereoSettings, depth_maps
@@ -146,7 +146,7 @@ def test_outliers_are_removed_before_densification(tmp_path: Path) -> None:
 
 def test_fern_is_triangulated_from_three_lr_images(shared_data: Path) -> None:
     """Half the triangulated points lie within 2 % of their depth of one that COLMAP found in all views."""
-    capture = llff.read(shared_data / "fern")
+    capture = colmap.read(shared_data / "fern")
     train, _ = split(capture, ViewSettings(train=3, test_every=8))
     photos = []
     for frame in train:

@@ -148,21 +148,11 @@ def colmap_txt(root: Path) -> Path:
     return root
 
 
-def poses_bounds() -> np.ndarray:
-    """LLFF's table for images of 64x48, four times the size of the photos; its axes are down, right, back."""
-    rows = []
-    for view in range(len(NAMES)):
-        pose = np.linalg.inv(world_to_camera(view))
-        right, down, forward, center = pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3]
-        matrix = np.stack((down, right, -forward, center, [4 * HEIGHT, 4 * WIDTH, 4 * FOCAL]), axis=1)
-        rows.append([*matrix.ravel(), 1.5, 9.0])
-    return np.array(rows)
-
-
 def llff(root: Path) -> Path:
-    """images_4/ and poses_bounds.npy, no COLMAP model."""
-    write_photos(root / "images_4")
-    np.save(root / "poses_bounds.npy", poses_bounds())
+    """The same scene in LLFF's layout: reduced photos under other names, in the order of the model's."""
+    colmap_bin(root)
+    (root / "images").rename(root / "images_4")
+    (root / "poses_bounds.npy").touch()
     return root
 
 
@@ -186,7 +176,7 @@ def nerfstudio(root: Path) -> Path:
 
 
 GOOD: dict[str, Callable[[Path], Path]] = {
-    "colmap": colmap_bin, "colmap_txt": colmap_txt, "llff": llff, "blender": blender, "nerfstudio": nerfstudio,
+    "colmap": colmap_bin, "colmap_txt": colmap_txt, "blender": blender, "nerfstudio": nerfstudio,
 }  # fmt: skip
 """What writes each of them."""
 

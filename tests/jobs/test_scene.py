@@ -11,7 +11,7 @@ import pytest
 from clear_strategies.compose import tree
 from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.priors import Bicubic, Corrupted, DemoPrior, Ncnn, ncnn
-from clear_strategies.data.readers import blender, colmap, demo, llff, nerfstudio
+from clear_strategies.data.readers import blender, colmap, demo, nerfstudio
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.errors import DataError, SettingError
@@ -85,7 +85,7 @@ def test_the_demo_prior_without_errors_gives_the_hr_photos_whatever_their_size(s
 @pytest.mark.parametrize(
     ("write", "reader"),
     [
-        (captures.llff, llff.read), (captures.colmap_bin, colmap.read), (captures.nerfstudio, nerfstudio.read),
+        (captures.colmap_bin, colmap.read), (captures.nerfstudio, nerfstudio.read),
         (captures.blender, blender.read),
     ],
 )  # fmt: skip

@@ -15,7 +15,6 @@ from clear_strategies.hydra_app import FAILED, SweepCallback
 from clear_strategies.jobs import device
 from clear_strategies.training import checkpoint
 from tests.helpers.command_line import TINY, run, started, stopped_by, wait_for
-from tests.helpers.configs import composed
 from tests.helpers.finished_run import make_run
 
 AUTO = ["fit.resume=auto", *TINY]
@@ -79,13 +78,7 @@ def test_torch_and_kernels_divide_the_cores_among_the_jobs_whatever_an_earlier_j
     assert later == default
     monkeypatch.setattr(device, "_threads_of_torch", lambda: 16)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: set(range(12)), raising=False)
-    for name in ("SLURM_CPUS_PER_TASK", "SLURM_CPUS_ON_NODE"):
-        monkeypatch.delenv(name, raising=False)
     assert [device.threads_of_each(jobs) for jobs in (1, 2, 5, 12, 40, -1, -2)] == [12, 6, 2, 1, 1, 1, 1]
-    monkeypatch.setenv("SLURM_CPUS_ON_NODE", "8")
-    assert device.threads_of_each(1) == 8
-    monkeypatch.setenv("SLURM_CPUS_PER_TASK", "3")
-    assert device.threads_of_each(1) == 3
     monkeypatch.setattr(device, "_threads_of_torch", lambda: 2)  # OMP_NUM_THREADS=2
     assert device.threads_of_each(1) == 2
 
@@ -145,23 +138,6 @@ def test_a_clusters_announcement_saves_before_its_handler_acts(tmp_path):
     every = ["+strategy=clear", "hydra.run.dir=here", *AUTO, "fit.checkpoint_every=0"]
     process = started("-c", code, *every, cwd=tmp_path, said=tmp_path / "said")
     assert process.wait() == 91, (tmp_path / "said").read_text()
-
-
-@pytest.mark.skipif(find_spec("submitit") is None, reason="submitit is not installed: pip install -e '.[sweeps]'")
-def test_the_slurm_configuration_is_one_that_submitit_takes(tmp_path):
-    """hydra/launcher=slurm, composed and turned into the head of a batch file."""
-    from omegaconf import OmegaConf
-    from submitit.slurm.slurm import _make_sbatch_string
-
-    launcher = composed("hydra/launcher=slurm", hydra=True).hydra.launcher
-    fields = {k: v for k, v in launcher.items() if k not in ("_target_", "submitit_folder", "max_num_timeout")}
-    names = {"name": "job_name", "timeout_min": "time", "mem_gb": "mem", "tasks_per_node": "ntasks_per_node"}
-    plain = {names.get(k, k): OmegaConf.to_container(v) if OmegaConf.is_config(v) else v for k, v in fields.items()}
-    script = _make_sbatch_string(command="true", folder=tmp_path, **plain)
-    for line in ("--signal=USR2@120", "--time=240", "--cpus-per-task=4", "--requeue\n"):
-        assert f"#SBATCH {line}" in script
-    assert "SlurmLauncher" in launcher._target_
-    assert launcher.max_num_timeout == 100
 
 
 def test_failed_jobs_are_told_where_the_report_cannot_be_written(tmp_path, caplog, monkeypatch):

@@ -25,7 +25,7 @@ from clear_strategies.data import ply
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.lenses import Lens
 from clear_strategies.data.photo_files import read_image
-from clear_strategies.data.readers import colmap, colmap_model, llff, nerfstudio
+from clear_strategies.data.readers import colmap, colmap_model, nerfstudio
 from clear_strategies.errors import DataError
 from clear_strategies.training import checkpoint
 from tests.helpers.captures import GOOD
@@ -73,9 +73,9 @@ def _mutant(good: bytes, uniform: Callable[[], float]) -> bytes:
 
 def binary(folder: Path) -> dict[str, Target]:
     """Each binary format by its own reader."""
-    model, table = GOOD["colmap"](folder / "colmap") / "sparse" / "0", GOOD["llff"](folder / "llff")
+    model = GOOD["colmap"](folder / "colmap") / "sparse" / "0"
     cameras, images, points = (model / f"{name}.bin" for name in ("cameras", "images", "points3D"))
-    bounds, cloud = table / "poses_bounds.npy", folder / "cloud.ply"
+    cloud = folder / "cloud.ply"
     ply.write_gaussians(cloud, _gaussians(20))
     saved = checkpoint.save(folder / "checkpoints", small(100, 1.0))
 
@@ -91,7 +91,6 @@ def binary(folder: Path) -> dict[str, Target]:
         "COLMAP cameras.bin": ([cameras], lambda: _require_lenses(colmap_model.read_cameras(cameras).values())),
         "COLMAP images.bin": ([images], lambda: _require_images(colmap_model.read_images(images))),
         "COLMAP points3D.bin": ([points], lambda: _require_points(colmap_model.read_points(points))),
-        "poses_bounds.npy": ([bounds], lambda: _require(bool(np.isfinite(llff.read_bounds(bounds)).all()))),
         "PLY": ([cloud], read_gaussians),
         "checkpoint": ([saved], read_checkpoint),
     }
@@ -127,7 +126,6 @@ def scenes(folder: Path) -> dict[str, Target]:
     return {
         "COLMAP binary scene": target("colmap", colmap.read),
         "COLMAP text scene": target("colmap_txt", colmap.read),
-        "LLFF scene": target("llff", llff.read),
     }
 
 

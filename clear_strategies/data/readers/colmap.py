@@ -1,10 +1,11 @@
-"""A scene folder with COLMAP's sparse model and photos."""
+"""A scene folder with COLMAP's sparse model and photos, as LLFF's scenes are, too."""
 
 from __future__ import annotations
 
 import logging
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -31,7 +32,7 @@ def recognises(path: Path) -> int:
 
 def read(
     root: str | Path,
-    images: str | None = "images",
+    images: str | None = None,
     *,
     background: Color = BLACK,
     skip_faulty: bool = False,
@@ -39,8 +40,9 @@ def read(
     """Read a scene folder with a sparse model in sparse/0, sparse, colmap/sparse/0 or the folder itself.
 
     Args:
-        images: folder of the photos below root. Cameras are rescaled if the photos have another size than the model's.
-            None: the first that exists of images, images_2, images_4, images_8.
+        images: folder of the photos below root; None: the first that exists of images, images_2, images_4, images_8. Cameras are
+            rescaled if the photos have another size than the model's. LLFF's scripts rename photos as they reduce them: beside a
+            poses_bounds.npy, as many photos under other names are matched by their order.
         background: RGB in [0, 1] behind transparent pixels.
         skip_faulty: leave out photos that are missing or damaged, with a warning for each; else they are an error.
 
@@ -54,7 +56,18 @@ def read(
     listing = model.folder / f"images{model.ending}"
     paths = _photos(folder, [image.name for image in model.images])
     if not any(map(is_file, paths.values())):
-        first = model.images[0].name
+        first, photos = min(paths), images_in(folder)
+        if (root / "poses_bounds.npy").is_file() and len(photos) == len(paths):
+            found = capture(
+                root,
+                model,
+                folder,
+                dict(zip(sorted(paths), photos, strict=True)),
+                background=background,
+                skip_faulty=skip_faulty,
+            )
+            by_order = f"photos matched to the model's by order ({first} is {photos[0].name})"
+            return replace(found, notes={**found.notes, "names": by_order})
         remedy = "set data.reader.images to the folder that the model was made from"
         raise DataError(listing, first, f"is not in {folder}, and no other photo is", remedy)
     return capture(root, model, folder, paths, background=background, skip_faulty=skip_faulty)

@@ -19,14 +19,13 @@ from tests.helpers import captures
 from tests.helpers.captures import GOOD, HEIGHT, NAMES, WIDTH
 from tests.stress.bad_inputs.scenes import READERS
 
-PHOTOS = {"colmap": "images", "nerfstudio": "images", "blender": "train", "llff": "images_4"}
+PHOTOS = {"colmap": "images", "nerfstudio": "images", "blender": "train"}
 # What is done to the photos, and parts of the message.
 DEFECTS: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
     "missing": (lambda f: (f / "b.png").unlink(), ("1 of ", "b.png", "data.reader.skip_faulty=true")),
     "truncated": (lambda f: os.truncate(f / "b.png", 200), ("b.png", "data.reader.skip_faulty=true")),
 }
-# LLFF's table has rows without names: a missing photo is not known.
-CASES = [(defect, reader) for defect in DEFECTS for reader in PHOTOS if (defect, reader) != ("missing", "llff")]
+CASES = [(defect, reader) for defect in DEFECTS for reader in PHOTOS]
 
 
 def built(tmp_path: Path, reader: str) -> tuple[Path, Path, Callable[..., Capture]]:
