@@ -6,6 +6,7 @@ the cut-offs too.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -22,13 +23,13 @@ from clear_strategies.bench import accuracy, scenes
 from clear_strategies.bench.accuracy import NO_CUT_OFFS, Drawn, affordable
 from clear_strategies.bench.results import Results, line_chart
 from clear_strategies.bench.scenes import SETTINGS, Workload
-from clear_strategies.bench.timing import interleaved, medians, milliseconds
+from clear_strategies.bench.timing import fill_queue, interleaved, medians, milliseconds
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import DataError
 from rasterizers.interface import PRESETS
 
 COTANGENTS: Final = 3
-FORWARD, TOGETHER, SEPARATE = "forward", "lr_hr_together", "lr_hr_separate"
+FORWARD, TOGETHER, SEPARATE, LATENCY = "forward", "lr_hr_together", "lr_hr_separate", "latency"
 BACKWARD: Final = tuple(f"backward_k{k}" for k in range(1, COTANGENTS + 1))
 SAME, NONE = "same cut-offs", "no cut-offs"
 
@@ -128,16 +129,27 @@ def presets_of(backend: str) -> Sequence[str]:
 
 
 def turn(contestant: Contestant, cotangents: Float[Tensor, "K H W 3"]) -> dict[str, float]:
-    """The milliseconds of every stage of a contestant, once."""
-    work_log = WorkLog(cotangents.device)
+    """The milliseconds of every stage of a contestant, once; on CUDA also those of a forward and a backward pass (K = 2) that
+    start on an idle device, by the host's clock.
+    """
+    work_log, device = WorkLog(cotangents.device), cotangents.device
+    fill_queue(device)
     with work_log.stage(FORWARD):
         rendering = contestant.render()
     for k, stage in enumerate(BACKWARD, 1):
+        fill_queue(device)
         with work_log.stage(stage):
             rendering.vjp(cotangents[:k])
     del rendering
     contestant.stages(work_log)
-    return milliseconds(work_log)
+    ms = milliseconds(work_log)
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+        began = time.perf_counter()
+        contestant.render().vjp(cotangents[:2])
+        torch.cuda.synchronize(device)
+        ms[LATENCY] = 1e3 * (time.perf_counter() - began)
+    return ms
 
 
 def random_cotangents(workload: Workload) -> Float[Tensor, "K H W 3"]:
@@ -154,8 +166,10 @@ def backend_on(workload: Workload, backend: str, preset: str) -> Contestant:
     lr = camera.scaled(1 / workload.lr_factor)
 
     def stages(work_log: WorkLog) -> None:
+        fill_queue(work_log.device)
         with work_log.stage(TOGETHER):
             rasterizer.render_scales([(splats, lr), (splats, camera)])
+        fill_queue(work_log.device)
         with work_log.stage(SEPARATE):
             rasterizer(splats, lr)
             rasterizer(splats, camera)

@@ -72,6 +72,24 @@ def surfaces(name: str, n: int, width: int, height: int, *, radius: float, seed:
     return Workload(name, Splats(*tensors), Camera(_pose(), focal, focal, width / 2, height / 2, width, height))
 
 
+def tails(name: str, n: int, width: int, height: int, *, radius: float, seed: int = 0) -> Workload:
+    """As `surfaces`, with the tails that long training leaves: a hundredth of the Gaussians, faint and large, has most of the pairs
+    of Gaussian and tile, one covers the image, and a fifteenth lies behind one tile.
+    """
+    w, random = surfaces(name, n, width, height, radius=radius, seed=seed), np.random.default_rng(seed + 1)
+    means, scales, opacities = w.splats.means, w.splats.scales, w.splats.opacities
+    chosen = torch.from_numpy(random.permutation(n))
+    large, crowd = chosen[: n // 100], chosen[n // 100 : n // 100 + n // 15]
+    scales[large] *= torch.from_numpy(45 * np.exp(random.normal(0, 0.5, (len(large), 1)))).float()
+    opacities[large] *= 0.1
+    scales[large[0]], opacities[large[0]] = float(means[large[0], 2]), 0.05
+    toward = means[crowd[0]] / means[crowd[0], 2]
+    pixel = means[crowd, 2:] / w.camera.fx
+    means[crowd] = toward * means[crowd, 2:] + pixel * torch.from_numpy(random.normal(0, 1.5, (len(crowd), 3))).float()
+    scales[crowd] = pixel * torch.from_numpy(np.exp(random.normal(-0.5, 0.4, (len(crowd), 3)))).float()
+    return w
+
+
 def _surface(
     random: np.random.Generator, n: int, width: int, height: int, focal: float
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
@@ -134,8 +152,9 @@ _GENERATED: Final = {
     "s100k": (100_000, 1008, 756, 5.5),
     "s500k": (500_000, 1008, 756, 5.5 * 5**-0.3),
 }
+_TAILS: Final = ("tails", 60_000, 1008, 756, 1.5)
 _AT_LR: Final = "s100k-lr"  # the same Gaussians at a quarter of the image size
-NAMES: Final = ("tiny", "small", "s100k", _AT_LR, "s500k")
+NAMES: Final = ("tiny", "small", "s100k", _AT_LR, "s500k", "tails")
 
 
 def load(name: str) -> Workload:
@@ -143,6 +162,8 @@ def load(name: str) -> Workload:
     if name == _AT_LR:
         hr = load("s100k")
         return Workload(name, hr.splats, hr.camera.scaled(1 / 4))
+    if name == "tails":
+        return tails(*_TAILS[:-1], radius=_TAILS[-1])
     if name in _GENERATED:
         n, width, height, radius = _GENERATED[name]
         return surfaces(name, n, width, height, radius=radius)

@@ -96,6 +96,19 @@ def count_tiles(ellipse: Ellipse, grid: Grid) -> wp.int32:
     return count
 
 
+@wp.func
+def nth_tile(ellipse: Ellipse, nth: wp.int32, grid: Grid) -> wp.int32:
+    """The n-th tile that the ellipse may reach, from the top left on; the tile that does not exist if it reaches fewer."""
+    left = nth
+    top, bottom = rows_of(ellipse, grid)
+    for row in range(top, bottom + 1):
+        begin, end = columns_of(ellipse, row, grid)
+        if left < end - begin:
+            return row * grid.tiles[0] + begin + left
+        left -= wp.max(end - begin, 0)
+    return grid.tiles[0] * grid.tiles[1]
+
+
 @wp.kernel
 def list_pairs(
     order: wp.array[wp.int32],
@@ -103,48 +116,35 @@ def list_pairs(
     ends: wp.array[wp.int64],
     rows: wp.array[Row],
     grid: Grid,
-    capacity: wp.int32,
     firsts: wp.array[wp.int32],
     tiles: wp.array[wp.int32],
-    pairs: wp.array[wp.int32],
+    places: wp.array[wp.int32],
     splats: wp.array[wp.int32],
 ) -> None:
-    """One thread per Gaussian, front to back: lists its tiles, from the top left on, at the places before `ends`.
+    """One thread per place: its Gaussian, front to back, and which of the Gaussian's tiles it holds.
 
-    `counts` comes from the same function in another kernel, where the compiler may round differently. If they differ, the
-    number of places holds, and the remaining ones get a tile that does not exist. Places beyond `capacity` are not used.
+    The Gaussian at `order[rank]` has the `counts` places before `ends[rank]`. `counts` comes from another kernel, where the
+    compiler may round differently; if the tiles differ, the number of places holds. Places without a tile, and those beyond the
+    last Gaussian's, get the tile that does not exist.
     """
-    rank = wp.tid()
+    place = wp.tid()
+    tiles[place] = grid.tiles[0] * grid.tiles[1]
+    places[place] = place
+    if wp.int64(place) >= ends[ends.shape[0] - 1]:
+        return
+    rank = wp.lower_bound(ends, wp.int64(place) + wp.int64(1))
     i = order[rank]
-    count = counts[i]
-    if count == 0:
-        return
-    place_of_first = ends[rank] - wp.int64(count)
-    if place_of_first >= wp.int64(capacity):
-        return
-    first = wp.int32(place_of_first)
-    count = wp.min(count, capacity - first)
-    firsts[i] = first
-    ellipse = ellipse_of(rows[i])
-    place = wp.int32(0)
-    top, bottom = rows_of(ellipse, grid)
-    for row in range(top, bottom + 1):
-        begin, end = columns_of(ellipse, row, grid)
-        for column in range(begin, end):
-            if place < count:
-                tiles[first + place] = row * grid.tiles[0] + column
-                place += 1
-    for unused in range(place, count):
-        tiles[first + unused] = grid.tiles[0] * grid.tiles[1]
-    for nth in range(count):
-        pairs[first + nth] = first + nth
-        splats[first + nth] = i
+    nth = place - wp.int32(ends[rank] - wp.int64(counts[i]))
+    if nth == 0:
+        firsts[i] = place
+    tiles[place] = nth_tile(ellipse_of(rows[i]), nth, grid)
+    splats[place] = i
 
 
 @wp.kernel
 def find_tiles(
     tiles: wp.array[wp.int32],
-    pairs: wp.array[wp.int32],
+    places: wp.array[wp.int32],
     splats: wp.array[wp.int32],
     totals: wp.array[wp.int64],
     nth: wp.int32,
@@ -162,7 +162,7 @@ def find_tiles(
     if at >= count:
         return
     tile = tiles[at]
-    listed[at] = splats[pairs[at]]
+    listed[at] = splats[places[at]]
     if at == 0 or tiles[at - 1] != tile:
         starts[tile] = at
     if at == count - 1 or tiles[at + 1] != tile:

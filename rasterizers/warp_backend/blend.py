@@ -1,5 +1,8 @@
 """Blend: composites the pixels of a tile front to back; its VJP for K image cotangents runs back to front.
 
+The VJP has a block of threads for every `SEGMENT` pairs, however long a tile's list is. Where a list goes on beyond a segment,
+the forward pass leaves a mark for each pixel: T at the segment's end, and the light from behind it.
+
     α_i = min(α_max, o_i exp(…)),   T_i = Π_{j<i} (1 - α_j),   I = Σ T_i α_i c_i + T_end · background
 
 Expected depth, where it is drawn, is E = Σ T_i α_i z_i / Σ T_i α_i.
@@ -16,7 +19,7 @@ from typing import Any
 import warp as wp
 
 from rasterizers.warp_backend.bins import exponent
-from rasterizers.warp_backend.types import PIXELS, SUMS, TILE, Cuts, Ellipse, Grid, Row, ellipse_of
+from rasterizers.warp_backend.types import PIXELS, SEGMENT, SUMS, TILE, Cuts, Ellipse, Grid, Row, ellipse_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -62,19 +65,24 @@ def blend(depth: bool) -> Any:
         alpha: wp.array2d[wp.float32],
         transmittance: wp.array2d[wp.float32],
         ended: wp.array2d[wp.int32],
-        reached: wp.array[wp.int32],
+        marks: wp.array2d[wp.vec4],
         expected: wp.array2d[wp.float32],
     ) -> None:
-        """One thread per pixel. `ended`: the first pair that it did not blend; `reached`: the largest such of the tile."""
+        """One thread per pixel. `ended`: the first pair that it did not blend."""
         thread = wp.tid()
-        tile = thread / PIXELS
-        pixel = pixel_of(tile, thread % PIXELS, grid)
+        tile, within = thread / PIXELS, thread % PIXELS
+        pixel = pixel_of(tile, within, grid)
         if not inside(pixel, grid):
             return
         through, rgb = wp.float32(1.0), wp.vec3(0.0, 0.0, 0.0)
         weighted, weights = wp.float32(0.0), wp.float32(0.0)
         at = wp.int32(starts[tile])
+        first_mark, mark = at / SEGMENT + 1, at / SEGMENT
         while at < ends[tile]:
+            if at % SEGMENT == 0 and at > starts[tile]:  # rgb is the light of one segment
+                mark = at / SEGMENT
+                marks[mark, within] = wp.vec4(rgb[0], rgb[1], rgb[2], through)
+                rgb = wp.vec3(0.0, 0.0, 0.0)
             ellipse = ellipse_of(rows[listed[at]])
             d = offset_of(pixel, ellipse)
             free = ellipse.opacity * wp.exp(-exponent(ellipse, d[0], d[1]))
@@ -90,7 +98,13 @@ def blend(depth: bool) -> Any:
                     weights += weight
                 through = after
             at += 1
-        image[pixel[1], pixel[0]] = rgb + through * cuts.background
+        rgb += through * cuts.background
+        while mark >= first_mark:
+            segment = marks[mark, within]
+            marks[mark, within] = wp.vec4(rgb[0], rgb[1], rgb[2], segment[3])
+            rgb += wp.vec3(segment[0], segment[1], segment[2])
+            mark -= 1
+        image[pixel[1], pixel[0]] = rgb
         alpha[pixel[1], pixel[0]] = 1.0 - through
         transmittance[pixel[1], pixel[0]] = through
         ended[pixel[1], pixel[0]] = at
@@ -99,17 +113,16 @@ def blend(depth: bool) -> Any:
             if weights > 0.0:
                 over = 1.0 / weights
             expected[pixel[1], pixel[0]] = weighted * over
-        wp.atomic_max(reached, tile, at)
 
     return blend
 
 
 @cache
 def blend_vjp(K: int, lanes: int) -> Any:
-    """The VJP kernel for K cotangents, with `lanes` threads per tile.
+    """The VJP kernel for K cotangents, with `lanes` threads per segment.
 
     Each lane has `per_lane` pixels. For every pair it sums over its pixels, the lanes' sums are reduced, and the result is
-    stored at the pair's place: no atomics, a fixed order. A GPU uses a warp per tile, a CPU one thread.
+    stored at the pair's place: no atomics, a fixed order. A GPU uses a warp per segment, a CPU one thread.
     """
     per_lane, W = PIXELS // lanes, SUMS + 3
     PairSums = wp.types.vector(length=W * K, dtype=wp.float32)
@@ -123,33 +136,47 @@ def blend_vjp(K: int, lanes: int) -> Any:
         grid: Grid,
         cuts: Cuts,
         rows: wp.array[Row],
+        tiles: wp.array[wp.int32],
         listed: wp.array[wp.int32],
-        pairs: wp.array[wp.int32],
-        starts: wp.array[wp.int32],
+        places: wp.array[wp.int32],
         ends: wp.array[wp.int32],
         transmittance: wp.array2d[wp.float32],
         ended: wp.array2d[wp.int32],
-        reached: wp.array[wp.int32],
+        marks: wp.array2d[wp.vec4],
         cotangents: wp.array3d[wp.vec3],
+        pairs: wp.int32,
         pair_sums: wp.array[PairSums],
     ) -> None:
-        tile, lane = wp.tid()
-        begin, last = starts[tile], wp.max(starts[tile], reached[tile])
+        segment, lane = wp.tid()
+        tile, n_tiles, after = wp.int32(-1), grid.tiles[0] * grid.tiles[1], (segment + 1) * SEGMENT
         through, stop, behind, v = Pixels(), Ends(), Behind(), Cotangents()
-        for j in range(per_lane):
-            pixel = pixel_of(tile, j * lanes + lane, grid)
-            if inside(pixel, grid):
-                through[j] = transmittance[pixel[1], pixel[0]]
-                stop[j] = ended[pixel[1], pixel[0]]
-                for k in range(K):
-                    w = cotangents[k, pixel[1], pixel[0]]
-                    v[j * K + k] = w
-                    # Σ_{j>i} T_j α_j (c_j·v) + T_end background·v, here with i the last Gaussian.
-                    behind[j, k] = through[j] * wp.dot(w, cuts.background)
-
-        for back in range(last - begin):
+        last = wp.min(after, pairs)
+        for back in range(last - segment * SEGMENT):
             at = last - 1 - back
-            ellipse = ellipse_of(rows[listed[at]])
+            if tiles[at] != tile:
+                tile = tiles[at]
+                for j in range(per_lane):
+                    within = j * lanes + lane
+                    pixel = pixel_of(tile, within, grid)
+                    through[j] = 0.0
+                    stop[j] = 0
+                    if tile < n_tiles and inside(pixel, grid):
+                        through[j] = transmittance[pixel[1], pixel[0]]
+                        stop[j] = ended[pixel[1], pixel[0]]
+                        light = through[j] * cuts.background
+                        if ends[tile] > after and stop[j] > after:
+                            mark = marks[segment + 1, within]
+                            through[j] = mark[3]
+                            light = wp.vec3(mark[0], mark[1], mark[2])
+                        for k in range(K):
+                            w = cotangents[k, pixel[1], pixel[0]]
+                            v[j * K + k] = w
+                            # Σ_{j>i} T_j α_j (c_j·v) + T_end background·v, here with i the last Gaussian.
+                            behind[j, k] = wp.dot(w, light)
+
+            ellipse = Ellipse()
+            if tile < n_tiles:
+                ellipse = ellipse_of(rows[listed[at]])
             part = PairSums()
             for j in range(per_lane):
                 d = offset_of(pixel_of(tile, j * lanes + lane, grid), ellipse)
@@ -161,9 +188,9 @@ def blend_vjp(K: int, lanes: int) -> Any:
                     weight = through[j] * share
                     rgb = colour(ellipse)
                     for k in range(K):
-                        light = wp.dot(v[j * K + k], rgb)
+                        light_k = wp.dot(v[j * K + k], rgb)
                         if free <= cuts.alpha_max:  # where α is capped, the image does not depend on the ellipse
-                            q = share * (through[j] * light - behind[j, k] * over)
+                            q = share * (through[j] * light_k - behind[j, k] * over)
                             part[W * k] += q
                             part[W * k + 1] += q * d[0]
                             part[W * k + 2] += q * d[1]
@@ -172,10 +199,7 @@ def blend_vjp(K: int, lanes: int) -> Any:
                             part[W * k + 5] += q * d[1] * d[1]
                         for c in range(3):
                             part[W * k + SUMS + c] += weight * v[j * K + k, c]
-                        behind[j, k] = behind[j, k] + weight * light
-            wp.tile_store(pair_sums, wp.tile_sum(wp.tile(part, preserve_type=True)), offset=(pairs[at],))
-        # The places of pairs that no pixel blended are read, too.
-        for at in range(last + lane, ends[tile], lanes):
-            pair_sums[pairs[at]] = PairSums()
+                        behind[j, k] = behind[j, k] + weight * light_k
+            wp.tile_store(pair_sums, wp.tile_sum(wp.tile(part, preserve_type=True)), offset=(places[at],))
 
     return blend_vjp

@@ -1,7 +1,7 @@
 """A frame: one set of Gaussians seen from one pose on one or more pixel grids. Launches the kernels, and keeps shared data.
 
     forward:   project (each grid) -> order by depth -> (each grid: list pairs -> blend)
-    backward:  blend_vjp -> project_vjp
+    backward:  blend_vjp -> fold -> project_vjp
 
 Torch allocates all memory except the sort's scratch, and all work runs on torch's current stream. The number of pairs of
 Gaussian and tile is counted on the device. The first image of a size waits for this count. Later images are launched at
@@ -28,7 +28,7 @@ from rasterizers.warp_backend import types
 from rasterizers.warp_backend.bins import find_tiles, list_pairs
 from rasterizers.warp_backend.blend import blend, blend_vjp
 from rasterizers.warp_backend.colour import basis
-from rasterizers.warp_backend.project import project, project_vjp
+from rasterizers.warp_backend.project import fold, project, project_vjp
 from rasterizers.warp_backend.settings import PAIR_BYTES, SUMS_BYTES, TILE, WarpSettings, mebibytes, padded
 from rasterizers.warp_runtime import array, on_stream
 
@@ -36,7 +36,7 @@ _ROW: Final = len(types.Row())
 DEFERRED_COUNTS: Final = {"cuda": True, "cpu": False}
 """Whether the host reads the number of pairs only when an image is accessed."""
 LANES: Final = {"cuda": 32, "cpu": 1}
-"""Threads per tile of the blending VJP: a warp on CUDA; on a CPU, Warp's blocks have one thread."""
+"""Threads per segment of the blending VJP: a warp on CUDA; on a CPU, Warp's blocks have one thread."""
 
 
 class _View:
@@ -61,8 +61,12 @@ class _View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lists:
-    """Pairs of Gaussian and tile: the Gaussians by tile, and each pair's place in the order of the Gaussians."""
+    """Pairs of Gaussian and tile. `splats` has the order of places, Gaussian by Gaussian; `tiles`, `gaussians` and `places` are
+    sorted by tile, whose part is from `starts` to `ends`.
+    """
 
+    splats: Tensor
+    tiles: Tensor
     gaussians: Tensor
     places: Tensor
     starts: Tensor
@@ -114,7 +118,8 @@ class Frame:
         """
         if self._resolved:
             return
-        *pairs, not_finite = self._read()
+        *pairs, not_finite, is_long, is_longer = self._read()
+        self.folds = (1,) * is_long + (types.SEGMENT,) * is_longer
         if not_finite:
             for splats, _ in self.jobs:
                 require_finite(splats)
@@ -145,7 +150,7 @@ class Frame:
     def project(self) -> Tensor:
         """Project onto each grid. Returns the depth keys, with space for sorting them, and starts counting pairs."""
         keys = self.empty(2 * self.n, dtype=torch.int32)
-        not_finite = self.like.new_zeros(1, dtype=torch.int64)
+        flags = self.like.new_zeros(3, dtype=torch.int64)
         for nth, view in enumerate(self.views):
             self.launch(
                 project, self.n, self.pose, view.grid, self.cuts,
@@ -155,9 +160,9 @@ class Frame:
                 nth == 0,
                 array(keys), array(self.colours, wp.vec3), array(self.slopes, wp.mat33),
                 array(self.depths), array(view.ellipses, types.Row), array(view.means2d, wp.vec2), array(view.visible),
-                array(view.counts), array(not_finite),
+                array(view.counts), array(flags),
             )  # fmt: skip
-        self.totals = torch.cat([*(view.counts.sum(0, True) for view in self.views), not_finite])
+        self.totals = torch.cat([*(view.counts.sum(0, True) for view in self.views), flags])
         return keys
 
     def _require_memory(self, view: _View, count: int) -> None:
@@ -172,26 +177,24 @@ class Frame:
         )
 
     def _list(self, nth: int, capacity: int) -> None:
-        """List the pairs of a grid. Unused places are sorted to the end."""
+        """List the pairs of a grid. Places without a pair are sorted to the end."""
         view, length = self.views[nth], padded(capacity)
-        tiles, pairs, splats, gaussians = (
+        tiles, places, splats, gaussians = (
             self.empty(n, dtype=torch.int32) for n in (2 * length, 2 * length, length, length)
         )
         after = torch.cumsum(view.counts[self._order.long()], 0)
         n_tiles = view.columns * view.rows_of_tiles
-        tiles[:capacity].fill_(n_tiles)
         starts, ends = self.like.new_zeros(2, n_tiles + 1, dtype=torch.int32)
         self.launch(
-            list_pairs, self.n, array(self._order), array(view.counts), array(after),
-            array(view.ellipses, types.Row), view.grid, capacity,
-            array(view.firsts), array(tiles), array(pairs), array(splats),
+            list_pairs, capacity, array(self._order), array(view.counts), array(after), array(view.ellipses, types.Row),
+            view.grid, array(view.firsts), array(tiles), array(places), array(splats),
         )  # fmt: skip
-        sorted_tiles, places = _sorted(tiles, pairs, capacity, n_tiles.bit_length())
+        tiles, places = _sorted(tiles, places, capacity, n_tiles.bit_length())
         self.launch(
-            find_tiles, capacity, array(sorted_tiles), array(places), array(splats), array(self.totals), nth, capacity,
+            find_tiles, capacity, array(tiles), array(places), array(splats), array(self.totals), nth, capacity,
             array(gaussians), array(starts), array(ends),
         )  # fmt: skip
-        view.capacity, view.lists = capacity, _Lists(gaussians, places, starts, ends)
+        view.capacity, view.lists = capacity, _Lists(splats, tiles, gaussians, places, starts, ends)
 
 
 class WarpRendering:
@@ -231,13 +234,14 @@ class WarpRendering:
 
     def _blend(self) -> None:
         frame, view, lists = self._frame, self._view, self._view.lists
-        self._drawn_from, self._reached = lists, torch.zeros_like(lists.starts)
+        self._drawn_from = lists
+        self._marks = frame.empty(view.capacity // types.SEGMENT + 1, types.PIXELS, 4)
         frame.launch(
             blend(view.has_depth), view.columns * view.rows_of_tiles * TILE**2, view.grid, frame.cuts,
             array(view.ellipses, types.Row), array(frame.depths), array(lists.gaussians), array(lists.starts),
             array(lists.ends),
             array(self._image, wp.vec3), array(self._alpha), array(self._transmittance), array(self._ended),
-            array(self._reached), array(self._depth),
+            array(self._marks, wp.vec4), array(self._depth),
         )  # fmt: skip
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
@@ -264,16 +268,19 @@ class WarpRendering:
         row = wp.types.vector(length=width, dtype=wp.float32)
         lanes = LANES[frame.settings.device]
         wp.launch_tiled(
-            blend_vjp(k, lanes), block_dim=lanes,
-            dim=[len(lists.starts)],  # includes the tile of unused places, see list_pairs
+            blend_vjp(k, lanes), dim=[-(-view.pairs // types.SEGMENT)], block_dim=lanes,
             device=wp.device_from_torch(frame.like.device),
             inputs=[
-                view.grid, frame.cuts, array(view.ellipses, types.Row), array(lists.gaussians),
-                array(lists.places), array(lists.starts), array(lists.ends), array(self._transmittance),
-                array(self._ended), array(self._reached), array(v, wp.vec3),
-                array(pair_sums, row),
+                view.grid, frame.cuts, array(view.ellipses, types.Row), array(lists.tiles), array(lists.gaussians),
+                array(lists.places), array(lists.ends), array(self._transmittance), array(self._ended),
+                array(self._marks, wp.vec4), array(v, wp.vec3), view.pairs, array(pair_sums, row),
             ],
         )  # fmt: skip
+        for stride in frame.folds:
+            frame.launch(
+                fold(k), view.pairs, array(view.counts), array(view.firsts), array(lists.splats), stride,
+                array(pair_sums, row),
+            )  # fmt: skip
         widths = (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec2, wp.vec3)
         frame.launch(
             project_vjp(k), frame.n, frame.pose, view.grid, frame.cuts,

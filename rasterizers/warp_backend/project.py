@@ -11,7 +11,7 @@ from rasterizers import geometry
 from rasterizers.warp_backend.bins import count_tiles, depth_key, reaches_image
 from rasterizers.warp_backend.colour import colour_of
 from rasterizers.warp_backend.geometry import Footprint, Sums, centre_of, footprint_of, geometry_of, geometry_vjp
-from rasterizers.warp_backend.types import FAR, SUMS, Cuts, Ellipse, Grid, Pose, Row, ellipse_of, row_of
+from rasterizers.warp_backend.types import FAR, SEGMENT, SUMS, Cuts, Ellipse, Grid, Pose, Row, ellipse_of, row_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -73,12 +73,12 @@ def project(
     means2d: wp.array[wp.vec2],
     visible: wp.array[wp.bool],
     counts: wp.array[wp.int32],
-    not_finite: wp.array[wp.int64],
+    flags: wp.array[wp.int64],
 ) -> None:
     """One thread per Gaussian. Depth key, colour and slope, which the grids share, are computed for the first grid that
     draws the Gaussian; and its depth, if `depths` is not empty.
 
-    `not_finite` becomes 1 if a number that was read is not finite.
+    `flags` become 1: a number that was read is not finite; a Gaussian has more tiles than a `SEGMENT`; or than its square.
     """
     i = wp.tid()
     quat, opacity = quats[i], opacities[i]
@@ -103,6 +103,10 @@ def project(
             if is_visible(ellipse, grid):
                 visible[i] = True
                 count = count_tiles(ellipse, grid)
+                if count > SEGMENT:
+                    flags[1] = wp.int64(1)
+                if count > SEGMENT * SEGMENT:
+                    flags[2] = wp.int64(1)
                 if count > 0:
                     counts[i] = count
                     if keys[i] == FAR:
@@ -119,7 +123,43 @@ def project(
                     rows[i] = row_of(ellipse)
                     all_finite = all_finite and finite(ellipse.rgb)
     if not all_finite:
-        not_finite[0] = wp.int64(1)
+        flags[0] = wp.int64(1)
+
+
+@wp.func
+def stride_of(count: wp.int32) -> wp.int32:
+    """The distance of the places whose sums, after `fold`, make up those of a Gaussian of `count` pairs."""
+    stride = wp.int32(1)
+    while count > stride * SEGMENT and stride < SEGMENT * SEGMENT:
+        stride *= SEGMENT
+    return stride
+
+
+@cache
+def fold(K: int) -> Any:
+    """The kernel that adds up a Gaussian's pairs by `SEGMENT`, for those Gaussians that have more."""
+    PairSums = wp.types.vector(length=(SUMS + 3) * K, dtype=wp.float32)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def fold(
+        counts: wp.array[wp.int32],
+        firsts: wp.array[wp.int32],
+        splats: wp.array[wp.int32],
+        stride: wp.int32,
+        pair_sums: wp.array[PairSums],
+    ) -> None:
+        """One thread per place; at every `SEGMENT`-th multiple of `stride` it adds the sums of the multiples up to the next."""
+        place = wp.tid()
+        i = splats[place]
+        nth, count = place - firsts[i], counts[i]
+        if count <= stride * SEGMENT or nth % (stride * SEGMENT) != 0:
+            return
+        total = PairSums()
+        for other in range(nth, wp.min(nth + stride * SEGMENT, count), stride):
+            total += pair_sums[firsts[i] + other]
+        pair_sums[place] = total
+
+    return fold
 
 
 @cache
@@ -162,7 +202,7 @@ def project_vjp(K: int) -> Any:
                 d_rgb[k, i] = wp.vec3(0.0, 0.0, 0.0)
             return
         total = PairSums()
-        for nth in range(counts[i]):
+        for nth in range(0, counts[i], stride_of(counts[i])):
             total += pair_sums[firsts[i] + nth]
         g = geometry_of(pose, grid, centre_of(pose, means[i]), quats[i], scales[i])
         f = footprint_of(g, grid, cuts)

@@ -13,6 +13,7 @@ wp.set_module_options({"enable_backward": False})
 TILE: Final = wp.constant(settings.TILE)
 PIXELS: Final = wp.constant(settings.TILE**2)
 """Pixels of a tile."""
+SEGMENT: Final = wp.constant(settings.SEGMENT)
 SUMS: Final = wp.constant(6)
 """Sums of a pair for one cotangent before those of the colour: q = ∂L/∂(log alpha) and its moments."""
 FAR: Final = wp.constant(2**31 - 1)

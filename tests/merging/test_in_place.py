@@ -169,17 +169,38 @@ class Count(TorchDispatchMode):
         return operation(*arguments, **(keywords or {}))
 
 
+def moved(params, before, hr, *, device: str):
+    """The same setting on another device."""
+    there = {name: torch.nn.Parameter(p.detach().to(device)) for name, p in params.items()}
+    for name, p in params.items():
+        there[name].grad = None if p.grad is None else p.grad.to(device)
+    evidence = Evidence(*(x.to(device) for x in (hr.step.evidence.reliability, hr.step.evidence.demand)))
+    colour = None if hr.colour is None else Colour(*(x.to(device) for x in hr.colour))
+    grads = {name: g.to(device) for name, g in hr.grads.items()}
+    before = {name: g.to(device) for name, g in before.items()}
+    return there, before, RoutedGradients(grads, toy.step(T, evidence), colour, hr.detail.to(device))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
+@pytest.mark.parametrize("factors", [False, True])
+def test_cuda_agrees_with_float64(factors):
+    results = []
+    for dtype, device in ((torch.float32, "cuda"), (torch.float64, "cpu")):
+        made = conductor()
+        made.on_fit_start(3, 0, device)
+        params, before, hr = moved(*setting(dtype, accumulated=True, factors=factors, scale=0.5), device=device)
+        ratios = deferred.resolve([dict(InPlaceMerge(made)(params, hr, T, before=before, scale=0.5))])[0]
+        results.append(({name: p.grad.double().cpu() for name, p in params.items()}, ratios))
+    (merged, ratios), (exact, expected) = results
+    for name, g in exact.items():
+        assert (merged[name] - g).abs().max() <= 4e-6 * g.abs().max(), name
+    assert ratios == pytest.approx(expected, abs=1e-9)
+
+
 def operations(n: int, device: str = "cpu") -> Counter[str]:
-    params, before, hr = setting(torch.float32, n=n, accumulated=False, factors=True, scale=1.0)
-    if device != "cpu":
-        params = {name: torch.nn.Parameter(p.detach().to(device)) for name, p in params.items()}
-        for name, p in params.items():
-            p.grad = None if name == "detail" else torch.empty_like(p)
-        grads = {name: g.to(device) for name, g in hr.grads.items()}
-        evidence = Evidence(*(x.to(device) for x in (hr.step.evidence.reliability, hr.step.evidence.demand)))
-        hr = RoutedGradients(
-            grads, toy.step(T, evidence), Colour(*(x.to(device) for x in hr.colour)), hr.detail.to(device)
-        )
+    params, before, hr = moved(
+        *setting(torch.float32, n=n, accumulated=False, factors=True, scale=1.0), device=device
+    )
     merge = InPlaceMerge(conductor())
     merge(params, hr, T, before=before)
     with Count() as count:
