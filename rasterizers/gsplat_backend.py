@@ -19,7 +19,8 @@ from rasterizers.checks import Backend, require_cotangents, require_device, requ
 from rasterizers.geometry import SH_C0, spherical_harmonics
 from rasterizers.interface import BackendUnavailable, Camera, Rendering, SplatGradients, Splats, Traits
 
-_FIXED: Final = {"alpha_min": 1 / 255, "alpha_max": 0.99, "transmittance_min": 1e-4}  # the defaults of RasterSettings
+_FIXED: Final = {"alpha_min": (1 / 255,), "alpha_max": (0.999, 0.99), "transmittance_min": (1e-4,)}
+"""The values that a setting may have; 0.99, the default of RasterSettings, is drawn as 0.999."""
 
 
 def _gsplat_rasterization() -> Callable[..., Any]:
@@ -57,9 +58,9 @@ class GsplatRasterizer(Backend):
         Backend.__post_init__(self)
         require_device(self.device)
         for name, fixed in _FIXED.items():
-            if getattr(self, name) != fixed:
+            if getattr(self, name) not in fixed:
                 raise ValueError(
-                    f"gsplat's cut-offs cannot be chosen; {name} must stay {fixed:g}, got {getattr(self, name):g}."
+                    f"gsplat's cut-offs cannot be chosen; {name} must stay {fixed[0]:g}, got {getattr(self, name):g}."
                 )
         if self.rasterization is None:
             _gsplat_rasterization()

@@ -302,7 +302,7 @@ def _read_deferred(numbers: Tensor) -> Any:
     """Start copying device numbers to the host; the returned function waits for this copy only."""
     if numbers.device.type == "cpu":
         return numbers.tolist
-    host = torch.empty(numbers.shape, dtype=numbers.dtype, pin_memory=True)
+    host = torch.empty(numbers.shape, dtype=numbers.dtype, device="cpu", pin_memory=True)
     host.copy_(numbers, non_blocking=True)
     copied = torch.cuda.current_stream(numbers.device).record_event()
 
