@@ -37,6 +37,8 @@ DEFERRED_COUNTS: Final = {"cuda": True, "cpu": False}
 """Whether the host reads the number of pairs only when an image is accessed."""
 LANES: Final = {"cuda": 32, "cpu": 1}
 """Threads per segment of the blending VJP: a warp on CUDA; on a CPU, Warp's blocks have one thread."""
+TILE_LANES: Final = {"cuda": TILE**2, "cpu": 1}
+"""Threads per tile of blending: a thread per pixel on CUDA."""
 
 
 class _View:
@@ -134,6 +136,11 @@ class Frame:
     def launch(self, kernel: Any, threads: int, *arguments: Any) -> None:
         """Launch a kernel with one thread per Gaussian, pair or pixel."""
         wp.launch(kernel, threads, inputs=arguments, device=wp.device_from_torch(self.like.device))
+
+    def launch_blocks(self, kernel: Any, blocks: int, lanes: int, *arguments: Any) -> None:
+        """Launch a kernel whose blocks of `lanes` threads work together."""
+        device = wp.device_from_torch(self.like.device)
+        wp.launch_tiled(kernel, dim=[blocks], inputs=arguments, block_dim=lanes, device=device)
 
     def empty(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         return self.like.new_empty(shape, dtype=dtype)
@@ -236,8 +243,9 @@ class WarpRendering:
         frame, view, lists = self._frame, self._view, self._view.lists
         self._drawn_from = lists
         self._marks = frame.empty(view.capacity // types.SEGMENT + 1, types.PIXELS, 4)
-        frame.launch(
-            blend(view.has_depth), view.columns * view.rows_of_tiles * TILE**2, view.grid, frame.cuts,
+        lanes = TILE_LANES[frame.settings.device]
+        frame.launch_blocks(
+            blend(view.has_depth, lanes), view.columns * view.rows_of_tiles, lanes, view.grid, frame.cuts,
             array(view.ellipses, types.Row), array(frame.depths), array(lists.gaussians), array(lists.starts),
             array(lists.ends),
             array(self._image, wp.vec3), array(self._alpha), array(self._transmittance), array(self._ended),
@@ -267,14 +275,11 @@ class WarpRendering:
         pair_sums = frame.empty(padded(view.pairs), width)
         row = wp.types.vector(length=width, dtype=wp.float32)
         lanes = LANES[frame.settings.device]
-        wp.launch_tiled(
-            blend_vjp(k, lanes), dim=[-(-view.pairs // types.SEGMENT)], block_dim=lanes,
-            device=wp.device_from_torch(frame.like.device),
-            inputs=[
-                view.grid, frame.cuts, array(view.ellipses, types.Row), array(lists.tiles), array(lists.gaussians),
-                array(lists.places), array(lists.ends), array(self._transmittance), array(self._ended),
-                array(self._marks, wp.vec4), array(v, wp.vec3), view.pairs, array(pair_sums, row),
-            ],
+        frame.launch_blocks(
+            blend_vjp(k, lanes, frame.settings.device == "cuda"), -(-view.pairs // types.SEGMENT), lanes, view.grid, frame.cuts,
+            array(view.ellipses, types.Row), array(lists.tiles), array(lists.gaussians), array(lists.places),
+            array(lists.ends), array(self._transmittance), array(self._ended), array(self._marks, wp.vec4),
+            array(v, wp.vec3), view.pairs, array(pair_sums),
         )  # fmt: skip
         for stride in frame.folds:
             frame.launch(

@@ -79,6 +79,7 @@ def test_the_blending_vjp_is_the_same_with_32_threads_per_tile(blocks_of, k):
     rasterizer = rasterizers.load("warp", device="cpu", **CLEAN)
     alone = rasterizer(splats, view).vjp(v)
     blocks_of(frame.LANES, 32)
+    blocks_of(frame.TILE_LANES, 64)
     together, again = (rasterizer(splats, view).vjp(v) for _ in range(2))
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN", "screen"):
         found, expected = gradient_of(together, name), gradient_of(alone, name)
@@ -223,7 +224,9 @@ def test_no_local_name_hides_a_constant_of_warp():
 def test_the_kernels_compile_for_cuda_on_a_machine_without(ptx_of):
     from rasterizers.warp_backend import bins, blend, colour, project
 
-    forward = (bins.list_pairs, colour.basis, project.project, blend.blend(False), blend.blend(True))
-    for kernel in (*forward, project.project_vjp(1)):
+    for kernel in (bins.list_pairs, colour.basis, project.project, project.fold(1), project.project_vjp(1)):
         ptx_of(kernel.module)
-    ptx_of(blend.blend_vjp(1, 32).module, 32)
+    for depth in (False, True):
+        ptx_of(blend.blend(depth, 64).module, 64)
+    for k in (1, 2, 3):
+        assert ptx_of(blend.blend_vjp(k, 32, True).module, 32).count("shfl.sync") == {1: 12, 2: 20, 3: 28}[k]
