@@ -1,7 +1,7 @@
 """The backend "gsplat": gsplat's CUDA kernels, for training with them and for comparison.
 
 The VJP is gsplat's autograd, one pass per cotangent. gsplat's cut-offs are fixed (alpha 1/255 to 0.999, transmittance
-1e-4). It sums by atomics, so two runs differ in their last bits. Not yet tested on a GPU.
+1e-4). It sums by atomics, so two runs differ in their last bits.
 """
 
 from __future__ import annotations

@@ -73,8 +73,8 @@ def surfaces(name: str, n: int, width: int, height: int, *, radius: float, seed:
 
 
 def tails(name: str, n: int, width: int, height: int, *, radius: float, seed: int = 0) -> Workload:
-    """As `surfaces`, with the tails that long training leaves: a hundredth of the Gaussians, faint and large, has most of the pairs
-    of Gaussian and tile, one covers the image, and a fifteenth lies behind one tile.
+    """As `surfaces`, with the tails that long training leaves: a hundredth of the Gaussians, faint and large, has most of the
+    pairs of Gaussian and tile, one covers the image, and a fifteenth lies behind one tile.
     """
     w, random = surfaces(name, n, width, height, radius=radius, seed=seed), np.random.default_rng(seed + 1)
     means, scales, opacities = w.splats.means, w.splats.scales, w.splats.opacities

@@ -47,9 +47,7 @@ def near(row: Row, tile: wp.int32, grid: Grid) -> Near:
     ellipse, first = ellipse_of(row), pixel_of(tile, 0, grid)
     centre = ellipse.whole - wp.vec2(wp.float32(first[0]), wp.float32(first[1])) + (ellipse.rest - wp.vec2(0.5, 0.5))
     rgb = wp.max(ellipse.rgb, wp.vec3(0.0, 0.0, 0.0))
-    return Near(
-        centre[0], centre[1], ellipse.A, ellipse.B, ellipse.C, ellipse.opacity, rgb[0], rgb[1], rgb[2]
-    )
+    return Near(centre[0], centre[1], ellipse.A, ellipse.B, ellipse.C, ellipse.opacity, rgb[0], rgb[1], rgb[2])
 
 
 @wp.func
@@ -65,7 +63,7 @@ def alpha_of(g: Near, d: wp.vec2) -> wp.float32:
 
 
 @cache
-def blend(depth: bool, lanes: int) -> Any:
+def blend(depth: bool, lanes: int) -> Any:  # noqa: PLR0915 - a kernel
     """The kernel that draws the image, with `lanes` threads per tile; with `depth` also E, which is 0 where nothing is drawn."""
     per_lane, both = PIXELS // lanes, 2 * lanes
     Numbers = wp.types.vector(length=per_lane, dtype=wp.float32)
@@ -73,7 +71,7 @@ def blend(depth: bool, lanes: int) -> Any:
     Colours = wp.types.matrix(shape=(per_lane, 3), dtype=wp.float32)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def blend(
+    def blend(  # noqa: PLR0912, PLR0915
         grid: Grid,
         cuts: Cuts,
         rows: wp.array[Row],
@@ -162,7 +160,9 @@ def warp_sum(width: int) -> Any:
     lines += [f"const int lane = threadIdx.x & 31; int first = 0, size = {width}; bool upper;"]
     for bit in (16, 8, 4, 2, 1):
         half = (size + 1) // 2
-        lines += [f"upper = lane & {bit}; first += upper ? {half} : 0; size = upper ? size - {half} : min(size, {half});"]
+        lines += [
+            f"upper = lane & {bit}; first += upper ? {half} : 0; size = upper ? size - {half} : min(size, {half});"
+        ]
         for k in range(half):
             low, high = f"x[{k}]", f"x[{half + k}]" if half + k < size else "0.0f"
             lines += [f"{low} = (upper ? {high} : {low}) + __shfl_xor_sync(0xffffffff, upper ? {low} : {high}, {bit});"]
@@ -178,7 +178,7 @@ def warp_sum(width: int) -> Any:
 
 
 @cache
-def blend_vjp(K: int, lanes: int, shuffles: bool) -> Any:
+def blend_vjp(K: int, lanes: int, shuffles: bool) -> Any:  # noqa: PLR0915 - a kernel
     """The VJP kernel for K cotangents, with `lanes` threads per segment.
 
     Each lane has `per_lane` pixels. For every pair it sums over its pixels, the lanes' sums are added up, and the result is
@@ -196,7 +196,7 @@ def blend_vjp(K: int, lanes: int, shuffles: bool) -> Any:
     store = warp_sum(W * K)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def blend_vjp(
+    def blend_vjp(  # noqa: PLR0912, PLR0915
         grid: Grid,
         cuts: Cuts,
         rows: wp.array[Row],

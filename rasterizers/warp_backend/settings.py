@@ -16,7 +16,9 @@ TILE: Final = 8
 SEGMENT: Final = 64
 """The most pairs that one thread, or one block of threads, goes through in turn: some tiles' lists and some Gaussians' are
 a hundred times as long as the others'."""
-PAIR_BYTES: Final = 40  # tile and place, twice for the sort, the Gaussian, before and after it, and a share of the marks
+PAIR_BYTES: Final = (
+    40  # tile and place, twice for the sort, the Gaussian, before and after it, and a share of the marks
+)
 SUMS_BYTES: Final = 36  # a pair's nine sums for one cotangent
 
 

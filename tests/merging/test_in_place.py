@@ -198,9 +198,7 @@ def test_cuda_agrees_with_float64(factors):
 
 
 def operations(n: int, device: str = "cpu") -> Counter[str]:
-    params, before, hr = moved(
-        *setting(torch.float32, n=n, accumulated=False, factors=True, scale=1.0), device=device
-    )
+    params, before, hr = moved(*setting(torch.float32, n=n, accumulated=False, factors=True, scale=1.0), device=device)
     merge = InPlaceMerge(conductor())
     merge(params, hr, T, before=before)
     with Count() as count:

@@ -13,7 +13,7 @@ import torch
 import rasterizers
 from rasterizers import BackendUnavailable
 from rasterizers.interface import over
-from rasterizers.testing import gradient_of
+from rasterizers.testing import gradient_of, to
 from tests.helpers.agreement import require_same_bits
 from tests.helpers.backends import CLEAN, camera, cotangents, dense_scene, everything, needs
 
@@ -142,6 +142,30 @@ def test_an_image_does_not_depend_on_the_capacity_of_its_lists(capacity, deferre
     found = [everything(r, w) for r, w in zip(rasterizer.render_scales(jobs), v, strict=True)]
     for one, other in zip(found, expected, strict=True):
         require_same_bits(one, other)
+
+
+@installed
+@needs("cpp")
+def test_long_lists_and_large_gaussians_are_summed_in_short_chains():
+    """A tile's list of 2,600, and a Gaussian on each of 12,000 tiles, whose sums are folded twice."""
+    from clear_strategies.bench import scenes
+    from rasterizers.warp_backend import frame, project
+    from rasterizers.warp_backend.settings import SEGMENT
+
+    tails = scenes.load("tails")
+    v = cotangents(1, tails.camera.height, tails.camera.width)
+    found = frame.Frame(rasterizers.load("warp", device="cpu", **CLEAN), [(tails.splats, tails.camera)], [False])
+    (drawn,) = found.draw()
+    exact = rasterizers.load("cpp", **CLEAN)(to(tails.splats, torch.float64), tails.camera)
+    g, expected = drawn.vjp(v), exact.vjp(v.double())
+    for name in ("means", "quats", "scales", "opacities", "sh0"):
+        error = gradient_of(g, name).double() - gradient_of(expected, name)
+        assert float(error.norm()) <= 2e-5 * float(gradient_of(expected, name).norm()), name
+    counts, lists = found.views[0].counts, found.views[0].lists
+    assert int((lists.ends - lists.starts).max()) > 30 * SEGMENT
+    assert int(counts.max()) > SEGMENT**2
+    assert found.folds == (1, SEGMENT)
+    assert all(count <= SEGMENT * project.stride_of(count) for count in counts.unique().tolist())
 
 
 @installed
