@@ -143,7 +143,7 @@ TRAIN, SHARED = "transforms_train.json", "transforms.json"
 INPUTS = [
     # COLMAP, binary
     case("no model", "colmap", remove(CAMERAS), r"cameras\.bin: file"),
-    case("no photos", "colmap", lambda root: (root / "images").rename(root / "photos"), r"scene: images: has none of the folders"),
+    case("no photos", "colmap", lambda root: (root / "images").rename(root / "photos"), r"images: has none of the folders"),
     case("photo absent", "colmap", remove("images/b.png"), r"images\.bin: photos: 1 of 3 .* b\.png: .*skip_faulty=true"),
     case("empty file", "colmap", write(IMAGES, b""), r"images\.bin: number of images: .*truncated"),
     case("cameras truncated", "colmap", cut(CAMERAS, -1), r"cameras\.bin: .*bytes"),
