@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -32,7 +31,7 @@ class Scene:
     background: Color = (0.0, 0.0, 0.0)
     synthetic_prior: bool = False
     notes: dict[str, str] = field(default_factory=dict)
-    unplaced: Mapping[str, str] = field(default_factory=dict)
+    unplaced: tuple[str, ...] = ()
     work_log: WorkLog = field(default_factory=WorkLog)
 
     @property
