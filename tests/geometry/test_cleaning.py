@@ -1,10 +1,15 @@
-"""Outliers: small cases by hand."""
+"""Outliers and voxels: small cases by hand."""
 
 from __future__ import annotations
 
+import sys
+
+import pytest
 import torch
 
-from clear_strategies.geometry.cleaning import remove_outliers
+from clear_strategies.core.points import PointCloud
+from clear_strategies.geometry.cleaning import averaged_in_voxels, remove_outliers
+from rasterizers.interface import BackendUnavailable
 
 
 def test_a_stray_point_is_removed() -> None:
@@ -22,3 +27,20 @@ def test_a_point_on_its_nearest_one_is_removed() -> None:
 def test_tiny_clouds_are_left_alone() -> None:
     for n in (0, 1):
         assert len(remove_outliers(torch.zeros(n, 3), 16, 3.0)) == n
+
+
+def test_voxels_hold_the_averages_of_their_points_in_the_order_of_the_cubes():
+    pytest.importorskip("open3d")
+    means = torch.tensor([[0.0, 0, 0], [5.0, 0, 0], [0.2, 0.1, 0], [0.0, 5, 0]])
+    cloud = averaged_in_voxels(PointCloud(means, means / 5, "given"), 1.0)
+    assert torch.allclose(cloud.means, torch.tensor([[0.1, 0.05, 0], [0.0, 5, 0], [5.0, 0, 0]]))
+    assert torch.allclose(cloud.colors, cloud.means / 5)
+    assert cloud.source == "given, in voxels of 1"
+
+
+def test_voxels_without_open3d_say_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)  # makes its import fail
+    with pytest.raises(
+        BackendUnavailable, match=r"data\.cloud\.voxel needs Open3D.*pip install 'clear-strategies\[open3d\]'"
+    ):
+        averaged_in_voxels(PointCloud(torch.rand(4, 3), torch.rand(4, 3), "given"), 0.1)

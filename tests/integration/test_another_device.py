@@ -11,6 +11,7 @@ import torch
 from torch.utils import backend_registration
 
 ROOT = Path(__file__).parents[2]
+STRATEGIES = ["best", "splatsure"]  # together all strategies
 
 
 def run(code):
@@ -50,3 +51,11 @@ with Elsewhere():
     ran = run(["-c", code])
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout.split() == ["elsewhere:0", "elsewhere:0", "cpu", "elsewhere:0", "elsewhere:0"]
+
+
+@pytest.mark.slow
+def test_strategies_train_in_a_gsplat_loop_elsewhere():
+    pytest.importorskip("gsplat")
+    ran = run(["-m", "tests.helpers.gsplat_elsewhere", *STRATEGIES])
+    assert ran.returncode == 0, ran.stderr
+    assert [line.split()[0] for line in ran.stdout.splitlines()] == STRATEGIES

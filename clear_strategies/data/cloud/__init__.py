@@ -21,7 +21,7 @@ from clear_strategies.data.cloud.compared import blackened, compared_at, shown_p
 from clear_strategies.data.ply import read_points
 from clear_strategies.errors import DataError
 from clear_strategies.geometry.cameras import common_box
-from clear_strategies.geometry.cleaning import OUTLIER_NEIGHBOURS, OUTLIER_RATIO, without_outliers
+from clear_strategies.geometry.cleaning import OUTLIER_NEIGHBOURS, OUTLIER_RATIO, averaged_in_voxels, without_outliers
 from clear_strategies.geometry.dense_stereo.cloud import stereo_cloud
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.filling import STRIDE, densify, pixel_grid
@@ -61,6 +61,7 @@ class CloudSettings:
         outlier_neighbours, outlier_ratio: a point is removed if the mean distance to its nearest `outlier_neighbours`
             points (itself included) exceeds the average by more than `outlier_ratio` standard deviations; 0
             neighbours: no point is removed.
+        voxel: points are averaged in cubes of this edge, world units, by Open3D (extra [open3d]); None: they are not.
         compare: the images that stereo compares. "hr": those at HR, up to `stereo.max_pixels`. Where these are photos, maps and
             points are made at their size; where a prior made them, their depth completes that of the LR photos, except before a
             plain background. "lr": the LR photos. "auto": as "hr", but SR images of at most five photos only: with more
@@ -83,6 +84,7 @@ class CloudSettings:
     box: float | None = None
     outlier_neighbours: int = OUTLIER_NEIGHBOURS
     outlier_ratio: float = OUTLIER_RATIO
+    voxel: float | None = None
     compare: Compare = "auto"
     max_points: int = MAX_POINTS
     triangulation: TriangulationSettings = field(default_factory=TriangulationSettings)
@@ -100,9 +102,9 @@ class CloudSettings:
         if self.outlier_neighbours == 1:
             rule = "must be 0 or at least 2, since a point is the first of its own neighbours"
             refuse("data.cloud.outlier_neighbours", rule, 1, "0 keeps outliers")
-        require_number("data.cloud.outlier_ratio", self.outlier_ratio, above=0)
-        if self.box is not None:
-            require_number("data.cloud.box", self.box, above=0)
+        for name in ("box", "outlier_ratio", "voxel"):
+            if name == "outlier_ratio" or getattr(self, name) is not None:
+                require_number(f"data.cloud.{name}", getattr(self, name), above=0)
 
 
 def require_source(settings: CloudSettings, sfm: SfmPoints | None) -> None:
@@ -170,6 +172,8 @@ def initial_points(
                 _log.debug("init: auto does not use the scene's own points, because test views were used for them.")
             initial = _from_depth(settings, photos, hr, hr_is_photo, known, background)
     cloud = random_cloud(photos, settings.random_points, seed, settings.box) if initial is None else initial.cloud
+    if settings.voxel is not None:
+        cloud = averaged_in_voxels(cloud, settings.voxel)
     if len(cloud) > settings.max_points:
         _log.debug("%d of %d points chosen at random (max_points).", settings.max_points, len(cloud))
     return InitialPoints(cloud.at_most(settings.max_points, seed), () if initial is None else initial.depths)
