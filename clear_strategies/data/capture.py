@@ -111,7 +111,7 @@ class Capture:
             capture has no prior of its own, as every capture of real photos.
         depth: the exact depth (z) through each pixel's centre of a camera, float32 [H, W], infinite where there is no
             surface; None: unknown.
-        unplaced: the names of photos whose pose could not be estimated.
+        unplaced: why the pose could not be estimated, by the names of such photos.
     """
 
     name: str
@@ -121,7 +121,7 @@ class Capture:
     notes: dict[str, str] = field(default_factory=dict)
     own_prior: Callable[[Mapping[str, Callable[[], Float[Tensor, "H W 3"]]]], Prior] | None = None
     depth: Callable[[Camera], Float[Tensor, "H W"]] | None = None
-    unplaced: tuple[str, ...] = ()
+    unplaced: Mapping[str, str] = field(default_factory=dict)
 
 
 def sorted_by_name(frames: Sequence[Frame], file: Path) -> tuple[Frame, ...]:

@@ -31,12 +31,16 @@ from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
-SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
+SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".heic", ".heif")
 _FORMATS: Final = ("PNG", "JPEG", "WEBP", "TIFF")
+_HEIF_BRANDS: Final = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1")  # bytes 8 to 12, behind "ftyp"
 _MAX_PIXELS: Final = 100_000_000
 PNG_LEVEL: Final = 3  # a third of the time of zlib's default, for 5 % more bytes
 _EXIF_ORIENTATION: Final = 0x0112
 _EXIF_PHOTO: Final = 0x8769
+_EXPOSURE_TIME: Final = 0x829A  # s
+_F_NUMBER: Final = 0x829D
+_ISO: Final = 0x8827
 _FOCAL_35MM: Final = 0xA405
 _DIAGONAL_35MM: Final = math.hypot(36, 24)  # mm
 _ON_THE_SIDE: Final = (5, 6, 7, 8)
@@ -59,7 +63,7 @@ def read_image(
             refuses it. A TIFF is never kept as it is stored, and a PNG of 16 bits never turned: they are refused.
 
     Raises:
-        DataError: the file is no PNG, JPEG, WebP or TIFF, is damaged or too large, or the image is turned by EXIF, has
+        DataError: the file is no PNG, JPEG, WebP, TIFF or HEIC, is damaged or too large, or the image is turned by EXIF, has
             an unknown colour mode, or has another size.
     """
     with _opened(path, turn) as image:
@@ -110,9 +114,11 @@ class Exif:
 
     Args:
         focal35: focal length on 35 mm film of the same diagonal, mm.
+        exposure: how much light the photo took of the same scene, in stops (powers of two), from an arbitrary zero.
     """
 
     focal35: float | None = None
+    exposure: float | None = None
 
     def focal_pixels(self, width: int, height: int) -> float | None:
         """The focal length of an image of this size, pixels."""
@@ -120,7 +126,7 @@ class Exif:
 
 
 def read_exif(path: Path) -> Exif:
-    """The lens of a photo; the DataErrors as of `read_image`."""
+    """The lens and the exposure of a photo; the DataErrors as of `read_image`."""
     with _opened(path, False) as image:
         try:
             block = image.getexif()
@@ -128,7 +134,11 @@ def read_exif(path: Path) -> Exif:
         except Exception as error:  # PIL raises many types of error on damaged blocks
             _log.debug("%s: its EXIF block cannot be read (%s) and is not used.", path.name, error)
             return Exif()
-    return Exif(_positive(tags.get(_FOCAL_35MM)))
+    time, f_number, iso = (_positive(tags.get(tag)) for tag in (_EXPOSURE_TIME, _F_NUMBER, _ISO))
+    exposure = None
+    if time is not None and f_number is not None:
+        exposure = math.log2(time * (iso or 100) / f_number**2)
+    return Exif(_positive(tags.get(_FOCAL_35MM)), exposure)
 
 
 def _positive(value: Any) -> float | None:
@@ -150,10 +160,11 @@ def write_png(path: Path, image: Float[Tensor, "H W 3"] | Float[Tensor, "H W"]) 
 @contextmanager
 def _opened(path: Path, turn: bool | None) -> Iterator[Image.Image]:
     require_regular(path)
+    formats = (*_FORMATS, "HEIF") if _is_heif(path) else _FORMATS
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # PIL's warnings: our own size limit follows, and damage fails on decoding
-            image = Image.open(path, formats=_FORMATS)
+            image = Image.open(path, formats=formats)
     except FileNotFoundError as error:
         raise DataError(path, "file", "is not there", "check the path") from error
     except Exception as error:  # PIL raises many types of error on damaged headers
@@ -166,6 +177,24 @@ def _opened(path: Path, turn: bool | None) -> Iterator[Image.Image]:
         if turn is None and image.format != "PNG" and (orientation := _orientation_of(image)) != 1:
             raise _turned(path, orientation)
         yield image
+
+
+def _is_heif(path: Path) -> bool:
+    """Whether the content is HEIC or HEIF, which PIL can then open; a DataError if pillow-heif is not installed."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(12)
+    except OSError:
+        return False  # opening it as an image says why
+    if head[4:8] != b"ftyp" or head[8:] not in _HEIF_BRANDS:
+        return False
+    try:
+        import pillow_heif
+    except ImportError as error:
+        remedy = "pip install 'clear-strategies[heic]', or save the photo as JPEG"
+        raise DataError(path, "HEIC", "needs pillow-heif, which is not installed", remedy) from error
+    pillow_heif.register_heif_opener()  # which turns images upright, and says so in their EXIF block
+    return True
 
 
 def _orientation_of(image: Image.Image) -> int:

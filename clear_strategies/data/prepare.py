@@ -6,7 +6,7 @@ Every choice made here changes published numbers, so each has a line in the scen
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -25,11 +25,13 @@ from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.cloud import CloudSettings, initial_points, require_source
 from clear_strategies.data.lenses import forget_maps
+from clear_strategies.data.photo_files import image_size, read_image
 from clear_strategies.data.priors import Bicubic, Prior, SuperResolved, super_resolved
 from clear_strategies.data.priors.cache import kept_network_of
+from clear_strategies.data.priors.interface import warn_if_far_from_lr
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.scene_notes import scene_notes, size_of
-from clear_strategies.data.view_names import write_pngs
+from clear_strategies.data.view_names import ViewFiles, write_pngs
 from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split
 from clear_strategies.errors import DataError
 from clear_strategies.geometry.exposure import exposure_gains
@@ -54,14 +56,14 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     """
     train_frames, test_frames = split(capture, views)
     frames = [*train_frames, *(replace(frame, transparency=None) for frame in test_frames)]  # only training needs it
-    check_headers(frames, views)
+    lr_files = check_headers(frames, views)
     require_source(cloud, capture.points)
     _warn_if_far_from_origin([frame.camera for frame in train_frames])
     progress = Progress("photos and their SR images", "photos", len(frames))
     made, work_log = list[View](), WorkLog()
     with work_log.stage("photos and SR images"):
         for frame, photo in zip(frames, photos_of(frames, views), strict=True):
-            made.append(_view(frame, photo, capture, views, prior, required=len(made) < len(train_frames)))
+            made.append(_view(frame, photo, capture, views, prior, lr_files, required=len(made) < len(train_frames)))
             progress(len(made))
     train, test = tuple(made[: len(train_frames)]), tuple(made[len(train_frames) :])
     with work_log.stage("initial points"):
@@ -80,14 +82,39 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     )
 
 
-def check_headers(frames: Sequence[Frame], views: ViewSettings) -> None:
-    """Raise a SettingError for a photo that is too small for `shrink` and `sr_scale`. No photo is decoded."""
+def lr_photos(frames: Sequence[Frame], capture: Capture, views: ViewSettings) -> list[Photo]:
+    """The LR photos of these frames, without SR images."""
+    lr_files, photos = check_headers(frames, views), photos_of(frames, views)
+    return [_lr(frame, photo, capture, views, lr_files) for frame, photo in zip(frames, photos, strict=True)]
+
+
+def check_headers(frames: Sequence[Frame], views: ViewSettings) -> dict[str, Path]:
+    """Check by their headers that these frames can be prepared. No photo is decoded.
+
+    Returns:
+        The ready-made LR image of each frame by its name; empty without `lr_folder`.
+
+    Raises:
+        SettingError: a photo is too small for `shrink` and `sr_scale`.
+        DataError: a ready-made LR image is missing, or has another size.
+    """
     for frame in frames:
         if min(lr_size(frame.camera, views)) < 1:
             rule = f"must leave a whole LR pixel of the photo {frame.name} of {size_of(frame.camera)}"
             if views.photos_are != "lr":
                 rule += f" at sr_scale={views.sr_scale}"
             refuse("data.views.shrink", rule, views.shrink, "lower data.views.shrink")
+    if views.lr_folder is None:
+        return {}
+    files, lr_files = ViewFiles(Path(views.lr_folder), "LR image", "name the LR images like the photos"), {}
+    for frame in frames:
+        width, height = lr_size(frame.camera, views)
+        file = lr_files[frame.name] = files.file(frame.name)
+        size = image_size(file)
+        if size != (width, height):
+            problem = f"is {size[0]}x{size[1]} where {width}x{height} is expected"
+            raise DataError(file, "size", problem, "see data.views for the LR size")
+    return lr_files
 
 
 def save_lr(scene: Scene, folder: Path) -> None:
@@ -113,13 +140,19 @@ def _pixels(frame: Frame, views: ViewSettings) -> Float[Tensor, "H W 3"]:
     return _reduced(replace(frame, shown=None, transparency=None), views).image
 
 
-def _lr(photo: Photo, views: ViewSettings) -> Photo:
-    """The LR photo; `photo` as `photos_of` gives it."""
+def _lr(frame: Frame, photo: Photo, capture: Capture, views: ViewSettings, lr_files: Mapping[str, Path]) -> Photo:
+    """The LR photo of a frame; `photo` as `photos_of` gives it."""
     if views.photos_are == "lr":
         return photo
-    down = partial(images.downsample, factor=views.sr_scale, kernel=views.downsample)
-    through = _of_layer(down, photo.transparency)
-    return Photo(photo.camera.scaled(1 / views.sr_scale), down(photo.image), transparency=through)
+    camera = photo.camera.scaled(1 / views.sr_scale)
+    if frame.name not in lr_files:
+        down = partial(images.downsample, factor=views.sr_scale, kernel=views.downsample)
+        return Photo(camera, down(photo.image), transparency=_of_layer(down, photo.transparency))
+    file = lr_files[frame.name]
+    image = read_image(file, background=capture.background, expect=(camera.width, camera.height))
+    check = f"{file} shows this view, undistorted as data.save_lr writes it"
+    warn_if_far_from_lr(f"{frame.name}: the photo", photo.image, image, views.sr_scale, check)
+    return Photo(camera, image)
 
 
 def _view(
@@ -128,6 +161,7 @@ def _view(
     capture: Capture,
     views: ViewSettings,
     prior: Prior,
+    lr_files: Mapping[str, Path],
     *,
     required: bool,
 ) -> View:
@@ -136,7 +170,7 @@ def _view(
     Args:
         required: the prior must have an SR image; else bicubic replaces one that it lacks.
     """
-    lr = _lr(photo, views)
+    lr = _lr(frame, photo, capture, views, lr_files)
     hr_camera, truth = (photo.camera.scaled(views.sr_scale), None) if lr is photo else (photo.camera, photo.image)
     if views.photos_are == "both":
         hr, sr_source, disagreement = replace(photo, shown=None), "the photos themselves", None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -31,7 +32,7 @@ class Scene:
     background: Color = (0.0, 0.0, 0.0)
     synthetic_prior: bool = False
     notes: dict[str, str] = field(default_factory=dict)
-    unplaced: tuple[str, ...] = ()
+    unplaced: Mapping[str, str] = field(default_factory=dict)
     work_log: WorkLog = field(default_factory=WorkLog)
 
     @property

@@ -72,6 +72,8 @@ def _names(views: Sequence[View]) -> str:
 def _lr_source(views: ViewSettings) -> str:
     if views.photos_are == "lr":
         return "the photos themselves; HR is unknown"
+    if views.lr_folder is not None:
+        return f"read from {views.lr_folder} (D is taken to be {views.downsample})"
     by = "" if views.downsample == "area" else "PIL "
     return f"{by}{views.downsample} of the {'HR photo' if views.photos_are == 'hr' else 'photos'}"
 

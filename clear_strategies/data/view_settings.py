@@ -40,6 +40,7 @@ class ViewSettings:
             training never uses, and LR is made from them, as in the papers. "both": they are the HR images in place of SR
             images, and LR is made from them.
         downsample: D, the operator that makes LR.
+        lr_folder: ready-made LR images by the photos' names, as prior=images finds them, instead of making them.
         equalize: scale the training photos to a common exposure and white balance, by a gain for each photo and channel
             (`clear_strategies.geometry.exposure_gains`); needs the depth of data.cloud.init=stereo or auto. Test photos stay as
             they are.
@@ -59,6 +60,7 @@ class ViewSettings:
     sizes: Sizes = "crop"
     photos_are: PhotosAre = "lr"
     downsample: DownKernel = "bicubic"
+    lr_folder: str | None = None
     equalize: bool = False
 
     def __post_init__(self) -> None:
@@ -81,6 +83,9 @@ class ViewSettings:
         require_choice("data.views.sizes", self.sizes, get_args(Sizes))
         require_choice("data.views.photos_are", self.photos_are, get_args(PhotosAre))
         require_choice("data.views.downsample", self.downsample, get_args(DownKernel))
+        if self.photos_are == "lr" and self.lr_folder:
+            rule = "must be null with photos_are=lr, the default, because the photos are the LR images"
+            refuse("data.views.lr_folder", rule, self.lr_folder, "data.views.photos_are=hr")
 
 
 def split(capture: Capture, views: ViewSettings) -> tuple[list[Frame], list[Frame]]:

@@ -65,7 +65,7 @@ def write_coverage(path: Path, scene: Scene, painter: Painter, title: str) -> No
     ]
     figure.legend(handles=legend, loc="outside lower left", ncols=2, fontsize=8, frameon=False)
     if scene.unplaced:
-        listed = ", ".join(scene.unplaced)
+        listed = "; ".join(f"{name}: {why}" for name, why in scene.unplaced.items())
         note = textwrap.fill(textwrap.shorten(f"without a pose, so not used: {listed}", _NOTE, placeholder=" …"), 110)
         axis.text(0, 0, note, fontsize=8, va="bottom", transform=axis.transAxes, **figures.AS_WRITTEN)
     figures.set_title(figure, f"{title}: what the photos see, from above")

@@ -40,7 +40,7 @@ _log = logging.getLogger(__name__)
 _METRICS: Final = "metrics.json"
 _COVERAGE: Final = "maps/coverage.png"
 _OF_RUN: Final = (
-    "contact_sheet.png", "curves.png", "history.csv", "timing.csv", "point_cloud.ply", "path.mp4",
+    "contact_sheet.png", "curves.png", "history.csv", "conflict.csv", "timing.csv", "point_cloud.ply", "path.mp4",
     splat_page.FILE, cameras.FILE, "maps/maps.json", _COVERAGE,
 )  # fmt: skip
 _OF_VIEW: Final = (
@@ -200,6 +200,10 @@ def _write_tables(
 ) -> None:
     columns = list(dict.fromkeys(key for row in history for key in row))
     files.write_csv(folder / "history.csv", history, columns)
+    shares = [c for prefix in ("conflict_", "corrected") for c in columns if c.startswith(prefix)]
+    means = [c for c in ("mean_q", "mean_w", "mean_omega") if c in columns]
+    compared = [row for row in history if "conflict" in row]
+    files.write_csv(folder / "conflict.csv", compared, ["t", "conflict", *shares, *means])
     files.write_csv(
         folder / "timing.csv", stages, ["stage", "runs", "ms_each", "seconds", "skipped", "seconds_saved", "why"]
     )

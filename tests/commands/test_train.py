@@ -14,7 +14,7 @@ from clear_strategies.errors import SettingError
     ("file", "kind"),
     [
         ("transforms_train.json", "blender"), ("transforms.json", "nerfstudio"),
-        ("sparse/0/cameras.bin", "colmap"), ("sparse/images.bin", "colmap"), ("photo.jpg", "photos"),
+        ("sparse/0/cameras.bin", "colmap"), ("sparse/cameras.txt", "colmap"), ("photo.jpg", "photos"),
     ],
 )  # fmt: skip
 def test_the_reader_is_the_one_of_what_lies_in_the_folder(tmp_path, file, kind):

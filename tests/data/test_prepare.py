@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -10,10 +11,9 @@ import torch
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.hr_limit import within_limit
-from clear_strategies.data.photo_files import read_image
+from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.prepare import check_headers, prepare, save_lr
 from clear_strategies.data.priors import Bicubic
-from clear_strategies.data.view_names import ViewFiles
 from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split
 from clear_strategies.errors import DataError, SettingError
 from rasterizers import Camera
@@ -121,6 +121,26 @@ def test_a_photo_that_becomes_smaller_than_an_lr_pixel_is_refused_by_its_header(
     check_headers(undecodable().frames, replace(views, shrink=most))
 
 
+@pytest.mark.parametrize("size", [None, (5, 5)])
+def test_ready_made_lr_images_are_checked_by_their_headers(size, tmp_path):
+    write_png(tmp_path / "0000.png", torch.zeros(10, 14, 3))  # of a test view
+    if size is not None:
+        write_png(tmp_path / "0001.png", torch.zeros(size[1], size[0], 3))
+    with pytest.raises(DataError, match="has no LR image" if size is None else "is 5x5 where 14x10 is expected"):
+        prepare(undecodable(), papers(train=1, lr_folder=str(tmp_path)), Bicubic(), POINTS)
+
+
+def test_a_ready_made_lr_image_that_is_not_like_its_photo_gives_a_warning(tmp_path, caplog):
+    views = papers(train=1, test_every=0, photos_are="both", lr_folder=str(tmp_path))
+    photos = capture(1, image=torch.full((16, 16, 3), 0.5))
+    for grey, warned in ((0.5, False), (0.4, True)):
+        write_png(tmp_path / "0000.png", torch.full((4, 4, 3), grey))
+        made = prepare(photos, views, Bicubic(), POINTS)
+        message = r"0000.png: the photo, reduced again, differs .* check that .*0000.png shows this view, undistorted"
+        assert bool(re.search(message, caplog.text)) is warned
+    assert made.notes["LR"] == f"4x4, read from {tmp_path} (D is taken to be bicubic)"
+
+
 RIG = ("cam1/0001.png", "cam1/0002.png", "cam2/0001.png", "cam2/rgb.0003.png")
 
 
@@ -153,9 +173,13 @@ def test_saved_lr_images_are_those_of_their_views_when_they_are_read(tmp_path):
     saved = prepare(rig(), papers(train=4, test_every=0), Bicubic(), POINTS)
     save_lr(saved, tmp_path / "lr")
     assert sorted(str(p.relative_to(tmp_path / "lr")) for p in (tmp_path / "lr").rglob("*.png")) == sorted(RIG)
-    for view in saved.train:
-        file = ViewFiles(tmp_path / "lr", "LR image", "").file(view.name)
-        torch.testing.assert_close(read_image(file), view.lr.image, atol=1 / 255, rtol=0)
+    read = prepare(rig(), papers(train=4, test_every=0, lr_folder=str(tmp_path / "lr")), Bicubic(), POINTS)
+    for view, expected in zip(read.train, saved.train, strict=True):
+        torch.testing.assert_close(view.lr.image, expected.lr.image, atol=1 / 255, rtol=0)
+    for name in ("0001.png", "0002.png"):
+        write_png(tmp_path / name, torch.zeros(4, 4, 3))
+    with pytest.raises(DataError, match=r"0001.png: LR image: would be that of two views, cam1/0001 and cam2/0001"):
+        check_headers(rig().frames, papers(lr_folder=str(tmp_path)))
 
 
 def test_two_photos_that_differ_by_their_ending_are_not_saved_as_one(tmp_path):
@@ -175,6 +199,11 @@ def test_a_photo_of_another_size_than_its_camera_is_refused():
 def test_points_that_do_not_exist_are_refused_before_a_photo_is_decoded(init):
     with pytest.raises(DataError, match=r"there are none|is not there"):
         prepare(undecodable(), papers(train=1), Bicubic(), CloudSettings(init=init, path="nowhere.ply"))
+
+
+def test_lr_photos_and_an_lr_folder_contradict_each_other():
+    with pytest.raises(SettingError, match=r"data\.views\.lr_folder: must be null"):
+        ViewSettings(photos_are="lr", lr_folder="here")
 
 
 @pytest.mark.parametrize(("away", "warns"), [(0.0, False), (4.5e6, True)])

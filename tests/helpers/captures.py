@@ -109,20 +109,16 @@ def link(folder: Path, elsewhere: Path) -> None:
         (folder / name).symlink_to(elsewhere / name)
 
 
-def colmap_bin(
-    root: Path, model: str = "PINHOLE", parameters: tuple[float, ...] = (FOCAL, FOCAL, 8, 6), names: Sequence[str] = NAMES,
-    length: float = 1.0,
-) -> Path:  # fmt: skip
-    """images/ and sparse/0 in COLMAP's layout, with photos of these names in the model, and quaternions of this length."""
+def colmap_bin(root: Path, model: str = "PINHOLE", parameters: tuple[float, ...] = (FOCAL, FOCAL, 8, 6)) -> Path:
+    """images/ and sparse/0 in COLMAP's binary layout."""
     write_photos(root / "images")
     sparse = root / "sparse" / "0"
     sparse.mkdir(parents=True)
     camera = struct.pack("<QiiQQ", 1, 1, MODEL_NUMBERS[model], WIDTH, HEIGHT)
     (sparse / "cameras.bin").write_bytes(camera + struct.pack(f"<{len(parameters)}d", *parameters))
-    images = struct.pack("<Q", len(names))
-    for i, name in enumerate(names):
-        quaternion = [length * x for x in QUATERNIONS[i]]
-        images += struct.pack("<i7di", i + 1, *quaternion, *TRANSLATIONS[i], 1) + name.encode() + b"\0"
+    images = struct.pack("<Q", len(NAMES))
+    for i, name in enumerate(NAMES):
+        images += struct.pack("<i7di", i + 1, *QUATERNIONS[i], *TRANSLATIONS[i], 1) + name.encode() + b"\0"
         images += struct.pack("<Qddq", 1, 8.0, 6.0, -1)
     (sparse / "images.bin").write_bytes(images)
     points = struct.pack("<Q", len(POINTS))
@@ -130,6 +126,25 @@ def colmap_bin(
         points += struct.pack("<Q3d3BdQ", i + 1, *xyz, *rgb, 0.5, len(track))
         points += b"".join(struct.pack("<ii", image, 0) for image in track)
     (sparse / "points3D.bin").write_bytes(points)
+    return root
+
+
+def colmap_txt(root: Path) -> Path:
+    """The same scene in COLMAP's text layout."""
+    write_photos(root / "images")
+    sparse = root / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    cameras = f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} 8 6\n"
+    (sparse / "cameras.txt").write_text(cameras)
+    images = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n"
+    for i, name in enumerate(NAMES):
+        images += " ".join(map(repr, (i + 1, *QUATERNIONS[i], *TRANSLATIONS[i], 1))) + f" {name}\n"
+        images += "8.0 6.0 -1\n" if i else "\n"
+    (sparse / "images.txt").write_text(images)
+    points = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n"
+    for i, (xyz, rgb, track) in enumerate(zip(POINTS, COLORS, TRACKS, strict=True)):
+        points += " ".join(map(str, (i + 1, *xyz, *rgb, 0.5))) + "".join(f" {image} 0" for image in track) + "\n"
+    (sparse / "points3D.txt").write_text(points)
     return root
 
 
@@ -161,7 +176,7 @@ def nerfstudio(root: Path) -> Path:
 
 
 GOOD: dict[str, Callable[[Path], Path]] = {
-    "colmap": colmap_bin, "blender": blender, "nerfstudio": nerfstudio,
+    "colmap": colmap_bin, "colmap_txt": colmap_txt, "blender": blender, "nerfstudio": nerfstudio,
 }  # fmt: skip
 """What writes each of them."""
 

@@ -29,7 +29,7 @@ CLEAR = "outputs/clear"
 
 def your_data() -> None:
     """What the pages call my/photos, my/fern, sr and span_x4.onnx, all tiny."""
-    captures.colmap_bin(Path("my/photos"))
+    captures.colmap_txt(Path("my/photos"))
     captures.llff(Path("my/fern"))
     Path("sr").mkdir()
     for i, name in enumerate(captures.NAMES):

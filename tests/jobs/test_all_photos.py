@@ -31,7 +31,7 @@ def used_by_default(folder: Path) -> tuple[int, int, int]:
     return len(capture.frames), len(pool), len(test)
 
 
-@pytest.mark.parametrize("write", [captures.colmap_bin, captures.llff, captures.nerfstudio])
+@pytest.mark.parametrize("write", [captures.colmap_bin, captures.colmap_txt, captures.llff, captures.nerfstudio])
 def test_every_readers_default_trains_on_all_photos(write: Callable[[Path], Path], tmp_path: Path) -> None:
     assert used_by_default(write(tmp_path)) == (3, 3, 0)
 

@@ -40,7 +40,7 @@ def test_a_name_that_is_no_text_is_refused_before_training(whose: str):
     named = {
         "capture": {"name": name},
         "frame": {"frames": (replace(capture.frames[0], name=name), *capture.frames[1:])},
-        "unplaced": {"unplaced": (name,)},
+        "unplaced": {"unplaced": {name: "blurred"}},
     }
     with pytest.raises(DataError, match=r"^photo_\\udce9: name: must be UTF-8"):
         load(DataSettings(reader=lambda: replace(capture, **named[whose])), AutoPrior(), 0)

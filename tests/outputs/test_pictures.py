@@ -50,7 +50,7 @@ def test_a_point_is_seen_by_the_photos_whose_frame_it_lies_in(monkeypatch: pytes
 
 
 def test_the_map_has_the_colours_of_its_legend_and_dollars_are_no_mathematics(tmp_path: Path) -> None:
-    scene = replace(SCENE, unplaced=("b$1_$.jpg",))
+    scene = replace(SCENE, unplaced={"b$1_$.jpg": "12 features: blurred, dark, or without texture"})
     coverage.write_coverage(tmp_path / "coverage.png", scene, wall.painter(), "toy $20_$")
     drawn = torch.from_numpy(read(tmp_path / "coverage.png").copy()).flatten(0, 1)
     for color in coverage._COLORS:

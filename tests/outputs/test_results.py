@@ -56,11 +56,14 @@ def names(folder: Path) -> set[str]:
     return {path.name + "/" * path.is_dir() for path in folder.iterdir()}
 
 
-def test_the_history_and_its_mean_are_kept_and_the_ply_says_how_it_was_drawn(tmp_path, state) -> None:
+def test_conflict_csv_holds_columns_of_history_csv_and_the_ply_says_how_it_was_drawn(tmp_path, state) -> None:
     evaluation = write(tmp_path, state, pictures=NO_PICTURES)
-    history = list(csv.DictReader((tmp_path / "history.csv").open(newline="")))
-    assert {"t", "conflict", "conflict_means", "corrected", "mean_q", "mean_w"} <= set(history[0])
-    mean = sum(float(row["conflict"]) for row in history) / len(history)
+    history, conflict = (
+        list(csv.DictReader((tmp_path / f"{name}.csv").open(newline=""))) for name in ("history", "conflict")
+    )
+    assert conflict == [{column: row[column] for column in conflict[0]} for row in history]
+    assert {"t", "conflict", "conflict_means", "corrected", "mean_q", "mean_w"} <= set(conflict[0])
+    mean = sum(float(row["conflict"]) for row in conflict) / len(conflict)
     content = json.loads((tmp_path / "metrics.json").read_text())
     assert content["conflict"]["gaussian"] == pytest.approx(mean)
     assert content["test"]["mean"]["ours"] == pytest.approx(asdict(evaluation.mean("test")))

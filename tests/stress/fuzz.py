@@ -98,6 +98,8 @@ def binary(folder: Path) -> dict[str, Target]:
 
 def text(folder: Path) -> dict[str, Target]:
     """Text files by their own readers; and PNG, whose decoder is a library."""
+    model = GOOD["colmap_txt"](folder / "txt") / "sparse" / "0"
+    cameras, images, points = (model / f"{name}.txt" for name in ("cameras", "images", "points3D"))
     photo, shared = GOOD["colmap"](folder / "photo") / "images" / "b.png", GOOD["nerfstudio"](folder / "nerfstudio")
 
     def read_photo() -> None:
@@ -105,6 +107,9 @@ def text(folder: Path) -> dict[str, Target]:
         _require(image.dim() == 3 and bool(image.isfinite().all()))
 
     return {
+        "COLMAP cameras.txt": ([cameras], lambda: _require_lenses(colmap_model.read_cameras(cameras).values())),
+        "COLMAP images.txt": ([images], lambda: _require_images(colmap_model.read_images(images))),
+        "COLMAP points3D.txt": ([points], lambda: _require_points(colmap_model.read_points(points))),
         "transforms.json": ([shared / "transforms.json"], lambda: _require_capture(nerfstudio.read(shared))),
         "PNG": ([photo], read_photo),
     }
@@ -119,7 +124,8 @@ def scenes(folder: Path) -> dict[str, Target]:
         return files, lambda: _require_capture(read(root))
 
     return {
-        "COLMAP scene": target("colmap", colmap.read),
+        "COLMAP binary scene": target("colmap", colmap.read),
+        "COLMAP text scene": target("colmap_txt", colmap.read),
     }
 
 

@@ -19,7 +19,7 @@ from clear_strategies.geometry.pseudo_views import border_views
 from clear_strategies.merging.objective import Objective
 from clear_strategies.training.loop import iterate
 from tests.helpers import planes
-from tests.helpers.captures import colmap_bin
+from tests.helpers.captures import colmap_txt
 from tests.helpers.short_run import SCENE, start, tensors
 from tests.helpers.toy import RASTERIZER
 
@@ -81,7 +81,7 @@ def test_an_lr_pixel_is_hidden_where_a_photo_pixel_below_it_is():
 
 
 def test_masks_beside_the_photos_folder_are_found_by_either_name(tmp_path):
-    capture = colmap_bin(tmp_path)
+    capture = colmap_txt(tmp_path)
     photos, lens = sorted((capture / "images").iterdir()), Lens(16, 12, 20.0, 20.0, 8.0, 6.0)
     for photo, name in zip(photos[:2], (f"{photos[0].stem}.png", f"{photos[1].name}.png"), strict=True):
         write_png(capture / "masks" / name, torch.zeros(1, 1, 3))

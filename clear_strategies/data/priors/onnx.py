@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,9 @@ from clear_strategies.errors import DataError
 
 _LARGEST_FILE: Final = 2 << 30  # bytes; protobuf's own limit
 _LARGEST_VALUE: Final = 1e6  # neither a [0, 1] nor a [0, 255] network gives more
+# A protobuf entry with the key "location" (field 1, length 8, in any valid encoding of these numbers) names a file of
+# weights beside the model. OpenCV would open any path named there.
+_EXTERNAL_DATA: Final = re.compile(rb"(?:\x0a|\x8a\x80*\x00)(?:\x08|\x88\x80*\x00)location")
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,8 +86,13 @@ def _read_network(path: Path) -> Any:
     require_file(path, "a network in ONNX")
     if path.stat().st_size > _LARGEST_FILE:
         raise DataError(path, "size", "is more than 2 GiB, which no ONNX file is", "check the path")
+    data = path.read_bytes()
+    if _EXTERNAL_DATA.search(data):
+        raise DataError(
+            path, "weights", "lie in other files (ONNX external data)", "save the model with its weights inside"
+        )
     try:
-        return cv2.dnn.readNetFromONNX(np.frombuffer(path.read_bytes(), np.uint8))
+        return cv2.dnn.readNetFromONNX(np.frombuffer(data, np.uint8))
     except cv2.error as error:
         problem = f"is no ONNX network that OpenCV can read ({error.err})"
         raise DataError(path, "network", problem, "export it as ONNX, opset 11 to 17, weights inside") from error

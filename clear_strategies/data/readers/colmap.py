@@ -53,7 +53,7 @@ def read(
     root, background = Path(root), as_color("data.reader.background", background)
     model = read_model(find_model(root))
     folder = image_folder(root, images)
-    listing = model.folder / "images.bin"
+    listing = model.folder / f"images{model.ending}"
     paths = _photos(folder, [image.name for image in model.images])
     if not any(map(is_file, paths.values())):
         first, photos = min(paths), images_in(folder)
@@ -91,7 +91,7 @@ def capture(
     Raises:
         DataError: an image cannot be used.
     """
-    listing = model.folder / "images.bin"
+    listing = model.folder / f"images{model.ending}"
     kept = usable(listing, model.images, lambda image: paths[image.name], skip_faulty=skip_faulty)
     frames = [
         Frame.of_photo(
@@ -102,7 +102,7 @@ def capture(
     ]  # fmt: skip
     some_of = f" of its {len(model.images)}" if len(frames) < len(model.images) else ""
     notes = {
-        "poses": f"COLMAP {_label(root, model)}, {len(frames)}{some_of} images",
+        "poses": f"COLMAP {_label(root, model)} ({model.ending[1:]}), {len(frames)}{some_of} images",
         "photos": folder_note(folder),
     }
     pattern = "**/*" if any(path.parent != folder for path in paths.values()) else "*"

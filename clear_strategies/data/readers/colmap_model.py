@@ -1,14 +1,15 @@
-"""COLMAP's sparse models, read strictly: every number must be finite and every id known.
+"""COLMAP's sparse models, binary (.bin) or text (.txt), read strictly: every number must be finite and every id known.
 
 pycolmap is no substitute: it reads a points3D.bin that is cut in half without an error.
 """
 
 from __future__ import annotations
 
+import io
 import logging
 import math
 import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
@@ -35,6 +36,7 @@ _TWO_FOCAL_LENGTHS: Final = ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE
 _LONGEST_NAME: Final = 4096
 
 _T = TypeVar("_T")
+_Number = TypeVar("_Number", int, float)
 
 
 class Image(NamedTuple):
@@ -62,9 +64,10 @@ class Points:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Model:
-    """The content of a sparse model's files."""
+    """The content of a sparse model's files, whose `ending` is .bin or .txt."""
 
     folder: Path
+    ending: str
     lenses: dict[int, Lens]
     images: list[Image]
     points: Points
@@ -76,7 +79,7 @@ def model_folders(root: Path) -> tuple[Path, ...]:
 
 
 def is_model(folder: Path) -> bool:
-    return any((folder / name).is_file() for name in ("cameras.bin", "images.bin"))
+    return any((folder / f"{name}{ending}").is_file() for name in ("cameras", "images") for ending in (".bin", ".txt"))
 
 
 def find_model(root: Path) -> Path:
@@ -89,16 +92,15 @@ def find_model(root: Path) -> Path:
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
     folder = next(filter(is_model, model_folders(root)), None)
     if folder is None:
-        texts = (there for there in model_folders(root) if (there / "cameras.txt").is_file())
-        remedy = "run COLMAP first, or use data=photos for photos without poses"
-        if (text := next(texts, None)) is not None:
-            remedy = f"colmap model_converter --output_type BIN --input_path {text} --output_path {text}"
-        raise DataError(root, "sparse model", "no cameras.bin in sparse/0, sparse, colmap/sparse/0 or here", remedy)
+        raise DataError(
+            root, "sparse model", "no cameras.bin or cameras.txt in sparse/0, sparse, colmap/sparse/0 or here",
+            "run COLMAP first, or use data=photos for photos without poses",
+        )  # fmt: skip
     numbered = sorted(folder.parent.glob("[1-9]*")) if folder.name == "0" else []
     models = [folder, *filter(is_model, numbered)]
     if len(models) == 1:
         return folder
-    photos = {model: len(read_images(model / "images.bin")) for model in models}
+    photos = {model: len(read_images(model / f"images{_ending(model)}")) for model in models}
     largest = max(models, key=lambda model: photos[model])
     others = ", ".join(f"{model.name} with {photos[model]}" for model in models if model != largest)
     _log.warning(
@@ -114,7 +116,8 @@ def read_model(folder: Path) -> Model:
     Raises:
         DataError: a file is missing or not what it should be.
     """
-    cameras, listing, points3d = (folder / f"{name}.bin" for name in ("cameras", "images", "points3D"))
+    ending = _ending(folder)
+    cameras, listing, points3d = (folder / f"{name}{ending}" for name in ("cameras", "images", "points3D"))
     lenses, images = read_cameras(cameras), read_images(listing)
     if not images:
         raise DataError(listing, "images", "there is none", "run COLMAP's mapper to its end")
@@ -125,17 +128,18 @@ def read_model(folder: Path) -> Model:
     unknown = np.setdiff1d(points.track[:, 1], [image.id for image in images])
     if len(unknown):
         raise _damaged(points3d, "track", f"names the unknown image {unknown[0]}")
-    return Model(folder, lenses, images, points)
+    return Model(folder, ending, lenses, images, points)
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:
     """The lens of each camera, by its id; the DataErrors of `read_model`."""
-    return _by_id(path, _cameras(path))
+    return _by_id(path, _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path))
 
 
 def read_images(path: Path) -> list[Image]:
     """The registered images of a file, in its order; the DataErrors of `read_model`."""
-    images = _by_id(path, ((image.id, image) for image in _images(path)))
+    records = _binary_images(path) if path.suffix == ".bin" else _text_images(path)
+    images = _by_id(path, ((image.id, image) for image in records))
     for image in images.values():
         where = image.name or f"image {image.id}"
         if not all(abs(x) < FARTHEST for x in (*image.quat, *image.translation)):
@@ -154,9 +158,16 @@ def pose_of(image: Image) -> Float[Tensor, "4 4"]:
     return pose
 
 
+def _ending(folder: Path) -> str:
+    """The ending of a model's files. If there is any binary file, text files are ignored."""
+    return ".bin" if any((folder / f"{name}.bin").exists() for name in ("cameras", "images", "points3D")) else ".txt"
+
+
 def read_points(path: Path) -> Points:
     """The points with their tracks; none where there is no file."""
-    records = list(_points(path)) if path.exists() else []
+    records: list[_Point] = []
+    if path.exists():
+        records = list(_binary_points(path) if path.suffix == ".bin" else _text_points(path))
     if not records:
         return Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 2), np.int64))
     ids, positions, colors, tracks = zip(*records, strict=True)
@@ -242,7 +253,7 @@ class _Bytes:
             raise _damaged(self.path, "end", f"{self.left} bytes are left over")
 
 
-def _cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
     file = _Bytes(path)
     for i in range(file.count("number of cameras", 24 + 3 * 8)):
         number, kind, *size = file.take("<iiQQ", f"camera {i}")
@@ -252,7 +263,7 @@ def _cameras(path: Path) -> Iterator[tuple[int, Lens]]:
     file.finish()
 
 
-def _images(path: Path) -> Iterator[Image]:
+def _binary_images(path: Path) -> Iterator[Image]:
     file = _Bytes(path)
     for i in range(file.count("number of images", 4 + 7 * 8 + 4 + 1 + 8)):
         number, *pose, camera = file.take("<i7di", f"image {i}")
@@ -263,7 +274,7 @@ def _images(path: Path) -> Iterator[Image]:
     file.finish()
 
 
-def _points(path: Path) -> Iterator[_Point]:
+def _binary_points(path: Path) -> Iterator[_Point]:
     file = _Bytes(path)
     for i in range(file.count("number of points", 8 + 24 + 3 + 8 + 8)):
         record = file.take("<Q3d3Bd", f"point {i}")  # id, position, colour, error
@@ -272,3 +283,74 @@ def _points(path: Path) -> Iterator[_Point]:
         file.at += 8 * length
         yield record[0], record[1:4], record[4:7], track
     file.finish()
+
+
+def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+    for line, cells in _rows(path):
+        if len(cells) < 4:
+            raise _damaged(path, f"line {line}", f"has {len(cells)} of at least 5 columns")
+        number, width, height = _numbers(path, line, (cells[0], *cells[2:4]), _whole)
+        expected = _parameters_of(path, cells[1])
+        if len(cells) != 4 + expected:
+            problem = f"has {len(cells) - 4} parameters, {cells[1]} has {expected}"
+            raise _damaged(path, f"line {line}", problem)
+        yield number, _lens(path, f"line {line}", cells[1], (width, height), _numbers(path, line, cells[4:], float))
+
+
+def _text_images(path: Path) -> Iterator[Image]:
+    """Two lines per image: its pose, then its 2D points, which are not used and may be none."""
+    lines = iter(_lines(path))
+    for line, text in lines:
+        if not text.strip() or text.startswith("#"):
+            continue
+        cells = text.split(maxsplit=9)
+        if len(cells) != 10:
+            raise _damaged(path, f"line {line}", f"has {len(cells)} of 10 columns")
+        number, camera = _numbers(path, line, (cells[0], cells[8]), _whole)
+        pose = _numbers(path, line, cells[1:8], float)
+        yield Image(number, tuple(pose[:4]), tuple(pose[4:]), camera, cells[9].strip())
+        second = next(lines, None)
+        if second is None or len(second[1].split()) % 3 or second[1].startswith("#"):
+            problem = "is no line of 2D points (X Y POINT3D_ID, or empty) for the image above it"
+            raise _damaged(path, f"line {line + 1}", problem)
+
+
+def _text_points(path: Path) -> Iterator[_Point]:
+    for line, cells in _rows(path):
+        if len(cells) < 8 or len(cells) % 2:
+            raise _damaged(path, f"line {line}", f"has {len(cells)} columns where 8 and pairs belong")
+        color = _numbers(path, line, cells[4:7], _whole)
+        if not all(0 <= c <= 255 for c in color):
+            raise DataError(path, f"line {line}", f"has the colour {color}", "colours lie in 0..255")
+        track = np.array(_numbers(path, line, cells[8::2], _whole), np.int64)
+        yield _numbers(path, line, cells[:1], _whole)[0], _numbers(path, line, cells[1:4], float), color, track
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    try:
+        text = io.StringIO(read_bytes(path).decode(), newline=None).read()  # with every line break as \n
+    except UnicodeDecodeError as error:
+        raise _damaged(path, "file", "is no UTF-8 text") from error
+    if text.startswith("\ufeff"):
+        raise DataError(path, "line 1", "starts with a byte-order mark", "save it as UTF-8 without one")
+    return list(enumerate(text.split("\n"), start=1))
+
+
+def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    for line, text in _lines(path):
+        if text.strip() and not text.startswith("#"):
+            yield line, text.split()
+
+
+def _numbers(path: Path, line: int, cells: Sequence[str], kind: Callable[[str], _Number]) -> list[_Number]:
+    try:
+        return [kind(cell) for cell in cells]
+    except ValueError as error:
+        comma = "; write a decimal point, not a comma" if any("," in cell for cell in cells) else ""
+        raise _damaged(path, f"line {line}", f"is not numeric ({str(error)[:80]}){comma}") from error
+
+
+def _whole(cell: str) -> int:
+    if not -(1 << 63) <= (number := int(cell)) < 1 << 63:
+        raise ValueError(f"{cell[:40]} has more than 64 bits")
+    return number

@@ -13,15 +13,18 @@ from typing import Final, Literal
 from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.photo_files import Exif, image_size, read_exif
-from clear_strategies.data.photo_folders import images_in, list_images, require_text, usable
+from clear_strategies.data.photo_folders import images_in, list_images, require_text, some, usable
 from clear_strategies.data.priors import cache_folder
 from clear_strategies.data.readers import colmap, sfm
 from clear_strategies.data.readers.colmap_model import read_model
+from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
 
 _log = logging.getLogger(__name__)
 
+_HEIC: Final = (".heic", ".heif")
 _FEW: Final = 30  # photos, up to which precise=auto is true
+_STOPS: Final = 0.5  # larger differences of exposure give a warning
 
 
 def recognises(path: Path) -> int:
@@ -98,27 +101,50 @@ def _capture(root: Path, photos: Mapping[Path, Exif], folder: Path) -> Capture:
     model, photo_of = read_model(folder), {sfm.copy_name(i): path for i, path in enumerate(photos)}
     posed = {image.name: photo_of[image.name] for image in model.images}
     capture = colmap.capture(root, model, root, posed, upright=True)
-    unplaced = [path.name for name, path in photo_of.items() if name not in posed]
+    unplaced = read_object(folder / sfm.UNPLACED)
     sfm.warn_unplaced(root, unplaced, len(photos))
     notes = {
         **capture.notes,
         "poses": f"estimated by pycolmap from all {len(photos)} photos, {len(capture.frames)} could be placed",
         "photos": root.name,
+        **_exposure(photos),
     }
     points = colmap.sfm_points(model, "estimated here by pycolmap")
-    return replace(capture, points=points, notes=notes, unplaced=tuple(unplaced))
+    return replace(capture, points=points, notes=notes, unplaced=unplaced)
 
 
 def _once_each(paths: Sequence[Path]) -> list[Path]:
-    """The paths, unless two are of one stem, as a photo that is saved in two formats."""
-    same = [stem for stem, count in Counter(path.stem for path in paths).items() if count > 1]
+    """Without the HEIC file of a photo that a phone has saved as JPEG, too."""
+    stems = {path.stem for path in paths if path.suffix.lower() not in _HEIC}
+    twice = [path.name for path in paths if path.suffix.lower() in _HEIC and path.stem in stems]
+    if twice:
+        _log.info("%d photos are there twice; their HEIC files are not used: %s.", len(twice), some(twice))
+    kept = [path for path in paths if path.name not in twice]
+    same = [stem for stem, count in Counter(path.stem for path in kept).items() if count > 1]
     if same:
-        raise DataError(paths[0].parent, "file name", f"{same[0]!r} has several files", "keep one file of each photo")
-    return list(paths)
+        raise DataError(kept[0].parent, "file name", f"{same[0]!r} has several files", "keep one file of each photo")
+    return kept
+
+
+def _exposure(photos: Mapping[Path, Exif]) -> dict[str, str]:
+    """A note where the exposures in EXIF differ; `ViewSettings.equalize` corrects that."""
+    known = {path.name: exif.exposure for path, exif in photos.items() if exif.exposure is not None}
+    if len(known) < 2:
+        return {}
+    low, high = min(known, key=lambda name: known[name]), max(known, key=lambda name: known[name])
+    stops = known[high] - known[low]
+    if stops <= _STOPS:
+        return {}
+    text = f"differs by {stops:.1f} stops between {low} and {high} (EXIF)"
+    _log.warning(
+        "the photos' exposure %s. data.views.equalize=true, the default here, evens it out, except where light is clipped. "
+        "Lock it next time.", text,
+    )  # fmt: skip
+    return {"exposure": text}
 
 
 def _key(paths: Sequence[Path], *settings: int) -> str:
-    digest = hashlib.sha256(repr(("upright copies, points of two views, guided", *settings)).encode())
+    digest = hashlib.sha256(repr(("upright copies, points of two views, guided, reasons in words", *settings)).encode())
     for path in paths:
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:24]

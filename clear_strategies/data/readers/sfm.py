@@ -6,12 +6,13 @@ EXIF share a camera, whose estimate starts at that focal length.
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import signal
 import tempfile
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -31,8 +32,11 @@ MORE_PHOTOS: Final = (
 )
 MODEL: Final = "cameras.bin"
 """The file of a model that exists only if the model is complete."""
+UNPLACED: Final = "unplaced.json"
+"""A file in the model's folder: why the pose is unknown, for each photo without one, by its name."""
 _DATABASE: Final = "database.db"
-_LISTED: Final = 8  # photos without a pose in the warning, at most
+_FEW_FEATURES: Final = 200  # a photo with fewer shows too little
+_LISTED: Final = 3  # photos without a pose in the warning, at most
 _MEGA: Final = 1 << 20
 _DISTANCES: Final = 4  # bytes of each pair of features that are compared
 _MEMORY: Final = 4 << 30  # bytes that all threads together may take in matching
@@ -82,6 +86,9 @@ def reconstruct(root: Path, photos: Mapping[Path, Exif], folder: Path, settings:
             result = Path(work) / "result"
             result.mkdir()
             models[0].write_binary(str(result))
+            placed = {image.name for image in models[0].images.values()}
+            names = [path.name for path in photos]
+            files.write_json(result / UNPLACED, _unplaced(pycolmap, Path(work) / _DATABASE, names, placed))
             files.install(result, folder, MODEL)
     except RuntimeError as error:
         raise DataError(root, "poses", f"structure-from-motion failed ({error})", MORE_PHOTOS) from error
@@ -213,12 +220,39 @@ def _pycolmap() -> Any:
     return pycolmap
 
 
-def warn_unplaced(root: Path, unplaced: Sequence[str], count: int) -> None:
-    """Log which of `count` photos have no pose."""
+def _unplaced(pycolmap: Any, database: Path, names: Sequence[str], placed: Set[str]) -> dict[str, str]:
+    """Why each photo that is not placed has no pose: its features, or the placed photo that it has most in common with.
+
+    Args:
+        names: of the photos, in the order of their copies.
+        placed: the names of the placed copies.
+    """
+    with pycolmap.Database.open(database) as opened:
+        copies = {image.image_id: image.name for image in opened.read_all_images()}
+        features = {number: opened.num_keypoints_for_image(number) for number in copies}
+        pairs = list(zip(*opened.read_two_view_geometry_num_inliers(), strict=True))
+    name_of = {copy_name(i): name for i, name in enumerate(names)}
+    most = {number: (0, "") for number, copy in copies.items() if copy not in placed}
+    for pair, matches in pairs:
+        for number, other in itertools.permutations(pycolmap.pair_id_to_image_pair(pair)):
+            if number in most and copies[other] in placed:
+                most[number] = max(most[number], (matches, name_of[copies[other]]))
+    return {name_of[copies[number]]: _why(features[number], *best) for number, best in most.items()}
+
+
+def _why(features: int, matches: int, other: str) -> str:
+    if features < _FEW_FEATURES:
+        return f"{features} features: blurred, dark, or without texture"
+    if not matches:
+        return "shares nothing with the placed photos: overlap by two thirds"
+    return f"{matches} features in common with {other}, less with every other photo: more overlap"
+
+
+def warn_unplaced(root: Path, unplaced: Mapping[str, str], count: int) -> None:
+    """Log which of `count` photos have no pose, and why."""
     if unplaced:
         placed = count - len(unplaced)
+        listed = "; ".join(f"{name} ({why})" for name, why in list(unplaced.items())[:_LISTED])
         more = f"; and {len(unplaced) - _LISTED} more" if len(unplaced) > _LISTED else ""
-        message = (
-            "%s: %d of %d photos could be placed (%.0f%%). Without a pose: %s%s. Blurred, dark, or too little overlap."
-        )
-        _log.warning(message, root, placed, count, 100 * placed / count, ", ".join(unplaced[:_LISTED]), more)
+        message = "%s: %d of %d photos could be placed (%.0f%%). Without a pose: %s%s."
+        _log.warning(message, root, placed, count, 100 * placed / count, listed, more)

@@ -1,4 +1,4 @@
-"""COLMAP models: photos and points are those of the files, lenses are straightened, photos are found."""
+"""COLMAP models: both layouts give the same scene, lenses are straightened, photos are found."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ from PIL import Image
 from clear_strategies.data import photo_files
 from clear_strategies.data.lenses import Lens
 from clear_strategies.data.readers import colmap
-from clear_strategies.errors import DataError
 from tests.helpers import captures as tiny
 
+LAYOUTS = {"bin": tiny.colmap_bin, "txt": tiny.colmap_txt}
 
-def test_photos_and_points_are_those_of_the_files(tmp_path: Path) -> None:
-    capture = colmap.read(tiny.colmap_bin(tmp_path))
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_photos_and_points_are_those_of_the_files(layout: str, tmp_path: Path) -> None:
+    capture = colmap.read(LAYOUTS[layout](tmp_path))
     assert [frame.name for frame in capture.frames] == list(tiny.NAMES)
     assert [frame.sfm_id for frame in capture.frames] == [1, 2, 3]
     for frame in capture.frames:
@@ -30,7 +32,7 @@ def test_photos_and_points_are_those_of_the_files(tmp_path: Path) -> None:
     pairs = sorted(zip(points.track_point.tolist(), points.track_image.tolist(), strict=True))
     assert pairs == [(0, 1), (0, 2), (1, 2), (1, 3)]
     assert points.source == "COLMAP sparse/0, 2 points, triangulated from all 3 images"
-    assert capture.notes["poses"] == "COLMAP sparse/0, 3 images"
+    assert capture.notes["poses"] == f"COLMAP sparse/0 ({layout}), 3 images"
 
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
@@ -64,10 +66,13 @@ def test_a_folder_is_listed_once_however_many_endings_differ(tmp_path: Path, mon
 
 
 def test_photos_may_all_lie_in_subfolders_with_masks_in_subfolders_of_the_same_names(tmp_path: Path) -> None:
-    tiny.colmap_bin(tmp_path, names=[f"cam_{name[0]}/1.png" for name in tiny.NAMES])
+    listing = tiny.colmap_txt(tmp_path) / "sparse/0/images.txt"
+    text = listing.read_text()
     for name in tiny.NAMES:
         (tmp_path / f"images/cam_{name[0]}").mkdir()
         (tmp_path / "images" / name).rename(tmp_path / f"images/cam_{name[0]}/1.png")
+        text = text.replace(f" {name}\n", f" cam_{name[0]}/1.png\n")
+    listing.write_text(text)
     for place, grey in (("cam_a/1.png.png", 0.0), ("cam_b/1.png", 1.0)):
         photo_files.write_png(tmp_path / "masks" / place, torch.full((12, 16), grey))
     shutil.copytree(tmp_path / "images/cam_a", tmp_path / "images/cam_d")
@@ -79,29 +84,26 @@ def test_photos_may_all_lie_in_subfolders_with_masks_in_subfolders_of_the_same_n
 
 
 def test_of_several_models_the_one_with_most_photos_is_read(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    tiny.colmap_bin(tmp_path / "small", names=tiny.NAMES[:2])
-    shutil.move(tiny.colmap_bin(tmp_path) / "sparse/0", tmp_path / "sparse/1")
-    shutil.move(tmp_path / "small/sparse/0", tmp_path / "sparse/0")
+    tiny.colmap_txt(tmp_path)
+    small = tmp_path / "sparse/0"
+    shutil.copytree(small, tmp_path / "sparse/1")
+    lines = (small / "images.txt").read_text().splitlines(keepends=True)
+    (small / "images.txt").write_text("".join(lines[:-2]))  # an image has two lines
+    (small / "points3D.txt").unlink()
     with caplog.at_level("WARNING"):
         assert len(colmap.read(tmp_path).frames) == 3
     assert "The largest, 1 with 3 photos, is used; the others are not: 0 with 2." in caplog.text
 
 
 def test_a_missing_file_of_points_and_a_quaternion_of_another_length_are_noted(tmp_path: Path) -> None:
-    (tiny.colmap_bin(tmp_path, length=1.5) / "sparse/0/points3D.bin").unlink()
+    file = tiny.colmap_txt(tmp_path) / "sparse/0/images.txt"
+    file.write_text(file.read_text().replace("1 1.0 0.0 0.0 0.0", "1 1.5 0.0 0.0 0.0"))
+    (tmp_path / "sparse/0/points3D.txt").unlink()
     capture = colmap.read(tmp_path)
     assert capture.points is None
     assert capture.notes["points"] == "the model has none"
     np.testing.assert_allclose(capture.frames[0].camera.world_to_camera.numpy(), tiny.world_to_camera(0))
-    assert capture.notes["rotations"].startswith("3 quaternions")
-
-
-def test_a_model_in_text_is_refused_with_the_command_that_converts_it(tmp_path: Path) -> None:
-    folder = tiny.colmap_bin(tmp_path) / "sparse/0"
-    for file in folder.iterdir():
-        file.rename(file.with_suffix(".txt"))
-    with pytest.raises(DataError, match=f"colmap model_converter --output_type BIN --input_path {folder}"):
-        colmap.read(tmp_path)
+    assert capture.notes["rotations"].startswith("1 quaternions")
 
 
 LENSES = [

@@ -37,7 +37,7 @@ def test_poses_are_those_of_the_ground_truth(shared_data, tmp_path, monkeypatch)
     capture = photos.read(folder, tmp_path / "cache", threads=1)
     assert [frame.name for frame in capture.frames] == [frame.name for frame in truth]
     assert "estimated by pycolmap from all 6 photos, 5 could be placed" in capture.notes["poses"]
-    assert capture.unplaced == ("z_flat.png",)
+    assert capture.unplaced == {"z_flat.png": "0 features: blurred, dark, or without texture"}
     assert len(capture.points.means) > 100
 
     assert largest_turn(capture.frames, truth) < 1
@@ -83,8 +83,10 @@ def test_a_run_that_is_terminated_while_it_reads_photos_ends_without_a_stack_tra
     assert (ended.returncode, ended.stderr) == (-signal.SIGTERM, "")
 
 
-def database_of(file: Path, features: dict[int, int]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """COLMAP's database of photos, by their number of features; keypoints and descriptors of each."""
+def database_of(
+    file: Path, features: dict[int, int], pairs: dict[tuple[int, int], int]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """COLMAP's database of photos, by their number of features and of matches in pairs; keypoints and descriptors of each."""
     rng, kind = np.random.default_rng(0), pycolmap.FeatureExtractorType.SIFT
     found = [(rng.random((n, 6), np.float32), rng.integers(0, 255, (n, 128), np.uint8)) for n in features.values()]
     with pycolmap.Database.open(file) as database:
@@ -93,7 +95,22 @@ def database_of(file: Path, features: dict[int, int]) -> list[tuple[np.ndarray, 
             image = database.write_image(pycolmap.Image(sfm.copy_name(number), camera_id=camera))
             database.write_keypoints(image, keypoints)
             database.write_descriptors(image, pycolmap.FeatureDescriptors(kind, descriptors))
+        for (one, other), matches in pairs.items():
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.inlier_matches = np.zeros((matches, 2), np.uint32)
+            database.write_two_view_geometry(one + 1, other + 1, geometry)  # COLMAP counts from 1
     return found
+
+
+def test_a_photo_without_a_pose_is_told_with_the_placed_photo_that_it_has_most_in_common_with(tmp_path: Path) -> None:
+    pairs = {(0, 1): 300, (0, 2): 9, (1, 2): 14, (2, 3): 80}
+    database_of(tmp_path / "database.db", {0: 1000, 1: 1000, 2: 1000, 3: 1000, 4: 7}, pairs)
+    names = ["a.png", "b.png", "c.png", "d.png", "e.png"]
+    assert sfm._unplaced(pycolmap, tmp_path / "database.db", names, {sfm.copy_name(0), sfm.copy_name(1)}) == {
+        "c.png": "14 features in common with b.png, less with every other photo: more overlap",
+        "d.png": "shares nothing with the placed photos: overlap by two thirds",
+        "e.png": "7 features: blurred, dark, or without texture",
+    }
 
 
 @pytest.mark.parametrize(("placed", "count"), [(4, 10), (5, 12), (7, 100), (106, 1000)])
@@ -122,6 +139,7 @@ class FakeModel:
 @pytest.fixture
 def estimate(tmp_path, monkeypatch):
     """Estimates the poses of ten photos, with a function in place of COLMAP's pipeline."""
+    monkeypatch.setattr(sfm, "_unplaced", lambda *_: {})
     photos = {tmp_path / f"{i}.jpg": Exif() for i in range(10)}
 
     def run(mapping):
@@ -166,7 +184,7 @@ def test_the_memory_of_matching_is_bounded_on_machines_of_many_cores(monkeypatch
 
 def test_no_photo_has_more_features_than_asked_for(tmp_path: Path) -> None:
     file = tmp_path / "database.db"
-    found = database_of(file, {0: 3, 1: 7})
+    found = database_of(file, {0: 3, 1: 7}, {})
     sfm._keep_coarsest(pycolmap, file, 5)
     with pycolmap.Database.open(file) as database:
         for image, (keypoints, descriptors) in enumerate(found, start=1):

@@ -6,6 +6,7 @@ Structure from motion is replaced by a model that is there already, of three pho
 from __future__ import annotations
 
 import shutil
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -34,6 +35,7 @@ def of_photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Re
         for path in found:  # it makes copies of all of them
             read_image(path, turn=True)
         shutil.copytree(model, folder)
+        (folder / photos.sfm.UNPLACED).write_text("{}")
 
     monkeypatch.setattr(photos.sfm, "reconstruct", reconstruct)
     captures.write_photos(tmp_path / "photos")
@@ -52,6 +54,13 @@ def again(folder: Path, name: str, **saving) -> None:
     image.save(folder / name, **saving)
 
 
+def as_heic(folder: Path, name: str) -> None:
+    heif = pytest.importorskip("pillow_heif")
+    heif.register_heif_opener()
+    image_of(folder / "b.png").resize((64, 48)).save(folder / "b.png")
+    again(folder, name, format="HEIF")
+
+
 def beside(folder: Path, *names: str) -> None:
     for name in names:
         (folder / name).write_bytes(b"never opened")
@@ -66,6 +75,9 @@ def as_portrait(folder: Path) -> None:
 # What the folder holds, and the photos that are then used.
 ALL = list(NAMES)
 READ: dict[str, tuple[Callable[[Path], object], list[str]]] = {
+    "HEIC among others": (lambda f: as_heic(f, "b.heic"), ["a.png", "b.heic", "c.png"]),
+    "HEIC that calls itself JPEG": (lambda f: as_heic(f, "b.jpg"), ["a.png", "b.jpg", "c.png"]),
+    "a photo saved as HEIC and as JPEG": (lambda f: beside(f, "b.HEIC"), ALL),
     "what a Mac and a phone leave": (lambda f: beside(f, "._a.png", ".DS_Store", "clip.mov", "Thumbs.db"), ALL),
     "links to another folder": (lambda f: captures.link(f, f.parent / "elsewhere"), ALL),
     "a link to nowhere": (lambda f: (f / "d.png").symlink_to(f / "gone.png"), ALL),
@@ -80,11 +92,13 @@ READ: dict[str, tuple[Callable[[Path], object], list[str]]] = {
 
 
 @pytest.mark.parametrize("name", READ)
-def test_untidy_photos_that_can_be_read_are_read(of_photos, name):
+def test_untidy_photos_that_can_be_read_are_read(of_photos, name, caplog):
     folder, read = of_photos
     make, expected = READ[name]
     make(folder)
-    capture = read()
+    with caplog.at_level("INFO"):
+        capture = read()
+    assert name != "a photo saved as HEIC and as JPEG" or "b.HEIC" in caplog.text
     assert [frame.name for frame in capture.frames] == expected
     assert all(bool(frame.load().isfinite().all()) for frame in capture.frames)
 
@@ -147,3 +161,22 @@ def test_poses_of_the_cache_are_refused_and_taken_as_those_just_estimated(of_pho
     assert len(read(least_placed=0.4).frames) == 3
     with pytest.raises(DataError, match=r"only 3 of the 7 photos .*data\.reader\.least_placed=0\.428"):
         read(least_placed=0.5)
+
+
+def test_heic_without_its_library_is_named_with_the_extra(of_photos, monkeypatch):
+    folder, read = of_photos
+    (folder / "b.png").unlink()
+    (folder / "b.heic").write_bytes(b"\0\0\0\x18ftypheic" + bytes(64))
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(DataError, match=r"b\.heic.*clear-strategies\[heic\]"):
+        read()
+
+
+def test_different_exposures_are_said(of_photos, caplog):
+    folder, read = of_photos
+    for name, time in (("a", 0.01), ("b", 0.04), ("c", 0.01)):
+        exif = Image.Exif()
+        exif[0x8769] = {0x829A: time, 0x829D: 2.0, 0x8827: 100}
+        image_of(folder / f"{name}.png").save(folder / f"{name}.png", exif=exif)
+    assert read().notes["exposure"].startswith("differs by 2.0 stops between a.png and b.png")
+    assert "exposure" in caplog.text

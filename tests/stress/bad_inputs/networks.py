@@ -25,6 +25,19 @@ def _enlarged(path: Path, **options: Any) -> object:
     return Onnx(str(path), **options)("view", photo(*_LR), 4)
 
 
+def _external(location: str) -> Callable[[Path], object]:
+    def give(folder: Path) -> object:
+        weight = upscaling_weight()
+        (folder / "models").mkdir()
+        for there in (folder / "secret.bin", folder / "models" / "beside.bin"):
+            there.write_bytes(weight.numpy().astype("<f4").tobytes())
+        path = folder / "models" / "external.onnx"
+        path.write_bytes(onnx_bytes(weight, external=location.format(folder=folder)))
+        return _enlarged(path)
+
+    return give
+
+
 def _images(spoil: Callable[[Path], object], *, suffix: str = "", view: str = "a.png") -> Callable[[Path], object]:
     def give(folder: Path) -> object:
         write_png(folder / "sr" / "a.png", images.upsample(photo(*_LR), 4))
@@ -58,7 +71,8 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "network that makes NaN": (_onnx(onnx_bytes(upscaling_weight() * math.nan)), "net.onnx: output: is not finite"),
     "network that makes millions": (_onnx(onnx_bytes(upscaling_weight() * 1e9)), "net.onnx: output: "),
-    "weights in a file beside": (_onnx(onnx_bytes(upscaling_weight(), external="beside.bin")), "is no ONNX network"),
+    "weights at an absolute path": (_external("{folder}/secret.bin"), "external.onnx: weights: lie in other files"),
+    "weights in a file beside": (_external("beside.bin"), "external.onnx: weights: lie in other files"),
     "SR folder absent": (lambda folder: Images(str(folder / "none"))("a.png", photo(*_LR), 4), "folder: is not there"),
     "SR image absent": (_images(lambda sr: None, view="b.png"), "b: has no SR image b"),
     "SR image without its suffix": (_images(lambda sr: None, suffix="_x4"), "a: has no SR image a_x4"),

@@ -26,14 +26,15 @@ Spoil = Callable[[Path], object]
 
 def case(name: str, good: str, spoil: Spoil, pattern: str) -> BadInput:
     """A sound scene by its name in `GOOD`, after a change to its folder."""
+    surface = good.removesuffix("_txt")
 
     def give(folder: Path) -> None:
         root = tiny.GOOD[good](folder / "scene")
         spoil(root)
-        for frame in READERS[good](root).frames:
+        for frame in READERS[surface](root).frames:
             frame.load()
 
-    return BadInput(good, name, give, pattern)
+    return BadInput(surface, name, give, pattern)
 
 
 def remove(name: str) -> Spoil:
@@ -98,19 +99,14 @@ def save_image(name: str, **options: Any) -> Spoil:
     return lambda root: Image.new(mode, size).save(root / name, **options)
 
 
-def named(root: Path, name: str) -> None:
-    """Another name for the first photo, which then lies outside."""
-    (root / "images/a.png").rename(root / "outside.png")
-    file = root / "sparse/0/images.bin"
-    file.write_bytes(file.read_bytes().replace(b"a.png\0", name.encode() + b"\0"))
-
-
 def photo_outside(root: Path) -> None:
-    named(root, "../outside.png")
+    (root / "images/a.png").rename(root / "outside.png")
+    replace(IMAGES_TXT, "a.png", "../outside.png")(root)
 
 
 def photo_at_absolute_path(root: Path) -> None:
-    named(root, str(root / "outside.png"))
+    (root / "images/a.png").rename(root / "outside.png")
+    replace(IMAGES_TXT, "a.png", str(root / "outside.png"))(root)
 
 
 def link_in_circle(name: str) -> Spoil:
@@ -138,13 +134,14 @@ def name_without_end(root: Path) -> None:
 
 
 CAMERAS, IMAGES, POINTS = (f"sparse/0/{name}.bin" for name in ("cameras", "images", "points3D"))
+CAMERAS_TXT, IMAGES_TXT, POINTS_TXT = (f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D"))
 QUATERNION_AT = 8 + 4  # in images.bin: behind the count and the first id
 NAME_AT = QUATERNION_AT + 7 * 8 + 4
 FAR = [[1.0, 0, 0, 1e17], [0, 1.0, 0, 0], [0, 0, 1.0, 0]]
 TRAIN, SHARED = "transforms_train.json", "transforms.json"
 
 INPUTS = [
-    # COLMAP
+    # COLMAP, binary
     case("no model", "colmap", remove(CAMERAS), r"cameras\.bin: file"),
     case("no photos", "colmap", lambda root: (root / "images").rename(root / "photos"), r"images: has none of the folders"),
     case("photo absent", "colmap", remove("images/b.png"), r"images\.bin: photos: 1 of 3 .* b\.png: .*skip_faulty=true"),
@@ -176,8 +173,21 @@ INPUTS = [
     case("name without end", "colmap", name_without_end, r"images\.bin: name of image 0: is no text"),
     case("symlink in a circle", "colmap", link_in_circle("images/b.png"), r"images\.bin: .*b\.png"),
     case("photo upside down by EXIF", "colmap", turned, r"b\.png: EXIF orientation: is 3.*auto-orient"),
-    case("absolute path", "colmap", photo_at_absolute_path, r"images\.bin: file name: '/.*outside\.png' leads out"),
-    case("path traversal", "colmap", photo_outside, r"images\.bin: file name: '\.\./outside\.png' leads out"),
+    # COLMAP, text
+    case("txt beside broken bin", "colmap_txt", write(CAMERAS, b"\1"), r"cameras\.bin: number of cameras"),
+    case("txt byte-order mark", "colmap_txt", replace(CAMERAS_TXT, "#", "\ufeff#"), r"cameras\.txt: line 1: .*byte-order"),
+    case("txt decimal comma", "colmap_txt", replace(CAMERAS_TXT, "20.0", "20,0"), r"cameras\.txt: line 2: .*comma"),
+    case("txt NaN", "colmap_txt", replace(POINTS_TXT, "3.0", "nan"), r"points3D\.txt: point 0: is not finite"),
+    case("txt 1e999", "colmap_txt", replace(CAMERAS_TXT, "20.0", "1e999"), r"cameras\.txt: line 2: .*finite"),
+    case("txt too few parameters", "colmap_txt", replace(CAMERAS_TXT, " 8 6", " 8"), r"cameras\.txt: line 2: has 3 param"),
+    case("txt second line missing", "colmap_txt", replace(IMAGES_TXT, "a.png\n\n", "a.png\n"), r"images\.txt: line 4"),
+    case("txt last line missing", "colmap_txt", replace(IMAGES_TXT, "c.png\n8.0 6.0 -1\n", "c.png"), r"images\.txt: line 8"),
+    case("txt odd track", "colmap_txt", replace(POINTS_TXT, "0.5 1 0", "0.5 1"), r"points3D\.txt: line 2: has 11 col"),
+    case("txt colour 300", "colmap_txt", replace(POINTS_TXT, "255", "300"), r"points3D\.txt: line 2: has the colour"),
+    case("txt 5000 digits", "colmap_txt", replace(CAMERAS_TXT, "16", "1" * 5000), r"cameras\.txt: line 2: is not numeric"),
+    case("txt id of 20 digits", "colmap_txt", replace(POINTS_TXT, "0.5 1 0", f"0.5 {10**20} 0"), r"line 2: .*64 bits"),
+    case("txt absolute path", "colmap_txt", photo_at_absolute_path, r"images\.txt: file name: '/.*outside\.png' leads out"),
+    case("txt path traversal", "colmap_txt", photo_outside, r"images\.txt: file name: '\.\./outside\.png' leads out"),
     # Blender
     case("JSON absent", "blender", remove(TRAIN), r"transforms_train\.json: file"),
     case("no JSON", "blender", write(TRAIN, b"{'a': 1}"), r"transforms_train\.json: json: is not valid"),
