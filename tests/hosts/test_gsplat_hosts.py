@@ -112,11 +112,13 @@ def test_a_view_is_recognised_while_its_pose_moves(host, scene, tmp_path):
     assert counts(said)["merges"] == STEPS
 
 
-def test_colours_in_float16_train(host, scene, tmp_path):
-    if host.name == "gsplat-1.5.3":
+@pytest.mark.parametrize("option", ["--packed", "--sh-fp16"])
+def test_other_ways_to_draw_train_and_densify(host, scene, tmp_path, option):
+    if option == "--sh-fp16" and host.name == "gsplat-1.5.3":
         pytest.skip("since 1.6.0")
-    said = launched(host, scene, tmp_path / "run", "default", "--sh-fp16")
+    said = launched(host, scene, tmp_path / "run", "default", option, **{"strategy.grow-grad2d": 1e-5})
     assert counts(said)["merges"] == STEPS
+    assert counts(said)["structure changes"] >= 1
     assert {p.dtype for p in stored(tmp_path / "run").values()} == {torch.float32}
 
 
