@@ -57,6 +57,13 @@ QUESTIONS: Final[Mapping[str, tuple[str, Options]]] = {
         "--width": {"type": positive(int), "default": 128, "metavar": "PX", "help": "of the LR photos (default 128)"},
         **_TURNS, "--repeats": {**_TURNS["--repeats"], "default": 20},
     }),
+    "scale": ("how time and memory grow with Gaussians, pixels and photos", {
+        "--gaussians": {"nargs": "*", "type": positive(int), "default": [1_000, 10_000, 100_000, 1_000_000], "metavar": "N"},
+        "--widths": {"nargs": "*", "type": positive(int), "default": [252, 504, 1008, 2016], "metavar": "PX"},
+        "--photos": {"nargs": "*", "type": positive(int), "default": [10, 50, 200], "metavar": "N"},
+        "--iterations": {"type": positive(int), "default": 200, "metavar": "N", "help": "of a run (default 200)"},
+        "--repeats": _TURNS["--repeats"],
+    }),
 }  # fmt: skip
 
 
@@ -74,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         module = "integration.bench" if question == "host" else f"clear_strategies.bench.{question}"
         import_module(module).measure(results, **options)
         sys.stdout.write(results.text())
-        results.write(question, {k: options[k] for k in ("device", "repeats")})
+        results.write(question, {k: options[k] for k in ("device", "repeats") if k in options})
         return 0
     except (ClearError, BackendUnavailable) as error:
         _log.error("%s", error)

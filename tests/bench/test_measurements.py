@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import rasterizers
-from clear_strategies.bench import accuracy, iteration, scenes, timing
+from clear_strategies.bench import accuracy, iteration, scale, scenes, timing
 from clear_strategies.bench import rasterizers as drawing
 from clear_strategies.bench.results import Results
 from clear_strategies.errors import DataError
@@ -120,3 +120,10 @@ def test_an_iteration_is_measured_with_and_without_hr():
     assert math.isnan(table.loc["evidence", "error"])
     assert list(table.index[-2:]) == [iteration.REST, iteration.TOTAL]
     assert math.isnan(table.loc["backward HR", "lr_only_ms"])
+
+
+def test_growth_has_an_exponent_for_each_step_and_none_across_what_grows():
+    table = measured(scale, gaussians=[200, 100], widths=[96], photos=[], iterations=1, repeats=1).tables["scale"]
+    assert list(table["size"]) == [100, 200, 96 * 72]
+    assert [math.isnan(p) for p in table["exponent"]] == [True, False, True]
+    assert table["exponent"][1] == pytest.approx(math.log2(table["ms"][1] / table["ms"][0]))

@@ -1,0 +1,99 @@
+"""How time and memory grow: an iteration with Gaussians and with pixels, a whole run with photos.
+
+The exponent p of a row is that of time ~ size^p from the row before: 1 is linear. Each row is a process of its own, and MiB is
+its peak. Photos are those of the demo; of a run of them the processor time counts.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import Any, Final
+
+import pandas as pd
+import torch
+
+import rasterizers
+from clear_strategies.bench import scenes
+from clear_strategies.bench.iteration import TOTAL, Training, view_of
+from clear_strategies.bench.results import Results
+from clear_strategies.bench.timing import interleaved, medians
+from clear_strategies.errors import DataError
+from clear_strategies.merging.objective import Objective
+from clear_strategies.training.loop import kernel_threads
+
+_WIDTH, _GAUSSIANS = 504, 100_000  # where the other size varies
+_MIB: Final = 1024 if sys.platform != "darwin" else 1 << 20  # units of ru_maxrss
+_RUN: Final = (
+    "data.reader.width=128", "data.reader.height=96", "fit.map_views=0", "fit.video=0", "fit.page=0",
+)  # fmt: skip
+
+
+def measure(
+    results: Results,
+    *,
+    gaussians: Sequence[int],
+    widths: Sequence[int],
+    photos: Sequence[int],
+    iterations: int,
+    repeats: int,
+) -> None:
+    """Measure each size.
+
+    Args:
+        widths: of HR images of 4:3, px, multiples of 12.
+        photos: training photos of a run of so many `iterations`.
+
+    Raises:
+        DataError: a run failed, or a width is not such a multiple.
+    """
+    if wrong := [width for width in widths if width % 12]:
+        raise DataError("--widths", str(wrong[0]), "is no multiple of 12", "use one, such as 504")
+    sizes = [("Gaussians", n, n, _WIDTH) for n in sorted(gaussians)]
+    sizes += [("pixels", w * w * 3 // 4, _GAUSSIANS, w) for w in sorted(widths)]
+    with ProcessPoolExecutor(1, get_context("spawn"), max_tasks_per_child=1) as one:
+        rows = [one.submit(_iteration, *size, repeats, torch.get_num_threads()).result() for size in sizes]
+    rows += [_run(n, iterations) for n in sorted(photos)]
+    table = pd.DataFrame(rows, columns=["of", "size", "ms", "mib"])
+    table["exponent"] = list(_exponents(rows))
+    results.tables["scale"] = table
+    size = f"{_WIDTH}x{_WIDTH * 3 // 4}"
+    results.note(
+        f"An iteration with Gaussians at HR {size}, with pixels at {_GAUSSIANS:,} Gaussians; a run of {iterations} iterations."
+    )
+
+
+def _iteration(of: str, size: int, gaussians: int, width: int, repeats: int, threads: int) -> tuple[Any, ...]:
+    torch.set_num_threads(threads)
+    # Gaussians shrink as their number grows, as in the generated scenes.
+    radius = 5.5 * width / 1008 * (gaussians / 100_000) ** -0.3
+    workload = scenes.surfaces(f"{of} {size:,}", gaussians, width, width * 3 // 4, radius=radius)
+    rasterizer = rasterizers.load(rasterizers.fastest("cpu"), preset="fast", **scenes.SETTINGS)
+    training = Training(workload, view_of(workload, rasterizer), rasterizer, Objective())
+    with kernel_threads(training.state, rasterizer):
+        turns = interleaved({of: training}, repeats, device="cpu", label=workload.name)
+    return of, size, medians(turns).loc[of, TOTAL], resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _MIB
+
+
+def _run(photos: int, iterations: int) -> tuple[Any, ...]:
+    with tempfile.TemporaryDirectory() as folder:
+        counts = (f"data.reader.views={photos + 1}", f"data.reader.train={photos}", f"fit.iterations={iterations}")
+        program = [sys.executable, "-m", "clear_strategies.run", *_RUN, *counts, f"hydra.run.dir={folder}/run"]
+        child = subprocess.Popen(program, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # noqa: S603 - this interpreter
+        _, status, used = os.wait4(child.pid, 0)
+        child.returncode = os.waitstatus_to_exitcode(status)
+    if child.returncode:
+        raise DataError("--photos", str(photos), f"its run ended with code {child.returncode}", " ".join(program[1:-1]))
+    return "photos", photos, 1e3 * (used.ru_utime + used.ru_stime), used.ru_maxrss / _MIB
+
+
+def _exponents(rows: Sequence[tuple[Any, ...]]) -> Iterator[float]:
+    for (of, size, ms, _), (of_before, size_before, ms_before, _) in zip(rows, [("", 0, 0, 0), *rows], strict=False):
+        yield math.log(ms / ms_before) / math.log(size / size_before) if of == of_before else math.nan
