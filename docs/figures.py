@@ -1,7 +1,8 @@
 """The pictures of the documentation.
 
 python docs/figures.py                     those of docs/explanation/evidence-sparse.md, from its CSV files
-python docs/figures.py demo [OVERRIDE …]   the README's, docs/images/demo.png: trains the demo without strategies and with clear
+python docs/figures.py demo [OVERRIDE …]   the first tutorial's: trains the demo without strategies and with clear
+python docs/figures.py host                the README's: trains in a gsplat loop, without strategies and with best
 python docs/figures.py notebook            runs docs/tutorial/notebook.ipynb and keeps the outputs of its cells
 python docs/figures.py pages RUN           a run's splat.html and the viewer, in Chromium
 """
@@ -109,6 +110,7 @@ def main(folder: Path) -> None:
 # The test view of the README's picture, and the part of it that is magnified: left, top, right, bottom, px.
 VIEW: Final = "demo_08"
 PART: Final = (10, 24, 122, 108)
+TEST: Final = 3  # of the demo's test views
 
 
 def demo(folder: Path, *overrides: str) -> None:
@@ -143,6 +145,35 @@ def readme_picture(baseline: Path, run: Path, out: Path) -> None:
         part.set_xlim(left, right)
         part.set_ylim(bottom, top)
     figure.subplots_adjust(0, 0, 1, 0.93, wspace=0.02, hspace=0.03)
+    figure.savefig(out, dpi=100)
+    plt.close(figure)
+
+
+def host(out: Path) -> None:
+    """A test view of the demo as gsplat's loop learns it from three LR photos, alone and with `best`."""
+    import torch
+
+    from clear_strategies.core.images import downsample
+    from integration.examples.gsplat_loop import train
+    from rasterizers import native
+
+    panels: dict[str, Any] = {}
+    torch.set_num_threads(1)
+    with torch.no_grad():
+        for title, strategies in (("gsplat's loop", None), ("the same loop with `best`", "best")):
+            torch.manual_seed(0)
+            with torch.enable_grad(), native.kernel_threads(native.threads()):
+                demo, render = train(500, strategies)
+            viewmat, K, truth = demo.tests[TEST]
+            height, width, _ = truth.shape
+            panels[title] = render(viewmat, K, width, height).clamp(0, 1)
+    panels = {"at the photos' size": downsample(truth, 4), **panels, "truth": truth}
+    figure, axes = plt.subplots(1, len(panels), figsize=(12, 2.5))
+    for axis, (title, image) in zip(axes, panels.items(), strict=True):
+        axis.imshow(image.numpy(), extent=(0, width, height, 0), interpolation="nearest")
+        axis.set_title(title)
+        axis.set_axis_off()
+    figure.subplots_adjust(0, 0, 1, 0.9, wspace=0.02)
     figure.savefig(out, dpi=100)
     plt.close(figure)
 
@@ -224,6 +255,8 @@ if __name__ == "__main__":
             main(DOCS / "images")
         case ["demo", *overrides]:
             demo(DOCS / "images", *overrides)
+        case ["host"]:
+            host(DOCS / "images" / "host.png")
         case ["notebook"]:
             notebook(DOCS / "tutorial" / "notebook.ipynb")
         case ["pages", run]:

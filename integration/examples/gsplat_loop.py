@@ -1,7 +1,7 @@
 """gsplat's documented loop with CLEAR, on the built-in demo: `python -m integration.examples.gsplat_loop`.
 
-The loop and DefaultStrategy are gsplat's; `# +` marks the added lines. On a GPU gsplat's own function draws, on a CPU this
-package's in its place.
+The loop and DefaultStrategy are gsplat's; `# +` marks the added lines, which the README shows. On a GPU gsplat's own function
+draws, on a CPU this package's in its place.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor
 from clear_strategies.compose import conductor
 from clear_strategies.geometry import stereo
 from clear_strategies.kernels import losses
-from integration.examples.demo import load_demo, splats_with_optimizers
+from integration.examples.demo import Demo, Render, load_demo, splats_with_optimizers
 from integration.gsplat import attach
 from integration.views import view
 from rasterizers import native
@@ -28,6 +28,12 @@ from rasterizers.autograd import rasterization as cpu_rasterization
 
 def main(iterations: int, strategies: str | None, seed: int = 0) -> float:
     """Train on the demo; returns the mean PSNR of its test views at HR in dB."""
+    demo, render = train(iterations, strategies, seed)
+    return demo.psnr(render)
+
+
+def train(iterations: int, strategies: str | None, seed: int = 0) -> tuple[Demo, Render]:
+    """Train on the demo; returns it, and what draws the splats."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
     demo = load_demo(device=device)
     photos = list(zip(demo.names, demo.images, demo.viewmats, demo.Ks, strict=True))
@@ -42,11 +48,10 @@ def main(iterations: int, strategies: str | None, seed: int = 0) -> float:
 
     rasterization = cuda_rasterization if device == "cuda" else cpu_rasterization
     if strategies is not None:
-        chosen = conductor(strategies, iterations=iterations)  # +
-        sr = chosen.prior(demo.prior)  # + the SR images, back-projected where the strategies say so
-        views = [view(*photo, sr=sr) for photo in photos]  # +
-        clear = attach(splats, optimizers, views, chosen, strategy=strategy, seed=seed)  # +
-        rasterization = clear.wrap(rasterization)  # +
+        clear = conductor(strategies, iterations=iterations)  # +
+        views = [view(*photo, sr=clear.prior(demo.prior)) for photo in photos]  # +
+        attached = attach(splats, optimizers, views, clear, strategy=strategy, seed=seed)  # +
+        rasterization = attached.wrap(rasterization)  # +
 
     def render(viewmat: Tensor, K: Tensor, width: int, height: int) -> tuple[Tensor, dict[str, Any]]:
         p = splats
@@ -68,7 +73,7 @@ def main(iterations: int, strategies: str | None, seed: int = 0) -> float:
         strategy.step_post_backward(splats, optimizers, state, step, info, packed=False)
         if (step + 1) % max(1, iterations // 5) == 0:
             logging.info("step %d: loss %.4f, %d Gaussians", step + 1, float(loss.detach()), len(splats["means"]))
-    return demo.psnr(lambda *camera: render(*camera)[0])
+    return demo, lambda *camera: render(*camera)[0]
 
 
 class Photometric(torch.autograd.Function):
