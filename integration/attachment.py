@@ -34,6 +34,7 @@ from clear_strategies.core import deferred
 from clear_strategies.core.gradients import conflict_columns
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
+from clear_strategies.data.masks import require_shown
 from clear_strategies.errors import HostError, SettingError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.in_place import InPlaceMerge, RoutedGradients
@@ -90,6 +91,7 @@ class Attachment:
     ) -> None:
         _require_supported(conductor, accumulation)
         self._views = by_name(views)
+        require_shown(views)
         self.conductor, self.params, self.accumulation = conductor, params, accumulation
         self._masks, self._own_background, self._reads_score = dict(masks or {}), own_background, reads_score
         self.t = 1

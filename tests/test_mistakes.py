@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.helpers import command_line
+from tests.helpers import captures, command_line
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "how-to" / "mistakes.md"
 ROW = re.compile(
@@ -44,6 +44,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (here / name).mkdir()
         for i, image in enumerate(images):
             image.save(here / name / f"{i}.png")
+    captures.write_photos(captures.colmap_bin(here / "hidden") / "masks")
+    for mask in (here / "hidden/masks").iterdir():
+        Image.new("L", (captures.WIDTH, captures.HEIGHT)).save(mask)
+    captures.write_photos(captures.colmap_bin(here / "thumbnails") / "images", (9, 6))
     (here / "text").mkdir()
     for i in range(3):
         (here / "text" / f"{i}.jpg").write_text("no photo")

@@ -13,6 +13,8 @@ from torch import Tensor
 from clear_strategies.core import images
 from rasterizers.interface import Camera, Color
 
+SMALLEST: Final = 12
+"""Pixels on each side of what can be scored: GMSD halves the image, and SSIM needs room for its window."""
 _KNOWN_SHARE: Final = 0.3  # of a block's pixels, for its depth to be known
 
 

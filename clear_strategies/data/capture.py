@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from clear_strategies.data.lenses import Lens
+from clear_strategies.data.masks import read_mask
 from clear_strategies.data.photo_files import has_alpha, image_size, read_image
 from clear_strategies.data.priors.interface import Prior
 from clear_strategies.errors import DataError
@@ -60,7 +61,6 @@ class Frame:
         split: str | None = None,
         sfm_id: int | None = None,
         mask: Path | None = None,
-        photos: Path | None = None,
     ) -> Frame:
         """The frame of a file, with the lens fitted to the photo's real size. Reads the file's header only.
 
@@ -70,12 +70,10 @@ class Frame:
             upright: the lens is that of the photo as its EXIF block turns it. None: for a photo on its side, the lens's shape
                 decides this; other turned photos are refused.
             background: behind transparent pixels; None: black, logged.
-            mask: an image of the photo's size, black where it hides; None: masks/STEM.png or masks/NAME.png (as for COLMAP)
-                beside the folder of the photos, if there is one.
-            photos: the folder of the photos; the mask lies in the subfolder that the photo is in. None: the photo's folder.
+            mask: an image of the photo's shape, at any size, see `read_mask`; `masks_of` finds it.
 
         Raises:
-            DataError: the photo is not there, or has another aspect ratio than the lens.
+            DataError: the photo is not there, or it or its mask has another aspect ratio than the lens.
         """
         turn = _turned_as(path, lens) if upright is None else upright
         width, height = image_size(path, turn=turn)
@@ -83,8 +81,9 @@ class Frame:
         pinhole = fitted.undistorted(path)
         camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, width, height)
         load = partial(_load, path, fitted, pinhole, background, turn)
-        mask = mask or _mask_of(path, photos or path.parent)
-        shown = None if mask is None else partial(_load_mask, mask, fitted, pinhole, turn)
+        if mask is not None:
+            lens.resized(*image_size(mask, turn=turn), mask)  # refuses another shape
+        shown = None if mask is None else partial(read_mask, mask, fitted, pinhole, turn)
         through = partial(_load_transparency, path, fitted, pinhole, turn) if has_alpha(path) else None
         return Frame(name, camera, load, split=split, sfm_id=sfm_id, lens=lens, shown=shown, transparency=through)
 
@@ -180,18 +179,7 @@ def _load(path: Path, lens: Lens, pinhole: Lens, background: Color | None, turn:
     return lens.undistort(image, pinhole) if lens.distorts else image
 
 
-def _mask_of(path: Path, photos: Path) -> Path | None:
-    if not path.is_relative_to(photos):
-        return None
-    folder = photos.parent / "masks" / path.parent.relative_to(photos)
-    return next((m for m in (folder / f"{path.stem}.png", folder / f"{path.name}.png") if m.is_file()), None)
-
-
 def _load_transparency(path: Path, lens: Lens, pinhole: Lens, turn: bool | None) -> Float[Tensor, "H W"]:
     """The photo over white less the photo over black."""
     white, black = (_load(path, lens, pinhole, (c, c, c), turn) for c in (1.0, 0.0))
     return (white - black).mean(dim=2).clamp(0, 1)
-
-
-def _load_mask(path: Path, lens: Lens, pinhole: Lens, turn: bool | None) -> Bool[Tensor, "H W"]:
-    return _load(path, lens, pinhole, None, turn).mean(dim=2) > 0.5

@@ -33,6 +33,7 @@ _log = logging.getLogger(__name__)
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".heic", ".heif")
 _FORMATS: Final = ("PNG", "JPEG", "WEBP", "TIFF")
+_LOSSLESS: Final = ("PNG", "TIFF")
 _HEIF_BRANDS: Final = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1")  # bytes 8 to 12, behind "ftyp"
 _MAX_PIXELS: Final = 100_000_000
 PNG_LEVEL: Final = 3  # a third of the time of zlib's default, for 5 % more bytes
@@ -106,6 +107,12 @@ def has_alpha(path: Path) -> bool:
     """Whether the file may have transparent pixels, from the header only; the DataErrors as of `read_image`."""
     with _opened(path, False) as image:
         return _has_alpha(image)
+
+
+def is_lossy(path: Path) -> bool:
+    """Whether the file's format may change pixels, from the header only; the DataErrors as of `read_image`."""
+    with _opened(path, False) as image:
+        return image.format not in _LOSSLESS
 
 
 @dataclass(frozen=True, slots=True)

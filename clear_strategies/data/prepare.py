@@ -18,13 +18,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import images
-from clear_strategies.core.checks import refuse
 from clear_strategies.core.progress import Progress
-from clear_strategies.core.view import Photo, View
+from clear_strategies.core.view import SMALLEST, Photo, View
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.cloud import CloudSettings, initial_points, require_source
 from clear_strategies.data.lenses import forget_maps
+from clear_strategies.data.masks import require_shown
 from clear_strategies.data.photo_files import image_size, read_image
 from clear_strategies.data.priors import Bicubic, Prior, SuperResolved, super_resolved
 from clear_strategies.data.priors.cache import kept_network_of
@@ -51,7 +51,6 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     What the headers of the photos show is checked before any photo is decoded.
 
     Raises:
-        SettingError: a photo is too small for `shrink` and `sr_scale`.
         DataError: the capture cannot give what the settings ask for.
     """
     train_frames, test_frames = split(capture, views)
@@ -66,6 +65,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
             made.append(_view(frame, photo, capture, views, prior, lr_files, required=len(made) < len(train_frames)))
             progress(len(made))
     train, test = tuple(made[: len(train_frames)]), tuple(made[len(train_frames) :])
+    require_shown(train)
     with work_log.stage("initial points"):
         initial = initial_points(
             cloud, [v.lr for v in train], hr=[v.hr for v in train], hr_is_photo=views.photos_are == "both",
@@ -95,15 +95,19 @@ def check_headers(frames: Sequence[Frame], views: ViewSettings) -> dict[str, Pat
         The ready-made LR image of each frame by its name; empty without `lr_folder`.
 
     Raises:
-        SettingError: a photo is too small for `shrink` and `sr_scale`.
-        DataError: a ready-made LR image is missing, or has another size.
+        DataError: a photo is too small for `shrink` and `sr_scale`; a ready-made LR image is missing, or has another size.
     """
     for frame in frames:
-        if min(lr_size(frame.camera, views)) < 1:
-            rule = f"must leave a whole LR pixel of the photo {frame.name} of {size_of(frame.camera)}"
-            if views.photos_are != "lr":
-                rule += f" at sr_scale={views.sr_scale}"
-            refuse("data.views.shrink", rule, views.shrink, "lower data.views.shrink")
+        width, height = (
+            size * (1 if views.photos_are == "lr" else views.sr_scale) for size in lr_size(frame.camera, views)
+        )
+        if min(width, height) < SMALLEST:
+            problem = (
+                f"is {size_of(frame.camera)}, scored at {width}x{height}, where scores need {SMALLEST} pixels a side"
+            )
+            smaller = min(frame.camera.width, frame.camera.height) < SMALLEST
+            remedy = "give larger photos" if smaller else "lower data.views.shrink or data.views.sr_scale"
+            raise DataError(frame.name, "size", problem, remedy)
     if views.lr_folder is None:
         return {}
     files, lr_files = ViewFiles(Path(views.lr_folder), "LR image", "name the LR images like the photos"), {}

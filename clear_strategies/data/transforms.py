@@ -117,8 +117,8 @@ def frames_of(
     file: Path,
     transforms: Sequence[Transform],
     photos: Sequence[tuple[str, Path, str | None]],
-    folder: Path | None = None,
     *,
+    masks: Mapping[Path, Path],
     background: Color,
     skip_faulty: bool,
 ) -> list[Frame]:
@@ -126,17 +126,15 @@ def frames_of(
 
     Args:
         photos: name, file and split of each of `transforms`.
-        folder: the folder that all photos are in or below; None: the photo's own. Masks lie beside it.
+        masks: of photos whose frame names none.
     """
     frames = []
     for i in usable(file, range(len(photos)), lambda i: photos[i][1], skip_faulty=skip_faulty):
         where, transform, (name, path, split) = f"frames[{i}]", transforms[i], photos[i]
         pose = pose_from_opengl(file, f"{where}.transform_matrix", transform.transform_matrix)
         lens = transform.lens(file, where, path)
-        mask = file.parent / transform.mask_path if transform.mask_path else None
-        frames.append(
-            Frame.of_photo(name, path, lens, pose, background=background, split=split, mask=mask, photos=folder)
-        )
+        mask = file.parent / transform.mask_path if transform.mask_path else masks.get(path)
+        frames.append(Frame.of_photo(name, path, lens, pose, background=background, split=split, mask=mask))
     return frames
 
 

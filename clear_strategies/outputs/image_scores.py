@@ -23,11 +23,11 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies.core.view import SMALLEST
 from clear_strategies.kernels.losses import cpp
 from rasterizers.native import threads
 
 PSNR_CAP: Final = 100.0  # dB, the PSNR of identical images
-_SMALLEST: Final = 12  # px; GMSD halves the image and SSIM needs room for its window
 _GMSD_C: Final = 170 / 255**2
 _LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
 
@@ -50,8 +50,8 @@ class Truth:
     """
 
     def __init__(self, image: Float[Tensor, "H W 3"]) -> None:
-        if min(image.shape[:2]) < _SMALLEST:
-            raise ValueError(f"images must be at least {_SMALLEST} pixels on each side, got {tuple(image.shape)}.")
+        if min(image.shape[:2]) < SMALLEST:
+            raise ValueError(f"images must be at least {SMALLEST} pixels on each side, got {tuple(image.shape)}.")
         self.image = image.detach().clamp(0, 1).cpu()
         grey = _grey(self.image)
         self.edges, self.blur = _gradient_at_half_size(grey), _blur(grey)

@@ -18,8 +18,8 @@ _log = logging.getLogger(__name__)
 
 # The facts on the console; the others are for `-v` and run.log.
 _SHORT: Final[Sequence[str]] = (
-    "scene", "poses", "HR side", "train views", "test views", "not used", "LR", "HR", "the SR images add", "initial points",
-    "method", "strategies", "rasterizer", "memory", "time", "iterations", "skipped",
+    "scene", "poses", "HR side", "train views", "test views", "not used", "masks", "LR", "HR", "the SR images add",
+    "initial points", "method", "strategies", "rasterizer", "memory", "time", "iterations", "skipped",
 )  # fmt: skip
 
 

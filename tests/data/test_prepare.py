@@ -113,12 +113,14 @@ def undecodable(n: int = 2, width: int = 57, height: int = 43) -> Capture:
 
 
 @pytest.mark.parametrize("sizes", ["crop", "round"])
-@pytest.mark.parametrize(("photos_are", "most"), [("hr", 10), ("lr", 43)])
-def test_a_photo_that_becomes_smaller_than_an_lr_pixel_is_refused_by_its_header(sizes, photos_are, most):
+@pytest.mark.parametrize("photos_are", ["hr", "lr", "both"])
+def test_a_photo_that_becomes_too_small_for_its_scores_is_refused_by_its_header(sizes, photos_are):
     views = papers(train=1, shrink=200, sizes=sizes, photos_are=photos_are)
-    with pytest.raises(SettingError, match=r"data\.views\.shrink: must leave a whole LR pixel .* of 57x43.*, got 200"):
+    with pytest.raises(DataError, match=r"0001\.png: size: is 57x43, scored at 0x0, .*: lower data\.views\.shrink"):
         prepare(undecodable(), views, Bicubic(), POINTS)
-    check_headers(undecodable().frames, replace(views, shrink=most))
+    with pytest.raises(DataError, match=r"size: is 9x60, .*: give larger photos"):
+        check_headers(undecodable(2, 9, 60).frames, replace(views, shrink=1))
+    check_headers(undecodable().frames, replace(views, shrink=3))
 
 
 @pytest.mark.parametrize("size", [None, (5, 5)])

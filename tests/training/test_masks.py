@@ -10,8 +10,6 @@ import torch
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.cloud import CloudSettings, initial_points
-from clear_strategies.data.lenses import Lens
-from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.prepare import prepare
 from clear_strategies.data.priors import Bicubic
 from clear_strategies.data.view_settings import ViewSettings
@@ -19,7 +17,6 @@ from clear_strategies.geometry.pseudo_views import border_views
 from clear_strategies.merging.objective import Objective
 from clear_strategies.training.loop import iterate
 from tests.helpers import planes
-from tests.helpers.captures import colmap_txt
 from tests.helpers.short_run import SCENE, start, tensors
 from tests.helpers.toy import RASTERIZER
 
@@ -78,16 +75,6 @@ def test_an_lr_pixel_is_hidden_where_a_photo_pixel_below_it_is():
     assert torch.equal(view.hr.shown, expected.repeat_interleave(4, 0).repeat_interleave(4, 1))
     assert made.notes["masks"] == "1 of 1 training photos have one, which hides 4.2% of it"
     assert view.hr.reduced(2).shown is not None
-
-
-def test_masks_beside_the_photos_folder_are_found_by_either_name(tmp_path):
-    capture = colmap_txt(tmp_path)
-    photos, lens = sorted((capture / "images").iterdir()), Lens(16, 12, 20.0, 20.0, 8.0, 6.0)
-    for photo, name in zip(photos[:2], (f"{photos[0].stem}.png", f"{photos[1].name}.png"), strict=True):
-        write_png(capture / "masks" / name, torch.zeros(1, 1, 3))
-        frame = Frame.of_photo("a", photo, lens, torch.eye(4))
-        assert frame.shown is not None
-    assert Frame.of_photo("a", photos[2], lens, torch.eye(4)).shown is None
 
 
 def test_hidden_pixels_have_no_depth_and_give_no_points():

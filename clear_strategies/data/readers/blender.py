@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 from pathlib import Path
 from typing import Final
 
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import Capture, Frame, lens_notes, require_names
+from clear_strategies.data.masks import masks_of
 from clear_strategies.data.photo_files import SUFFIXES
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.data.transforms import frames_of, photo_transforms
@@ -50,13 +52,12 @@ def read(
         files.append(root / "transforms_test.json")
     else:
         _log.warning("%s has no transforms_test.json: there are no test views.", root)
+    transforms = {file: photo_transforms(file, read_object(file)) for file in files}
+    paths = {file: [_photo(root, transform.file_path) for transform in transforms[file]] for file in files}
+    masks = masks_of(root, itertools.chain(*paths.values()))
     for file, split in zip(files, ("train", "test"), strict=False):
-        transforms, photos = photo_transforms(file, read_object(file)), []
-        for transform in transforms:
-            ending = "" if transform.file_path.lower().endswith(SUFFIXES) else ".png"
-            path = root / (transform.file_path + ending)
-            photos.append((path.stem if split == "train" else f"test/{path.stem}", path, split))
-        frames += frames_of(file, transforms, photos, background=background, skip_faulty=skip_faulty)
+        photos = [(path.stem if split == "train" else f"test/{path.stem}", path, split) for path in paths[file]]
+        frames += frames_of(file, transforms[file], photos, masks=masks, background=background, skip_faulty=skip_faulty)
     require_names(frames, root)
     color = "white" if background == _WHITE else f"RGB {background}"
     notes = {
@@ -66,3 +67,7 @@ def read(
         **lens_notes(frames),
     }
     return Capture(root.resolve().name, tuple(frames), None, background, notes)
+
+
+def _photo(root: Path, name: str) -> Path:
+    return root / (name if name.lower().endswith(SUFFIXES) else f"{name}.png")

@@ -15,6 +15,7 @@ import torch
 
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import BLACK, Capture, Frame, SfmPoints, lens_notes, sorted_by_name
+from clear_strategies.data.masks import masks_of
 from clear_strategies.data.photo_folders import by_stem, folder_note, image_folder, images_in, is_file, usable
 from clear_strategies.data.readers.colmap_model import Model, find_model, is_model, model_folders, pose_of, read_model
 from clear_strategies.errors import DataError
@@ -93,10 +94,11 @@ def capture(
     """
     listing = model.folder / f"images{model.ending}"
     kept = usable(listing, model.images, lambda image: paths[image.name], skip_faulty=skip_faulty)
+    masks = masks_of(folder.parent, paths.values())
     frames = [
         Frame.of_photo(
             _name_below(folder, paths[image.name]), paths[image.name], model.lenses[image.camera],
-            pose_of(image), upright=upright, background=background, sfm_id=image.id, photos=folder,
+            pose_of(image), upright=upright, background=background, sfm_id=image.id, mask=masks.get(paths[image.name]),
         )
         for image in kept
     ]  # fmt: skip

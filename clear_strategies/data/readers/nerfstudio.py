@@ -14,6 +14,7 @@ import torch
 
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import BLACK, Capture, Frame, SfmPoints, lens_notes, sorted_by_name
+from clear_strategies.data.masks import masks_of
 from clear_strategies.data.photo_files import SUFFIXES
 from clear_strategies.data.photo_folders import is_file
 from clear_strategies.data.ply import read_points
@@ -70,8 +71,8 @@ def read(
         ("/".join(part[len(shared) :]), _photo(folder, name), splits.get(name))
         for name, part in zip(names, parts, strict=True)
     ]
-    below = folder.joinpath(*shared) if shared else None
-    frames = frames_of(file, transforms, photos, below, background=background, skip_faulty=skip_faulty)
+    masks = masks_of(folder, [path for _, path, _ in photos])
+    frames = frames_of(file, transforms, photos, masks=masks, background=background, skip_faulty=skip_faulty)
     notes = {"poses": f"{file.name}, {len(frames)} images", **lens_notes(frames)}
     if splits:
         if strangers := sorted(splits.keys() - set(names)):

@@ -1,0 +1,118 @@
+"""Masks: whose file is whose, what it hides, and whether anything is left to train on."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool
+from torch import Tensor
+
+from clear_strategies.core.view import Photo, View
+from clear_strategies.data.lenses import Lens
+from clear_strategies.data.photo_files import SUFFIXES, is_lossy, read_image
+from clear_strategies.data.photo_folders import images_in, some
+from clear_strategies.errors import DataError
+
+_log = logging.getLogger(__name__)
+
+_MARKED: Final = re.compile(r"^(?:.*mask[-_.])?(.+?)(?:[-_.]mask)?$")  # dynamic_mask_0001, 0001_mask
+_NOTHING: Final = 1e-3  # of a photo's pixels: one that shows fewer teaches nothing
+_NEARLY_ALL: Final = 0.9  # of the photos
+_FAINT: Final = 0.02  # alpha of a pixel that counts as transparent: 1 of 255 does, as in an alpha of 0 and 1
+_LITTLE: Final = 0.1  # of all pixels: less is more often a mask upside down than what was meant
+
+
+def masks_of(root: Path, paths: Iterable[Path]) -> dict[Path, Path]:
+    """The mask of each photo that has one; a warning names the files in a folder of masks that belong to no photo.
+
+    Masks lie in a folder `masks` (or `mask`), in place of one folder of the photo's path below `root`, or in one of them; beside
+    images_4, `masks_4` comes first. A mask is named like its photo, with its ending or without, in any case, and may be marked:
+    0001.png, 0001.jpg.png, 0001_mask.png, dynamic_mask_0001.png.
+    """
+    found, used, folders = dict[Path, Path](), set[Path](), dict[Path, dict[str, Path]]()
+    for parent in dict.fromkeys(path.parent for path in paths):
+        for folder in filter(Path.is_dir, dict.fromkeys(_folders(root, parent))):
+            masks = folders.setdefault(folder, _by_name(folder))
+            for photo in images_in(parent):
+                names = (photo.stem.lower(), photo.name.lower())
+                if mask := next((masks[name] for name in names if name in masks), None):
+                    found.setdefault(photo, mask)
+                    used.add(mask)
+    for folder in folders:
+        listed = sorted(file for file in folder.iterdir() if file.is_file() and not file.name.startswith("."))
+        if unused := [file.name for file in listed if file not in used]:
+            message = "%s: %d of %d files belong to no photo and are not used: %s. Name a mask like its photo."
+            _log.warning(message, folder, len(unused), len(listed), some(unused))
+    return found
+
+
+def _folders(root: Path, parent: Path) -> Iterator[Path]:
+    parts = parent.relative_to(root).parts if parent.is_relative_to(root) else ()
+    for i, part in enumerate(parts):
+        size = part.removeprefix("images") if part.startswith("images") else ""
+        for name in (f"masks{size}", "masks", "mask"):
+            yield root.joinpath(*parts[:i], name, *parts[i + 1 :])
+    for name in ("masks", "mask"):
+        yield root.joinpath(name, *parts)
+        yield parent / name
+
+
+def _by_name(folder: Path) -> dict[str, Path]:
+    """The masks of a folder by the names that their photos may have; the plainest name comes first, then PNG."""
+    masks = dict[str, Path]()
+    files = sorted(images_in(folder), key=lambda file: file.suffix.lower() != SUFFIXES[0])
+    for names in (r"\g<0>", r"\g<1>"):
+        for file in files:
+            masks.setdefault(_MARKED.sub(names, file.stem.lower()), file)
+    return masks
+
+
+def read_mask(path: Path, lens: Lens, pinhole: Lens, turn: bool | None) -> Bool[Tensor, "H W"]:
+    """False where the mask hides its photo: where it is 0, as in COLMAP and nerfstudio, so that 0 and 1 are a mask as 0 and 255
+    are. Of a lossy file, whose 0 is not exact, at most half of its largest value.
+
+    Args:
+        lens, pinhole: of the photo, to whose size the mask is brought.
+        turn: as of `read_image`.
+    """
+    values = read_image(path, turn=turn).amax(dim=2)
+    shown = (values > (values.max() / 2 if is_lossy(path) else 0)).float()
+    shown = F.interpolate(shown[None, None], (lens.height, lens.width), mode="nearest-exact")[0, 0]
+    if lens.distorts:
+        shown = lens.undistort(shown[..., None].expand(-1, -1, 3).contiguous(), pinhole)[..., 0]
+    return shown > 0.5
+
+
+def require_shown(views: Sequence[View]) -> None:
+    """Warn of photos whose mask or alpha leaves nothing to train on, and of masks that leave little of all photos.
+
+    Raises:
+        DataError: that are nearly all of the photos.
+    """
+    shown = {view.name: _shown(view.lr) for view in views}
+    empty = [name for name, share in shown.items() if share < _NOTHING]
+    why = "their masks hide every pixel, or their alpha is 0"
+    if len(empty) > _NEARLY_ALL * len(views):
+        problem = f"show nothing of {len(empty)} of {len(views)} photos: {some(empty)}"
+        remedy = "a mask is 0 where it hides, and alpha where it is transparent: invert them, or train without them"
+        raise DataError(empty[0], "masks or alpha", problem, remedy)
+    if empty:
+        _log.warning("%d of %d photos teach nothing, since %s: %s.", len(empty), len(views), why, some(empty))
+    masked = [float(view.lr.shown.float().mean()) for view in views if view.lr.shown is not None]
+    if masked and sum(masked) < _LITTLE * len(masked):
+        message = "masks hide %.0f%% of their %d photos. A mask is 0 where it hides: are they upside down?"
+        _log.warning(message, 100 * (1 - sum(masked) / len(masked)), len(masked))
+
+
+def _shown(photo: Photo) -> float:
+    """The share of its pixels that a photo shows."""
+    shown = torch.ones(photo.image.shape[:2], dtype=torch.bool) if photo.shown is None else photo.shown.cpu()
+    if photo.transparency is not None:
+        shown = shown & (photo.transparency.cpu() < 1 - _FAINT)
+    return float(shown.float().mean())

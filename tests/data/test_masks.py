@@ -1,0 +1,142 @@
+"""Masks as tools write them: their names, sizes and values, and masks that hide too much."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from clear_strategies.data.capture import Capture
+from clear_strategies.data.masks import masks_of, require_shown
+from clear_strategies.data.prepare import prepare
+from clear_strategies.data.priors import Bicubic
+from clear_strategies.data.readers import blender, colmap, nerfstudio
+from clear_strategies.errors import DataError
+from tests.helpers import captures as tiny
+from tests.helpers.short_run import SCENE
+
+LEFT = np.repeat(np.arange(tiny.WIDTH)[None] >= 4, tiny.HEIGHT, axis=0)  # shown: all but four columns
+
+
+def save(path: Path, values: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(values.astype(np.uint8) if values.dtype == int else values).save(path)
+
+
+VALUES = {
+    "0 and 255": ("png", 255 * LEFT),
+    "0 and 1": ("png", LEFT.astype(int)),
+    "0 and 1 in colour": ("png", np.dstack([LEFT.astype(int)] * 3)),
+    "one bit": ("png", LEFT),
+    "numbers of objects": ("png", LEFT * np.arange(tiny.WIDTH)),
+    "16 bits": ("png", LEFT.astype(np.uint16)),
+    "alpha": ("png", np.dstack([np.full((*LEFT.shape, 3), 255), 255 * LEFT])),
+    "JPEG, with noise where it hides": ("jpg", np.where(LEFT, 255, 12)),
+}
+
+
+@pytest.mark.parametrize("kind", VALUES)
+def test_what_is_not_0_is_shown(tmp_path: Path, kind: str) -> None:
+    ending, values = VALUES[kind]
+    save(tiny.colmap_bin(tmp_path) / f"masks/a.{ending}", values)
+    shown = colmap.read(tmp_path).frames[0].shown
+    assert shown is not None
+    assert torch.equal(shown(), torch.from_numpy(LEFT))
+
+
+NAMED = ("a.png", "a.PNG", "a.jpg", "A.png", "a.png.png", "dynamic_mask_a.png", "a_mask.png", "mask-a.jpeg")
+
+
+@pytest.mark.parametrize("name", NAMED)
+@pytest.mark.parametrize("reader", ["colmap", "nerfstudio", "blender"])
+def test_a_mask_is_found_by_the_names_that_tools_give_it(tmp_path: Path, reader: str, name: str, caplog) -> None:
+    read = {"colmap": colmap.read, "nerfstudio": nerfstudio.read, "blender": blender.read}[reader]
+    save(tiny.GOOD[reader](tmp_path) / "masks" / name, 255 * LEFT)
+    first = read(tmp_path).frames[0]
+    assert first.shown is not None
+    assert torch.equal(first.shown(), torch.from_numpy(LEFT))
+    assert "belong to no photo" not in caplog.text
+
+
+@pytest.mark.parametrize("folder", ["masks", "mask", "images/masks", "masks/images"])
+def test_masks_may_lie_beside_the_photos_or_in_their_folder(tmp_path: Path, folder: str) -> None:
+    save(tiny.colmap_bin(tmp_path) / folder / "b.png", 1 * LEFT)
+    assert [frame.shown is not None for frame in colmap.read(tmp_path).frames] == [False, True, False]
+
+
+def test_files_among_the_masks_that_belong_to_no_photo_are_named(tmp_path: Path, caplog) -> None:
+    tiny.colmap_bin(tmp_path)
+    for name in ("a.png", "a_mask.png", "frame_7.png"):
+        save(tmp_path / "masks" / name, 1 * LEFT)
+    (tmp_path / "masks/b.npy").touch()
+    colmap.read(tmp_path)
+    assert "3 of 4 files belong to no photo and are not used: a_mask.png, b.npy, frame_7.png" in caplog.text
+
+
+def test_masks_follow_the_size_of_their_photos(tmp_path: Path) -> None:
+    tiny.colmap_bin(tmp_path)
+    tiny.write_photos(tmp_path / "images_2", (tiny.WIDTH // 2, tiny.HEIGHT // 2))
+    for name in ("a", "b"):
+        save(tmp_path / f"masks/{name}.png", 1 * LEFT)
+    save(tmp_path / "masks_2/b.png", 1 - 1 * LEFT[::2, ::2])
+    a, b, _ = colmap.read(tmp_path, images="images_2").frames
+    assert torch.equal(a.shown(), torch.from_numpy(LEFT[::2, ::2]))
+    assert torch.equal(b.shown(), torch.from_numpy(~LEFT[::2, ::2]))
+    whole = colmap.read(tmp_path).frames
+    assert all(torch.equal(frame.shown(), torch.from_numpy(LEFT)) for frame in whole[:2])
+
+
+def test_a_mask_of_another_shape_is_refused_before_any_photo_is_read(tmp_path: Path) -> None:
+    save(tiny.colmap_bin(tmp_path) / "masks/a.png", np.ones((16, 12), int))
+    with pytest.raises(DataError, match=r"masks/a\.png: size: is 12x16, but its camera is for 16x12: another shape"):
+        colmap.read(tmp_path)
+
+
+def prepared(root: Path, read: Callable[[Path], Capture]) -> None:
+    prepare(read(root), tiny.papers(train=None, test_every=0, sr_scale=1), Bicubic(), tiny.POINTS_AT_RANDOM)
+
+
+def test_masks_that_hide_all_photos_are_refused_and_of_one_are_told(tmp_path: Path, caplog) -> None:
+    tiny.colmap_bin(tmp_path)
+    for i, name in enumerate(tiny.NAMES):
+        save(tmp_path / "masks" / name, 0 * LEFT)
+        if i == 0:
+            prepared(tmp_path, colmap.read)
+            assert "1 of 3 photos teach nothing" in caplog.text
+            assert "a.png" in caplog.text
+    with pytest.raises(
+        DataError, match=r"a\.png: masks or alpha: show nothing of 3 of 3 photos: a\.png.*: a mask is 0 where"
+    ):
+        prepared(tmp_path, colmap.read)
+    for name in tiny.NAMES:
+        save(tmp_path / "masks" / name, np.arange(LEFT.size).reshape(LEFT.shape) < 10)
+    prepared(tmp_path, colmap.read)
+    assert "masks hide 95% of their 3 photos" in caplog.text
+
+
+@pytest.mark.parametrize("alpha", [0, 1])
+def test_photos_that_are_transparent_everywhere_are_refused(tmp_path: Path, alpha: int) -> None:
+    for path in (tiny.blender(tmp_path) / "train").iterdir():
+        image = Image.open(path)
+        image.putalpha(alpha)
+        image.save(path)
+    with pytest.raises(DataError, match=r"show nothing of 2 of 2 photos: a, b"):
+        prepared(tmp_path, blender.read)
+
+
+def test_a_hosts_masks_that_hide_everything_are_refused() -> None:
+    nothing = torch.zeros(SCENE.train[0].lr.image.shape[:2], dtype=torch.bool)
+    with pytest.raises(DataError, match="show nothing"):
+        require_shown([view.hiding(nothing) for view in SCENE.train])
+    require_shown([replace(view, hr=view.hr) for view in SCENE.train])
+
+
+def test_photos_outside_of_the_captures_folder_have_their_masks_in_their_own(tmp_path: Path) -> None:
+    tiny.write_photos(tmp_path / "elsewhere")
+    save(tmp_path / "elsewhere/masks/a.png", 1 * LEFT)
+    assert list(masks_of(tmp_path / "scene", [tmp_path / "elsewhere/a.png"])) == [tmp_path / "elsewhere/a.png"]
