@@ -43,6 +43,11 @@ class Photo:
             if (layer := getattr(self, name)) is not None and layer.shape != shape[:2]:
                 raise ValueError(f"{name} must be {shape[:2]}, one value for each pixel, got {tuple(layer.shape)}.")
 
+    @property
+    def shows_something(self) -> bool:
+        """Whether its mask leaves a pixel."""
+        return self.shown is None or bool(self.shown.any())
+
     def to(self, device: torch.device | str) -> Photo:
         """The same photo with its image on `device`. The camera stays on the CPU, where kernels read its numbers."""
         layers = (self.shown, self.transparency)

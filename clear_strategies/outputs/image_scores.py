@@ -10,6 +10,9 @@
 On photographs of six real scenes each of the four ranks the truth first, then a ×4 network, bicubic ×4 and bicubic ×8.
 Only PSNR, SSIM and GMSD respond to a shift by two pixels: blur ignores where contrast is. Noise on a blurred image brings
 blur back to 0 while GMSD rises, so read the two together.
+
+Only shown pixels count: where a mask hides one of the truth's, the image is taken to have it, and PSNR, SSIM and GMSD are those of
+the other pixels.
 """
 
 from __future__ import annotations
@@ -20,7 +23,8 @@ from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core.view import SMALLEST
@@ -45,14 +49,18 @@ class ImageScores:
 class Truth:
     """What images are compared with, and what the scores need of it alone.
 
+    Args:
+        shown: False at pixels that do not count: there an image is taken to be right. One at least is shown. None: all are.
+
     Raises:
         ValueError: it is too small.
     """
 
-    def __init__(self, image: Float[Tensor, "H W 3"]) -> None:
+    def __init__(self, image: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None = None) -> None:
         if min(image.shape[:2]) < SMALLEST:
             raise ValueError(f"images must be at least {SMALLEST} pixels on each side, got {tuple(image.shape)}.")
         self.image = image.detach().clamp(0, 1).cpu()
+        self.shown = None if shown is None or bool(shown.all()) else shown.cpu()
         grey = _grey(self.image)
         self.edges, self.blur = _gradient_at_half_size(grey), _blur(grey)
 
@@ -68,16 +76,21 @@ class Truth:
         if not bool(image.isfinite().all()):
             return ImageScores(math.nan, math.nan, math.nan, math.nan)
         image = image.detach().clamp(0, 1).cpu()
-        mse = float((image.double() - self.image.double()).square().mean())
+        if self.shown is not None:
+            image = torch.where(self.shown[..., None], image, self.image)
+        share = 1.0 if self.shown is None else float(self.shown.double().mean())
+        mse = float((image.double() - self.image.double()).square().mean()) / share
         psnr = min(PSNR_CAP, 10 * math.log10(1 / mse)) if mse > 0 else PSNR_CAP
         grey = _grey(image)
-        gmsd = _gmsd(_gradient_at_half_size(grey), self.edges)
-        return ImageScores(psnr, _ssim(image, self.image), gmsd, _blur(grey) - self.blur)
+        gmsd = _gmsd(_gradient_at_half_size(grey), self.edges, self.shown)
+        return ImageScores(psnr, _ssim(image, self.image, self.shown), gmsd, _blur(grey) - self.blur)
 
 
-def score(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> ImageScores:
-    """`Truth(truth).score(image)`."""
-    return Truth(truth).score(image)
+def score(
+    image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None = None
+) -> ImageScores:
+    """`Truth(truth, shown).score(image)`."""
+    return Truth(truth, shown).score(image)
 
 
 def mean_scores(scores: Sequence[ImageScores]) -> ImageScores | None:
@@ -87,14 +100,15 @@ def mean_scores(scores: Sequence[ImageScores]) -> ImageScores | None:
     return ImageScores(*(sum(getattr(s, f.name) for s in scores) / len(scores) for f in fields(ImageScores)))
 
 
-def _ssim(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"]) -> float:
-    """By the kernel of the loss, in a thirtieth of scikit-image's time; they differ by less than 1e-6."""
-    if cpp.available():
+def _ssim(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None) -> float:
+    """By the kernel of the loss, in a thirtieth of scikit-image's time; they differ by less than 1e-6. The kernel has no map."""
+    if shown is None and cpp.available():
         return float(cpp.native().mean_ssim(x.float().contiguous(), y.float().contiguous(), threads()))
     from skimage.metrics import structural_similarity
 
     how = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0, "channel_axis": 2}
-    return float(structural_similarity(x.double().numpy(), y.double().numpy(), **how))
+    mean, values = structural_similarity(x.double().numpy(), y.double().numpy(), full=True, **how)
+    return float(mean if shown is None else values[shown.numpy()].mean())
 
 
 def _grey(image: Float[Tensor, "H W 3"]) -> np.ndarray:
@@ -107,16 +121,20 @@ def _blur(grey: np.ndarray) -> float:
     return float(blur_effect(grey))
 
 
-def _gmsd(gx: np.ndarray, gy: np.ndarray) -> float:
-    """Standard deviation of the similarity of two gradient magnitudes."""
+def _gmsd(gx: np.ndarray, gy: np.ndarray, shown: Bool[Tensor, "H W"] | None) -> float:
+    """Standard deviation of the similarity of two gradient magnitudes, where one of the four pixels is shown."""
     similarity = (2 * gx * gy + _GMSD_C) / (gx**2 + gy**2 + _GMSD_C)
-    return float(similarity.std())
+    return float((similarity if shown is None else similarity[_at_half_size(shown.double().numpy()) > 0]).std())
 
 
 def _gradient_at_half_size(image: np.ndarray) -> np.ndarray:
     """Prewitt's gradient magnitude."""
     from skimage.filters import prewitt_h, prewitt_v
 
-    h, w = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
-    half = image[:h, :w].reshape(h // 2, 2, w // 2, 2).mean(axis=(1, 3))
+    half = _at_half_size(image)
     return np.asarray(np.hypot(prewitt_h(half), prewitt_v(half)))
+
+
+def _at_half_size(image: np.ndarray) -> np.ndarray:
+    h, w = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
+    return np.asarray(image[:h, :w].reshape(h // 2, 2, w // 2, 2).mean(axis=(1, 3)))

@@ -145,16 +145,17 @@ class Evaluation:
 def evaluate(
     scene: Scene, render: Callable[[Camera], Float[Tensor, "H W 3"]], *, down: DownKernel = "bicubic"
 ) -> Evaluation:
-    """Render and score the views, of many training views a sample.
+    """Render and score the views, of many training views a sample. Pixels that a mask hides do not count.
 
     Where the HR photo is unknown, D of the render is compared with the LR photo.
     """
     renders: dict[str, Tensor] = {}
     tables: dict[str, Table] = {"test": {}, "train": {}}
     against = {"test": _against(scene.test), "train": _against(scene.train)}
-    train = spaced(scene.train, MOST_TRAIN)
-    kept = {view.name for view in scene.test or spaced(train, TRAIN_RENDERS)}
-    for part, views in (("test", scene.test), ("train", train)):
+    test = [view for view in scene.test if view.lr.shows_something]
+    train = spaced([view for view in scene.train if view.lr.shows_something], MOST_TRAIN)
+    kept = {view.name for view in test or spaced(train, TRAIN_RENDERS)}
+    for part, views in (("test", test), ("train", train)):
         for view in views:
             image = render(view.hr.camera).clamp(0, 1)
             if not bool(image.isfinite().all()):
@@ -190,12 +191,14 @@ def _against(views: Sequence[View]) -> str:
 
 def _scores_of(view: View, image: Float[Tensor, "H W 3"], down: DownKernel) -> dict[str, ImageScores]:
     """The scores of the view's images, each in a thread: scikit-image uses one."""
-    truth, shown = view.truth, {"ours": image}
+    truth, mask, scored = view.truth, view.hr.shown, {"ours": image}
     if truth is None:
-        truth, shown["prior"] = view.lr.image, view.hr.image
-        shown = {name: images.downsample(i, view.factor, down) for name, i in shown.items()}
+        if mask is not None:  # else D would mix what it hides into what is shown
+            scored["ours"] = torch.where(mask[..., None], image, view.hr.image)
+        truth, mask, scored["prior"] = view.lr.image, view.lr.shown, view.hr.image
+        scored = {name: images.downsample(i, view.factor, down) for name, i in scored.items()}
     elif not view.hr_is_photo:  # else no SR has a part
-        shown |= {"bicubic": images.upsample(view.lr.image, view.factor), "prior": view.hr.image}
-    scored_against = Truth(truth)
+        scored |= {"bicubic": images.upsample(view.lr.image, view.factor), "prior": view.hr.image}
+    against = Truth(truth, mask)
     with ThreadPoolExecutor(torch.get_num_threads()) as threads:
-        return dict(zip(shown, threads.map(scored_against.score, shown.values()), strict=True))
+        return dict(zip(scored, threads.map(against.score, scored.values()), strict=True))

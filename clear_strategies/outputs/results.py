@@ -178,8 +178,8 @@ def _write_page(
 
 
 def _write_sheet(folder: Path, scene: Scene, evaluation: Evaluation, title: str) -> None:
-    rows, part = [], evaluation.test if scene.test else evaluation.train
-    rendered = [view for view in scene.test or scene.train if view.name in evaluation.renders]
+    rows, part = [], evaluation.test or evaluation.train
+    rendered = [view for view in (*scene.test, *scene.train) if view.name in evaluation.renders]
     for view in spaced(rendered, _SHEET_VIEWS):
         for kind, shown in {"lr": view.lr.image, "prior": view.hr.image, "truth": view.truth}.items():
             if shown is not None:

@@ -25,9 +25,9 @@ def evaluate(state: TrainState, scene: Scene, rasterizer: Rasterizer, done: int)
         return
     with work_log.stage(_STAGE):
         values = [
-            psnr_of(state.field.render(rasterizer, view.hr.camera), view.truth)
+            psnr_of(state.field.render(rasterizer, view.hr.camera), view.truth, view.hr.shown)
             for view in scene.test[: state.settings.probe_views]
-            if view.truth is not None
+            if view.truth is not None and view.lr.shows_something
         ]
         if values:
             state.history[-1]["psnr_test"] = sum(deferred.read(values)) / len(values)
@@ -48,8 +48,11 @@ def loss_of_views(state: TrainState, rasterizer: Rasterizer) -> Number:
     return sum(losses) / len(losses)
 
 
-def psnr_of(image: Tensor, target: Tensor) -> Number:
-    return deferred.defer(_decibels, deferred.scalar((image.clamp(0, 1) - target).square().mean()))
+def psnr_of(image: Tensor, target: Tensor, shown: Tensor | None) -> Number:
+    """dB, of the shown pixels."""
+    squared = (image.clamp(0, 1) - target).square()
+    mse = squared.mean() if shown is None else (squared.mean(2) * shown).sum() / shown.sum().clamp_min(1)
+    return deferred.defer(_decibels, deferred.scalar(mse))
 
 
 def _decibels(mse: float) -> float:

@@ -113,7 +113,7 @@ def _row(s: TrainState, u: Update, lr_image: Tensor, view: View) -> dict[str, Nu
     row: dict[str, Number] = {
         "t": float(s.t),
         "lambda_hr": s.conductor.objective.lambda_hr(s.t),
-        "psnr_train_lr": psnr_of(lr_image, photo.image),
+        "psnr_train_lr": psnr_of(lr_image, photo.image, photo.shown),
         "n_gaussians": float(len(s.field)),
         "detail_abs": deferred.scalar(s.field.detail.data.abs().mean()),
     }

@@ -131,3 +131,19 @@ def test_blur_and_gmsd_tell_blur_invented_texture_and_displaced_structure_apart(
     displaced = score(photograph.roll(2, dims=1), photograph)
     assert abs(displaced.blur) < 0.01
     assert displaced.gmsd > score(enlarged(photograph, 2), photograph).gmsd
+
+
+# ── masks ────────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_hidden_pixels_do_not_count(photograph: Tensor) -> None:
+    shown = torch.ones(photograph.shape[:2], dtype=torch.bool)
+    shown[:, 100:] = False
+    image = (enlarged(photograph, 4) + 0.02 * noise(1, *photograph.shape[:2])).clamp(0, 1)
+    masked = score(image, photograph, shown)
+    assert score(torch.where(shown[..., None], image, 1.0), photograph, shown) == masked
+    alone = score(image[:, :100].contiguous(), photograph[:, :100].contiguous())
+    assert masked.psnr == pytest.approx(alone.psnr, abs=1e-4)
+    assert masked.ssim == pytest.approx(alone.ssim, abs=0.01)
+    assert masked.gmsd == pytest.approx(alone.gmsd, abs=0.01)
+    assert astuple(score(image, photograph, torch.ones_like(shown))) == astuple(score(image, photograph))

@@ -52,6 +52,22 @@ def test_each_view_is_scored_by_method_and_the_mean_is_over_views_if_there_are_a
     assert metrics.to_json(without)["test"] == {"against": "nothing", "views": {}, "mean": {}}
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_what_a_mask_hides_has_no_part_in_the_scores(known: bool) -> None:
+    shown = torch.ones(12, 16, dtype=torch.bool)
+    shown[:, 10:] = False
+    a, empty = (view(name, noise(0, 48, 64), known=known) for name in ("a", "empty"))
+    a, empty = a.hiding(shown), empty.hiding(torch.zeros_like(shown))
+    right = noise(0, 48, 64) if known else a.hr.image
+    evaluations = []
+    for color in (0.0, 1.0):
+        image = torch.where(a.hr.shown[..., None], right, color)
+        evaluations.append(metrics.evaluate(scene((a, empty), (a, empty)), lambda camera, image=image: image))
+    assert evaluations[0].test == evaluations[1].test
+    assert evaluations[0].test["a"]["ours"].psnr > (99 if known else 30)
+    assert list(evaluations[0].test) == list(evaluations[0].train) == list(evaluations[0].renders) == ["a"]
+
+
 def test_of_many_training_views_a_sample_is_scored(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(metrics, "MOST_TRAIN", 3)
     views = tuple(view(str(i), noise(i, 48, 64)) for i in range(7))
