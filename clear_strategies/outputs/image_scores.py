@@ -11,8 +11,8 @@ On photographs of six real scenes each of the four ranks the truth first, then a
 Only PSNR, SSIM and GMSD respond to a shift by two pixels: blur ignores where contrast is. Noise on a blurred image brings
 blur back to 0 while GMSD rises, so read the two together.
 
-Only shown pixels count: where a mask hides one of the truth's, the image is taken to have it, and PSNR, SSIM and GMSD are those of
-the other pixels.
+Only shown pixels count: where a mask hides one of the truth's, the image is taken to have it, and PSNR, SSIM and GMSD are of the
+others.
 """
 
 from __future__ import annotations
