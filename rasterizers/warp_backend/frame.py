@@ -14,6 +14,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Final
 
 import torch
@@ -30,7 +31,7 @@ from rasterizers.warp_backend.blend import blend, blend_vjp
 from rasterizers.warp_backend.colour import basis
 from rasterizers.warp_backend.project import fold, project, project_vjp
 from rasterizers.warp_backend.settings import PAIR_BYTES, SUMS_BYTES, TILE, WarpSettings, mebibytes, padded
-from rasterizers.warp_runtime import array, on_stream
+from rasterizers.warp_runtime import array, launch, on_stream
 
 _ROW: Final = len(types.Row())
 DEFERRED_COUNTS: Final = {"cuda": True, "cpu": False}
@@ -134,13 +135,12 @@ class Frame:
         self._resolved = True
 
     def launch(self, kernel: Any, threads: int, *arguments: Any) -> None:
-        """Launch a kernel with one thread per Gaussian, pair or pixel."""
-        wp.launch(kernel, threads, inputs=arguments, device=wp.device_from_torch(self.like.device))
+        """Launch a kernel with one thread per Gaussian, place or pair."""
+        launch(kernel, [threads], arguments, self.like.device)
 
     def launch_blocks(self, kernel: Any, blocks: int, lanes: int, *arguments: Any) -> None:
         """Launch a kernel whose blocks of `lanes` threads work together."""
-        device = wp.device_from_torch(self.like.device)
-        wp.launch_tiled(kernel, dim=[blocks], inputs=arguments, block_dim=lanes, device=device)
+        launch(kernel, [blocks], arguments, self.like.device, block=lanes, together=True)
 
     def empty(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         return self.like.new_empty(shape, dtype=dtype)
@@ -319,15 +319,17 @@ def _read_deferred(numbers: Tensor) -> Any:
     return wait
 
 
+@lru_cache(maxsize=1024)
 def _pose_struct(camera: Camera) -> Any:
     pose, world = types.Pose(), camera.world_to_camera.double()
     rotation = world[:3, :3].flatten().tolist()
     pose.rotation, pose.exact_rotation = wp.mat33(*rotation), wp.mat33d(*rotation)
     pose.exact_translation = wp.vec3d(*world[:3, 3].tolist())
     pose.center = wp.vec3(*camera.center.double().tolist())
-    return pose
+    return pose.__ctype__()  # type: ignore[attr-defined]
 
 
+@lru_cache(maxsize=1024)
 def _grid_struct(camera: Camera, columns: int, rows: int) -> Any:
     grid = types.Grid()
     grid.exact_focal, grid.exact_principal = wp.vec2d(camera.fx, camera.fy), wp.vec2d(camera.cx, camera.cy)
@@ -335,13 +337,14 @@ def _grid_struct(camera: Camera, columns: int, rows: int) -> Any:
     grid.size, grid.tiles = wp.vec2i(camera.width, camera.height), wp.vec2i(columns, rows)
     (left, right), (top, bottom) = tangent_limits(camera)
     grid.low, grid.high = wp.vec2(left, top), wp.vec2(right, bottom)
-    return grid
+    return grid.__ctype__()  # type: ignore[attr-defined]
 
 
+@lru_cache(maxsize=1024)
 def _cuts_struct(settings: WarpSettings) -> Any:
     cuts = types.Cuts()
     cuts.kernel, cuts.near, cuts.antialiased = settings.kernel, settings.near, settings.antialiased
     cuts.near_bits = int.from_bytes(struct.pack("<d", settings.near), "little")
     cuts.alpha_min, cuts.alpha_max = settings.alpha_min, settings.alpha_max
     cuts.transmittance_min, cuts.background = settings.transmittance_min, wp.vec3(*settings.background)
-    return cuts
+    return cuts.__ctype__()  # type: ignore[attr-defined]

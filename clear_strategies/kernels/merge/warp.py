@@ -35,7 +35,7 @@ from clear_strategies.kernels.gaussian_step.warp.conflict import (
     rule_of,
 )
 from clear_strategies.kernels.merge import interface
-from rasterizers.warp_runtime import array, on_stream, structure
+from rasterizers.warp_runtime import array, launch, on_stream, struct
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -214,50 +214,41 @@ def merge(
     """See `kernels.merge.Merge`."""
     like = next(iter(attributes.values())).out
     n, device = len(like), like.device
-    rows = [_rows(name, attributes.get(name), n, has_colour=colour is not None) for name in _ORDER]
-    o = Options()
-    o.n, o.bases, o.lambda_hr, o.scale, o.keeps_lr = n, 1, lambda_hr, scale, keeps_lr
-    o.corrects = rule is not None and lambda_hr > 0
+    rows = [_rows(name, attributes.get(name), has_colour=colour is not None) for name in _ORDER]
     rgb, basis = (like.new_empty(0, 1, dtype=torch.float32) for _ in range(2))
     if colour is not None:
         rgb, basis = colour.rgb.contiguous(), colour.basis.contiguous()
-        o.bases = basis.shape[1]
-    lanes = _LANES[device.type]
+    lanes, corrects = _LANES[device.type], rule is not None and lambda_hr > 0
+    o = struct(
+        Options, {}, n=n, bases=1 if colour is None else basis.shape[1], lambda_hr=lambda_hr, scale=scale, keeps_lr=keeps_lr,
+        corrects=corrects,
+    )  # fmt: skip
     blocks = -(-n // lanes) if lambda_hr > 0 else 0
     counts = like.new_empty(blocks, 27, dtype=torch.int32)
     omegas, multiples = (like.new_empty(k, 6, dtype=torch.float64) for k in (blocks, n if blocks else 0))
     finite = like.new_ones(1, dtype=torch.int32)
     reliability = None if q is None else q.float().contiguous()
-    on = wp.device_from_torch(device)
+    decided = (
+        *rows[:-1], o, array(rgb), array(basis), rule_of(rule, reliability), array(reliability), array(multiples, Six),
+        array(counts, Counts), array(omegas, Six),
+    )  # fmt: skip
+    combined = *rows, o, array(rgb), array(basis), array(multiples, Six), array(finite)
     with on_stream(device):
-        if blocks:
-            wp.launch_tiled(
-                decide, dim=[blocks], block_dim=lanes, device=on,
-                inputs=[
-                    *rows[:-1], o, array(rgb), array(basis), rule_of(rule, reliability), array(reliability),
-                    array(multiples, Six), array(counts, Counts), array(omegas, Six),
-                ],
-            )  # fmt: skip
-        wp.launch(
-            combine, (n, sum(row.width for row in rows)), device=on, block_dim=lanes,
-            inputs=[*rows, o, array(rgb), array(basis), array(multiples, Six), array(finite)],
-        )  # fmt: skip
+        launch(decide, [blocks], decided, device, block=lanes, together=True)
+        launch(combine, [n, sum(row.width for row in rows)], combined, device, block=lanes)
     seven, six = int(GROUPS) + 1, int(GROUPS)
     sums = counts.sum(0).split_with_sizes([seven, seven, six, six, 1])[:4]
     comparable, opposed, corrected, at_lower_bound, omega = (x.unbind() for x in (*sums, omegas.sum(0)))
     return interface.Merged(ConflictCounts(comparable, opposed, corrected, omega, at_lower_bound), finite[0])
 
 
-def _rows(name: str, rows: interface.Rows | None, n: int, *, has_colour: bool) -> Any:
+def _rows(name: str, rows: interface.Rows | None, *, has_colour: bool) -> Any:
     """An attribute as the kernels take it; one that is absent has no numbers."""
     if rows is None:
-        return Rows()
+        return struct(Rows, {})
     tensors = {field: getattr(rows, field) for field in _ROWS}
-    width = rows.out.shape[1:].numel()
-    kept = {field: x.detach().contiguous() for field, x in tensors.items() if x is not None}
-    fields = tuple((field, x.data_ptr(), n * width) for field, x in kept.items())
-    out = structure(f"merge {name}", Rows, fields, str(rows.out.device))
-    out.has = sum(1 << k for k, field in enumerate(_ROWS[1:]) if field in kept)
-    out.width, out.stiffness = width, rows.stiffness
-    out.first_band = {"sh0": 0, "shN": 1}.get(name, -1) if has_colour else -1
-    return out
+    return struct(
+        Rows, tensors, has=sum(1 << k for k, field in enumerate(_ROWS[1:]) if tensors[field] is not None),
+        width=rows.out.shape[1:].numel(), stiffness=rows.stiffness,
+        first_band={"sh0": 0, "shN": 1}.get(name, -1) if has_colour else -1,
+    )  # fmt: skip

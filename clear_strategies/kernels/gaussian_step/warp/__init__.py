@@ -11,14 +11,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from clear_strategies.core.compiled_rules import CorrectionRule
 from clear_strategies.core.conflicts import ConflictCounts
 from clear_strategies.kernels.gaussian_step import Attribute, StepCounts, StepSettings
 from clear_strategies.kernels.gaussian_step.warp import adam, conflict, passes, raw_gradients
-from rasterizers.warp_runtime import array, on_stream, structure
+from rasterizers.warp_runtime import array, launch, on_stream, struct
 
 LANES: Final = {"cuda": 128, "cpu": 1}
 """Threads per block; on a CPU, Warp's blocks have one."""
@@ -56,16 +55,17 @@ class WarpGaussianStep:
         self._kept = (activation, lr, base, hf)  # kept alive while kernels may read them
         self._has_base, self._hr_basis = base is not None, (lr if base is None else base)["basis"]
         self._one_basis = self._hr_basis.data_ptr() == lr["basis"].data_ptr()
-        view = raw_gradients.View()
-        view.n, view.bases, view.one_basis, view.lambda_hf = self._n, self._bases, self._one_basis, lambda_hf
-        view.has_base, view.has_hf, view.routed = self._has_base, hf is not None, activation["route"] is not None
+        view = struct(
+            raw_gradients.View, {}, n=self._n, bases=self._bases, one_basis=self._one_basis, lambda_hf=lambda_hf,
+            has_base=self._has_base, has_hf=hf is not None, routed=activation["route"] is not None,
+        )  # fmt: skip
         inputs = {"scales": 3, "filtered": 3, "filter": 1, "sigmoid": 1, "factor": 1, "route": 1}
         widths = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "rgb": 3, "basis": self._bases}
         self._gradients = (
-            self._rows("activation", raw_gradients.Activation, activation, inputs, optional=("route",)),
-            self._rows("lr", raw_gradients.Gradient, lr, widths),
-            raw_gradients.Gradient() if base is None else self._rows("base", raw_gradients.Gradient, base, widths),
-            raw_gradients.Gradient() if hf is None else self._rows("hf", raw_gradients.Gradient, hf, widths),
+            self._rows(raw_gradients.Activation, activation, inputs, optional=("route",)),
+            self._rows(raw_gradients.Gradient, lr, widths),
+            self._rows(raw_gradients.Gradient, base or {}, widths if base else {}),
+            self._rows(raw_gradients.Gradient, hf or {}, widths if hf else {}),
             view,
         )
 
@@ -76,8 +76,8 @@ class WarpGaussianStep:
             raise ValueError("there is no HR gradient to correct.")
         if q is not None:
             self._required("reliability", q, 1)
-        parameters = {name: self._attribute(name, attributes[name], width) for name, width in _WIDTHS.items()}
-        bands = self._attribute("shN", attributes["shN"], math.prod(attributes["shN"].p.shape[1:]))
+        parameters = [self._attribute(attributes[name], width) for name, width in _WIDTHS.items()]
+        bands = self._attribute(attributes["shN"], math.prod(attributes["shN"].p.shape[1:]))
         least, most = 3 * (self._bases - 1), min(bands.width, 45)
         if settings.width % 3 or not least <= settings.width <= most:
             raise ValueError(
@@ -87,19 +87,18 @@ class WarpGaussianStep:
         moving = self._like.new_empty(self._n, dtype=torch.bool)
         counts, omegas = self._blocks(conflict.Counts, torch.int32), self._blocks(conflict.Six, torch.float64)
         adam_step = _adam(settings)
-        with on_stream(self._like.device):
-            self._launch_tiled(
-                passes.step, *self._gradients, conflict.rule_of(rule, q), array(q),
-                _options(self._has_base, rule is not None, settings), adam_step, *parameters.values(), bands,
-                array(colours), array(moving), array(counts, conflict.Counts), array(omegas, conflict.Six),
-            )  # fmt: skip
-            wp.launch(
-                passes.step_bands, (self._n, settings.width), device=self._device, block_dim=self._lanes,
-                inputs=[
-                    self._gradients[-1], array(self._like), array(self._hr_basis), array(colours),
-                    array(moving), adam_step, bands,
-                ],
-            )  # fmt: skip
+        device, lanes = self._like.device, self._lanes
+        step = (
+            *self._gradients, conflict.rule_of(rule, q), array(q), _options(self._has_base, rule is not None, settings),
+            adam_step, *parameters, bands,
+            array(colours), array(moving), array(counts, conflict.Counts), array(omegas, conflict.Six),
+        )  # fmt: skip
+        of_bands = (
+            self._gradients[-1], array(self._like), array(self._hr_basis), array(colours), array(moving), adam_step, bands,
+        )  # fmt: skip
+        with on_stream(device):
+            launch(passes.step, [len(counts)], step, device, block=lanes, together=True)
+            launch(passes.step_bands, [self._n, settings.width], of_bands, device, block=lanes)
         comparable, opposed, corrected, at_lower_bound, (still,) = counts.sum(0).split_with_sizes(
             [_GROUPS + 1, _GROUPS + 1, _GROUPS, _GROUPS, 1]
         )
@@ -112,44 +111,33 @@ class WarpGaussianStep:
     def _lanes(self) -> int:
         return LANES[self._like.device.type]
 
-    @property
-    def _device(self) -> Any:
-        return wp.device_from_torch(self._like.device)
-
-    def _launch_tiled(self, kernel: Any, *arguments: Any) -> None:
-        """Launch a kernel with one thread per Gaussian, in blocks that sum together."""
-        wp.launch_tiled(
-            kernel, dim=[-(-self._n // self._lanes)], inputs=arguments, block_dim=self._lanes, device=self._device
-        )
-
     def _blocks(self, row: Any, dtype: torch.dtype) -> Tensor:
         """A row per block for its counts."""
         return self._like.new_empty(-(-self._n // self._lanes), len(row()), dtype=dtype)
 
-    def _attribute(self, name: str, a: Attribute, width: int) -> Any:
+    def _attribute(self, a: Attribute, width: int) -> Any:
         tensors = {"p": a.p, "m": a.m, "v": a.v, "anchor": a.anchor, "merged": a.merged}
-        widths = dict.fromkeys(tensors, width)
-        out = self._rows(name, adam.Attribute, tensors, widths, optional=("anchor", "merged"))
-        out.width, out.anchored, out.merges = width, a.anchor is not None, a.merged is not None
-        out.bounded = a.keep != 1 or a.limit != math.inf
-        out.stiffness, out.rate, out.keep, out.limit = a.stiffness, -a.rate, a.keep, a.limit
-        return out
+        return self._rows(
+            adam.Attribute, tensors, dict.fromkeys(tensors, width), optional=("anchor", "merged"),
+            width=width, anchored=a.anchor is not None, merges=a.merged is not None,
+            bounded=a.keep != 1 or a.limit != math.inf, stiffness=a.stiffness, rate=-a.rate, keep=a.keep, limit=a.limit,
+        )  # fmt: skip
 
     def _rows(
         self,
-        owner: str,
         kind: Any,
         tensors: Mapping[str, Tensor | None],
         widths: Mapping[str, int],
         optional: Sequence[str] = (),
+        **numbers: float,
     ) -> Any:
         """A structure of type `kind` over tensors of n rows with `widths` numbers each, for which it checks them."""
-        fields = tuple(
-            (name, self._required(name, tensors[name], width).data_ptr(), self._n * width)
+        rows = {
+            name: self._required(name, tensors[name], width)
             for name, width in widths.items()
             if name not in optional or tensors[name] is not None
-        )
-        return structure(owner, kind, fields, str(self._like.device))
+        }
+        return struct(kind, rows, **numbers)
 
     def _required(self, name: str, tensor: Tensor | None, width: int) -> Tensor:
         """The tensor, if it has a row of `width` numbers for each Gaussian."""
@@ -163,14 +151,20 @@ class WarpGaussianStep:
 
 
 def _options(has_hr: bool, corrects: bool, settings: StepSettings) -> Any:
-    out = passes.StepOptions()
-    out.lambda_hr, out.skips, out.width = settings.lambda_hr, settings.skips, settings.width
-    out.compares, out.corrects = has_hr and settings.lambda_hr > 0, corrects
-    return out
+    return struct(
+        passes.StepOptions, {}, lambda_hr=settings.lambda_hr, skips=settings.skips, width=settings.width,
+        compares=has_hr and settings.lambda_hr > 0, corrects=corrects,
+    )  # fmt: skip
 
 
 def _adam(s: StepSettings) -> Any:
-    out = adam.AdamStep()
-    out.beta1, out.beta2, out.gain1, out.gain2 = s.beta1, s.beta2, 1 - s.beta1, 1 - s.beta2
-    out.per_bias2, out.eps = 1 / s.bias2, s.eps
-    return out
+    return struct(
+        adam.AdamStep,
+        {},
+        beta1=s.beta1,
+        beta2=s.beta2,
+        gain1=1 - s.beta1,
+        gain2=1 - s.beta2,
+        per_bias2=1 / s.bias2,
+        eps=s.eps,
+    )

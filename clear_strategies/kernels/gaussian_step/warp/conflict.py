@@ -13,6 +13,7 @@ from torch import Tensor
 
 from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule
 from clear_strategies.kernels.gaussian_step.warp.raw_gradients import Gradient, RawGradient, View, basis_products
+from rasterizers.warp_runtime import struct
 
 GROUPS: Final = wp.constant(6)
 MEANS: Final = wp.constant(0)
@@ -52,12 +53,12 @@ class Rule:
 
 def rule_of(rule: CorrectionRule | None, q: Tensor | None) -> Any:
     """The rule as kernels take it; None: nothing is corrected."""
-    out = Rule()
-    if rule is not None:
-        out.groups = sum(on << k for k, on in enumerate(rule.corrects))
-        out.tolerance, out.weight_min, out.weight_max = rule.tolerance, rule.weight_min, rule.weight_max
-        out.rotation_noise, out.has_reliability = ROTATION_NOISE, q is not None
-    return out
+    if rule is None:
+        return struct(Rule, {})
+    return struct(
+        Rule, {}, groups=sum(on << k for k, on in enumerate(rule.corrects)), tolerance=rule.tolerance,
+        weight_min=rule.weight_min, weight_max=rule.weight_max, rotation_noise=ROTATION_NOISE, has_reliability=q is not None,
+    )  # fmt: skip
 
 
 @wp.struct

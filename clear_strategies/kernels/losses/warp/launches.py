@@ -12,7 +12,7 @@ from torch import Tensor
 
 from clear_strategies.kernels.losses.images import ImagePair
 from clear_strategies.kernels.losses.warp import haar, similarity, sums
-from rasterizers.warp_runtime import array, on_stream
+from rasterizers.warp_runtime import array, launch, on_stream
 
 LANES: Final = {"cuda": 256, "cpu": 1}  # threads per block; on a CPU, Warp's blocks have one
 
@@ -45,10 +45,8 @@ def haar_l1(images: ImagePair, levels: int) -> Float[Tensor, ""]:
         for _ in range(levels - 1):
             finer = pyramid[-1]
             low = finer.new_empty(-(-finer.shape[0] // 2), -(-finer.shape[1] // 2), 3)
-            wp.launch(
-                haar.low_part, low.shape[:2], device=wp.device_from_torch(x.device),
-                inputs=[array(finer, wp.vec3), array(y, wp.vec3), finer is x, array(low, wp.vec3)],
-            )  # fmt: skip
+            blocks = array(finer, wp.vec3), array(y, wp.vec3), finer is x, array(low, wp.vec3)
+            launch(haar.low_part, low.shape[:2], blocks, x.device)
             pyramid.append(low)
         rows = [-(-level.shape[0] // 2) for level in pyramid]  # of blocks
         parts, above = _parts(x, sum(rows)), None
@@ -76,4 +74,4 @@ def _total(parts: Tensor) -> Float[Tensor, ""]:
 def _launch(kernel: Any, blocks: Sequence[int], device: torch.device, *arguments: Any) -> None:
     """Launch a kernel; `kernel` makes it for a number of threads per block."""
     lanes = LANES[device.type]
-    wp.launch_tiled(kernel(lanes), dim=blocks, block_dim=lanes, inputs=arguments, device=wp.device_from_torch(device))
+    launch(kernel(lanes), blocks, arguments, device, block=lanes, together=True)
