@@ -112,7 +112,6 @@ def nth_tile(ellipse: Ellipse, nth: wp.int32, grid: Grid) -> wp.int32:
 @wp.kernel
 def list_pairs(
     order: wp.array[wp.int32],
-    counts: wp.array[wp.int32],
     ends: wp.array[wp.int64],
     rows: wp.array[Row],
     grid: Grid,
@@ -123,18 +122,18 @@ def list_pairs(
 ) -> None:
     """One thread per place: its Gaussian, front to back, and which of the Gaussian's tiles it holds.
 
-    The Gaussian at `order[rank]` has the `counts` places before `ends[rank]`. `counts` comes from another kernel, where the
-    compiler may round differently; if the tiles differ, the number of places holds. Places without a tile, and those beyond the
-    last Gaussian's, get the tile that does not exist.
+    The Gaussian at `order[rank]` has the places from `ends[rank]` to `ends[rank + 1]`, as many as another kernel counted, where
+    the compiler may round differently; if the tiles differ, the number of places holds. Places without a tile, and those beyond
+    the last Gaussian's, get the tile that does not exist.
     """
     place = wp.tid()
     tiles[place] = grid.tiles[0] * grid.tiles[1]
     places[place] = place
     if wp.int64(place) >= ends[ends.shape[0] - 1]:
         return
-    rank = wp.lower_bound(ends, wp.int64(place) + wp.int64(1))
-    i = order[rank]
-    nth = place - wp.int32(ends[rank] - wp.int64(counts[i]))
+    after = wp.lower_bound(ends, wp.int64(place) + wp.int64(1))
+    i = order[after - 1]
+    nth = place - wp.int32(ends[after - 1])
     if nth == 0:
         firsts[i] = place
     tiles[place] = nth_tile(ellipse_of(rows[i]), nth, grid)

@@ -57,6 +57,7 @@ class _View:
         self.visible = like.new_empty(n, dtype=torch.bool)
         self.counts = like.new_empty(n, dtype=torch.int32)  # tiles of each Gaussian
         self.firsts = like.new_empty(n, dtype=torch.int32)  # its first pair
+        self.ends = like.new_zeros(n + 1, dtype=torch.int64)  # pairs up to each Gaussian, front to back
         self.pairs = 0  # set by `Frame.resolve_counts`
         self.lists: _Lists  # set by `Frame._list`
         self.capacity = -1  # pairs that the lists have space for; the nearest ones if there are more
@@ -100,10 +101,14 @@ class Frame:
     def draw(self) -> list[WarpRendering]:
         """An image on each grid. Errors in the input may be raised only when an image is first accessed."""
         with on_stream(self.like.device):
-            keys = self.project()
-            self._read = _read_deferred(self.totals)
+            keys, flags = self.project()
             places = torch.arange(2 * self.n, dtype=torch.int32, device=self.like.device)
             self._order = _sorted(keys, places, self.n, 31)[1]
+            front_to_back = self._order.long()
+            for view in self.views:
+                torch.cumsum(view.counts[front_to_back], 0, out=view.ends[1:])
+            self.totals = torch.cat([*(view.ends[-1:] for view in self.views), flags])
+            self._read = _read_deferred(self.totals)
             capacities = [self.settings.capacity(view.camera) for view in self.views]
             if DEFERRED_COUNTS[self.settings.device] and min(capacities) >= 0:
                 for nth, capacity in enumerate(capacities):
@@ -154,8 +159,8 @@ class Frame:
             self.launch(basis, self.n, *arguments)
         return self._basis
 
-    def project(self) -> Tensor:
-        """Project onto each grid. Returns the depth keys, with space for sorting them, and starts counting pairs."""
+    def project(self) -> tuple[Tensor, Tensor]:
+        """Project onto each grid. Returns the depth keys, with space for sorting them, and the kernel's flags."""
         keys = self.empty(2 * self.n, dtype=torch.int32)
         flags = self.like.new_zeros(3, dtype=torch.int64)
         for nth, view in enumerate(self.views):
@@ -169,8 +174,7 @@ class Frame:
                 array(self.depths), array(view.ellipses, types.Row), array(view.means2d, wp.vec2), array(view.visible),
                 array(view.counts), array(flags),
             )  # fmt: skip
-        self.totals = torch.cat([*(view.counts.sum(0, True) for view in self.views), flags])
-        return keys
+        return keys, flags
 
     def _require_memory(self, view: _View, count: int) -> None:
         """Refuse counts beyond the budget. Counts are 64-bit up to here, and fit 32 bits after it."""
@@ -189,11 +193,10 @@ class Frame:
         tiles, places, splats, gaussians = (
             self.empty(n, dtype=torch.int32) for n in (2 * length, 2 * length, length, length)
         )
-        after = torch.cumsum(view.counts[self._order.long()], 0)
         n_tiles = view.columns * view.rows_of_tiles
         starts, ends = self.like.new_zeros(2, n_tiles + 1, dtype=torch.int32)
         self.launch(
-            list_pairs, capacity, array(self._order), array(view.counts), array(after), array(view.ellipses, types.Row),
+            list_pairs, capacity, array(self._order), array(view.ends), array(view.ellipses, types.Row),
             view.grid, array(view.firsts), array(tiles), array(places), array(splats),
         )  # fmt: skip
         tiles, places = _sorted(tiles, places, capacity, n_tiles.bit_length())
