@@ -6,6 +6,7 @@ conductor("clear", "strategies.gco.tolerance=0.1", iterations=30_000)
 from __future__ import annotations
 
 import hashlib
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -40,6 +41,8 @@ _PACKAGE: Final = Path(__file__).resolve().parent
 # In a wheel conf/ lies inside the package, in a checkout beside it.
 CONF: Final = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / "conf"
 
+_PLAIN: Final = re.compile(r"(/|\./|(\.\./)+)?[A-Za-z_][\w./-]*", re.ASCII)  # needs no quotes, for Hydra or a shell
+_NO_TEXT: Final = ("null", "true", "false", "nan", "inf")
 _LONGEST_NAME: Final = 200  # bytes of a folder's name; most file systems take 255
 
 OPTIONS: Final = "clear_strategies_conf"
@@ -163,6 +166,17 @@ def composed(overrides: list[str], config: str = "conductor") -> DictConfig:
         raise SettingError(f"{' '.join(overrides)}: {problem}. See conf/ for what there is.") from error
     finally:
         GlobalHydra.instance().hydra = before
+
+
+def quoted(value: str) -> str:
+    """A string of Hydra's grammar: paths may contain spaces, commas, brackets, equals signs and `${`, or look like
+    numbers. A backslash is itself, except before a quote or `${`, where both libraries want two.
+    """
+    if _PLAIN.fullmatch(value) and value.lower() not in _NO_TEXT:
+        return value
+    for_omegaconf = re.sub(r"(\\*)\$\{", r"\1\1\\${", value)
+    for_hydra = re.sub(r"(\\*)('|\Z)", lambda end: end[1] * 2 + ("\\'" if end[2] else ""), for_omegaconf)
+    return f"'{for_hydra}'"
 
 
 def require_each_once(overrides: Iterable[str]) -> None:

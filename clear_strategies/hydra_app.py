@@ -19,13 +19,14 @@ from typing import Any, Final
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import ConfigCompositionException
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import ConfigCompositionException, HydraException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from clear_strategies import files
-from clear_strategies.compose import CONF, composed, flat, require_each_once
+from clear_strategies.compose import CONF, composed, flat, quoted, require_each_once
 from clear_strategies.errors import ClearError, SettingError
 from clear_strategies.jobs import exit_codes
 
@@ -52,7 +53,7 @@ def main(overrides: Sequence[str] | None = None) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     arguments = sys.argv[1:] if overrides is None else overrides
     _require_known_flags(arguments)
-    sys.argv[1:] = [_VERBOSE if a in ("-v", "--verbose") else a for a in arguments]  # Hydra reads them there
+    sys.argv[1:] = [_VERBOSE if a in ("-v", "--verbose") else readable(a) for a in arguments]  # Hydra reads them there
     exit_codes.require_train()
     try:
         hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(job)()
@@ -60,6 +61,20 @@ def main(overrides: Sequence[str] | None = None) -> None:
         if (unknown := re.match(r"Could not override '([^']+)'", str(error))) is None:
             raise
         raise SettingError(_no_such_setting(unknown[1])) from error
+
+
+def readable(word: str) -> str:
+    """A word of the command line, its value quoted where Hydra's grammar has no such value, as paths may have any letters, or
+    where it would take a path with a comma for two.
+    """
+    key, equals, value = word.partition("=")
+    if not equals or word.startswith("-"):
+        return word
+    try:
+        OverridesParser.create().parse_override(word)
+    except HydraException:
+        return f"{key}={quoted(value)}"
+    return f"{key}={quoted(value)}" if "," in value and os.path.exists(value) else word  # noqa: PTH110 - as `is_file`
 
 
 def _require_known_flags(arguments: Sequence[str]) -> None:

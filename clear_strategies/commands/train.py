@@ -5,7 +5,6 @@ The reader is the one of what lies in the folder. Everything behind the folder g
 
 from __future__ import annotations
 
-import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -32,8 +31,6 @@ The command trains +strategy=best on all photos for fit.iterations={_ITERATIONS}
 """
 # What decides which strategies train, and for how long, so that the defaults must not.
 CHOOSE_STRATEGIES: Final = ("+strategy=", "+method=", "experiment=", "+experiment=")
-_PLAIN: Final = re.compile(r"(/|\./|(\.\./)+)?[A-Za-z_][\w./-]*", re.ASCII)  # needs no quotes, for Hydra or a shell
-_NO_TEXT: Final = ("null", "true", "false", "nan", "inf")
 _CHOOSE_ITERATIONS: Final = ("fit.iterations=", "experiment=", "+experiment=", "+protocol=", "+scene=")
 
 
@@ -60,6 +57,8 @@ def overrides(arguments: Sequence[str]) -> list[str]:
     path, rest = Path(arguments[0]), arguments[1:]
     if not path.exists():
         raise SettingError(f"train: {path} is not there. Name the folder of the photos or of the capture.")
+    from clear_strategies.compose import quoted
+
     defaults = {"+strategy=best": CHOOSE_STRATEGIES, f"fit.iterations={_ITERATIONS}": _CHOOSE_ITERATIONS}
     used = [default for default, chosen in defaults.items() if not any(word.startswith(chosen) for word in rest)]
     return [*used, f"data={detect(path)}", f"data.path={quoted(str(path))}", *rest]
@@ -76,14 +75,3 @@ def detect(path: Path) -> str:
         module = import_module(node.get("reader", {}).get("_target_", __name__).rpartition(".")[0])
         ranks[name] = module.recognises(path) if hasattr(module, "recognises") else 0
     return max(sorted(ranks), key=lambda name: ranks[name])
-
-
-def quoted(value: str) -> str:
-    """A string of Hydra's grammar: paths may contain spaces, commas, brackets, equals signs and `${`, or look like
-    numbers. A backslash is itself, except before a quote or `${`, where both libraries want two.
-    """
-    if _PLAIN.fullmatch(value) and value.lower() not in _NO_TEXT:
-        return value
-    for_omegaconf = re.sub(r"(\\*)\$\{", r"\1\1\\${", value)
-    for_hydra = re.sub(r"(\\*)('|\Z)", lambda end: end[1] * 2 + ("\\'" if end[2] else ""), for_omegaconf)
-    return f"'{for_hydra}'"

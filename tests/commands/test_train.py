@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from clear_strategies import compose
+from clear_strategies import compose, hydra_app
 from clear_strategies.commands import train
 from clear_strategies.compose import composed, tree
 from clear_strategies.errors import SettingError
@@ -66,6 +66,15 @@ def test_a_plain_path_needs_no_quotes_and_a_path_that_looks_like_a_number_is_tex
     overrides = train.overrides([name])
     assert (f"data.path={name}" in overrides) == plain
     assert composed(overrides, "config").data.path == name
+
+
+@pytest.mark.parametrize("name", ["it's", 'a "b" c', "a, b", "a (1)", "a=b", "[x", "a{b}"])
+def test_data_path_of_any_letters_needs_no_quotes_of_hydras(tmp_path, name):
+    (tmp_path / name).mkdir()
+    word = hydra_app.readable(f"data.path={tmp_path / name}")
+    assert composed(["data=colmap", word], "config").data.path == str(tmp_path / name)
+    for as_it_is in ("fit.seed=1,2", "+strategy=[gco,svs]", "~prior", "--cfg"):
+        assert hydra_app.readable(as_it_is) == as_it_is
 
 
 def test_strategies_that_are_named_replace_the_whole_method(tmp_path):
