@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -54,11 +55,27 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (here / "file").write_text("no folder")
     (here / "clip.mp4").write_text("no folder")
     (here / "damaged.ply").write_text("ply\nformat ascii 1.0\n")
+    (here / "compressed.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty uint packed_position\nend_header\n"
+    )
+    (captures.nerfstudio(here / "renamed") / "images").rename(here / "renamed/photos")
+    for name, lens in (
+        ("units", {"fl_x": 0.9, "fl_y": 1.2, "cx": 0.5, "cy": 0.5}),
+        ("panoramas", {"camera_model": "EQUIRECTANGULAR"}),
+    ):
+        file = captures.nerfstudio(here / name) / "transforms.json"
+        captures.write_json(file, json.loads(file.read_text()) | lens)
+    for folder, file, text in (
+        ("polycam", "keyframes/cameras/1.json", '{"t_00": 1}'),
+        ("record3d", "metadata", '{"poses": []}'),
+    ):
+        (here / folder / file).parent.mkdir(parents=True)
+        (here / folder / file).write_text(text)
     return here
 
 
 def test_the_table_has_its_rows() -> None:
-    assert len(ROWS) >= 19
+    assert len(ROWS) >= 25
     assert len({row["command"] for row in ROWS}) == len(ROWS)
 
 

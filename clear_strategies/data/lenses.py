@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -20,6 +21,18 @@ from clear_strategies.errors import DataError
 FARTHEST: Final = 1e12
 """The largest coordinate, world units: float32 cannot resolve a scene beyond it."""
 _LARGEST_SIDE: Final = 1 << 20
+_SHORTEST: Final = 0.1  # of a focal length, in sides of the image: a pinhole of 157 degrees, a fisheye of more than 360
+# Coefficients of each camera model of COLMAP that OpenCV undistorts, in OpenCV's order; of the others all must be 0.
+_PERSPECTIVE: Final = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_FISHEYE: Final = ("k1", "k2", "k3", "k4")
+_TERMS: Final = {
+    "SIMPLE_PINHOLE": (), "PINHOLE": (), "SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2"), "FULL_OPENCV": _PERSPECTIVE,
+    "OPENCV": ("k1", "k2", "p1", "p2", "k3"),  # nerfstudio's has a k3, and a k4 that is another than OpenCV's
+    "FOV": (), "SIMPLE_DIVISION": (), "DIVISION": (), "EUCM": (),
+    "SIMPLE_FISHEYE": (), "FISHEYE": (), "SIMPLE_RADIAL_FISHEYE": ("k1",), "RADIAL_FISHEYE": ("k1", "k2"),
+    "OPENCV_FISHEYE": _FISHEYE, "THIN_PRISM_FISHEYE": _FISHEYE, "RAD_TAN_THIN_PRISM_FISHEYE": _FISHEYE,
+}  # fmt: skip
+_UNDISTORT: Final = "colmap image_undistorter --image_path images --input_path sparse/0 --output_path undistorted"
 _BORDER_SAMPLES: Final = 33
 _Coordinate = Annotated[float, Meta(gt=-FARTHEST, lt=FARTHEST)]
 _Rows = Annotated[
@@ -56,9 +69,15 @@ class Lens:
             raise DataError(file, where, f"has intrinsics that are not finite: {numbers}", "estimate the cameras again")
         if not (0 < self.width < _LARGEST_SIDE and 0 < self.height < _LARGEST_SIDE):
             raise DataError(file, where, f"has size {self.width}x{self.height}", "check the camera")
-        if not all(1e-3 < f / self.width < 1e6 for f in (self.fx, self.fy)):
-            problem = f"has focal lengths {self.fx:g}, {self.fy:g} px where the image is {self.width} px wide"
-            raise DataError(file, where, problem, "check the camera")
+        shortest = min(self.fx / self.width, self.fy / self.height)
+        in_sides = 0 < max(self.cx, self.cy) <= 1 < min(self.width, self.height) / 8
+        if not (shortest > _SHORTEST and max(self.fx, self.fy) / self.width < 1e6) or in_sides:
+            problem = (
+                f"has focal lengths {self.fx:g}, {self.fy:g} and principal point ({self.cx:g}, {self.cy:g}) "
+                f"where the image is {self.width}x{self.height}; all must be pixels"
+            )
+            sides = shortest > 0 and "multiply what is in units of the image by its width (x) and height (y)"
+            raise DataError(file, where, problem, sides or "estimate the cameras again")
         if not (-self.width < self.cx < 2 * self.width and -self.height < self.cy < 2 * self.height):
             problem = f"has its principal point ({self.cx:g}, {self.cy:g}) px far outside the image"
             raise DataError(file, where, problem, "check the camera")
@@ -118,6 +137,44 @@ class Lens:
     def matrix(self) -> Float[np.ndarray, "3 3"]:
         """K in OpenCV's convention: the first pixel is centred at (0, 0)."""
         return np.array([[self.fx, 0, self.cx - 0.5], [0, self.fy, self.cy - 0.5], [0, 0, 1.0]])
+
+
+def lens_of(
+    file: Path,
+    where: str,
+    model: str,
+    size: tuple[int, int],
+    pinhole: tuple[float, float, float, float],
+    terms: Mapping[str, float],
+) -> Lens:
+    """The lens of a camera model that a file names.
+
+    Args:
+        pinhole: fx, fy, cx, cy.
+        terms: its coefficients by their names, p and k counted from 1; those left out are 0.
+
+    Raises:
+        DataError: the model is not known, a coefficient that OpenCV cannot undistort is not 0, or `Lens.check` refuses it.
+    """
+    kept = terms_of(file, where, model)
+    if rest := [name for name, value in terms.items() if value != 0 and name not in kept]:
+        problem = f"has {rest[0]} = {terms[rest[0]]:g}; of the camera model {model} it must be 0"
+        raise DataError(file, where, problem, f"check the model, or undistort the photos first: {_UNDISTORT}")
+    distortion = tuple(terms.get(name, 0.0) for name in kept)
+    return Lens(*size, *pinhole, distortion, "FISHEYE" in model).check(file, where)
+
+
+def terms_of(file: Path, where: str, model: str) -> tuple[str, ...]:
+    """The coefficients of a camera model that need not be 0; a DataError for a model that is not supported."""
+    if model not in _TERMS:
+        panorama = "ns-process-data images --camera-type equirectangular --data images --output-dir flat"
+        remedy = (
+            f"cut panoramas into flat photos: {panorama}"
+            if model == "EQUIRECTANGULAR"
+            else f"undistort the photos first: {_UNDISTORT}"
+        )
+        raise DataError(file, where, f"has the camera model {model[:40]}, which is not supported", remedy)
+    return _TERMS[model]
 
 
 def pose_from_opengl(file: Path, where: str, matrix: object) -> Float[Tensor, "4 4"]:

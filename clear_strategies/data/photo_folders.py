@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
+from functools import cache
+from pathlib import Path, PureWindowsPath
 from typing import Final, TypeVar
 
 from clear_strategies.data.photo_files import SUFFIXES, read_image
@@ -20,22 +22,23 @@ _Entry = TypeVar("_Entry")
 
 
 def image_folder(root: Path, name: str | None = None) -> Path:
-    """The folder of photos in `root`; without a name, the first of images, images_2, images_4, images_8.
+    """The folder of photos in `root`; without a name, the first of images, images_2, images_4, images_8, else `root` with photos.
 
     Raises:
         DataError: it does not exist.
     """
-    present = [folder for folder in _FOLDERS if (root / folder).is_dir()]
+    present = [folder for name in _FOLDERS if (folder := named(root, name)).is_dir()]
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
     if name is not None:
         if not (root / name).is_dir():
-            remedy = f"choose one of {', '.join(present)}" if present else "check the path"
+            remedy = f"choose one of {', '.join(path.name for path in present)}" if present else "check the path"
             raise DataError(root / name, "images", "is no folder", remedy)
         return root / name
-    if not present:
-        raise DataError(root, "images", f"has none of the folders {', '.join(_FOLDERS)}", "name the folder of photos")
-    return root / present[0]
+    if not present and not images_in(root):
+        remedy = "name the folder of photos: data.reader.images=FOLDER"
+        raise DataError(root, "images", f"has none of the folders {', '.join(_FOLDERS)}", remedy)
+    return present[0] if present else root
 
 
 def folder_note(folder: Path) -> str:
@@ -78,6 +81,57 @@ def by_stem(paths: Iterable[Path]) -> dict[str, list[Path]]:
     return stems
 
 
+def named(folder: Path, name: str) -> Path:
+    """What lies in a folder under this name, whatever the case of its letters; a path to nothing where it does not."""
+    path = folder / name
+    if path.exists() or not folder.is_dir():
+        return path
+    return next((other for other in sorted(folder.iterdir()) if other.name.lower() == name.lower()), path)
+
+
+def finder(folder: Path) -> Callable[[str], Path]:
+    """How each reader finds the files that a capture names, in or below a folder.
+
+    A name is taken as it stands, without an ending as that of a PNG file. Where no such file is there, backslashes separate
+    folders, letters may have another case, the beginning of an absolute path may differ, and the ending is that of the only image
+    of this name. Where all of this finds none, the path leads to nothing.
+    """
+
+    @cache
+    def entries(parent: Path) -> dict[str, list[Path]]:
+        """What lies there, in lower case: by name, and images also by their names without ending."""
+        found: dict[str, list[Path]] = {}
+        for path in sorted(parent.iterdir()) if parent.is_dir() else ():
+            for key in {path.name.lower(), (path.stem if path.suffix.lower() in SUFFIXES else path.name).lower()}:
+                found.setdefault(key, []).append(path)
+        return found
+
+    def below(parts: Sequence[str]) -> Path | None:
+        parent, last = folder, PureWindowsPath(parts[-1])
+        for part in parts[:-1]:
+            there = parent / part
+            same = [] if os.path.isdir(there) else entries(parent).get(part.lower(), [])  # noqa: PTH112 - as in `is_file`
+            parent = next((path for path in same if path.is_dir()), there)
+        for key in (last.name, last.stem) if last.suffix[1:2].isalpha() else (last.name,):  # "rgb.0001" has no ending
+            files = [path for path in entries(parent).get(key.lower(), []) if path.is_file()]
+            if len(files) == 1:
+                return files[0]
+        return None
+
+    def find(name: str) -> Path:
+        for exact in (folder / name, folder / f"{name}.png"):
+            if is_file(exact):
+                inside = folder.absolute()
+                return folder / exact.relative_to(inside) if exact.is_relative_to(inside) else exact
+        path = PureWindowsPath(name)
+        parts = [part for part in path.parts if part != path.anchor]
+        starts = range(len(parts) if path.anchor else min(1, len(parts)))
+        missing = folder.joinpath(*(parts[-1:] if path.anchor else parts))
+        return next(filter(None, (below(parts[i:]) for i in starts)), missing)
+
+    return find
+
+
 def is_file(path: Path) -> bool:
     """Whether the path leads to a file; not for a name that no file can have, such as one of 5,000 letters."""
     return os.path.isfile(path)  # noqa: PTH113 - Path.is_file raises for a name that is too long
@@ -96,9 +150,11 @@ def usable(
     Raises:
         DataError: a photo is missing and none may be left out, or none is left.
     """
-    absent = [path_of(entry).name for entry in entries if not is_file(path_of(entry))]
+    absent = [path_of(entry) for entry in entries if not is_file(path_of(entry))]
+    if absent and len(absent) == len(entries):
+        raise _none_there(listing, absent)
     if absent and not skip_faulty:
-        problem = f"{len(absent)} of {len(entries)} are not there: {some(absent)}"
+        problem = f"{len(absent)} of {len(entries)} are not there: {some([path.name for path in absent])}"
         raise DataError(
             listing, "photos", problem, "put them back, or train without them: data.reader.skip_faulty=true"
         )
@@ -106,6 +162,24 @@ def usable(
     if entries and not kept:
         raise DataError(listing, "photos", f"none of {len(entries)} can be used", "check the path")
     return kept
+
+
+def _none_there(listing: Path, absent: Sequence[Path]) -> DataError:
+    """The error where no photo of a list is there: the folder that was searched, and what lies there or one folder deeper."""
+    searched = next(folder for folder in absent[0].parents if folder.is_dir())
+    remedy = f"give the photos these names, or correct those in {listing.name}"
+    if photos := images_in(searched) or images_in(searched, "*/*"):
+        found = f"{len(photos)} others, such as {some([photos[0].relative_to(searched).as_posix()])}"
+        if listing.suffix != ".json":
+            inside = "" if photos[0].parent == searched else f"{searched.name}/{photos[0].parent.name}"
+            remedy = f"name the folder of the model's photos: data.reader.images={inside or 'FOLDER'}"
+    else:
+        endings = Counter(path.suffix or path.name for path in sorted(searched.iterdir()))
+        found = ", ".join(f"{count} {ending}" for ending, count in endings.most_common(_LISTED)) or "nothing"
+        remedy = "put the photos there, as PNG or JPEG"
+    missing = some([absent[0].relative_to(searched).as_posix()])
+    problem = f"none of {len(absent)} is in {searched}, such as {missing}; it holds {found}"
+    return DataError(listing, "photos", problem, remedy)
 
 
 def some(names: Sequence[str]) -> str:

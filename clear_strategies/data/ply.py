@@ -7,6 +7,7 @@ licence, GPL-3.0, does not go with this package's.)
 from __future__ import annotations
 
 import logging
+import math
 import re
 import warnings
 from collections.abc import Sequence
@@ -29,6 +30,7 @@ _log = logging.getLogger(__name__)
 
 _BANDS: Final = (0, 3, 8, 15)  # (degree + 1)² - 1
 _MIP: Final = "SplatRenderMode: mip"  # tells viewers to draw with opacity compensation
+_FLAT: Final = -30.0  # logarithm of a scale that no pixel shows
 _OPAQUE: Final = 16.0  # logit: sigmoid gives 1 as closely as float32 tells it from 1
 
 _TYPES: Final = {
@@ -109,7 +111,7 @@ def write_gaussians(path: Path, g: GaussianPly) -> None:
 def read_gaussians(path: Path) -> GaussianPly:
     """Read the standard layout. Other properties are ignored, with a warning that names them.
 
-    Opacities of exactly 0 and 1, whose logits are infinite, are read: formats of 8 bits have them.
+    Opacities of exactly 0 and 1, whose logits are infinite, are read, since formats of 8 bits have them, and so are scales of 0.
 
     Raises:
         DataError: the file is damaged or truncated, or a property is missing or not finite.
@@ -126,8 +128,8 @@ def read_gaussians(path: Path) -> GaussianPly:
         means=_columns(path, table, _XYZ),
         sh0=_columns(path, table, _DC)[:, None],
         shN=_columns(path, table, rest).view(len(table), 3, len(rest) // 3).transpose(1, 2).contiguous(),
-        opacities=_columns(path, table, ("opacity",), infinite=_OPAQUE)[:, 0],
-        scales=_columns(path, table, _SCALE),
+        opacities=_columns(path, table, ("opacity",), infinite=(-_OPAQUE, _OPAQUE))[:, 0],
+        scales=_columns(path, table, _SCALE, infinite=(_FLAT, math.inf)),
         quats=_columns(path, table, _ROTATION),
         antialiased=_MIP in comments,
     )
@@ -246,6 +248,9 @@ def _split_header(path: Path, head: bytes) -> tuple[str, int]:
 
 def _parsed(path: Path, header: str) -> tuple[str, int, list[tuple[str, str]], bool]:
     """The format, the number of vertices, the name and type of each of their properties, and whether nothing follows them."""
+    if "packed_position" in header:
+        remedy = f"convert it: splat-transform {path.name} {path.name.removesuffix('.ply').removesuffix('.compressed')}-plain.ply"
+        raise DataError(path, "format", "is SuperSplat's compressed PLY, which is not read", remedy)
     form, counts, row = "", dict[str, int](), dict[str, str]()
     for line in header.splitlines():
         match line.split():
@@ -272,17 +277,16 @@ def _names_of(table: np.ndarray) -> tuple[str, ...]:
 
 
 def _columns(
-    path: Path, table: np.ndarray, names: Sequence[str], *, infinite: float | None = None
+    path: Path, table: np.ndarray, names: Sequence[str], *, infinite: tuple[float, float] = (-math.inf, math.inf)
 ) -> Float[Tensor, "N C"]:
-    """Properties as float32; each must exist and be finite, unless this number stands for infinity."""
+    """Properties as float32; each must exist and be finite, unless `infinite` has what stands for -inf and inf."""
     missing = [name for name in names if name not in _names_of(table)]
     if missing:
         problem = f"is missing from the vertices, which have {', '.join(_names_of(table))}"
         raise DataError(path, missing[0], problem, "export it again, with this property")
     with np.errstate(over="ignore"):  # overflow gives infinity
         values = np.array(structured_to_unstructured(table[list(names)], np.float32))
-    if infinite is not None:
-        values = np.where(np.isinf(values), np.copysign(np.float32(infinite), values), values)
+    values = np.nan_to_num(values, nan=np.nan, neginf=infinite[0], posinf=infinite[1])
     finite = np.isfinite(values)
     if not finite.all():
         i, k = np.argwhere(~finite)[0]

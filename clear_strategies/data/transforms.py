@@ -8,24 +8,18 @@ from pathlib import Path
 from typing import Any, Final
 
 import msgspec
+import torch
 
-from clear_strategies.data.capture import Frame
-from clear_strategies.data.lenses import Lens, pose_from_opengl
+from clear_strategies.data.capture import Frame, SfmPoints
+from clear_strategies.data.lenses import Lens, lens_of, pose_from_opengl
 from clear_strategies.data.photo_files import image_size
-from clear_strategies.data.photo_folders import usable
+from clear_strategies.data.photo_folders import finder, usable
+from clear_strategies.data.ply import read_points
 from clear_strategies.data.strict_json import Number, typed
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
 
-# Distortion keys of each model, in OpenCV's order. nerfstudio's OPENCV has a k4 that OpenCV's polynomial lacks.
-_MODELS: Final = {
-    "PINHOLE": (),
-    "SIMPLE_PINHOLE": (),
-    "SIMPLE_RADIAL": ("k1",),
-    "RADIAL": ("k1", "k2"),
-    "OPENCV": ("k1", "k2", "p1", "p2", "k3"),
-    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
-}
+_COEFFICIENTS: Final = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 class Transform(msgspec.Struct):
@@ -48,6 +42,8 @@ class Transform(msgspec.Struct):
     k2: Number = 0.0
     k3: Number = 0.0
     k4: Number = 0.0
+    k5: Number = 0.0
+    k6: Number = 0.0
     p1: Number = 0.0
     p2: Number = 0.0
 
@@ -81,18 +77,12 @@ class Transform(msgspec.Struct):
         )
         fx, fy, cx, cy = self.pinhole(path, where, width, height)
         model = "OPENCV_FISHEYE" if self.is_fisheye else self.camera_model
-        if model not in _MODELS:
-            raise DataError(path, f"{where}.camera_model", f"is {model[:40]!r}", f"use one of {', '.join(_MODELS)}")
-        keys = _MODELS[model]
-        unused = [key for key in ("k1", "k2", "k3", "k4", "p1", "p2") if key not in keys and getattr(self, key) != 0]
-        if unused:
-            raise DataError(
-                path, f"{where}.{unused[0]}", f"is not 0, but {model} has no such term that OpenCV could undistort",
-                "set camera_model to what the coefficients belong to, or undistort the images first",
-            )  # fmt: skip
-        distortion = tuple(getattr(self, key) for key in keys)
-        fisheye = model == "OPENCV_FISHEYE"
-        return Lens(round(width), round(height), fx, fy, cx, cy, distortion, fisheye).check(path, where)
+        terms = {key: value for key in _COEFFICIENTS if (value := getattr(self, key)) != 0}
+        return lens_of(path, where, model, (round(width), round(height)), (fx, fy, cx, cy), terms)
+
+
+class _Points(msgspec.Struct):
+    ply_file_path: str | None = None
 
 
 def transforms_of(path: Path, content: Mapping[str, Any]) -> list[Transform]:
@@ -128,14 +118,22 @@ def frames_of(
         photos: name, file and split of each of `transforms`.
         masks: of photos whose frame names none.
     """
-    frames = []
+    find, frames = finder(file.parent), []
     for i in usable(file, range(len(photos)), lambda i: photos[i][1], skip_faulty=skip_faulty):
         where, transform, (name, path, split) = f"frames[{i}]", transforms[i], photos[i]
         pose = pose_from_opengl(file, f"{where}.transform_matrix", transform.transform_matrix)
         lens = transform.lens(file, where, path)
-        mask = file.parent / transform.mask_path if transform.mask_path else masks.get(path)
+        mask = find(transform.mask_path) if transform.mask_path else masks.get(path)
         frames.append(Frame.of_photo(name, path, lens, pose, background=background, split=split, mask=mask))
     return frames
+
+
+def points_of(file: Path, content: Mapping[str, Any]) -> SfmPoints | None:
+    """The points of the PLY file that a file names, if it does."""
+    if not (name := typed(file, content, _Points).ply_file_path):
+        return None
+    cloud, none = read_points(finder(file.parent)(name)), torch.zeros(0, dtype=torch.long)
+    return SfmPoints(cloud.means, cloud.colors, none, none, f"{name}, {len(cloud):,} points without tracks")
 
 
 def _focal(path: Path, where: str, angle: float, size: float) -> float:

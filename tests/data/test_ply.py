@@ -160,11 +160,14 @@ def test_a_missing_file_and_a_folder_get_one_line(tmp_path: Path) -> None:
             read_points(path)
 
 
-def test_opacities_of_exactly_0_and_1_are_read(tmp_path: Path) -> None:
+def test_opacities_of_exactly_0_and_1_and_scales_of_0_are_read(tmp_path: Path) -> None:
     """As a PLY has them that was converted from a format of 8 bits; any other infinity is damage."""
     path, g = tmp_path / "a.ply", gaussians(3, 0)
     write_gaussians(path, g)
     content = path.read_bytes()
+    at = content.index(struct.pack("<f", float(g.scales[1, 2])))
+    path.write_bytes(content[:at] + struct.pack("<f", float("-inf")) + content[at + 4 :])
+    assert 0 < float(read_gaussians(path).scales[1, 2].exp()) < 1e-12
     at = content.index(struct.pack("<f", float(g.opacities[1])))
     for value in (float("inf"), float("-inf")):
         path.write_bytes(content[:at] + struct.pack("<f", value) + content[at + 4 :])

@@ -10,20 +10,21 @@ from typing import Final
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import Capture, Frame, lens_notes, require_names
 from clear_strategies.data.masks import masks_of
-from clear_strategies.data.photo_files import SUFFIXES
+from clear_strategies.data.photo_folders import finder, named
 from clear_strategies.data.strict_json import read_object
-from clear_strategies.data.transforms import frames_of, photo_transforms
+from clear_strategies.data.transforms import frames_of, photo_transforms, points_of
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
+_TRAIN: Final = "transforms_train.json"
 _WHITE: Final = (1.0, 1.0, 1.0)
 
 
 def recognises(path: Path) -> int:
     """The rank of `clear_strategies.commands.train.detect`."""
-    return 4 * (path / "transforms_train.json").is_file()
+    return 4 * named(path, _TRAIN).is_file()
 
 
 def read(
@@ -47,13 +48,14 @@ def read(
     root, background = Path(root), as_color("data.reader.background", background)
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
-    files, frames = [root / "transforms_train.json"], list[Frame]()
-    if (root / "transforms_test.json").exists():
-        files.append(root / "transforms_test.json")
+    find, files, frames = finder(root), [named(root, _TRAIN)], list[Frame]()
+    if (test := named(root, "transforms_test.json")).exists():
+        files.append(test)
     else:
         _log.warning("%s has no transforms_test.json: there are no test views.", root)
-    transforms = {file: photo_transforms(file, read_object(file)) for file in files}
-    paths = {file: [_photo(root, transform.file_path) for transform in transforms[file]] for file in files}
+    contents = {file: read_object(file) for file in files}
+    transforms = {file: photo_transforms(file, content) for file, content in contents.items()}
+    paths = {file: [find(transform.file_path) for transform in transforms[file]] for file in files}
     masks = masks_of(root, itertools.chain(*paths.values()))
     for file, split in zip(files, ("train", "test"), strict=False):
         photos = [(path.stem if split == "train" else f"test/{path.stem}", path, split) for path in paths[file]]
@@ -66,8 +68,4 @@ def read(
         "background": f"{color} behind transparent pixels",
         **lens_notes(frames),
     }
-    return Capture(root.resolve().name, tuple(frames), None, background, notes)
-
-
-def _photo(root: Path, name: str) -> Path:
-    return root / (name if name.lower().endswith(SUFFIXES) else f"{name}.png")
+    return Capture(root.resolve().name, tuple(frames), points_of(files[0], contents[files[0]]), background, notes)

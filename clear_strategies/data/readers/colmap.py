@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -16,9 +15,8 @@ import torch
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import BLACK, Capture, Frame, SfmPoints, lens_notes, sorted_by_name
 from clear_strategies.data.masks import masks_of
-from clear_strategies.data.photo_folders import by_stem, folder_note, image_folder, images_in, is_file, usable
+from clear_strategies.data.photo_folders import finder, folder_note, image_folder, images_in, is_file, usable
 from clear_strategies.data.readers.colmap_model import Model, find_model, is_model, model_folders, pose_of, read_model
-from clear_strategies.errors import DataError
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
@@ -54,24 +52,15 @@ def read(
     root, background = Path(root), as_color("data.reader.background", background)
     model = read_model(find_model(root))
     folder = image_folder(root, images)
-    listing = model.folder / f"images{model.ending}"
-    paths = _photos(folder, [image.name for image in model.images])
-    if not any(map(is_file, paths.values())):
-        first, photos = min(paths), images_in(folder)
-        if (root / "poses_bounds.npy").is_file() and len(photos) == len(paths):
-            found = capture(
-                root,
-                model,
-                folder,
-                dict(zip(sorted(paths), photos, strict=True)),
-                background=background,
-                skip_faulty=skip_faulty,
-            )
-            by_order = f"photos matched to the model's by order ({first} is {photos[0].name})"
-            return replace(found, notes={**found.notes, "names": by_order})
-        remedy = "set data.reader.images to the folder that the model was made from"
-        raise DataError(listing, first, f"is not in {folder}, and no other photo is", remedy)
-    return capture(root, model, folder, paths, background=background, skip_faulty=skip_faulty)
+    find, notes = finder(folder), {}
+    paths = {image.name: find(image.name) for image in model.images}
+    if (root / "poses_bounds.npy").is_file() and not any(map(is_file, paths.values())):
+        photos, first = images_in(folder), min(paths)
+        if len(photos) == len(paths):
+            paths = dict(zip(sorted(paths), photos, strict=True))
+            notes["names"] = f"photos matched to the model's by order ({first} is {photos[0].name})"
+    found = capture(root, model, folder, paths, background=background, skip_faulty=skip_faulty)
+    return replace(found, notes=found.notes | notes)
 
 
 def capture(
@@ -92,7 +81,7 @@ def capture(
     Raises:
         DataError: an image cannot be used.
     """
-    listing = model.folder / f"images{model.ending}"
+    listing = model.listing
     kept = usable(listing, model.images, lambda image: paths[image.name], skip_faulty=skip_faulty)
     masks = masks_of(folder.parent, paths.values())
     frames = [
@@ -104,7 +93,7 @@ def capture(
     ]  # fmt: skip
     some_of = f" of its {len(model.images)}" if len(frames) < len(model.images) else ""
     notes = {
-        "poses": f"COLMAP {_label(root, model)} ({model.ending[1:]}), {len(frames)}{some_of} images",
+        "poses": f"COLMAP {_label(root, model)} ({listing.suffix[1:]}), {len(frames)}{some_of} images",
         "photos": folder_note(folder),
     }
     pattern = "**/*" if any(path.parent != folder for path in paths.values()) else "*"
@@ -145,17 +134,3 @@ def _label(root: Path, model: Model) -> str:
 def _name_below(folder: Path, path: Path) -> str:
     """The name of a photo's frame; a path that is not below the folder stays whole, which `sorted_by_name` refuses."""
     return (path.relative_to(folder) if path.is_relative_to(folder) else path).as_posix()
-
-
-def _photos(folder: Path, names: Sequence[str]) -> dict[str, Path]:
-    """The photo of each name, else the only one of the same stem: images_4 often holds PNG files for JPG names.
-
-    The path of a missing photo leads to no file.
-    """
-    by_stem_in = cache(lambda parent: by_stem(images_in(parent)))
-    paths = {}
-    for name in names:
-        path = folder / name
-        twins = [] if is_file(path) else by_stem_in(path.parent).get(path.stem, [])
-        paths[name] = twins[0] if len(twins) == 1 else path
-    return paths

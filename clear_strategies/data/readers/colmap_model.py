@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import logging
 import math
+import re
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -19,21 +20,27 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from clear_strategies.data.lenses import FARTHEST, Lens
+from clear_strategies.data.lenses import FARTHEST, Lens, lens_of, terms_of
+from clear_strategies.data.photo_folders import named
 from clear_strategies.errors import DataError
 from clear_strategies.files import read_bytes
 from rasterizers.geometry import rotation_matrix
 
 _log = logging.getLogger(__name__)
 
-# name -> COLMAP's number for the model, and how many parameters it has.
+# The models by COLMAP's numbers, with the parameters that follow the principal point; p and k are counted from 1 here. Those of
+# `_ONE_FOCAL` have one focal length in front of it, the others two.
 _MODELS: Final = {
-    "SIMPLE_PINHOLE": (0, 3), "PINHOLE": (1, 4), "SIMPLE_RADIAL": (2, 4), "RADIAL": (3, 5), "OPENCV": (4, 8),
-    "OPENCV_FISHEYE": (5, 8), "FULL_OPENCV": (6, 12), "SIMPLE_RADIAL_FISHEYE": (8, 4), "RADIAL_FISHEYE": (9, 5),
+    "SIMPLE_PINHOLE": "", "PINHOLE": "", "SIMPLE_RADIAL": "k1", "RADIAL": "k1 k2", "OPENCV": "k1 k2 p1 p2",
+    "OPENCV_FISHEYE": "k1 k2 k3 k4", "FULL_OPENCV": "k1 k2 p1 p2 k3 k4 k5 k6", "FOV": "omega", "SIMPLE_RADIAL_FISHEYE": "k1",
+    "RADIAL_FISHEYE": "k1 k2", "THIN_PRISM_FISHEYE": "k1 k2 p1 p2 k3 k4 sx1 sy1",
+    "RAD_TAN_THIN_PRISM_FISHEYE": "k1 k2 k3 k4 k5 k6 p1 p2 s0 s1 s2 s3", "SIMPLE_DIVISION": "k", "DIVISION": "k",
+    "SIMPLE_FISHEYE": "", "FISHEYE": "", "EUCM": "alpha beta", "EQUIRECTANGULAR": "",
 }  # fmt: skip
-_MODEL_OF_NUMBER: Final = {number: name for name, (number, _) in _MODELS.items()}
-_TWO_FOCAL_LENGTHS: Final = ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
+_ONE_FOCAL: Final = ("SIMPLE_", "RADIAL")  # beginnings of their names
 _LONGEST_NAME: Final = 4096
+_SAID: Final = re.compile(r"Number of images: (\d+)")
+_NUMERIC: Final = re.compile(r"[\d\s.+eE-]*")
 
 _T = TypeVar("_T")
 _Number = TypeVar("_Number", int, float)
@@ -64,10 +71,10 @@ class Points:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Model:
-    """The content of a sparse model's files, whose `ending` is .bin or .txt."""
+    """The content of a sparse model's files; `listing` is that of the images, .bin or .txt."""
 
     folder: Path
-    ending: str
+    listing: Path
     lenses: dict[int, Lens]
     images: list[Image]
     points: Points
@@ -79,7 +86,14 @@ def model_folders(root: Path) -> tuple[Path, ...]:
 
 
 def is_model(folder: Path) -> bool:
-    return any((folder / f"{name}{ending}").is_file() for name in ("cameras", "images") for ending in (".bin", ".txt"))
+    return any(file.is_file() for ending in (".bin", ".txt") for file in _files(folder, ending)[:2])
+
+
+def _files(folder: Path, ending: str | None = None) -> list[Path]:
+    """The files of cameras, images and points, RealityCapture's capital letters too; .txt where there is no .bin."""
+    if ending is None:
+        ending = ".bin" if any(file.exists() for file in _files(folder, ".bin")) else ".txt"
+    return [named(folder, f"{name}{ending}") for name in ("cameras", "images", "points3D")]
 
 
 def find_model(root: Path) -> Path:
@@ -100,7 +114,7 @@ def find_model(root: Path) -> Path:
     models = [folder, *filter(is_model, numbered)]
     if len(models) == 1:
         return folder
-    photos = {model: len(read_images(model / f"images{_ending(model)}")) for model in models}
+    photos = {model: len(read_images(_files(model)[1])) for model in models}
     largest = max(models, key=lambda model: photos[model])
     others = ", ".join(f"{model.name} with {photos[model]}" for model in models if model != largest)
     _log.warning(
@@ -116,8 +130,7 @@ def read_model(folder: Path) -> Model:
     Raises:
         DataError: a file is missing or not what it should be.
     """
-    ending = _ending(folder)
-    cameras, listing, points3d = (folder / f"{name}{ending}" for name in ("cameras", "images", "points3D"))
+    cameras, listing, points3d = _files(folder)
     lenses, images = read_cameras(cameras), read_images(listing)
     if not images:
         raise DataError(listing, "images", "there is none", "run COLMAP's mapper to its end")
@@ -128,7 +141,7 @@ def read_model(folder: Path) -> Model:
     unknown = np.setdiff1d(points.track[:, 1], [image.id for image in images])
     if len(unknown):
         raise _damaged(points3d, "track", f"names the unknown image {unknown[0]}")
-    return Model(folder, ending, lenses, images, points)
+    return Model(folder, listing, lenses, images, points)
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:
@@ -156,11 +169,6 @@ def pose_of(image: Image) -> Float[Tensor, "4 4"]:
     pose[:3, :3] = rotation_matrix(torch.tensor([image.quat], dtype=torch.float64))[0]
     pose[:3, 3] = torch.tensor(image.translation, dtype=torch.float64)
     return pose
-
-
-def _ending(folder: Path) -> str:
-    """The ending of a model's files. If there is any binary file, text files are ignored."""
-    return ".bin" if any((folder / f"{name}.bin").exists() for name in ("cameras", "images", "points3D")) else ".txt"
 
 
 def read_points(path: Path) -> Points:
@@ -192,19 +200,17 @@ def _by_id(path: Path, records: Iterable[tuple[int, _T]]) -> dict[int, _T]:
 
 
 def _lens(path: Path, where: str, model: str, size: tuple[int, int], parameters: Sequence[float]) -> Lens:
-    if model in _TWO_FOCAL_LENGTHS:
-        fx, fy, cx, cy, *distortion = parameters
-    else:
-        fx, cx, cy, *distortion = parameters  # one focal length, and k1, k2 if the model has them
-        fy = fx
-    return Lens(*size, fx, fy, cx, cy, tuple(distortion), model.endswith("_FISHEYE")).check(path, where)
+    fx, *_ = f = parameters[: 1 if model.startswith(_ONE_FOCAL) else 2]
+    cx, cy, *rest = parameters[len(f) :]
+    terms = dict(zip(_MODELS[model].split(), rest, strict=True))
+    if model == "EUCM" and terms["alpha"] == 0:
+        del terms["beta"]  # of no effect then
+    return lens_of(path, where, model, size, (fx, f[-1], cx, cy), terms)
 
 
-def _parameters_of(path: Path, model: str) -> int:
-    if model not in _MODELS:
-        remedy = "undistort with `colmap image_undistorter` first"
-        raise DataError(path, "camera model", f"{model[:40]} is not supported", remedy)
-    return _MODELS[model][1]
+def _parameters_of(path: Path, where: str, model: str) -> int:
+    terms_of(path, where, model)  # refuses those that are not supported
+    return (3 if model.startswith(_ONE_FOCAL) else 4) + len(_MODELS[model].split())
 
 
 def _damaged(path: Path, where: str, problem: str) -> DataError:
@@ -255,10 +261,11 @@ class _Bytes:
 
 def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
     file = _Bytes(path)
-    for i in range(file.count("number of cameras", 24 + 3 * 8)):
+    for i in range(file.count("number of cameras", 24 + 2 * 8)):
         number, kind, *size = file.take("<iiQQ", f"camera {i}")
-        model = _MODEL_OF_NUMBER.get(kind, f"number {kind}")
-        parameters = file.take(f"<{_parameters_of(path, model)}d", f"parameters of camera {i}")
+        model = dict(enumerate(_MODELS)).get(kind, f"number {kind}")
+        count = _parameters_of(path, f"camera {number}", model)
+        parameters = file.take(f"<{count}d", f"parameters of camera {i}")
         yield number, _lens(path, f"camera {number}", model, (size[0], size[1]), parameters)
     file.finish()
 
@@ -290,7 +297,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
         if len(cells) < 4:
             raise _damaged(path, f"line {line}", f"has {len(cells)} of at least 5 columns")
         number, width, height = _numbers(path, line, (cells[0], *cells[2:4]), _whole)
-        expected = _parameters_of(path, cells[1])
+        expected = _parameters_of(path, f"line {line}", cells[1])
         if len(cells) != 4 + expected:
             problem = f"has {len(cells) - 4} parameters, {cells[1]} has {expected}"
             raise _damaged(path, f"line {line}", problem)
@@ -298,21 +305,43 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
 
 
 def _text_images(path: Path) -> Iterator[Image]:
-    """Two lines per image: its pose, then its 2D points, which are not used and may be none."""
-    lines = iter(_lines(path))
-    for line, text in lines:
-        if not text.strip() or text.startswith("#"):
+    """A line of an image's pose, and behind it one of its 2D points, which are not used, may be none, or are left out.
+
+    A line that could be either is taken as the number of images in the file's header says.
+    """
+    poses, either = list[tuple[int, str]](), list[tuple[int, str]]()
+    said, above = -1, False  # the number of images in the header; whether the line above is a pose
+    for line, text in _lines(path):
+        if text.startswith("#"):
+            said = int(header[1]) if (header := _SAID.search(text)) else said
             continue
+        points = above and len(text.split()) % 3 == 0 and _NUMERIC.fullmatch(text) is not None
+        if points and _could_be_pose(text):
+            either.append((line, text))
+        elif text.strip() and not points:
+            poses.append((line, text))
+        above = bool(text.strip()) and not points
+    if either and said not in (len(poses), len(poses) + len(either)):
+        problem = "could be an image's pose or the 2D points of the image above"
+        raise _damaged(path, f"line {either[0][0]}", problem)
+    if either and said > len(poses):
+        poses = sorted(poses + either)
+    if said > len(poses):
+        _log.warning("%s: its header says %d images, %d are there.", path, said, len(poses))
+    for line, text in poses:
         cells = text.split(maxsplit=9)
         if len(cells) != 10:
             raise _damaged(path, f"line {line}", f"has {len(cells)} of 10 columns")
         number, camera = _numbers(path, line, (cells[0], cells[8]), _whole)
         pose = _numbers(path, line, cells[1:8], float)
         yield Image(number, tuple(pose[:4]), tuple(pose[4:]), camera, cells[9].strip())
-        second = next(lines, None)
-        if second is None or len(second[1].split()) % 3 or second[1].startswith("#"):
-            problem = "is no line of 2D points (X Y POINT3D_ID, or empty) for the image above it"
-            raise _damaged(path, f"line {line + 1}", problem)
+
+
+def _could_be_pose(text: str) -> bool:
+    """Whether a line of numbers has an id, a unit quaternion, and the id of a camera where an image has them."""
+    cells = text.split(maxsplit=9)
+    whole = len(cells) == 10 and cells[0].isdecimal() and cells[8].isdecimal()
+    return whole and 0.9 < math.hypot(*map(float, cells[1:5])) < 1.1
 
 
 def _text_points(path: Path) -> Iterator[_Point]:
@@ -328,11 +357,9 @@ def _text_points(path: Path) -> Iterator[_Point]:
 
 def _lines(path: Path) -> list[tuple[int, str]]:
     try:
-        text = io.StringIO(read_bytes(path).decode(), newline=None).read()  # with every line break as \n
+        text = io.StringIO(read_bytes(path).decode("utf-8-sig"), newline=None).read()  # with every line break as \n
     except UnicodeDecodeError as error:
         raise _damaged(path, "file", "is no UTF-8 text") from error
-    if text.startswith("\ufeff"):
-        raise DataError(path, "line 1", "starts with a byte-order mark", "save it as UTF-8 without one")
     return list(enumerate(text.split("\n"), start=1))
 
 

@@ -5,41 +5,38 @@ from __future__ import annotations
 import logging
 import os
 from collections import Counter
-from collections.abc import Sequence
-from pathlib import Path, PurePosixPath
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Final
 
 import msgspec
-import torch
 
 from clear_strategies.core.checks import as_color
-from clear_strategies.data.capture import BLACK, Capture, Frame, SfmPoints, lens_notes, sorted_by_name
+from clear_strategies.data.capture import BLACK, Capture, Frame, lens_notes, sorted_by_name
 from clear_strategies.data.masks import masks_of
-from clear_strategies.data.photo_files import SUFFIXES
-from clear_strategies.data.photo_folders import is_file
-from clear_strategies.data.ply import read_points
+from clear_strategies.data.photo_folders import finder, named
 from clear_strategies.data.strict_json import read_object, typed
-from clear_strategies.data.transforms import frames_of, photo_transforms
+from clear_strategies.data.transforms import frames_of, photo_transforms, points_of
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
+_FILE: Final = "transforms.json"
 _SIDES: Final = {"train_filenames": "train", "val_filenames": "test", "test_filenames": "test"}
 
 
 class _Lists(msgspec.Struct):
-    """The files that transforms.json names besides its frames."""
+    """How transforms.json splits its frames."""
 
     train_filenames: list[str] = []
     val_filenames: list[str] = []
     test_filenames: list[str] = []
-    ply_file_path: str | None = None
 
 
 def recognises(path: Path) -> int:
     """The rank of `clear_strategies.commands.train.detect`."""
-    return 4 * (path.name == "transforms.json" or (path / "transforms.json").is_file())
+    return 4 * ((path.suffix == ".json" and path.is_file()) or named(path, _FILE).is_file())
 
 
 def read(
@@ -59,49 +56,33 @@ def read(
         DataError: something is missing or not what it should be.
     """
     root, background = Path(root), as_color("data.reader.background", background)
-    file = root if root.suffix == ".json" else root / "transforms.json"
+    file = root if root.suffix == ".json" else named(root, _FILE)
     folder, content = file.parent, read_object(file)
     transforms = photo_transforms(file, content)
+    find = finder(folder)
+    paths = [find(transform.file_path) for transform in transforms]
     lists = typed(file, content, _Lists)
-    names = [transform.file_path for transform in transforms]
-    splits = _splits(file, lists)
-    parts = [PurePosixPath(name).parts for name in names]
-    shared = os.path.commonprefix([part[:-1] for part in parts])  # noqa: RUF071 - compares tuples of folders
-    photos = [
-        ("/".join(part[len(shared) :]), _photo(folder, name), splits.get(name))
-        for name, part in zip(names, parts, strict=True)
-    ]
-    masks = masks_of(folder, [path for _, path, _ in photos])
+    splits = _splits(file, lists, find)
+    shared = os.path.commonprefix([path.parent.parts for path in paths])  # noqa: RUF071 - compares tuples of folders
+    photos = [("/".join(path.parts[len(shared) :]), path, splits.get(path)) for path in paths]
+    masks = masks_of(folder, paths)
     frames = frames_of(file, transforms, photos, masks=masks, background=background, skip_faulty=skip_faulty)
     notes = {"poses": f"{file.name}, {len(frames)} images", **lens_notes(frames)}
     if splits:
-        if strangers := sorted(splits.keys() - set(names)):
+        if strangers := [name for key in _SIDES for name in getattr(lists, key) if find(name) not in paths]:
             problem = f"lists {strangers[0]!r}, which is no frame's file_path"
             raise DataError(file, "split", problem, "correct the lists")
         notes["split"] = _split_note(file, frames)
-    points = None
-    if (name := lists.ply_file_path) is not None:
-        cloud = read_points(folder / name)
-        none = torch.zeros(0, dtype=torch.long)
-        points = SfmPoints(cloud.means, cloud.colors, none, none, f"{name}, {len(cloud):,} points without tracks")
-    return Capture(folder.resolve().name, sorted_by_name(frames, file), points, background, notes)
+    return Capture(folder.resolve().name, sorted_by_name(frames, file), points_of(file, content), background, notes)
 
 
-def _photo(folder: Path, name: str) -> Path:
-    """The photo of this name; instant-ngp omits the ending .png."""
-    has_ending = name.lower().endswith(SUFFIXES) or is_file(folder / name)
-    return folder / (name if has_ending else f"{name}.png")
-
-
-def _splits(file: Path, lists: _Lists) -> dict[str, str]:
+def _splits(file: Path, lists: _Lists, find: Callable[[str], Path]) -> dict[Path, str]:
     """The side of each photo in the file's lists, "train" or "test"."""
-    splits: dict[str, str] = {}
+    splits: dict[Path, str] = {}
     for key, side in _SIDES.items():
-        names = getattr(lists, key)
-        both = sorted(name for name in names if splits.get(name, side) != side)
-        if both:
-            raise DataError(file, key, f"{both[0]!r} is for training, too", "list each photo once")
-        splits |= dict.fromkeys(names, side)
+        for name in getattr(lists, key):
+            if splits.setdefault(find(name), side) != side:
+                raise DataError(file, key, f"{name!r} is for training, too", "list each photo once")
     return splits
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -13,7 +14,7 @@ from typing import Final, Literal
 from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.photo_files import Exif, image_size, read_exif
-from clear_strategies.data.photo_folders import images_in, list_images, require_text, some, usable
+from clear_strategies.data.photo_folders import images_in, list_images, named, require_text, some, usable
 from clear_strategies.data.priors import cache_folder
 from clear_strategies.data.readers import colmap, sfm
 from clear_strategies.data.readers.colmap_model import read_model
@@ -25,6 +26,28 @@ _log = logging.getLogger(__name__)
 _HEIC: Final = (".heic", ".heif")
 _FEW: Final = 30  # photos, up to which precise=auto is true
 _STOPS: Final = 0.5  # larger differences of exposure give a warning
+_HEAD: Final = 1 << 16  # bytes of a file that tell what it is
+_LOOKED_INTO: Final = 50  # files of a kind, at most
+# Poses of other tools that no reader reads: where they lie, what such a file contains, whose they are, what makes use of them.
+_OTHERS: Final = (
+    ("*.json", b'"frames"', "transforms.json", "clear-strategies train {file}"),
+    ("*.xml", b"<document", "Metashape", "ns-process-data metashape --data {root} --xml {file} --output-dir converted"),
+    (
+        "*.csv",
+        b"#name,x,y",
+        "RealityCapture",
+        "ns-process-data realitycapture --data {root} --csv {file} --output-dir converted",
+    ),
+    ("*.xmp", b"xcr:", "RealityCapture", "export Cameras.txt, Images.txt and Points3D.txt (COLMAP) into {root}"),
+    ("keyframes/cameras/*.json", b'"t_00"', "Polycam", "ns-process-data polycam --data {root} --output-dir converted"),
+    ("cameras/*.json", b'"t_00"', "Polycam", "ns-process-data polycam --data {root}/.. --output-dir converted"),
+    ("metadata*", b'"poses"', "Record3D", "ns-process-data record3d --data {root} --output-dir converted"),
+    ("poses_bounds.npy", b"NUMPY", "LLFF", "put the COLMAP model that they were made from into {root}/sparse/0"),
+    *(
+        (place, b"", "COLMAP", "put the model into {root}/sparse/0")
+        for place in ("*/cameras.*", "*/sparse/cameras.*", "*/sparse/0/cameras.*")
+    ),
+)
 
 
 def recognises(path: Path) -> int:
@@ -72,8 +95,9 @@ def read(
     if root.is_file():
         frames = "ffmpeg -i VIDEO -vf thumbnail=15 -fps_mode passthrough -q:v 2 FOLDER/%03d.jpg"
         raise DataError(root, "photos", "is a file", f"give a folder of photos; of a video: {frames}")
-    if (root / "images").is_dir() and not images_in(root):
-        root = root / "images"
+    _tell_of_other_poses(root)
+    if (inside := named(root, "images")).is_dir() and not images_in(root):
+        root = inside
     base = Path(cache) if cache is not None else cache_folder() / "sfm"
     if base.resolve().is_relative_to(root.resolve()):
         raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
@@ -94,6 +118,23 @@ def read(
     capture = _capture(root, photos, folder)
     sfm.require_placed(root, len(capture.frames), len(paths), least_placed)
     return replace(capture, name=name)
+
+
+def _tell_of_other_poses(root: Path) -> None:
+    """Warn of poses that are there, and would be estimated anew; a DataError where there are no photos beside them."""
+    for pattern, content, tool, remedy in _OTHERS:
+        for file in filter(Path.is_file, sorted(root.glob(pattern))[:_LOOKED_INTO]):
+            with file.open("rb") as opened:
+                if content not in opened.read(_HEAD):
+                    continue
+            use = remedy.format(root=shlex.quote(str(root)), file=shlex.quote(str(file)))
+            if not (images_in(root) or images_in(named(root, "images"))):
+                raise DataError(file, "poses", f"are as {tool} has them, which is not read", f"to use them: {use}")
+            _log.warning(
+                "%s has poses as %s has them, which are not read: they are estimated anew, at another scale. To use them: %s",
+                file, tool, use,
+            )  # fmt: skip
+            return
 
 
 def _capture(root: Path, photos: Mapping[Path, Exif], folder: Path) -> Capture:

@@ -22,7 +22,7 @@ from tests.stress.bad_inputs.scenes import READERS
 PHOTOS = {"colmap": "images", "nerfstudio": "images", "blender": "train"}
 # What is done to the photos, and parts of the message.
 DEFECTS: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
-    "missing": (lambda f: (f / "b.png").unlink(), ("1 of ", "b.png", "data.reader.skip_faulty=true")),
+    "missing": (lambda f: (f / "b.png").unlink(), ("1 of ", ": b", "data.reader.skip_faulty=true")),
     "truncated": (lambda f: os.truncate(f / "b.png", 200), ("b.png", "data.reader.skip_faulty=true")),
 }
 CASES = [(defect, reader) for defect in DEFECTS for reader in PHOTOS]
@@ -46,16 +46,14 @@ def test_a_defect_is_refused_in_one_line_with_the_setting_that_goes_on(tmp_path,
     capture = read(root, skip_faulty=True)
     assert [Path(frame.name).stem for frame in capture.frames] == ["a", "c"]
     assert all(bool(frame.load().isfinite().all()) for frame in capture.frames)
-    assert (
-        len([record for record in caplog.records if "skipped: " in record.message and "b.png" in record.message]) == 1
-    )
+    assert len([record for record in caplog.records if "skipped: " in record.message and "/b" in record.message]) == 1
 
 
 def test_a_capture_without_any_photo_is_refused_even_where_faulty_ones_are_skipped(tmp_path):
     root, folder, read = built(tmp_path, "nerfstudio")
     for name in NAMES:
         (folder / name).unlink()
-    with pytest.raises(DataError, match=r"transforms\.json: photos: none of 3 can be used: check the path"):
+    with pytest.raises(DataError, match=r"transforms\.json: photos: none of 3 is in .*/images, such as a\.png"):
         read(root, skip_faulty=True)
 
 

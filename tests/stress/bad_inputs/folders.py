@@ -47,7 +47,10 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     **{f"{kind} at a path that is a file": (at("file", read, b"no folder"), "file") for kind, read in READERS.items()},
     **{f"{kind} in an empty folder": (read, ": ") for kind, read in READERS.items()},
     "photos in a folder of another name": (at("", colmap.read, _photos_renamed), "images: is no folder|has none of"),
-    "no photo of the model is there": (at("", colmap.read, _photos_gone), "is not in .*, and no other photo is"),
+    "no photo of the model is there": (
+        at("", colmap.read, _photos_gone),
+        "none of 3 is in .*images, such as a.png; it holds nothing",
+    ),
     "no folder of photos": (image_folder, "images: has none of the folders images, images_2"),
     "folder of photos by a name that is not there": (lambda folder: image_folder(folder, "images_16"), "is no folder"),
     "photos at a path that is absent": (at("none", list_images), "folder: is not there"),

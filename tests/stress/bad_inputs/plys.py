@@ -64,6 +64,10 @@ _GAUSSIANS: dict[str, tuple[bytes, str]] = {
     "list before the vertices": (
         ply(form=f"{_BINARY}\nelement face 1\nproperty list uchar int i"), "not understood there: 'property list",
     ),
+    "SuperSplat's compressed": (
+        f"ply\n{_BINARY}\nelement chunk 1\nproperty float min_x\nelement vertex 1\nproperty uint packed_position\nend_header\n"
+        .encode(), "format: is SuperSplat's compressed PLY.*splat-transform a.ply a-plain.ply",
+    ),
     "one f_rest": (ply(rows={**_GOOD, "f_rest_0": 0.0}), "f_rest: has 1 properties"),
     "f_rest with a gap": (ply(rows=_GOOD | {f"f_rest_{i + (i > 4)}": 0.0 for i in range(9)}), "f_rest_5: is missing"),
     **{f"{name} missing": (ply(rows=_without(name)), f"{name}: is missing from the vertices") for name in NAMES},

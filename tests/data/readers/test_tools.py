@@ -1,0 +1,362 @@
+"""Captures as other tools write them, in small: what is read of each, and what the message is where it is not."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from clear_strategies.commands.train import detect
+from clear_strategies.data.capture import Capture
+from clear_strategies.data.lenses import Lens
+from clear_strategies.data.ply import write_points
+from clear_strategies.data.readers import blender, colmap, nerfstudio, photos
+from clear_strategies.errors import DataError
+from tests.helpers import captures as tiny
+from tests.helpers.captures import GOOD, NAMES
+from tests.stress.bad_inputs.scenes import READERS
+
+
+def edited(file: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    value = json.loads(file.read_text())
+    change(value)
+    tiny.write_json(file, value)
+
+
+def poses_are_those_of_the_tiny_scene(capture: Capture) -> None:
+    assert len(capture.frames) == 3
+    for i, frame in enumerate(capture.frames):
+        np.testing.assert_allclose(frame.camera.world_to_camera.numpy(), tiny.world_to_camera(i), atol=1e-12)
+
+
+# ---- names: one rule for all readers
+
+NAMED: dict[str, tuple[Callable[[str], str], Callable[[Path], object]]] = {
+    "backslashes": (lambda name: name.replace("/", "\\"), lambda _: None),
+    "another ending": (lambda name: name.replace(".png", ".JPG"), lambda _: None),
+    "no ending": (lambda name: name.removesuffix(".png"), lambda _: None),
+    "no ending of a jpeg": (
+        lambda name: name.removesuffix(".png"),
+        lambda file: Image.open(file).convert("RGB").save(file.with_suffix(".jpg")) or file.unlink(),
+    ),
+    "another case": (str.upper, lambda _: None),
+    "capital ending of the file": (lambda name: name, lambda file: file.rename(file.with_suffix(".PNG"))),
+    "absolute of another machine": (lambda name: f"C:\\scans\\room\\{name}", lambda _: None),
+}
+
+
+@pytest.mark.parametrize("kind", GOOD)
+@pytest.mark.parametrize("case", [*NAMED, "absolute"])
+def test_a_photo_is_found_however_its_name_is_written(kind: str, case: str, tmp_path: Path) -> None:
+    root = GOOD[kind](tmp_path / "scene")
+    folder = root / ("train" if kind == "blender" else "images")
+    rename, spoil = NAMED.get(case, (lambda name: f"{folder}/{Path(name).name}", lambda _: None))
+    if kind == "colmap":  # as text, whose names may have any length
+        poses = [(i + 1, *tiny.QUATERNIONS[i], *tiny.TRANSLATIONS[i], 1, rename(name)) for i, name in enumerate(NAMES)]
+        for file in (root / "sparse/0").glob("*.bin"):
+            file.unlink()
+        tiny.colmap_txt(tmp_path / "txt")
+        (tmp_path / "txt/sparse/0").replace(root / "sparse/0")
+        (root / "sparse/0/images.txt").write_text("".join(" ".join(map(str, pose)) + "\n\n" for pose in poses))
+    elif kind == "colmap_txt":
+        listing = root / "sparse/0/images.txt"
+        text = listing.read_text()
+        for name in NAMES:
+            text = text.replace(f" {name}\n", f" {rename(name)}\n")
+        listing.write_text(text)
+    else:
+        for file in root.glob("*.json"):
+            edited(
+                file,
+                lambda v: [
+                    f.update(file_path=rename(f["file_path"].removeprefix("./").removesuffix(".png") + ".png"))
+                    for f in v["frames"]
+                ],
+            )
+    for name in NAMES:
+        spoil(folder / name)
+    capture = READERS[kind.removesuffix("_txt")](root)
+    poses_are_those_of_the_tiny_scene(capture)
+    assert [Path(frame.name).stem for frame in capture.frames] == ["a", "b", "c"]
+
+
+def test_masks_points_and_split_lists_are_found_by_the_same_rule(tmp_path: Path) -> None:
+    root = tiny.nerfstudio(tmp_path)
+    write_points(root / "points.ply", torch.zeros(1, 3), torch.zeros(1, 3))
+    (root / "m").mkdir()
+    Image.new("L", (tiny.WIDTH, tiny.HEIGHT)).save(root / "m/a.png")
+
+    def change(value: dict[str, Any]) -> None:
+        value.update(ply_file_path=".\\Points.ply", train_filenames=["images\\a.png", "images\\b.png"])
+        value["frames"][0]["mask_path"] = "m\\A.png"
+
+    edited(root / "transforms.json", change)
+    capture = nerfstudio.read(root)
+    assert len(capture.points.means) == 1
+    assert [frame.split for frame in capture.frames] == ["train", "train", None]
+    assert not capture.frames[0].shown().any()
+
+
+def test_two_files_that_a_name_could_mean_are_not_chosen_from(tmp_path: Path) -> None:
+    folder = tiny.colmap_txt(tmp_path) / "images"
+    (folder / "a.png").rename(folder / "a.webp")
+    (folder / "a.webp").with_suffix(".tif").write_bytes(b"")
+    with pytest.raises(DataError, match=r"photos: 1 of 3 are not there: a\.png"):
+        colmap.read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("moved", "message"),
+    [
+        (
+            "images/cam0",
+            r"images, such as a\.png; it holds 3 others, such as cam0/a\.png: .*data\.reader\.images=(\S+)",
+        ),
+        ("photos", r"has none of the folders images, .*: name the folder of photos: data\.reader\.images=FOLDER"),
+    ],
+)
+def test_where_no_photo_is_there_the_message_says_what_is(moved: str, message: str, tmp_path: Path) -> None:
+    root = tiny.colmap_txt(tmp_path)
+    (root / moved).mkdir()
+    for name in NAMES:
+        (root / "images" / name).rename(root / moved / name)
+    if moved == "photos":
+        (root / "images").rmdir()
+    with pytest.raises(DataError, match=message):
+        colmap.read(root)
+    assert len(colmap.read(root, images=moved).frames) == 3  # the remedy
+
+
+def test_where_photos_have_an_ending_that_is_not_read_the_message_names_it(tmp_path: Path) -> None:
+    root = tiny.nerfstudio(tmp_path)
+    for name in NAMES:
+        (root / "images" / name).rename((root / "images" / name).with_suffix(".CR2"))
+    with pytest.raises(
+        DataError, match=r"none of 3 is in .*images, such as a\.png; it holds 3 \.CR2: .* as PNG or JPEG"
+    ):
+        nerfstudio.read(root)
+
+
+# ---- RealityCapture's model, and poses that no reader reads beside photos
+
+
+@pytest.mark.parametrize("photos_in", ["images", "."])
+def test_reality_captures_model_is_read_beside_the_photos(photos_in: str, tmp_path: Path) -> None:
+    made, root = tiny.colmap_txt(tmp_path / "made"), tmp_path / "export"
+    root.mkdir()
+    for name in ("Cameras", "Images", "Points3D"):
+        text = (made / f"sparse/0/{name[0].lower()}{name[1:]}.txt").read_text()
+        (root / f"{name}.txt").write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
+    tiny.write_photos(root / photos_in)
+    assert detect(root) == "colmap"
+    capture = colmap.read(root)
+    poses_are_those_of_the_tiny_scene(capture)
+    assert len(capture.points.means) == 2
+
+
+BESIDE: dict[str, tuple[str, str, str]] = {
+    "transform_train.json": ("transform_train.json", '{"frames": []}', "clear-strategies train .*transform_train.json"),
+    "Metashape": (
+        "cameras.xml",
+        '<?xml version="1.0"?>\n<document version="2.0.0"><chunk>',
+        "ns-process-data metashape",
+    ),
+    "RealityCapture's table": ("cameras.csv", "#name,x,y,alt,heading,pitch,roll,f\n", "ns-process-data realitycapture"),
+    "RealityCapture's XMP": ("a.xmp", '<rdf:Description xcr:PosePrior="initial">', "export Cameras.txt"),
+    "Polycam's keyframes": ("cameras/1.json", '{"t_00": 1.0}', "ns-process-data polycam"),
+    "LLFF": ("poses_bounds.npy", "\x93NUMPY", "sparse/0"),
+    "COLMAP's undistorter": ("dense/sparse/cameras.bin", "", "sparse/0"),
+}
+
+
+@pytest.mark.parametrize("what", BESIDE)
+def test_poses_that_are_not_read_are_told_before_new_ones_are_estimated(what, tmp_path, monkeypatch, caplog):
+    name, text, remedy = BESIDE[what]
+    tiny.write_photos(tmp_path / "images")
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / name).write_text(text, encoding="latin-1")
+
+    def estimate(*_: object) -> None:
+        assert "they are estimated anew, at another scale" in caplog.text
+        raise DataError(tmp_path, "poses", "would be estimated", "")
+
+    monkeypatch.setattr(photos.sfm, "reconstruct", estimate)
+    with pytest.raises(DataError, match="would be estimated"):
+        photos.read(tmp_path, tmp_path.parent / "cache")
+    (warning,) = [record.message for record in caplog.records if record.levelname == "WARNING"]
+    assert remedy.split(".*")[0] in warning
+    assert name in warning
+
+
+@pytest.mark.parametrize(
+    ("name", "photo", "text", "command"),
+    [
+        (
+            "keyframes/cameras/1.json",
+            "keyframes/images/1.jpg",
+            '{"t_00": 1.0}',
+            r"Polycam.*ns-process-data polycam --data",
+        ),
+        ("metadata.json", "rgb/1.jpg", '{"poses": []}', r"Record3D.*ns-process-data record3d --data"),
+        ("metadata", "rgbd/1.jpg", '{"K": [], "poses": []}', r"Record3D.*ns-process-data record3d --data"),
+    ],
+)
+def test_raw_folders_of_phones_are_refused_with_what_converts_them(name, photo, text, command, tmp_path):
+    for file in (name, photo):
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", (16, 12)).save(tmp_path / photo)
+    (tmp_path / name).write_text(text)
+    with pytest.raises(DataError, match=command):
+        photos.read(tmp_path)
+
+
+def test_transforms_under_any_name_are_read_when_the_file_is_named(tmp_path: Path) -> None:
+    file = tiny.nerfstudio(tmp_path) / "transforms.json"
+    file = file.rename(tmp_path / "transform_train.json")
+    assert detect(file) == "nerfstudio"
+    poses_are_those_of_the_tiny_scene(nerfstudio.read(file))
+
+
+# ---- nothing is dropped in silence
+
+
+def images_txt(root: Path, names: tuple[str, ...], points: str = "", header: str = "") -> Path:
+    """images.txt in which each pose is followed by `points`."""
+    rows = [" ".join(map(str, (i + 1, *tiny.QUATERNIONS[i], *tiny.TRANSLATIONS[i], 1, n))) for i, n in enumerate(names)]
+    file = root / "sparse/0/images.txt"
+    file.write_text(header + "".join(f"{row}\n{points}" for row in rows))
+    return file
+
+
+@pytest.mark.parametrize("names", [NAMES, ("a photo 1.png", "b photo 2.png", "c photo 3.png")])
+@pytest.mark.parametrize("points", ["", "\n", "8.0 6.0 -1 7 7 12\n"])
+def test_images_without_a_line_of_points_are_all_read(names: tuple[str, ...], points: str, tmp_path: Path) -> None:
+    root = tiny.colmap_txt(tmp_path)
+    for old, new in zip(NAMES, names, strict=True):
+        (root / "images" / old).rename(root / "images" / new)
+    images_txt(root, names, points)
+    poses_are_those_of_the_tiny_scene(colmap.read(root))
+
+
+def test_of_a_line_that_could_be_a_pose_or_points_the_header_decides(tmp_path: Path) -> None:
+    root, names = tiny.colmap_txt(tmp_path), ("0 0 1", "0 0 2", "0 0 3")
+    for old, new in zip(NAMES, names, strict=True):
+        (root / "images" / old).rename(root / "images" / f"{new}.png")
+    images_txt(root, names, header="# Number of images: 3, mean observations per image: 0\n")
+    poses_are_those_of_the_tiny_scene(colmap.read(root))
+    images_txt(root, names)
+    with pytest.raises(DataError, match=r"images\.txt: line 2: could be an image's pose or the 2D points"):
+        colmap.read(root)
+
+
+def test_a_text_model_that_has_fewer_images_than_its_header_says_is_told(tmp_path: Path, caplog) -> None:
+    root = tiny.colmap_txt(tmp_path)
+    (root / "sparse/0/points3D.txt").unlink()
+    images_txt(root, NAMES[:2], header="# Number of images: 3\n")
+    assert len(colmap.read(root).frames) == 2
+    assert "says 3 images, 2 are there" in caplog.text
+
+
+def test_the_points_that_a_blender_file_names_are_read(tmp_path: Path) -> None:
+    root = tiny.blender(tmp_path)
+    write_points(root / "points3d.ply", torch.tensor([[1.0, 2, 3]]), torch.zeros(1, 3))
+    edited(root / "transforms_train.json", lambda value: value.update(ply_file_path="points3d.ply"))
+    assert blender.read(root).points.means.tolist() == [[1, 2, 3]]
+
+
+# ---- lenses: units, and COLMAP's camera models
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"fl_x": 0.9, "fl_y": 1.2, "cx": 0.5, "cy": 0.5},
+        {"fl_x": 0.9, "fl_y": 1.2},
+        {"fl_x": 700.0, "cx": 0.5, "cy": 0.5},
+        {"fl_x": 50.0},
+    ],
+)
+def test_a_lens_in_units_of_the_image_is_refused(lens: dict[str, float], tmp_path: Path) -> None:
+    root = tiny.nerfstudio(tmp_path)
+    tiny.write_photos(root / "images", (800, 600))
+    for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+        edited(root / "transforms.json", lambda value, key=key: value.pop(key))
+    edited(root / "transforms.json", lambda value: value.update(lens))
+    with pytest.raises(DataError, match=r"frames\[0\]: has focal lengths .* all must be pixels: multiply"):
+        nerfstudio.read(root)
+    scale = {"fl_x": 800, "fl_y": 600, "cx": 800, "cy": 600}
+    pixels = {key: value * scale[key] if value < 100 else value for key, value in lens.items()}
+    edited(root / "transforms.json", lambda value: value.update(pixels))
+    assert len(nerfstudio.read(root).frames) == 3  # the remedy
+
+
+PERSPECTIVE, FISHEYE = Lens(16, 12, 20, 20, 8, 6), Lens(16, 12, 20, 20, 8, 6, (0.1, 0.0, 0.0, 0.0), fisheye=True)
+SUPPORTED = {
+    "FOV": ((20, 20, 8, 6, 0), PERSPECTIVE), "SIMPLE_DIVISION": ((20, 8, 6, 0), PERSPECTIVE),
+    "DIVISION": ((20, 20, 8, 6, 0), PERSPECTIVE), "EUCM": ((20, 20, 8, 6, 0, 1), PERSPECTIVE),
+    "SIMPLE_FISHEYE": ((20, 8, 6), Lens(16, 12, 20, 20, 8, 6, fisheye=True)),
+    "FISHEYE": ((20, 20, 8, 6), Lens(16, 12, 20, 20, 8, 6, fisheye=True)),
+    "OPENCV_FISHEYE": ((20, 20, 8, 6, 0.1, 0, 0, 0), FISHEYE),
+    "THIN_PRISM_FISHEYE": ((20, 20, 8, 6, 0.1, *[0] * 7), FISHEYE),
+    "RAD_TAN_THIN_PRISM_FISHEYE": ((20, 20, 8, 6, 0.1, *[0] * 11), FISHEYE),
+}  # fmt: skip
+
+
+def with_model(root: Path, model: str, parameters: tuple[float, ...], layout: str) -> Path:
+    pycolmap = pytest.importorskip("pycolmap")
+    tiny.colmap_txt(root)
+    camera = pycolmap.Camera(model=model, width=16, height=12, params=parameters)
+    model_of_one = pycolmap.Reconstruction()
+    camera.camera_id = 1
+    model_of_one.add_camera(camera)
+    (root / "written").mkdir()
+    (model_of_one.write_text if layout == "txt" else model_of_one.write_binary)(str(root / "written"))
+    if layout == "txt":
+        (root / "written/cameras.txt").replace(root / "sparse/0/cameras.txt")
+        return root
+    return root / "written"
+
+
+@pytest.mark.parametrize("model", SUPPORTED)
+def test_models_with_coefficients_of_zero_are_those_that_opencv_has(model: str, tmp_path: Path) -> None:
+    parameters, lens = SUPPORTED[model]
+    frame = colmap.read(with_model(tmp_path, model, parameters, "txt")).frames[0]
+    assert (frame.lens.fx, frame.lens.cx, frame.lens.fisheye) == (20, 8, lens.fisheye)
+    import pycolmap
+
+    camera = pycolmap.Camera(model=model, width=16, height=12, params=parameters)
+    ray = np.array([[0.3, -0.2, 1.0]])
+    theirs = camera.img_from_cam(ray)[0]
+    angle = math.atan2(math.hypot(0.3, 0.2), 1.0)
+    k1 = lens.distortion[0] if lens.distortion else 0.0
+    along = angle * (1 + k1 * angle**2) if lens.fisheye else math.tan(angle)
+    ours = np.array([8, 6]) + 20 * along * np.array([0.3, -0.2]) / math.hypot(0.3, 0.2)
+    np.testing.assert_allclose(theirs, ours, atol=1e-6)
+
+
+@pytest.mark.parametrize("layout", ["bin", "txt"])
+@pytest.mark.parametrize(
+    ("model", "parameters", "command"),
+    [
+        ("FOV", (20, 20, 8, 6, 0.5), "omega = 0.5; of the camera model FOV it must be 0.*colmap image_undistorter"),
+        (
+            "THIN_PRISM_FISHEYE",
+            (20, 20, 8, 6, *[0] * 7, 0.1),
+            "sy1 = 0.1; .*THIN_PRISM_FISHEYE.*colmap image_undistorter",
+        ),
+        ("EQUIRECTANGULAR", (16, 12), "EQUIRECTANGULAR, .*ns-process-data images --camera-type equirectangular"),
+    ],
+)
+def test_other_models_are_refused_by_name(model, parameters, command, layout, tmp_path):
+    from clear_strategies.data.readers.colmap_model import read_cameras
+
+    root = with_model(tmp_path, model, parameters, layout)
+    with pytest.raises(DataError, match=command):
+        read_cameras(root / "cameras.bin" if layout == "bin" else root / "sparse/0/cameras.txt")
