@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -46,9 +47,10 @@ def lift(
     A centre outside the image has the border patch, an invisible Gaussian 0 (F24).
 
     Args:
-        centers: u_i in pixels of the image that the patches tile. patch: edge of a patch in those pixels.
+        centers: u_i in pixels of the image that the patches tile; of invisible Gaussians anything, since gsplat leaves their
+            rows uninitialised. patch: edge of a patch in those pixels.
     """
-    x, y = (centers / patch).unbind(-1)
+    x, y = (torch.where(visible[:, None], centers, 0.0) / patch).unbind(-1)
     height, width = patch_maps.shape[1:]
     column, row = x.clamp(0, width - 1).long(), y.clamp(0, height - 1).long()
     return patch_maps.flatten(1).index_select(1, row * width + column) * visible

@@ -69,6 +69,13 @@ def test_lifting_takes_the_patch_of_the_centre_and_the_border_outside():
     assert result.tolist() == pytest.approx([0.1, 0.1, 0.2, 0.3, 0.3, 0.4, 0.0])
 
 
+@pytest.mark.parametrize("garbage", [math.nan, math.inf, -1e30])
+def test_rows_of_invisible_gaussians_may_hold_anything(garbage):
+    """Gsplat leaves the centres of culled Gaussians uninitialised: on CUDA they were an index outside the map."""
+    visible, u = torch.tensor([True, False]), torch.tensor([[5.0, 5.0], [garbage, garbage]])
+    assert lift(torch.ones(2, 3, 4), u, visible, 16).tolist() == [[1.0, 0.0]] * 2
+
+
 @given(q=st.floats(0, 1, width=32), a=st.floats(0, 1, width=32), floor=st.floats(0, 1))
 @settings(max_examples=50, deadline=None)
 def test_routing_as_printed_lies_between_the_floor_and_one(q, a, floor):
