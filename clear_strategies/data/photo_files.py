@@ -1,8 +1,9 @@
 """Image files, read and written, and their EXIF blocks. An image that cannot be read exactly is refused.
 
 The content of a file decides its format. A truncated file is an error, not an image with a grey bottom. 16 bits stay 16 bits.
-Alpha is composited over a given background. The caller decides whether a photo is turned as its EXIF block says, because
-programs disagree on whether a camera's pose includes the turn.
+Colours of another profile become sRGB, in 8 bits. Alpha is composited over a given background, before anything is resampled, so
+that no colour of a transparent pixel shows at an edge. The caller decides whether a photo is turned as its EXIF block says,
+because programs disagree on whether a camera's pose includes the turn.
 """
 
 from __future__ import annotations
@@ -10,10 +11,12 @@ from __future__ import annotations
 import io
 import logging
 import math
+import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -45,6 +48,10 @@ _ISO: Final = 0x8827
 _FOCAL_35MM: Final = 0xA405
 _DIAGONAL_35MM: Final = math.hypot(36, 24)  # mm
 _ON_THE_SIDE: Final = (5, 6, 7, 8)
+_SAME_COLOR: Final = 4  # levels of 255 by which makers' sRGB profiles differ
+_PROFILES: Final = threading.Lock()  # several photos are read at once, and each profile is logged once
+_NCLX_PRIMARIES: Final = (1, 2)  # BT.709's, which are sRGB's, and unknown
+_NCLX_TRANSFER: Final = (1, 2, 6, 13, 14, 15)  # BT.709's in all its names, unknown, and sRGB's
 _TIFF_SIZE: Final = (256, 257)  # tags: the width and height that are stored
 
 
@@ -233,11 +240,56 @@ def _to_float(path: Path, image: Image.Image, sixteen_bits: bool) -> Float[np.nd
     if image.mode in ("I;16", "I;16B", "I;16L", "I;16N"):
         grey = np.asarray(image).astype(np.float32) / 65535
         return np.repeat(grey[..., None], 3, axis=2)
-    if sixteen_bits:
-        return _read_sixteen_bits(path)
     if image.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
         raise DataError(path, "colour mode", f"is {image.mode}", "convert the image to 8-bit or 16-bit RGB")
-    return np.asarray(image.convert("RGBA" if _has_alpha(image) else "RGB"), np.float32) / 255
+    to_srgb = _to_srgb_of(image)
+    if sixteen_bits and to_srgb is None:
+        return _read_sixteen_bits(path)
+    pixels = np.array(image.convert("RGBA" if _has_alpha(image) else "RGB"), np.float32) / 255
+    if to_srgb is not None:
+        pixels[..., :3] = np.asarray(to_srgb.apply(image.convert(to_srgb.input_mode)), np.float32) / 255
+    return pixels
+
+
+def _to_srgb_of(image: Image.Image) -> Any:
+    """What turns the image's colours into sRGB; None where they are sRGB, or it does not say."""
+    nclx = image.info.get("nclx_profile") or {}
+    with _PROFILES:
+        if profile := image.info.get("icc_profile"):
+            return _to_srgb(profile, image.mode in ("1", "L", "LA"))
+        _warn_of_nclx(nclx.get("color_primaries", 1), nclx.get("transfer_characteristics", 1))
+        return None
+
+
+@lru_cache(maxsize=16)  # photos of one camera have the same profile, which is logged once
+def _to_srgb(profile: bytes, grey: bool) -> Any:
+    from PIL import ImageCms
+
+    try:
+        own, srgb = ImageCms.ImageCmsProfile(io.BytesIO(profile)), ImageCms.createProfile("sRGB")
+        mode = "L" if grey and own.profile.xcolor_space.strip() == "GRAY" else "RGB"
+        name = ImageCms.getProfileDescription(own).strip()
+        transform = ImageCms.buildTransform(own, srgb, mode, "RGB", ImageCms.Intent.RELATIVE_COLORIMETRIC)
+    except (ImageCms.PyCMSError, OSError) as error:
+        _log.warning("photos have a colour profile that cannot be used (%s): their colours are taken as sRGB.", error)
+        return None
+    levels = np.indices((6, 6, 6)).reshape(3, 36, 6).transpose(1, 2, 0).astype(np.uint8) * 51
+    sample = Image.fromarray(levels).convert(mode)
+    before, after = (np.asarray(i, np.int16) for i in (sample.convert("RGB"), transform.apply(sample)))
+    if np.abs(after - before).max() <= _SAME_COLOR:
+        return None
+    _log.info("photos have the colours of %s: they are converted to sRGB.", name)
+    return transform
+
+
+@lru_cache(maxsize=16)
+def _warn_of_nclx(primaries: int, transfer: int) -> None:
+    """Warn of a HEIC whose colours are given by numbers (ITU-T H.273) instead of a profile, if they are not sRGB's."""
+    if primaries not in _NCLX_PRIMARIES or transfer not in _NCLX_TRANSFER:
+        _log.warning(
+            "photos have the colours of ITU-T H.273's primaries %d and transfer %d (HDR, or a wide gamut), and are taken as "
+            "sRGB. Export them in sRGB.", primaries, transfer,
+        )  # fmt: skip
 
 
 def _has_alpha(image: Image.Image) -> bool:

@@ -140,6 +140,19 @@ def test_transparent_photos_can_be_shown_before_any_background(tmp_path, photos_
     assert prepare(capture(), replace(views, photos_are="hr"), Bicubic(), POINTS).train[0].lr.transparency is None
 
 
+@pytest.mark.parametrize("downsample", ["bicubic", "area", "lanczos"])
+def test_the_colour_of_transparent_pixels_makes_no_fringe_where_photos_are_reduced(tmp_path, downsample):
+    rows, columns = np.mgrid[:48, :64]
+    disc = (rows - 24) ** 2 + (columns - 30) ** 2 < 15**2
+    root = tiny.blender(tmp_path)
+    for photo in (root / "train").glob("*.png"):
+        Image.fromarray(np.where(disc[..., None], (90, 90, 90, 255), (255, 0, 0, 0)).astype(np.uint8)).save(photo)
+    views = ViewSettings(photos_are="both", shrink=4, sr_scale=1, downsample=downsample)
+    for view in prepare(blender.read(root), views, Bicubic(), POINTS).train:
+        for image in (view.lr.image, view.lr.over((0.0, 0.0, 0.0), view.background).image):
+            assert float((image.amax(2) - image.amin(2)).max()) < 1.5 / 255
+
+
 def test_a_network_enlarges_the_transparency_of_a_photo_once(tmp_path):
     network = Counting()
     half = torch.full((16, 16), 0.5)

@@ -24,6 +24,8 @@ from clear_strategies.errors import DataError
 _log = logging.getLogger(__name__)
 
 _HEIC: Final = (".heic", ".heif")
+FRAMES: Final = "ffmpeg -i VIDEO -vf thumbnail=15 -fps_mode passthrough -q:v 2 FOLDER/%03d.jpg"
+HDR: Final = "-vf thumbnail=15,scale=out_primaries=bt709:out_transfer=iec61966-2-1,format=rgb24 (ffmpeg 8)"
 _FEW: Final = 30  # photos, up to which precise=auto is true
 _STOPS: Final = 0.5  # larger differences of exposure give a warning
 _HEAD: Final = 1 << 16  # bytes of a file that tell what it is
@@ -93,8 +95,8 @@ def read(
     require_whole("data.reader.seed", seed, least=0)
     root, name = Path(root), Path(root).resolve().name
     if root.is_file():
-        frames = "ffmpeg -i VIDEO -vf thumbnail=15 -fps_mode passthrough -q:v 2 FOLDER/%03d.jpg"
-        raise DataError(root, "photos", "is a file", f"give a folder of photos; of a video: {frames}")
+        remedy = f"give a folder of photos; of a video: {FRAMES}; of one in HDR: {HDR}"
+        raise DataError(root, "photos", "is a file", remedy)
     _tell_of_other_poses(root)
     if (inside := named(root, "images")).is_dir() and not images_in(root):
         root = inside

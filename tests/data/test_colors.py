@@ -1,0 +1,117 @@
+"""Photos with a colour profile of their own become sRGB; photos of sRGB keep their bits."""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from clear_strategies.data import photo_files
+from clear_strategies.data.readers.photos import FRAMES, HDR
+from tests.helpers import icc
+
+LEVELS = np.random.default_rng(0).integers(30, 200, (8, 8, 3), np.uint8)
+P3, SRGB = icc.profile("Display P3", icc.DISPLAY_P3), icc.profile("sRGB of a maker", icc.SRGB)
+
+
+@pytest.fixture(autouse=True)
+def forgotten_profiles():
+    photo_files._to_srgb.cache_clear()
+    photo_files._warn_of_nclx.cache_clear()
+
+
+def in_srgb(levels: np.ndarray) -> torch.Tensor:
+    """Display P3 in sRGB, by the definition."""
+    level = levels / 255
+    linear = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
+    linear = linear @ (np.linalg.inv(icc.to_xyz(icc.SRGB)) @ icc.to_xyz(icc.DISPLAY_P3)).T
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.abs(linear) ** (1 / 2.4) - 0.055)
+    return torch.from_numpy(encoded.clip(0, 1)).float()
+
+
+def write(path: Path, levels: np.ndarray, **options: object) -> Path:
+    if path.suffix == ".heic":
+        pytest.importorskip("pillow_heif").register_heif_opener()
+        options["quality"] = -1  # lossless
+        options["chroma"] = 444
+        levels = np.repeat(np.repeat(levels, 8, 0), 8, 1)
+    Image.fromarray(levels).save(path, **options)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("ending", "allowed"), [(".png", 1.5), (".tiff", 1.5), (".jpg", 12), (".webp", 1.5), (".heic", 8)]
+)
+def test_display_p3_becomes_srgb_with_one_line(tmp_path: Path, ending: str, allowed: float, caplog) -> None:
+    levels = LEVELS if ending != ".jpg" else np.broadcast_to(LEVELS[:1, :1], LEVELS.shape)  # JPEG blurs noise
+    lossless = {"lossless": True} if ending == ".webp" else {"quality": 100} if ending == ".jpg" else {}
+    with caplog.at_level("INFO"):
+        for name in ("a", "b"):
+            path = write(tmp_path / f"{name}{ending}", levels, icc_profile=P3, **lossless)
+            read = photo_files.read_image(path)
+            step = len(read) // 8
+            assert float((read[::step, ::step] - in_srgb(levels)).abs().max()) < allowed / 255
+    assert caplog.text.count("photos have the colours of Display P3: they are converted to sRGB.") == 1
+    assert float((in_srgb(levels) - torch.from_numpy(levels / 255)).abs().max()) > 12 / 255
+
+
+def test_alpha_and_16_bits_keep_their_photos_colours(tmp_path: Path) -> None:
+    rgba = np.dstack([LEVELS, np.full((8, 8), 128, np.uint8)])
+    read = photo_files.read_image(write(tmp_path / "a.png", rgba, icc_profile=P3), background=(1, 1, 1))
+    assert torch.allclose(read, in_srgb(LEVELS) * 128 / 255 + 127 / 255, atol=1.5 / 255)
+    file = tmp_path / "b.png"
+    assert cv2.imwrite(str(file), LEVELS[..., ::-1].astype(np.uint16) * 257)
+    chunk = b"iCCP" + b"P3\0\0" + zlib.compress(P3)
+    data = file.read_bytes()  # the header's chunk ends at byte 33
+    file.write_bytes(
+        data[:33] + struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) + data[33:]
+    )
+    assert torch.allclose(photo_files.read_image(file), in_srgb(LEVELS), atol=1.5 / 255)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "L", "P"])
+def test_profiles_of_srgb_and_damaged_ones_change_no_bit(tmp_path: Path, mode: str, caplog) -> None:
+    image = Image.fromarray(LEVELS).convert(mode)
+    image.save(tmp_path / "plain.png")
+    plain = photo_files.read_image(tmp_path / "plain.png")
+    for profile, warned in ((SRGB, False), (b"no profile", True)):
+        image.save(tmp_path / "a.png", icc_profile=profile)
+        assert torch.equal(photo_files.read_image(tmp_path / "a.png"), plain)
+        assert ("colour profile that cannot be used" in caplog.text) is warned
+
+
+def test_hdr_photos_without_a_profile_are_told(tmp_path: Path, caplog) -> None:
+    path = write(tmp_path / "a.heic", LEVELS)
+    photo_files.read_image(path)
+    assert not caplog.text
+    with photo_files._opened(path, False) as image:
+        image.info["nclx_profile"] = {"color_primaries": 9, "transfer_characteristics": 16}
+        photo_files._to_srgb_of(image)
+    assert "primaries 9 and transfer 16 (HDR, or a wide gamut)" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("transfer", "most"), [("arib-std-b67", 25), ("smpte2084", 6), ("iec61966-2-1", 6)], ids=["HLG", "PQ", "sRGB"]
+)
+def test_the_line_for_clips_in_hdr_gives_photos_in_srgb(tmp_path: Path, transfer: str, most: int) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
+    color, clip = (200, 60, 40), tmp_path / "clip.mkv"
+    wide = f"p=bt2020:t={transfer}:m=bt2020nc:r=limited:npl=203"
+    made = f"format=gbrp,zscale=pin=bt709:tin=iec61966-2-1:min=gbr:rin=full:{wide},format=yuv420p10le"
+    source = ["-f", "lavfi", "-i", "color=c=0xC83C28:s=64x64:d=1:r=30", "-vf", made, "-c:v", "ffv1", str(clip)]
+    if subprocess.run([ffmpeg, "-v", "error", *source], check=False).returncode:
+        pytest.skip("this ffmpeg cannot make the clip")
+    line = FRAMES.replace("VIDEO", str(clip)).replace("FOLDER", str(tmp_path)).split()
+    line[line.index("-vf") + 1] = HDR.split()[1]
+    subprocess.run([ffmpeg, "-v", "error", *line[1:]], check=True)
+    photos = sorted(tmp_path.glob("*.jpg"))
+    assert len(photos) == 2
+    off = (photo_files.read_image(photos[0])[32, 32] * 255 - torch.tensor(color)).abs().max()
+    assert float(off) < most
