@@ -1,6 +1,6 @@
 """The pictures of the documentation.
 
-python docs/figures.py                     those of docs/explanation/evidence-sparse.md, from its CSV files
+python docs/figures.py                     those of the evidence pages, from their CSV files
 python docs/figures.py demo [OVERRIDE …]   the first tutorial's: trains the demo without strategies and with clear
 python docs/figures.py host                the README's: trains in a gsplat loop, without strategies and with best
 python docs/figures.py notebook            runs docs/tutorial/notebook.ipynb and keeps the outputs of its cells
@@ -19,6 +19,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from statistics import fmean
 from typing import Any, Final
 
 import matplotlib as mpl
@@ -102,9 +103,44 @@ def skips(folder: Path) -> None:
     write(figure, folder, "skips")
 
 
+def best(folder: Path) -> None:
+    rows = table("best_today")
+    figure, axes = plt.subplots(figsize=(7, 2.4))
+    places, gains = range(len(rows)), [numbers(row["Δ best"])[0] for row in rows]
+    colors = ["black" if row["scene"].startswith("average") else "C0" for row in rows]
+    axes.bar(places, gains, yerr=[error(row["Δ best"]) for row in rows], color=colors, width=0.6)
+    axes.axhline(0, color=GREY, linewidth=1)
+    axes.set_xticks(places, [f"{row['scene']}\n{numbers(row['baseline'])[0]:.2f} dB" for row in rows])
+    axes.set_ylabel("Δ PSNR of best, dB")
+    write(figure, folder, "best")
+
+
+def hosts(folder: Path) -> None:
+    rows = [row for row in table("hosts_best") if row["measured"] < "2026-11-26"]  # HR drawn whole
+    names = list(dict.fromkeys(row["host"] for row in rows))
+    series = (("own", "none"), ("stereo", "clear"), ("stereo", "best"))
+    figure, axes = plt.subplots(figsize=(7, 2.4))
+    for k, (points, strategies) in enumerate(series):
+        means = [
+            fmean(
+                float(row["PSNR at HR (dB)"])
+                for row in rows
+                if (row["host"], row["points"], row["strategies"], row["seed"]) == (name, points, strategies, "0")
+            )
+            for name in names
+        ]
+        label = "alone, its own points" if strategies == "none" else f"{strategies}, from stereo"
+        axes.bar([i + 0.25 * (k - 1) for i in range(len(names))], means, width=0.23, label=label)
+    axes.set_xticks(range(len(names)), names)
+    axes.set_ylim(14, None)
+    axes.set_ylabel("PSNR at HR, dB")
+    axes.legend(fontsize=7, ncols=3, frameon=False, loc="upper left", bbox_to_anchor=(0, 1.16))
+    write(figure, folder, "hosts")
+
+
 def main(folder: Path) -> None:
-    ablation(folder)
-    skips(folder)
+    for draw in (ablation, skips, best, hosts):
+        draw(folder)
 
 
 # The test view of the README's picture, and the part of it that is magnified: left, top, right, bottom, px.
