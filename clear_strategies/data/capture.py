@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from clear_strategies.data.lenses import Lens
-from clear_strategies.data.masks import read_mask
+from clear_strategies.data.masks import check_mask, read_mask
 from clear_strategies.data.photo_files import has_alpha, image_size, read_image
 from clear_strategies.data.priors.interface import Prior
 from clear_strategies.errors import DataError
@@ -82,7 +82,7 @@ class Frame:
         camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, width, height)
         load = partial(_load, path, fitted, pinhole, background, turn)
         if mask is not None:
-            lens.resized(*image_size(mask, turn=turn), mask)  # refuses another shape
+            check_mask(mask, fitted, turn)
         shown = None if mask is None else partial(read_mask, mask, fitted, pinhole, turn)
         through = partial(_load_transparency, path, fitted, pinhole, turn) if has_alpha(path) else None
         return Frame(name, camera, load, split=split, sfm_id=sfm_id, lens=lens, shown=shown, transparency=through)

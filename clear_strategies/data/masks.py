@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 import torch
@@ -15,7 +17,7 @@ from torch import Tensor
 
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.lenses import Lens
-from clear_strategies.data.photo_files import SUFFIXES, is_lossy, read_image
+from clear_strategies.data.photo_files import SUFFIXES, image_size, is_lossy, read_image
 from clear_strategies.data.photo_folders import images_in, some
 from clear_strategies.errors import DataError
 
@@ -28,14 +30,17 @@ _FAINT: Final = 0.02  # alpha of a pixel that counts as transparent: 1 of 255 do
 _LITTLE: Final = 0.1  # of all pixels: less is more often a mask upside down than what was meant
 
 
-def masks_of(root: Path, paths: Iterable[Path]) -> dict[Path, Path]:
+def masks_of(root: Path, paths: Iterable[Path], given: Mapping[Path, Path] = MappingProxyType({})) -> dict[Path, Path]:
     """The mask of each photo that has one; a warning names the files in a folder of masks that belong to no photo.
+
+    Args:
+        given: the masks of photos whose capture names them.
 
     Masks lie in a folder `masks` (or `mask`), in place of one folder of the photo's path below `root`, or in one of them; beside
     images_4, `masks_4` comes first. A mask is named like its photo, with its ending or without, in any case, and may be marked:
     0001.png, 0001.jpg.png, 0001_mask.png, dynamic_mask_0001.png.
     """
-    found, used, folders = dict[Path, Path](), set[Path](), dict[Path, dict[str, Path]]()
+    found, used, folders = dict(given), set(given.values()), dict[Path, dict[str, Path]]()
     for parent in dict.fromkeys(path.parent for path in paths):
         for folder in filter(Path.is_dir, dict.fromkeys(_folders(root, parent))):
             masks = folders.setdefault(folder, _by_name(folder))
@@ -73,6 +78,12 @@ def _by_name(folder: Path) -> dict[str, Path]:
     return masks
 
 
+def check_mask(path: Path, lens: Lens, turn: bool | None) -> None:
+    """A DataError where a mask is no image of its lens's shape, by its header; `turn` as of `read_image`."""
+    with _of_mask():
+        lens.resized(*image_size(path, turn=turn), path)
+
+
 def read_mask(path: Path, lens: Lens, pinhole: Lens, turn: bool | None) -> Bool[Tensor, "H W"]:
     """False where the mask hides its photo: where it is 0, as in COLMAP and nerfstudio, so that 0 and 1 are a mask as 0 and 255
     are. Of a lossy file, whose 0 is not exact, at most half of its largest value.
@@ -81,12 +92,23 @@ def read_mask(path: Path, lens: Lens, pinhole: Lens, turn: bool | None) -> Bool[
         lens, pinhole: of the photo, to whose size the mask is brought.
         turn: as of `read_image`.
     """
-    values = read_image(path, turn=turn).amax(dim=2)
-    shown = (values > (values.max() / 2 if is_lossy(path) else 0)).float()
+    with _of_mask():
+        values = read_image(path, turn=turn).amax(dim=2)
+        shown = (values > (values.max() / 2 if is_lossy(path) else 0)).float()
     shown = F.interpolate(shown[None, None], (lens.height, lens.width), mode="nearest-exact")[0, 0]
     if lens.distorts:
         shown = lens.undistort(shown[..., None].expand(-1, -1, 3).contiguous(), pinhole)[..., 0]
     return shown > 0.5
+
+
+@contextmanager
+def _of_mask() -> Iterator[None]:
+    """What would help a photo does not help its mask."""
+    try:
+        yield
+    except DataError as error:
+        remedy = "put a mask of the photo's shape there, or remove it and the field that names it"
+        raise DataError(error.file, f"mask: {error.field}", error.problem, remedy) from error
 
 
 def require_shown(views: Sequence[View]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,6 +12,7 @@ import torch
 
 from clear_strategies.data.capture import Frame, SfmPoints
 from clear_strategies.data.lenses import Lens, lens_of, pose_from_opengl
+from clear_strategies.data.masks import masks_of
 from clear_strategies.data.photo_files import image_size
 from clear_strategies.data.photo_folders import finder, usable
 from clear_strategies.data.ply import read_points
@@ -116,16 +117,22 @@ def frames_of(
 
     Args:
         photos: name, file and split of each of `transforms`.
-        masks: of photos whose frame names none.
+        masks: see `masks_of_frames`.
     """
-    find, frames = finder(file.parent), []
+    frames = []
     for i in usable(file, range(len(photos)), lambda i: photos[i][1], skip_faulty=skip_faulty):
         where, transform, (name, path, split) = f"frames[{i}]", transforms[i], photos[i]
         pose = pose_from_opengl(file, f"{where}.transform_matrix", transform.transform_matrix)
         lens = transform.lens(file, where, path)
-        mask = find(transform.mask_path) if transform.mask_path else masks.get(path)
-        frames.append(Frame.of_photo(name, path, lens, pose, background=background, split=split, mask=mask))
+        frames.append(Frame.of_photo(name, path, lens, pose, background=background, split=split, mask=masks.get(path)))
     return frames
+
+
+def masks_of_frames(folder: Path, transforms: Iterable[Transform], paths: Sequence[Path]) -> dict[Path, Path]:
+    """`masks_of` these photos, by the frames' own `mask_path` where they have one."""
+    find = finder(folder)
+    named = {path: find(frame.mask_path) for frame, path in zip(transforms, paths, strict=True) if frame.mask_path}
+    return masks_of(folder, paths, named)
 
 
 def points_of(file: Path, content: Mapping[str, Any]) -> SfmPoints | None:

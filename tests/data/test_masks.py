@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -93,8 +94,34 @@ def test_masks_follow_the_size_of_their_photos(tmp_path: Path) -> None:
 
 def test_a_mask_of_another_shape_is_refused_before_any_photo_is_read(tmp_path: Path) -> None:
     save(tiny.colmap_bin(tmp_path) / "masks/a.png", np.ones((16, 12), int))
-    with pytest.raises(DataError, match=r"masks/a\.png: size: is 12x16, but its camera is for 16x12: another shape"):
+    with pytest.raises(
+        DataError, match=r"masks/a\.png: mask: size: is 12x16, but its camera is for 16x12: another shape"
+    ):
         colmap.read(tmp_path)
+
+
+def test_a_mask_that_cannot_be_read_is_refused_with_what_helps_a_mask(tmp_path: Path) -> None:
+    mask = tiny.colmap_bin(tmp_path) / "masks/a.png"
+    save(mask, 255 * LEFT)
+    whole = mask.read_bytes()
+    for content, message in ((b"no image", "is no readable image"), (whole[:-30], "cannot be decoded")):
+        mask.write_bytes(content)
+        with pytest.raises(
+            DataError, match=rf"a\.png: mask: .*{message}.*: put a mask of the photo's shape there, or remove it"
+        ):
+            [frame.shown() for frame in colmap.read(tmp_path, skip_faulty=True).frames if frame.shown is not None]
+    mask.unlink()
+    assert not any(frame.shown for frame in colmap.read(tmp_path).frames)
+
+
+def test_masks_that_the_frames_name_belong_to_them_whatever_their_names(tmp_path: Path, caplog) -> None:
+    content = json.loads((tiny.nerfstudio(tmp_path) / "transforms.json").read_text())
+    for i, frame in enumerate(content["frames"]):
+        frame["mask_path"] = f".\\Masks\\{i}.PNG"
+        save(tmp_path / f"masks/{i}.png", 255 * LEFT)
+    tiny.write_json(tmp_path / "transforms.json", content)
+    assert all(torch.equal(frame.shown(), torch.from_numpy(LEFT)) for frame in nerfstudio.read(tmp_path).frames)
+    assert not caplog.text
 
 
 def prepared(root: Path, read: Callable[[Path], Capture]) -> None:

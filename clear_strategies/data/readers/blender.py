@@ -9,10 +9,9 @@ from typing import Final
 
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import Capture, Frame, lens_notes, require_names
-from clear_strategies.data.masks import masks_of
 from clear_strategies.data.photo_folders import finder, named
 from clear_strategies.data.strict_json import read_object
-from clear_strategies.data.transforms import frames_of, photo_transforms, points_of
+from clear_strategies.data.transforms import frames_of, masks_of_frames, photo_transforms, points_of
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
 
@@ -56,7 +55,7 @@ def read(
     contents = {file: read_object(file) for file in files}
     transforms = {file: photo_transforms(file, content) for file, content in contents.items()}
     paths = {file: [find(transform.file_path) for transform in transforms[file]] for file in files}
-    masks = masks_of(root, itertools.chain(*paths.values()))
+    masks = masks_of_frames(root, itertools.chain(*transforms.values()), list(itertools.chain(*paths.values())))
     for file, split in zip(files, ("train", "test"), strict=False):
         photos = [(path.stem if split == "train" else f"test/{path.stem}", path, split) for path in paths[file]]
         frames += frames_of(file, transforms[file], photos, masks=masks, background=background, skip_faulty=skip_faulty)

@@ -13,10 +13,9 @@ import msgspec
 
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import BLACK, Capture, Frame, lens_notes, sorted_by_name
-from clear_strategies.data.masks import masks_of
 from clear_strategies.data.photo_folders import finder, named
 from clear_strategies.data.strict_json import read_object, typed
-from clear_strategies.data.transforms import frames_of, photo_transforms, points_of
+from clear_strategies.data.transforms import frames_of, masks_of_frames, photo_transforms, points_of
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
 
@@ -65,7 +64,7 @@ def read(
     splits = _splits(file, lists, find)
     shared = os.path.commonprefix([path.parent.parts for path in paths])  # noqa: RUF071 - compares tuples of folders
     photos = [("/".join(path.parts[len(shared) :]), path, splits.get(path)) for path in paths]
-    masks = masks_of(folder, paths)
+    masks = masks_of_frames(folder, transforms, paths)
     frames = frames_of(file, transforms, photos, masks=masks, background=background, skip_faulty=skip_faulty)
     notes = {"poses": f"{file.name}, {len(frames)} images", **lens_notes(frames)}
     if splits:
