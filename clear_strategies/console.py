@@ -9,8 +9,9 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
+import logging.handlers
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final, TextIO
 
@@ -62,18 +63,27 @@ def show_in_host() -> None:
 
 
 @contextlib.contextmanager
-def logged(path: Path) -> Iterator[None]:
-    """Write all messages of the packages to a file, those that are shown with -v alone included, as Hydra does for its jobs."""
-    file = logging.FileHandler(path, encoding="utf-8")
-    file.setFormatter(logging.Formatter("%(asctime)s  %(message)s", "%H:%M:%S"))
+def logged(path: Path) -> Iterator[Callable[[], None]]:
+    """Write all messages to a file, those for `-v` included, once the function that this yields has been called."""
+    kept = logging.handlers.MemoryHandler(sys.maxsize, sys.maxsize, flushOnClose=False)
     before = {logger: logger.level for logger in map(logging.getLogger, _OURS)}
+
+    def write() -> None:
+        if kept.target is None:
+            file = logging.FileHandler(path, encoding="utf-8")
+            file.setFormatter(logging.Formatter("%(asctime)s  %(message)s", "%H:%M:%S"))
+            kept.setTarget(file)
+            kept.capacity = 1  # from now on at once
+            kept.flush()
+
+    logging.getLogger().addHandler(kept)
     for logger in before:
-        logger.addHandler(file)
         logger.setLevel(logging.DEBUG)
     try:
-        yield
+        yield write
     finally:
+        logging.getLogger().removeHandler(kept)
         for logger, level in before.items():
-            logger.removeHandler(file)
             logger.setLevel(level)
-        file.close()
+        if kept.target is not None:
+            kept.target.close()

@@ -14,6 +14,7 @@ import re
 import signal
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,7 +26,7 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from clear_strategies import files
+from clear_strategies import console, files
 from clear_strategies.compose import CONF, composed, flat, quoted, require_each_once
 from clear_strategies.errors import ClearError, SettingError
 from clear_strategies.jobs import exit_codes
@@ -105,17 +106,25 @@ def job(config: DictConfig) -> float | None:
     """One job of Hydra's. Returns what `jobs.job.run` does; in a sweep also None for a job that failed or is left to another."""
     hydra_config = HydraConfig.get()
     folder, overrides = Path(hydra_config.runtime.output_dir), list(hydra_config.overrides.task)
-    try:
-        from clear_strategies.jobs import job
+    with console.logged(folder / "run.log") as log:
 
-        (folder / FAILED).unlink(missing_ok=True)
-        require_each_once(overrides)
-        return job.run(config, folder, overrides)
-    except (Exception, KeyboardInterrupt) as error:
-        if (ending := exit_codes.describe(error)) is None:
-            raise
-        _end(error, ending, folder, resumes=config.fit.get("resume") == "auto")
-        return None
+        def claim() -> None:
+            log()
+            (folder / FAILED).unlink(missing_ok=True)
+            written = {"config": config, "hydra": HydraConfig.instance().cfg, "overrides": hydra_config.overrides.task}
+            for name, content in written.items():
+                files.write_text(folder / ".hydra" / f"{name}.yaml", OmegaConf.to_yaml(content))
+
+        try:
+            from clear_strategies.jobs import job
+
+            require_each_once(overrides)
+            return job.run(config, folder, overrides, claim)
+        except (Exception, KeyboardInterrupt) as error:
+            if (ending := exit_codes.describe(error)) is None:
+                raise
+            _end(error, ending, folder, resumes=config.fit.get("resume") == "auto")
+            return None
 
 
 def _end(error: BaseException, ending: exit_codes.Ending, folder: Path, *, resumes: bool) -> None:
@@ -132,6 +141,8 @@ def _end(error: BaseException, ending: exit_codes.Ending, folder: Path, *, resum
     if in_sweep and code == exit_codes.UNUSABLE:
         files.write_text(folder / FAILED, f"job {hydra_config.job.num}: {message}\n")
         return
+    with suppress(OSError):
+        folder.rmdir()  # where nothing was written
     if code - exit_codes.SIGNALS not in (signal.SIGINT, signal.SIGTERM) and code > exit_codes.SIGNALS:
         signal.raise_signal(code - exit_codes.SIGNALS)  # all is saved: now the launcher's handler may resubmit the job
     sys.exit(code)

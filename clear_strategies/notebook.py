@@ -6,9 +6,9 @@ The command line composes the same configuration and calls the same job (`clear-
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -104,7 +104,8 @@ def train(photos: str | Path | None = None, *settings: str, folder: str | Path |
             key, "must be left out, since Hydra takes no part in a run from Python", value, "folder=… is for its files"
         )
     name = "demo" if photos is None else Path(photos).resolve().stem
-    into = Path(folder) if folder is not None else Path("outputs") / name / time.strftime("%Y-%m-%d_%H-%M-%S")
+    now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S-%f")
+    into = Path(folder) if folder is not None else Path("outputs") / name / now
     config = composed(overrides, "config")
     if (lr := config.data.get("save_lr")) is not None:
         rule = "must be null, since a run that writes LR images does not train"
@@ -112,8 +113,8 @@ def train(photos: str | Path | None = None, *settings: str, folder: str | Path |
     into.mkdir(parents=True, exist_ok=True)
     threads = torch.get_num_threads()
     try:
-        with console.logged(into / "run.log"):
-            job.run(config, into, overrides=overrides)
+        with console.logged(into / "run.log") as claim:
+            job.run(config, into, overrides, claim)
     finally:
         torch.set_num_threads(threads)
     _log.info("%s", into)

@@ -60,6 +60,7 @@ class _Training:
         compared: the configuration from `resume.comparable`, which a resumed run must have in common.
         folder: for its files.
         overrides: of the command line, for the report; None: unknown.
+        claim: called once `folder` is this run's, see `run`.
     """
 
     settings: JobSettings
@@ -67,6 +68,7 @@ class _Training:
     compared: Mapping[str, Any]
     folder: Path
     overrides: Sequence[str] | None
+    claim: Callable[[], None]
 
     @property
     def chosen(self) -> plan.Chosen:
@@ -84,17 +86,21 @@ class _Training:
             mip=scaled(settings.mip, stretch),
             near=place.drawing.near,
         )
-        resume.resume(state, settings.fit.resume, self.folder, self.compared)
+        resume.resume(state, place.scene, settings.fit.resume, self.folder, self.compared)
         return state
 
 
-def run(config: DictConfig, folder: Path, overrides: Sequence[str] | None = None) -> float | None:
+def run(
+    config: DictConfig, folder: Path, overrides: Sequence[str] | None = None, claim: Callable[[], None] = lambda: None
+) -> float | None:
     """Run one job and write its files into `folder`.
 
     Every setting is checked before the folder is locked and before data is read.
 
     Args:
         overrides: that the configuration was composed of, which the report names the run by.
+        claim: called, perhaps twice, once the folder is this run's: at once where there was no run, else when nothing can refuse
+            this one any more. Nothing is written there before, except the lock.
 
     Returns:
         The mean PSNR of the test views, dB, which a sweeper may optimize; of the training views if there are no test views.
@@ -110,10 +116,11 @@ def run(config: DictConfig, folder: Path, overrides: Sequence[str] | None = None
     fit = settings.fit
     if fit.viewer:
         viewing.require_viewer()
-    training = _Training(settings, settings.conductor(fit.stretch), resume.comparable(values), folder, overrides)
+    training = _Training(settings, settings.conductor(fit.stretch), resume.comparable(values), folder, overrides, claim)
     drawing = device.drawing(settings.rasterizer, fit.device)
     with hold(folder), signals.interrupted("before training began"):
-        files.sweep(folder)
+        if not resume.begun(folder):
+            claim()
         return _run(training, drawing)
 
 
@@ -123,14 +130,15 @@ def _in_sweep() -> bool:
 
 def _run(training: _Training, drawing: device.Drawing) -> float | None:
     settings = training.settings
+    threads, reason = device.threads(settings.fit.threads)
+    torch.set_num_threads(threads)
+    load = functools.partial(scenes.load, settings.data, settings.prior, settings.fit.seed, training.conductor.prior)
     if settings.fit.resume == resume.AUTO:
-        finished = resume.finished(training.folder, training.compared)
+        finished = resume.finished(training.folder, training.compared, load)
         if finished is not None:
             score = finished.shown.mean.get("ours")
             return None if score is None else score.psnr
-    threads, reason = device.threads(settings.fit.threads)
-    torch.set_num_threads(threads)
-    scene = scenes.load(settings.data, settings.prior, settings.fit.seed, training.conductor.prior)
+    scene = load()
     if settings.data.save_lr is not None:
         save_lr(scene, Path(settings.data.save_lr))
         return None
@@ -138,6 +146,8 @@ def _run(training: _Training, drawing: device.Drawing) -> float | None:
     drawing = drawing.over(scene.background)
     place = _Place(scene, scene.to(drawing.device), drawing)
     state = training.start(place)
+    training.claim()
+    files.sweep(training.folder)
     _announce(training, state, place, f"{threads} ({reason})")
     # In a sweep the console shows one line per job; the rest is in run.log.
     level = logging.DEBUG if _in_sweep() else logging.INFO

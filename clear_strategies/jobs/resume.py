@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
+import torch
 
 from clear_strategies.compose import flat
+from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DataError
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.metrics import Metrics
@@ -17,6 +20,9 @@ from clear_strategies.settings import CHANGES_NO_RESULT
 from clear_strategies.training import checkpoint
 from clear_strategies.training.checkpoint import CHECKPOINTS, Checkpoint
 from clear_strategies.training.state import TrainState
+from clear_strategies.viewing.cameras import FILE as CAMERAS
+from clear_strategies.viewing.cameras import read_cameras
+from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
@@ -25,16 +31,40 @@ AUTO: Final = "auto"  # the value of fit.resume that is not a path
 
 # What may differ between a run and the one that it resumes. Another device changes bits, which is logged.
 _NOT_COMPARED: Final = CHANGES_NO_RESULT | {"fit.device"}
+# Where the data set lies, which may be moved: the cameras that are read there are compared.
+_DATA: Final = ("data.path", "data.root", "data.reader.root", "data.reader.cache")
+# Where other files lie, by the ends of their keys: their names and sizes are compared.
+_FILES: Final = ("path", "lr_folder")
+_HELD: Final = " holds"
+_ROUNDED: Final = 1e-6  # of a position, as float32 has it
+_SAME: Final = 1e-3  # of a camera's focal length, and of the distances between the cameras
 
 
 def comparable(values: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration, flat and JSON-ready, without what a resumed run may change."""
     compared = {key: value for key, value in flat(values).items() if key not in _NOT_COMPARED}
+    places = {key: Path(str(value)) for key, value in compared.items() if key.rpartition(".")[2] in _FILES and value}
+    compared |= {key + _HELD: _held(path) for key, path in places.items() if key not in _DATA and path.exists()}
     return dict(msgspec.json.decode(msgspec.json.encode(compared)))  # as it comes back from a file
 
 
-def finished(folder: Path, config: Mapping[str, Any]) -> Metrics | None:
+def _held(path: Path) -> str:
+    """A digest of the names and sizes of the files at a place."""
+    files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else []
+    listed = [(file.relative_to(path).as_posix(), file.stat().st_size) for file in files] or path.stat().st_size
+    return hashlib.sha256(repr(listed).encode()).hexdigest()[:12]
+
+
+def begun(folder: Path) -> bool:
+    """Whether a run has been in this folder, finished or not."""
+    return (folder / "metrics.json").exists() or newest(folder) is not None
+
+
+def finished(folder: Path, config: Mapping[str, Any], scene: Callable[[], Scene]) -> Metrics | None:
     """The results of the finished run in this folder; None where there is none.
+
+    Args:
+        scene: reads that of `config`, if its place is another.
 
     Raises:
         DataError: it was another configuration's, or its metrics.json is damaged.
@@ -43,17 +73,20 @@ def finished(folder: Path, config: Mapping[str, Any]) -> Metrics | None:
     if not path.exists():
         return None
     content = metrics.read(path, _TRAIN_AGAIN)
-    _require_same(path, content.config, config)
+    _require_same(folder, content.config, config)
+    if any(content.config.get(key) != config.get(key) for key in _DATA):
+        _require_same_cameras(folder, scene())
     mean = content.shown.mean.get("ours")
     score = "no PSNR" if mean is None or mean.psnr is None else f"PSNR {mean.psnr:.2f} dB"
     _log.info("%s: this run finished on %s (%s); nothing is trained.", folder, content.provenance.date, score)
     return content
 
 
-def resume(state: TrainState, source: str | None, folder: Path, config: Mapping[str, Any]) -> None:
+def resume(state: TrainState, scene: Scene, source: str | None, folder: Path, config: Mapping[str, Any]) -> None:
     """Restore what `fit.resume` names.
 
     Args:
+        scene: of the state.
         source: a run's folder or one of its checkpoints; "auto": the newest checkpoint in `folder` that is whole, or none.
 
     Raises:
@@ -62,7 +95,7 @@ def resume(state: TrainState, source: str | None, folder: Path, config: Mapping[
     if source is None:
         return
     if source != AUTO:
-        restore(state, checkpoint.load(Path(source)), Path(source), config)
+        restore(state, scene, checkpoint.load(Path(source)), Path(source), config)
         return
     checkpoints = checkpoint.saved(folder / CHECKPOINTS)
     for path in reversed(checkpoints):
@@ -71,7 +104,7 @@ def resume(state: TrainState, source: str | None, folder: Path, config: Mapping[
         except DataError as error:
             _log.warning("%s; trying an earlier one.", error)
             continue
-        restore(state, saved, path, config)
+        restore(state, scene, saved, path, config)
         return
     if checkpoints:
         _log.warning("%s: no checkpoint is whole; the run starts from the beginning.", folder / CHECKPOINTS)
@@ -87,9 +120,10 @@ def newest(folder: Path) -> Path | None:
     return next(reversed(checkpoint.saved(folder / CHECKPOINTS)), None)
 
 
-def restore(state: TrainState, saved: Checkpoint, source: Path, config: Mapping[str, Any]) -> None:
-    """Continue from a checkpoint of the same configuration."""
+def restore(state: TrainState, scene: Scene, saved: Checkpoint, source: Path, config: Mapping[str, Any]) -> None:
+    """Continue from a checkpoint of the same configuration, on the same photos and poses."""
     _require_same(source, saved.config, config)
+    _require_same_cameras(source, scene)
     state.restore(saved, source)
     _log.info("resumed from %s: %d iterations are done.", source, saved.t - 1)
     if saved.device != state.device.type:
@@ -100,9 +134,12 @@ def restore(state: TrainState, saved: Checkpoint, source: Path, config: Mapping[
 
 
 def _require_same(source: Path, then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    moved = {key for key in {*then, *now} if key + _HELD in then and key + _HELD in now}  # what they hold is compared
+    moved |= {*_DATA} if (folder_of(source) / CAMERAS).is_file() else set()
+    moved |= {key for key in {*then, *now} if key.endswith(_HELD) and not (key in then and key in now)}
     differences = [
         f"{key}: {then.get(key)!r} then, {now.get(key)!r} now"
-        for key in sorted({*then, *now})
+        for key in sorted({*then, *now} - moved)
         if then.get(key) != now.get(key)
     ]
     if differences:
@@ -110,3 +147,33 @@ def _require_same(source: Path, then: Mapping[str, Any], now: Mapping[str, Any])
             source, "config", "this is not the configuration that wrote it: " + "; ".join(differences[:5]),
             "resume with the same overrides, or start a new run",
         )  # fmt: skip
+
+
+def _require_same_cameras(source: Path, scene: Scene) -> None:
+    """Refuse a scene with other photos, sizes or poses than those of the run of `source`, if its folder has them."""
+    file = folder_of(source) / CAMERAS
+    if not file.is_file():
+        return
+    then = {saved.name: saved.camera for saved in read_cameras(file)}
+    now = {view.name: view.hr.camera for view in (*scene.train, *scene.test)}
+    centers = torch.stack([camera.center.double() for camera in then.values()])
+    near = _SAME * float((centers - centers.mean(0)).norm(dim=1).max()) + _ROUNDED * float(centers.norm(dim=1).max())
+    changed = [
+        name
+        for name in sorted({*then, *now})
+        if not (name in then and name in now and _same(then[name], now[name], near))
+    ]
+    if changed:
+        problem = f"{len(changed)} of {len(now)} photos have another name, size or pose than in this run, such as {changed[0]}"
+        raise DataError(source, "data", problem, "give the same data, at whatever path, or start a new run")
+
+
+def _same(a: Camera, b: Camera, near: float) -> bool:
+    turned = float((a.world_to_camera.double()[:3, :3] - b.world_to_camera.double()[:3, :3]).abs().max())
+    moved = float((a.center.double() - b.center.double()).norm())
+    return (
+        (a.width, a.height) == (b.width, b.height)
+        and abs(a.fx / b.fx - 1) <= _SAME
+        and turned <= _SAME
+        and moved <= near
+    )

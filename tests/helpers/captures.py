@@ -18,6 +18,8 @@ from PIL import Image
 
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.cloud import CloudSettings
+from clear_strategies.data.photo_files import write_png
+from clear_strategies.data.readers import demo
 from clear_strategies.data.view_settings import ViewSettings
 from rasterizers import Camera
 
@@ -173,6 +175,39 @@ def nerfstudio(root: Path) -> Path:
     shared = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 8.0, "cy": 6.0, "w": WIDTH, "h": HEIGHT, "camera_model": "OPENCV"}
     write_json(root / "transforms.json", {**shared, "frames": frames})
     return root
+
+
+def demo_on_disk(
+    root: Path,
+    scale: float = 1.0,
+    views: int = 4,
+    size: tuple[int, int] = (64, 48),
+    pose: Callable[[int], int] = lambda i: i,
+) -> Path:
+    """Views of the demo's room as a nerfstudio capture, in other units: `scale` units to one of the room's.
+
+    Args:
+        pose: the view whose pose a photo's frame has.
+    """
+    frames = []
+    for i, frame in enumerate(views_of := demo.read(width=size[0], height=size[1], views=views, train=2).frames):
+        write_png(root / f"images/{i}.png", frame.load())
+        matrix = np.linalg.inv(views_of[pose(i)].camera.world_to_camera.double().numpy()) @ np.diag(
+            [1.0, -1.0, -1.0, 1.0]
+        )
+        matrix[:3, 3] *= scale
+        frames.append({"file_path": f"images/{i}.png", "transform_matrix": matrix.tolist()})
+    camera = views_of[0].camera
+    lens = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "w": size[0], "h": size[1]}
+    write_json(root / "transforms.json", {**lens, "frames": frames})
+    return root
+
+
+def edit(file: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change a JSON file's object in place."""
+    value = json.loads(file.read_text())
+    change(value)
+    write_json(file, value)
 
 
 GOOD: dict[str, Callable[[Path], Path]] = {

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import hydra
 import pytest
+from omegaconf import OmegaConf
 
-from clear_strategies.compose import tree
+from clear_strategies.compose import CONF, tree
 from clear_strategies.errors import DataError
 from clear_strategies.jobs import job, resume
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.signals import Interrupted
-from tests.helpers import pictures, toy
-from tests.helpers.command_line import TINY
+from tests.helpers import captures, pictures, toy
+from tests.helpers.command_line import ALONE, TINY, run
 from tests.helpers.configs import composed
-from tests.helpers.short_run import start
+from tests.helpers.short_run import SCENE, start
 
 
 def compared(*overrides: str):
@@ -26,9 +29,9 @@ def test_resuming_on_another_device_is_logged(caplog):
     state = start(())
     iterate(state, toy.RASTERIZER)
     saved = state.checkpoint({})
-    resume.restore(start(()), saved, Path("there"), {})
+    resume.restore(start(()), SCENE, saved, Path("there"), {})
     assert "bit for bit" not in caplog.text
-    resume.restore(start(()), replace(saved, device="cuda"), Path("there"), {})
+    resume.restore(start(()), SCENE, replace(saved, device="cuda"), Path("there"), {})
     assert "this run trained on cuda until now and continues on cpu" in caplog.text
 
 
@@ -37,7 +40,7 @@ def test_device_threads_and_memory_may_differ_and_defaults_are_compared_too():
     assert compared()["fit.seed"] == 0  # a default of the class, which no file gives
     saved = replace(start(()).checkpoint({}), config=compared("density.every=50"))
     with pytest.raises(DataError, match=r"density\.every: 50 then, 100 now"):
-        resume.restore(start(()), saved, Path("there"), compared())
+        resume.restore(start(()), SCENE, saved, Path("there"), compared())
 
 
 def test_ctrl_c_after_training_names_the_checkpoint_that_was_saved(tmp_path: Path, monkeypatch):
@@ -65,3 +68,89 @@ def test_a_setting_of_density_has_no_effect_beside_a_strategy_that_densifies(tmp
         with pictures.not_drawn():
             job.run(composed(*chosen, "fit.scale_schedule=false"), tmp_path / strategy, chosen)
     assert caplog.text.count("density.every=50 has no effect: MCMC densifies in place of it.") == 1
+
+
+MOVED = [
+    *ALONE,
+    "prior=bicubic",
+    "data.cloud.init=random",
+    "data.cloud.random_points=60",
+    "fit.max_degree=1",
+    "fit.iterations=4",
+]
+
+
+def train_on(photos: Path, folder: Path, *more: str) -> None:
+    words = ["data=nerfstudio", f"data.path={photos}", *MOVED, *more]
+    with pictures.not_drawn():
+        job.run(composed(*words), folder, words)
+
+
+@pytest.mark.parametrize("there", ["checkpoint", "finished"])
+def test_a_run_goes_on_where_its_data_moved_and_not_on_other_data(there: str, tmp_path: Path, caplog) -> None:
+    caplog.set_level("INFO")
+    here, folder = captures.demo_on_disk(tmp_path / "here"), tmp_path / "run"
+    train_on(here, folder)
+    if there == "checkpoint":
+        (folder / "metrics.json").unlink()
+    other = shutil.copytree(here, tmp_path / "other")
+    captures.edit(
+        other / "transforms.json", lambda value: value["frames"][0]["transform_matrix"][0].__setitem__(3, 9.0)
+    )
+    with pytest.raises(
+        DataError, match=r"1 of 4 photos have another name, size or pose than in this run, such as 0\.png: give"
+    ):
+        train_on(other, folder, "fit.resume=auto")
+    train_on(here.rename(tmp_path / "moved"), folder, "fit.resume=auto")
+    assert ("resumed from" if there == "checkpoint" else "nothing is trained") in caplog.text
+    assert (folder / "metrics.json").is_file()
+
+
+def test_of_other_files_that_moved_names_and_sizes_are_compared(tmp_path: Path) -> None:
+    for name, content in (("a", b"1"), ("b", b"1"), ("c", b"22")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "0.png").write_bytes(content)
+    a, b, c = (compared("prior=images", f"prior.path={tmp_path / name}") for name in "abc")
+    saved = replace(start(()).checkpoint({}), config=a)
+    resume.restore(start(()), SCENE, saved, Path("there"), b)
+    with pytest.raises(DataError, match=r"prior\.path holds: "):
+        resume.restore(start(()), SCENE, saved, Path("there"), c)
+
+
+@pytest.mark.parametrize(
+    "refused", ["fit.iterations=-3", "fit.seed=9 fit.resume=auto", "data.path=nowhere", "+strategy=[gco,gco]"]
+)
+def test_a_command_that_is_refused_writes_nothing_into_the_folder_of_a_run(refused: str, finished_run: Path) -> None:
+    def state() -> dict[Path, int]:
+        return {path: path.stat().st_mtime_ns for path in finished_run.rglob("*") if path.is_file()}
+
+    before, words = state(), ["data=nerfstudio", f"data.path={finished_run.parent / 'photos'}", *MOVED]
+    assert "iterations=4" in (finished_run / ".hydra/overrides.yaml").read_text()
+    ended = run(*words, "hydra.run.dir=run", *refused.split(), cwd=finished_run.parent)
+    assert ended.returncode == 2, ended.stdout + ended.stderr
+    assert state() == before
+
+
+@pytest.fixture(scope="module")
+def finished_run(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("finished")
+    photos = captures.demo_on_disk(folder / "photos")
+    ended = run("data=nerfstudio", f"data.path={photos}", *MOVED, "hydra.run.dir=run", cwd=folder)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    log = (folder / "run/run.log").read_text()
+    assert "poses" in log
+    assert "done in" in log
+    return folder / "run"
+
+
+def test_a_command_that_is_refused_leaves_no_empty_folder_and_default_folders_differ(tmp_path: Path) -> None:
+    assert run("data=demo", "fit.iterations=-3", cwd=tmp_path).returncode == 2
+    assert not list((tmp_path / "outputs/demo").iterdir())
+    for pattern in (composed_hydra("run"), composed_hydra("sweep")):
+        assert "%f" in pattern
+
+
+def composed_hydra(kind: str) -> str:
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        whole = hydra.compose("config", return_hydra_config=True)
+    return str(OmegaConf.to_container(whole, resolve=False)["hydra"][kind]["dir"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -22,12 +21,6 @@ from clear_strategies.errors import DataError
 from tests.helpers import captures as tiny
 from tests.helpers.captures import GOOD, NAMES
 from tests.stress.bad_inputs.scenes import READERS
-
-
-def edited(file: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    value = json.loads(file.read_text())
-    change(value)
-    tiny.write_json(file, value)
 
 
 def poses_are_those_of_the_tiny_scene(capture: Capture) -> None:
@@ -73,7 +66,7 @@ def test_a_photo_is_found_however_its_name_is_written(kind: str, case: str, tmp_
         listing.write_text(text)
     else:
         for file in root.glob("*.json"):
-            edited(
+            tiny.edit(
                 file,
                 lambda v: [
                     f.update(file_path=rename(f["file_path"].removeprefix("./").removesuffix(".png") + ".png"))
@@ -97,7 +90,7 @@ def test_masks_points_and_split_lists_are_found_by_the_same_rule(tmp_path: Path)
         value.update(ply_file_path=".\\Points.ply", train_filenames=["images\\a.png", "images\\b.png"])
         value["frames"][0]["mask_path"] = "m\\A.png"
 
-    edited(root / "transforms.json", change)
+    tiny.edit(root / "transforms.json", change)
     capture = nerfstudio.read(root)
     assert len(capture.points.means) == 1
     assert [frame.split for frame in capture.frames] == ["train", "train", None]
@@ -267,7 +260,7 @@ def test_a_text_model_that_has_fewer_images_than_its_header_says_is_told(tmp_pat
 def test_the_points_that_a_blender_file_names_are_read(tmp_path: Path) -> None:
     root = tiny.blender(tmp_path)
     write_points(root / "points3d.ply", torch.tensor([[1.0, 2, 3]]), torch.zeros(1, 3))
-    edited(root / "transforms_train.json", lambda value: value.update(ply_file_path="points3d.ply"))
+    tiny.edit(root / "transforms_train.json", lambda value: value.update(ply_file_path="points3d.ply"))
     assert blender.read(root).points.means.tolist() == [[1, 2, 3]]
 
 
@@ -287,13 +280,13 @@ def test_a_lens_in_units_of_the_image_is_refused(lens: dict[str, float], tmp_pat
     root = tiny.nerfstudio(tmp_path)
     tiny.write_photos(root / "images", (800, 600))
     for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
-        edited(root / "transforms.json", lambda value, key=key: value.pop(key))
-    edited(root / "transforms.json", lambda value: value.update(lens))
+        tiny.edit(root / "transforms.json", lambda value, key=key: value.pop(key))
+    tiny.edit(root / "transforms.json", lambda value: value.update(lens))
     with pytest.raises(DataError, match=r"frames\[0\]: has focal lengths .* all must be pixels: multiply"):
         nerfstudio.read(root)
     scale = {"fl_x": 800, "fl_y": 600, "cx": 800, "cy": 600}
     pixels = {key: value * scale[key] if value < 100 else value for key, value in lens.items()}
-    edited(root / "transforms.json", lambda value: value.update(pixels))
+    tiny.edit(root / "transforms.json", lambda value: value.update(pixels))
     assert len(nerfstudio.read(root).frames) == 3  # the remedy
 
 

@@ -13,7 +13,7 @@ from safetensors.torch import load, save
 
 from clear_strategies.jobs import resume
 from clear_strategies.training import checkpoint
-from tests.helpers.short_run import start
+from tests.helpers.short_run import SCENE, start
 from tests.stress.bad_inputs import BadInput
 from tests.stress.faults import small
 
@@ -54,7 +54,7 @@ def _restored(
         tensors, facts = dict(saved.tensors), {**saved.facts, **stated.pop("facts", {})}
         change(tensors)
         path = checkpoint.save(folder, replace(saved, tensors=tensors, facts=facts, **stated))
-        return resume.restore(start(("gco", "svs")), checkpoint.load(path), path, {})
+        return resume.restore(start(("gco", "svs")), SCENE, checkpoint.load(path), path, {})
 
     return give
 

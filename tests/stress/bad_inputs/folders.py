@@ -12,6 +12,7 @@ from clear_strategies.jobs import resume
 from clear_strategies.jobs.lock import hold
 from clear_strategies.jobs.saved import open_splat
 from tests.helpers.captures import GOOD
+from tests.helpers.short_run import SCENE
 from tests.stress.bad_inputs import BadInput, at
 from tests.stress.bad_inputs.scenes import READERS
 
@@ -34,7 +35,7 @@ def _photos_gone(folder: Path) -> None:
 
 def _finished(metrics: object) -> Callable[[Path], object]:
     content = metrics if isinstance(metrics, str) else json.dumps(metrics)
-    return at("metrics.json", lambda path: resume.finished(path.parent, {}), content.encode())
+    return at("metrics.json", lambda path: resume.finished(path.parent, {}, lambda: SCENE), content.encode())
 
 
 def _hidden_photos_only(folder: Path) -> None:
