@@ -1,7 +1,8 @@
 """Messages on the terminal. conf/config.yaml sets a run's logging up with this.
 
 INFO is for everybody: the plan, what takes long, the result and where to look next. DEBUG is for those who ask (`-v`): every
-round of the densifier, timings, which kernels were chosen. Warnings are always shown. A run's run.log has all three.
+round of the densifier, timings, which kernels were chosen. Warnings are always shown, but for those of libraries. A
+run's run.log has all three.
 """
 
 from __future__ import annotations
@@ -17,12 +18,15 @@ from typing import Any, Final, TextIO
 
 _OURS: Final = ("clear_strategies", "rasterizers", "integration")
 
-_CHATTY: Final = ("websockets", "PIL", "matplotlib", "asyncio")  # libraries that log every event at INFO
+# Libraries, and Python's warnings ("py.warnings"), whose remarks are for run.log: nobody who trains can do anything about them.
+_LIBRARIES: Final = (
+    "asyncio", "fontTools", "imageio", "kornia", "matplotlib", "PIL", "py", "torch", "trimesh", "viser", "websockets",
+)  # fmt: skip
 _PREFIXES: Final = {logging.WARNING: "warning: ", logging.ERROR: "error: ", logging.CRITICAL: "error: "}
 
 
 class Console(logging.StreamHandler[Any]):
-    """Writes messages above a progress bar, warnings and errors with a prefix; of chatty libraries nothing else.
+    """Writes messages above a progress bar, warnings and errors with a prefix; of libraries only errors.
 
     Args:
         stream: None: stdout.
@@ -32,7 +36,7 @@ class Console(logging.StreamHandler[Any]):
     def __init__(self, stream: TextIO | io.TextIOBase | None = None, *, verbose: bool = False) -> None:
         super().__init__(stream if stream is not None else sys.stdout)
         self.setLevel(logging.DEBUG if verbose else logging.INFO)
-        self.addFilter(lambda record: record.levelno >= logging.WARNING or record.name.split(".")[0] not in _CHATTY)
+        self.addFilter(lambda record: record.levelno > logging.WARNING or record.name.split(".")[0] not in _LIBRARIES)
 
     def format(self, record: logging.LogRecord) -> str:
         return _PREFIXES.get(record.levelno, "") + super().format(record)

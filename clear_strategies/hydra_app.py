@@ -104,6 +104,7 @@ def _no_such_setting(key: str) -> str:
 
 def job(config: DictConfig) -> float | None:
     """One job of Hydra's. Returns what `jobs.job.run` does; in a sweep also None for a job that failed or is left to another."""
+    logging.captureWarnings(True)  # as `run.main`, which a launcher's processes do not pass
     hydra_config = HydraConfig.get()
     folder, overrides = Path(hydra_config.runtime.output_dir), list(hydra_config.overrides.task)
     with console.logged(folder / "run.log") as log:

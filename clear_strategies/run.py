@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import atexit
 import gc
+import logging
 import os
 import signal
 import sys
@@ -20,6 +21,7 @@ from clear_strategies.jobs import exit_codes
 def main() -> None:
     """The command line: a subcommand, or Hydra's."""
     atexit.register(gc.freeze)  # else Python looks through all of torch's objects before it ends, for 0.3 s
+    logging.captureWarnings(True)  # of libraries: they are for run.log
     try:
         (commands.named(sys.argv[1:]) or _of_hydra)()
         sys.stdout.flush()

@@ -39,7 +39,15 @@ class Chosen:
 
     @property
     def title(self) -> str:
-        return self.method or " + ".join(self.strategies) or "baseline"
+        """The names on the command line, as "best"; where there are none, those of the strategies."""
+        given = [self.method] if self.method else []
+        for override in self.overrides or ():
+            key, _, value = override.lstrip("+").partition("=")
+            if key == "method":  # replaces the strategies before it
+                given = [value]
+            elif key == "strategy":
+                given.append(value.strip("[]").replace(",", " + "))
+        return " + ".join(given or self.strategies) or "baseline"
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import sys
 import time
@@ -12,6 +13,7 @@ from typing import Final
 from clear_strategies.training.loop import Progress
 from clear_strategies.training.state import TrainState
 
+_LINES: Final = 20  # in a file, which shows no bar
 _READ_EVERY: Final = 0.25  # seconds; reading the history's numbers waits for the device
 
 
@@ -19,7 +21,8 @@ _READ_EVERY: Final = 0.25  # seconds; reading the history's numbers waits for th
 def progress_bar(
     state: TrainState, after_step: Callable[[], None] | None = None, name: str | None = None, *, shown: bool = True
 ) -> Iterator[Progress]:
-    """A bar with loss, PSNR, number of Gaussians, conflict ratio and remaining time. Yields the function that advances it.
+    """A bar with loss, PSNR, number of Gaussians, conflict ratio and remaining time; where stderr is no terminal, 20 lines of it.
+    Yields the function that advances it.
 
     Args:
         after_step: called after each iteration.
@@ -29,10 +32,18 @@ def progress_bar(
     from tqdm import tqdm
 
     numbers: dict[str, str] = {}
-    redraw_every = 0.5 if sys.stderr.isatty() else 15  # seconds; a log file needs no animation
-    total, done = state.settings.iterations, state.t - 1
+    total, done, in_lines = state.settings.iterations, state.t - 1, shown and not sys.stderr.isatty()
+    between = max(1, total // _LINES)
+    screen = io.StringIO() if in_lines else sys.stderr
     with tqdm(
-        desc=name, total=total, initial=done, unit="it", dynamic_ncols=True, mininterval=redraw_every, disable=not shown
+        desc=name,
+        total=total,
+        initial=done,
+        unit="it",
+        dynamic_ncols=True,
+        mininterval=0.5,
+        disable=not shown,
+        file=screen,
     ) as bar:
         last_read = -math.inf
 
@@ -48,11 +59,15 @@ def progress_bar(
 
         def update(state: TrainState) -> None:
             nonlocal last_read
-            at_once = state.ended or "psnr_test" in state.history[-1]
+            ran = state.t - 1 - bar.n  # more than one where a plateau was skipped
+            line = in_lines and (state.ended or (bar.n + ran) // between > bar.n // between)
+            at_once = line or state.ended or "psnr_test" in state.history[-1]
             if at_once or time.monotonic() - last_read >= _READ_EVERY:
                 show(state.history_as_floats()[-1])
                 last_read = time.monotonic()
-            bar.update(1)
+            bar.update(ran)
+            if line:
+                sys.stderr.write(f"{bar}\n")
             if after_step is not None:
                 after_step()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -15,6 +15,7 @@ import pandas as pd
 from clear_strategies.data.view_names import file_stem
 from clear_strategies.errors import DataError
 from clear_strategies.outputs import metrics
+from clear_strategies.outputs.plan import Chosen
 from clear_strategies.settings import CHANGES_NO_RESULT
 
 _log = logging.getLogger(__name__)
@@ -79,7 +80,7 @@ class Run:
                 folder=folder,
                 scene=content.scene + (f" ({', '.join(marks)})" if marks else ""),
                 marks=", ".join(marks),
-                name=_name(overrides, content.strategies),
+                name=Chosen(None, content.strategies, overrides).title,
                 settings=tuple(filter(_is_setting, overrides)),
                 seed=content.seed,
                 iterations=content.iterations,
@@ -141,17 +142,6 @@ def _is_setting(override: str) -> bool:
     key = override.partition("=")[0]
     named_elsewhere = override.startswith((_SEED, _METHOD, _STRATEGY)) or _PATH.fullmatch(key)
     return not (named_elsewhere or key.startswith("hydra") or key in CHANGES_NO_RESULT)
-
-
-def _name(overrides: Sequence[str], strategies: Sequence[str]) -> str:
-    given: list[str] = []
-    for override in overrides:
-        key, value = override.lstrip("+"), override.partition("=")[2].strip("[]").replace(",", " + ")
-        if key.startswith(_METHOD):  # replaces the strategies before it
-            given = [value]
-        elif key.startswith(_STRATEGY):
-            given.append(value)
-    return " + ".join(given or strategies) or "baseline"
 
 
 def _sorted(paths: Iterable[Path]) -> list[Path]:

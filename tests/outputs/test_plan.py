@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+from dataclasses import replace
 from importlib import metadata
 from typing import Any
 
@@ -77,7 +78,22 @@ def test_the_progress_bar_counts_iterations(capsys: pytest.CaptureFixture[str]) 
             iterate(state, toy.RASTERIZER)
             update(state)
     assert steps == list(range(2, 12))
-    assert "10/10" in capsys.readouterr().err
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split("|")[2].split()[0] for line in lines] == [f"{i}/10" for i in range(1, 11)]
+
+
+def test_of_progress_that_goes_to_a_file_a_twentieth_is_a_line_and_jumps_are_followed(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    state = started()
+    state.settings = replace(state.settings, iterations=200)
+    state.history.append({"t": 1.0, "lambda_hr": 0.0, "loss_lr": 0.5, "n_gaussians": 9.0})
+    with progress_bar(state, name="best") as update:
+        for t in (*range(2, 52), *range(101, 202)):
+            state.t = t
+            update(state)
+    lines = capsys.readouterr().err.splitlines()
+    assert [int(line.split("%")[0].removeprefix("best:")) for line in lines] == [5, 10, 15, 20, 25, *range(50, 101, 5)]
 
 
 # ---- provenance holds what can be found out, and never fails
@@ -107,3 +123,16 @@ def test_a_package_that_is_not_installed_is_not_listed(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(metadata, "version", absent)
     assert provenance()["versions"] == {"clear-strategies": "source checkout"}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "title"),
+    [
+        (["+strategy=best", "fit.seed=3"], "best"),
+        (["+strategy=[gco,svs]"], "gco + svs"),
+        (["+method=srgs"], "srgs"),
+        (None, "gco + p2g"),
+    ],
+)
+def test_a_run_is_called_as_on_the_command_line(overrides: list[str] | None, title: str) -> None:
+    assert plan.Chosen(None, ["gco", "p2g"], overrides).title == title
