@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import re
+import subprocess
 import sys
 
 import pytest
@@ -46,6 +47,16 @@ def test_what_libraries_say_is_not_shown_but_their_errors_are():
     assert (
         stream.getvalue() == "error: websockets.server 40\nerror: matplotlib.font_manager 40\nerror: py.warnings 40\n"
     )
+
+
+def test_pythons_warnings_do_not_reach_the_user(tmp_path):
+    code = """if True:
+        import warnings
+        from clear_strategies import commands, run
+        commands.named = lambda arguments: lambda: warnings.warn("this library has a new name")
+        run.main()
+    """
+    assert subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, check=True).stderr == b""
 
 
 def test_a_message_stands_on_a_line_of_its_own_above_the_bar(logger, monkeypatch):

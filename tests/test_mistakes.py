@@ -48,6 +48,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     captures.write_photos(captures.colmap_bin(here / "hidden") / "masks")
     for mask in (here / "hidden/masks").iterdir():
         Image.new("L", (captures.WIDTH, captures.HEIGHT)).save(mask)
+    captures.write_photos(captures.colmap_bin(here / "misfit") / "masks", (captures.HEIGHT, captures.WIDTH))
     captures.write_photos(captures.colmap_bin(here / "thumbnails") / "images", (9, 6))
     (here / "text").mkdir()
     for i in range(3):

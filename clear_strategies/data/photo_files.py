@@ -42,6 +42,9 @@ _MAX_PIXELS: Final = 100_000_000
 PNG_LEVEL: Final = 3  # a third of the time of zlib's default, for 5 % more bytes
 _EXIF_ORIENTATION: Final = 0x0112
 _EXIF_PHOTO: Final = 0x8769
+_EXIF_INTEROP: Final = 0xA005
+_EXIF_INTEROP_INDEX: Final = 1
+_ADOBE_RGB: Final = "R03"
 _EXPOSURE_TIME: Final = 0x829A  # s
 _F_NUMBER: Final = 0x829D
 _ISO: Final = 0x8827
@@ -142,12 +145,7 @@ class Exif:
 def read_exif(path: Path) -> Exif:
     """The lens and the exposure of a photo; the DataErrors as of `read_image`."""
     with _opened(path, False) as image:
-        try:
-            block = image.getexif()
-            tags = {**block, **block.get_ifd(_EXIF_PHOTO)}
-        except Exception as error:  # PIL raises many types of error on damaged blocks
-            _log.debug("%s: its EXIF block cannot be read (%s) and is not used.", path.name, error)
-            return Exif()
+        tags = _tags(image, _EXIF_PHOTO)
     time, f_number, iso = (_positive(tags.get(tag)) for tag in (_EXPOSURE_TIME, _F_NUMBER, _ISO))
     exposure = None
     if time is not None and f_number is not None:
@@ -213,12 +211,18 @@ def _is_heif(path: Path) -> bool:
 
 def _orientation_of(image: Image.Image) -> int:
     """The EXIF orientation of an opened image, 1 to 8; 1, upright, where there is none or it cannot be read."""
+    orientation = _tags(image).get(_EXIF_ORIENTATION, 1)
+    return orientation if orientation in range(1, 9) else 1
+
+
+def _tags(image: Image.Image, *blocks: int) -> dict[int, Any]:
+    """The tags of an image's EXIF block, and of blocks in it; none where it cannot be read."""
     try:
-        orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
+        exif = image.getexif()
+        return {**exif, **{tag: value for block in blocks for tag, value in exif.get_ifd(block).items()}}
     except Exception as error:  # PIL raises many types of error on damaged blocks
         _log.debug("%s: its EXIF block cannot be read (%s) and is not used.", image.filename, error)  # type: ignore[attr-defined]
-        return 1
-    return orientation if orientation in range(1, 9) else 1
+        return {}
 
 
 def _turned(path: Path, orientation: int) -> DataError:
@@ -253,11 +257,17 @@ def _to_float(path: Path, image: Image.Image, sixteen_bits: bool) -> Float[np.nd
 
 def _to_srgb_of(image: Image.Image) -> Any:
     """What turns the image's colours into sRGB; None where they are sRGB, or it does not say."""
-    nclx = image.info.get("nclx_profile") or {}
     with _PROFILES:
         if profile := image.info.get("icc_profile"):
             return _to_srgb(profile, image.mode in ("1", "L", "LA"))
-        _warn_of_nclx(nclx.get("color_primaries", 1), nclx.get("transfer_characteristics", 1))
+        nclx = image.info.get("nclx_profile") or {}
+        primaries, transfer = nclx.get("color_primaries", 1), nclx.get("transfer_characteristics", 1)
+        if primaries not in _NCLX_PRIMARIES or transfer not in _NCLX_TRANSFER:
+            _warn_of_colors(
+                f"the primaries {primaries} and the transfer {transfer} of ITU-T H.273 (HDR, or a wide gamut)"
+            )
+        elif _tags(image, _EXIF_INTEROP).get(_EXIF_INTEROP_INDEX) == _ADOBE_RGB:
+            _warn_of_colors("Adobe RGB (EXIF)")
         return None
 
 
@@ -283,13 +293,9 @@ def _to_srgb(profile: bytes, grey: bool) -> Any:
 
 
 @lru_cache(maxsize=16)
-def _warn_of_nclx(primaries: int, transfer: int) -> None:
-    """Warn of a HEIC whose colours are given by numbers (ITU-T H.273) instead of a profile, if they are not sRGB's."""
-    if primaries not in _NCLX_PRIMARIES or transfer not in _NCLX_TRANSFER:
-        _log.warning(
-            "photos have the colours of ITU-T H.273's primaries %d and transfer %d (HDR, or a wide gamut), and are taken as "
-            "sRGB. Export them in sRGB.", primaries, transfer,
-        )  # fmt: skip
+def _warn_of_colors(colors: str) -> None:
+    """Warn of photos that say what their colours are without a profile that converts them."""
+    _log.warning("photos have the colours of %s, and are taken as sRGB. Export them in sRGB.", colors)
 
 
 def _has_alpha(image: Image.Image) -> bool:

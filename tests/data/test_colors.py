@@ -24,7 +24,7 @@ P3, SRGB = icc.profile("Display P3", icc.DISPLAY_P3), icc.profile("sRGB of a mak
 @pytest.fixture(autouse=True)
 def forgotten_profiles():
     photo_files._to_srgb.cache_clear()
-    photo_files._warn_of_nclx.cache_clear()
+    photo_files._warn_of_colors.cache_clear()
 
 
 def in_srgb(levels: np.ndarray) -> torch.Tensor:
@@ -94,7 +94,14 @@ def test_hdr_photos_without_a_profile_are_told(tmp_path: Path, caplog) -> None:
     with photo_files._opened(path, False) as image:
         image.info["nclx_profile"] = {"color_primaries": 9, "transfer_characteristics": 16}
         photo_files._to_srgb_of(image)
-    assert "primaries 9 and transfer 16 (HDR, or a wide gamut)" in caplog.text
+    assert "primaries 9 and the transfer 16 of ITU-T H.273 (HDR, or a wide gamut)" in caplog.text
+
+
+def test_adobe_rgb_that_only_exif_tells_is_told(tmp_path: Path, caplog) -> None:
+    exif = Image.Exif()
+    exif[0x8769] = {0xA005: {1: "R03"}}
+    photo_files.read_image(write(tmp_path / "a.jpg", LEVELS, exif=exif))
+    assert "photos have the colours of Adobe RGB (EXIF), and are taken as sRGB. Export them in sRGB." in caplog.text
 
 
 @pytest.mark.parametrize(

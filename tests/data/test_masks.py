@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +12,12 @@ import torch
 from PIL import Image
 
 from clear_strategies.data.capture import Capture
-from clear_strategies.data.masks import masks_of, require_shown
+from clear_strategies.data.masks import masks_of
 from clear_strategies.data.prepare import prepare
 from clear_strategies.data.priors import Bicubic
 from clear_strategies.data.readers import blender, colmap, nerfstudio
 from clear_strategies.errors import DataError
 from tests.helpers import captures as tiny
-from tests.helpers.short_run import SCENE
 
 LEFT = np.repeat(np.arange(tiny.WIDTH)[None] >= 4, tiny.HEIGHT, axis=0)  # shown: all but four columns
 
@@ -154,13 +152,6 @@ def test_photos_that_are_transparent_everywhere_are_refused(tmp_path: Path, alph
         image.save(path)
     with pytest.raises(DataError, match=r"show nothing of 2 of 2 photos: a, b"):
         prepared(tmp_path, blender.read)
-
-
-def test_a_hosts_masks_that_hide_everything_are_refused() -> None:
-    nothing = torch.zeros(SCENE.train[0].lr.image.shape[:2], dtype=torch.bool)
-    with pytest.raises(DataError, match="show nothing"):
-        require_shown([view.hiding(nothing) for view in SCENE.train])
-    require_shown([replace(view, hr=view.hr) for view in SCENE.train])
 
 
 def test_photos_outside_of_the_captures_folder_have_their_masks_in_their_own(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -12,7 +14,7 @@ from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.training.field import GaussianField
 from integration.examples.demo import load_demo, splats_with_optimizers
 from integration.views import by_name, view
-from tests.helpers import toy
+from tests.helpers import gsplat_host, toy
 
 # ---- A host's photos as views: what a mask hides, and what is refused
 
@@ -35,6 +37,14 @@ def test_what_a_mask_hides_is_hidden_at_both_scales():
     assert int((~masked.hr.shown).sum()) == 16 * int((~masked.lr.shown).sum())
     assert float(masked.hr.image[:, :24].abs().max()) == 0
     assert of_host().lr.shown is None
+
+
+@pytest.mark.parametrize("level", [0.0, 1 / 255])
+def test_a_hosts_masks_that_hide_everything_are_refused(level):
+    scene = toy.scene(20)
+    hidden = [of_host(name=v.name, mask=torch.full((16, 24), level)) for v in scene.train]
+    with pytest.raises(DataError, match="masks or alpha: show nothing of"):
+        gsplat_host.started(host=gsplat_host.Host(scene), scene=replace(scene, train=tuple(hidden)))
 
 
 def test_an_sr_image_may_overshoot_but_not_have_other_values():
