@@ -38,7 +38,7 @@ def masks_of(root: Path, paths: Iterable[Path], given: Mapping[Path, Path] = Map
 
     Masks lie in a folder `masks` (or `mask`), in place of one folder of the photo's path below `root`, or in one of them; beside
     images_4, `masks_4` comes first. A mask is named like its photo, with its ending or without, in any case, and may be marked:
-    0001.png, 0001.jpg.png, 0001_mask.png, dynamic_mask_0001.png.
+    0001.png, 0001.jpg.png, 0001_mask.png, dynamic_mask_0001.png. Marked ones may also lie among the photos, see `masks_among`.
     """
     found, used, folders = dict(given), set(given.values()), dict[Path, dict[str, Path]]()
     for parent in dict.fromkeys(path.parent for path in paths):
@@ -49,12 +49,20 @@ def masks_of(root: Path, paths: Iterable[Path], given: Mapping[Path, Path] = Map
                 if mask := next((masks[name] for name in names if name in masks), None):
                     found.setdefault(photo, mask)
                     used.add(mask)
+        found = masks_among(images_in(parent)) | found
     for folder in folders:
         listed = sorted(file for file in folder.iterdir() if file.is_file() and not file.name.startswith("."))
         if unused := [file.name for file in listed if file not in used]:
             message = "%s: %d of %d files belong to no photo and are not used: %s. Name a mask like its photo."
             _log.warning(message, folder, len(unused), len(listed), some(unused))
     return found
+
+
+def masks_among(photos: Sequence[Path]) -> dict[Path, Path]:
+    """The masks that lie among the photos of a folder, by the photo: 0001.jpg.mask.png of RealityCapture, 0001_mask.png."""
+    named = {name.lower(): photo for photo in photos for name in (photo.stem, photo.name)}
+    marked = {file: _MARKED.sub(r"\g<1>", stem) for file in photos if (stem := file.stem.lower())}
+    return {named[name]: file for file, name in marked.items() if named.get(name, file).stem != file.stem}
 
 
 def _folders(root: Path, parent: Path) -> Iterator[Path]:

@@ -68,6 +68,15 @@ def test_masks_may_lie_beside_the_photos_or_in_their_folder(tmp_path: Path, fold
     assert [frame.shown is not None for frame in colmap.read(tmp_path).frames] == [False, True, False]
 
 
+@pytest.mark.parametrize("name", ["b.png.mask.png", "b_mask.jpg", "mask_b.PNG"])
+@pytest.mark.parametrize("reader", ["colmap", "nerfstudio"])
+def test_marked_masks_may_lie_among_the_photos(tmp_path: Path, reader: str, name: str) -> None:
+    save(tiny.GOOD[reader](tmp_path) / "images" / name, 255 * LEFT)
+    capture = {"colmap": colmap.read, "nerfstudio": nerfstudio.read}[reader](tmp_path)
+    assert [frame.shown is not None for frame in capture.frames] == [False, True, False]
+    assert "without pose" not in capture.notes
+
+
 def test_files_among_the_masks_that_belong_to_no_photo_are_named(tmp_path: Path, caplog) -> None:
     tiny.colmap_bin(tmp_path)
     for name in ("a.png", "a_mask.png", "frame_7.png"):

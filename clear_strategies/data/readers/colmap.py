@@ -97,7 +97,7 @@ def capture(
         "photos": folder_note(folder),
     }
     pattern = "**/*" if any(path.parent != folder for path in paths.values()) else "*"
-    posed = set(paths.values())
+    posed = {*paths.values(), *masks.values()}
     unposed = [path.relative_to(folder).as_posix() for path in images_in(folder, pattern) if path not in posed]
     if unposed:
         notes["without pose"] = f"{len(unposed)} photos, not used: {', '.join(unposed[:8])}"

@@ -13,6 +13,7 @@ from typing import Final, Literal
 
 from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.data.capture import Capture
+from clear_strategies.data.masks import masks_among
 from clear_strategies.data.photo_files import Exif, image_size, read_exif
 from clear_strategies.data.photo_folders import images_in, list_images, named, require_text, some, usable
 from clear_strategies.data.priors import cache_folder
@@ -103,7 +104,7 @@ def read(
     base = Path(cache) if cache is not None else cache_folder() / "sfm"
     if base.resolve().is_relative_to(root.resolve()):
         raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
-    paths = usable(root, _once_each(list_images(root)), lambda path: path, skip_faulty=skip_faulty)
+    paths = usable(root, _once_each(_without_masks(list_images(root))), lambda path: path, skip_faulty=skip_faulty)
     require_text((name, *(path.name for path in paths)))
     if len(paths) < sfm.FEWEST:
         problem = f"there are {len(paths)}, poses need at least {sfm.FEWEST}"
@@ -154,6 +155,13 @@ def _capture(root: Path, photos: Mapping[Path, Exif], folder: Path) -> Capture:
     }
     points = colmap.sfm_points(model, "estimated here by pycolmap")
     return replace(capture, points=points, notes=notes, unplaced=unplaced)
+
+
+def _without_masks(paths: Sequence[Path]) -> list[Path]:
+    masks = set(masks_among(paths).values())
+    if masks:
+        _log.info("%d of the images are masks of others: %s.", len(masks), some(sorted(path.name for path in masks)))
+    return [path for path in paths if path not in masks]
 
 
 def _once_each(paths: Sequence[Path]) -> list[Path]:

@@ -82,6 +82,10 @@ READ: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     "links to another folder": (lambda f: captures.link(f, f.parent / "elsewhere"), ALL),
     "a link to nowhere": (lambda f: (f / "d.png").symlink_to(f / "gone.png"), ALL),
     "an ending in capitals, a name with spaces": (lambda f: again(f, "b é (1).JPG"), ["a.png", "b é (1).JPG", "c.png"]),
+    "masks among the photos": (
+        lambda f: [Image.new("L", (captures.WIDTH, captures.HEIGHT), 1).save(f / f"{n}.mask.png") for n in NAMES],
+        ALL,
+    ),
     "a grey photo": (lambda f: image_of(f / "b.png").convert("L").save(f / "b.png"), ALL),
     "a portrait of two pictures": (as_portrait, ["a.png", "b.jpg", "c.png"]),
     "a damaged EXIF block": (
@@ -98,6 +102,7 @@ def test_untidy_photos_that_can_be_read_are_read(of_photos, name, caplog):
     make(folder)
     with caplog.at_level("INFO"):
         capture = read()
+    assert name != "masks among the photos" or all(frame.shown is not None for frame in capture.frames)
     assert name != "a photo saved as HEIC and as JPEG" or "b.HEIC" in caplog.text
     assert [frame.name for frame in capture.frames] == expected
     assert all(bool(frame.load().isfinite().all()) for frame in capture.frames)
