@@ -23,6 +23,11 @@ from clear_strategies.errors import DataError
 from rasterizers.interface import Camera, Color
 
 BLACK: Final = (0.0, 0.0, 0.0)
+NO_PARALLAX: Final = "no parallax: the photos are all from one place, so nothing tells how far away anything is"
+MORE_PHOTOS: Final = (
+    "take more photos that overlap by two thirds, with the same camera and zoom, of a scene with texture"
+)
+STEP_ASIDE: Final = "take a step to the side from photo to photo, in place of turning on the spot"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,7 +115,7 @@ class Capture:
             capture has no prior of its own, as every capture of real photos.
         depth: the exact depth (z) through each pixel's centre of a camera, float32 [H, W], infinite where there is no
             surface; None: unknown.
-        unplaced: why the pose could not be estimated, by the names of such photos.
+        unplaced: why the pose is unknown, by the names of such photos.
     """
 
     name: str

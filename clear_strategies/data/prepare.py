@@ -21,7 +21,7 @@ from clear_strategies.core import images
 from clear_strategies.core.progress import Progress
 from clear_strategies.core.view import SMALLEST, Photo, View
 from clear_strategies.core.work_log import WorkLog
-from clear_strategies.data.capture import Capture, Frame
+from clear_strategies.data.capture import NO_PARALLAX, STEP_ASIDE, Capture, Frame
 from clear_strategies.data.cloud import CloudSettings, initial_points, require_source
 from clear_strategies.data.lenses import forget_maps
 from clear_strategies.data.masks import require_shown
@@ -42,6 +42,8 @@ _log = logging.getLogger(__name__)
 _READERS: Final = 4  # photos read at once, at most: each is held at its full size meanwhile
 _WHOLE: Final = 0.99  # of a pixel's mask, for the pixel to be shown
 _SAME_EXPOSURE: Final = 0.01  # photos whose gains are closer to 1 stay as they are
+_ONE_PLACE: Final = 1e-6  # distances of the cameras in that to the origin: as files round positions
+_NO_STEP: Final = 1e-3  # the same in that to the points: less than two pixels of a photo of 2,000
 _BLURRED: Final = 3e-4  # rounding of positions, in distances of the cameras, that is a visible part of an HR pixel
 
 
@@ -57,6 +59,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     frames = [*train_frames, *(replace(frame, transparency=None) for frame in test_frames)]  # only training needs it
     lr_files = check_headers(frames, views)
     require_source(cloud, capture.points)
+    _require_parallax(capture, [frame.camera for frame in train_frames], cloud)
     _warn_if_far_from_origin([frame.camera for frame in train_frames])
     progress = Progress("photos and their SR images", "photos", len(frames))
     made, work_log = list[View](), WorkLog()
@@ -261,6 +264,22 @@ def _sized(image: Tensor, camera: Camera, views: ViewSettings) -> Photo:
     image = images.crop_to_multiple(image, views.shrink * multiple)
     camera = replace(camera, width=image.shape[1], height=image.shape[0])
     return Photo(camera.scaled(1 / views.shrink), images.downsample(image, views.shrink, views.downsample))
+
+
+def _require_parallax(capture: Capture, cameras: Sequence[Camera], cloud: CloudSettings) -> None:
+    """Refuse photos from one place, whose depth nothing tells but a file of points."""
+    if len(cameras) < 2 or cloud.init == "ply":
+        return
+    centers = torch.stack([camera.center.double() for camera in cameras])
+    apart = float(torch.linalg.vector_norm(centers - centers.mean(0), dim=1).max())
+    least = _ONE_PLACE * float(torch.linalg.vector_norm(centers.mean(0)))
+    if capture.points is not None and len(capture.points.means):
+        least += _NO_STEP * float(
+            torch.linalg.vector_norm(capture.points.means.double() - centers.mean(0), dim=1).median()
+        )
+    if apart <= least:
+        remedy = f"{STEP_ASIDE}; or give the depth: data.cloud.init=ply data.cloud.path=POINTS.ply"
+        raise DataError(capture.name, "poses", f"{NO_PARALLAX} (cameras within {apart:.2g} units)", remedy)
 
 
 def _warn_if_far_from_origin(cameras: Sequence[Camera]) -> None:

@@ -139,6 +139,9 @@ def _run(training: _Training, drawing: device.Drawing) -> float | None:
             score = finished.shown.mean.get("ours")
             return None if score is None else score.psnr
     scene = load()
+    few = scene.notes.get(scenes.FEW_PLACED)
+    if few:
+        _log.warning("%s.", few)
     if settings.data.save_lr is not None:
         save_lr(scene, Path(settings.data.save_lr))
         return None
@@ -156,6 +159,8 @@ def _run(training: _Training, drawing: device.Drawing) -> float | None:
     _log.log(level, "%s", score_table.describe(training.folder, evaluation, seconds))
     if _in_sweep():
         _log.info("%s", score_table.describe_job(HydraConfig.get().job.num, training.folder, evaluation, seconds))
+    if few:
+        _log.warning("%s.", few)
     mean = evaluation.mean("test") or evaluation.mean("train")
     return None if mean is None else mean.psnr
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, cast
 
-from clear_strategies.data.capture import Capture
+from clear_strategies.data.capture import MORE_PHOTOS, Capture
 from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.hr_limit import within_limit
 from clear_strategies.data.photo_folders import require_text
@@ -22,6 +22,9 @@ from clear_strategies.settings import LISTED
 
 _log = logging.getLogger(__name__)
 
+FEW_PLACED: Final = "few photos"
+"""The note of a scene that lacks so many photos that this is said before and after training."""
+_ENOUGH: Final = 0.6  # of the photos
 _NETWORK: Final = "waifu2x"  # of `auto`: close to the truth and fast
 
 
@@ -112,6 +115,10 @@ def read(data: DataSettings, prior: PriorSettings) -> tuple[Capture, ViewSetting
     """The capture as the data set has it, and the settings of its views, both within the limit of the HR images."""
     capture = data.reader()
     require_text((capture.name, *(frame.name for frame in capture.frames), *capture.unplaced))
+    placed, photos = len(capture.frames), len(capture.frames) + len(capture.unplaced)
+    if placed < _ENOUGH * photos:
+        few = f"{placed} of {photos} photos ({placed / photos:.0%}) have a pose, and the others are not used: {MORE_PHOTOS}"
+        capture = replace(capture, notes={**capture.notes, FEW_PLACED: few})
     auto = isinstance(prior, AutoPrior) and data.save_lr is None
     return within_limit(capture, data.views, reaches=_reach(prior, auto), super_resolve=not auto)
 

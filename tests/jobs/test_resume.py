@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from clear_strategies.compose import CONF, tree
 from clear_strategies.errors import DataError
 from clear_strategies.jobs import job, resume
+from clear_strategies.jobs import scene as scenes
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.signals import Interrupted
 from tests.helpers import captures, pictures, toy
@@ -104,6 +105,22 @@ def test_a_run_goes_on_where_its_data_moved_and_not_on_other_data(there: str, tm
     train_on(here.rename(tmp_path / "moved"), folder, "fit.resume=auto")
     assert ("resumed from" if there == "checkpoint" else "nothing is trained") in caplog.text
     assert (folder / "metrics.json").is_file()
+
+
+def test_that_few_photos_have_a_pose_is_said_first_and_last(tmp_path: Path, monkeypatch, caplog) -> None:
+    caplog.set_level("INFO")
+    load = scenes.load
+    monkeypatch.setattr(
+        scenes,
+        "load",
+        lambda *words: replace(scene := load(*words), notes={**scene.notes, scenes.FEW_PLACED: "3 of 9 photos"}),
+    )
+    train_on(captures.demo_on_disk(tmp_path / "here"), tmp_path / "run")
+    said = [record.getMessage() for record in caplog.records]
+    warned = [i for i, message in enumerate(said) if message == "3 of 9 photos."]
+    done = next(i for i, message in enumerate(said) if message.startswith("done in"))
+    assert len(warned) == 2
+    assert warned[0] < done < warned[1] == len(said) - 1
 
 
 def test_of_other_files_that_moved_names_and_sizes_are_compared(tmp_path: Path) -> None:

@@ -109,7 +109,8 @@ def capture(
     points = sfm_points(model, _label(root, model))
     if points is None:
         notes["points"] = "the model has none"
-    return Capture(root.resolve().name, sorted_by_name(frames, listing), points, background, notes)
+    lost = dict.fromkeys(unposed, "has no pose in the model")
+    return Capture(root.resolve().name, sorted_by_name(frames, listing), points, background, notes, unplaced=lost)
 
 
 def sfm_points(model: Model, label: str) -> SfmPoints | None:

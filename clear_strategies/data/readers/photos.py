@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from clear_strategies.core.checks import require_choice, require_number, require_whole
-from clear_strategies.data.capture import Capture
+from clear_strategies.data.capture import MORE_PHOTOS, Capture
 from clear_strategies.data.masks import masks_among
 from clear_strategies.data.photo_files import Exif, image_size, read_exif
 from clear_strategies.data.photo_folders import images_in, list_images, named, require_text, some, usable
@@ -108,7 +108,7 @@ def read(
     require_text((name, *(path.name for path in paths)))
     if len(paths) < sfm.FEWEST:
         problem = f"there are {len(paths)}, poses need at least {sfm.FEWEST}"
-        raise DataError(root, "images", problem, sfm.MORE_PHOTOS)
+        raise DataError(root, "images", problem, MORE_PHOTOS)
     photos = {path: read_exif(path) for path in paths}  # unreadable photos are refused before the long work
     for path in paths:
         image_size(path, turn=True)

@@ -17,25 +17,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+from jaxtyping import Float
 from PIL import Image as Picture
 
 from clear_strategies import files
 from clear_strategies.core.images import to_bytes
+from clear_strategies.data.capture import MORE_PHOTOS, NO_PARALLAX, STEP_ASIDE
 from clear_strategies.data.photo_files import Exif, read_image
 from clear_strategies.errors import DataError
 
 _log = logging.getLogger(__name__)
 
 FEWEST: Final = 3
-MORE_PHOTOS: Final = (
-    "take more photos that overlap by two thirds, with the same camera and zoom, of a scene with texture"
-)
 MODEL: Final = "cameras.bin"
 """The file of a model that exists only if the model is complete."""
 UNPLACED: Final = "unplaced.json"
 """A file in the model's folder: why the pose is unknown, for each photo without one, by its name."""
 _DATABASE: Final = "database.db"
 _FEW_FEATURES: Final = 200  # a photo with fewer shows too little
+_MATCHED: Final = 50  # features in common, from which a pair's relation is trusted
+_NEARLY_ALL: Final = 0.9  # of the pairs
+_TURN: Final = 0.03  # entries by which a map between two photos may differ from a turn's, as distortion makes it
 _LISTED: Final = 3  # photos without a pose in the warning, at most
 _MEGA: Final = 1 << 20
 _DISTANCES: Final = 4  # bytes of each pair of features that are compared
@@ -158,11 +161,49 @@ def _map(pycolmap: Any, photos: Mapping[Path, Exif], work: Path, settings: SfmSe
         mapping.mapper.abs_pose_min_num_inliers = 15
         # Most points of few photos are seen by two photos only. With these points those six poses are four times more exact.
         mapping.triangulation.ignore_two_view_tracks = False
+        _require_parallax(pycolmap, database, next(iter(photos)).parent)
         _log.info("placing the photos.")
         models = pycolmap.incremental_mapping(database, copies, work, options=mapping)
     finally:
         pycolmap.logging.minloglevel = level
     return list(models.values())
+
+
+def _require_parallax(pycolmap: Any, database: Path, root: Path) -> None:
+    """Refuse photos whose pairs are all related by a turn of the camera, of whatever focal length, before COLMAP makes up motion.
+
+    Raises:
+        DataError: the photos are from one place, or all the same.
+    """
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    flat = {int(kind) for kind in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)}
+    with pycolmap.Database.open(database) as opened:
+        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
+        of_image = {image.image_id: cameras[image.camera_id] for image in opened.read_all_images()}
+        pairs = [
+            (*map(of_image.get, pycolmap.pair_id_to_image_pair(pair)), found)
+            for pair, found in zip(*opened.read_two_view_geometries(), strict=True)
+            if len(found.inlier_matches) >= _MATCHED
+        ]
+    centred = [_centred(b) @ found.H @ np.linalg.inv(_centred(a)) for a, b, found in pairs if int(found.config) in flat]
+    if len(centred) < _NEARLY_ALL * len(pairs) or not centred:
+        return
+    maps = np.stack([H / np.cbrt(np.linalg.det(H)) for H in centred])
+    scale = np.array([1.0, 1.0, 0.0])
+    bent = min(
+        float(np.median(np.abs(turn.mT @ turn - np.eye(3)).max(axis=(1, 2))))
+        for focal in np.geomspace(0.3, 5.0, 60)
+        for turn in [maps * (scale * (1 / focal - 1) + 1)[:, None] * (scale * (focal - 1) + 1)]
+    )
+    if bent < _TURN:
+        raise DataError(root, "poses", NO_PARALLAX, STEP_ASIDE)
+
+
+def _centred(camera: Any) -> Float[np.ndarray, "3 3"]:
+    """From pixels to a square of about 1 around the middle of the photo."""
+    width, height = int(camera.width), int(camera.height)
+    size = max(width, height)
+    return np.array([[1, 0, -width / 2], [0, 1, -height / 2], [0, 0, size]]) / size
 
 
 def _keep_coarsest(pycolmap: Any, database: Path, most: int) -> None:

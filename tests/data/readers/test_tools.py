@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,16 @@ from PIL import Image
 
 from clear_strategies.commands.train import detect
 from clear_strategies.data.capture import Capture
+from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.lenses import Lens
+from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.ply import write_points
-from clear_strategies.data.readers import blender, colmap, nerfstudio, photos
+from clear_strategies.data.prepare import prepare
+from clear_strategies.data.priors import Bicubic
+from clear_strategies.data.readers import blender, colmap, demo, nerfstudio, photos
+from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.errors import DataError
+from clear_strategies.jobs import scene
 from tests.helpers import captures as tiny
 from tests.helpers.captures import GOOD, NAMES
 from tests.stress.bad_inputs.scenes import READERS
@@ -353,3 +360,52 @@ def test_other_models_are_refused_by_name(model, parameters, command, layout, tm
     root = with_model(tmp_path, model, parameters, layout)
     with pytest.raises(DataError, match=command):
         read_cameras(root / "cameras.bin" if layout == "bin" else root / "sparse/0/cameras.txt")
+
+
+# ---- too little to train on
+
+
+@pytest.mark.parametrize(("others", "warned"), [(1, False), (3, True)])
+def test_where_few_photos_have_a_pose_a_note_says_so(others: int, warned: bool, tmp_path: Path) -> None:
+    root = tiny.colmap_txt(tmp_path)
+    for i in range(others):
+        Image.new("RGB", (16, 12)).save(root / f"images/z{i}.png")
+    data = scene.DataSettings(reader=lambda: colmap.read(root))
+    capture, _ = scene.read(data, Bicubic())
+    assert (capture.notes.get(scene.FEW_PLACED, "").startswith("3 of 6 photos (50%) have a pose")) == warned
+
+
+@pytest.mark.parametrize("jitter", [0.0, 2e-7])
+def test_photos_from_one_place_are_refused_before_they_are_decoded_unless_points_are_given(jitter, tmp_path):
+    root = tiny.demo_on_disk(tmp_path, scale=jitter)
+    for file in (root / "images").iterdir():
+        file.write_bytes(file.read_bytes()[:-60])
+    tiny.edit(
+        root / "transforms.json",
+        lambda v: [f["transform_matrix"][0].__setitem__(3, f["transform_matrix"][0][3] + 1) for f in v["frames"]],
+    )
+    with pytest.raises(DataError, match="no parallax: the photos are all from one place"):
+        prepare(nerfstudio.read(root), ViewSettings(), Bicubic(), CloudSettings())
+    write_points(root / "points.ply", torch.ones(1, 3), torch.zeros(1, 3))
+    with pytest.raises(DataError, match="cannot be decoded"):
+        prepare(
+            nerfstudio.read(root), ViewSettings(), Bicubic(), CloudSettings(init="ply", path=str(root / "points.ply"))
+        )
+
+
+@pytest.mark.slow
+def test_photos_turned_on_the_spot_are_refused_before_poses_are_made_up(tmp_path: Path) -> None:
+    """Without this check COLMAP places all of them along a line that never was, by a wrong focal length."""
+    pytest.importorskip("pycolmap")
+    base = demo.read(width=320, height=240, views=5, train=2).frames[2].camera
+    center = base.center.double()
+    for i, angle in enumerate(map(math.radians, (-12, -7, -2, 4))):
+        turn = torch.tensor(
+            [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]]
+        ).double()
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = turn @ base.world_to_camera.double()[:3, :3]
+        pose[:3, 3] = -pose[:3, :3] @ center
+        write_png(tmp_path / f"photos/{i}.png", demo.render(replace(base, world_to_camera=pose)))
+    with pytest.raises(DataError, match=r"no parallax: .*: take a step to the side"):
+        photos.read(tmp_path / "photos", tmp_path / "cache", precise=False)
