@@ -99,6 +99,24 @@ def test_masks_follow_the_size_of_their_photos(tmp_path: Path) -> None:
     assert all(torch.equal(frame.shown(), torch.from_numpy(LEFT)) for frame in whole[:2])
 
 
+@pytest.mark.parametrize("sized", [True, False])
+def test_nerfstudios_reduced_photos_keep_their_masks_splits_and_lenses(tmp_path: Path, sized: bool) -> None:
+    content = json.loads((tiny.nerfstudio(tmp_path) / "transforms.json").read_text())
+    if not sized:
+        del content["w"], content["h"]
+    content["frames"][0]["mask_path"] = "masks/a.png"
+    tiny.write_json(
+        tmp_path / "transforms.json", content | {"train_filenames": ["images/a.png"], "val_filenames": ["images/b.png"]}
+    )
+    tiny.write_photos(tmp_path / "images_2", (tiny.WIDTH // 2, tiny.HEIGHT // 2))
+    save(tmp_path / "masks/a.png", 255 * LEFT)
+    first, second, _ = nerfstudio.read(tmp_path, images="images_2").frames
+    assert (first.camera.width, first.camera.fx, first.split, second.split) == (8, tiny.FOCAL / 2, "train", "test")
+    assert torch.equal(first.shown(), torch.from_numpy(LEFT[::2, ::2]))
+    with pytest.raises(DataError, match="images_4: images: is no folder: choose one of images, images_2"):
+        nerfstudio.read(tmp_path, images="images_4")
+
+
 def test_a_mask_of_another_shape_is_refused_before_any_photo_is_read(tmp_path: Path) -> None:
     save(tiny.colmap_bin(tmp_path) / "masks/a.png", np.ones((16, 12), int))
     with pytest.raises(

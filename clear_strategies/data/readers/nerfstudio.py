@@ -6,16 +6,17 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Final
 
 import msgspec
 
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import BLACK, Capture, Frame, lens_notes, sorted_by_name
-from clear_strategies.data.photo_folders import finder, named
+from clear_strategies.data.photo_files import image_size
+from clear_strategies.data.photo_folders import finder, image_folder, named
 from clear_strategies.data.strict_json import read_object, typed
-from clear_strategies.data.transforms import frames_of, masks_of_frames, photo_transforms, points_of
+from clear_strategies.data.transforms import Transform, frames_of, masks_of_frames, photo_transforms, points_of
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
 
@@ -40,6 +41,7 @@ def recognises(path: Path) -> int:
 
 def read(
     root: str | Path,
+    images: str | None = None,
     *,
     background: Color = BLACK,
     skip_faulty: bool = False,
@@ -47,6 +49,8 @@ def read(
     """Read a folder with transforms.json, or that file. Poses are taken as they are, `applied_transform` included.
 
     Args:
+        images: the folder that takes the place of the first in the frames' paths, such as images_4, where nerfstudio keeps
+            reduced photos. None: the photos that the frames name.
         background: RGB in [0, 1] behind transparent pixels.
         skip_faulty: leave out photos that are missing or damaged, with a warning for each; else they are an error.
 
@@ -59,6 +63,9 @@ def read(
     folder, content = file.parent, read_object(file)
     transforms = photo_transforms(file, content)
     find = finder(folder)
+    if images is not None:
+        transforms = [_sized(transform, find) for transform in transforms]
+        find = _in_place_of_first(image_folder(folder, images))
     paths = [find(transform.file_path) for transform in transforms]
     lists = typed(file, content, _Lists)
     splits = _splits(file, lists, find)
@@ -73,6 +80,20 @@ def read(
             raise DataError(file, "split", problem, "correct the lists")
         notes["split"] = _split_note(file, frames)
     return Capture(folder.resolve().name, sorted_by_name(frames, file), points_of(file, content), background, notes)
+
+
+def _in_place_of_first(folder: Path) -> Callable[[str], Path]:
+    """`finder` of the names without their first folder, or where they are absolute, without their first folders."""
+    find = finder(folder)
+    return lambda name: find(f"/{'/'.join(PureWindowsPath(name).parts[1:])}")
+
+
+def _sized(transform: Transform, find: Callable[[str], Path]) -> Transform:
+    """The frame with the size that its lens is for, which is that of its own photo where it gives none."""
+    if transform.w is not None and transform.h is not None:
+        return transform
+    width, height = image_size(find(transform.file_path))
+    return msgspec.structs.replace(transform, w=float(width), h=float(height))
 
 
 def _splits(file: Path, lists: _Lists, find: Callable[[str], Path]) -> dict[Path, str]:
