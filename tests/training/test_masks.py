@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from clear_strategies.core import deferred
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.cloud import CloudSettings, initial_points
@@ -15,6 +16,7 @@ from clear_strategies.data.priors import Bicubic
 from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.geometry.pseudo_views import border_views
 from clear_strategies.merging.objective import Objective
+from clear_strategies.training.evaluation import psnr_of
 from clear_strategies.training.loop import iterate
 from tests.helpers import planes
 from tests.helpers.short_run import SCENE, start, tensors
@@ -47,6 +49,13 @@ def test_a_field_does_not_depend_on_hidden_pixels(fused):
             iterate(state, RASTERIZER)
         trained.append(tensors(state))
     assert all(torch.equal(a, trained[1][name]) for name, a in trained[0].items())
+
+
+def test_the_psnr_while_training_is_of_shown_pixels():
+    target, shown = torch.rand(8, 8, 3), torch.arange(8).expand(8, 8) < 5
+    image = torch.where(shown[..., None], (target + 0.1).clamp(0, 1), 1 - target)
+    alone = psnr_of(image[:, :5], target[:, :5], None)
+    assert deferred.read([psnr_of(image, target, shown)]) == pytest.approx(deferred.read([alone]))
 
 
 def test_hidden_pixels_have_no_cotangent_and_shown_ones_keep_theirs():
