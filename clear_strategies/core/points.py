@@ -13,6 +13,12 @@ MAX_POINTS: Final = 200_000
 """The most initial points by default, here and in other trainers."""
 
 
+def spread(means: Float[Tensor, "N 3"]) -> float:
+    """The size of a scene, world units: nine tenths of its points lie so close to their median."""
+    distances = torch.linalg.vector_norm(means - means.median(dim=0).values, dim=-1)
+    return float(distances.kthvalue(max(1, round(0.9 * len(distances)))).values)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PointCloud:
     """Points: positions in world units, colours in [0, 1].

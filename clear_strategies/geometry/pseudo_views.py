@@ -141,7 +141,7 @@ def _warped(camera: Camera, sources: Sequence[_Source], tolerance: float) -> Pse
     color, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
     for s in nearest:
         shows, pixels = on_surface(s.photo.camera, s.depth, points, tolerance)
-        w = shows / (s.photo.camera.center - camera.center).square().sum().clamp_min(1e-12)  # the nearest counts most
+        w = shows / (s.photo.camera.center - camera.center).square().sum().clamp_min(1e-24)  # the nearest counts most
         color += w[:, None] * sample_colors(s.photo.image, pixels)
         weight += w
     image = torch.zeros(camera.height, camera.width, 3)

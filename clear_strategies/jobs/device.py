@@ -11,8 +11,11 @@ from typing import Any, Final, Literal
 
 import torch
 from hydra.core.hydra_config import HydraConfig
+from jaxtyping import Float
+from torch import Tensor
 
 import rasterizers
+from clear_strategies.core.points import spread
 from clear_strategies.errors import SettingError
 from clear_strategies.settings import TARGET
 from rasterizers.interface import BackendUnavailable, Color, Rasterizer, RasterSettings
@@ -105,6 +108,13 @@ class Drawing:
         if "background" in self.make.keywords:
             return self
         make = functools.partial(self.make, background=background)
+        return replace(self, rasterizer=make(), make=make)
+
+    def among(self, means: Float[Tensor, "N 3"]) -> Drawing:
+        """The same for a scene of these points: where they spread less than 1, the default near plane is as much nearer."""
+        if self.make.keywords.get("near") != _SHARED.near or not len(means) or not 0 < (size := spread(means)) < 1:
+            return self
+        make = functools.partial(self.make, near=_SHARED.near * size)
         return replace(self, rasterizer=make(), make=make)
 
 

@@ -146,7 +146,7 @@ def _run(training: _Training, drawing: device.Drawing) -> float | None:
         save_lr(scene, Path(settings.data.save_lr))
         return None
     device.log_choice(settings.rasterizer, drawing)
-    drawing = drawing.over(scene.background)
+    drawing = drawing.over(scene.background).among(scene.cloud.means)
     place = _Place(scene, scene.to(drawing.device), drawing)
     state = training.start(place)
     training.claim()

@@ -89,7 +89,7 @@ def overview(field: GaussianField) -> Camera:
         torch.stack([means[order[int(torch.searchsorted(total[:, k].contiguous(), q)), k], k] for k in range(3)])
         for q in (0.1, 0.5, 0.9)
     )
-    radius = max(float((high - low).norm()) / 2, 1e-3)
+    radius = float((high - low).norm()) / 2 or 1e-3
     pose = np.eye(4)
     pose[:3, 3] = -(middle.numpy() - [0, 0, _FAR * radius])
     width, height = _SIZE
@@ -135,7 +135,7 @@ def _name(folder: Path) -> str:
 
 def _painter(field: GaussianField, drawing: Drawing, cameras: Sequence[SavedCamera]) -> Painter:
     """Draws the field over the background of the cameras; black where there are none."""
-    drawing = drawing.over(cameras[0].background if cameras else (0.0, 0.0, 0.0))
+    drawing = drawing.over(cameras[0].background if cameras else (0.0, 0.0, 0.0)).among(field.means.data)
     return Painter(field.to(drawing.device), drawing.make)
 
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.core.compiled_rules import Anchor
 from clear_strategies.core.gradients import ATTRIBUTES, Grads
+from clear_strategies.core.points import spread
 from clear_strategies.core.seeds import hashed_generator_at
 from clear_strategies.core.step import Step
 from clear_strategies.errors import AnchorError
@@ -137,9 +138,7 @@ class SVS(Strategy):
     def _extent(self) -> float:
         if "extent" not in self.cache:
             means = self.state["means"]
-            distances = torch.linalg.vector_norm(means - means.median(dim=0).values, dim=-1)
-            rank = max(1, round(0.9 * len(distances)))
-            self.cache["extent"] = max(float(distances.kthvalue(rank).values), torch.finfo(means.dtype).tiny ** 0.5)
+            self.cache["extent"] = max(spread(means), torch.finfo(means.dtype).tiny ** 0.5)
         return float(self.cache["extent"])
 
     def _require_same_number(self, n: int) -> None:

@@ -109,6 +109,6 @@ class DensifierSettings(Protocol):
 
 
 def cameras_extent(centers: Float[Tensor, "V 3"]) -> float:
-    """3DGS's scene size: 1.1 times the largest distance of a training camera from their mean, at least a little."""
+    """3DGS's scene size: 1.1 times the largest distance of a training camera from their mean; a little where that is 0."""
     radius = torch.linalg.vector_norm(centers - centers.mean(0), dim=-1).max()
-    return max(1.1 * float(radius), 1e-6)
+    return 1.1 * float(radius) or 1e-6

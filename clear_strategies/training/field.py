@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from clear_strategies.core.gradients import ATTRIBUTES, Grads
-from clear_strategies.core.points import PointCloud
+from clear_strategies.core.points import PointCloud, spread
 from clear_strategies.core.view import View
 from clear_strategies.training.mip import NEAR, filter_std
 from rasterizers.geometry import SH_C0
@@ -230,4 +230,6 @@ def _neighbour_distance(means: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
     points = means.numpy()
     distances = np.asarray(cKDTree(points).query(points, k=k)[0])
     squared = torch.from_numpy(distances[:, 1:]).square().mean(1)
-    return squared.clamp_min(_SMALLEST_SQUARED_DISTANCE).sqrt().to(means)
+    size = spread(means)  # in units of a scene whose size is between 1 and 1000, as most have
+    unit = size / min(max(size, 1.0), 1000.0) or 1.0
+    return squared.clamp_min(_SMALLEST_SQUARED_DISTANCE * unit**2).sqrt().to(means)
