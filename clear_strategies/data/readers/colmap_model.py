@@ -40,7 +40,7 @@ _MODELS: Final = {
 _ONE_FOCAL: Final = ("SIMPLE_", "RADIAL")  # beginnings of their names
 _LONGEST_NAME: Final = 4096
 _SAID: Final = re.compile(r"Number of images: (\d+)")
-_NUMERIC: Final = re.compile(r"[\d\s.+eE-]*")
+_NUMERIC: Final = "0123456789.+-eE \t"  # letters of a line of numbers
 
 _T = TypeVar("_T")
 _Number = TypeVar("_Number", int, float)
@@ -315,8 +315,9 @@ def _text_images(path: Path) -> Iterator[Image]:
         if text.startswith("#"):
             said = int(header[1]) if (header := _SAID.search(text)) else said
             continue
-        points = above and len(text.split()) % 3 == 0 and _NUMERIC.fullmatch(text) is not None
-        if points and _could_be_pose(text):
+        pose = _could_be_pose(text)
+        points = above and len(text.split()) % 3 == 0 and not (pose and text.strip(_NUMERIC))
+        if points and pose:
             either.append((line, text))
         elif text.strip() and not points:
             poses.append((line, text))
@@ -333,15 +334,19 @@ def _text_images(path: Path) -> Iterator[Image]:
         if len(cells) != 10:
             raise _damaged(path, f"line {line}", f"has {len(cells)} of 10 columns")
         number, camera = _numbers(path, line, (cells[0], cells[8]), _whole)
-        pose = _numbers(path, line, cells[1:8], float)
-        yield Image(number, tuple(pose[:4]), tuple(pose[4:]), camera, cells[9].strip())
+        numbers = _numbers(path, line, cells[1:8], float)
+        yield Image(number, tuple(numbers[:4]), tuple(numbers[4:]), camera, cells[9].strip())
 
 
 def _could_be_pose(text: str) -> bool:
-    """Whether a line of numbers has an id, a unit quaternion, and the id of a camera where an image has them."""
+    """Whether a line has an id, a quaternion of a length that is read, the id of a camera and a name where an image has them."""
     cells = text.split(maxsplit=9)
-    whole = len(cells) == 10 and cells[0].isdecimal() and cells[8].isdecimal()
-    return whole and 0.9 < math.hypot(*map(float, cells[1:5])) < 1.1
+    if len(cells) < 10 or not (cells[0].isdecimal() and cells[8].isdecimal()):
+        return False
+    try:
+        return 0.5 < math.hypot(*map(float, cells[1:5])) < 2
+    except ValueError:
+        return False
 
 
 def _text_points(path: Path) -> Iterator[_Point]:
