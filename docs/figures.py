@@ -138,8 +138,22 @@ def hosts(folder: Path) -> None:
     write(figure, folder, "hosts")
 
 
+def conflict(folder: Path) -> None:
+    """The share of Gaussians whose LR and HR gradients oppose: by the number of views, and in training."""
+    figure, (by_views, in_training) = plt.subplots(1, 2, figsize=(7, 2.6))
+    for axes, name, x in ((by_views, "conflict_by_views", "views"), (in_training, "conflict_in_training", "iteration")):
+        rows = table(name)
+        for method in dict.fromkeys(row["method"] for row in rows):
+            of_method = [(float(row[x]), float(row["conflict"])) for row in rows if row["method"] == method]
+            axes.plot(*zip(*of_method, strict=True), marker="o" if x == "views" else None, markersize=4, label=method)
+        axes.set_xlabel(f"training {x}" if x == "views" else x)
+        axes.legend(fontsize=7, frameon=False)
+    by_views.set_ylabel("Gaussians in conflict")
+    write(figure, folder, "conflict")
+
+
 def main(folder: Path) -> None:
-    for draw in (ablation, skips, best, hosts):
+    for draw in (ablation, skips, best, hosts, conflict):
         draw(folder)
 
 

@@ -63,19 +63,21 @@ def blocks_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[str, int], int]
 
 @pytest.fixture
 def ptx_of(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., str]:
-    """Compiles the module of a kernel for CUDA, with `lanes` threads per block or Warp's own number; returns its assembly."""
+    """Compiles the module of a kernel for CUDA, with `lanes` threads per block or Warp's own number, for a kind of GPU; returns
+    its assembly.
+    """
     if sys.platform == "darwin":
         pytest.skip("Warp for macOS brings no compiler for CUDA")
     import warp as wp
 
-    def compiled(module: Any, lanes: int | None = None) -> str:
+    def compiled(module: Any, lanes: int | None = None, arch: int = 90) -> str:
         if lanes is not None:
             monkeypatch.setitem(module.options, "block_dim", lanes)
         folder = tmp_path / str(len(list(tmp_path.iterdir())))
-        wp.compile_aot_module(module, arch=90, module_dir=folder, use_ptx=True)
+        wp.compile_aot_module(module, arch=arch, module_dir=folder, use_ptx=True)
         (file,) = folder.glob("*.ptx")
         assembly = file.read_text()
-        assert ".target sm_90" in assembly
+        assert f".target sm_{arch}" in assembly
         return assembly
 
     return compiled

@@ -244,12 +244,13 @@ def test_no_local_name_hides_a_constant_of_warp():
 
 @pytest.mark.slow
 @installed
-def test_the_kernels_compile_for_cuda_on_a_machine_without(ptx_of):
+@pytest.mark.parametrize("arch", [80, 90, 120])
+def test_the_kernels_compile_for_cuda_on_a_machine_without(ptx_of, arch):
     from rasterizers.warp_backend import bins, blend, colour, project
 
     for kernel in (bins.list_pairs, colour.basis, project.project, project.fold(1), project.project_vjp(1)):
-        ptx_of(kernel.module)
+        ptx_of(kernel.module, arch=arch)
     for depth in (False, True):
-        ptx_of(blend.blend(depth, 64).module, 64)
+        ptx_of(blend.blend(depth, 64).module, 64, arch)
     for k in (1, 2, 3):
-        assert ptx_of(blend.blend_vjp(k, 32, True).module, 32).count("shfl.sync") == {1: 12, 2: 20, 3: 28}[k]
+        assert ptx_of(blend.blend_vjp(k, 32, True).module, 32, arch).count("shfl.sync") == {1: 12, 2: 20, 3: 28}[k]
