@@ -147,7 +147,7 @@ def test_the_table_of_hooks_shows_the_hooks_of_a_strategy():
 def test_pictures_are_drawn_from_the_tables(tmp_path):
     figures = loaded(DOCS / "figures.py")
     figures.main(tmp_path)
-    pages = "".join(path.read_text() for path in (DOCS / "explanation").glob("evidence*.md"))
+    pages = "".join(path.read_text() for path in (DOCS / "explanation").glob("*.md"))
     named = set(re.findall(r"images/(evidence_\w+\.svg)", pages))
     assert named == {path.name for path in tmp_path.iterdir()}
     assert all((DOCS / "images" / picture).exists() for picture in named)
