@@ -93,7 +93,7 @@ HEAVY = {"cv2", "scipy", "skimage", "kornia", "matplotlib"}
         ("prior=onnx", "prior.path: is needed and missing"),
         ("+data.typo=1", "data.typo: "),
         ("prior=demo prior.share=7", "prior.share: must lie in [0, 1], got 7"),
-        ("fit.iterations=[", "no viable alternative at input"),
+        ("fit.iterations=[", "fit.iterations: must be a whole number, got '['"),
     ],
 )
 def test_a_bad_setting_is_told_before_data_are_read_and_heavy_libraries_imported(overrides, message, tmp_path):
