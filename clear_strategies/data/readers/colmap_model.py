@@ -39,7 +39,7 @@ _MODELS: Final = {
 }  # fmt: skip
 _ONE_FOCAL: Final = ("SIMPLE_", "RADIAL")  # beginnings of their names
 _LONGEST_NAME: Final = 4096
-_SAID: Final = re.compile(r"Number of images: (\d+)")
+_SAID: Final = re.compile(r"# Number of \w+: (\d+)")  # of a text file's header
 _NUMERIC: Final = "0123456789.+-eE \t"  # letters of a line of numbers
 
 _T = TypeVar("_T")
@@ -313,7 +313,7 @@ def _text_images(path: Path) -> Iterator[Image]:
     said, above = -1, False  # the number of images in the header; whether the line above is a pose
     for line, text in _lines(path):
         if text.startswith("#"):
-            said = int(header[1]) if (header := _SAID.search(text)) else said
+            said = int(header[1]) if (header := _SAID.match(text)) else said
             continue
         pose = _could_be_pose(text)
         points = above and len(text.split()) % 3 == 0 and not (pose and text.strip(_NUMERIC))
@@ -327,8 +327,7 @@ def _text_images(path: Path) -> Iterator[Image]:
         raise _damaged(path, f"line {either[0][0]}", problem)
     if either and said > len(poses):
         poses = sorted(poses + either)
-    if said > len(poses):
-        _log.warning("%s: its header says %d images, %d are there.", path, said, len(poses))
+    _warn_if_cut(path, said, len(poses))
     for line, text in poses:
         cells = text.split(maxsplit=9)
         if len(cells) != 10:
@@ -369,9 +368,21 @@ def _lines(path: Path) -> list[tuple[int, str]]:
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    said, count = -1, 0
     for line, text in _lines(path):
-        if text.strip() and not text.startswith("#"):
+        if text.startswith("#"):
+            said = int(header[1]) if (header := _SAID.match(text)) else said
+        elif text.strip():
+            count += 1
             yield line, text.split()
+    _warn_if_cut(path, said, count)
+
+
+def _warn_if_cut(path: Path, said: int, count: int) -> None:
+    if count < said:
+        _log.warning(
+            "%s: its header says %d, and %d are there: if you did not remove any, export it again.", path, said, count
+        )
 
 
 def _numbers(path: Path, line: int, cells: Sequence[str], kind: Callable[[str], _Number]) -> list[_Number]:

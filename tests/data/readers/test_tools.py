@@ -261,7 +261,10 @@ def test_a_text_model_that_has_fewer_images_than_its_header_says_is_told(tmp_pat
     (root / "sparse/0/points3D.txt").unlink()
     images_txt(root, NAMES[:2], header="# Number of images: 3\n")
     assert len(colmap.read(root).frames) == 2
-    assert "says 3 images, 2 are there" in caplog.text
+    (root / "sparse/0/points3D.txt").write_text("# Number of points: 9, mean track length: 2\n1 0 0 3 0 0 0 0.5 1 0\n")
+    assert len(colmap.read(root).points.means) == 1
+    assert "images.txt: its header says 3, and 2 are there" in caplog.text
+    assert "points3D.txt: its header says 9, and 1 are there" in caplog.text
 
 
 def test_the_points_that_a_blender_file_names_are_read(tmp_path: Path) -> None:
