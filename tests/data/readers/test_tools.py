@@ -48,6 +48,7 @@ NAMED: dict[str, tuple[Callable[[str], str], Callable[[Path], object]]] = {
     ),
     "another case": (str.upper, lambda _: None),
     "capital ending of the file": (lambda name: name, lambda file: file.rename(file.with_suffix(".PNG"))),
+    "the folder's own name first": (lambda name: name if "/" in name else f"images/{name}", lambda _: None),
     "absolute of another machine": (lambda name: f"C:\\scans\\room\\{name}", lambda _: None),
 }
 
