@@ -93,8 +93,8 @@ def finder(folder: Path) -> Callable[[str], Path]:
     """How each reader finds the files that a capture names, in or below a folder.
 
     A name is taken as it stands, without an ending as that of a PNG file. Where no such file is there, backslashes separate
-    folders, letters may have another case, the beginning of an absolute path may differ, the folder's own name may stand first, and
-    the ending is that of the only image of this name. Where all of this finds none, the path leads to nothing.
+    folders, letters may have another case, the beginning of an absolute path may differ, the folder's own name may stand first,
+    and the ending is that of the only image of this name. Where all of this finds none, the path leads to nothing.
     """
 
     @cache
@@ -125,8 +125,8 @@ def finder(folder: Path) -> Callable[[str], Path]:
                 return folder / exact.relative_to(inside) if exact.is_relative_to(inside) else exact
         path = PureWindowsPath(name)
         parts = [part for part in path.parts if part != path.anchor]
-        inside = len(parts) > 1 and parts[0].lower() == folder.absolute().name.lower()
-        starts = range(len(parts) if path.anchor else min(1 + inside, len(parts)))
+        twice = len(parts) > 1 and parts[0].lower() == folder.absolute().name.lower()
+        starts = range(len(parts) if path.anchor else min(1 + twice, len(parts)))
         missing = folder.joinpath(*(parts[-1:] if path.anchor else parts))
         return next(filter(None, (below(parts[i:]) for i in starts)), missing)
 
