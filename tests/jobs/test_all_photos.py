@@ -57,7 +57,10 @@ PROTOCOLS = {
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_under_a_protocol_photos_and_cameras_keep_their_bits(protocol: str, tmp_path: Path) -> None:
+def test_under_a_protocol_photos_and_cameras_keep_their_bits(
+    protocol: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("clear_strategies.data.prepare.SMALLEST", 1)  # px that scores need, more than these photos have
     write, changed, expected = PROTOCOLS[protocol]
     scene = write(tmp_path / "scene").name
     job = settings(f"+protocol={protocol}", f"data.root={tmp_path}", f"data.scene={scene}", *changed)

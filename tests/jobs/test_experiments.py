@@ -148,6 +148,8 @@ EVIDENCE = {
     "evidence_baselines": (5 * 8, "Onnx"),
     "evidence_skips": (4 * 3 * 2, "Onnx"),
     "evidence_geometry": (5 * 3 * 2 * 2, "AutoPrior"),
+    "conflict_by_views": (6 * 2, "Onnx"),
+    "conflict_in_training": (4, "Onnx"),
 }
 
 
