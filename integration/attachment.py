@@ -34,7 +34,7 @@ from clear_strategies.core import deferred
 from clear_strategies.core.gradients import conflict_columns
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
-from clear_strategies.data.masks import require_shown
+from clear_strategies.data.shown import require_shown
 from clear_strategies.errors import HostError, SettingError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.in_place import InPlaceMerge, RoutedGradients

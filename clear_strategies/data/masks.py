@@ -1,4 +1,4 @@
-"""Masks: whose file is whose, what it hides, and whether anything is left to train on."""
+"""Masks: whose file is whose, and what it hides."""
 
 from __future__ import annotations
 
@@ -10,12 +10,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
-import torch
 import torch.nn.functional as F
 from jaxtyping import Bool
 from torch import Tensor
 
-from clear_strategies.core.view import Photo, View
 from clear_strategies.data.lenses import Lens
 from clear_strategies.data.photo_files import SUFFIXES, image_size, is_lossy, read_image
 from clear_strategies.data.photo_folders import images_in, some
@@ -24,10 +22,6 @@ from clear_strategies.errors import DataError
 _log = logging.getLogger(__name__)
 
 _MARKED: Final = re.compile(r"^(?:.*mask[-_.])?(.+?)(?:[-_.]mask)?$")  # dynamic_mask_0001, 0001_mask
-_NOTHING: Final = 1e-3  # of a photo's pixels: one that shows fewer teaches nothing
-_NEARLY_ALL: Final = 0.9  # of the photos
-_FAINT: Final = 0.02  # alpha of a pixel that counts as transparent: 1 of 255 does, as in an alpha of 0 and 1
-_LITTLE: Final = 0.1  # of all pixels: less is more often a mask upside down than what was meant
 
 
 def masks_of(root: Path, paths: Iterable[Path], given: Mapping[Path, Path] = MappingProxyType({})) -> dict[Path, Path]:
@@ -117,32 +111,3 @@ def _of_mask() -> Iterator[None]:
     except DataError as error:
         remedy = "put a mask of the photo's shape there, or remove it and the field that names it"
         raise DataError(error.file, f"mask: {error.field}", error.problem, remedy) from error
-
-
-def require_shown(views: Sequence[View]) -> None:
-    """Warn of photos whose mask or alpha leaves nothing to train on, and of masks that leave little of all photos.
-
-    Raises:
-        DataError: that are nearly all of the photos.
-    """
-    shown = {view.name: _shown(view.lr) for view in views}
-    empty = [name for name, share in shown.items() if share < _NOTHING]
-    why = "their masks hide every pixel, or their alpha is 0"
-    if len(empty) > _NEARLY_ALL * len(views):
-        problem = f"show nothing of {len(empty)} of {len(views)} photos: {some(empty)}"
-        remedy = "a mask is 0 where it hides, and alpha where it is transparent: invert them, or train without them"
-        raise DataError(empty[0], "masks or alpha", problem, remedy)
-    if empty:
-        _log.warning("%d of %d photos teach nothing, since %s: %s.", len(empty), len(views), why, some(empty))
-    masked = [float(view.lr.shown.float().mean()) for view in views if view.lr.shown is not None]
-    if masked and sum(masked) < _LITTLE * len(masked):
-        message = "masks hide %.0f%% of their %d photos. A mask is 0 where it hides: are they upside down?"
-        _log.warning(message, 100 * (1 - sum(masked) / len(masked)), len(masked))
-
-
-def _shown(photo: Photo) -> float:
-    """The share of its pixels that a photo shows."""
-    shown = torch.ones(photo.image.shape[:2], dtype=torch.bool) if photo.shown is None else photo.shown.cpu()
-    if photo.transparency is not None:
-        shown = shown & (photo.transparency.cpu() < 1 - _FAINT)
-    return float(shown.float().mean())

@@ -24,13 +24,13 @@ from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.capture import NO_PARALLAX, STEP_ASIDE, Capture, Frame
 from clear_strategies.data.cloud import CloudSettings, initial_points, require_source
 from clear_strategies.data.lenses import forget_maps
-from clear_strategies.data.masks import require_shown
 from clear_strategies.data.photo_files import image_size, read_image
 from clear_strategies.data.priors import Bicubic, Prior, SuperResolved, super_resolved
 from clear_strategies.data.priors.cache import kept_network_of
 from clear_strategies.data.priors.interface import warn_if_far_from_lr
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.scene_notes import scene_notes, size_of
+from clear_strategies.data.shown import require_shown
 from clear_strategies.data.view_names import ViewFiles, write_pngs
 from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split
 from clear_strategies.errors import DataError
