@@ -11,7 +11,19 @@ import pytest
 from tests.helpers.command_line import started
 
 ROOT = Path(__file__).resolve().parents[2]
-HEAVY = ("cv2", "gsplat", "hydra", "kornia", "matplotlib", "msgspec", "nerfstudio", "open3d", "scipy", "skimage", "warp")
+HEAVY = (
+    "cv2",
+    "gsplat",
+    "hydra",
+    "kornia",
+    "matplotlib",
+    "msgspec",
+    "nerfstudio",
+    "open3d",
+    "scipy",
+    "skimage",
+    "warp",
+)
 
 
 MODULES = (
