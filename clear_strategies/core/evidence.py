@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -50,7 +49,7 @@ def lift(
         centers: u_i in pixels of the image that the patches tile; of invisible Gaussians anything, since gsplat leaves their
             rows uninitialised. patch: edge of a patch in those pixels.
     """
-    x, y = (torch.where(visible[:, None], centers, 0.0) / patch).unbind(-1)
+    column, row = (centers / patch).long().unbind(-1)  # of NaN or infinity any number, which the clamps bring inside
     height, width = patch_maps.shape[1:]
-    column, row = x.clamp(0, width - 1).long(), y.clamp(0, height - 1).long()
+    column, row = column.clamp(0, width - 1), row.clamp(0, height - 1)
     return patch_maps.flatten(1).index_select(1, row * width + column) * visible
