@@ -35,12 +35,14 @@ def reaches_image(ellipse: Ellipse, grid: Grid) -> wp.bool:
     near_x, near_y = wp.clamp(0.0, low[0], high[0]), wp.clamp(0.0, low[1], high[1])
     on_x = wp.clamp(-ellipse.B * near_x / (2.0 * ellipse.C), low[1], high[1])
     on_y = wp.clamp(-ellipse.B * near_y / (2.0 * ellipse.A), low[0], high[0])
-    return wp.min(exponent(ellipse, near_x, on_x), exponent(ellipse, on_y, near_y)) <= ellipse.reach
+    at_x = exponent(ellipse.A, ellipse.B, ellipse.C, near_x, on_x)
+    at_y = exponent(ellipse.A, ellipse.B, ellipse.C, on_y, near_y)
+    return wp.min(at_x, at_y) <= ellipse.reach
 
 
 @wp.func
-def exponent(ellipse: Ellipse, dx: wp.float32, dy: wp.float32) -> wp.float32:
-    return dx * (ellipse.A * dx + ellipse.B * dy) + ellipse.C * dy * dy
+def exponent(A: wp.float32, B: wp.float32, C: wp.float32, dx: wp.float32, dy: wp.float32) -> wp.float32:
+    return dx * (A * dx + B * dy) + C * dy * dy
 
 
 @wp.func

@@ -21,6 +21,7 @@ from typing import Any, Final
 
 import warp as wp
 
+from rasterizers.warp_backend.bins import exponent
 from rasterizers.warp_backend.types import PIXELS, SEGMENT, SUMS, TILE, Cuts, Grid, Row, ellipse_of
 
 wp.set_module_options({"enable_backward": False})
@@ -59,7 +60,7 @@ def offset_of(within: wp.int32, g: Near) -> wp.vec2:
 @wp.func
 def alpha_of(g: Near, d: wp.vec2) -> wp.float32:
     """α before its cap."""
-    return g[5] * wp.exp(-(d[0] * (g[2] * d[0] + g[3] * d[1]) + g[4] * d[1] * d[1]))
+    return g[5] * wp.exp(-exponent(g[2], g[3], g[4], d[0], d[1]))
 
 
 @cache
@@ -131,8 +132,9 @@ def blend(depth: bool, lanes: int) -> Any:  # noqa: PLR0915 - a kernel
             pixel = pixel_of(tile, within, grid)
             if inside(pixel, grid):
                 rgb = wp.vec3(light[j, 0], light[j, 1], light[j, 2]) + through[j] * cuts.background
-                for back in range(wp.max(wp.min(stop[j], end - 1) / SEGMENT - begin / SEGMENT, 0)):
-                    mark = wp.min(stop[j], end - 1) / SEGMENT - back
+                last = wp.min(stop[j], end - 1) / SEGMENT
+                for back in range(wp.max(last - begin / SEGMENT, 0)):
+                    mark = last - back
                     segment = marks[mark, within]
                     marks[mark, within] = wp.vec4(rgb[0], rgb[1], rgb[2], segment[3])
                     rgb += wp.vec3(segment[0], segment[1], segment[2])
