@@ -20,7 +20,7 @@ from clear_strategies.bench.accuracy import affordable, in_float64, relative, tr
 from clear_strategies.bench.rasterizers import require_device, usable
 from clear_strategies.bench.results import Results
 from clear_strategies.bench.scenes import SETTINGS, Workload
-from clear_strategies.bench.timing import fill_queue, interleaved, medians, milliseconds
+from clear_strategies.bench.timing import interleaved, medians, milliseconds, queued
 from clear_strategies.core import images
 from clear_strategies.core.view import Photo, View
 from clear_strategies.core.work_log import WorkLog
@@ -88,8 +88,7 @@ class Training:
         device = self.state.field.means.device
         iterations = _PER_TURN[device.type]
         whole, self.state.conductor.work_log = WorkLog(device), WorkLog(device)
-        fill_queue(device)
-        with whole.stage(TOTAL):
+        with queued(whole, TOTAL):
             for _ in range(iterations):
                 iterate(self.state, self.rasterizer)
         stages: dict[str, float] = {}

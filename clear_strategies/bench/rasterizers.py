@@ -23,7 +23,7 @@ from clear_strategies.bench import accuracy, scenes
 from clear_strategies.bench.accuracy import NO_CUT_OFFS, Drawn, affordable
 from clear_strategies.bench.results import Results, line_chart
 from clear_strategies.bench.scenes import SETTINGS, Workload
-from clear_strategies.bench.timing import fill_queue, interleaved, medians, milliseconds
+from clear_strategies.bench.timing import interleaved, medians, milliseconds, queued
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import DataError
 from rasterizers.interface import PRESETS
@@ -133,12 +133,10 @@ def turn(contestant: Contestant, cotangents: Float[Tensor, "K H W 3"]) -> dict[s
     start on an idle device, by the host's clock.
     """
     work_log, device = WorkLog(cotangents.device), cotangents.device
-    fill_queue(device)
-    with work_log.stage(FORWARD):
+    with queued(work_log, FORWARD):
         rendering = contestant.render()
     for k, stage in enumerate(BACKWARD, 1):
-        fill_queue(device)
-        with work_log.stage(stage):
+        with queued(work_log, stage):
             rendering.vjp(cotangents[:k])
     del rendering
     contestant.stages(work_log)
@@ -166,11 +164,9 @@ def backend_on(workload: Workload, backend: str, preset: str) -> Contestant:
     lr = camera.scaled(1 / workload.lr_factor)
 
     def stages(work_log: WorkLog) -> None:
-        fill_queue(work_log.device)
-        with work_log.stage(TOGETHER):
+        with queued(work_log, TOGETHER):
             rasterizer.render_scales([(splats, lr), (splats, camera)])
-        fill_queue(work_log.device)
-        with work_log.stage(SEPARATE):
+        with queued(work_log, SEPARATE):
             rasterizer(splats, lr)
             rasterizer(splats, camera)
 

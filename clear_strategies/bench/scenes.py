@@ -145,16 +145,17 @@ def facing_all(splats: Splats, width: int = 1008, height: int = 756) -> Camera:
     return Camera(pose, focal, focal, width / 2, height / 2, width, height)
 
 
+_TAILS: Final = "tails"
 # Gaussians shrink as their number grows, as under densification: the radius is 5.5 px at 100k.
 _GENERATED: Final = {
     "tiny": (600, 96, 72, 4.0),
     "small": (5_000, 252, 189, 5.5),
     "s100k": (100_000, 1008, 756, 5.5),
     "s500k": (500_000, 1008, 756, 5.5 * 5**-0.3),
+    _TAILS: (60_000, 1008, 756, 1.5),
 }
-_TAILS: Final = ("tails", 60_000, 1008, 756, 1.5)
 _AT_LR: Final = "s100k-lr"  # the same Gaussians at a quarter of the image size
-NAMES: Final = ("tiny", "small", "s100k", _AT_LR, "s500k", "tails")
+NAMES: Final = ("tiny", "small", "s100k", _AT_LR, "s500k", _TAILS)
 
 
 def load(name: str) -> Workload:
@@ -162,11 +163,9 @@ def load(name: str) -> Workload:
     if name == _AT_LR:
         hr = load("s100k")
         return Workload(name, hr.splats, hr.camera.scaled(1 / 4))
-    if name == "tails":
-        return tails(*_TAILS[:-1], radius=_TAILS[-1])
     if name in _GENERATED:
         n, width, height, radius = _GENERATED[name]
-        return surfaces(name, n, width, height, radius=radius)
+        return (tails if name == _TAILS else surfaces)(name, n, width, height, radius=radius)
     if Path(name).is_file():
         return from_ply(Path(name))
     raise DataError("--scene", name, "is no scene and no file", f"choose one of {', '.join(NAMES)}, or give a .ply")

@@ -1,13 +1,14 @@
 """Contenders take turns, so that other work on the machine slows all of them alike.
 
-On a CPU times are wall-clock. On CUDA they are taken between events on torch's current stream (`WorkLog`). `fill_queue` keeps
+On a CPU times are wall-clock. On CUDA they are taken between events on torch's current stream (`WorkLog`). `queued` keeps
 the device busy until the host has launched a stage, whose time is then the device's; where the host has to wait for the device
 within a stage, that wait is a part of it, as in a training loop.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Final
 
 import pandas as pd
@@ -26,10 +27,13 @@ _AHEAD: Final = 20_000_000
 """Cycles of a GPU, about 10 ms: more than the host needs to launch a stage."""
 
 
-def fill_queue(device: torch.device) -> None:
-    """Give a CUDA device work, so that the next event does not start on an idle device and measure how the host launches."""
-    if device.type == "cuda":
+@contextmanager
+def queued(work_log: WorkLog, stage: str) -> Iterator[None]:
+    """A stage that a CUDA device begins after other work, so that it does not start idle and measure how the host launches."""
+    if work_log.device.type == "cuda":
         torch.cuda._sleep(_AHEAD)  # type: ignore[no-untyped-call]
+    with work_log.stage(stage):
+        yield
 
 
 def milliseconds(work_log: WorkLog) -> dict[str, float]:
