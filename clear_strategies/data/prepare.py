@@ -85,12 +85,6 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     )
 
 
-def lr_photos(frames: Sequence[Frame], capture: Capture, views: ViewSettings) -> list[Photo]:
-    """The LR photos of these frames, without SR images."""
-    lr_files, photos = check_headers(frames, views), photos_of(frames, views)
-    return [_lr(frame, photo, capture, views, lr_files) for frame, photo in zip(frames, photos, strict=True)]
-
-
 def check_headers(frames: Sequence[Frame], views: ViewSettings) -> dict[str, Path]:
     """Check by their headers that these frames can be prepared. No photo is decoded.
 
