@@ -19,11 +19,7 @@ import logging
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Final
-
-from jaxtyping import Float
-from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
@@ -43,12 +39,11 @@ def within_limit(
 ) -> tuple[Capture, ViewSettings]:
     """Reduce the photos and choose the factor so that the HR images fit into `views.max_hr_megapixels`.
 
+    Both are returned unchanged where the HR images fit or `photos_are` is not "lr".
+
     Args:
         reaches: whether the prior can enlarge by a factor.
         super_resolve: the HR images must come from the prior, even if the photos are large enough.
-
-    Returns:
-        The capture and the settings of its views, unchanged where the HR images fit or `photos_are` is not "lr".
     """
     limit, photo = views.max_hr_megapixels, _largest(capture)
     pixels = _megapixels(photo, views)
@@ -90,8 +85,4 @@ def _reduced(frame: Frame, ratio: float, multiple: int, kernel: DownKernel) -> F
     """The frame with a photo `ratio` times smaller, rounded to a size that `multiple` divides."""
     width, height = (max(1, round(s / ratio / multiple)) * multiple for s in (frame.camera.width, frame.camera.height))
     camera = resized(frame.camera, width, height)
-    return replace(frame, camera=camera, load=partial(_load, frame, (width, height), kernel))
-
-
-def _load(frame: Frame, size: tuple[int, int], kernel: DownKernel) -> Float[Tensor, "H W 3"]:
-    return images.resize(frame.load(), size, kernel)
+    return replace(frame, camera=camera, load=lambda: images.resize(frame.load(), (width, height), kernel))

@@ -25,9 +25,9 @@ from clear_strategies.data.capture import NO_PARALLAX, STEP_ASIDE, Capture, Fram
 from clear_strategies.data.cloud import CloudSettings, initial_points, require_source
 from clear_strategies.data.lenses import forget_maps
 from clear_strategies.data.photo_files import image_size, read_image
-from clear_strategies.data.priors import Bicubic, Prior, SuperResolved, super_resolved
+from clear_strategies.data.priors import Bicubic, Prior
 from clear_strategies.data.priors.cache import kept_network_of
-from clear_strategies.data.priors.interface import warn_if_far_from_lr
+from clear_strategies.data.priors.interface import SuperResolved, super_resolved, warn_if_far_from_lr
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.scene_notes import scene_notes, size_of
 from clear_strategies.data.shown import require_shown
@@ -42,7 +42,7 @@ _log = logging.getLogger(__name__)
 _READERS: Final = 4  # photos read at once, at most: each is held at its full size meanwhile
 _WHOLE: Final = 0.99  # of a pixel's mask, for the pixel to be shown
 _SAME_EXPOSURE: Final = 0.01  # photos whose gains are closer to 1 stay as they are
-_ONE_PLACE: Final = 1e-6  # distances of the cameras in that to the origin: as files round positions
+_ONE_PLACE: Final = 1e-6  # distances of the cameras, in that to the origin: as files round positions
 _NO_STEP: Final = 1e-3  # the same in that to the points: less than two pixels of a photo of 2,000
 _BLURRED: Final = 3e-4  # rounding of positions, in distances of the cameras, that is a visible part of an HR pixel
 
@@ -50,17 +50,13 @@ _BLURRED: Final = 3e-4  # rounding of positions, in distances of the cameras, th
 def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSettings, *, seed: int = 0) -> Scene:
     """Split the frames, make LR and HR of each view, and make the initial points.
 
-    What the headers of the photos show is checked before any photo is decoded.
-
-    Raises:
-        DataError: the capture cannot give what the settings ask for.
+    What the headers of the photos show is checked before any photo is decoded; a DataError says what the capture cannot give.
     """
     train_frames, test_frames = split(capture, views)
     frames = [*train_frames, *(replace(frame, transparency=None) for frame in test_frames)]  # only training needs it
     lr_files = check_headers(frames, views)
     require_source(cloud, capture.points)
-    _require_parallax(capture, [frame.camera for frame in train_frames], cloud)
-    _warn_if_far_from_origin([frame.camera for frame in train_frames])
+    _check_places(capture, [frame.camera for frame in train_frames], cloud)
     progress = Progress("photos and their SR images", "photos", len(frames))
     made, work_log = list[View](), WorkLog()
     with work_log.stage("photos and SR images"):
@@ -79,41 +75,35 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
         train = tuple(replace(v, depth=depth) for v, depth in zip(train, initial.depths, strict=True))
     train, exposure = _equalized(train) if views.equalize else (train, {})
     notes = scene_notes(capture, views, prior, train, test, train_frames[0].camera, initial.cloud, exposure)
-    synthetic = "synthetic" in train[0].sr_source
     return Scene(
-        capture.name, train, test, initial.cloud, capture.background, synthetic, notes, capture.unplaced, work_log
-    )
+        capture.name, train, test, initial.cloud, capture.background, synthetic_prior="synthetic" in train[0].sr_source,
+        notes=notes, unplaced=capture.unplaced, work_log=work_log,
+    )  # fmt: skip
 
 
 def check_headers(frames: Sequence[Frame], views: ViewSettings) -> dict[str, Path]:
-    """Check by their headers that these frames can be prepared. No photo is decoded.
+    """Check by their headers that these frames can be prepared: a DataError for a photo that is too small, or a ready-made LR
+    image that is missing or has another size. No photo is decoded.
 
     Returns:
         The ready-made LR image of each frame by its name; empty without `lr_folder`.
-
-    Raises:
-        DataError: a photo is too small for `shrink` and `sr_scale`; a ready-made LR image is missing, or has another size.
     """
+    factor = 1 if views.photos_are == "lr" else views.sr_scale
     for frame in frames:
-        width, height = (
-            size * (1 if views.photos_are == "lr" else views.sr_scale) for size in lr_size(frame.camera, views)
-        )
+        width, height = (factor * size for size in lr_size(frame.camera, views))
         if min(width, height) < SMALLEST:
-            problem = (
-                f"is {size_of(frame.camera)}, scored at {width}x{height}, where scores need {SMALLEST} pixels a side"
-            )
+            size = f"{size_of(frame.camera)}, scored at {width}x{height}"
             smaller = min(frame.camera.width, frame.camera.height) < SMALLEST
             remedy = "give larger photos" if smaller else "lower data.views.shrink or data.views.sr_scale"
-            raise DataError(frame.name, "size", problem, remedy)
+            raise DataError(frame.name, "size", f"is {size}, where scores need {SMALLEST} pixels a side", remedy)
     if views.lr_folder is None:
         return {}
     files, lr_files = ViewFiles(Path(views.lr_folder), "LR image", "name the LR images like the photos"), {}
     for frame in frames:
         width, height = lr_size(frame.camera, views)
         file = lr_files[frame.name] = files.file(frame.name)
-        size = image_size(file)
-        if size != (width, height):
-            problem = f"is {size[0]}x{size[1]} where {width}x{height} is expected"
+        if (given := image_size(file)) != (width, height):
+            problem = f"is {given[0]}x{given[1]} where {width}x{height} is expected"
             raise DataError(file, "size", problem, "see data.views for the LR size")
     return lr_files
 
@@ -166,11 +156,7 @@ def _view(
     *,
     required: bool,
 ) -> View:
-    """The view of a frame; `photo` as `photos_of` gives it.
-
-    Args:
-        required: the prior must have an SR image; else bicubic replaces one that it lacks.
-    """
+    """The view of a frame; `photo` as `photos_of` gives it. Unless it is `required`, bicubic replaces a missing SR image."""
     lr = _lr(frame, photo, capture, views, lr_files)
     hr_camera, truth = (photo.camera.scaled(views.sr_scale), None) if lr is photo else (photo.camera, photo.image)
     if views.photos_are == "both":
@@ -180,7 +166,7 @@ def _view(
         hr = Photo(hr_camera, sr.image, transparency=_enlarged(lr.transparency, frame.name, prior, views.sr_scale))
         disagreement = sr.disagreement
     view = View(
-        frame.name, lr, hr, truth=truth, sr_source=sr_source, disagreement=disagreement, background=capture.background
+        frame.name, lr, hr, truth, sr_source=sr_source, disagreement=disagreement, background=capture.background
     )
     shown = None if photo.shown is None else photo.reduced(photo.camera.width // lr.camera.width).shown
     return view if shown is None else view.hiding(shown)
@@ -260,27 +246,19 @@ def _sized(image: Tensor, camera: Camera, views: ViewSettings) -> Photo:
     return Photo(camera.scaled(1 / views.shrink), images.downsample(image, views.shrink, views.downsample))
 
 
-def _require_parallax(capture: Capture, cameras: Sequence[Camera], cloud: CloudSettings) -> None:
-    """Refuse photos from one place, whose depth nothing tells but a file of points."""
-    if len(cameras) < 2 or cloud.init == "ply":
-        return
+def _check_places(capture: Capture, cameras: Sequence[Camera], cloud: CloudSettings) -> None:
+    """Refuse photos from one place, whose depth nothing tells but a file of points, and warn where float32 cannot place
+    Gaussians to a part of a pixel, as in a capture with geographic coordinates.
+    """
     centers = torch.stack([camera.center.double() for camera in cameras])
-    apart = float(torch.linalg.vector_norm(centers - centers.mean(0), dim=1).max())
-    least = _ONE_PLACE * float(torch.linalg.vector_norm(centers.mean(0)))
+    middle = centers.mean(0)
+    apart, away = float((centers - middle).norm(dim=1).max()), float(middle.norm())
+    least = _ONE_PLACE * away
     if capture.points is not None and len(capture.points.means):
-        least += _NO_STEP * float(
-            torch.linalg.vector_norm(capture.points.means.double() - centers.mean(0), dim=1).median()
-        )
-    if apart <= least:
+        least += _NO_STEP * float((capture.points.means.double() - middle).norm(dim=1).median())
+    if apart <= least and len(cameras) > 1 and cloud.init != "ply":
         remedy = f"{STEP_ASIDE}; or give the depth: data.cloud.init=ply data.cloud.path=POINTS.ply"
         raise DataError(capture.name, "poses", f"{NO_PARALLAX} (cameras within {apart:.2g} units)", remedy)
-
-
-def _warn_if_far_from_origin(cameras: Sequence[Camera]) -> None:
-    """Warn where float32 cannot place Gaussians to a part of a pixel, as in a capture with geographic coordinates."""
-    centers = torch.stack([camera.center.double() for camera in cameras])
-    away = float(torch.linalg.vector_norm(centers.mean(0)))
-    apart = float(torch.linalg.vector_norm(centers - centers.mean(0), dim=1).max())
     rounded = away * torch.finfo(torch.float32).eps / 2
     if rounded > _BLURRED * apart > 0:
         _log.warning(

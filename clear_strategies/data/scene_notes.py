@@ -32,15 +32,9 @@ def scene_notes(
     points: PointCloud,
     exposure: Mapping[str, str],
 ) -> dict[str, str]:
-    """The notes of a scene, in the order of the plan.
-
-    Args:
-        photo: the camera of the first training photo, as the capture has it.
-        exposure: the notes of `ViewSettings.equalize`.
-    """
+    """The notes of a scene, in the order of the plan; `photo`: the camera of the first training photo, as the capture has it."""
     sample, sr = train[0], views.photos_are != "both"
-    network = network_of(prior) if sr else None
-    unused = len(capture.frames) - len(train) - len(test)
+    network, unused = network_of(prior) if sr else None, len(capture.frames) - len(train) - len(test)
     all_trained = "none: all are trained on (data.views.test_every=8 keeps every 8th for testing)"
     return {
         "scene": f"{capture.name}, {len(capture.frames)} photos",

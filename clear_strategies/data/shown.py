@@ -21,10 +21,8 @@ _LITTLE: Final = 0.1  # of all pixels: less is more often a mask upside down tha
 
 
 def require_shown(views: Sequence[View]) -> None:
-    """Warn of photos whose mask or alpha leaves nothing to train on, and of masks that leave little of all photos.
-
-    Raises:
-        DataError: that are nearly all of the photos.
+    """Warn of photos whose mask or alpha leaves nothing to train on, and of masks that leave little of all photos; a DataError
+    where nothing is left of nearly all photos.
     """
     shown = {view.name: _shown(view.lr) for view in views}
     empty = [name for name, share in shown.items() if share < _NOTHING]

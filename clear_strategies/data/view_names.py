@@ -31,17 +31,14 @@ def matching(names: Sequence[str], wanted: str) -> list[str]:
 
 
 def write_pngs(folder: Path, images: Iterable[tuple[str, Float[Tensor, "h w 3"]]]) -> int:
-    """Write images by their views' names, and return how many. `ViewFiles` finds files of the same names.
-
-    Raises:
-        DataError: two views would have the same file.
-    """
+    """Write images by their views' names, and return how many. `ViewFiles` finds files of the same names."""
     written = set[Path]()
     for name, image in images:
         file = folder / f"{bare(name)}.png"
         if file in written:
-            remedy = "give every photo its own name, without its ending"
-            raise DataError(file, "file name", "is that of two photos", remedy)
+            raise DataError(
+                file, "file name", "is that of two photos", "give every photo its own name, without its ending"
+            )
         write_png(file, image)
         written.add(file)
     return len(written)
@@ -49,27 +46,17 @@ def write_pngs(folder: Path, images: Iterable[tuple[str, Float[Tensor, "h w 3"]]
 
 @dataclass(frozen=True, slots=True)
 class ViewFiles:
-    """A folder with one image per view, see `clear_strategies.data.priors.Images`.
-
-    Args:
-        what: a noun for one of the images, for messages.
-        remedy: for a missing file.
-        suffix: of the files' stems.
-    """
+    """A folder with one image per view, see `clear_strategies.data.priors.Images`."""
 
     folder: Path
-    what: str
-    remedy: str
-    suffix: str = ""
+    what: str  # a noun for one of the images, for messages
+    remedy: str  # for a missing file
+    suffix: str = ""  # of the files' stems
     _view_of: dict[Path, str] = field(default_factory=dict, init=False)
     _listed: dict[Path, dict[str, list[Path]]] = field(default_factory=dict, init=False)
 
     def file(self, name: str) -> Path:
-        """The image of the view.
-
-        Raises:
-            DataError: it has none or several, or shares one with another view that was asked for.
-        """
+        """The image of the view; a DataError where it has none or several, or one that another view was given."""
         view = bare(name)
         below, stem = self.folder / view.rpartition("/")[0], _file(view) + self.suffix
         folder = below if below.is_dir() else self.folder

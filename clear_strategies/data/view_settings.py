@@ -44,9 +44,6 @@ class ViewSettings:
         equalize: scale the training photos to a common exposure and white balance, by a gain for each photo and channel
             (`clear_strategies.geometry.exposure_gains`); needs the depth of data.cloud.init=stereo or auto. Test photos stay as
             they are.
-
-    Raises:
-        SettingError: a value is outside its range, or contradicts another.
     """
 
     train: int | None = None
@@ -70,30 +67,20 @@ class ViewSettings:
                 rule = "must be null or a list of names"
                 refuse("data.views.train_names", rule, self.train_names, "data.views.train_names=[r_2,r_16]")
             object.__setattr__(self, "train_names", tuple(names))
-        if self.train is not None:
-            require_whole("data.views.train", self.train, least=1)
-        if self.test_limit is not None:
-            require_whole("data.views.test_limit", self.test_limit, least=0)
-        if self.test_every not in (None, 0):
-            require_whole("data.views.test_every", self.test_every, least=2)
-        require_whole("data.views.sr_scale", self.sr_scale, least=1)
+        for name, least in {"train": 1, "test_limit": 0, "test_every": 2, "sr_scale": 1, "shrink": 1}.items():
+            if (value := getattr(self, name)) is not None and not (name == "test_every" and value == 0):
+                require_whole(f"data.views.{name}", value, least=least)
         if self.max_hr_megapixels is not None:
             require_number("data.views.max_hr_megapixels", self.max_hr_megapixels, above=0)
-        require_whole("data.views.shrink", self.shrink, least=1)
-        require_choice("data.views.sizes", self.sizes, get_args(Sizes))
-        require_choice("data.views.photos_are", self.photos_are, get_args(PhotosAre))
-        require_choice("data.views.downsample", self.downsample, get_args(DownKernel))
+        for name, choices in {"sizes": Sizes, "photos_are": PhotosAre, "downsample": DownKernel}.items():
+            require_choice(f"data.views.{name}", getattr(self, name), get_args(choices))
         if self.photos_are == "lr" and self.lr_folder:
             rule = "must be null with photos_are=lr, the default, because the photos are the LR images"
             refuse("data.views.lr_folder", rule, self.lr_folder, "data.views.photos_are=hr")
 
 
 def split(capture: Capture, views: ViewSettings) -> tuple[list[Frame], list[Frame]]:
-    """(training, test) frames: the data set's own split, or every `test_every`-th for testing (RegNeRF's rule).
-
-    Raises:
-        DataError: a named view does not exist, or there are too few.
-    """
+    """(training, test) frames: the data set's own split, or every `test_every`-th for testing (RegNeRF's rule)."""
     frames = list(capture.frames)
     own_split = views.own_split and any(f.split for f in frames)
     if own_split:
@@ -139,14 +126,15 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
 
 def _only(capture: Capture, names: Sequence[str], wanted: str) -> str:
     """The name of the only view that `wanted`, a name in `train_names`, matches."""
-    matches = matching(names, wanted)
-    if not matches:
-        remedy = f"choose among {', '.join(map(bare, names))}"
-        raise DataError(capture.name, "train_names", f"there is no view {wanted!r}", remedy)
-    if len(matches) > 1:
-        problem = f"{wanted!r} may be {' or '.join(map(repr, matches))}"
-        raise DataError(capture.name, "train_names", problem, "give the whole name of one of them")
-    return matches[0]
+    match matching(names, wanted):
+        case [match]:
+            return match
+        case []:
+            problem, remedy = f"there is no view {wanted!r}", f"choose among {', '.join(map(bare, names))}"
+        case several:
+            problem = f"{wanted!r} may be {' or '.join(map(repr, several))}"
+            remedy = "give the whole name of one of them"
+    raise DataError(capture.name, "train_names", problem, remedy)
 
 
 def _evenly_spaced(frames: Sequence[Frame], count: int) -> list[Frame]:

@@ -1,22 +1,14 @@
 """Priors: where the super-resolved (SR) image of each view comes from. One file per prior; `cache` keeps results."""
 
 from clear_strategies.data.priors.back_projected import BackProjected
-from clear_strategies.data.priors.bicubic import Bicubic
 from clear_strategies.data.priors.cache import Cached, cache_folder, cached
 from clear_strategies.data.priors.corrupted import Corrupted, DemoPrior
 from clear_strategies.data.priors.images import Images
-from clear_strategies.data.priors.interface import (
-    Network,
-    Prior,
-    SuperResolved,
-    fingerprint,
-    network_of,
-    super_resolved,
-)
+from clear_strategies.data.priors.interface import Bicubic, Network, Prior, fingerprint, network_of, super_resolved
 from clear_strategies.data.priors.ncnn import Ncnn
 from clear_strategies.data.priors.onnx import Onnx
 
 __all__ = [
     "BackProjected", "Bicubic", "Cached", "Corrupted", "DemoPrior", "Images", "Ncnn", "Network", "Onnx",
-    "Prior", "SuperResolved", "cache_folder", "cached", "fingerprint", "network_of", "super_resolved",
+    "Prior", "cache_folder", "cached", "fingerprint", "network_of", "super_resolved",
 ]  # fmt: skip

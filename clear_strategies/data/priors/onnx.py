@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -13,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.data.priors.interface import finished, require_file, require_path
+from clear_strategies.data.priors.interface import compared, require_file, require_path
 from clear_strategies.data.priors.tiling import require_tiles, tiled
 from clear_strategies.errors import DataError
 
@@ -32,9 +31,6 @@ class Onnx:
         path: the .onnx file.
         tile: edge of the tiles into which larger images are cut, LR px.
         overlap: see `tiling.tiled`, LR px.
-
-    Raises:
-        SettingError: no path is given, or the tiles would be all overlap.
     """
 
     path: str = ""
@@ -54,10 +50,9 @@ class Onnx:
         return (Path(self.path),)
 
     def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
-        began = time.perf_counter()
         network = _read_network(Path(self.path))
-        result = tiled(lambda part: self._run(network, part, factor), lr.cpu(), factor, self.tile, self.overlap)
-        return finished(name, self.label, result, lr, factor, began)
+        large = tiled(lambda part: self._run(network, part, factor), lr.cpu(), factor, self.tile, self.overlap)
+        return compared(self.label, large, lr, factor)
 
     def _run(self, network: Any, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
         import cv2
@@ -67,10 +62,8 @@ class Onnx:
             network.setInput(lr.permute(2, 0, 1)[None].float().contiguous().numpy())
             out = np.asarray(network.forward())
         except cv2.error as error:
-            problem = f"cannot run on {width}x{height} ({error.err})"
-            raise DataError(
-                self.path, "network", problem, "export it for RGB images [1, 3, h, w] of any size"
-            ) from error
+            problem, remedy = f"cannot run on {width}x{height} ({error.err})", "export it for RGB images of any size"
+            raise DataError(self.path, "network", problem, remedy) from error
         expected = (1, 3, height * factor, width * factor)
         if out.shape != expected:
             problem = f"has shape {out.shape} where {expected} is expected"
@@ -88,9 +81,8 @@ def _read_network(path: Path) -> Any:
         raise DataError(path, "size", "is more than 2 GiB, which no ONNX file is", "check the path")
     data = path.read_bytes()
     if _EXTERNAL_DATA.search(data):
-        raise DataError(
-            path, "weights", "lie in other files (ONNX external data)", "save the model with its weights inside"
-        )
+        problem = "lie in other files (ONNX external data)"
+        raise DataError(path, "weights", problem, "save the model with its weights inside")
     try:
         return cv2.dnn.readNetFromONNX(np.frombuffer(data, np.uint8))
     except cv2.error as error:

@@ -37,18 +37,12 @@ def tiled(
     weight = lr.new_zeros(height * factor, width * factor, 1)
     progress = Progress("super-resolution of a photo", "tiles", len(rows) * len(columns))
     for done, (row, column) in enumerate((r, c) for r in rows for c in columns):
-        part = tuple(
-            slice(max(a - 2 * overlap, 0), min(b + 2 * overlap, size))
-            for (a, b), size in ((row, height), (column, width))
+        (rows_in, rows_out, fade_y), (columns_in, columns_out, fade_x) = (
+            _along(share, size, factor, overlap) for share, size in ((row, height), (column, width))
         )
-        fade_y, fade_x = (
-            _fade(share, along, size, factor, overlap).to(lr)
-            for share, along, size in ((row, part[0], height), (column, part[1], width))
-        )
-        fade = (fade_y[:, None] * fade_x)[..., None]
-        enlarged = tuple(slice(along.start * factor, along.stop * factor) for along in part)
-        out[enlarged] += fade * upscale(lr[part])
-        weight[enlarged] += fade
+        fade = (fade_y[:, None] * fade_x)[..., None].to(lr)
+        out[rows_out, columns_out] += fade * upscale(lr[rows_in, columns_in])
+        weight[rows_out, columns_out] += fade
         progress(done + 1)
     return out / weight
 
@@ -70,13 +64,16 @@ def _shares(size: int, tile: int, overlap: int) -> list[tuple[int, int]]:
     return list(itertools.pairwise(ends))
 
 
-def _fade(share: tuple[int, int], part: slice, size: int, factor: int, overlap: int) -> Float[Tensor, " n"]:
-    """A tile's weight per HR pixel along one axis: 1 inside its share, a ramp of 2 `overlap` at inner borders, then 0."""
-    at = torch.arange(part.start * factor, part.stop * factor) + 0.5
+def _along(share: tuple[int, int], size: int, factor: int, overlap: int) -> tuple[slice, slice, Float[Tensor, " n"]]:
+    """A tile's LR pixels along one axis, its HR pixels, and their weight: 1 inside its share, a ramp of 2 `overlap` at inner
+    borders, then 0.
+    """
+    first, last = max(share[0] - 2 * overlap, 0), min(share[1] + 2 * overlap, size)
+    at = torch.arange(first * factor, last * factor) + 0.5
     ramp = max(2 * overlap * factor, 1)  # without overlap: a sharp cut between two pixels
     weight = torch.ones_like(at)
     if share[0] > 0:
         weight = weight * ((at - share[0] * factor) / ramp + 0.5).clamp(0, 1)
     if share[1] < size:
         weight = weight * ((share[1] * factor - at) / ramp + 0.5).clamp(0, 1)
-    return weight
+    return slice(first, last), slice(first * factor, last * factor), weight

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -16,10 +15,8 @@ from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import BLACK, Capture, Frame, SfmPoints, lens_notes, sorted_by_name
 from clear_strategies.data.masks import masks_of
 from clear_strategies.data.photo_folders import finder, folder_note, image_folder, images_in, is_file, usable
-from clear_strategies.data.readers.colmap_model import Model, find_model, is_model, model_folders, pose_of, read_model
+from clear_strategies.data.readers.colmap_model import Model, find_model, is_model, model_folders, read_model
 from rasterizers.interface import Color
-
-_log = logging.getLogger(__name__)
 
 _UNEVEN: Final = 1e-6  # a quaternion's length may differ from 1 by this much without a note
 
@@ -30,11 +27,7 @@ def recognises(path: Path) -> int:
 
 
 def read(
-    root: str | Path,
-    images: str | None = None,
-    *,
-    background: Color = BLACK,
-    skip_faulty: bool = False,
+    root: str | Path, images: str | None = None, *, background: Color = BLACK, skip_faulty: bool = False
 ) -> Capture:
     """Read a scene folder with a sparse model in sparse/0, sparse, colmap/sparse/0 or the folder itself.
 
@@ -44,10 +37,6 @@ def read(
             poses_bounds.npy, as many photos under other names are matched by their order.
         background: RGB in [0, 1] behind transparent pixels.
         skip_faulty: leave out photos that are missing or damaged, with a warning for each; else they are an error.
-
-    Raises:
-        SettingError: the background is no colour.
-        DataError: the model or an image cannot be used.
     """
     root, background = Path(root), as_color("data.reader.background", background)
     model = read_model(find_model(root))
@@ -72,28 +61,28 @@ def capture(
     background: Color = BLACK,
     skip_faulty: bool = False,
     upright: bool | None = None,
+    points: str = "",
 ) -> Capture:
     """The capture of a model and its photos: `paths` by the model's names, below `folder`.
 
     Args:
         upright: see `Frame.of_photo`.
-
-    Raises:
-        DataError: an image cannot be used.
+        points: where its points come from, for the plan; empty: from the model's own place.
     """
     listing = model.listing
     kept = usable(listing, model.images, lambda image: paths[image.name], skip_faulty=skip_faulty)
     masks = masks_of(folder.parent, paths.values())
     frames = [
         Frame.of_photo(
-            _name_below(folder, paths[image.name]), paths[image.name], model.lenses[image.camera],
-            pose_of(image), upright=upright, background=background, sfm_id=image.id, mask=masks.get(paths[image.name]),
+            _name_below(folder, path := paths[image.name]), path, model.lenses[image.camera], image.pose,
+            upright=upright, background=background, sfm_id=image.id, mask=masks.get(path),
         )
         for image in kept
     ]  # fmt: skip
+    label = model.folder.relative_to(root).as_posix() if model.folder.is_relative_to(root) else model.folder.name
     some_of = f" of its {len(model.images)}" if len(frames) < len(model.images) else ""
     notes = {
-        "poses": f"COLMAP {_label(root, model)} ({listing.suffix[1:]}), {len(frames)}{some_of} images",
+        "poses": f"COLMAP {label} ({listing.suffix[1:]}), {len(frames)}{some_of} images",
         "photos": folder_note(folder),
     }
     pattern = "**/*" if any(path.parent != folder for path in paths.values()) else "*"
@@ -101,35 +90,23 @@ def capture(
     unposed = [path.relative_to(folder).as_posix() for path in images_in(folder, pattern) if path not in posed]
     if unposed:
         notes["without pose"] = f"{len(unposed)} photos, not used: {', '.join(unposed[:8])}"
-        _log.debug("%s: %d photos have no pose and are not used: %s.", root, len(unposed), ", ".join(unposed[:8]))
     notes |= lens_notes(frames)
-    uneven = sum(abs(math.hypot(*image.quat) - 1) > _UNEVEN for image in model.images)
-    if uneven:
+    if uneven := sum(abs(math.hypot(*image.quat) - 1) > _UNEVEN for image in model.images):
         notes["rotations"] = f"{uneven} quaternions were not of length 1 and were normalised"
-    points = sfm_points(model, _label(root, model))
-    if points is None:
+    if not len(model.points.means):
         notes["points"] = "the model has none"
     lost = dict.fromkeys(unposed, "has no pose in the model")
-    return Capture(root.resolve().name, sorted_by_name(frames, listing), points, background, notes, unplaced=lost)
+    sfm = _sfm_points(model, points or label)
+    return Capture(root.resolve().name, sorted_by_name(frames, listing), sfm, background, notes, unplaced=lost)
 
 
-def sfm_points(model: Model, label: str) -> SfmPoints | None:
-    """The model's points with their tracks, or None if it has none. `label` is for the printed plan."""
-    p = model.points
-    if not len(p.means):
+def _sfm_points(model: Model, label: str) -> SfmPoints | None:
+    if not len(model.points.means):
         return None
-    return SfmPoints(
-        means=torch.from_numpy(p.means).float(),
-        colors=torch.from_numpy(p.colors).float() / 255,
-        track_point=torch.from_numpy(np.ascontiguousarray(p.track[:, 0])),
-        track_image=torch.from_numpy(np.ascontiguousarray(p.track[:, 1])),
-        source=f"COLMAP {label}, {len(p.means):,} points, triangulated from all {len(model.images)} images",
-    )
-
-
-def _label(root: Path, model: Model) -> str:
-    """The model's folder relative to the scene's, e.g. sparse/0."""
-    return model.folder.relative_to(root).as_posix() if model.folder.is_relative_to(root) else model.folder.name
+    means, colors = torch.from_numpy(model.points.means).float(), torch.from_numpy(model.points.colors).float() / 255
+    point, image = (torch.from_numpy(np.ascontiguousarray(ids)) for ids in model.points.track.T)
+    source = f"COLMAP {label}, {len(means):,} points, triangulated from all {len(model.images)} images"
+    return SfmPoints(means, colors, point, image, source)
 
 
 def _name_below(folder: Path, path: Path) -> str:

@@ -28,19 +28,21 @@ from rasterizers.geometry import rotation_matrix
 
 _log = logging.getLogger(__name__)
 
-# The models by COLMAP's numbers, with the parameters that follow the principal point; p and k are counted from 1 here. Those of
-# `_ONE_FOCAL` have one focal length in front of it, the others two.
-_MODELS: Final = {
-    "SIMPLE_PINHOLE": "", "PINHOLE": "", "SIMPLE_RADIAL": "k1", "RADIAL": "k1 k2", "OPENCV": "k1 k2 p1 p2",
-    "OPENCV_FISHEYE": "k1 k2 k3 k4", "FULL_OPENCV": "k1 k2 p1 p2 k3 k4 k5 k6", "FOV": "omega", "SIMPLE_RADIAL_FISHEYE": "k1",
-    "RADIAL_FISHEYE": "k1 k2", "THIN_PRISM_FISHEYE": "k1 k2 p1 p2 k3 k4 sx1 sy1",
-    "RAD_TAN_THIN_PRISM_FISHEYE": "k1 k2 k3 k4 k5 k6 p1 p2 s0 s1 s2 s3", "SIMPLE_DIVISION": "k", "DIVISION": "k",
-    "SIMPLE_FISHEYE": "", "FISHEYE": "", "EUCM": "alpha beta", "EQUIRECTANGULAR": "",
+_ONE, _TWO = "f cx cy ", "fx fy cx cy "
+_MODELS: Final = {  # by COLMAP's numbers, with their parameters; p and k are counted from 1 here
+    "SIMPLE_PINHOLE": _ONE, "PINHOLE": _TWO, "SIMPLE_RADIAL": _ONE + "k1", "RADIAL": _ONE + "k1 k2",
+    "OPENCV": _TWO + "k1 k2 p1 p2", "OPENCV_FISHEYE": _TWO + "k1 k2 k3 k4", "FULL_OPENCV": _TWO + "k1 k2 p1 p2 k3 k4 k5 k6",
+    "FOV": _TWO + "omega", "SIMPLE_RADIAL_FISHEYE": _ONE + "k1", "RADIAL_FISHEYE": _ONE + "k1 k2",
+    "THIN_PRISM_FISHEYE": _TWO + "k1 k2 p1 p2 k3 k4 sx1 sy1",
+    "RAD_TAN_THIN_PRISM_FISHEYE": _TWO + "k1 k2 k3 k4 k5 k6 p1 p2 s0 s1 s2 s3", "SIMPLE_DIVISION": _ONE + "k",
+    "DIVISION": _TWO + "k", "SIMPLE_FISHEYE": _ONE, "FISHEYE": _TWO, "EUCM": _TWO + "alpha beta", "EQUIRECTANGULAR": "",
 }  # fmt: skip
-_ONE_FOCAL: Final = ("SIMPLE_", "RADIAL")  # beginnings of their names
 _LONGEST_NAME: Final = 4096
 _SAID: Final = re.compile(r"# Number of \w+: (\d+)")  # of a text file's header
 _NUMERIC: Final = "0123456789.+-eE \t"  # letters of a line of numbers
+
+_COUNT, _CAMERA, _IMAGE = map(struct.Struct, ("<Q", "<iiQQ", "<i7di"))
+_POINT: Final = struct.Struct("<Q3d3BdQ")  # id, position, colour, error, length of the track
 
 _T = TypeVar("_T")
 _Number = TypeVar("_Number", int, float)
@@ -55,13 +57,20 @@ class Image(NamedTuple):
     camera: int
     name: str
 
+    @property
+    def pose(self) -> Float[Tensor, "4 4"]:
+        """World-to-camera."""
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = rotation_matrix(torch.tensor([self.quat], dtype=torch.float64))[0]
+        pose[:3, 3] = torch.tensor(self.translation, dtype=torch.float64)
+        return pose
+
 
 _Point = tuple[int, Sequence[float], Sequence[int], np.ndarray]
 """Id, position, 8-bit colour, and the ids of the images that observe it; a plain tuple, because there may be millions."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Points:
+class Points(NamedTuple):
     """Positions, 8-bit colours, and the tracks: point `track[j, 0]` is observed in image `track[j, 1]`."""
 
     means: Float[np.ndarray, "N 3"]
@@ -97,11 +106,7 @@ def _files(folder: Path, ending: str | None = None) -> list[Path]:
 
 
 def find_model(root: Path) -> Path:
-    """The folder of the sparse model; of the several that COLMAP's mapper may leave in `sparse`, the one with most photos.
-
-    Raises:
-        DataError: there is none, or one of several cannot be read.
-    """
+    """The folder of the sparse model; of the several that COLMAP's mapper may leave in `sparse`, the one with most photos."""
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
     folder = next(filter(is_model, model_folders(root)), None)
@@ -125,11 +130,7 @@ def find_model(root: Path) -> Path:
 
 
 def read_model(folder: Path) -> Model:
-    """Cameras, images and points of a model folder.
-
-    Raises:
-        DataError: a file is missing or not what it should be.
-    """
+    """Cameras, images and points of a model folder; a DataError where a file is missing or not what it should be."""
     cameras, listing, points3d = _files(folder)
     lenses, images = read_cameras(cameras), read_images(listing)
     if not images:
@@ -163,14 +164,6 @@ def read_images(path: Path) -> list[Image]:
     return list(images.values())
 
 
-def pose_of(image: Image) -> Float[Tensor, "4 4"]:
-    """World-to-camera."""
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = rotation_matrix(torch.tensor([image.quat], dtype=torch.float64))[0]
-    pose[:3, 3] = torch.tensor(image.translation, dtype=torch.float64)
-    return pose
-
-
 def read_points(path: Path) -> Points:
     """The points with their tracks; none where there is no file."""
     records: list[_Point] = []
@@ -199,18 +192,18 @@ def _by_id(path: Path, records: Iterable[tuple[int, _T]]) -> dict[int, _T]:
     return found
 
 
-def _lens(path: Path, where: str, model: str, size: tuple[int, int], parameters: Sequence[float]) -> Lens:
-    fx, *_ = f = parameters[: 1 if model.startswith(_ONE_FOCAL) else 2]
-    cx, cy, *rest = parameters[len(f) :]
-    terms = dict(zip(_MODELS[model].split(), rest, strict=True))
+def _parameters_of(path: Path, where: str, model: str) -> list[str]:
+    terms_of(path, where, model)  # refuses those that are not supported
+    return _MODELS[model].split()
+
+
+def _lens(path: Path, where: str, model: str, size: tuple[int, int], parameters: Iterable[float]) -> Lens:
+    terms = dict(zip(_MODELS[model].split(), parameters, strict=True))
+    f = terms.pop("f", 0.0)
+    pinhole = (terms.pop("fx", f), terms.pop("fy", f), terms.pop("cx"), terms.pop("cy"))
     if model == "EUCM" and terms["alpha"] == 0:
         del terms["beta"]  # of no effect then
-    return lens_of(path, where, model, size, (fx, f[-1], cx, cy), terms)
-
-
-def _parameters_of(path: Path, where: str, model: str) -> int:
-    terms_of(path, where, model)  # refuses those that are not supported
-    return (3 if model.startswith(_ONE_FOCAL) else 4) + len(_MODELS[model].split())
+    return lens_of(path, where, model, size, pinhole, terms)
 
 
 def _damaged(path: Path, where: str, problem: str) -> DataError:
@@ -219,30 +212,24 @@ def _damaged(path: Path, where: str, problem: str) -> DataError:
 
 
 class _Bytes:
-    """A file's bytes, read from front to back. Each count is compared with the bytes left before anything is allocated."""
+    """A file's bytes, read from front to back; a DataError where fewer are left than a field needs."""
 
     def __init__(self, path: Path) -> None:
         self.data, self.path, self.at = read_bytes(path), path, 0
 
-    @property
-    def left(self) -> int:
-        return len(self.data) - self.at
-
-    def take(self, layout: str, field: str) -> tuple[Any, ...]:
-        size = struct.calcsize(layout)
-        if size > self.left:
-            raise _damaged(self.path, field, f"needs {size} bytes, {self.left} are left: truncated")
-        values = struct.unpack_from(layout, self.data, self.at)
+    def skip(self, size: int, field: str) -> int:
+        """The place of the next `size` bytes."""
+        start, left = self.at, len(self.data) - self.at
+        if size > left:
+            raise _damaged(self.path, field, f"needs {size} bytes, {left} are left: truncated")
         self.at += size
-        return values
+        return start
 
-    def count(self, field: str, record: int) -> int:
-        """A 64-bit count of records of at least `record` bytes each."""
-        (n,) = self.take("<Q", field)
-        if n * record > self.left:
-            problem = f"is {n}, of {record} bytes or more each, but {self.left} bytes are left"
-            raise _damaged(self.path, field, problem)
-        return int(n)
+    def take(self, layout: struct.Struct, field: str) -> tuple[Any, ...]:
+        return layout.unpack_from(self.data, self.skip(layout.size, field))
+
+    def count(self, field: str) -> int:
+        return int(self.take(_COUNT, field)[0])
 
     def text(self, field: str) -> str:
         end = self.data.find(b"\0", self.at, self.at + _LONGEST_NAME)
@@ -255,40 +242,36 @@ class _Bytes:
             raise _damaged(self.path, field, "is no UTF-8 text") from error
 
     def finish(self) -> None:
-        if self.left:
-            raise _damaged(self.path, "end", f"{self.left} bytes are left over")
+        if left := len(self.data) - self.at:
+            raise _damaged(self.path, "end", f"{left} bytes are left over")
 
 
 def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
     file = _Bytes(path)
-    for i in range(file.count("number of cameras", 24 + 2 * 8)):
-        number, kind, *size = file.take("<iiQQ", f"camera {i}")
-        model = dict(enumerate(_MODELS)).get(kind, f"number {kind}")
-        count = _parameters_of(path, f"camera {number}", model)
-        parameters = file.take(f"<{count}d", f"parameters of camera {i}")
-        yield number, _lens(path, f"camera {number}", model, (size[0], size[1]), parameters)
+    for i in range(file.count("number of cameras")):
+        number, kind, width, height = file.take(_CAMERA, f"camera {i}")
+        where, model = f"camera {number}", dict(enumerate(_MODELS)).get(kind, f"number {kind}")
+        layout = struct.Struct(f"<{len(_parameters_of(path, where, model))}d")
+        yield number, _lens(path, where, model, (width, height), file.take(layout, f"parameters of {where}"))
     file.finish()
 
 
 def _binary_images(path: Path) -> Iterator[Image]:
     file = _Bytes(path)
-    for i in range(file.count("number of images", 4 + 7 * 8 + 4 + 1 + 8)):
-        number, *pose, camera = file.take("<i7di", f"image {i}")
+    for i in range(file.count("number of images")):
+        number, *pose, camera = file.take(_IMAGE, f"image {i}")
         name = file.text(f"name of image {i}")
-        seen = file.count(f"2D points of {name!r}", 24)
-        file.at += 24 * seen
+        file.skip(24 * file.count(f"2D points of {name!r}"), f"2D points of {name!r}")
         yield Image(number, tuple(pose[:4]), tuple(pose[4:]), camera, name)
     file.finish()
 
 
 def _binary_points(path: Path) -> Iterator[_Point]:
     file = _Bytes(path)
-    for i in range(file.count("number of points", 8 + 24 + 3 + 8 + 8)):
-        record = file.take("<Q3d3Bd", f"point {i}")  # id, position, colour, error
-        length = file.count(f"track of point {i}", 8)
-        track = np.frombuffer(file.data, "<i4", 2 * length, file.at)[::2]
-        file.at += 8 * length
-        yield record[0], record[1:4], record[4:7], track
+    for i in range(file.count("number of points")):
+        number, x, y, z, *color, _, length = file.take(_POINT, f"point {i}")
+        track = np.frombuffer(file.data, "<i4", 2 * length, file.skip(8 * length, f"track of point {i}"))[::2]
+        yield number, (x, y, z), color, track
     file.finish()
 
 
@@ -297,10 +280,9 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
         if len(cells) < 4:
             raise _damaged(path, f"line {line}", f"has {len(cells)} of at least 5 columns")
         number, width, height = _numbers(path, line, (cells[0], *cells[2:4]), _whole)
-        expected = _parameters_of(path, f"line {line}", cells[1])
+        expected = len(_parameters_of(path, f"line {line}", cells[1]))
         if len(cells) != 4 + expected:
-            problem = f"has {len(cells) - 4} parameters, {cells[1]} has {expected}"
-            raise _damaged(path, f"line {line}", problem)
+            raise _damaged(path, f"line {line}", f"has {len(cells) - 4} parameters, {cells[1]} has {expected}")
         yield number, _lens(path, f"line {line}", cells[1], (width, height), _numbers(path, line, cells[4:], float))
 
 
@@ -323,8 +305,7 @@ def _text_images(path: Path) -> Iterator[Image]:
             poses.append((line, text))
         above = bool(text.strip()) and not points
     if either and said not in (len(poses), len(poses) + len(either)):
-        problem = "could be an image's pose or the 2D points of the image above"
-        raise _damaged(path, f"line {either[0][0]}", problem)
+        raise _damaged(path, f"line {either[0][0]}", "could be an image's pose or the 2D points of the image above")
     if either and said > len(poses):
         poses = sorted(poses + either)
     _warn_if_cut(path, said, len(poses))

@@ -144,7 +144,7 @@ def _capture(root: Path, photos: Mapping[Path, Exif], folder: Path) -> Capture:
     """The photos that have poses in the model in `folder`, whose images are named by `sfm.copy_name`."""
     model, photo_of = read_model(folder), {sfm.copy_name(i): path for i, path in enumerate(photos)}
     posed = {image.name: photo_of[image.name] for image in model.images}
-    capture = colmap.capture(root, model, root, posed, upright=True)
+    capture = colmap.capture(root, model, root, posed, upright=True, points="estimated here by pycolmap")
     unplaced = read_object(folder / sfm.UNPLACED)
     sfm.warn_unplaced(root, unplaced, len(photos))
     notes = {
@@ -153,8 +153,7 @@ def _capture(root: Path, photos: Mapping[Path, Exif], folder: Path) -> Capture:
         "photos": root.name,
         **_exposure(photos),
     }
-    points = colmap.sfm_points(model, "estimated here by pycolmap")
-    return replace(capture, points=points, notes=notes, unplaced=unplaced)
+    return replace(capture, notes=notes, unplaced=unplaced)
 
 
 def _without_masks(paths: Sequence[Path]) -> list[Path]:
