@@ -36,13 +36,15 @@ from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
 from clear_strategies.data.shown import require_shown
 from clear_strategies.errors import HostError, SettingError
+from clear_strategies.kernels.merge import Colour
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.in_place import InPlaceMerge, RoutedGradients
 from clear_strategies.merging.iteration import HrGradients
-from integration.autograd_shot import AutogradShot, DrawnGradients, HostOutput, RenderAt
+from integration.autograd_shot import AutogradShot, DrawnGradients, HostOutput, RenderAt, passes_to_parameters
 from integration.extra_steps import ExtraSteps
 from integration.host_score import ScoreScaler, write_score
 from integration.views import by_name, enlarged_mask
+from rasterizers.autograd import Drawing
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
@@ -148,8 +150,27 @@ class Attachment:
         self.counts["LR renders"] += 1
         if output.hooked.requires_grad:
             self._pending = (nth := self.counts["LR renders"]), output, hr, routed
+            self._take_colours(output.shot.drawing, nth)
             output.hooked.register_hook(_called_at(WeakMethod(self._on_backward), nth))  # type: ignore[no-untyped-call]
         return output.returned
+
+    def _take_colours(self, drawing: Drawing | None, nth: int) -> None:
+        """Take the LR gradient of the colours by its factors, past the host's own copies of them, where the pass that is merged
+        would only pass it on to the parameters.
+        """
+        params = self.params()
+        if drawing is None or not (
+            self._merge_in_place.takes_factors(params) and passes_to_parameters(drawing, params)
+        ):
+            return
+        leaves = [torch.autograd.graph.get_gradient_edge(params[name]).node for name in ("sh0", "shN")]
+        is_pending = WeakMethod(self._is_pending)  # the drawing must not hold what holds it, see `_called_at`
+        drawing.colour.taken = lambda: (
+            (alive := is_pending()) is not None and alive(nth) and all(map(_is_accumulated, leaves))
+        )
+
+    def _is_pending(self, nth: int) -> bool:
+        return self._pending is not None and self._pending[0] == nth
 
     def _count_parts(self, n: int) -> None:
         self.counts["HR renders in parts"] += 1
@@ -306,9 +327,12 @@ class Attachment:
                     "rasterization(sparse_grad=False)."
                 )
         scale = (self._loss_scale() if self._loss_scale is not None else 1.0) / self.accumulation
+        drawing = output.shot.drawing
+        lr_colour = None if drawing is None or drawing.colour.factors is None else Colour(*drawing.colour.factors)
         conflict = self._merge_in_place(
-            params, routed, self.t, before=self._grads_before, scale=scale, must_be_finite=self._loss_scale is None
-        )
+            params, routed, self.t, before=self._grads_before, lr_colour=lr_colour, scale=scale,
+            must_be_finite=self._loss_scale is None,
+        )  # fmt: skip
         if "detail" in params and hr is not None and hr.hf is not None:
             self._decay_detail(params["detail"])
         if screen_gradient is not None and hr is not None:
@@ -388,6 +412,14 @@ def _announce(conductor: Conductor, views: Sequence[View], *, own_background: bo
 def _called_at(on_backward: WeakMethod[Callable[[int], None]], nth: int) -> Callable[[Tensor], None]:
     """A tensor hook that calls `on_backward(nth)`. Its reference is weak: with a strong one, its tensor would never be freed."""
     return lambda _: None if (alive := on_backward()) is None else alive(nth)
+
+
+def _is_accumulated(leaf: Any) -> bool:
+    """Whether the backward pass under way adds to a leaf's `.grad`; `torch.autograd.grad` returns its gradient instead."""
+    try:
+        return bool(torch._C._will_engine_execute_node(leaf))
+    except RuntimeError:  # what torch does in a pass of `torch.autograd.grad` for this leaf
+        return False
 
 
 @contextmanager

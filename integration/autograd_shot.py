@@ -222,6 +222,13 @@ def _plus_rows(
     return torch.addcmul(a, b, weight.to(b).view(-1, *[1] * (b.dim() - 1)))
 
 
+def passes_to_parameters(drawing: Drawing, params: Mapping[str, Tensor]) -> bool:
+    """Whether the gradient of the drawn colours becomes that of sh0 and shN and nothing else, without a hook on the way."""
+    leaves = [params[name] for name in ("sh0", "shN") if name in params]
+    hooked = any(p._backward_hooks or getattr(p, "_post_accumulate_grad_hooks", None) for p in leaves)
+    return len(leaves) == 2 and not hooked and are_bands(drawing.splats.sh0, drawing.splats.shN, params)
+
+
 _VIEWS: Final = frozenset(
     {"UnsqueezeBackward0", "SqueezeBackward1", "ViewBackward0", "UnsafeViewBackward0", "ReshapeAliasBackward0"}
 )

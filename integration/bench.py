@@ -21,9 +21,10 @@ from tqdm import tqdm
 from clear_strategies.bench.rasterizers import require_device
 from clear_strategies.bench.results import Results
 from clear_strategies.compose import conductor
+from clear_strategies.core.deferred import Number
 from clear_strategies.data.priors import Bicubic
 from clear_strategies.geometry import stereo
-from integration.attachment import Attachment
+from clear_strategies.merging.in_place import InPlaceMerge
 from integration.examples.demo import load_demo, splats_with_optimizers
 from integration.gsplat import attach
 from integration.views import view
@@ -62,16 +63,15 @@ class Loop:
         self.splats = {name: torch.nn.Parameter(p.detach().to(device, dtype)) for name, p in splats.items()}
         self.optimizers = {name: torch.optim.Adam([p], lr=1e-9, eps=1e-15) for name, p in self.splats.items()}
         self.photos, self.viewmats, self.Ks = (x.to(device, dtype) for x in (photos, demo.viewmats, Ks))
-        self.draw, self.attachment, self.t, self.seconds_merging = _rasterization(device), None, 0, 0.0
+        self.draw, self.merge, self.t = _rasterization(device), None, 0
         if strategies is not None:
             name, *overrides = strategies.split()
             chosen = conductor(name, *overrides, iterations=_ITERATIONS)
             sr = chosen.prior(Bicubic())
             views = [view(*x, sr=sr) for x in zip(demo.names, self.photos, self.viewmats, self.Ks, strict=True)]
             attached = attach(self.splats, self.optimizers, views, chosen)
-            self.draw, self.attachment = attached.wrap(self.draw), attached.attachment
-            self.attachment.t = _FROM
-            self._time_merges(self.attachment)
+            self.draw, self.merge = attached.wrap(self.draw), _TimedMerge(chosen)
+            attached.attachment.t, attached.attachment._merge_in_place = _FROM, self.merge
 
     def backward(self) -> None:
         """Render the next photo and take the gradients."""
@@ -91,18 +91,20 @@ class Loop:
             optimizer.step()
             optimizer.zero_grad()
 
-    def _time_merges(self, attachment: Attachment) -> None:
-        merge = attachment._merge_in_place
 
-        def timed(*arguments: Any, **keywords: Any) -> Any:
-            clock = time.perf_counter if self.photos.is_cuda else time.process_time
-            began = clock()
-            result = merge(*arguments, **keywords)
-            _wait(self.photos.device)
-            self.seconds_merging += clock() - began
-            return result
+class _TimedMerge(InPlaceMerge):
+    """The merge, and the seconds that it has taken: of the processor, on a device by the wall clock."""
 
-        attachment._merge_in_place = timed  # type: ignore[assignment]
+    seconds = 0.0
+
+    def __call__(self, params: Mapping[str, Tensor], *arguments: Any, **keywords: Any) -> Mapping[str, Number]:
+        device = params["means"].device
+        clock = time.perf_counter if device.type == "cuda" else time.process_time
+        began = clock()
+        result = super().__call__(params, *arguments, **keywords)
+        _wait(device)
+        self.seconds += clock() - began
+        return result
 
 
 def measure(
@@ -142,7 +144,7 @@ def _timed(loops: Mapping[str, Loop], repeats: int, device: str) -> pd.DataFrame
     rows = []
     for turn in tqdm(range(-_WARM_UPS, repeats + repeats % 2), desc="steps", unit="turn", leave=False):
         for name, loop in loops.items():
-            loop.seconds_merging = 0.0
+            before = 0.0 if loop.merge is None else loop.merge.seconds
             _wait(torch.device(device))
             began, began_processor = time.perf_counter(), time.process_time()
             loop.step()
@@ -150,8 +152,8 @@ def _timed(loops: Mapping[str, Loop], repeats: int, device: str) -> pd.DataFrame
             ms, processor_ms = (
                 1e3 * (a - b) for a, b in ((time.perf_counter(), began), (time.process_time(), began_processor))
             )
-            row = {"loop": name, "ms": ms, "processor_ms": processor_ms, "merge_ms": 1e3 * loop.seconds_merging}
-            rows.append({"turn": turn, **row})
+            merging = 0.0 if loop.merge is None else loop.merge.seconds - before
+            rows.append({"turn": turn, "loop": name, "ms": ms, "processor_ms": processor_ms, "merge_ms": 1e3 * merging})
     return pd.DataFrame(rows).query("turn >= 0").drop(columns=["turn"])
 
 

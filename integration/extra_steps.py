@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from typing import Any, Final
 
 import torch
@@ -93,8 +94,13 @@ class ExtraSteps:
         self._gradients, self._rendered = [], {}
 
 
+@cache
+def _parameters(step: Callable[..., Any]) -> frozenset[str]:
+    return frozenset(inspect.signature(step).parameters)
+
+
 def _step(optimizer: torch.optim.Optimizer, rows: Tensor) -> None:
     """One step of all rows. An Adam of visible Gaussians takes which move, 3DGS's SparseGaussianAdam also how many there are."""
-    parameters = inspect.signature(type(optimizer).step).parameters
+    parameters = _parameters(type(optimizer).step)
     known: dict[str, Any] = {"visibility": torch.ones(len(rows), dtype=torch.bool, device=rows.device), "N": len(rows)}
     optimizer.step(**{name: value for name, value in known.items() if name in parameters})

@@ -50,17 +50,33 @@ class Drawn(NamedTuple):
     depth: Float[Tensor, "H W"] | None = None
 
 
+@dataclass(slots=True, eq=False)
+class ColourGradient:
+    """The gradient of a drawing's spherical harmonics by its factors Y ⊗ ∇rgb, for a caller that takes these in place of tensors
+    as wide as the colours.
+
+    Attributes:
+        taken: asked when a backward pass has reached the drawing. If true, sh0 and shN get no gradient from this pass.
+        factors: (∇rgb [N, 3], Y [N, B1]) of the last pass that was taken.
+    """
+
+    taken: Callable[[], bool] = lambda: False
+    factors: tuple[Tensor, Tensor] | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawing:
     """What `draw` drew.
 
     Args:
         splats: as `draw` was given them, and image: as it returned it, both in the autograd graph.
+        colour: where a caller can take the gradient of the colours.
     """
 
     rendering: Rendering
     splats: Splats
     image: Float[Tensor, "H W 3"]
+    colour: ColourGradient
 
 
 _recordings: Final[list[list[Drawing]]] = []
@@ -195,16 +211,19 @@ def _in_graph(
 ) -> Drawn:
     """What was rendered, as a function of the splats and of the projected centres, those of all or of these rows."""
     tensors = [getattr(splats, field.name) for field in fields(Splats)]
-    image, alpha, visible, depth = _Draw.apply(rendered, rows, means2d, *tensors)  # type: ignore[no-untyped-call]
+    colour = ColourGradient()
+    image, alpha, visible, depth = _Draw.apply(rendered, rows, colour, means2d, *tensors)  # type: ignore[no-untyped-call]
     for drawings in _recordings if image.grad_fn is not None else ():
-        drawings.append(Drawing(rendered.rendering, splats, image))
+        drawings.append(Drawing(rendered.rendering, splats, image, colour))
     return Drawn(image, alpha, means2d, visible, depth)
 
 
 class _Draw(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, rendered: _Rendered, rows: Tensor | None, means2d: Tensor, *tensors: Tensor | None) -> Any:
-        ctx.rendered, ctx.rows, rendering = rendered, rows, rendered.rendering
+    def forward(
+        ctx: Any, rendered: _Rendered, rows: Tensor | None, colour: ColourGradient, means2d: Tensor, *tensors: Tensor | None
+    ) -> Any:  # fmt: skip
+        ctx.rendered, ctx.rows, ctx.colour, rendering = rendered, rows, colour, rendered.rendering
         ctx.save_for_backward(*tensors)
         ctx.mark_non_differentiable(visible := rendering.visible.data)
         ctx.set_materialize_grads(False)
@@ -225,7 +244,7 @@ class _Draw(torch.autograd.Function):
         if d_image is None:
             d_image = torch.zeros_like(rendering.image)
         if d_alpha is None or not bool(d_alpha.any()):
-            gradients = _gradients(rendering, d_image)
+            gradients = _gradients(rendering, d_image, ctx.colour)
         else:
             # With C the colour and T = 1 - alpha, I(b) = C + T b. The difference of two backgrounds has the gradient of T.
             b = rasterizer.background
@@ -237,17 +256,24 @@ class _Draw(torch.autograd.Function):
             gradients = [g + h for g, h in zip(*both, strict=True)]
         screen, *others, rgb = gradients
         screen = screen if ctx.rows is None else screen[ctx.rows]
-        return None, None, screen, *others, None if splats.rgb_offset is None else rgb
+        return None, None, None, screen, *others, None if splats.rgb_offset is None else rgb
 
 
 def _detached(tensors: Sequence[Tensor | None]) -> Splats:
     return Splats(*(x if x is None else x.detach() for x in tensors))  # type: ignore[arg-type]
 
 
-def _gradients(rendering: Rendering, cotangent: Float[Tensor, "H W 3"]) -> list[Tensor]:
-    """The gradients of the tensors that `_Draw` takes, in their order."""
+def _gradients(
+    rendering: Rendering, cotangent: Float[Tensor, "H W 3"], colour: ColourGradient | None = None
+) -> list[Any]:
+    """The gradients of the tensors that `_Draw` takes, in their order; None for those of the colours where these are taken."""
     g = rendering.vjp(cotangent[None])
-    return [x[0] for x in (g.screen, g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN, g.rgb)]
+    bands: tuple[Tensor | None, ...]
+    if colour is not None and colour.taken():
+        colour.factors, bands = (g.rgb[0], g.basis), (None, None)
+    else:
+        bands = g.sh0[0], g.shN[0]
+    return [*(x[0] for x in (g.screen, g.means, g.quats, g.scales, g.opacities)), *bands, g.rgb[0]]
 
 
 @uncompiled

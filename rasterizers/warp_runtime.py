@@ -108,14 +108,14 @@ def _descriptor() -> Any:
     return type(wp.from_torch(torch.empty(1, device="cpu"), return_ctype=True))
 
 
-def struct(kind: Any, rows: Mapping[str, Tensor | None], **numbers: float) -> Any:
-    """A Warp structure as a kernel argument: `rows` as flat arrays, and numbers. What is not given is empty, or 0."""
+def struct(kind: Any, rows: Mapping[str, Tensor | None], **values: Any) -> Any:
+    """A Warp structure as a kernel argument: `rows` as flat arrays, numbers, structures. What is not given is empty, or 0."""
     out = kind.ctype()
     for name, tensor in rows.items():
         if tensor is not None:
             setattr(out, name, array(tensor.detach().view(-1)))
-    for name, number in numbers.items():
-        setattr(out, name, number)
+    for name, value in values.items():
+        setattr(out, name, value)
     return out
 
 

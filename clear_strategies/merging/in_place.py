@@ -50,10 +50,14 @@ class RoutedGradients:
 def dense(grads: Mapping[str, Tensor], colour: Colour | None, like: Mapping[str, Tensor]) -> Grads:
     """The same with every number of the spherical harmonics, in the shapes of `like` and for its attributes alone."""
     g = Grads(grads)
-    if colour is not None:
-        rgb, Y, bands = colour.rgb[:, None], colour.basis[..., None], like["shN"].shape[1]
+    if colour is not None and (merge := kernel.compiled((colour.rgb, like["sh0"], like["shN"]))) is not None:
+        bands = {name: Rows(kernel.empty_like(like[name])) for name in ("sh0", "shN")}
+        merge(bands, None, None, lr_colour=colour, lambda_hr=0.0)
+        g |= {name: rows.out for name, rows in bands.items()}
+    elif colour is not None:
+        rgb, Y, n_bands = colour.rgb[:, None], colour.basis[..., None], like["shN"].shape[1]
         g["sh0"], shN = Y[:, :1] * rgb, Y[:, 1:] * rgb  # contiguous each, since optimizers read them
-        inactive = bands - shN.shape[1]
+        inactive = n_bands - shN.shape[1]
         g["shN"] = torch.nn.functional.pad(shN, (0, 0, 0, inactive)) if inactive else shN
     return Grads({name: value.reshape(like[name].shape) for name, value in g.items() if name in like})
 
@@ -82,6 +86,7 @@ class InPlaceMerge:
         t: int,
         *,
         before: Mapping[str, Tensor],
+        lr_colour: Colour | None = None,
         scale: float = 1.0,
         must_be_finite: bool = True,
     ) -> Mapping[str, Number]:
@@ -90,6 +95,7 @@ class InPlaceMerge:
         Args:
             params: the leaves by gsplat's names; those without `.grad` are frozen and stay so, but for "detail".
             before: `.grad` as it was when the backward pass began, by name, where it was there.
+            lr_colour: what `.grad` of sh0 and shN lacks of this pass, where `takes_factors`.
             scale: of the loss: an AMP gradient scaler's, or 1 / the number of accumulated passes.
 
         Returns:
@@ -99,7 +105,8 @@ class InPlaceMerge:
             DivergedError: a merged gradient in the CPU's memory is not finite, and `must_be_finite`: False for a trainer with an
                 AMP gradient scaler, which skips such a step.
         """
-        trained = {name: p for name, p in params.items() if p.grad is not None or name == "detail"}
+        factored = ("detail",) if lr_colour is None else ("detail", "sh0", "shN")
+        trained = {name: p for name, p in params.items() if p.grad is not None or name in factored}
         whole = [p for p in trained.values() if p.dtype not in _HALF]
         merge = kernel.compiled(whole) if self.compiled and whole else None
         if merge is None:
@@ -110,8 +117,8 @@ class InPlaceMerge:
         rule = self._rule if λ > 0 else None
         evidence = None if hr is None else hr.step.evidence
         counts, finite = merge(
-            rows, rule, None if evidence is None else evidence.reliability, colour=None if hr is None else hr.colour,
-            lambda_hr=λ, scale=scale,
+            rows, rule, None if evidence is None else evidence.reliability, lr_colour=lr_colour,
+            colour=None if hr is None else hr.colour, lambda_hr=λ, scale=scale,
         )  # fmt: skip
         for name, p in trained.items():
             _give(p, rows[name].out)
@@ -124,12 +131,16 @@ class InPlaceMerge:
             rule.report(counts, groups, evidence is not None)
         return counts.ratios(groups)
 
+    def takes_factors(self, params: Mapping[str, Tensor]) -> bool:
+        """Whether the gradient of the colours may come by its factors: whether these parameters take the compiled pass."""
+        return self.compiled and kernel.compiled(params.values()) is not None
+
     def _rows(self, name: str, p: Tensor, hr: RoutedGradients | None, before: Tensor | None, anchor: Anchor) -> Rows:
         lr = None if p.grad is None or name == "detail" else p.grad.detach().float().contiguous()
         g_hr = None if hr is None else hr.detail if name == "detail" else hr.grads.get(name)
         target = anchor.targets.get(name)
         return Rows(
-            torch.empty_like(p, dtype=torch.float32, memory_format=torch.contiguous_format) if lr is None else lr,
+            kernel.empty_like(p) if lr is None else lr,
             lr,
             None if before is None else before.float().contiguous(),
             None if g_hr is None else g_hr.float().contiguous(),

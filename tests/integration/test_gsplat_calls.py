@@ -13,6 +13,7 @@ from clear_strategies import P2G, Conductor, RandomBackground
 from clear_strategies.core.view import View
 from clear_strategies.errors import SettingError
 from clear_strategies.geometry.projection import intrinsics
+from clear_strategies.merging.in_place import InPlaceMerge
 from integration import HostError
 from integration.gsplat import attach
 from rasterizers import autograd
@@ -100,18 +101,44 @@ def test_the_detail_feature_is_trained_in_a_loop_that_tells_every_optimizer_what
     assert float(host.splats["detail"].detach().abs().max()) > 0
 
 
-def test_gradients_that_a_loop_asks_for_beside_its_backward_pass_leave_the_merge_to_it():
+@pytest.mark.parametrize("asked", ["means", "shN"])
+def test_gradients_that_a_loop_asks_for_beside_its_backward_pass_leave_the_merge_to_it(asked):
     merged = []
     for asks in (False, True):
         host, clear, render = started()
         for i in range(2):  # the second with gradients of the first, which are not zeroed
             image = render(i)
             if asks:
-                torch.autograd.grad(image.square().mean(), host.splats["means"], retain_graph=True)
+                (asked_for,) = torch.autograd.grad(image.square().mean(), host.splats[asked], retain_graph=True)
+                assert asked_for.any()
             image.mean().backward()
         merged.append({name: p.grad for name, p in host.splats.items() if p.grad is not None})
         assert clear.attachment.counts["merges"] == 2
     assert all(torch.equal(g, merged[1][name]) for name, g in merged[0].items())
+
+
+@pytest.mark.parametrize("penalty", [0.0, 1e-3])
+def test_the_gradient_of_the_colours_comes_by_its_factors_but_where_a_hook_looks_at_it(penalty, monkeypatch):
+    by_factors, merge = [], InPlaceMerge.__call__
+
+    def spied(self, *arguments, lr_colour, **settings):
+        by_factors.append(lr_colour is not None)
+        return merge(self, *arguments, lr_colour=lr_colour, **settings)
+
+    monkeypatch.setattr(InPlaceMerge, "__call__", spied)
+    merged = []
+    for hooked in (False, True):
+        host, _, render = started()
+        host.splats["shN"].data += 0.1
+        seen = []
+        if hooked:
+            host.splats["shN"].register_hook(seen.append)
+        for i in range(2):  # the second with gradients of the first, which are not zeroed
+            (render(i).mean() + penalty * host.splats["shN"].square().sum()).backward()
+        assert len(seen) == (2 if hooked else 0)
+        merged.append({name: p.grad for name, p in host.splats.items() if p.grad is not None})
+    assert by_factors == [True, True, False, False]
+    assert all(torch.allclose(g, merged[1][name], rtol=1e-5, atol=1e-9) for name, g in merged[0].items())
 
 
 def test_a_loop_without_backward_is_refused():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -110,6 +111,35 @@ def test_every_pass_agrees_with_the_conductor_in_float64(passes, accumulated, fa
         error = (results[0][name] - exact).flatten(1 if exact.dim() > 1 else 0).abs().max()
         assert error <= 4e-6 * exact.abs().max(), name
     assert conflicts[0] == pytest.approx(conflicts[1], abs=1e-9)
+
+
+@pytest.mark.parametrize("accumulated", [False, True])
+@pytest.mark.parametrize("hr", ["none", "rows", "factors", "factors of one basis"])
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_the_lr_gradient_of_the_colours_may_come_by_its_factors(passes, accumulated, hr, scale):
+    if passes == "torch":
+        pytest.skip("the readable path takes no factors")
+    basis = torch.rand(N, 9, generator=torch.Generator().manual_seed(8)) - 0.5
+    rgb = drawn(9, ["means"])["means"]
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        params, before, routed = setting(dtype, accumulated=accumulated, factors=hr.startswith("factors"), scale=scale)
+        lr = Colour(scale * rgb.to(dtype), basis.to(dtype))
+        if hr == "factors of one basis":
+            routed = replace(routed, colour=Colour(routed.colour.rgb, lr.basis))
+        for name in ("sh0", "shN"):
+            params[name].grad = before.get(name, torch.zeros(0)).clone() if accumulated else None
+        if dtype == torch.float64:
+            for name, g in dense({}, lr, {name: params[name] for name in ("sh0", "shN")}).items():
+                params[name].grad = g if params[name].grad is None else params[name].grad + g
+        merge = InPlaceMerge(made := conductor())
+        assert merge.takes_factors(params) == (dtype == torch.float32)
+        merge(params, None if hr == "none" else routed, T, before=before, scale=scale,
+              lr_colour=lr if merge.takes_factors(params) else None)  # fmt: skip
+        assert hr == "none" or deferred.read([made.logs()["corrected"]])[0] > 0.1
+        results.append({name: p.grad.double() for name, p in params.items()})
+    for name, exact in results[1].items():
+        assert (results[0][name] - exact).abs().max() <= 4e-6 * exact.abs().max(), name
 
 
 @pytest.mark.parametrize("names", [("means",), ("opacities", "sh0", "shN"), ("means", "quats", "scales", "detail")])

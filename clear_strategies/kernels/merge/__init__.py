@@ -19,7 +19,7 @@ from rasterizers.interface import BackendUnavailable
 from rasterizers.native import load_kernels
 from rasterizers.warp_runtime import require_warp
 
-__all__ = ["Colour", "Merge", "Merged", "Rows", "compiled"]
+__all__ = ["Colour", "Merge", "Merged", "Rows", "compiled", "empty_like"]
 
 
 def compiled(tensors: Iterable[Tensor]) -> Merge | None:
@@ -29,6 +29,14 @@ def compiled(tensors: Iterable[Tensor]) -> Merge | None:
     if any(g.dtype != torch.float32 or g.device != first.device or g.shape[1:].numel() > WIDEST for g in gradients):
         return None
     return _for_device(first.device.type)
+
+
+def empty_like(p: Tensor) -> Tensor:
+    """Contiguous float32 of this shape, not initialized; on a CPU in memory that the last gradient has left."""
+    if p.device.type == "cpu":
+        recycled: Tensor = load_kernels("rasterizers.cpp").Frame.empty(p.shape)
+        return recycled
+    return torch.empty_like(p, dtype=torch.float32, memory_format=torch.contiguous_format)
 
 
 @cache

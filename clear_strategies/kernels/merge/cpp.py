@@ -21,7 +21,8 @@ FIRST_BANDS: Final = {"sh0": 0, "shN": 1}
 
 def merge(
     attributes: Mapping[str, Rows], rule: CorrectionRule | None, q: Float[Tensor, " N"] | None, *,
-    colour: Colour | None = None, keeps_lr: bool = True, lambda_hr: float = 1.0, scale: float = 1.0,
+    lr_colour: Colour | None = None, colour: Colour | None = None,
+    keeps_lr: bool = True, lambda_hr: float = 1.0, scale: float = 1.0,
 ) -> Merged:  # fmt: skip
     """See `kernels.merge.Merge`."""
     n, kept = len(next(iter(attributes.values())).out), []
@@ -37,19 +38,23 @@ def merge(
         kept.append(x.contiguous())
         return kept[-1].data_ptr()
 
+    def factors(colour: Colour | None) -> tuple[int, int, int]:
+        if colour is None:
+            return 0, 0, 1
+        bases = colour.basis.shape[1]
+        return address(colour.rgb, 3), address(colour.basis, bases), bases
+
     tuples = []
     for name, rows in attributes.items():
-        width, first_band = rows.out.shape[1:].numel(), FIRST_BANDS.get(name, -1) if colour is not None else -1
+        width, first_band = rows.out.shape[1:].numel(), FIRST_BANDS.get(name, -1)
         if not rows.out.is_contiguous():
             raise ValueError(f"the merged gradient of {name} must be contiguous, got strides {rows.out.stride()}.")
         tensors = (rows.out, rows.lr, rows.before, rows.hr, rows.p, rows.anchor)
         tuples.append((*(address(x, width) for x in tensors), rows.stiffness, width, GROUPS[name], first_band))
-    factors = (0, 0, 1)
-    if colour is not None:
-        bases = colour.basis.shape[1]
-        factors = address(colour.rgb, 3), address(colour.basis, bases), bases
     kernels: Any = load_kernels("clear_strategies.kernels")
-    counts, finite = kernels.merge(n, tuples, factors, correction_table(rule, q), keeps_lr, lambda_hr, scale, threads())
+    counts, finite = kernels.merge(
+        n, tuples, factors(lr_colour), factors(colour), correction_table(rule, q), keeps_lr, lambda_hr, scale, threads()
+    )
     return Merged(ConflictCounts(*counts), finite)
 
 

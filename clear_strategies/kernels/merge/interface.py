@@ -23,7 +23,8 @@ class Rows:
 
     Args:
         out: receives the result; it may be `lr`.
-        lr: scale · g_LR + before. before: what the gradient was before this backward pass.
+        lr: scale · g_LR + before; for sh0 and shN without what `lr_colour` holds of it.
+        before: what the gradient was before this backward pass.
         hr: g^HR. None for sh0 and shN: from the colour, if there is one.
         p, anchor: θ and θ^a, for the pull of the anchor.
     """
@@ -38,7 +39,7 @@ class Rows:
 
 
 class Colour(NamedTuple):
-    """g^HR of the spherical harmonics as its factors, Y ⊗ ∇rgb."""
+    """A gradient of the spherical harmonics as its factors, Y ⊗ ∇rgb."""
 
     rgb: Float[Tensor, "N 3"]
     basis: Float[Tensor, "N B1"]
@@ -57,12 +58,14 @@ class Merge(Protocol):
 
     def __call__(
         self, attributes: Mapping[str, Rows], rule: CorrectionRule | None, q: Float[Tensor, " N"] | None, *,
-        colour: Colour | None = None, keeps_lr: bool = True, lambda_hr: float = 1.0, scale: float = 1.0,
+        lr_colour: Colour | None = None, colour: Colour | None = None,
+        keeps_lr: bool = True, lambda_hr: float = 1.0, scale: float = 1.0,
     ) -> Merged:  # fmt: skip
         """
         Args:
             attributes: by gsplat's names, and "detail", which is compared with nothing.
             rule: None: nothing is corrected. q: reliability; None: 0.
+            lr_colour: of scale · g_LR, and colour: of g^HR.
             keeps_lr: False: out is ĝ_HR alone.
             lambda_hr: 0: neither compared nor added.
         """

@@ -56,8 +56,17 @@ class Rows:
     anchor: wp.array[wp.float32]
     has: wp.int32
     width: wp.int32
-    first_band: wp.int32  # of g^HR = Y ⊗ ∇rgb; -1: g^HR is `hr`, or 0
+    first_band: wp.int32  # of the spherical harmonics; -1: others
     stiffness: wp.float32
+
+
+@wp.struct
+class Factors:
+    """A gradient of the spherical harmonics, Y ⊗ ∇rgb; no bases: none."""
+
+    rgb: wp.array[wp.float32]
+    basis: wp.array[wp.float32]
+    bases: wp.int32
 
 
 @wp.struct
@@ -65,7 +74,8 @@ class Options:
     """What holds for all attributes."""
 
     n: wp.int32
-    bases: wp.int32
+    lr: Factors
+    hr: Factors
     lambda_hr: wp.float32
     scale: wp.float32
     keeps_lr: wp.bool
@@ -73,37 +83,42 @@ class Options:
 
 
 @wp.func
-def low(a: Rows, at: wp.int32, o: Options) -> wp.float32:
-    """g_LR."""
-    if (a.has & 1) == 0:
+def product(f: Factors, a: Rows, i: wp.int32, d: wp.int32) -> wp.float32:
+    """The d-th number of an attribute's row of Y ⊗ ∇rgb."""
+    band = a.first_band + d / 3
+    if a.first_band < 0 or band >= f.bases:
         return 0.0
-    if (a.has & 2) != 0:
-        return (a.lr[at] - a.before[at]) * (1.0 / o.scale)
-    if o.scale != 1.0:
-        return a.lr[at] * (1.0 / o.scale)
-    return a.lr[at]
+    return f.basis[i * f.bases + band] * f.rgb[i * 3 + d % 3]
 
 
 @wp.func
-def high(
-    a: Rows, i: wp.int32, d: wp.int32, o: Options, rgb: wp.array2d[wp.float32], basis: wp.array2d[wp.float32]
-) -> wp.float32:
+def low(a: Rows, i: wp.int32, d: wp.int32, o: Options) -> wp.float32:
+    """g_LR."""
+    at = i * a.width + d
+    g = wp.float32(0.0)
+    if (a.has & 1) != 0:
+        g = a.lr[at]
+    if (a.has & 2) != 0:
+        g -= a.before[at]
+    g += product(o.lr, a, i, d)
+    if o.scale != 1.0:
+        g *= 1.0 / o.scale
+    return g
+
+
+@wp.func
+def high(a: Rows, i: wp.int32, d: wp.int32, o: Options) -> wp.float32:
     """g^HR."""
     if (a.has & 4) != 0:
         return a.hr[i * a.width + d]
-    band = a.first_band + d / 3
-    if a.first_band < 0 or band >= o.bases:
-        return 0.0
-    return basis[i, band] * rgb[i, d % 3]
+    return product(o.hr, a, i, d)
 
 
 @wp.func
-def products_of(
-    a: Rows, i: wp.int32, o: Options, rgb: wp.array2d[wp.float32], basis: wp.array2d[wp.float32]
-) -> wp.vec3d:
+def products_of(a: Rows, i: wp.int32, o: Options) -> wp.vec3d:
     total = wp.vec3d()
     for d in range(a.width):
-        g_lr, g_hr = wp.float64(low(a, i * a.width + d, o)), wp.float64(high(a, i, d, o, rgb, basis))
+        g_lr, g_hr = wp.float64(low(a, i, d, o)), wp.float64(high(a, i, d, o))
         total += wp.vec3d(g_lr * g_hr, g_lr * g_lr, g_hr * g_hr)
     return total
 
@@ -111,7 +126,7 @@ def products_of(
 @wp.kernel
 def decide(
     means: Rows, quats: Rows, scales: Rows, opacities: Rows, sh0: Rows, shN: Rows, o: Options,
-    rgb: wp.array2d[wp.float32], basis: wp.array2d[wp.float32], rule: Rule, reliability: wp.array[wp.float32],
+    rule: Rule, reliability: wp.array[wp.float32],
     multiples: wp.array[Six], counts: wp.array[Counts], omegas: wp.array[Six],
 ) -> None:  # fmt: skip
     """The multiples of g_LR that are subtracted from g^HR, and what is counted."""
@@ -119,16 +134,8 @@ def decide(
     i = block * wp.block_dim() + lane
     tally, omega = Counts(), Six()
     if i < o.n:
-        m, b, n = (
-            products_of(means, i, o, rgb, basis),
-            products_of(sh0, i, o, rgb, basis),
-            products_of(shN, i, o, rgb, basis),
-        )
-        a, s, q = (
-            products_of(opacities, i, o, rgb, basis),
-            products_of(scales, i, o, rgb, basis),
-            products_of(quats, i, o, rgb, basis),
-        )
+        m, b, n = products_of(means, i, o), products_of(sh0, i, o), products_of(shN, i, o)
+        a, s, q = products_of(opacities, i, o), products_of(scales, i, o), products_of(quats, i, o)
         total = m + b + n + a + s + q
         p = Products()
         p.dot = Seven(m[0], b[0], n[0], a[0], s[0], q[0], total[0])
@@ -145,12 +152,9 @@ def decide(
 
 
 @wp.func
-def write(
-    a: Rows, i: wp.int32, d: wp.int32, multiple: wp.float64, o: Options, rgb: wp.array2d[wp.float32],
-    basis: wp.array2d[wp.float32], finite: wp.array[wp.int32],
-) -> None:  # fmt: skip
+def write(a: Rows, i: wp.int32, d: wp.int32, multiple: wp.float64, o: Options, finite: wp.array[wp.int32]) -> None:
     at = i * a.width + d
-    g_lr, g_hr = low(a, at, o), high(a, i, d, o, rgb, basis)
+    g_lr, g_hr = low(a, i, d, o), high(a, i, d, o)
     if multiple != wp.float64(0.0):
         g_hr = wp.float32(wp.float64(g_hr) - wp.float64(g_lr) * multiple)  # Eq. 7
     total = g_hr
@@ -172,7 +176,7 @@ def write(
 @wp.kernel
 def combine(
     means: Rows, quats: Rows, scales: Rows, opacities: Rows, sh0: Rows, shN: Rows, detail: Rows, o: Options,
-    rgb: wp.array2d[wp.float32], basis: wp.array2d[wp.float32], multiples: wp.array[Six], finite: wp.array[wp.int32],
+    multiples: wp.array[Six], finite: wp.array[wp.int32],
 ) -> None:  # fmt: skip
     """Thread (i, j) writes the j-th number of Gaussian i, over the attributes side by side."""
     i, j = wp.tid()
@@ -182,46 +186,44 @@ def combine(
     zero = wp.float64(0.0)
     d = j
     if d < shN.width:
-        write(shN, i, d, m[SHN], o, rgb, basis, finite)
+        write(shN, i, d, m[SHN], o, finite)
         return
     d -= shN.width
     if d < means.width:
-        write(means, i, d, m[MEANS], o, rgb, basis, finite)
+        write(means, i, d, m[MEANS], o, finite)
         return
     d -= means.width
     if d < quats.width:
-        write(quats, i, d, m[QUATS], o, rgb, basis, finite)
+        write(quats, i, d, m[QUATS], o, finite)
         return
     d -= quats.width
     if d < scales.width:
-        write(scales, i, d, m[SCALES], o, rgb, basis, finite)
+        write(scales, i, d, m[SCALES], o, finite)
         return
     d -= scales.width
     if d < opacities.width:
-        write(opacities, i, d, m[OPACITIES], o, rgb, basis, finite)
+        write(opacities, i, d, m[OPACITIES], o, finite)
         return
     d -= opacities.width
     if d < sh0.width:
-        write(sh0, i, d, m[SH0], o, rgb, basis, finite)
+        write(sh0, i, d, m[SH0], o, finite)
         return
-    write(detail, i, d - sh0.width, zero, o, rgb, basis, finite)
+    write(detail, i, d - sh0.width, zero, o, finite)
 
 
 def merge(
     attributes: Mapping[str, interface.Rows], rule: CorrectionRule | None, q: Float[Tensor, " N"] | None, *,
-    colour: interface.Colour | None = None, keeps_lr: bool = True, lambda_hr: float = 1.0, scale: float = 1.0,
+    lr_colour: interface.Colour | None = None, colour: interface.Colour | None = None,
+    keeps_lr: bool = True, lambda_hr: float = 1.0, scale: float = 1.0,
 ) -> interface.Merged:  # fmt: skip
     """See `kernels.merge.Merge`."""
     like = next(iter(attributes.values())).out
     n, device = len(like), like.device
-    rows = [_rows(name, attributes.get(name), has_colour=colour is not None) for name in _ORDER]
-    rgb, basis = (like.new_empty(0, 1, dtype=torch.float32) for _ in range(2))
-    if colour is not None:
-        rgb, basis = colour.rgb.contiguous(), colour.basis.contiguous()
+    rows = [_rows(name, attributes.get(name)) for name in _ORDER]
+    lr, hr = (c if c is None else interface.Colour(*(x.contiguous() for x in c)) for c in (lr_colour, colour))
     lanes, corrects = _LANES[device.type], rule is not None and lambda_hr > 0
     o = struct(
-        Options, {}, n=n, bases=1 if colour is None else basis.shape[1], lambda_hr=lambda_hr, scale=scale, keeps_lr=keeps_lr,
-        corrects=corrects,
+        Options, {}, n=n, lr=_factors(lr), hr=_factors(hr), lambda_hr=lambda_hr, scale=scale, keeps_lr=keeps_lr, corrects=corrects
     )  # fmt: skip
     blocks = -(-n // lanes) if lambda_hr > 0 else 0
     counts = like.new_empty(blocks, 27, dtype=torch.int32)
@@ -229,10 +231,10 @@ def merge(
     finite = like.new_ones(1, dtype=torch.int32)
     reliability = None if q is None else q.float().contiguous()
     decided = (
-        *rows[:-1], o, array(rgb), array(basis), rule_of(rule, reliability), array(reliability), array(multiples, Six),
+        *rows[:-1], o, rule_of(rule, reliability), array(reliability), array(multiples, Six),
         array(counts, Counts), array(omegas, Six),
     )  # fmt: skip
-    combined = *rows, o, array(rgb), array(basis), array(multiples, Six), array(finite)
+    combined = *rows, o, array(multiples, Six), array(finite)
     with on_stream(device):
         launch(decide, [blocks], decided, device, block=lanes, together=True)
         launch(combine, [n, sum(row.width for row in rows)], combined, device, block=lanes)
@@ -242,7 +244,13 @@ def merge(
     return interface.Merged(ConflictCounts(comparable, opposed, corrected, omega, at_lower_bound), finite[0])
 
 
-def _rows(name: str, rows: interface.Rows | None, *, has_colour: bool) -> Any:
+def _factors(colour: interface.Colour | None) -> Any:
+    if colour is None:
+        return struct(Factors, {})
+    return struct(Factors, colour._asdict(), bases=colour.basis.shape[1])
+
+
+def _rows(name: str, rows: interface.Rows | None) -> Any:
     """An attribute as the kernels take it; one that is absent has no numbers."""
     if rows is None:
         return struct(Rows, {})
@@ -250,5 +258,5 @@ def _rows(name: str, rows: interface.Rows | None, *, has_colour: bool) -> Any:
     return struct(
         Rows, tensors, has=sum(1 << k for k, field in enumerate(_ROWS[1:]) if tensors[field] is not None),
         width=rows.out.shape[1:].numel(), stiffness=rows.stiffness,
-        first_band={"sh0": 0, "shN": 1}.get(name, -1) if has_colour else -1,
+        first_band={"sh0": 0, "shN": 1}.get(name, -1),
     )  # fmt: skip

@@ -13,14 +13,19 @@ using RowsOfAttribute = std::tuple<Address, Address, Address, Address, Address, 
 
 inline float* at(Address a) { return reinterpret_cast<float*>(a); }
 
-// Merges attributes (out, lr, before, hr, p, anchor, stiffness, width, group, first band) in place; `colour` is (rgb, basis, bases).
-// Returns `counts`, and whether every number of the result is finite.
-inline nb::tuple merge_gradients(std::int64_t n, const std::vector<RowsOfAttribute>& attributes, std::tuple<Address, Address, int> colour,
-                                 nb::object correction, bool keeps_lr, double lambda_hr, double scale, int threads) {
-  Tensors tensors;
+inline ColourFactors factors_at(std::tuple<Address, Address, int> colour) {
   auto [rgb, basis, bases] = colour;
-  Merge m{.n = n, .basis = at(basis), .colour = at(rgb), .bases = bases, .keeps_lr = keeps_lr, .lambda_hr = float(lambda_hr), .scale = float(scale)};
   if (bases < 1 || bases > kLanes) throw nb::value_error("the basis must have 1 to 16 columns");
+  return {at(rgb), at(basis), bases};
+}
+
+// Merges attributes (out, lr, before, hr, p, anchor, stiffness, width, group, first band) in place; a colour is (rgb, basis, bases).
+// Returns `counts`, and whether every number of the result is finite.
+inline nb::tuple merge_gradients(std::int64_t n, const std::vector<RowsOfAttribute>& attributes, std::tuple<Address, Address, int> lr_colour,
+                                 std::tuple<Address, Address, int> colour, nb::object correction, bool keeps_lr, double lambda_hr, double scale,
+                                 int threads) {
+  Tensors tensors;
+  Merge m{.n = n, .lr = factors_at(lr_colour), .hr = factors_at(colour), .keeps_lr = keeps_lr, .lambda_hr = float(lambda_hr), .scale = float(scale)};
   if (attributes.size() > kGroups + 1) throw nb::value_error("there are at most seven attributes");
   for (auto [out, lr, before, hr, p, anchor, stiffness, width, group, first_band] : attributes) {
     if (width < 0 || width > kWidest) throw nb::value_error("an attribute must have 0 to 45 numbers a row");
@@ -38,7 +43,7 @@ inline nb::tuple merge_gradients(std::int64_t n, const std::vector<RowsOfAttribu
 }
 
 inline void bind_merge(nb::module_& m) {
-  m.def("merge", &merge_gradients, nb::arg("n"), nb::arg("attributes"), nb::arg("colour"), nb::arg("correction").none(),
+  m.def("merge", &merge_gradients, nb::arg("n"), nb::arg("attributes"), nb::arg("lr_colour"), nb::arg("colour"), nb::arg("correction").none(),
         nb::arg("keeps_lr"), nb::arg("lambda_hr"), nb::arg("scale"), nb::arg("threads"));
 }
 

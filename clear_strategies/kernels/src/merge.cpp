@@ -17,20 +17,21 @@ CLEAR_INLINE const float* block_of(const float* rows, std::int64_t i, int count,
   return copy;
 }
 
-// Sixteen rows of Y ⊗ colour: band `first_band` + j / 3 and channel j % 3 for number j.
-CLEAR_INLINE void expand(const Merge& m, const MergedRows& a, const RowPlan& plan, std::int64_t i, int count, float* to) {
+// Sixteen rows of Y ⊗ ∇rgb, from the same rows of its factors: band `first_band` + j / 3 and channel j % 3 for number j.
+CLEAR_INLINE void expand(const float* rgb_rows, const float* basis, int bases, const MergedRows& a, const RowPlan& plan, int count,
+                         float* to) {
   if (count < kLanes) std::fill_n(to, kLanes * a.width, 0.0f);
   if (a.first_band == 0) {
     Floats rgb[3], Y0[1];
-    load_columns(m.colour + 3 * i, count, rgb), load_columns(m.basis + m.bases * i, count, Y0, m.bases);
+    load_columns(rgb_rows, count, rgb), load_columns(basis, count, Y0, bases);
     for (Floats& channel : rgb) channel *= Y0[0];
     join_rows(to, rgb);
     return;
   }
   float colour[4 * kLanes] = {};  // padded, because reads are sixteen wide
-  std::copy_n(m.colour + 3 * i, 3 * count, colour);
+  std::copy_n(rgb_rows, 3 * count, colour);
   for (int k = 0; k < count; ++k, to += a.width) {
-    Floats Y = load_some(m.basis + m.bases * (i + k), m.bases), rgb = Floats::load(colour + 3 * k);
+    Floats Y = load_some(basis + bases * k, bases), rgb = Floats::load(colour + 3 * k);
     float few[kLanes];  // of a row of less than sixteen numbers
     float* row = a.width < kLanes ? few : to;
     for (int v = 0; v < plan.sixteens; ++v) (pick(Y, plan.band[v]) * pick(rgb, plan.channel[v])).store(row + plan.offset[v]);
@@ -78,6 +79,7 @@ class ChunkMerge {
  public:
   ChunkMerge(const Merge& m, const Correction* correction) : m(m), correction(correction) {
     for (const MergedRows& a : m.attributes) plans.emplace_back(a.width);
+    one_basis = m.keeps_lr && m.lambda_hr > 0 && m.lr.rgb && m.hr.rgb && m.lr.basis == m.hr.basis && m.lr.bases == m.hr.bases;
   }
 
   Merged run(std::int64_t number) const {
@@ -92,6 +94,7 @@ class ChunkMerge {
   const Merge& m;
   const Correction* correction;
   std::vector<RowPlan> plans;
+  bool one_basis;  // of both gradients of the colours
 
   struct Gradients {
     const float *l, *h;
@@ -103,6 +106,10 @@ class ChunkMerge {
     Products p[kGroups];
     for (std::size_t k = 0; k < m.attributes.size(); ++k) {
       const MergedRows& a = m.attributes[k];
+      if (in_factors(a)) {
+        p[kShN] = products_of_factors(i, count);
+        continue;
+      }
       read(a, plans[k], i, count, rows[k]);
       if (a.group < kGroups && m.lambda_hr > 0) p[a.group] = products_of(rows[k].l, rows[k].h, a.width);
     }
@@ -110,23 +117,60 @@ class ChunkMerge {
     if (m.lambda_hr > 0) multiples = decide(p, correction, i, count, tally);
     for (std::size_t k = 0; k < m.attributes.size(); ++k) {
       const MergedRows& a = m.attributes[k];
+      if (in_factors(a)) {
+        merge_factors(a, plans[k], multiples, i, count, rows[k]);
+        write(a, rows[k], 0, i, count, finite);
+        continue;
+      }
       if (a.group < kGroups && multiples.any[a.group]) correct_rows(rows[k], a.width, multiples.of[a.group]);
-      write(a, rows[k], i, count, finite);
+      write(a, rows[k], m.lambda_hr, i, count, finite);
     }
   }
 
+  // Whether both gradients are Y ⊗ ∇rgb with one Y, so that they are compared, corrected and added as ∇rgb.
+  bool in_factors(const MergedRows& a) const { return one_basis && a.group == kShN && !a.lr && !a.before && !a.hr; }
+
+  CLEAR_INLINE void load_factors(std::int64_t i, int count, Floats (&l)[3], Floats (&h)[3]) const {
+    load_columns(m.lr.rgb + 3 * i, count, l), load_columns(m.hr.rgb + 3 * i, count, h);
+    if (m.scale != 1)
+      for (Floats& channel : l) channel *= 1 / m.scale;
+  }
+
+  CLEAR_INLINE Products products_of_factors(std::int64_t i, int count) const {
+    Floats l[3], h[3];
+    load_factors(i, count, l, h);
+    Products rgb = products(l, h);
+    Doubles Y2 = basis_products(m.lr.basis, m.lr.basis, m.lr.bases, i, count).lr2;
+    return {Y2 * rgb.dot, Y2 * rgb.l2, Y2 * rgb.h2};
+  }
+
+  // The merged rows, as those of LR.
+  CLEAR_INLINE void merge_factors(const MergedRows& a, const RowPlan& plan, const Multiples& multiples, std::int64_t i, int count,
+                                  Gradients& g) const {
+    Floats l[3], h[3];
+    load_factors(i, count, l, h);
+    correct(multiples, kShN, h, l);  // Eq. 7
+    for (int c = 0; c < 3; ++c) l[c] += h[c] * Floats(m.lambda_hr);  // Eq. 8
+    alignas(64) float rgb[3 * kLanes];
+    join_rows(rgb, l);
+    expand(rgb, m.lr.basis + m.lr.bases * i, m.lr.bases, a, plan, count, g.l_copy);
+    g.l = g.h = g.l_copy;
+  }
+
   void read(const MergedRows& a, const RowPlan& plan, std::int64_t i, int count, Gradients& g) const {
+    const bool from_colour = a.first_band >= 0 && m.lr.rgb;
     g.l = block_of(a.lr, i, count, a.width, g.l_copy);
-    if (a.lr && (a.before || m.scale != 1)) {
-      float zeros[kBlock];
+    if (from_colour || (a.lr && (a.before || m.scale != 1))) {
+      float zeros[kBlock], product[kBlock] = {};
       const float* before = block_of(a.before, i, count, a.width, zeros);
+      if (from_colour) expand(m.lr.rgb + 3 * i, m.lr.basis + m.lr.bases * i, m.lr.bases, a, plan, count, product);
       Floats per_scale = 1 / m.scale;
       for (int j = 0; j < kLanes * a.width; j += kLanes)
-        ((Floats::load(g.l + j) - Floats::load(before + j)) * per_scale).store(g.l_copy + j);
+        ((Floats::load(g.l + j) - Floats::load(before + j) + Floats::load(product + j)) * per_scale).store(g.l_copy + j);
       g.l = g.l_copy;
     }
-    if (!a.hr && a.first_band >= 0 && m.colour) {
-      expand(m, a, plan, i, count, g.h_copy);
+    if (!a.hr && a.first_band >= 0 && m.hr.rgb) {
+      expand(m.hr.rgb + 3 * i, m.hr.basis + m.hr.bases * i, m.hr.bases, a, plan, count, g.h_copy);
       g.h = g.h_copy;
     } else {
       g.h = block_of(a.hr, i, count, a.width, g.h_copy);
@@ -145,8 +189,8 @@ class ChunkMerge {
     }
   }
 
-  void write(const MergedRows& a, const Gradients& g, std::int64_t i, int count, bool& finite) const {
-    Floats λ = m.lambda_hr, scale = m.scale, stiffness = a.stiffness, most = std::numeric_limits<float>::max();
+  void write(const MergedRows& a, const Gradients& g, float lambda_hr, std::int64_t i, int count, bool& finite) const {
+    Floats λ = lambda_hr, scale = m.scale, stiffness = a.stiffness, most = std::numeric_limits<float>::max();
     float last[kLanes];
     std::int64_t from = i * a.width;
     int numbers = count * a.width;
@@ -154,7 +198,7 @@ class ChunkMerge {
       int few = std::min(kLanes, numbers - j);
       Floats total = Floats::load(g.h + j);
       if (m.keeps_lr) {
-        total = m.lambda_hr > 0 ? Floats::load(g.l + j) + total * λ : Floats::load(g.l + j);  // Eq. 8
+        total = lambda_hr > 0 ? Floats::load(g.l + j) + total * λ : Floats::load(g.l + j);  // Eq. 8
         if (a.anchor) total += (load_some(a.p + from + j, few) - load_some(a.anchor + from + j, few)) * stiffness;  // Eq. 16
         if (m.scale != 1) total = total * scale;
         if (a.before) total += load_some(a.before + from + j, few);

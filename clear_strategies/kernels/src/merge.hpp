@@ -10,9 +10,9 @@ namespace clear {
 
 // One attribute's gradients [n, width]; a pointer may be null.
 struct MergedRows {
-  const float* lr;      // scale · g_LR + before; null: 0
+  const float* lr;      // scale · g_LR + before; null: 0; without what `Merge::lr` holds of it
   const float* before;  // what the gradient was before this backward pass; null: 0
-  const float* hr;      // g^HR; null: 0, or Y ⊗ colour from `first_band` on
+  const float* hr;      // g^HR; null: 0, or what `Merge::hr` holds of it
   int first_band;       // of the spherical harmonics; -1: none
   const float *p, *anchor;
   float stiffness;
@@ -20,11 +20,16 @@ struct MergedRows {
   int width, group;     // group: kGroups for f_det, which is compared with nothing
 };
 
+// A gradient of the spherical harmonics, Y ⊗ ∇rgb, by its factors [n, 3] and [n, bases]; none where rgb is null.
+struct ColourFactors {
+  const float *rgb = nullptr, *basis = nullptr;
+  int bases = 1;
+};
+
 struct Merge {
   std::int64_t n;
   std::vector<MergedRows> attributes;
-  const float *basis = nullptr, *colour = nullptr;  // Y [n, bases] and ∇rgb [n, 3] of g^HR
-  int bases = 1;
+  ColourFactors lr, hr;  // that of LR times the scale
   bool keeps_lr = true;  // false: out is the corrected g^HR alone
   float lambda_hr = 0, scale = 1;
 };
