@@ -41,6 +41,7 @@ class GradientColumns:
     lr: Float[Tensor, "N D"]
     hr: Float[Tensor, "N D"]
     member: Float[Tensor, "D G"]
+    work: Float[Tensor, "N D"]  # one buffer for all that is computed: fresh pages cost more than the arithmetic
 
     @classmethod
     def of(
@@ -54,17 +55,16 @@ class GradientColumns:
                 f"{', '.join(lr) or 'none'}, hr has {', '.join(hr) or 'none'}. Name them so."
             )
         widths = tuple((name, lr[name].shape[1:].numel()) for name in names)
-        return cls(names, _side_by_side(lr, names), _side_by_side(hr, names), _member(widths, str(lr[names[0]].device)))
+        low, high = _side_by_side(lr, names), _side_by_side(hr, names)
+        return cls(names, low, high, _member(widths, str(low.device)), torch.empty_like(low))
 
     def products(self) -> Products:
-        work = self.lr * self.hr  # one buffer for all three: fresh pages cost more than the arithmetic
-        dot = work @ self.member
-        l2 = torch.mul(self.lr, self.lr, out=work) @ self.member
-        return Products(dot, l2, torch.mul(self.hr, self.hr, out=work) @ self.member)
+        pairs = (self.lr, self.hr), (self.lr, self.lr), (self.hr, self.hr)
+        return Products(*(torch.mul(a, b, out=self.work) @ self.member for a, b in pairs))
 
     def minus(self, multiple: Float[Tensor, "N G"], like: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The difference h - multiple · l by group, with the shapes and the type of `like`. It takes the place of `hr`."""
-        corrected = self.hr.sub_((multiple @ self.member.T).mul_(self.lr))
+        corrected = self.hr.sub_(torch.mm(multiple, self.member.T, out=self.work).mul_(self.lr))
         widths = [like[name].shape[1:].numel() for name in self.names]
         parts = corrected.to(like[self.names[0]].dtype).split_with_sizes(widths, 1)
         return {
