@@ -159,17 +159,25 @@ class ChunkMerge {
 
   void read(const MergedRows& a, const RowPlan& plan, std::int64_t i, int count, Gradients& g) const {
     const bool from_colour = a.first_band >= 0 && m.lr.rgb;
-    g.l = block_of(a.lr, i, count, a.width, g.l_copy);
-    if (from_colour || (a.lr && (a.before || m.scale != 1))) {
-      float zeros[kBlock], product[kBlock] = {};
+    float product[kBlock];
+    if (from_colour) expand(m.lr.rgb + 3 * i, m.lr.basis + m.lr.bases * i, m.lr.bases, a, plan, count, a.lr ? product : g.l_copy);
+    g.l = from_colour && !a.lr ? g.l_copy : block_of(a.lr, i, count, a.width, g.l_copy);
+    if (a.lr && (from_colour || a.before)) {
+      float zeros[kBlock];
       const float* before = block_of(a.before, i, count, a.width, zeros);
-      if (from_colour) expand(m.lr.rgb + 3 * i, m.lr.basis + m.lr.bases * i, m.lr.bases, a, plan, count, product);
-      Floats per_scale = 1 / m.scale;
-      for (int j = 0; j < kLanes * a.width; j += kLanes)
-        ((Floats::load(g.l + j) - Floats::load(before + j) + Floats::load(product + j)) * per_scale).store(g.l_copy + j);
+      for (int j = 0; j < kLanes * a.width; j += kLanes) {
+        Floats own = Floats::load(g.l + j) - Floats::load(before + j);
+        (from_colour ? own + Floats::load(product + j) : own).store(g.l_copy + j);
+      }
       g.l = g.l_copy;
     }
-    if (!a.hr && a.first_band >= 0 && m.hr.rgb) {
+    if (m.scale != 1 && (a.lr || from_colour)) {
+      for (int j = 0; j < kLanes * a.width; j += kLanes) (Floats::load(g.l + j) * Floats(1 / m.scale)).store(g.l_copy + j);
+      g.l = g.l_copy;
+    }
+    if (m.keeps_lr && m.lambda_hr == 0) {
+      g.h = g.l;  // not added
+    } else if (!a.hr && a.first_band >= 0 && m.hr.rgb) {
       expand(m.hr.rgb + 3 * i, m.hr.basis + m.hr.bases * i, m.hr.bases, a, plan, count, g.h_copy);
       g.h = g.h_copy;
     } else {
