@@ -32,27 +32,16 @@ STEP_ASIDE: Final = "take a step to the side from photo to photo, in place of tu
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One posed photo.
+    """One posed photo. Readers never call `load`, `shown` and `transparency`, which decode it."""
 
-    Args:
-        name: unique in its capture, e.g. the file's name.
-        camera: pinhole (undistorted), on the pixel grid of the image that `load` returns.
-        load: decodes the image, float32 [H, W, 3] in [0, 1]. Readers never call it; the size is in `camera`.
-        split: "train" or "test" where the data set itself defines the split (Blender), else None.
-        sfm_id: the frame's id in `SfmPoints.track_image`, or None.
-        lens: as the data set gives it, before it was fitted to the photo and undistorted; None: the camera was exact.
-        shown: decodes the photo's mask at the photo's own size, False at hidden pixels; None: there is no mask.
-        transparency: decodes 1 - alpha at the photo's own size; None: its file has no alpha.
-    """
-
-    name: str
-    camera: Camera
+    name: str  # unique in its capture, e.g. the file's name
+    camera: Camera  # a pinhole, on the pixel grid of what `load` returns
     load: Callable[[], Float[Tensor, "H W 3"]]
-    split: str | None = None
-    sfm_id: int | None = None
-    lens: Lens | None = None
-    shown: Callable[[], Bool[Tensor, "H W"]] | None = None
-    transparency: Callable[[], Float[Tensor, "H W"]] | None = None
+    split: str | None = None  # "train" or "test" where the data set itself defines the split (Blender)
+    sfm_id: int | None = None  # in `SfmPoints.track_image`
+    lens: Lens | None = None  # as the data set gives it; None: the camera was exact
+    shown: Callable[[], Bool[Tensor, "H W"]] | None = None  # its mask, False at hidden pixels
+    transparency: Callable[[], Float[Tensor, "H W"]] | None = None  # 1 - alpha; None: its file has no alpha
 
     @staticmethod
     def of_photo(
@@ -70,27 +59,29 @@ class Frame:
         """The frame of a file, with the lens fitted to the photo's real size. Reads the file's header only.
 
         Args:
-            lens: for the photo at any size.
+            lens: for the photo, and for its mask, at any size.
             pose: world to camera, OpenCV axes.
             upright: the lens is that of the photo as its EXIF block turns it. None: for a photo on its side, the lens's shape
                 decides this; other turned photos are refused.
             background: behind transparent pixels; None: black, logged.
-            mask: an image of the photo's shape, at any size, see `read_mask`; `masks_of` finds it.
-
-        Raises:
-            DataError: the photo is not there, or it or its mask has another aspect ratio than the lens.
+            mask: see `read_mask`; `masks_of` finds it.
         """
         turn = _turned_as(path, lens) if upright is None else upright
         width, height = image_size(path, turn=turn)
         fitted = lens.resized(width, height, path)
         pinhole = fitted.undistorted(path)
         camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, width, height)
-        load = partial(_load, path, fitted, pinhole, background, turn)
+        load = partial(_load, path, fitted, pinhole, turn)
         if mask is not None:
             check_mask(mask, fitted, turn)
         shown = None if mask is None else partial(read_mask, mask, fitted, pinhole, turn)
-        through = partial(_load_transparency, path, fitted, pinhole, turn) if has_alpha(path) else None
-        return Frame(name, camera, load, split=split, sfm_id=sfm_id, lens=lens, shown=shown, transparency=through)
+
+        def transparency() -> Float[Tensor, "H W"]:
+            """The photo over white less the photo over black."""
+            return (load((1.0, 1.0, 1.0)) - load(BLACK)).mean(dim=2).clamp(0, 1)
+
+        through = transparency if has_alpha(path) else None
+        return Frame(name, camera, partial(load, background), split, sfm_id, lens, shown, through)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,10 +102,8 @@ class Capture:
     Args:
         background: the colour behind the scene (white for Blender's RGBA).
         notes: label -> fact for the printed plan (the source of the poses, what was undistorted …).
-        own_prior: builds the prior of `prior=auto` from the functions that load the photos, by the frames' names; None: the
-            capture has no prior of its own, as every capture of real photos.
-        depth: the exact depth (z) through each pixel's centre of a camera, float32 [H, W], infinite where there is no
-            surface; None: unknown.
+        own_prior: makes the prior of `prior=auto` of what loads the photos, by the frames' names; real photos have none.
+        depth: the exact depth (z) through each pixel's centre of a camera, infinite without a surface; None: unknown.
         unplaced: why the pose is unknown, by the names of such photos.
     """
 
@@ -129,16 +118,13 @@ class Capture:
 
 
 def sorted_by_name(frames: Sequence[Frame], file: Path) -> tuple[Frame, ...]:
-    """Frames in order of names; the DataErrors of `require_names`."""
+    """Frames in order of names, after `require_names`."""
     require_names(frames, file)
     return tuple(sorted(frames, key=lambda frame: frame.name))
 
 
 def require_names(frames: Sequence[Frame], file: Path) -> None:
-    """Raise a DataError where two frames have the same name, a name leads out of a folder, or there is no frame.
-
-    Images are written by these names, e.g. by `data.save_lr`.
-    """
+    """A DataError where two frames have the same name, it leads out of a folder where images are written, or there is none."""
     if not frames:
         raise DataError(file, "frames", "there is none", "give a capture with at least one posed photo")
     for name, following in itertools.pairwise(sorted(frame.name for frame in frames)):
@@ -146,8 +132,8 @@ def require_names(frames: Sequence[Frame], file: Path) -> None:
             raise DataError(file, "file name", f"{name!r} belongs to two frames", "give each photo one pose")
     for path in (PurePosixPath(frame.name) for frame in frames):
         if path.is_absolute() or ".." in path.parts:
-            problem = f"'{path}' leads out of the folder of the photos"
-            raise DataError(file, "file name", problem, "put the photos, or links to them, below one folder")
+            remedy = "put the photos, or links to them, below one folder"
+            raise DataError(file, "file name", f"'{path}' leads out of the folder of the photos", remedy)
 
 
 def lens_notes(frames: Sequence[Frame]) -> dict[str, str]:
@@ -179,12 +165,6 @@ def _turned_as(path: Path, lens: Lens) -> bool | None:
     return None if stored == image_size(path, turn=True) else (width > height) != (lens.width > lens.height)
 
 
-def _load(path: Path, lens: Lens, pinhole: Lens, background: Color | None, turn: bool | None) -> Float[Tensor, "H W 3"]:
+def _load(path: Path, lens: Lens, pinhole: Lens, turn: bool | None, background: Color | None) -> Float[Tensor, "H W 3"]:
     image = read_image(path, background=background, expect=(lens.width, lens.height), turn=turn)
     return lens.undistort(image, pinhole) if lens.distorts else image
-
-
-def _load_transparency(path: Path, lens: Lens, pinhole: Lens, turn: bool | None) -> Float[Tensor, "H W"]:
-    """The photo over white less the photo over black."""
-    white, black = (_load(path, lens, pinhole, (c, c, c), turn) for c in (1.0, 0.0))
-    return (white - black).mean(dim=2).clamp(0, 1)

@@ -33,6 +33,10 @@ _TERMS: Final = {
     "OPENCV_FISHEYE": _FISHEYE, "THIN_PRISM_FISHEYE": _FISHEYE, "RAD_TAN_THIN_PRISM_FISHEYE": _FISHEYE,
 }  # fmt: skip
 _UNDISTORT: Final = "colmap image_undistorter --image_path images --input_path sparse/0 --output_path undistorted"
+_CUT: Final = (
+    "cut panoramas into flat photos: "
+    "ns-process-data images --camera-type equirectangular --data images --output-dir flat"
+)
 _BORDER_SAMPLES: Final = 33
 _Coordinate = Annotated[float, Meta(gt=-FARTHEST, lt=FARTHEST)]
 _Rows = Annotated[
@@ -42,11 +46,8 @@ _Rows = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """Intrinsics in pixels of a width × height image whose first pixel is centred at (0.5, 0.5).
-
-    Args:
-        distortion: the first of OpenCV's (k1, k2, p1, p2, k3, k4, k5, k6), or with `fisheye` of (k1, k2, k3, k4); empty: a
-            pinhole.
+    """Intrinsics in pixels of a width × height image whose first pixel is centred at (0.5, 0.5), and the first of OpenCV's
+    (k1, k2, p1, p2, k3, k4, k5, k6), or with `fisheye` of (k1, k2, k3, k4); none: a pinhole.
     """
 
     width: int
@@ -59,11 +60,7 @@ class Lens:
     fisheye: bool = False
 
     def check(self, file: Path, where: str) -> Lens:
-        """The lens itself, if its numbers are plausible.
-
-        Raises:
-            DataError: a number is not finite, or no camera has it.
-        """
+        """The lens itself, if its numbers are plausible; a DataError if one is not finite, or no camera has it."""
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if not all(math.isfinite(x) and abs(x) < 1e12 for x in numbers):
             raise DataError(file, where, f"has intrinsics that are not finite: {numbers}", "estimate the cameras again")
@@ -93,37 +90,28 @@ class Lens:
         return np.array([*self.distortion, *[0.0] * (4 - len(self.distortion))])
 
     def resized(self, width: int, height: int, file: Path) -> Lens:
-        """The same lens for an image scaled to another size, each axis by its own factor.
-
-        Raises:
-            DataError: the two sizes have another aspect ratio, beyond a pixel of rounding: `file` is another image.
+        """The same lens for an image scaled to another size, each axis by its own factor; a DataError where the two sizes differ
+        in their aspect ratio, beyond a pixel of rounding: `file` is another image.
         """
         low = max((width - 1) / self.width, (height - 1) / self.height)
         high = min((width + 1) / self.width, (height + 1) / self.height)
         if low > high:
-            raise DataError(
-                file, "size", f"is {width}x{height}, but its camera is for {self.width}x{self.height}: another shape",
-                "use the images that the cameras were estimated from, or a scaled copy of them",
-            )  # fmt: skip
-        sx, sy = width / self.width, height / self.height
-        return replace(
-            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
-        )
+            problem = f"is {width}x{height}, but its camera is for {self.width}x{self.height}: another shape"
+            remedy = "use the images that the cameras were estimated from, or a scaled copy of them"
+            raise DataError(file, "size", problem, remedy)
+        x, y = width / self.width, height / self.height
+        return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
     def undistorted(self, file: Path) -> Lens:
-        """The pinhole of the undistorted image: the same size, zoomed so that every pixel has data.
-
-        Raises:
-            DataError: there is no such pinhole, because the distortion folds the image over itself.
+        """The pinhole of the undistorted image: the same size, zoomed so that every pixel has data; a DataError where there is
+        none, because the distortion folds the image over itself.
         """
-        if not self.distorts:
-            return replace(self, distortion=())
-        pinhole = _filled_pinhole(self)
+        pinhole = _filled_pinhole(self) if self.distorts else replace(self, distortion=())
         if pinhole is None:
+            problem = f"{self.distortion} cannot be removed from a {self.width}x{self.height} image"
             raise DataError(
-                file, "distortion", f"{self.distortion} cannot be removed from a {self.width}x{self.height} image",
-                "check the camera, or undistort the images first (e.g. with `colmap image_undistorter`)",
-            )  # fmt: skip
+                file, "distortion", problem, f"check the camera, or undistort the images first: {_UNDISTORT}"
+            )
         return pinhole
 
     def undistort(self, image: Float[Tensor, "H W 3"], pinhole: Lens) -> Float[Tensor, "H W 3"]:
@@ -147,14 +135,11 @@ def lens_of(
     pinhole: tuple[float, float, float, float],
     terms: Mapping[str, float],
 ) -> Lens:
-    """The lens of a camera model that a file names.
+    """The lens of a camera model that a file names; a DataError where OpenCV cannot undistort it.
 
     Args:
         pinhole: fx, fy, cx, cy.
         terms: its coefficients by their names, p and k counted from 1; those left out are 0.
-
-    Raises:
-        DataError: the model is not known, a coefficient that OpenCV cannot undistort is not 0, or `Lens.check` refuses it.
     """
     kept = terms_of(file, where, model)
     if rest := [name for name, value in terms.items() if value != 0 and name not in kept]:
@@ -166,23 +151,14 @@ def lens_of(
 
 def terms_of(file: Path, where: str, model: str) -> tuple[str, ...]:
     """The coefficients of a camera model that need not be 0; a DataError for a model that is not supported."""
-    if model not in _TERMS:
-        panorama = "ns-process-data images --camera-type equirectangular --data images --output-dir flat"
-        remedy = (
-            f"cut panoramas into flat photos: {panorama}"
-            if model == "EQUIRECTANGULAR"
-            else f"undistort the photos first: {_UNDISTORT}"
-        )
-        raise DataError(file, where, f"has the camera model {model[:40]}, which is not supported", remedy)
-    return _TERMS[model]
+    if model in _TERMS:
+        return _TERMS[model]
+    remedy = _CUT if model == "EQUIRECTANGULAR" else f"undistort the photos first: {_UNDISTORT}"
+    raise DataError(file, where, f"has the camera model {model[:40]}, which is not supported", remedy)
 
 
 def pose_from_opengl(file: Path, where: str, matrix: object) -> Float[Tensor, "4 4"]:
-    """World-to-camera (OpenCV axes) from a camera-to-world matrix with OpenGL axes (x right, y up, z back).
-
-    Raises:
-        DataError: not a rigid 3x4 or 4x4 matrix of finite numbers.
-    """
+    """World-to-camera (OpenCV axes) from a camera-to-world matrix with OpenGL axes (x right, y up, z back)."""
     remedy = "write camera-to-world matrices: a rotation, a translation, last row 0 0 0 1"
     try:
         rows = msgspec.convert(matrix, _Rows)
@@ -197,16 +173,10 @@ def pose_from_opengl(file: Path, where: str, matrix: object) -> Float[Tensor, "4
 
 
 def rigid_inverse(file: Path, where: str, rotation: np.ndarray, center: np.ndarray) -> Float[Tensor, "4 4"]:
-    """World-to-camera from a camera's axes (columns) and centre.
-
-    Raises:
-        DataError: the axes are not orthonormal and right-handed within 1e-3.
-    """
+    """World-to-camera from a camera's axes (columns), which are orthonormal and right-handed within 1e-3, and centre."""
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or abs(np.linalg.det(rotation) - 1) > 1e-3:
-        raise DataError(
-            file, where, f"holds no rotation (determinant {np.linalg.det(rotation):.4g})",
-            "remove scale and reflection from the camera-to-world matrices",
-        )  # fmt: skip
+        problem = f"holds no rotation (determinant {np.linalg.det(rotation):.4g})"
+        raise DataError(file, where, problem, "remove scale and reflection from the camera-to-world matrices")
     left, _, right = np.linalg.svd(rotation)  # the nearest exact rotation, because files keep six digits
     pose = np.eye(4)
     pose[:3, :3] = (left @ right).T
@@ -255,8 +225,7 @@ def _sampling_maps(lens: Lens, pinhole: Lens) -> tuple[Float[np.ndarray, "H W"],
     """The position of each new pixel in the distorted image."""
     import cv2
 
-    maps = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
-    size = (lens.width, lens.height)
+    maps, size = (cv2.fisheye if lens.fisheye else cv2).initUndistortRectifyMap, (lens.width, lens.height)
     x, y = maps(lens.matrix(), lens.coefficients, np.eye(3), pinhole.matrix(), size, cv2.CV_32FC1)
     return x, y
 

@@ -88,11 +88,7 @@ def check_mask(path: Path, lens: Lens, turn: bool | None) -> None:
 
 def read_mask(path: Path, lens: Lens, pinhole: Lens, turn: bool | None) -> Bool[Tensor, "H W"]:
     """False where the mask hides its photo: where it is 0, as in COLMAP and nerfstudio, so that 0 and 1 are a mask as 0 and 255
-    are. Of a lossy file, whose 0 is not exact, at most half of its largest value.
-
-    Args:
-        lens, pinhole: of the photo, to whose size the mask is brought.
-        turn: as of `read_image`.
+    are. Of a lossy file, whose 0 is not exact, at most half of its largest value. It is brought to the size of `lens`.
     """
     with _of_mask():
         values = read_image(path, turn=turn).amax(dim=2)

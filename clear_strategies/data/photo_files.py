@@ -15,7 +15,6 @@ import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
@@ -23,8 +22,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image, ImageOps
-from PIL.TiffImagePlugin import TiffImageFile
+from PIL import ExifTags, Image, ImageOps, TiffImagePlugin
 from torch import Tensor
 
 from clear_strategies.core.images import to_bytes
@@ -40,22 +38,12 @@ _LOSSLESS: Final = ("PNG", "TIFF")
 _HEIF_BRANDS: Final = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1")  # bytes 8 to 12, behind "ftyp"
 _MAX_PIXELS: Final = 100_000_000
 PNG_LEVEL: Final = 3  # a third of the time of zlib's default, for 5 % more bytes
-_EXIF_ORIENTATION: Final = 0x0112
-_EXIF_PHOTO: Final = 0x8769
-_EXIF_INTEROP: Final = 0xA005
-_EXIF_INTEROP_INDEX: Final = 1
-_ADOBE_RGB: Final = "R03"
-_EXPOSURE_TIME: Final = 0x829A  # s
-_F_NUMBER: Final = 0x829D
-_ISO: Final = 0x8827
-_FOCAL_35MM: Final = 0xA405
-_DIAGONAL_35MM: Final = math.hypot(36, 24)  # mm
+_ADOBE_RGB: Final = "R03"  # EXIF's index of interoperability
 _ON_THE_SIDE: Final = (5, 6, 7, 8)
 _SAME_COLOR: Final = 4  # levels of 255 by which makers' sRGB profiles differ
 _PROFILES: Final = threading.Lock()  # several photos are read at once, and each profile is logged once
 _NCLX_PRIMARIES: Final = (1, 2)  # BT.709's, which are sRGB's, and unknown
 _NCLX_TRANSFER: Final = (1, 2, 6, 13, 14, 15)  # BT.709's in all its names, unknown, and sRGB's
-_TIFF_SIZE: Final = (256, 257)  # tags: the width and height that are stored
 
 
 def read_image(
@@ -72,10 +60,6 @@ def read_image(
         expect: (width, height) the image must have.
         turn: of an image that is stored turned by its EXIF block: True turns it upright, False keeps the stored pixels, None
             refuses it. A TIFF is never kept as it is stored, and a PNG of 16 bits never turned: they are refused.
-
-    Raises:
-        DataError: the file is no PNG, JPEG, WebP, TIFF or HEIC, is damaged or too large, or the image is turned by EXIF, has
-            an unknown colour mode, or has another size.
     """
     with _opened(path, turn) as image:
         sixteen_bits = ";16" in str(getattr(image, "tile", ""))  # the layout in the file, unknown after decoding
@@ -110,7 +94,12 @@ def read_image(
 def image_size(path: Path, *, turn: bool | None = None) -> tuple[int, int]:
     """(width, height), from the header only; `turn` and the DataErrors as of `read_image`."""
     with _opened(path, turn) as image:
-        return _size(image, turn)
+        width, height = image.size
+        if isinstance(
+            image, TiffImagePlugin.TiffImageFile
+        ):  # of a turned one some versions of PIL say the upright size
+            width, height = image.tag_v2[TiffImagePlugin.IMAGEWIDTH], image.tag_v2[TiffImagePlugin.IMAGELENGTH]
+        return (height, width) if turn and _orientation_of(image) in _ON_THE_SIDE else (width, height)
 
 
 def has_alpha(path: Path) -> bool:
@@ -125,36 +114,10 @@ def is_lossy(path: Path) -> bool:
         return image.format not in _LOSSLESS
 
 
-@dataclass(frozen=True, slots=True)
-class Exif:
-    """Of one photo; None where its block does not say.
-
-    Args:
-        focal35: focal length on 35 mm film of the same diagonal, mm.
-        exposure: how much light the photo took of the same scene, in stops (powers of two), from an arbitrary zero.
-    """
-
-    focal35: float | None = None
-    exposure: float | None = None
-
-    def focal_pixels(self, width: int, height: int) -> float | None:
-        """The focal length of an image of this size, pixels."""
-        return None if self.focal35 is None else self.focal35 / _DIAGONAL_35MM * math.hypot(width, height)
-
-
-def read_exif(path: Path) -> Exif:
-    """The lens and the exposure of a photo; the DataErrors as of `read_image`."""
+def focal_35mm(path: Path) -> float | None:
+    """The focal length on 35 mm film of the same diagonal, mm, where EXIF says it; cameras also write 0, 0/0, text and tuples."""
     with _opened(path, False) as image:
-        tags = _tags(image, _EXIF_PHOTO)
-    time, f_number, iso = (_positive(tags.get(tag)) for tag in (_EXPOSURE_TIME, _F_NUMBER, _ISO))
-    exposure = None
-    if time is not None and f_number is not None:
-        exposure = math.log2(time * (iso or 100) / f_number**2)
-    return Exif(_positive(tags.get(_FOCAL_35MM)), exposure)
-
-
-def _positive(value: Any) -> float | None:
-    """A finite number above 0; cameras also write 0, 0/0, text and tuples."""
+        value = _tags(image, ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm, 0)
     try:
         number = float(value[0] if isinstance(value, tuple) else value)
     except (TypeError, ValueError, ZeroDivisionError, IndexError):
@@ -211,7 +174,7 @@ def _is_heif(path: Path) -> bool:
 
 def _orientation_of(image: Image.Image) -> int:
     """The EXIF orientation of an opened image, 1 to 8; 1, upright, where there is none or it cannot be read."""
-    orientation = _tags(image).get(_EXIF_ORIENTATION, 1)
+    orientation = _tags(image).get(ExifTags.Base.Orientation, 1)
     return orientation if orientation in range(1, 9) else 1
 
 
@@ -231,19 +194,12 @@ def _turned(path: Path, orientation: int) -> DataError:
     return DataError(path, "EXIF orientation", problem, remedy)
 
 
-def _size(image: Image.Image, turn: bool | None) -> tuple[int, int]:
-    """(width, height) of an image that is not decoded yet. Of a turned TIFF some versions of PIL say the upright size."""
-    width, height = (image.tag_v2[tag] for tag in _TIFF_SIZE) if isinstance(image, TiffImageFile) else image.size
-    return (height, width) if turn and _orientation_of(image) in _ON_THE_SIDE else (width, height)
-
-
 def _to_float(path: Path, image: Image.Image, sixteen_bits: bool) -> Float[np.ndarray, "H W C"]:
     """[H, W, 3 or 4] in [0, 1]."""
     if image.format in ("PNG", "TIFF", "WEBP") and getattr(image, "n_frames", 1) > 1:
         raise DataError(path, "pages", "are several in one file", "save each image as a file of its own")
     if image.mode in ("I;16", "I;16B", "I;16L", "I;16N"):
-        grey = np.asarray(image).astype(np.float32) / 65535
-        return np.repeat(grey[..., None], 3, axis=2)
+        return np.repeat(np.asarray(image).astype(np.float32)[..., None] / 65535, 3, axis=2)
     if image.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
         raise DataError(path, "colour mode", f"is {image.mode}", "convert the image to 8-bit or 16-bit RGB")
     to_srgb = _to_srgb_of(image)
@@ -263,10 +219,9 @@ def _to_srgb_of(image: Image.Image) -> Any:
         nclx = image.info.get("nclx_profile") or {}
         primaries, transfer = nclx.get("color_primaries", 1), nclx.get("transfer_characteristics", 1)
         if primaries not in _NCLX_PRIMARIES or transfer not in _NCLX_TRANSFER:
-            _warn_of_colors(
-                f"the primaries {primaries} and the transfer {transfer} of ITU-T H.273 (HDR, or a wide gamut)"
-            )
-        elif _tags(image, _EXIF_INTEROP).get(_EXIF_INTEROP_INDEX) == _ADOBE_RGB:
+            of = f"the primaries {primaries} and the transfer {transfer} of ITU-T H.273 (HDR, or a wide gamut)"
+            _warn_of_colors(of)
+        elif _tags(image, ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex) == _ADOBE_RGB:
             _warn_of_colors("Adobe RGB (EXIF)")
         return None
 

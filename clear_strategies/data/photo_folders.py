@@ -22,11 +22,7 @@ _Entry = TypeVar("_Entry")
 
 
 def image_folder(root: Path, name: str | None = None) -> Path:
-    """The folder of photos in `root`; without a name, the first of images, images_2, images_4, images_8, else `root` with photos.
-
-    Raises:
-        DataError: it does not exist.
-    """
+    """The folder of photos in `root`; without a name, the first of images, images_2, images_4, images_8, else `root` itself."""
     present = [folder for name in _FOLDERS if (folder := named(root, name)).is_dir()]
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
@@ -36,8 +32,11 @@ def image_folder(root: Path, name: str | None = None) -> Path:
             raise DataError(root / name, "images", "is no folder", remedy)
         return root / name
     if not present and not images_in(root):
-        remedy = "name the folder of photos: data.reader.images=FOLDER"
-        raise DataError(root, "images", f"has none of the folders {', '.join(_FOLDERS)}", remedy)
+        problem, remedy = (
+            f"has none of the folders {', '.join(_FOLDERS)}",
+            "name the folder of photos: data.reader.images=FOLDER",
+        )
+        raise DataError(root, "images", problem, remedy)
     return present[0] if present else root
 
 
@@ -48,11 +47,7 @@ def folder_note(folder: Path) -> str:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The image files of a folder, by their suffix, in order of names. Other files and hidden ones are ignored.
-
-    Raises:
-        DataError: the folder does not exist, or holds no image.
-    """
+    """The image files of a folder, by their suffix, in order of names, without hidden ones; a DataError where there is none."""
     if not folder.is_dir():
         raise DataError(folder, "folder", "is not there", "check the path")
     if not (images := images_in(folder)):
@@ -146,20 +141,25 @@ def usable(
     Args:
         listing: the file or folder that lists the photos, for messages.
         skip_faulty: decode every photo, and leave out those that are missing or cannot be decoded, with a warning for each.
-            Else no photo is decoded: a damaged one fails when it is loaded.
-
-    Raises:
-        DataError: a photo is missing and none may be left out, or none is left.
+            Else no photo is decoded: a damaged one fails when it is loaded, and a missing one is a DataError.
     """
+
+    def decodes(entry: _Entry) -> bool:
+        try:
+            read_image(path_of(entry), turn=True)
+        except DataError as error:
+            _log.warning("skipped: %s", error)
+            return False
+        return True
+
     absent = [path_of(entry) for entry in entries if not is_file(path_of(entry))]
     if absent and len(absent) == len(entries):
         raise _none_there(listing, absent)
     if absent and not skip_faulty:
         problem = f"{len(absent)} of {len(entries)} are not there: {some([path.name for path in absent])}"
-        raise DataError(
-            listing, "photos", problem, "put them back, or train without them: data.reader.skip_faulty=true"
-        )
-    kept = [entry for entry in entries if _decodes(path_of(entry))] if skip_faulty else list(entries)
+        remedy = "put them back, or train without them: data.reader.skip_faulty=true"
+        raise DataError(listing, "photos", problem, remedy)
+    kept = [entry for entry in entries if decodes(entry)] if skip_faulty else list(entries)
     if entries and not kept:
         raise DataError(listing, "photos", f"none of {len(entries)} can be used", "check the path")
     return kept
@@ -187,12 +187,3 @@ def some(names: Sequence[str]) -> str:
     """The first few names, each at most 80 characters of it."""
     shown = [name[:80].encode(errors="backslashreplace").decode() for name in names[:_LISTED]]
     return ", ".join(shown) + (", …" if len(names) > _LISTED else "")
-
-
-def _decodes(path: Path) -> bool:
-    try:
-        read_image(path, turn=True)
-    except DataError as error:
-        _log.warning("skipped: %s", error)
-        return False
-    return True

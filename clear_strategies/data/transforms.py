@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -87,52 +87,43 @@ class _Points(msgspec.Struct):
 
 
 def transforms_of(path: Path, content: Mapping[str, Any]) -> list[Transform]:
-    """The frames of a file's content; a frame's own values replace those shared by all."""
-    frames = typed(
-        path, content.get("frames") or None, list[dict[str, Any]], where="frames", remedy="give a transforms file"
-    )
+    """The frames of a file's content, which name their images; a frame's own values replace those shared by all."""
+    remedy = "give a transforms file"
+    frames = typed(path, content.get("frames") or None, list[dict[str, Any]], where="frames", remedy=remedy)
     shared = {name: content[name] for name in Transform.__struct_fields__ if name in content}
-    return [typed(path, {**shared, **frame}, Transform, where=f"frames[{i}]") for i, frame in enumerate(frames)]
-
-
-def photo_transforms(path: Path, content: Mapping[str, Any]) -> list[Transform]:
-    """As `transforms_of`, for a file whose frames must name their images."""
-    transforms = transforms_of(path, content)
-    for i, transform in enumerate(transforms):
-        if not transform.file_path:
-            raise DataError(path, f"frames[{i}].file_path", "is missing", "name the frame's image")
+    transforms = [typed(path, {**shared, **frame}, Transform, where=f"frames[{i}]") for i, frame in enumerate(frames)]
+    if unnamed := [i for i, transform in enumerate(transforms) if not transform.file_path]:
+        raise DataError(path, f"frames[{unnamed[0]}].file_path", "is missing", "name the frame's image")
     return transforms
 
 
 def frames_of(
-    file: Path,
-    transforms: Sequence[Transform],
-    photos: Sequence[tuple[str, Path, str | None]],
+    transforms: Mapping[Path, Sequence[Transform]],
+    photos: Mapping[Path, Sequence[tuple[str, Path, str | None]]],
     *,
-    masks: Mapping[Path, Path],
     background: Color,
     skip_faulty: bool,
 ) -> list[Frame]:
-    """The frames of a file whose photos can be used.
+    """The frames of a folder's files whose photos can be used, with their masks: the frames' own, or those of `masks_of`.
 
     Args:
         photos: name, file and split of each of `transforms`.
-        masks: see `masks_of_frames`.
     """
-    frames = []
-    for i in usable(file, range(len(photos)), lambda i: photos[i][1], skip_faulty=skip_faulty):
-        where, transform, (name, path, split) = f"frames[{i}]", transforms[i], photos[i]
-        pose = pose_from_opengl(file, f"{where}.transform_matrix", transform.transform_matrix)
-        lens = transform.lens(file, where, path)
-        frames.append(Frame.of_photo(name, path, lens, pose, background=background, split=split, mask=masks.get(path)))
+    folder = next(iter(transforms)).parent
+    find, frames = finder(folder), list[Frame]()
+    listed = [
+        (frame, path) for file in transforms for frame, (_, path, _) in zip(transforms[file], photos[file], strict=True)
+    ]
+    own = {path: find(frame.mask_path) for frame, path in listed if frame.mask_path}
+    masks = masks_of(folder, [path for _, path in listed], own)
+    for file, of_file in photos.items():
+        paths = [path for _, path, _ in of_file]
+        for i in usable(file, range(len(paths)), paths.__getitem__, skip_faulty=skip_faulty):
+            where, transform, (name, path, split) = f"frames[{i}]", transforms[file][i], of_file[i]
+            pose = pose_from_opengl(file, f"{where}.transform_matrix", transform.transform_matrix)
+            lens, mask = transform.lens(file, where, path), masks.get(path)
+            frames.append(Frame.of_photo(name, path, lens, pose, background=background, split=split, mask=mask))
     return frames
-
-
-def masks_of_frames(folder: Path, transforms: Iterable[Transform], paths: Sequence[Path]) -> dict[Path, Path]:
-    """`masks_of` these photos, by the frames' own `mask_path` where they have one."""
-    find = finder(folder)
-    named = {path: find(frame.mask_path) for frame, path in zip(transforms, paths, strict=True) if frame.mask_path}
-    return masks_of(folder, paths, named)
 
 
 def points_of(file: Path, content: Mapping[str, Any]) -> SfmPoints | None:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 from pathlib import Path
 from typing import Final
 
 from clear_strategies.core.checks import as_color
-from clear_strategies.data.capture import Capture, Frame, lens_notes, require_names
+from clear_strategies.data.capture import Capture, lens_notes, require_names
 from clear_strategies.data.photo_folders import finder, named
 from clear_strategies.data.strict_json import read_object
-from clear_strategies.data.transforms import frames_of, masks_of_frames, photo_transforms, points_of
+from clear_strategies.data.transforms import frames_of, points_of, transforms_of
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
 
@@ -26,12 +25,7 @@ def recognises(path: Path) -> int:
     return 4 * named(path, _TRAIN).is_file()
 
 
-def read(
-    root: str | Path,
-    *,
-    background: Color = _WHITE,
-    skip_faulty: bool = False,
-) -> Capture:
+def read(root: str | Path, *, background: Color = _WHITE, skip_faulty: bool = False) -> Capture:
     """Read a scene folder. Frames are named by their file (r_2), test frames with the prefix "test/".
 
     Frames keep the order of the JSON files, which is the protocols' numbering. By name, r_10 would come before r_2.
@@ -39,32 +33,29 @@ def read(
     Args:
         background: RGB in [0, 1], behind transparent pixels.
         skip_faulty: leave out photos that are missing or damaged, with a warning for each; else they are an error.
-
-    Raises:
-        SettingError: the background is no colour.
-        DataError: something is missing or not what it should be.
     """
     root, background = Path(root), as_color("data.reader.background", background)
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
-    find, files, frames = finder(root), [named(root, _TRAIN)], list[Frame]()
+    find, splits = finder(root), {named(root, _TRAIN): "train"}
     if (test := named(root, "transforms_test.json")).exists():
-        files.append(test)
+        splits[test] = "test"
     else:
         _log.warning("%s has no transforms_test.json: there are no test views.", root)
-    contents = {file: read_object(file) for file in files}
-    transforms = {file: photo_transforms(file, content) for file, content in contents.items()}
-    paths = {file: [find(transform.file_path) for transform in transforms[file]] for file in files}
-    masks = masks_of_frames(root, itertools.chain(*transforms.values()), list(itertools.chain(*paths.values())))
-    for file, split in zip(files, ("train", "test"), strict=False):
-        photos = [(path.stem if split == "train" else f"test/{path.stem}", path, split) for path in paths[file]]
-        frames += frames_of(file, transforms[file], photos, masks=masks, background=background, skip_faulty=skip_faulty)
+    contents = {file: read_object(file) for file in splits}
+    transforms, photos = {}, {}
+    for file, split in splits.items():
+        transforms[file] = transforms_of(file, contents[file])
+        paths, prefix = [find(transform.file_path) for transform in transforms[file]], "test/" * (split == "test")
+        photos[file] = [(f"{prefix}{path.stem}", path, split) for path in paths]
+    frames = frames_of(transforms, photos, background=background, skip_faulty=skip_faulty)
     require_names(frames, root)
     color = "white" if background == _WHITE else f"RGB {background}"
     notes = {
-        "poses": ", ".join(file.name for file in files),
+        "poses": ", ".join(file.name for file in splits),
         "order": "of the files",
         "background": f"{color} behind transparent pixels",
         **lens_notes(frames),
     }
-    return Capture(root.resolve().name, tuple(frames), points_of(files[0], contents[files[0]]), background, notes)
+    points = points_of(*next(iter(contents.items())))
+    return Capture(root.resolve().name, tuple(frames), points, background, notes)

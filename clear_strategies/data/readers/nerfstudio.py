@@ -16,7 +16,7 @@ from clear_strategies.data.capture import BLACK, Capture, Frame, lens_notes, sor
 from clear_strategies.data.photo_files import image_size
 from clear_strategies.data.photo_folders import finder, image_folder, named
 from clear_strategies.data.strict_json import read_object, typed
-from clear_strategies.data.transforms import Transform, frames_of, masks_of_frames, photo_transforms, points_of
+from clear_strategies.data.transforms import Transform, frames_of, points_of, transforms_of
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
 
@@ -40,11 +40,7 @@ def recognises(path: Path) -> int:
 
 
 def read(
-    root: str | Path,
-    images: str | None = None,
-    *,
-    background: Color = BLACK,
-    skip_faulty: bool = False,
+    root: str | Path, images: str | None = None, *, background: Color = BLACK, skip_faulty: bool = False
 ) -> Capture:
     """Read a folder with transforms.json, or that file. Poses are taken as they are, `applied_transform` included.
 
@@ -53,15 +49,11 @@ def read(
             reduced photos. None: the photos that the frames name.
         background: RGB in [0, 1] behind transparent pixels.
         skip_faulty: leave out photos that are missing or damaged, with a warning for each; else they are an error.
-
-    Raises:
-        SettingError: the background is no colour.
-        DataError: something is missing or not what it should be.
     """
     root, background = Path(root), as_color("data.reader.background", background)
     file = root if root.suffix == ".json" else named(root, _FILE)
     folder, content = file.parent, read_object(file)
-    transforms = photo_transforms(file, content)
+    transforms = transforms_of(file, content)
     find = finder(folder)
     if images is not None:
         transforms = [_sized(transform, find) for transform in transforms]
@@ -71,8 +63,7 @@ def read(
     splits = _splits(file, lists, find)
     shared = os.path.commonprefix([path.parent.parts for path in paths])  # noqa: RUF071 - compares tuples of folders
     photos = [("/".join(path.parts[len(shared) :]), path, splits.get(path)) for path in paths]
-    masks = masks_of_frames(folder, transforms, paths)
-    frames = frames_of(file, transforms, photos, masks=masks, background=background, skip_faulty=skip_faulty)
+    frames = frames_of({file: transforms}, {file: photos}, background=background, skip_faulty=skip_faulty)
     notes = {"poses": f"{file.name}, {len(frames)} images", **lens_notes(frames)}
     if splits:
         if strangers := [name for key in _SIDES for name in getattr(lists, key) if find(name) not in paths]:

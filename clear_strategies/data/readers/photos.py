@@ -6,7 +6,7 @@ import hashlib
 import logging
 import shlex
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, Literal
@@ -14,7 +14,7 @@ from typing import Final, Literal
 from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.data.capture import MORE_PHOTOS, Capture
 from clear_strategies.data.masks import masks_among
-from clear_strategies.data.photo_files import Exif, image_size, read_exif
+from clear_strategies.data.photo_files import focal_35mm, image_size
 from clear_strategies.data.photo_folders import images_in, list_images, named, require_text, some, usable
 from clear_strategies.data.priors import cache_folder
 from clear_strategies.data.readers import colmap, sfm
@@ -28,28 +28,21 @@ _HEIC: Final = (".heic", ".heif")
 FRAMES: Final = "ffmpeg -i VIDEO -vf thumbnail=15 -fps_mode passthrough -q:v 2 FOLDER/%03d.jpg"
 HDR: Final = "-vf thumbnail=15,scale=out_primaries=bt709:out_transfer=iec61966-2-1,format=rgb24 (ffmpeg 8)"
 _FEW: Final = 30  # photos, up to which precise=auto is true
-_STOPS: Final = 0.5  # larger differences of exposure give a warning
 _HEAD: Final = 1 << 16  # bytes of a file that tell what it is
 _LOOKED_INTO: Final = 50  # files of a kind, at most
+_CONVERT: Final = "ns-process-data {0} --data {{root}}{1} --output-dir converted"
+_HERE: Final = "put the model into {root}/sparse/0"
 # Poses of other tools that no reader reads: where they lie, what such a file contains, whose they are, what makes use of them.
 _OTHERS: Final = (
     ("*.json", b'"frames"', "transforms.json", "clear-strategies train {file}"),
-    ("*.xml", b"<document", "Metashape", "ns-process-data metashape --data {root} --xml {file} --output-dir converted"),
-    (
-        "*.csv",
-        b"#name,x,y",
-        "RealityCapture",
-        "ns-process-data realitycapture --data {root} --csv {file} --output-dir converted",
-    ),
+    ("*.xml", b"<document", "Metashape", _CONVERT.format("metashape", " --xml {file}")),
+    ("*.csv", b"#name,x,y", "RealityCapture", _CONVERT.format("realitycapture", " --csv {file}")),
     ("*.xmp", b"xcr:", "RealityCapture", "export Cameras.txt, Images.txt and Points3D.txt (COLMAP) into {root}"),
-    ("keyframes/cameras/*.json", b'"t_00"', "Polycam", "ns-process-data polycam --data {root} --output-dir converted"),
-    ("cameras/*.json", b'"t_00"', "Polycam", "ns-process-data polycam --data {root}/.. --output-dir converted"),
-    ("metadata*", b'"poses"', "Record3D", "ns-process-data record3d --data {root} --output-dir converted"),
+    ("keyframes/cameras/*.json", b'"t_00"', "Polycam", _CONVERT.format("polycam", "")),
+    ("cameras/*.json", b'"t_00"', "Polycam", _CONVERT.format("polycam", "/..")),
+    ("metadata*", b'"poses"', "Record3D", _CONVERT.format("record3d", "")),
     ("poses_bounds.npy", b"NUMPY", "LLFF", "put the COLMAP model that they were made from into {root}/sparse/0"),
-    *(
-        (place, b"", "COLMAP", "put the model into {root}/sparse/0")
-        for place in ("*/cameras.*", "*/sparse/cameras.*", "*/sparse/0/cameras.*")
-    ),
+    *((f"{place}cameras.*", b"", "COLMAP", _HERE) for place in ("*/", "*/sparse/", "*/sparse/0/")),
 )
 
 
@@ -83,10 +76,6 @@ def read(
         threads: of COLMAP; -1: all. With more than one, the poses' last digits may change from run to run.
         seed: of COLMAP's random samples.
         skip_faulty: leave out photos that are missing or damaged, with a warning for each; else they are an error.
-
-    Raises:
-        SettingError: a number is outside its range.
-        DataError: too few photos, too few can be related to each other, or pycolmap is not installed.
     """
     require_whole("data.reader.max_side", max_side, least=1)
     require_whole("data.reader.max_features", max_features, least=1)
@@ -104,12 +93,11 @@ def read(
     base = Path(cache) if cache is not None else cache_folder() / "sfm"
     if base.resolve().is_relative_to(root.resolve()):
         raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
-    paths = usable(root, _once_each(_without_masks(list_images(root))), lambda path: path, skip_faulty=skip_faulty)
+    paths = usable(root, _once_each(list_images(root)), lambda path: path, skip_faulty=skip_faulty)
     require_text((name, *(path.name for path in paths)))
     if len(paths) < sfm.FEWEST:
-        problem = f"there are {len(paths)}, poses need at least {sfm.FEWEST}"
-        raise DataError(root, "images", problem, MORE_PHOTOS)
-    photos = {path: read_exif(path) for path in paths}  # unreadable photos are refused before the long work
+        raise DataError(root, "images", f"there are {len(paths)}, poses need at least {sfm.FEWEST}", MORE_PHOTOS)
+    photos = {path: focal_35mm(path) for path in paths}  # unreadable photos are refused before the long work
     for path in paths:
         image_size(path, turn=True)
     precise = len(paths) <= _FEW if precise == "auto" else precise
@@ -118,9 +106,14 @@ def read(
         _log.debug("%s: poses from the cache %s.", root, folder)
     else:
         sfm.reconstruct(root, photos, folder, sfm.SfmSettings(max_side, max_features, precise, threads, seed))
-    capture = _capture(root, photos, folder)
-    sfm.require_placed(root, len(capture.frames), len(paths), least_placed)
-    return replace(capture, name=name)
+    model, photo_of = read_model(folder), {sfm.copy_name(i): path for i, path in enumerate(paths)}
+    posed = {image.name: photo_of[image.name] for image in model.images}
+    capture = colmap.capture(root, model, root, posed, upright=True, points="estimated here by pycolmap")
+    unplaced, placed = read_object(folder / sfm.UNPLACED), len(capture.frames)
+    sfm.warn_unplaced(root, unplaced, len(paths))
+    sfm.require_placed(root, placed, len(paths), least_placed)
+    poses = f"estimated by pycolmap from all {len(paths)} photos, {placed} could be placed"
+    return replace(capture, name=name, notes={**capture.notes, "poses": poses, "photos": root.name}, unplaced=unplaced)
 
 
 def _tell_of_other_poses(root: Path) -> None:
@@ -140,57 +133,20 @@ def _tell_of_other_poses(root: Path) -> None:
             return
 
 
-def _capture(root: Path, photos: Mapping[Path, Exif], folder: Path) -> Capture:
-    """The photos that have poses in the model in `folder`, whose images are named by `sfm.copy_name`."""
-    model, photo_of = read_model(folder), {sfm.copy_name(i): path for i, path in enumerate(photos)}
-    posed = {image.name: photo_of[image.name] for image in model.images}
-    capture = colmap.capture(root, model, root, posed, upright=True, points="estimated here by pycolmap")
-    unplaced = read_object(folder / sfm.UNPLACED)
-    sfm.warn_unplaced(root, unplaced, len(photos))
-    notes = {
-        **capture.notes,
-        "poses": f"estimated by pycolmap from all {len(photos)} photos, {len(capture.frames)} could be placed",
-        "photos": root.name,
-        **_exposure(photos),
-    }
-    return replace(capture, notes=notes, unplaced=unplaced)
-
-
-def _without_masks(paths: Sequence[Path]) -> list[Path]:
-    masks = set(masks_among(paths).values())
-    if masks:
-        _log.info("%d of the images are masks of others: %s.", len(masks), some(sorted(path.name for path in masks)))
-    return [path for path in paths if path not in masks]
-
-
 def _once_each(paths: Sequence[Path]) -> list[Path]:
-    """Without the HEIC file of a photo that a phone has saved as JPEG, too."""
-    stems = {path.stem for path in paths if path.suffix.lower() not in _HEIC}
-    twice = [path.name for path in paths if path.suffix.lower() in _HEIC and path.stem in stems]
-    if twice:
-        _log.info("%d photos are there twice; their HEIC files are not used: %s.", len(twice), some(twice))
-    kept = [path for path in paths if path.name not in twice]
-    same = [stem for stem, count in Counter(path.stem for path in kept).items() if count > 1]
-    if same:
+    """The photos without their masks, and without the HEIC file of one that a phone has saved as JPEG, too."""
+    masks, stems = set(masks_among(paths).values()), {path.stem for path in paths if path.suffix.lower() not in _HEIC}
+    twice = {path for path in paths if path.suffix.lower() in _HEIC and path.stem in stems}
+    for left, what in (
+        (masks, "are masks of others"),
+        (twice, "are not used, since their photos are there as JPEG, too"),
+    ):
+        if left:
+            _log.info("%d of the images %s: %s.", len(left), what, some(sorted(path.name for path in left)))
+    kept = [path for path in paths if path not in masks | twice]
+    if same := [stem for stem, count in Counter(path.stem for path in kept).items() if count > 1]:
         raise DataError(kept[0].parent, "file name", f"{same[0]!r} has several files", "keep one file of each photo")
     return kept
-
-
-def _exposure(photos: Mapping[Path, Exif]) -> dict[str, str]:
-    """A note where the exposures in EXIF differ; `ViewSettings.equalize` corrects that."""
-    known = {path.name: exif.exposure for path, exif in photos.items() if exif.exposure is not None}
-    if len(known) < 2:
-        return {}
-    low, high = min(known, key=lambda name: known[name]), max(known, key=lambda name: known[name])
-    stops = known[high] - known[low]
-    if stops <= _STOPS:
-        return {}
-    text = f"differs by {stops:.1f} stops between {low} and {high} (EXIF)"
-    _log.warning(
-        "the photos' exposure %s. data.views.equalize=true, the default here, evens it out, except where light is clipped. "
-        "Lock it next time.", text,
-    )  # fmt: skip
-    return {"exposure": text}
 
 
 def _key(paths: Sequence[Path], *settings: int) -> str:

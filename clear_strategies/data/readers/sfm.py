@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 import os
 import signal
 import tempfile
@@ -24,7 +25,7 @@ from PIL import Image as Picture
 from clear_strategies import files
 from clear_strategies.core.images import to_bytes
 from clear_strategies.data.capture import MORE_PHOTOS, NO_PARALLAX, STEP_ASIDE
-from clear_strategies.data.photo_files import Exif, read_image
+from clear_strategies.data.photo_files import read_image
 from clear_strategies.errors import DataError
 
 _log = logging.getLogger(__name__)
@@ -40,6 +41,7 @@ _MATCHED: Final = 50  # features in common, from which a pair's relation is trus
 _NEARLY_ALL: Final = 0.9  # of the pairs
 _TURN: Final = 0.03  # entries by which a map between two photos may differ from a turn's, as distortion makes it
 _LISTED: Final = 3  # photos without a pose in the warning, at most
+_DIAGONAL_35MM: Final = math.hypot(36, 24)  # mm
 _MEGA: Final = 1 << 20
 _DISTANCES: Final = 4  # bytes of each pair of features that are compared
 _MEMORY: Final = 4 << 30  # bytes that all threads together may take in matching
@@ -67,11 +69,11 @@ class SfmSettings:
         return (3 if self.precise else 2) * _DISTANCES * self.max_features**2
 
 
-def reconstruct(root: Path, photos: Mapping[Path, Exif], folder: Path, settings: SfmSettings) -> None:
+def reconstruct(root: Path, photos: Mapping[Path, float | None], folder: Path, settings: SfmSettings) -> None:
     """Estimate the poses of these photos, and write the model with most of them to `folder`. Its images have `copy_name`s.
 
-    Raises:
-        DataError: pycolmap is not installed, or too few photos can be placed.
+    Args:
+        photos: with their focal lengths on 35 mm film, as `focal_35mm` gives them.
     """
     pycolmap = _pycolmap()
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -82,12 +84,12 @@ def reconstruct(root: Path, photos: Mapping[Path, Exif], folder: Path, settings:
     )  # fmt: skip
     try:
         with tempfile.TemporaryDirectory(prefix=f"{folder.name}.", dir=folder.parent) as work:
-            models = _map(pycolmap, photos, Path(work), settings)
-            models.sort(key=lambda model: model.num_reg_images(), reverse=True)
+            models = sorted(
+                _map(pycolmap, photos, Path(work), settings), key=lambda m: m.num_reg_images(), reverse=True
+            )
             sizes = [model.num_reg_images() for model in models]
-            require_placed(root, sizes[0] if sizes else 0, count)
-            result = Path(work) / "result"
-            result.mkdir()
+            require_placed(root, max(sizes, default=0), count)
+            (result := Path(work) / "result").mkdir()
             models[0].write_binary(str(result))
             placed = {image.name for image in models[0].images.values()}
             names = [path.name for path in photos]
@@ -108,14 +110,7 @@ def copy_name(index: int) -> str:
 
 
 def require_placed(root: Path, placed: int, count: int, least: float = 0.0) -> None:
-    """Refuse poses of too few photos.
-
-    Args:
-        least: the least share of the photos.
-
-    Raises:
-        DataError: fewer than `FEWEST` of `count` photos are placed, or a smaller share.
-    """
+    """Raise a DataError where fewer than `FEWEST` of `count` photos are placed, or a smaller share than `least`."""
     if placed >= FEWEST and placed / count >= least:
         return
     remedy = MORE_PHOTOS
@@ -126,7 +121,7 @@ def require_placed(root: Path, placed: int, count: int, least: float = 0.0) -> N
     raise DataError(root, "poses", f"{some} of the {count} photos could be related to each other", remedy)
 
 
-def _map(pycolmap: Any, photos: Mapping[Path, Exif], work: Path, settings: SfmSettings) -> list[Any]:
+def _map(pycolmap: Any, photos: Mapping[Path, float | None], work: Path, settings: SfmSettings) -> list[Any]:
     """The models that COLMAP's incremental pipeline finds: features, matching of all pairs, mapping."""
     copies, database, count = work / "copies", work / _DATABASE, len(photos)
     level = pycolmap.logging.minloglevel
@@ -170,11 +165,7 @@ def _map(pycolmap: Any, photos: Mapping[Path, Exif], work: Path, settings: SfmSe
 
 
 def _require_parallax(pycolmap: Any, database: Path, root: Path) -> None:
-    """Refuse photos whose pairs are all related by a turn of the camera, of whatever focal length, before COLMAP makes up motion.
-
-    Raises:
-        DataError: the photos are from one place, or all the same.
-    """
+    """Refuse photos of which each is another turned, by whatever focal length, before COLMAP makes up motion."""
     kinds = pycolmap.TwoViewGeometryConfiguration
     flat = {int(kind) for kind in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)}
     with pycolmap.Database.open(database) as opened:
@@ -185,10 +176,17 @@ def _require_parallax(pycolmap: Any, database: Path, root: Path) -> None:
             for pair, found in zip(*opened.read_two_view_geometries(), strict=True)
             if len(found.inlier_matches) >= _MATCHED
         ]
-    centred = [_centred(b) @ found.H @ np.linalg.inv(_centred(a)) for a, b, found in pairs if int(found.config) in flat]
-    if len(centred) < _NEARLY_ALL * len(pairs) or not centred:
+
+    def centred(camera: Any) -> Float[np.ndarray, "3 3"]:
+        """From pixels to a square of about 1 around the middle of the photo."""
+        width, height = int(camera.width), int(camera.height)
+        size = max(width, height)
+        return np.array([[1, 0, -width / 2], [0, 1, -height / 2], [0, 0, size]]) / size
+
+    turns = [centred(b) @ found.H @ np.linalg.inv(centred(a)) for a, b, found in pairs if int(found.config) in flat]
+    if len(turns) < _NEARLY_ALL * len(pairs) or not turns:
         return
-    maps = np.stack([H / np.cbrt(np.linalg.det(H)) for H in centred])
+    maps = np.stack([H / np.cbrt(np.linalg.det(H)) for H in turns])
     scale = np.array([1.0, 1.0, 0.0])
     bent = min(
         float(np.median(np.abs(turn.mT @ turn - np.eye(3)).max(axis=(1, 2))))
@@ -197,13 +195,6 @@ def _require_parallax(pycolmap: Any, database: Path, root: Path) -> None:
     )
     if bent < _TURN:
         raise DataError(root, "poses", NO_PARALLAX, STEP_ASIDE)
-
-
-def _centred(camera: Any) -> Float[np.ndarray, "3 3"]:
-    """From pixels to a square of about 1 around the middle of the photo."""
-    width, height = int(camera.width), int(camera.height)
-    size = max(width, height)
-    return np.array([[1, 0, -width / 2], [0, 1, -height / 2], [0, 0, size]]) / size
 
 
 def _keep_coarsest(pycolmap: Any, database: Path, most: int) -> None:
@@ -229,22 +220,20 @@ def _keep_coarsest(pycolmap: Any, database: Path, most: int) -> None:
 
 
 def _write_copies(
-    photos: Mapping[Path, Exif], folder: Path, max_side: int
+    photos: Mapping[Path, float | None], folder: Path, max_side: int
 ) -> dict[tuple[int, int, float | None], list[str]]:
     """Copies for COLMAP; their names by width, height and focal length (pixels of the copy, or None)."""
     folder.mkdir()
     groups: dict[tuple[int, int, float | None], list[str]] = {}
-    for i, (path, exif) in enumerate(photos.items()):
+    for i, (path, focal_35mm) in enumerate(photos.items()):
         image = read_image(path, turn=True)
         height, width = image.shape[:2]
         scale = min(1.0, max_side / max(width, height))
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
         copy = Picture.fromarray(to_bytes(image)).resize(size, Picture.Resampling.LANCZOS)
         copy.save(folder / copy_name(i), quality=95, subsampling=0)
-        focal = exif.focal_pixels(*size)
-        groups.setdefault((*size, focal and round(focal, 2)), []).append(copy_name(i))
-    known = sum(len(names) for (_, _, focal), names in groups.items() if focal is not None)
-    _log.debug("%d cameras; the focal length of %d of %d photos is in EXIF.", len(groups), known, len(photos))
+        focal = focal_35mm and round(focal_35mm / _DIAGONAL_35MM * math.hypot(*size), 2)
+        groups.setdefault((*size, focal), []).append(copy_name(i))
     return groups
 
 
@@ -262,12 +251,7 @@ def _pycolmap() -> Any:
 
 
 def _unplaced(pycolmap: Any, database: Path, names: Sequence[str], placed: Set[str]) -> dict[str, str]:
-    """Why each photo that is not placed has no pose: its features, or the placed photo that it has most in common with.
-
-    Args:
-        names: of the photos, in the order of their copies.
-        placed: the names of the placed copies.
-    """
+    """Why each photo has no pose whose copy is not `placed`; `names` of the photos are in the order of their copies."""
     with pycolmap.Database.open(database) as opened:
         copies = {image.image_id: image.name for image in opened.read_all_images()}
         features = {number: opened.num_keypoints_for_image(number) for number in copies}

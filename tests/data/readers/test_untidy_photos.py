@@ -175,13 +175,3 @@ def test_heic_without_its_library_is_named_with_the_extra(of_photos, monkeypatch
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     with pytest.raises(DataError, match=r"b\.heic.*clear-strategies\[heic\]"):
         read()
-
-
-def test_different_exposures_are_said(of_photos, caplog):
-    folder, read = of_photos
-    for name, time in (("a", 0.01), ("b", 0.04), ("c", 0.01)):
-        exif = Image.Exif()
-        exif[0x8769] = {0x829A: time, 0x829D: 2.0, 0x8827: 100}
-        image_of(folder / f"{name}.png").save(folder / f"{name}.png", exif=exif)
-    assert read().notes["exposure"].startswith("differs by 2.0 stops between a.png and b.png")
-    assert "exposure" in caplog.text
