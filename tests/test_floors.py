@@ -1,4 +1,4 @@
-"""Who may import whom: the tables in docs/explanation/architecture.md, kept true."""
+"""Who may import whom: the table in docs/explanation/architecture.md, kept true."""
 
 from __future__ import annotations
 
@@ -13,17 +13,27 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def rows(header: str) -> list[list[set[str]]]:
-    """The names in each cell of a table of the page."""
-    text = (ROOT / "docs" / "explanation" / "architecture.md").read_text().split(header)[1].split("\n\n")[0]
-    lines = [line for line in text.splitlines() if line.startswith("| `")]
-    return [[set(re.findall(r"`([^`]+)`", cell)) for cell in line.split("|")[1:-1]] for line in lines]
+PAGE = (ROOT / "docs" / "explanation" / "architecture.md").read_text()
 
 
-# The floors of clear_strategies/, from the bottom: a folder, the folders that it may import, and the heavy libraries that
-# it may use. The doors may import every floor.
-FLOORS = {min(folder): (imports, libraries) for folder, _, imports, libraries in rows("| folder or file |")}
-DOORS = {min(door): libraries for door, libraries in rows("| door |")}
+def named(text: str) -> set[str]:
+    return set(re.findall(r"`([^`]+)`", text))
+
+
+def floors() -> dict[str, tuple[set[str], set[str]]]:
+    """The folders of clear_strategies/ from the bottom: what each may import, and the heavy libraries that it may use."""
+    found: dict[str, tuple[set[str], set[str]]] = {}
+    for line in PAGE.split("| folder or file |")[1].split("\n\n")[0].splitlines()[2:]:
+        folder, _, imported, libraries = line.split("|")[1:-1]
+        allowed = found.keys() - named(imported) if "all above" in imported else named(imported)
+        found[min(named(folder))] = allowed, named(libraries)
+    return found
+
+
+FLOORS = floors()
+DOORS = {
+    door: named(own) for door, own in re.findall(r"`(\w+)`(?: \((.*?)\))?", PAGE.split("The doors")[1].split("\n\n")[0])
+}
 
 HEAVY = {"cv2", "kornia", "open3d", "PIL", "warp", "gsplat", "hydra", "omegaconf"}
 PACKAGES = ("clear_strategies", "rasterizers", "integration")
