@@ -97,7 +97,7 @@ HEAVY = {"cv2", "scipy", "skimage", "kornia", "matplotlib"}
     ],
 )
 def test_a_bad_setting_is_told_before_data_are_read_and_heavy_libraries_imported(overrides, message, tmp_path):
-    """docs/how-to/mistakes.md lists more settings, and tests/test_mistakes.py the line and the exit code of each."""
+    """tests/mistakes.csv lists more settings, with the line and the exit code of each."""
     code = (
         "import sys\nfrom clear_strategies.run import main\n"
         f"try:\n    main()\nfinally:\n    print(sys.modules.keys() & {HEAVY})"
