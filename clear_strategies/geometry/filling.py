@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -33,7 +33,7 @@ _NEARER: Final = 0.95  # share of another photo's depth, in front of which a poi
 
 def densify(cloud: PointCloud, photos: Sequence[Photo], stride: int, background: Color | None = None) -> PointCloud:
     """The cloud, with what `grid_points` adds where the photos hide nothing."""
-    means, colors = grid_points(cloud.means, photos, stride, background, masks=[photo.shown for photo in photos])
+    means, colors = grid_points(cloud.means, photos, stride, background)
     if len(means) == 0:
         _log.warning("densify added no point.")
         return cloud
@@ -49,7 +49,6 @@ def grid_points(
     stride: int,
     background: Color | None = None,
     maps: Sequence[DepthMap] | None = None,
-    masks: Sequence[Bool[Tensor, "h w"] | None] | None = None,
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
     """(positions, colours): in each photo a point every `stride` pixels, at depth that is completed from `means` and `maps`.
 
@@ -57,23 +56,19 @@ def grid_points(
         background: pixels of this colour show no surface and get no point.
         maps: of each photo; only pixels of unknown depth get a point, unless it floats in front of the depth that another
             photo knows. None: no depth is known.
-        masks: of each photo, False where it hides pixels; None: it hides none.
     """
     added, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
     for i, photo in enumerate(photos):
-        grid = pixel_grid(photo, stride)
+        grid, depth_map = pixel_grid(photo, stride), None if maps is None else maps[i]
         x, y = grid.long().unbind(dim=1)
-        wanted = torch.ones(photo.image.shape[:2], dtype=torch.bool)
-        if maps is not None:
-            wanted &= ~maps[i].known.cpu()
-        if masks is not None and (shown := masks[i]) is not None:
-            wanted &= shown.cpu()
+        wanted = torch.ones(photo.image.shape[:2], dtype=torch.bool) if photo.shown is None else photo.shown.cpu()
+        if depth_map is not None:
+            wanted = wanted & ~depth_map.known.cpu()
         grid = grid[wanted[y, x]]
         shade = sample_colors(photo.image, grid)
         if background is not None:
             surface = ~is_background(shade, background)
             grid, shade = grid[surface], shade[surface]
-        depth_map = None if maps is None else maps[i]
         inverse_depth = _completed(means, photo, grid, 2 * stride, depth_map) if len(grid) else None
         if inverse_depth is None:
             continue

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from clear_strategies.core.view import Photo
 from rasterizers.interface import Camera, Color
 
 _SAME_COLOR: Final = 2 / 255  # largest difference of a background pixel from the background's colour
@@ -70,6 +72,11 @@ def sample_colors(image: Float[Tensor, "H W 3"], pixels: Float[Tensor, "N 2"]) -
     batch = image.permute(2, 0, 1)[None]
     samples = torch.nn.functional.grid_sample(batch, grid, padding_mode="border", align_corners=False)
     return samples[0, :, 0].T.cpu()
+
+
+def blackened(photo: Photo) -> Photo:
+    """The photo with black in place of what its mask hides, where no features are found then."""
+    return photo if photo.shown is None else replace(photo, image=photo.image * photo.shown[..., None])
 
 
 def is_background(colors: Float[Tensor, "*shape 3"], background: Color) -> Bool[Tensor, "*shape"]:

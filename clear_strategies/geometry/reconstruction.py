@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import NoReturn
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,7 +16,7 @@ from clear_strategies.errors import DataError
 from clear_strategies.geometry.dense_stereo.cloud import stereo_cloud
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
-from clear_strategies.geometry.projection import seen_pixels
+from clear_strategies.geometry.projection import blackened, seen_pixels
 from clear_strategies.geometry.sift import features_of
 from rasterizers.interface import Camera
 
@@ -76,88 +75,70 @@ def stereo(
 
     Raises:
         DataError: a shape, range or camera is wrong, there are fewer than two photos, or stereo confirms no depth.
-        SettingError: `background` is no colour.
     """
     color = None if background is None else as_color("background", list(background))
     settings = settings or StereoSettings()
-    photos = _photos(images, world_to_camera, Ks)
-    shown = None if masks is None else _masks(masks, photos)
-    if shown is not None:
-        photos = [replace(p, image=p.image * m[..., None]) for p, m in zip(photos, shown, strict=True)]
+    photos = _photos(images, world_to_camera, Ks, masks)
     known = features_of(photos) if features is None else _features(*features)
-    if shown is not None:
-        known = known[_unhidden(known.means, photos, shown).nonzero()[:, 0]]
-    maps = depth_maps(photos, known.means, settings, color, shown)
-    cloud = stereo_cloud(known, photos, maps, settings, background=color, masks=shown, fill=fill)
+    known = known[_unhidden(known.means, photos).nonzero()[:, 0]]
+    maps = depth_maps(photos, known.means, settings, color)
+    cloud = stereo_cloud(known, photos, maps, settings, background=color, fill=fill)
     if cloud is None:
-        remedy = (
-            "check the poses (world-to-camera, OpenCV axes) and Ks (in pixels of these photos), or give photos that see the "
-            "same surfaces from 1 to 45 degrees apart"
-        )
-        _refuse("images", f"stereo confirms no depth in any of the {len(photos)} photos", remedy)
+        raise DataError(
+            "stereo", "images", f"stereo confirms no depth in any of the {len(photos)} photos",
+            "check the poses (world-to-camera, OpenCV axes) and Ks (in pixels of these photos), or give photos that see the same "
+            "surfaces from 1 to 45 degrees apart",
+        )  # fmt: skip
     summary = cloud.source if features is not None or len(known) else f"{cloud.source}; {known.source}"
-    device = photos[0].image.device
-    return Stereo(
-        tuple(maps), cloud.means.to(device), cloud.colors.to(device), f"{len(cloud):,} points in all: {summary}"
-    )
+    means, colors = (x.to(photos[0].image.device) for x in (cloud.means, cloud.colors))
+    return Stereo(tuple(maps), means, colors, f"{len(cloud):,} points in all: {summary}")
 
 
-def _photos(images: Sequence[Tensor] | Tensor, world_to_camera: Tensor, Ks: Tensor) -> list[Photo]:
+def _photos(
+    images: Sequence[Tensor] | Tensor, poses: Tensor, Ks: Tensor, masks: Sequence[Tensor | None] | None
+) -> list[Photo]:
+    """What was given, checked; black where a mask hides it."""
     count = len(images)
-    if count < 2:
-        _refuse("images", f"must be at least 2 photos, got {count}", "depth needs a second photo of the same surfaces")
-    for name, tensor, shape in (("world_to_camera", world_to_camera, (count, 4, 4)), ("Ks", Ks, (count, 3, 3))):
-        if tuple(tensor.shape) != shape:
-            _refuse(
-                name, f"must have shape {shape} for {count} photos, got {tuple(tensor.shape)}", "stack one per photo"
-            )
-    device = images[0].device
-    poses, intrinsics = world_to_camera.detach().cpu(), Ks.detach().cpu().double()
-    colors = [_image(i, image) for i, image in enumerate(images)]
-    return [Photo(_camera(i, poses[i], intrinsics[i], color), color.to(device)) for i, color in enumerate(colors)]
+    _require(
+        count >= 2, "images", f"must be at least 2 photos, got {count}", "depth needs a second photo of the surfaces"
+    )
+    for name, tensor, shape in (("world_to_camera", poses, (count, 4, 4)), ("Ks", Ks, (count, 3, 3))):
+        found = f"must have shape {shape} for {count} photos, got {tuple(tensor.shape)}"
+        _require(tuple(tensor.shape) == shape, name, found, "stack one per photo")
+    masks = [None] * count if masks is None else masks
+    found = f"must be one for each of {count} photos, got {len(masks)}"
+    _require(len(masks) == count, "masks", found, "give None where none hides")
+    poses, Ks, photos = poses.detach().cpu(), Ks.detach().cpu().double(), []
+    for i, (image, mask) in enumerate(zip(images, masks, strict=True)):
+        color = _image(f"images[{i}]", image)
+        if mask is not None:
+            found = f"must have shape {tuple(color.shape[:2])}, got {tuple(mask.shape)}"
+            _require(mask.shape == color.shape[:2], f"masks[{i}]", found, "give [h, w] of the photo")
+        shown = None if mask is None else mask.detach().to(images[0].device) > 0
+        photos.append(blackened(Photo(_camera(i, poses[i], Ks[i], color), color.to(images[0].device), shown)))
+    return photos
 
 
-def _image(i: int, image: Tensor) -> Float[Tensor, "h w 3"]:
-    name = f"images[{i}]"
-    if image.ndim != 3 or image.shape[-1] != 3 or image.numel() == 0:
-        _refuse(
-            name, f"must have shape [h, w, 3], got {tuple(image.shape)}", "put the RGB channels last, without alpha"
-        )
+def _image(name: str, image: Tensor) -> Float[Tensor, "h w 3"]:
+    rgb = image.ndim == 3 and image.shape[-1] == 3 and image.numel() > 0
+    remedy = "put the RGB channels last, without alpha"
+    _require(rgb, name, f"must have shape [h, w, 3], got {tuple(image.shape)}", remedy)
     if image.dtype == torch.uint8:
         return image.detach().float() / 255
-    if not image.is_floating_point():
-        _refuse(name, f"must be uint8 or floating point, got {image.dtype}", "give uint8 in 0…255, or float in [0, 1]")
+    found = f"must be uint8 or floating point, got {image.dtype}"
+    _require(image.is_floating_point(), name, found, "give uint8 in 0…255, or float in [0, 1]")
     low, high = (float(x) for x in image.detach().aminmax())
-    if not 0 <= low <= high <= 1:  # nan too
-        _refuse(name, f"must lie in [0, 1], spans [{low:g}, {high:g}]", "divide 8-bit values by 255, or clamp")
+    found = f"must lie in [0, 1], spans [{low:g}, {high:g}]"
+    _require(0 <= low <= high <= 1, name, found, "divide 8-bit values by 255, or clamp")  # not for nan
     return image.detach().float()
 
 
-def _masks(masks: Sequence[Tensor | None], photos: Sequence[Photo]) -> list[Bool[Tensor, "h w"]]:
-    if len(masks) != len(photos):
-        _refuse(
-            "masks", f"must be one for each of {len(photos)} photos, got {len(masks)}", "give None where none hides"
-        )
-    shown = []
-    for i, (mask, photo) in enumerate(zip(masks, photos, strict=True)):
-        shape = photo.image.shape[:2]
-        if mask is not None and mask.shape != shape:
-            _refuse(
-                f"masks[{i}]", f"must have shape {tuple(shape)}, got {tuple(mask.shape)}", "give [h, w] of the photo"
-            )
-        ones = torch.ones(shape, dtype=torch.bool, device=photo.image.device)
-        shown.append(ones if mask is None else mask.detach().to(photo.image.device) > 0)
-    return shown
-
-
-def _unhidden(
-    points: Float[Tensor, "N 3"], photos: Sequence[Photo], masks: Sequence[Bool[Tensor, "h w"]]
-) -> Bool[Tensor, " N"]:
+def _unhidden(points: Float[Tensor, "N 3"], photos: Sequence[Photo]) -> Bool[Tensor, " N"]:
     """False for points that lie only at hidden pixels of the photos."""
     shown, hidden = torch.zeros(len(points), dtype=torch.bool), torch.zeros(len(points), dtype=torch.bool)
-    for photo, mask in zip(photos, masks, strict=True):
+    for photo in photos:
         inside, row, column, _ = seen_pixels(photo.camera, points)
-        visible = mask.cpu()[row, column]
+        visible = torch.ones_like(row, dtype=torch.bool) if photo.shown is None else photo.shown.cpu()[row, column]
         shown[inside] |= visible
         hidden[inside] |= ~visible
     return shown | ~hidden
@@ -165,27 +146,26 @@ def _unhidden(
 
 def _camera(i: int, pose: Tensor, K: Tensor, image: Tensor) -> Camera:
     (fx, skew, cx), (below, fy, cy), last = K.tolist()
-    if skew != 0 or below != 0 or last != [0, 0, 1]:
-        _refuse(f"Ks[{i}]", f"must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}", "rectify the photo")
+    found = f"must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}"
+    _require(skew == below == 0 and last == [0, 0, 1], f"Ks[{i}]", found, "rectify the photo")
     try:
         return Camera(pose, fx, fy, cx, cy, image.shape[1], image.shape[0])
     except ValueError as error:
-        raise DataError(
-            "stereo", f"camera {i}", str(error), "give rigid world-to-camera transforms, and Ks in pixels"
-        ) from error
+        remedy = "give rigid world-to-camera transforms, and Ks in pixels"
+        raise DataError("stereo", f"camera {i}", str(error), remedy) from error
 
 
 def _features(means: Tensor, colors: Tensor) -> PointCloud:
     means, colors = (x.detach().cpu().float() for x in (means, colors))
-    if means.ndim != 2 or means.shape[1] != 3 or means.shape != colors.shape:
-        shapes = f"{tuple(means.shape)} and {tuple(colors.shape)}"
-        _refuse("features", f"must be positions [N, 3] and colours [N, 3], got {shapes}", "give a pair (means, colors)")
-    if not bool(means.isfinite().all()):
-        _refuse("features", "must have finite positions", "remove the others")
-    if not bool(((colors >= 0) & (colors <= 1)).all()):
-        _refuse("features", "must have colours in [0, 1]", "divide 8-bit values by 255")
+    pair = means.ndim == 2 and means.shape[1] == 3 and means.shape == colors.shape
+    found = f"must be positions [N, 3] and colours [N, 3], got {tuple(means.shape)} and {tuple(colors.shape)}"
+    _require(pair, "features", found, "give a pair (means, colors)")
+    _require(bool(means.isfinite().all()), "features", "must have finite positions", "remove the others")
+    in_range = bool(((colors >= 0) & (colors <= 1)).all())
+    _require(in_range, "features", "must have colours in [0, 1]", "divide 8-bit values by 255")
     return PointCloud(means, colors, f"{len(means):,} given points")
 
 
-def _refuse(field: str, problem: str, remedy: str) -> NoReturn:
-    raise DataError("stereo", field, problem, remedy)
+def _require(condition: bool, field: str, problem: str, remedy: str) -> None:
+    if not condition:
+        raise DataError("stereo", field, problem, remedy)

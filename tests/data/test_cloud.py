@@ -11,7 +11,6 @@ import torch
 from clear_strategies.core import images
 from clear_strategies.core.view import Photo
 from clear_strategies.data.cloud import CloudSettings, from_tracks, initial_points, random_cloud
-from clear_strategies.data.cloud.compared import compared_at
 from clear_strategies.data.ply import write_points
 from clear_strategies.data.readers import colmap
 from clear_strategies.data.view_settings import ViewSettings, split
@@ -60,29 +59,23 @@ def test_stereo_at_hr_keeps_its_size_for_photos_and_that_of_lr_for_sr_images(com
     assert ((known / 4 - 1).abs() < 0.03).float().mean() > 0.95
 
 
-def test_sr_images_of_few_photos_only_are_compared(monkeypatch) -> None:
+def test_sr_images_are_compared_of_few_photos_and_not_of_an_object_before_a_plain_background(monkeypatch) -> None:
     hr = plane_photos(6, 64, 48)
-    lr = [photo.reduced(2) for photo in hr]
-    compared = []
+    lr, compared = [photo.reduced(2) for photo in hr], []
 
     def recorded(photos, *arguments):
         compared.append(photos[0].camera.width)
         return depth_maps(photos, *arguments)
 
     monkeypatch.setattr("clear_strategies.data.cloud.compared.depth_maps", recorded)
+    settings = CloudSettings(init="stereo", densify=False)
     for n in (5, 6):
-        initial_points(CloudSettings(init="stereo", densify=False), lr[:n], hr=hr[:n])
+        initial_points(settings, lr[:n], hr=hr[:n])
     assert compared == [32, 64, 32]
-
-
-def test_sr_images_of_an_object_before_a_plain_background_are_not_compared() -> None:
-    hr = plane_photos(3, 128, 96)
-    for one in hr:
-        one.image[:48] = 1.0
-    lr = [photo.reduced(4) for photo in hr]
-    compared = compared_at(lr, hr, hr_is_photo=False, settings=StereoSettings(), background=(1.0, 1.0, 1.0))
-    assert compared.reduction == 1
-    assert compared.images == lr
+    for one in lr[:3]:
+        one.image[:12] = 1.0
+    initial_points(settings, lr[:3], hr=hr[:3], background=(1.0, 1.0, 1.0))
+    assert compared == [32, 64, 32, 32]
 
 
 @pytest.mark.parametrize(

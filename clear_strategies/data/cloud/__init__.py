@@ -9,7 +9,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final, Literal, get_args
+from typing import Final, Literal, NamedTuple, get_args
 
 import torch
 
@@ -17,7 +17,7 @@ from clear_strategies.core.checks import refuse, require_choice, require_number,
 from clear_strategies.core.points import MAX_POINTS, PointCloud
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.capture import SfmPoints
-from clear_strategies.data.cloud.compared import blackened, compared_at, shown_pixels
+from clear_strategies.data.cloud.compared import stereo_depths
 from clear_strategies.data.ply import read_points
 from clear_strategies.errors import DataError
 from clear_strategies.geometry.cameras import common_box
@@ -25,6 +25,7 @@ from clear_strategies.geometry.cleaning import OUTLIER_NEIGHBOURS, OUTLIER_RATIO
 from clear_strategies.geometry.dense_stereo.cloud import stereo_cloud
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.filling import STRIDE, densify, pixel_grid
+from clear_strategies.geometry.projection import blackened
 from clear_strategies.geometry.sift import TriangulationSettings, triangulate
 from rasterizers.interface import Color
 
@@ -69,9 +70,6 @@ class CloudSettings:
         max_points: a larger cloud is reduced to this many points, chosen at random.
         triangulation: for init=stereo, triangulated and auto.
         stereo: for init=stereo and auto.
-
-    Raises:
-        SettingError: a value is outside its range, or init=ply comes without a path.
     """
 
     init: Init = "auto"
@@ -116,8 +114,7 @@ def require_source(settings: CloudSettings, sfm: SfmPoints | None) -> None:
         raise DataError(str(settings.path), "file", "is not there", "set data.cloud.path to a PLY file")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class InitialPoints:
+class InitialPoints(NamedTuple):
     """The initial cloud, and the depth maps that stereo made it from, one for each photo; without stereo none."""
 
     cloud: PointCloud
@@ -146,12 +143,9 @@ def initial_points(
         train_ids: their ids of the training frames.
         sfm_is_train: every photo of the capture is a training view, so init=auto may take the SfM points as features.
         background: the colour of pixels without a surface (Blender's white), RGB in [0, 1].
-
-    Raises:
-        DataError: the scene cannot give this cloud.
     """
     require_source(settings, sfm)
-    initial: InitialPoints | None = None
+    shown, initial = [blackened(photo) for photo in photos], None
     match settings.init:
         case "ply":
             initial = _cleaned(settings, from_ply(Path(str(settings.path))), photos, background)
@@ -160,23 +154,21 @@ def initial_points(
         case "sfm_train" if sfm is not None:
             initial = _cleaned(settings, from_tracks(sfm, train_ids, settings.min_views), photos, background)
         case "triangulated":
-            visible = [blackened(photo) for photo in photos]
-            features = triangulate(visible, settings.triangulation)
+            features = triangulate(shown, settings.triangulation)
             if len(features) == 0:
                 problem = f"none could be triangulated from the {len(photos)} training LR images"
                 raise DataError("scene", "points", problem, "use init=random, or more or closer views")
-            initial = _cleaned(settings, features, visible, background)
+            initial = _cleaned(settings, features, shown, background)
         case "stereo" | "auto":
             known = _sfm_of_training_views(settings, sfm, train_ids) if sfm_is_train else None
             if settings.init == "auto" and sfm is not None and not sfm_is_train:
                 _log.debug("init: auto does not use the scene's own points, because test views were used for them.")
-            initial = _from_depth(settings, photos, hr, hr_is_photo, known, background)
-    cloud = random_cloud(photos, settings.random_points, seed, settings.box) if initial is None else initial.cloud
+            shown_hr = [blackened(photo) for photo in hr]
+            initial = _from_depth(settings, shown, shown_hr, hr_is_photo, known, background)
+    cloud, depths = initial or InitialPoints(random_cloud(photos, settings.random_points, seed, settings.box))
     if settings.voxel is not None:
         cloud = averaged_in_voxels(cloud, settings.voxel)
-    if len(cloud) > settings.max_points:
-        _log.debug("%d of %d points chosen at random (max_points).", settings.max_points, len(cloud))
-    return InitialPoints(cloud.at_most(settings.max_points, seed), () if initial is None else initial.depths)
+    return InitialPoints(cloud.at_most(settings.max_points, seed), depths)
 
 
 def _sfm_of_training_views(
@@ -200,34 +192,29 @@ def _from_depth(
     features: PointCloud | None,
     background: Color | None,
 ) -> InitialPoints | None:
-    """init=stereo and auto: points of depth maps; where there is no depth, auto takes features, or None if these are too few.
-
-    Args:
-        features: points on the surfaces; None: they are triangulated.
-    """
-    photos, hr = [blackened(photo) for photo in photos], [blackened(photo) for photo in hr]
+    """init=stereo and auto: points of depth maps; where there is no depth, auto takes features, or None if these are too few."""
     features = triangulate(photos, settings.triangulation) if features is None else features
-    compares_hr = settings.compare == "hr" or (
-        settings.compare == "auto" and (hr_is_photo or len(photos) <= _FEW_PHOTOS)
+    few = hr_is_photo or len(photos) <= _FEW_PHOTOS
+    compares_hr = settings.compare == "hr" or (settings.compare == "auto" and few)
+    found = stereo_depths(
+        photos,
+        hr if compares_hr else (),
+        features.means,
+        settings.stereo,
+        hr_is_photo=hr_is_photo,
+        background=background,
     )
-    compared = compared_at(
-        photos, hr if compares_hr else (), hr_is_photo=hr_is_photo, settings=settings.stereo,
-        background=background or (0.0, 0.0, 0.0),
-    )  # fmt: skip
-    maps = compared.depth_maps(features.means, background)
     cloud = stereo_cloud(
-        features, compared.photos, maps, compared.settings, background=background, masks=shown_pixels(compared.photos),
-        fill=settings.densify is not False,
-        stride=round(compared.finer * settings.stride),  # completed points stay as few as at LR
+        features, found.photos, found.maps, found.settings, background=background, fill=settings.densify is not False,
+        stride=round(found.finer * settings.stride),  # completed points stay as few as at LR
         outlier_neighbours=settings.outlier_neighbours, outlier_ratio=settings.outlier_ratio,
     )  # fmt: skip
-    none = f"stereo confirms no depth in any of the {len(photos)} training LR images"
     if cloud is not None:
-        initial = InitialPoints(cloud, maps)
+        initial = InitialPoints(cloud, found.maps)
     elif settings.init == "stereo":
+        none = f"stereo confirms no depth in any of the {len(photos)} training LR images"
         raise DataError("scene", "points", none, "use init=triangulated or random, or closer views")
     else:
-        _log.debug("init: %s.", none)
         if len(features) < settings.enough:
             message = "init: auto chose random points: the training LR images give only %d (data.cloud.enough: %d)."
             _log.warning(message, len(features), settings.enough)
@@ -268,9 +255,6 @@ def from_tracks(sfm: SfmPoints, train_ids: Sequence[int], min_views: int) -> Poi
     """The scene's SfM points that at least `min_views` of the frames `train_ids` observe.
 
     Their positions still come from all views, test views included, so `uses_test_views` is "yes".
-
-    Raises:
-        DataError: there is no such point, or the points have no tracks.
     """
     if len(sfm.track_point) == 0:
         raise DataError("scene", "points", "come without tracks", "use init=triangulated, or init=sfm for all of them")
@@ -285,11 +269,7 @@ def from_tracks(sfm: SfmPoints, train_ids: Sequence[int], min_views: int) -> Poi
 
 
 def random_cloud(photos: Sequence[Photo], count: int, seed: int, box: float | None = None) -> PointCloud:
-    """Uniform points in a box, nearly grey.
-
-    Args:
-        box: half-edge of the box around the origin, world units; None: `common_box`.
-    """
+    """Uniform points, nearly grey, in a box around the origin of half-edge `box`, world units; None: `common_box`."""
     if box is None:
         (low, high), where = common_box(photos), "the cameras' common box"
     else:

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.core.points import PointCloud
@@ -28,7 +28,6 @@ def stereo_cloud(
     settings: StereoSettings,
     *,
     background: Color | None = None,
-    masks: Sequence[Bool[Tensor, "h w"]] | None = None,
     fill: bool = True,
     stride: int = STRIDE,
     outlier_neighbours: int = OUTLIER_NEIGHBOURS,
@@ -41,7 +40,6 @@ def stereo_cloud(
     Args:
         features: points of the surfaces, e.g. triangulated ones; there may be none.
         background: the colour of pixels without a surface.
-        masks: of each photo, False where it hides pixels, which are not filled.
         fill: add a grid of `stride` px at completed depth where a photo's depth is unknown.
         outlier_neighbours, outlier_ratio: see `without_outliers`.
     """
@@ -65,7 +63,7 @@ def stereo_cloud(
     cloud = without_outliers(PointCloud(means, colors, source), outlier_neighbours, outlier_ratio)
     if not fill:
         return cloud
-    added, shades = grid_points(cloud.means, photos, stride, background, maps, masks)
+    added, shades = grid_points(cloud.means, photos, stride, background, maps)
     source = f"{source}, filled by {len(added):,} at completed depth"
     return PointCloud(torch.cat((cloud.means, added)), torch.cat((cloud.colors, shades)), source)
 

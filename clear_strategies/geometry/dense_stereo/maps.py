@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.progress import Progress
@@ -35,17 +35,15 @@ def depth_maps(
     points: Float[Tensor, "N 3"] | None = None,
     settings: StereoSettings | None = None,
     background: Color | None = None,
-    masks: Sequence[Bool[Tensor, "h w"]] | None = None,
 ) -> list[DepthMap]:
     """The depth of each photo where others confirm it; unknown everywhere for photos whose stereo cannot be trusted.
 
     Args:
-        photos: posed, of any sizes, on one device.
+        photos: posed, of any sizes, on one device. What their masks hide gets no depth.
         points: of the surfaces, world units: they give the range of depth, and the result is checked by them. There may be
             none; then the cameras give the range. None: features are triangulated where OpenCV, kornia and SciPy are
             installed.
         background: the colour of pixels without a surface, RGB in [0, 1].
-        masks: of each photo, False where it hides pixels: they get no depth. None: every pixel counts.
 
     Returns:
         A map for each photo, of its size and on its device.
@@ -68,8 +66,8 @@ def depth_maps(
         good &= (estimate.correlation >= settings.min_correlation) & (agreeing > 0)
         if background is not None:
             good &= ~is_background(photo.image, background)
-        if masks is not None:
-            good &= masks[i].to(good.device)
+        if photo.shown is not None:
+            good &= photo.shown
         confidence = estimate.correlation.clamp(0, 1) * (agreeing.float() / 2).clamp(max=1)
         depth = torch.where(good, 1 / inverse_depth, torch.nan)
         good &= ~speckles(depth, settings.speckle, _LIKE)
