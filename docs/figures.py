@@ -4,7 +4,6 @@ python docs/figures.py                     those of the evidence pages, from the
 python docs/figures.py demo [OVERRIDE …]   the first tutorial's: trains the demo without strategies and with clear
 python docs/figures.py host                the README's: trains in a gsplat loop, without strategies and with best
 python docs/figures.py notebook            runs docs/tutorial/notebook.ipynb and keeps the outputs of its cells
-python docs/figures.py pages RUN           a run's splat.html and the viewer, in Chromium
 """
 
 from __future__ import annotations
@@ -13,11 +12,9 @@ import base64
 import csv
 import os
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Final
@@ -54,7 +51,7 @@ def numbers(cell: str) -> list[float]:
 
 def error(cell: str) -> float:
     """The number after ±; 0 without one."""
-    return float(cell.split("±")[1]) if "±" in cell else 0.0
+    return float(cell.partition("±")[2] or 0)
 
 
 def write(figure: Any, folder: Path, name: str) -> None:
@@ -254,51 +251,6 @@ def notebook(path: Path) -> None:
     nbformat.write(content, path)
 
 
-CHROMIUM: Final = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-WINDOW: Final = {"width": 720, "height": 460}
-# viser's, that the browser draws without a GPU.
-CLOSE_WARNING: Final = (
-    "document.querySelectorAll('.mantine-Notification-closeButton').forEach(button => button.click())"
-)
-
-
-def pages(folder: Path, run: Path) -> None:
-    """A run as Chromium shows it: the page of the splat, and the viewer."""
-    from playwright.sync_api import sync_playwright
-
-    from clear_strategies.jobs.saved import open_splat
-    from clear_strategies.viewing.server import Screen, SplatViewer
-
-    splat = open_splat(run)
-    viewer = SplatViewer(Screen(splat.painter, splat.cameras), title=splat.name, port=8437, out=run)
-    addresses = {
-        "splat_page": (run / "splat.html").resolve().as_uri(),
-        "viewer": viewer.address,
-    }
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM)
-        for name, address in addresses.items():
-            page = browser.new_page(viewport=WINDOW)
-            page.set_default_timeout(600_000)
-            page.goto(address)
-            (folder / f"{name}.jpg").write_bytes(settled(page))
-            page.close()
-        browser.close()
-    viewer.close()
-
-
-def settled(page: Any) -> bytes:
-    """The picture of a page that shows something and no longer changes."""
-    session, before = page.context.new_cdp_session(page), 0
-    while True:
-        time.sleep(5)
-        page.evaluate(CLOSE_WARNING)
-        shot = session.send("Page.captureScreenshot", {"format": "jpeg", "quality": 85})["data"]
-        if before == len(shot) > 40_000:  # an empty page has one colour
-            return base64.b64decode(shot)
-        before = len(shot)
-
-
 if __name__ == "__main__":
     match sys.argv[1:]:
         case []:
@@ -309,7 +261,5 @@ if __name__ == "__main__":
             host(DOCS / "images" / "host.png")
         case ["notebook"]:
             notebook(DOCS / "tutorial" / "notebook.ipynb")
-        case ["pages", run]:
-            pages(DOCS / "images", Path(run))
         case _:
             sys.exit(__doc__)

@@ -182,7 +182,6 @@ NOT_RUN = {
     "waits for a browser": r"^clear-strategies view",
     "takes minutes, or a file that the viewer saves": r"--frames 240|flight\.json",
     "a class that the reader names": r"YourStrategy",
-    "a wheel's first run, in the gate": r"^clear-strategies \+strategy=clear fit.iterations=10$",
 }
 
 
