@@ -21,6 +21,8 @@ from clear_strategies.core.checks import require_choice
 DownKernel = Literal["bicubic", "bilinear", "lanczos", "area"]
 UpKernel = Literal["bicubic", "nearest"]
 
+_LEAST_DIFFERENCE: Final = 1 / 255  # a smaller one is no contradiction
+
 _PIL_FILTERS: Final = {
     "bicubic": Image.Resampling.BICUBIC,
     "bilinear": Image.Resampling.BILINEAR,
@@ -116,6 +118,15 @@ def patch_means(values: Float[Tensor, "H W C"], patch: int) -> Float[Tensor, "ph
     """
     mean = values.mean(dim=2)[None, None]
     return F.avg_pool2d(mean, patch, ceil_mode=True, count_include_pad=False)[0, 0]
+
+
+def agreement(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 1"]:
+    """1 / (1 + (r / 2m)²) at each pixel, with r the mean difference of the 5 x 5 pixels around it and m the median of r: a robust
+    weight, near 1 at most pixels and low where `target` shows what `image` contradicts.
+    """
+    difference = (image - target).abs().mean(dim=2)[None, None]
+    r = F.avg_pool2d(difference, 5, 1, 2, count_include_pad=False)[0, 0]
+    return (1 / (1 + (r / (2 * r.median()).clamp_min(_LEAST_DIFFERENCE)).square()))[..., None]
 
 
 def to_bytes(image: Float[Tensor, "H W *C"]) -> np.ndarray:

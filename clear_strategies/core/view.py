@@ -202,11 +202,14 @@ class ExtraView:
         photo: the target, and its camera. Any size; the smaller, the cheaper.
         weight: >= 0 for each pixel, a multiple of λ_LR; 0 where the target is unknown.
         background: see `View.background`; what a transparent photo lies over.
+        robust: the photo was invented in part: where the render differs from it much more than elsewhere, the weight is lower,
+            see `clear_strategies.core.images.agreement`.
     """
 
     photo: Photo
     weight: Float[Tensor, "h w"]
     background: Color = (0.0, 0.0, 0.0)
+    robust: bool = False
 
     def to(self, device: torch.device | str) -> ExtraView:
         return replace(self, photo=self.photo.to(device), weight=self.weight.to(device))

@@ -58,6 +58,11 @@ def partners(cameras: Sequence[Camera]) -> list[list[int]]:
     return [sorted(row[rank] for rank in ranks) for row in rows]
 
 
+def distance_to(camera: Camera, means: Float[Tensor, "N 3"]) -> float:
+    """From the camera to the middle of the points, the median of each coordinate; 1 for a camera that is there."""
+    return float(torch.linalg.vector_norm(camera.center.double() - means.median(dim=0).values.cpu().double())) or 1.0
+
+
 def moved(camera: Camera, step: Float[Tensor, " 3"], *, aim: float) -> Camera:
     """The camera moved, and turned to keep in its middle what it saw there.
 

@@ -207,6 +207,7 @@ def _train(training: _Training, state: TrainState, place: _Place) -> tuple[Evalu
             fit(state, place.device_scene, rasterizer, checkpoints=folder, config=training.compared, progress=progress)
         seconds = time.perf_counter() - began
         training.conductor.on_fit_end()  # its memory is for the results
+        state.second = state.other = None
         memory.release()
         evaluation = results.write_results(
             training.folder, place.scene, state, rasterizer, training.chosen,

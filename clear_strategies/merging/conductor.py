@@ -24,14 +24,14 @@ from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.iteration import HrGradients, Merged, Stepper, Update, require_finite_parts
 from clear_strategies.merging.objective import Losses, Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
-from clear_strategies.strategies.base import ScreenGradients, Strategy, by_class, overrides
+from clear_strategies.strategies.base import Drawn, ScreenGradients, Strategy, by_class, overrides
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
 P = TypeVar("P")
 
-_ONE_ANSWER: Final = ("densifier", "background", "gate", "observe", "route", "correct", "score")
+_ONE_ANSWER: Final = ("densifier", "background", "gate", "observe", "route", "correct", "score", "second_seed")
 
 
 class Conductor:
@@ -50,6 +50,7 @@ class Conductor:
         skips: which work of the run is left out.
         regularizers: the strategies that override `regularize`.
         decorated: whether `prior` has been called, or there are no decorators.
+        sr: the prior that `prior` was called with; None before.
 
     Raises:
         StrategyConflict: two strategies answer a question that only one may.
@@ -65,6 +66,7 @@ class Conductor:
         self.decorators, self.detail = tuple(decorators), detail if detail is not None else DetailRates()
         self.skips = SkipPolicy(skips)
         self.decorated = not self.decorators
+        self.sr: Any = None
         self.work_log = WorkLog()
         self._hr_cotangents: Tensor | None = None
         self._owner = dict.fromkeys(_ONE_ANSWER, Strategy())  # its hooks hold where no strategy overrides them
@@ -79,7 +81,7 @@ class Conductor:
             if owners:
                 self._owner[hook] = owners[0]
         self.regularizers = [s for s in strategies if overrides(s, "regularize")]
-        others = ("regularize", "extra_views", "may_densify", "after_step")
+        others = ("regularize", "extra_views", "drawn_views", "may_densify", "after_step")
         for s in strategies:
             if not any(overrides(s, hook) for hook in (*_ONE_ANSWER, *others)):
                 _log.warning("%s implements no hook; it has no effect.", type(s).__name__)
@@ -107,6 +109,7 @@ class Conductor:
 
     def prior(self, prior: P) -> P:
         """The prior with every decorator around it: what makes the SR images of a run with this conductor."""
+        self.sr = prior
         for decorate in self.decorators:
             prior = decorate(prior)
         self.decorated = True
@@ -216,11 +219,31 @@ class Conductor:
         apart = apart or self.owner("route") is not None or self.owner("score") is not None
         return self._backward_hr(hr, Step(t, view, hr.visible), vjp or _vjp, apart=apart)[1]
 
-    def extra_views(self, t: int) -> list[ExtraView]:
-        """The pictures that the field should match at t besides the view; each gets a step on `extra_loss`."""
+    def copy(self) -> Conductor:
+        """A conductor of the same settings for a second field, which shares the work log. No plateau ends the second field's
+        training: it follows the first.
+        """
+        copy = Conductor(
+            *(replace(s) for s in self.strategies), objective=self.objective, statistics_from=self.statistics_from,
+            decorators=self.decorators, detail=self.detail, skips=replace(self.skips.skips, plateau_gain=0.0),
+        )  # fmt: skip
+        copy.decorated, copy.sr, copy.work_log = self.decorated, self.sr, self.work_log
+        return copy
+
+    def extra_views(self, t: int, drawn: Drawn | None = None) -> list[ExtraView]:
+        """The pictures that the field should match at t besides the view; each gets a step on `extra_loss`.
+
+        Args:
+            drawn: what `Strategy.drawn_views` may look at; None: it is not called.
+        """
         if self.objective.lambda_lr == 0:
             return []
-        return [extra for s in self.strategies for extra in s.extra_views(t)]
+        views = [extra for s in self.strategies for extra in s.extra_views(t)]
+        for s in self.strategies:
+            if drawn is not None and overrides(s, "drawn_views"):
+                with self.work_log.stage("pictures drawn"):
+                    views += s.drawn_views(t, drawn)
+        return views
 
     def extra_loss(self, image: Float[Tensor, "h w 3"], extra: ExtraView, t: int) -> Losses:
         """The LR loss of a render of `extra`, weighted by pixel: its value and its cotangent [1, h, w, 3].  Eq. 4
@@ -232,7 +255,10 @@ class Conductor:
         """
         weight = extra.weight[..., None]
         target = torch.where(weight > 0, extra.photo.over(self.background(t), extra.background).image, 0.0)
-        loss = self.objective.lr(torch.where(weight > 0, image.detach(), 0.0), target)
+        render = torch.where(weight > 0, image.detach(), 0.0)
+        if extra.robust:
+            weight = weight * images.agreement(render, target)
+        loss = self.objective.lr(render, target)
         require_finite_losses(f"t={t}, an extra view", loss.values, {"its picture": target, "the render": image})
         return loss._replace(cotangents=loss.cotangents * weight)
 

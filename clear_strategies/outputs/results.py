@@ -17,6 +17,7 @@ from clear_strategies.core.images import DownKernel
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.view_names import file_stem
+from clear_strategies.density.shuffle import SECOND_STAGE
 from clear_strategies.errors import DataError
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.contact_sheet import OWN_PHOTO, TRAINED_ON, SheetRow, write_contact_sheet
@@ -110,7 +111,7 @@ def write_results(
         _write_video(folder / "path.mp4", train, painter, pictures.video_frames)
     with work_log.stage("page"):
         _write_page(folder / splat_page.FILE, train, painter, pictures.page_gaussians, title, scene.background)
-    _write_tables(folder, history, [*scene.work_log.rows(), *work_log.rows()])
+    _write_tables(folder, history, [*scene.work_log.rows(), *_two_stages(state, history), *work_log.rows()])
     files.write_json(
         folder / _METRICS,
         metrics.to_json(
@@ -207,6 +208,16 @@ def _write_tables(
     files.write_csv(
         folder / "timing.csv", stages, ["stage", "runs", "ms_each", "seconds", "skipped", "seconds_saved", "why"]
     )
+
+
+def _two_stages(state: TrainState, history: Sequence[Mapping[str, float]]) -> list[dict[str, str | int | float]]:
+    """Iterations and seconds of each stage of a method of two stages; the rows after them say what the seconds went to."""
+    begins = state.density.marks.get(SECOND_STAGE)
+    if begins is None or not history:
+        return []
+    first, whole = max((row["seconds"] for row in history if row["t"] < begins), default=0.0), history[-1]["seconds"]
+    rows = ("first stage", begins - 1, first), (SECOND_STAGE, state.t - begins, whole - first)
+    return [{"stage": name, "runs": runs, "seconds": round(seconds, 3)} for name, runs, seconds in rows]
 
 
 def _mean_conflict(history: Sequence[Mapping[str, float]]) -> dict[str, float]:

@@ -20,10 +20,12 @@ from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import conflict_columns
 from clear_strategies.core.seeds import generator_at
 from clear_strategies.core.view import ExtraView, View
+from clear_strategies.data.priors import Bicubic, network_of
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DivergedError
 from clear_strategies.merging.iteration import Update
 from clear_strategies.merging.skips import PLATEAU_LOSS
+from clear_strategies.strategies.base import Drawn
 from clear_strategies.training import checkpoint
 from clear_strategies.training.clock import Clock
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
@@ -38,6 +40,8 @@ EXTRA_LOSS: Final = "loss_extra"
 
 def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     """One iteration, in the paper's order."""
+    if s.second is not None:  # a field of its own, of the same t
+        iterate(s.second, rasterizer)
     t, θ, conductor, stage = s.t, s.field, s.conductor, s.conductor.work_log.stage
     θ.degree = min(s.settings.max_degree, (t - 1) // max(1, s.settings.degree_every))
     view = conductor.skips.view(view_at(s), t)
@@ -52,7 +56,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
         with stage("optimizer"):
             s.optimizer.step(θ.raw(), u.grads)
             θ.constrain()
-    extra = extra_steps(s, over_color, conductor.extra_views(t))
+    extra = extra_steps(s, over_color, conductor.extra_views(t, drawn_of(s, over_color)))
     conductor.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS
     *_, finest = (shot for shot in (lr, hr) if shot is not None)
     s.density.accumulate(u, finest, t)  # S^dens         Eq. 14
@@ -67,6 +71,8 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
         with stage("training views drawn whole"):
             s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)
     s.advance()
+    if s.second is not None:
+        s.second.follow(s)
     return u
 
 
@@ -76,6 +82,17 @@ def view_at(s: TrainState) -> View:
     generator = generator_at(s.settings.seed, epoch)
     order = torch.randperm(len(s.views), generator=generator, device=generator.device)
     return s.views[int(order[position])]
+
+
+def drawn_of(s: TrainState, rasterizer: Rasterizer) -> Drawn:
+    """What the strategies of `s` may look at: the other field where there are two."""
+    field = (s if s.other is None else s.other).field
+
+    def enlarged(image: Tensor, factor: int) -> Tensor:
+        network = network_of(s.conductor.sr) or Bicubic()
+        return network("a drawn picture", images.quantize(image.cpu()), factor).to(image.device)
+
+    return Drawn(field.means.data, lambda camera: field.render(rasterizer, camera, detail=False), enlarged)
 
 
 def extra_steps(s: TrainState, rasterizer: Rasterizer, extra_views: Sequence[ExtraView]) -> dict[str, Number]:

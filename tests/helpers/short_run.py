@@ -12,7 +12,18 @@ from dataclasses import replace
 
 import torch
 
-from clear_strategies import GCO, P2G, SVS, Conductor, FadingOpacity, Objective, PseudoViews, RandomBackground, Strategy
+from clear_strategies import (
+    GCO,
+    P2G,
+    SVS,
+    Conductor,
+    FadingOpacity,
+    Objective,
+    PseudoViews,
+    RandomBackground,
+    Strategy,
+    TwoFields,
+)  # fmt: skip
 from clear_strategies.core.view import DepthMap
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
@@ -60,6 +71,7 @@ def start(
         "pseudo_views": lambda: PseudoViews(count=8, reach=0.1),
         "fading_opacity": lambda: FadingOpacity(rate=0.02, until=1_350),
         "random_background": lambda: RandomBackground(until=1_350),
+        "two_fields": lambda: TwoFields(start=4, alone=0.2, compare_every=5, compare_until=12),
     }  # fmt: skip
     objective = Objective(lambda_hr=WarmupDecay(final=0.1, start=3, full=8, decay_from=14, end=ITERATIONS))
     return TrainState.start(

@@ -20,8 +20,10 @@ from clear_strategies import (
     PseudoViews,
     RandomBackground,
     SplatSuRe,
+    SRStage,
     Strategy,
     StrategyConflict,
+    TwoFields,
 )
 from clear_strategies.core.view import Photo
 from clear_strategies.kernels.losses import reference
@@ -49,7 +51,20 @@ def anchoring() -> SVS:
 
 @pytest.mark.parametrize(
     "make",
-    [GCO, P2G, SVS, anchoring, SplatSuRe, PseudoViews, FadingOpacity, MCMC, RandomBackground, Halve],
+    [
+        GCO,
+        P2G,
+        SVS,
+        anchoring,
+        SplatSuRe,
+        PseudoViews,
+        FadingOpacity,
+        MCMC,
+        RandomBackground,
+        TwoFields,
+        SRStage,
+        Halve,
+    ],
     ids=lambda make: make.__name__,
 )
 @pytest.mark.parametrize("check", CHECKS, ids=lambda c: c.__name__)

@@ -1,0 +1,93 @@
+"""A stage of its own for the SR images, after S2Gaussian (Wan et al. 2025): first a field of the LR photos, then its refinement.
+
+In the second stage each iteration also matches a picture at HR: in turn the SR image of a training view, and what the field of
+the first stage showed by a camera beside a training camera, enlarged by the network of the prior. Both are invented in part, and
+each view is invented differently, so pixels that the field contradicts count less (`ExtraView.robust`).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from clear_strategies.core.checks import require_number, require_whole
+from clear_strategies.core.seeds import hashed_generator_at
+from clear_strategies.core.view import ExtraView, Photo, View
+from clear_strategies.geometry.cameras import distance_to
+from clear_strategies.geometry.pseudo_views import moved_aside
+from clear_strategies.schedules import milestone
+from clear_strategies.strategies.base import Drawn, Strategy
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class SRStage(Strategy):
+    """HR pictures in a second stage. For this package's trainer: another one draws no picture for a strategy.
+
+    A run that is resumed in its second stage draws its pictures anew, and says so: its bits differ from an uninterrupted run's.
+
+    Args:
+        start: the last iteration of the first stage.
+        count: of pictures beside the training cameras, at least 0.
+        reach: as that of `PseudoViews`, as a multiple of a camera's distance from the middle of the Gaussians.
+        weight: of the loss of an HR picture, > 0, as a multiple of a photo's LR loss.
+
+    Raises:
+        SettingError: a setting is outside its range.
+    """
+
+    start: int = milestone(5_000)
+    count: int = 24
+    reach: float = 0.4
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        require_whole("count", self.count, least=0)
+        for name in ("reach", "weight"):
+            require_number(name, getattr(self, name), above=0)
+
+    def on_fit_start(self, n_views: int, seed: int) -> None:
+        super().on_fit_start(n_views, seed)
+        self.cache.update(seed=seed, views=(), pictures=None)
+
+    def on_views(self, views: Sequence[View]) -> None:
+        self.cache["views"] = views
+
+    def drawn_views(self, t: int, drawn: Drawn) -> Sequence[ExtraView]:
+        """From `start` on one picture at HR: a function of (seed, t) and of the field at the end of the first stage."""
+        views: Sequence[View] = self.cache["views"]
+        if t <= self.start or not views:
+            return ()
+        if self.cache["pictures"] is None:
+            if t > self.start + 1:
+                _log.warning("SRStage draws its pictures at t=%d, not at t=%d: the bits are not those of an uninterrupted run.",
+                             t, self.start + 1)  # fmt: skip
+            self.cache["pictures"] = [self._picture(views[i % len(views)], i, drawn) for i in range(self.count)]
+        photos = [view.hr for view in views] if t % 2 or not self.count else self.cache["pictures"]
+        generator = hashed_generator_at(self.cache["seed"], t)
+        photo: Photo = photos[int(torch.randint(len(photos), (), generator=generator))]
+        weight = torch.full_like(photo.image[..., 0], self.weight)
+        weight = weight if photo.shown is None else weight * photo.shown
+        return (ExtraView(photo, weight, views[0].background, robust=True),)
+
+    def _picture(self, view: View, i: int, drawn: Drawn) -> Photo:
+        """What the field shows by an LR camera beside that of `view`, enlarged."""
+        generator = hashed_generator_at(self.cache["seed"], -1 - i)
+        camera = view.lr.camera
+        camera = moved_aside(camera, distance_to(camera, drawn.means), self.reach, generator)
+        return Photo(camera.scaled(view.factor), drawn.enlarge(drawn.draw(camera), view.factor))
+
+    def on_fit_end(self) -> None:
+        self.cache.update(views=(), pictures=None)
+
+    def summary(self) -> str | None:
+        if not self.cache.get("views"):
+            return None
+        return f"SR images from t={self.start + 1} on, and {self.count} enlarged pictures of the field by cameras aside"
+
+    def without_effect(self, *, lambda_lr: float, lambda_hr: float, lambda_hf: float) -> str | None:
+        return "it is the LR loss that its pictures are trained by, and lambda_lr is 0" if lambda_lr == 0 else None
