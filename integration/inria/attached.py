@@ -13,16 +13,21 @@ from typing import Any, Final
 import torch
 from torch import Tensor
 
+from clear_strategies.core.view import View
 from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
-from integration.autograd_shot import Target
+from integration.attachment import Attachment
+from integration.autograd_shot import HostOutput, Target
 from integration.densification import require_end
-from integration.inria.cameras import HostViews, enlarged_camera
-from integration.inria.model_proxy import AttachedModel, Role
+from integration.host_score import warn_if_score_is_unused
+from integration.inria.cameras import HostViews, enlarged_camera, replaced_camera
+from integration.inria.detail import DetailFeature
+from integration.inria.model_proxy import Overrides, Role, host_output, proxy
 from integration.inria.rows import CarriedRows
 from integration.replacing import replace_everywhere, replace_methods, replaced_attribute
 from integration.views import SuperResolve, sr_source
-from rasterizers.autograd import uncompiled
+from rasterizers.autograd import recorded, uncompiled
+from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
@@ -58,6 +63,7 @@ class Attached:
 
     Attributes:
         views: the training views, by name and by camera.
+        detail: f_det, which follows the host's structure even if it is not trained.
 
     Raises:
         SettingError: HR is used, but there is no `sr`; there is no camera; densification outlasts the anchor.
@@ -91,12 +97,14 @@ class Attached:
         require_end(conductor, densify_until, "densify_until_iter")
         self._model = gaussians
         self.views = HostViews(cameras, *sr_source(sr, conductor, factor, suffix), gaussians._xyz.device)
+        warn_if_score_is_unused(conductor, gaussians, threshold)
         self._rows = CarriedRows(gaussians, self._host_params)
-        self._attached = AttachedModel(
-            gaussians, _ROLES, self._host_params, self._rows, conductor, self.views.all, detail=detail, densifier=gaussians,
-            threshold=threshold, masks=self.views.masks, seed=seed, own_background=own_background,
+        self.detail, self._trains_detail = DetailFeature(lambda: gaussians._xyz, self._rows, conductor.detail), detail
+        self._warned: set[str] = set()
+        self.attachment = Attachment(
+            conductor, self.params, views=self.views.all, seed=seed, threshold=threshold, masks=self.views.masks,
+            poll_parents=lambda: self.detail.poll_parents(conductor.state_dict), own_background=own_background,
         )  # fmt: skip
-        self.attachment = self._attached.attachment
         self._undo = ExitStack()
         self._undo.callback(replace_methods(gaussians, {
             **dict.fromkeys(_SAVERS, self._save_with_detail), "compute_3D_filter": self._compute_filter_at_hr,
@@ -108,7 +116,7 @@ class Attached:
 
     def params(self) -> dict[str, Tensor]:
         """The current leaves, by gsplat's names."""
-        return self._attached.params()
+        return {**self._host_params(), **({"detail": self.detail.value} if self._trains_detail else {})}
 
     def wrap(self, render: Callable[..., Any]) -> Callable[..., Any]:
         """`render` that renders training cameras at both scales, and shows f_base + f_det anywhere else."""
@@ -122,7 +130,8 @@ class Attached:
                 return render(viewpoint_camera, pc, *args, **kwargs)
             view = self.views.find(viewpoint_camera) if torch.is_grad_enabled() else None
             if view is None:  # evaluation, a viewer, a camera without a photo
-                return render(viewpoint_camera, self._attached.with_detail(), *args, **kwargs)
+                shown = Overrides(detail=self.detail.value.detach() if self._trains_detail else None)
+                return render(viewpoint_camera, proxy(self._model, shown, _ROLES), *args, **kwargs)
             if kwargs.get("subpixel_offset") is not None:
                 raise HostError(
                     "rays are jittered, and two scales of a view cannot share that. Train without ray_jitter."
@@ -130,12 +139,21 @@ class Attached:
             if self._model.optimizer is not self._optimizer:
                 self._hook_optimizer()
 
-            def draw(model: Any, camera: Any, _: Target) -> Any:
-                call = signature.bind(camera, model, *args, **kwargs)
+            def render_at(target: Target, gate: Tensor | None, sized: View) -> HostOutput:
+                camera, pinhole = self._camera_of(target, viewpoint_camera, sized)
+                params = self.params() if target == "hr" else self._host_params()
+                overrides = Overrides(gate, params.get("detail"))
+                call = signature.bind(camera, proxy(self._model, overrides, _ROLES), *args, **kwargs)
                 call.arguments |= self._bg_color(call.arguments.get("bg_color"))
-                return render(*call.args, **call.kwargs)
+                with recorded() as drawings:
+                    result = render(*call.args, **call.kwargs)
+                output = host_output(
+                    result, pinhole, params, gate, drawings, ranks_by_third_column=self._ranks_by_absgrad
+                )
+                self._warn_of_what_was_not_read(overrides, output)
+                return output
 
-            return self._attached.render_view(view, viewpoint_camera, draw)
+            return self.attachment.render_view(view, render_at)
 
         return wrapped
 
@@ -148,8 +166,8 @@ class Attached:
     @torch.no_grad()
     def fold_detail(self) -> None:
         """Add f_det to the constant band of the colours and set it to 0."""
-        self._model._features_dc += self._attached.detail.offset(self._model._features_dc)
-        self._attached.detail.value.zero_()
+        self._model._features_dc += self.detail.offset(self._model._features_dc)
+        self.detail.value.zero_()
 
     def remove(self) -> None:
         """Restore the loop; f_det is no longer shown, see `fold_detail`."""
@@ -161,6 +179,34 @@ class Attached:
 
     def _host_params(self) -> dict[str, Tensor]:
         return {name: getattr(self._model, attribute) for name, attribute in _ATTRIBUTES.items()}
+
+    @property
+    def _ranks_by_absgrad(self) -> bool:
+        """Mip-Splatting splits as many Gaussians by the absolute gradient as by the gradient: only its order counts."""
+        return hasattr(self._model, "xyz_gradient_accum_abs")
+
+    def _camera_of(self, target: Target, camera: Any, view: View) -> tuple[Any, Camera]:
+        """The host's camera that draws the target, and the same as a pinhole camera."""
+        if isinstance(target, Camera):
+            return replaced_camera(camera, target), target
+        return (camera, view.lr.camera) if target == "lr" else (enlarged_camera(camera, view.factor), view.hr.camera)
+
+    def _warn_of_what_was_not_read(self, overrides: Overrides, output: HostOutput) -> None:
+        scoring = self.attachment.conductor.owner("score")
+        if overrides.gate is not None and "gate" not in overrides.used:
+            self._warn_once("render reads none of the model's opacity getters: dropout has no effect.")
+        if overrides.detail is not None and "detail" not in overrides.used:
+            self._warn_once("render does not read the model's constant colours: the detail feature has no effect.")
+        if output.shot.gradient_slot.tensor.shape[-1] == 4 and scoring is not None:
+            self._warn_once(
+                "viewspace_points have 4 columns: absolute gradients stay those of the LR image, and the densification "
+                "score of %s goes to the first two columns only.", type(scoring).__name__,
+            )  # fmt: skip
+
+    def _warn_once(self, message: str, *values: Any) -> None:
+        if message not in self._warned:
+            _log.warning(message, *values)
+            self._warned.add(message)
 
     def _bg_color(self, own: Tensor | None) -> dict[str, Tensor]:
         """The colour that the strategies choose for this iteration, in place of the host's own, which must be black."""
@@ -188,14 +234,14 @@ class Attached:
             hook.remove()
         self._optimizer = optimizer = self._model.optimizer
         self._hooks = [
-            optimizer.register_step_post_hook(lambda *_: self._attached.detail.step()),
+            optimizer.register_step_post_hook(lambda *_: self.detail.step()),
             optimizer.register_state_dict_post_hook(self._save_state),
             optimizer.register_load_state_dict_pre_hook(self._load_state),
         ]
         self.attachment.hook([optimizer])
 
     def _save_state(self, _: Any, stored: dict[str, Any]) -> None:
-        stored[_STATE] = self._attached.state_dict()
+        stored[_STATE] = {"detail": self.detail.state_dict(), "attachment": self.attachment.state_dict()}
 
     def _load_state(self, _: Any, stored: dict[str, Any]) -> None:
         if _STATE not in stored:
@@ -203,12 +249,13 @@ class Attached:
                 "the checkpoint was written without CLEAR: it holds neither the iteration nor f_det. Start from the "
                 "beginning, or from a checkpoint of a run with CLEAR."
             )
-        self._attached.load_state_dict(stored[_STATE])
+        self.detail.load_state_dict(stored[_STATE]["detail"])
+        self.attachment.load_state_dict(stored[_STATE]["attachment"])
 
     def _save_with_detail(self, save: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """`save_ply` with f_det in the colours of the file."""
         trained = self._model._features_dc
-        shown = torch.nn.Parameter(trained.detach() + self._attached.detail.offset(trained))
+        shown = torch.nn.Parameter(trained.detach() + self.detail.offset(trained))
         with replaced_attribute(self._model, "_features_dc", shown):
             return save(*args, **kwargs)
 

@@ -5,9 +5,8 @@ HR.
 from __future__ import annotations
 
 import inspect
-import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal
 
@@ -15,20 +14,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core.view import View
 from clear_strategies.errors import HostError
-from clear_strategies.merging.conductor import Conductor
-from integration.attachment import Attachment
-from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot, Target
+from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot
 from integration.detail import sh0_offset
-from integration.host_score import warn_if_score_is_unused
-from integration.inria.cameras import enlarged_camera, replaced_camera
-from integration.inria.detail import DetailFeature
-from integration.inria.rows import CarriedRows
-from rasterizers.autograd import recorded
+from rasterizers.autograd import Drawing
 from rasterizers.interface import Camera
-
-_log = logging.getLogger(__name__)
 
 Role = Literal["gate", "detail"]
 """What an override changes: opacities are multiplied by the gate, colours are offset by f_det."""
@@ -111,114 +101,12 @@ def _apply(value: Any, overrides: Overrides, role: Role) -> Any:
     return value
 
 
-class AttachedModel:
-    """The strategies beside a host that renders its model as a whole: f_det, and renderings through a proxy.
-
-    Args:
-        roles: see `proxy`. params: returns the host's current leaves, by gsplat's names.
-        rows: finds the host's changes of structure.
-        detail: train f_det.
-        densifier, threshold: what densifies in the host, and its threshold on the screen gradient.
-        views, masks, seed, own_background: see `Attachment`.
-
-    Attributes:
-        detail: f_det, which follows the host's structure even if it is not trained.
-    """
-
-    def __init__(
-        self,
-        model: Any,
-        roles: tuple[tuple[str, Role], ...],
-        params: Callable[[], Mapping[str, Tensor]],
-        rows: CarriedRows,
-        conductor: Conductor,
-        views: Sequence[View],
-        *,
-        detail: bool,
-        densifier: Any,
-        threshold: float | None,
-        masks: Mapping[str, Tensor],
-        seed: int,
-        own_background: bool = True,
-    ) -> None:
-        warn_if_score_is_unused(conductor, densifier, threshold)
-        self._model, self._roles, self._host_params = model, roles, params
-        self.detail, self._has_detail = DetailFeature(lambda: params()["means"], rows, conductor.detail), detail
-        self._scoring = conductor.owner("score")
-        self._warned: set[str] = set()
-        self.attachment = Attachment(
-            conductor, self.params, views=views, seed=seed, threshold=threshold, masks=masks,
-            poll_parents=lambda: self.detail.poll_parents(conductor.state_dict), own_background=own_background,
-        )  # fmt: skip
-
-    def params(self) -> dict[str, Tensor]:
-        """The host's current leaves and f_det."""
-        return {**self._host_params(), **({"detail": self.detail.value} if self._has_detail else {})}
-
-    def with_detail(self) -> Any:
-        """The model with colours f_base + f_det, for renderings that do not train: evaluation, viewers."""
-        overrides = Overrides(detail=self.detail.value.detach() if self._has_detail else None)
-        return proxy(self._model, overrides, self._roles)
-
-    def render_view(self, view: View, camera: Any, render: Callable[[Any, Any, Target], Any]) -> Any:
-        """Render a training view at both scales; returns what the host's render function returns at LR.
-
-        Args:
-            camera: the host's.
-            render: the host's function of a model and a camera; the third argument is what is drawn.
-        """
-
-        def render_at(target: Target, gate: Tensor | None, sized_view: View) -> HostOutput:
-            if target == "lr":
-                sized, pinhole = camera, sized_view.lr.camera
-            elif target == "hr":
-                sized, pinhole = enlarged_camera(camera, sized_view.factor), sized_view.hr.camera
-            else:
-                sized, pinhole = replaced_camera(camera, target), target
-            params = self.params() if target == "hr" else self._host_params()
-            overrides = Overrides(gate, params.get("detail"))
-            with recorded() as drawings:
-                result = render(proxy(self._model, overrides, self._roles), sized, target)
-            output = self._output(result, overrides, pinhole, params)
-            return replace(output, shot=replace(output.shot, drawings=drawings))
-
-        return self.attachment.render_view(view, render_at)
-
-    def _output(self, result: Any, overrides: Overrides, camera: Camera, params: Mapping[str, Tensor]) -> HostOutput:
-        if overrides.gate is not None and "gate" not in overrides.used:
-            self._warn_once("render reads none of the model's opacity getters: dropout has no effect.")
-        if overrides.detail is not None and "detail" not in overrides.used:
-            self._warn_once("render does not read the model's constant colours: the detail feature has no effect.")
-        # Mip-Splatting splits as many Gaussians by the absolute gradient as by the gradient: only its order counts.
-        ranks = hasattr(self._model, "xyz_gradient_accum_abs")
-        output = host_output(result, camera, params, overrides.gate, ranks_by_third_column=ranks)
-        if output.shot.gradient_slot.tensor.shape[-1] == 4 and self._scoring is not None:
-            self._warn_once(
-                "viewspace_points have 4 columns: absolute gradients stay those of the LR image, and the densification "
-                "score of %s goes to the first two columns only.", type(self._scoring).__name__,
-            )  # fmt: skip
-        return output
-
-    def state_dict(self) -> dict[str, Any]:
-        """What the host's checkpoint must hold to continue."""
-        return {"detail": self.detail.state_dict(), "attachment": self.attachment.state_dict()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state; the host has loaded its parameters already."""
-        self.detail.load_state_dict(state["detail"])
-        self.attachment.load_state_dict(state["attachment"])
-
-    def _warn_once(self, message: str, *values: Any) -> None:
-        if message not in self._warned:
-            _log.warning(message, *values)
-            self._warned.add(message)
-
-
 def host_output(
     result: Any,
     camera: Camera,
     params: Mapping[str, Tensor],
     gate: Float[Tensor, " N"] | None,
+    drawings: Sequence[Drawing],
     *,
     ranks_by_third_column: bool,
 ) -> HostOutput:
@@ -226,7 +114,7 @@ def host_output(
     "visibility_filter" [N]. Gaussians that the gate drops are marked as not visible in it.
 
     Args:
-        camera: the camera of the photo at this resolution.
+        camera: the camera of the photo at this resolution. drawings: see `AutogradShot`.
         ranks_by_third_column: a third column of "viewspace_points" holds what the host ranks Gaussians by.
 
     Raises:
@@ -259,7 +147,8 @@ def host_output(
     ranked = 2 if ranks_by_third_column and centres.shape[-1] == 3 else None
     slot = ScreenGradientSlot(centres, (width, height), (2 / width, 2 / height), ranked=ranked)
     means2d = project(params["means"].detach(), camera)
-    return HostOutput(AutogradShot(image.permute(1, 2, 0), means2d, visible, params, slot), image, result)
+    shot = AutogradShot(image.permute(1, 2, 0), means2d, visible, params, slot, drawings=drawings)
+    return HostOutput(shot, image, result)
 
 
 def project(means: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, "N 2"]:
