@@ -47,8 +47,7 @@ def partners(cameras: Sequence[Camera]) -> list[list[int]]:
     """For each camera the others that its photo is compared with: all of few, of many the nearest and some that lie ever
     farther away.
 
-    With all pairs, a hundred photos would take an hour. The nearest alone may be a burst, which shows no depth, or one side of
-    the scene, which shows nothing of the other.
+    The nearest alone may be a burst, which shows no depth, or one side of the scene, which shows nothing of the other.
     """
     centers, others = torch.stack([camera.center.double() for camera in cameras]), len(cameras) - 1
     far = np.geomspace(_NEAREST + 1, max(others, _PARTNERS), _PARTNERS - _NEAREST).round().astype(int) - 1
@@ -64,11 +63,8 @@ def distance_to(camera: Camera, means: Float[Tensor, "N 3"]) -> float:
 
 
 def moved(camera: Camera, step: Float[Tensor, " 3"], *, aim: float) -> Camera:
-    """The camera moved, and turned to keep in its middle what it saw there.
-
-    Args:
-        step: along its axes right, down and forward, world units, float64.
-        aim: the depth of what it saw in its middle, world units.
+    """The camera moved by `step`, along its axes right, down and forward, and turned to keep in its middle what it saw there at
+    the depth `aim`; in world units.
     """
     pose = camera.world_to_camera.double()
     axes, centre = pose[:3, :3], camera.center.double()

@@ -25,32 +25,19 @@ OUTLIER_RATIO: Final = 3.0
 
 
 def without_outliers(cloud: PointCloud, neighbours: int, ratio: float) -> PointCloud:
-    """The cloud without the points that `remove_outliers` removes; all of it if `neighbours` is 0 or there are too few points.
-
-    Args:
-        neighbours: 0, or at least 2.
-    """
-    if neighbours == 0:
-        return cloud
-    if len(cloud) <= neighbours:
-        _log.debug("outliers are kept: %d points are too few to tell them.", len(cloud))
+    """The cloud without the points that `remove_outliers` removes; all of it if `neighbours` is 0 or there are too few points."""
+    if neighbours == 0 or len(cloud) <= neighbours:
         return cloud
     kept = remove_outliers(cloud.means, neighbours, ratio)
     if len(kept) == 0:
         _log.warning("outliers are kept: the points coincide, so all of them would be removed.")
         return cloud
-    _log.debug("%d of %d points removed as outliers.", len(cloud) - len(kept), len(cloud))
     return cloud[kept]
 
 
 def averaged_in_voxels(cloud: PointCloud, edge: float) -> PointCloud:
-    """One point per occupied cube: the averages of its positions and colours, ordered by cube.
-
-    Args:
-        edge: of a cube, world units, > 0. The grid starts half a cube below the smallest coordinates.
-
-    Raises:
-        BackendUnavailable: Open3D is not installed, or a library of the system that it needs.
+    """One point per occupied cube of this edge (world units): the averages of its positions and colours, ordered by cube. The
+    grid starts half a cube below the smallest coordinates.
     """
     try:
         import open3d
@@ -75,12 +62,9 @@ def averaged_in_voxels(cloud: PointCloud, edge: float) -> PointCloud:
 def remove_outliers(means: Float[Tensor, "N 3"], neighbours: int, ratio: float) -> Int[Tensor, " K"]:
     """Indices, ascending, of the points that are no outliers.
 
-    A point's measure is the mean distance to its `neighbours` nearest points, itself included. The point is kept if its
-    measure is below the average plus `ratio` standard deviations. A point whose measure is 0, because its neighbours
+    A point's measure is the mean distance to its `neighbours` nearest points (2 or more), itself included. The point is kept if
+    its measure is below the average plus `ratio` standard deviations. A point whose measure is 0, because its neighbours
     coincide with it, is removed.
-
-    Args:
-        neighbours: at least 2, because the first is the point itself. ratio: > 0.
     """
     points = means.detach().double().cpu().numpy()
     if len(points) < 2:

@@ -38,15 +38,14 @@ def exposure_gains(photos: Sequence[Photo], depths: Sequence[DepthMap]) -> Float
     if not pairs:
         return torch.ones(len(photos), 3, device=device)
     photos, depths = [photo.to("cpu") for photo in photos], [depth.to("cpu") for depth in depths]
-    ratios, weights = zip(*(_ratio(photos[a], depths[a], photos[b], depths[b]) for a, b in pairs), strict=True)
+    measured = (_ratio(photos[a], depths[a], photos[b], depths[b]) for a, b in pairs)
+    ratios, weights = map(torch.stack, zip(*measured, strict=True))  # [pairs, 3]
     difference = torch.zeros(len(pairs), len(photos), dtype=torch.float64)
     for row, (a, b) in enumerate(pairs):
         difference[row, a], difference[row, b] = 1, -1
-    root = torch.stack(weights).sqrt()  # [pairs, 3]
+    root = weights.sqrt()
     # The pseudo-inverse has the least norm: the mean of the logarithms, which no pair determines, is 0.
-    logs = [
-        torch.linalg.pinv(root[:, c, None] * difference) @ (root[:, c] * torch.stack(ratios)[:, c]) for c in range(3)
-    ]
+    logs = [torch.linalg.pinv(root[:, c, None] * difference) @ (root[:, c] * ratios[:, c]) for c in range(3)]
     return torch.exp(-torch.stack(logs, dim=1)).float().to(device)
 
 

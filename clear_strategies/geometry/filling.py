@@ -37,10 +37,9 @@ def densify(cloud: PointCloud, photos: Sequence[Photo], stride: int, background:
     if len(means) == 0:
         _log.warning("densify added no point.")
         return cloud
-    source = f"{cloud.source}, densified by {len(means):,} at completed depth"
-    return replace(
-        cloud, means=torch.cat((cloud.means, means)), colors=torch.cat((cloud.colors, colors)), source=source
-    )
+    means, colors = torch.cat((cloud.means, means)), torch.cat((cloud.colors, colors))
+    source = f"{cloud.source}, densified by {len(means) - len(cloud):,} at completed depth"
+    return replace(cloud, means=means, colors=colors, source=source)
 
 
 def grid_points(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -30,19 +30,13 @@ _NEIGHBOURS: Final = 3  # of a pixel and the eight around it, those that must be
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PseudoView:
-    """A picture that was not taken.
-
-    Args:
-        photo: the colours, 0 where unknown, and the camera.
-        known: where a photo shows the colour.
-    """
+    """A picture that was not taken: its camera and its colours, 0 where they are unknown."""
 
     photo: Photo
     known: Bool[Tensor, "h w"]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Source:
+class _Source(NamedTuple):
     """A photo with depth: its points, and the depth up to which its colours are used, 0 where they are not."""
 
     photo: Photo
@@ -69,7 +63,7 @@ def pseudo_views(
         reach: largest distance of a pseudo camera from its photo's, as a multiple of the photo's median depth.
         tolerance: relative difference of depth up to which a photo shows a point.
         max_pixels: larger photos are reduced by a whole factor first.
-        background: of the scene; its colour belongs to no surface.
+        background: its colour belongs to no surface.
     """
     sources = []
     for name, photo in photos.items():
@@ -88,12 +82,7 @@ def pseudo_views(
 
 
 def border_views(photos: Iterable[Photo], *, field: float, max_pixels: int) -> list[PseudoView]:
-    """Each photo as the middle of a picture `field` times as wide and as high.
-
-    Args:
-        field: at least 1.
-        max_pixels: larger photos are reduced by a whole factor first.
-    """
+    """Each photo, reduced to at most `max_pixels`, as the middle of a picture `field` times as wide and as high."""
     views = []
     for photo in (photo.reduced(photo.factor_to(max_pixels)) for photo in photos):
         c = photo.camera
@@ -102,8 +91,7 @@ def border_views(photos: Iterable[Photo], *, field: float, max_pixels: int) -> l
         known = torch.zeros(wide.height, wide.width, dtype=torch.bool)
         known[y : y + c.height, x : x + c.width] = True if photo.shown is None else photo.shown
         image = F.pad(photo.image, (0, 0, x, x, y, y))
-        through = photo.transparency
-        through = None if through is None else F.pad(through, (x, x, y, y))
+        through = None if photo.transparency is None else F.pad(photo.transparency, (x, x, y, y))
         views.append(PseudoView(Photo(wide, image, transparency=through), known))
     return views
 
@@ -117,9 +105,8 @@ def cut_out(photos: Iterable[Photo], background: Color) -> bool:
 def moved_aside(camera: Camera, distance: float, reach: float, generator: torch.Generator) -> Camera:
     """The camera moved by up to `reach` × `distance`, and turned to keep in its middle what it saw there at `distance`."""
     direction = torch.randn(3, generator=generator, dtype=torch.float64)
-    direction = (
-        direction / torch.linalg.vector_norm(direction) * torch.rand((), generator=generator, dtype=torch.float64)
-    )
+    length = torch.rand((), generator=generator, dtype=torch.float64)
+    direction = direction / torch.linalg.vector_norm(direction) * length
     direction[2] *= _ALONG
     return moved(camera, direction * reach * distance, aim=distance)
 
@@ -176,9 +163,6 @@ def continued(image: Float[Tensor, "h w 3"], known: Bool[Tensor, "h w"]) -> Floa
     A pyramid of means: each level halves the one before, and its pixels are known where one of the four below is. From the
     coarsest level down, each unknown pixel takes the colour of the coarser level, so that colours become smoother the further
     away known pixels are.
-
-    Args:
-        known: where `image` shows something; its other pixels are not read.
     """
     if not bool(known.any()):
         return image
@@ -188,10 +172,7 @@ def continued(image: Float[Tensor, "h w 3"], known: Bool[Tensor, "h w"]) -> Floa
 
 
 def _filled(colors: Float[Tensor, "1 3 h w"], mask: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "1 3 h w"]:
-    """
-    Args:
-        colors: 0 where `mask` is 0. mask: 1 where known, at one pixel at least.
-    """
+    """`colors`, 0 where they are unknown, filled where `mask` is 0; it is 1 at one pixel at least."""
     if bool(mask.all()):
         return colors
     sums, share = (F.avg_pool2d(x, 2, ceil_mode=True) for x in (colors, mask))  # of each block of four

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -45,9 +45,6 @@ class TriangulationSettings:
         epipolar: largest distance from the epipolar lines, root mean square over both views, LR px.
         reprojection: largest reprojection error in either view, LR px.
         angle: smallest angle between the two rays, degrees.
-
-    Raises:
-        SettingError: a number is outside its range.
     """
 
     enlarge: int = 2
@@ -67,16 +64,14 @@ class TriangulationSettings:
             require_number(name, getattr(self, name), above=0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Features:
+class Features(NamedTuple):
     """Keypoints of one image, in its own pixels, and their descriptors of length 1."""
 
     pixels: Float[Tensor, "F 2"]
     descriptors: Float[Tensor, "F 128"]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Pairs:
+class Pairs(NamedTuple):
     """Points of two views: position, the two features (numbered over all views), angle between the rays (degrees)."""
 
     means: Float[Tensor, "P 3"]
@@ -108,13 +103,11 @@ def triangulate(photos: Sequence[Photo], settings: TriangulationSettings | None 
         x, y = features[i].pixels[index[:, 0]], features[j].pixels[index[:, 1]]
         points, angles, good = triangulate_pair(photos[i].camera, photos[j].camera, x, y, settings)
         per_pair.append(Pairs(points[good], index[good] + first_of[[i, j]], angles[good]))
-        _log.debug("views %d and %d: %d matches, %d points.", i, j, len(index), int(good.sum()))
-    pairs = Pairs(*(torch.cat([getattr(p, name) for p in per_pair]) for name in ("means", "features", "angles")))
+    pairs = Pairs(*map(torch.cat, zip(*per_pair, strict=True)))
     chosen = one_per_track(pairs, view)
 
     sampled = [sample_colors(photo.image, f.pixels) for photo, f in zip(photos, features, strict=True)]
     colors = torch.cat(sampled)[pairs.features[chosen]].mean(dim=1) if len(chosen) else torch.zeros(0, 3)
-    _log.debug("%d features, %d pairs of them, %d points.", len(view), len(pairs.means), len(chosen))
     source = f"{len(chosen):,} points triangulated from the {len(photos)} photos"
     return PointCloud(pairs.means[chosen].float(), colors, source)
 
@@ -143,12 +136,8 @@ def match(a: Features, b: Features, ratio: float) -> Int[Tensor, "M 2"]:
     """Indices of mutual nearest neighbours that pass Lowe's ratio test against the second nearest in b."""
     if len(a.pixels) < 1 or len(b.pixels) < 2:
         return torch.zeros(0, 2, dtype=torch.long)
-    similarity, candidate = (
-        torch.cat(parts)
-        for parts in zip(
-            *((x @ b.descriptors.T).topk(2, dim=1) for x in torch.split(a.descriptors, _ROWS)), strict=True
-        )
-    )
+    nearest = [(rows @ b.descriptors.T).topk(2, dim=1) for rows in torch.split(a.descriptors, _ROWS)]
+    similarity, candidate = map(torch.cat, zip(*nearest, strict=True))
     distance = (2 - 2 * similarity).clamp_min(0).sqrt()  # |x - y|² = 2 - 2 x·y: descriptors have length 1
     first = torch.nonzero(distance[:, 0] < ratio * distance[:, 1])[:, 0]
     second = candidate[first, 0]

@@ -18,11 +18,7 @@ _TOLERANCE: Final = 0.03  # a camera sees a point whose depth there exceeds the 
 def times_seen(
     points: Float[Tensor, "N 3"], cameras: Sequence[tuple[Camera, Float[Tensor, "h w"]]]
 ) -> Int[Tensor, " N"]:
-    """In how many cameras each point is inside the image and not hidden.
-
-    Args:
-        cameras: each with its depth, nan where there is no surface, so that no point is seen there.
-    """
+    """In how many cameras, each with its depth (nan without a surface), each point is inside the image and not hidden."""
     count = torch.zeros(len(points), dtype=torch.long)
     for camera, depth in cameras:
         inside, row, column, z = seen_pixels(camera, points)
@@ -33,11 +29,8 @@ def times_seen(
 def on_surface(
     camera: Camera, depth: Float[Tensor, "h w"], points: Float[Tensor, "N 3"], tolerance: float
 ) -> tuple[Bool[Tensor, " N"], Float[Tensor, "N 2"]]:
-    """(whether each point lies on the surface at the pixel that it projects to, these pixels).
-
-    Args:
-        depth: of the camera, nan or 0 where it is unknown, so that no point lies there.
-        tolerance: relative difference of depth up to which a point lies on the surface.
+    """(whether each point's depth differs from `depth`, nan or 0 where it is unknown, by at most `tolerance`, relatively; the
+    pixels that the points project to).
     """
     pixels, z = project(camera, points)
     inside = inside_of(camera, pixels, z)

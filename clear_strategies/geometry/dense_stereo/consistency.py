@@ -47,12 +47,8 @@ def carry(
     inverse_depth: Float[Tensor, "H W"],
     at: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(column, row, depth, whether inside) in the other estimate of the points at these inverse depths.
-
-    Columns and rows are in pixels and clamped into the other photo.
-
-    Args:
-        at: (rows, columns) of the pixels; None: every pixel.
+    """(column, row, depth, whether inside) in the other estimate of the points at these inverse depths, behind every pixel or
+    those `at` (rows, columns). Columns and rows are in pixels and clamped into the other photo.
     """
     rotated, shift = estimate.image.towards(other.image)
     if at is not None:
@@ -70,10 +66,7 @@ def carry(
 def speckles(depth: Float[Tensor, "h w"], fewest: int, tolerance: float) -> Bool[Tensor, "h w"]:
     """Where known depth belongs to fewer than `fewest` connected pixels: mostly chance matches. Nowhere without SciPy.
 
-    Two pixels are connected if they share an edge, and their depths differ by at most `tolerance`, relatively.
-
-    Args:
-        depth: NaN where unknown.
+    Two pixels are connected if they share an edge, and their depths, NaN where unknown, differ by at most this share.
     """
     if fewest <= 1 or missing("scipy"):
         return torch.zeros_like(depth, dtype=torch.bool)

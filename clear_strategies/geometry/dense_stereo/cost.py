@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
 from typing import Final
 
@@ -46,10 +47,8 @@ def mean_of_lowest(values: Iterator[Tensor], count: int) -> Tensor:
             lowest[k], rest = torch.minimum(kept, rest), torch.maximum(kept, rest)
         if len(lowest) < count:
             lowest.append(rest)
-    total = lowest[0]
-    for value in lowest[1:]:
-        total = total + value
-    return total / count
+    mean: Tensor = functools.reduce(torch.add, lowest) / count
+    return mean
 
 
 class _Windows:
@@ -86,15 +85,7 @@ class _Swept:
 
 
 def _cost(reference: _Windows, other: _Swept, inverse_depths: Float[Tensor, " P"]) -> Float[Tensor, "P H W"]:
-    covariance, variance = _compared(reference, other, inverse_depths)
-    deviation = variance.clamp_min_(0).add_(_VARIANCE_FLOOR).sqrt_()
-    return (1 - covariance.div_(deviation.mul_(reference.deviation))).div_(2)
-
-
-def _compared(
-    reference: _Windows, other: _Swept, inverse_depths: Float[Tensor, " P"]
-) -> tuple[Float[Tensor, "P H W"], Float[Tensor, "P H W"]]:
-    """(covariance with the windows of the other photo drawn through each plane, 0 where it does not see them; their variance)."""
+    """From the covariance with the windows of the other photo drawn through each plane, 0 where it does not see them."""
     image, window = reference.image, reference.window
     if image.device.type == "cpu" and image.dtype == torch.float32 and cpp.available():
         covariance, variance = image.new_empty(2, len(inverse_depths), *image.shape)
@@ -102,10 +93,12 @@ def _compared(
             image, reference.mean[0], other.rotated, other.shift, other.image, inverse_depths, window,
             covariance, variance, threads(),
         )  # fmt: skip
-        return covariance, variance
-    drawn, seen = other.through(inverse_depths)
-    mean, variance = _moments(drawn, window)
-    return torch.where(seen, box_mean(image * drawn, window) - reference.mean * mean, 0.0), variance
+    else:
+        drawn, seen = other.through(inverse_depths)
+        mean, variance = _moments(drawn, window)
+        covariance = torch.where(seen, box_mean(image * drawn, window) - reference.mean * mean, 0.0)
+    deviation = variance.clamp_min_(0).add_(_VARIANCE_FLOOR).sqrt_()
+    return (1 - covariance.div_(deviation.mul_(reference.deviation))).div_(2)
 
 
 def _moments(images: Float[Tensor, "P H W"], window: int) -> tuple[Float[Tensor, "P H W"], Float[Tensor, "P H W"]]:

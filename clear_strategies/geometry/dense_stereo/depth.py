@@ -17,16 +17,11 @@ from clear_strategies.geometry.dense_stereo.sources import Comparison, plane_cou
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """The depth of one photo, before it is compared with that of others.
-
-    Args:
-        inverse_depth: 1 / z, 1 / world units.
-        correlation: ZNCC of the windows at that depth, in [-1, 1].
-    """
+    """The depth of one photo, before it is compared with that of others."""
 
     image: Grey
-    inverse_depth: Float[Tensor, "H W"]
-    correlation: Float[Tensor, "H W"]
+    inverse_depth: Float[Tensor, "H W"]  # 1 / z, 1 / world units
+    correlation: Float[Tensor, "H W"]  # ZNCC of the windows at that depth, in [-1, 1]
 
 
 def plane_sweep(image: Grey, others: list[Grey], comparison: Comparison, settings: StereoSettings) -> Estimate:

@@ -34,9 +34,6 @@ class StereoSettings:
         speckle: fewer connected pixels of similar depth than these are unknown; 0: none are. Needs SciPy.
         spacing: distance of the points on the surface, LR px of the photo that sees them.
         trust: a photo is used whose stereo covers at least this share of its pixels.
-
-    Raises:
-        SettingError: a number is outside its range.
     """
 
     enlarge: int = 2
@@ -72,10 +69,6 @@ class StereoSettings:
     def finer(self, ratio: float) -> StereoSettings:
         """These settings for the same photos `ratio` times as large: HR photos in place of LR photos."""
         return replace(
-            self,
-            enlarge=1,
-            window=self.window + _WIDER,
-            max_planes=round(_MORE * self.max_planes),
-            reprojection=_MORE * self.reprojection,
-            spacing=min(_APART, ratio) * self.spacing,
-        )
+            self, enlarge=1, window=self.window + _WIDER, max_planes=round(_MORE * self.max_planes),
+            reprojection=_MORE * self.reprojection, spacing=min(_APART, ratio) * self.spacing,
+        )  # fmt: skip

@@ -19,12 +19,7 @@ _FAR: Final = 1e9  # cost of planes before the first and after the last
 def smooth(
     cost: Float[Tensor, "H W D"], image: Float[Tensor, "H W"], small_step: float, large_step: float
 ) -> Float[Tensor, "H W D"]:
-    """The mean over eight directions of L.
-
-    Args:
-        image: grey in [0, 1].
-        small_step, large_step: P1 and the largest P2.
-    """
+    """The mean over eight directions of L; `small_step` is P1, `large_step` the largest P2, and `image` grey in [0, 1]."""
     total = torch.zeros_like(cost)
     for turned, shifts in ((False, (-1, 0, 1)), (True, (0,))):
         C, grey, rows = (x.transpose(0, 1) if turned else x for x in (cost, image, total))

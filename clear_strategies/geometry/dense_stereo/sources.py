@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -28,18 +27,12 @@ _FARTHER, _NEARER = 0.5, 1.4  # the range of inverse depth is wider than that of
 _GUESS_FAR, _GUESS_NEAR = 0.1, 3.0  # the same, about the depth of what all cameras look at
 
 
-@dataclass(frozen=True, slots=True)
-class Comparison:
-    """What one photo is compared with.
+class Comparison(NamedTuple):
+    """What one photo is compared with."""
 
-    Args:
-        others: indices of photos, best first.
-        far, near: the smallest and largest inverse depth, 1 / world units.
-    """
-
-    others: tuple[int, ...]
-    far: float
-    near: float
+    others: tuple[int, ...]  # indices of photos, best first
+    far: float  # the smallest inverse depth, 1 / world units
+    near: float  # the largest
 
 
 def comparisons(photos: Sequence[Photo], points: Float[Tensor, "N 3"], most: int) -> list[Comparison]:
