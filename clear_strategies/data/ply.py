@@ -18,7 +18,7 @@ from typing import Final, Literal
 import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.lib.recfunctions import structured_to_unstructured, unstructured_to_structured
+from numpy.lib.recfunctions import structured_to_unstructured
 from torch import Tensor
 
 from clear_strategies.core.points import PointCloud
@@ -39,10 +39,8 @@ _TYPES: Final = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 _BYTE_ORDERS: Final[dict[str, Literal["=", "<", ">"]]] = {
-    "ascii": "=",
-    "binary_little_endian": "<",
-    "binary_big_endian": ">",
-}
+    "ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">",
+}  # fmt: skip
 _LONGEST_HEADER: Final = 1 << 16  # bytes
 _COUNT: Final = re.compile(r"[0-9]{1,18}")
 
@@ -56,24 +54,15 @@ _ROTATION: Final = ("rot_0", "rot_1", "rot_2", "rot_3")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GaussianPly:
-    """Gaussians in the standard layout: raw parameters, view-dependent colour included.
-
-    Args:
-        sh0, shN: colour as spherical harmonics; B in {0, 3, 8, 15} bands in `shN`.
-        opacities: logit. scales: natural logarithm. quats: wxyz, any norm.
-        antialiased: they are drawn with opacity compensation, as they were trained: see `RasterSettings`.
-
-    Raises:
-        ValueError: the shapes do not match.
-    """
+    """Gaussians in the standard layout: raw parameters, view-dependent colour (B in {0, 3, 8, 15} bands) included."""
 
     means: Float[Tensor, "N 3"]
     sh0: Float[Tensor, "N 1 3"]
     shN: Float[Tensor, "N B 3"]  # noqa: N815 - gsplat's name
-    opacities: Float[Tensor, " N"]
-    scales: Float[Tensor, "N 3"]
-    quats: Float[Tensor, "N 4"]
-    antialiased: bool = True
+    opacities: Float[Tensor, " N"]  # logits
+    scales: Float[Tensor, "N 3"]  # natural logarithms
+    quats: Float[Tensor, "N 4"]  # wxyz, any norm
+    antialiased: bool = True  # drawn with opacity compensation, as they were trained: see `RasterSettings`
 
     def __post_init__(self) -> None:
         n, bands = len(self.means), self.shN.shape[1]
@@ -89,32 +78,19 @@ class GaussianPly:
 
 
 def write_gaussians(path: Path, g: GaussianPly) -> None:
-    """Binary little-endian, atomically.
-
-    Raises:
-        ValueError: a number is not finite.
-    """
+    """Binary little-endian, atomically; a ValueError where a number is not finite."""
     rest = g.shN.transpose(1, 2).reshape(len(g), g.shN.shape[1] * 3)  # channel-major
     groups = (
         (_XYZ, g.means), (_NORMAL, torch.zeros_like(g.means)), (_DC, g.sh0[:, 0]), (_rest_names(rest.shape[1]), rest),
         (("opacity",), g.opacities[:, None]), (_SCALE, g.scales), (_ROTATION, g.quats),
     )  # fmt: skip
-    names = [name for group, _ in groups for name in group]
-    columns = torch.cat([values.detach().cpu().float() for _, values in groups], dim=1).numpy()
-    finite = np.isfinite(columns)
-    if not finite.all():
-        i, k = np.argwhere(~finite)[0]
-        raise ValueError(f"Gaussians must be finite, got {names[k]} = {columns[i, k]} in number {i}.")
-    _write(path, unstructured_to_structured(columns.astype("<f4"), names=names), (_MIP,) if g.antialiased else ())
+    _write(path, groups, (_MIP,) if g.antialiased else ())
 
 
 def read_gaussians(path: Path) -> GaussianPly:
     """Read the standard layout. Other properties are ignored, with a warning that names them.
 
     Opacities of exactly 0 and 1, whose logits are infinite, are read, since formats of 8 bits have them, and so are scales of 0.
-
-    Raises:
-        DataError: the file is damaged or truncated, or a property is missing or not finite.
     """
     table, comments = _read_vertices(path)
     rest = _rest_names(sum(name.startswith("f_rest_") for name in _names_of(table)))
@@ -136,47 +112,41 @@ def read_gaussians(path: Path) -> GaussianPly:
 
 
 def write_points(path: Path | str, means: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"]) -> None:
-    """Positions, normals of 0, and 8-bit colours: the layout of 3DGS' points3D.ply. Binary little-endian, atomically.
-
-    Args:
-        means: world units.
-        colors: RGB in [0, 1].
-
-    Raises:
-        ValueError: the shapes do not match, a position is not finite, or a colour is out of range.
+    """Positions, normals of 0, and colours (RGB in [0, 1]) of 8 bits: the layout of 3DGS' points3D.ply. Binary little-endian,
+    atomically; a ValueError for what no file should hold.
     """
     n = len(means)
     if tuple(means.shape) != (n, 3) or tuple(colors.shape) != (n, 3):
-        raise ValueError(
-            f"means and colors must have shape [N, 3], got {tuple(means.shape)} and {tuple(colors.shape)}."
-        )
-    if not bool(means.isfinite().all()):
-        raise ValueError("means must be finite: remove the other points.")
+        given = f"{tuple(means.shape)} and {tuple(colors.shape)}"
+        raise ValueError(f"means and colors must have shape [N, 3], got {given}.")
     if not bool(((colors >= 0) & (colors <= 1)).all()):
         raise ValueError("colors must lie in [0, 1]: divide 8-bit values by 255.")
-    row = [*((name, "<f4") for name in (*_XYZ, *_NORMAL)), *((name, "u1") for name in _RGB)]
-    table = np.zeros(n, row)
-    for k in range(3):
-        table[_XYZ[k]] = means[:, k].detach().cpu().numpy()
-        table[_RGB[k]] = (colors[:, k].detach().cpu() * 255).round().numpy()
-    _write(Path(path), table)
+    levels = (colors.detach().cpu() * 255).round().to(torch.uint8)
+    _write(Path(path), ((_XYZ, means), (_NORMAL, torch.zeros_like(means)), (_RGB, levels)))
 
 
-def _write(path: Path, table: np.ndarray, comments: Sequence[str] = ()) -> None:
-    """A structured array of floats and bytes as the vertices."""
+def _write(path: Path, groups: Sequence[tuple[Sequence[str], Tensor]], comments: Sequence[str] = ()) -> None:
+    """The vertices' properties, floats and bytes, each group with its values [N, C]."""
+    columns = {
+        name: (values[:, k].detach().cpu().numpy(), "uchar" if values.dtype == torch.uint8 else "float")
+        for names, values in groups for k, name in enumerate(names)
+    }  # fmt: skip
+    table = np.zeros(
+        len(groups[0][1]), [(name, "u1" if kind == "uchar" else "<f4") for name, (_, kind) in columns.items()]
+    )
+    for name, (values, _) in columns.items():
+        if not (finite := np.isfinite(values)).all():
+            i = np.flatnonzero(~finite)[0]
+            raise ValueError(f"a PLY file must have finite numbers, got {name} = {values[i]} in number {i}: remove it.")
+        table[name] = values
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {' '.join(c.split())}" for c in comments)]
-    kinds = [(name, "float" if table.dtype[name].kind == "f" else "uchar") for name in _names_of(table)]
-    lines += [f"element vertex {len(table)}", *(f"property {kind} {name}" for name, kind in kinds), "end_header\n"]
+    lines += [f"element vertex {len(table)}", *(f"property {kind} {name}" for name, (_, kind) in columns.items())]
     # Some readers expect ASCII headers.
-    write_bytes(path, "\n".join(lines).encode("ascii", "replace") + table.tobytes())
+    write_bytes(path, "\n".join([*lines, "end_header\n"]).encode("ascii", "replace") + table.tobytes())
 
 
 def read_points(path: Path) -> PointCloud:
-    """Read positions and colours: red, green, blue (8 or 16 bits, or floats in [0, 1]), or f_dc of Gaussians, else grey.
-
-    Raises:
-        DataError: the file is no PLY, is damaged or truncated, is not finite, or has colours out of range.
-    """
+    """Read positions and colours: red, green, blue (8 or 16 bits, or floats in [0, 1]), or f_dc of Gaussians, else grey."""
     table, _ = _read_vertices(path)
     names = set(_names_of(table))
     means = _columns(path, table, _XYZ)
@@ -234,16 +204,12 @@ def _read_vertices(path: Path) -> tuple[np.ndarray, str]:
 
 def _split_header(path: Path, head: bytes) -> tuple[str, int]:
     """The lines between `ply` and `end_header`, and the offset behind them."""
-    first, _, lines = head.partition(b"\n")
-    if first.strip() != b"ply":
+    if not (first := re.match(rb"\s*ply\s*\n", head)):
         raise DataError(path, "header", "does not begin with a line `ply`", "give a .ply file")
-    at = 0
-    for line in lines.splitlines(keepends=True):
-        if line.strip() == b"end_header" and line.endswith(b"\n"):
-            return lines[:at].decode("latin-1"), len(first) + 1 + at + len(line)
-        at += len(line)
-    problem = f"has no line `end_header` in its first {_LONGEST_HEADER} bytes"
-    raise DataError(path, "header", problem, "the file is truncated; write it again")
+    if not (last := re.search(rb"^[ \t]*end_header[ \t\r]*\n", head, re.MULTILINE)):
+        problem = f"has no line `end_header` in its first {_LONGEST_HEADER} bytes"
+        raise DataError(path, "header", problem, "the file is truncated; write it again")
+    return head[first.end() : last.start()].decode("latin-1"), last.end()
 
 
 def _parsed(path: Path, header: str) -> tuple[str, int, list[tuple[str, str]], bool]:

@@ -124,11 +124,11 @@ def photos_of(frames: Sequence[Frame], views: ViewSettings) -> Iterator[Photo]:
 
 def at_hr(capture: Capture, views: ViewSettings) -> Capture:
     """The capture with photos that load as `photos_of` gives them, for priors that use the truth."""
-    return replace(capture, frames=tuple(replace(f, load=partial(_pixels, f, views)) for f in capture.frames))
 
+    def pixels(frame: Frame) -> Float[Tensor, "H W 3"]:
+        return _reduced(replace(frame, shown=None, transparency=None), views).image
 
-def _pixels(frame: Frame, views: ViewSettings) -> Float[Tensor, "H W 3"]:
-    return _reduced(replace(frame, shown=None, transparency=None), views).image
+    return replace(capture, frames=tuple(replace(f, load=partial(pixels, f)) for f in capture.frames))
 
 
 def _lr(frame: Frame, photo: Photo, capture: Capture, views: ViewSettings, lr_files: Mapping[str, Path]) -> Photo:

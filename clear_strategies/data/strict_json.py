@@ -1,13 +1,4 @@
-"""JSON files, checked against msgspec types, which ignore keys that they do not have:
-
-    class Run(msgspec.Struct):
-        iterations: Count
-        scores: dict[str, float | None]
-
-    run = typed(path, read_object(path), Run, remedy="train the run again")
-
-A value of another type is refused with its place in the file.
-"""
+"""JSON files, checked against msgspec types, which ignore keys that they do not have: `typed(path, read_object(path), Run)`."""
 
 from __future__ import annotations
 
@@ -31,11 +22,7 @@ _T = TypeVar("_T")
 
 
 def read(path: Path) -> Any:
-    """The content of a file.
-
-    Raises:
-        DataError: it cannot be read, or is no JSON, which has neither NaN nor numbers beyond a float.
-    """
+    """The content of a file; a DataError where it is no JSON, which has neither NaN nor numbers beyond a float."""
     try:
         return msgspec.json.decode(read_bytes(path, most=_LARGEST))
     except RecursionError as error:
@@ -55,14 +42,8 @@ def read_object(path: Path) -> dict[str, Any]:
 def typed(
     path: Path, content: Any, kind: Callable[..., _T], *, where: str = "", remedy: str = "correct the field"
 ) -> _T:
-    """The content as `kind`.
-
-    Args:
-        kind: a struct, or a list or dict of such.
-        where: of the content in the file.
-
-    Raises:
-        DataError: a value has another type. The message has its place, e.g. `frames[1].fl_x`.
+    """The content, which lies at `where` in the file, as `kind`: a struct, or a list or dict of such. A DataError tells where
+    a value has another type, e.g. at `frames[1].fl_x`.
     """
     try:
         value: _T = msgspec.convert(content, kind)

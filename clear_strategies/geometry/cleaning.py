@@ -11,8 +11,6 @@ from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
-from torch import Tensor
 
 from clear_strategies.core.points import PointCloud
 from rasterizers.interface import BackendUnavailable
@@ -25,14 +23,28 @@ OUTLIER_RATIO: Final = 3.0
 
 
 def without_outliers(cloud: PointCloud, neighbours: int, ratio: float) -> PointCloud:
-    """The cloud without the points that `remove_outliers` removes; all of it if `neighbours` is 0 or there are too few points."""
-    if neighbours == 0 or len(cloud) <= neighbours:
+    """The cloud without outliers; all of it if `neighbours` is 0 or there are too few points.
+
+    A point's measure is the mean distance to its `neighbours` nearest points (2 or more), itself included. The point is kept if
+    its measure is below the average plus `ratio` standard deviations. A point whose measure is 0, because its neighbours
+    coincide with it, is removed.
+    """
+    n = len(cloud)
+    if neighbours == 0 or n <= neighbours:
         return cloud
-    kept = remove_outliers(cloud.means, neighbours, ratio)
+    from scipy.spatial import cKDTree
+
+    points = cloud.means.detach().double().cpu().numpy()
+    measure = np.mean(cKDTree(points).query(points, k=neighbours)[0], axis=1)
+    apart = measure > 0
+    # As in Open3D, coinciding points count in n, although not in the deviation's sum.
+    average = measure.sum() / n
+    deviation = np.sqrt(np.square(measure[apart] - average).sum() / (n - 1))
+    kept = np.flatnonzero(apart & (measure < average + ratio * deviation))
     if len(kept) == 0:
         _log.warning("outliers are kept: the points coincide, so all of them would be removed.")
         return cloud
-    return cloud[kept]
+    return cloud[torch.from_numpy(kept)]
 
 
 def averaged_in_voxels(cloud: PointCloud, edge: float) -> PointCloud:
@@ -57,25 +69,3 @@ def averaged_in_voxels(cloud: PointCloud, edge: float) -> PointCloud:
         cloud, means=torch.from_numpy(means[order]).to(cloud.means), colors=torch.from_numpy(colors[order]).to(cloud.colors),
         source=f"{cloud.source}, in voxels of {edge:g}",
     )  # fmt: skip
-
-
-def remove_outliers(means: Float[Tensor, "N 3"], neighbours: int, ratio: float) -> Int[Tensor, " K"]:
-    """Indices, ascending, of the points that are no outliers.
-
-    A point's measure is the mean distance to its `neighbours` nearest points (2 or more), itself included. The point is kept if
-    its measure is below the average plus `ratio` standard deviations. A point whose measure is 0, because its neighbours
-    coincide with it, is removed.
-    """
-    points = means.detach().double().cpu().numpy()
-    if len(points) < 2:
-        return torch.arange(len(points))
-    from scipy.spatial import cKDTree
-
-    distances, _ = cKDTree(points).query(points, k=min(neighbours, len(points)))
-    measure = np.mean(distances, axis=1)
-    apart = measure > 0
-    # As in Open3D, coinciding points count in n, although not in the deviation's sum.
-    n = len(points)
-    average = measure.sum() / n
-    deviation = np.sqrt(np.square(measure[apart] - average).sum() / (n - 1))
-    return torch.from_numpy(np.flatnonzero(apart & (measure < average + ratio * deviation)))

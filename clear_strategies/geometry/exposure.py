@@ -15,8 +15,7 @@ from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.cameras import partners
-from clear_strategies.geometry.projection import back_project, sample_colors
-from clear_strategies.geometry.visibility import on_surface
+from clear_strategies.geometry.projection import back_project, on_surface, sample_colors
 
 _TOLERANCE: Final = 0.02  # relative difference of depth up to which two photos show the same surface
 _UNCLIPPED: Final = (0.05, 0.92)  # darker, a ratio is that of noise; lighter, the photo may have been clipped

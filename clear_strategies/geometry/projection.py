@@ -1,7 +1,8 @@
-"""From points to pixels and back, and an image's colours there. Pixel (0, 0) spans [0, 1)²."""
+"""From points to pixels and back, which cameras see a point, and an image's colours there. Pixel (0, 0) spans [0, 1)²."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -12,6 +13,7 @@ from torch import Tensor
 from clear_strategies.core.view import Photo
 from rasterizers.interface import Camera, Color
 
+_BEHIND: Final = 0.03  # a camera sees a point whose depth there exceeds the camera's own by at most this share of it
 _SAME_COLOR: Final = 2 / 255  # largest difference of a background pixel from the background's colour
 
 
@@ -46,6 +48,29 @@ def seen_pixels(
     inside = inside_of(camera, pixels, depth)
     column, row = pixels[inside].long().unbind(dim=1)
     return inside, row, column, depth[inside]
+
+
+def times_seen(
+    points: Float[Tensor, "N 3"], cameras: Sequence[tuple[Camera, Float[Tensor, "h w"]]]
+) -> Int[Tensor, " N"]:
+    """In how many cameras, each with its depth (nan without a surface), each point is inside the image and not hidden."""
+    count = torch.zeros(len(points), dtype=torch.long)
+    for camera, depth in cameras:
+        inside, row, column, z = seen_pixels(camera, points)
+        count[inside] += z <= depth[row, column] * (1 + _BEHIND)
+    return count
+
+
+def on_surface(
+    camera: Camera, depth: Float[Tensor, "h w"], points: Float[Tensor, "N 3"], tolerance: float
+) -> tuple[Bool[Tensor, " N"], Float[Tensor, "N 2"]]:
+    """(whether each point's depth differs from `depth`, nan or 0 where it is unknown, by at most `tolerance`, relatively; the
+    pixels that the points project to).
+    """
+    pixels, z = project(camera, points)
+    inside = inside_of(camera, pixels, z)
+    column, row = torch.where(inside[:, None], pixels, 0.0).long().unbind(dim=1)
+    return inside & ((depth[row, column] / z - 1).abs() <= tolerance), pixels
 
 
 def back_project(camera: Camera, pixels: Float[Tensor, "G 2"], depth: Float[Tensor, " G"]) -> Float[Tensor, "G 3"]:

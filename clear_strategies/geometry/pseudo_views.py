@@ -18,8 +18,14 @@ from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.cameras import moved
-from clear_strategies.geometry.projection import back_project, inside_of, is_background, project, sample_colors
-from clear_strategies.geometry.visibility import on_surface
+from clear_strategies.geometry.projection import (
+    back_project,
+    inside_of,
+    is_background,
+    on_surface,
+    project,
+    sample_colors,
+)
 from rasterizers.interface import Camera, Color
 
 _SOURCES: Final = 4  # the nearest photos that a pseudo view is made of

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.data.scene import Scene
-from clear_strategies.geometry.visibility import times_seen
+from clear_strategies.geometry.projection import times_seen
 from clear_strategies.outputs import figures
 from clear_strategies.viewing.cameras import at_most
 from clear_strategies.viewing.look import Painter

@@ -8,25 +8,25 @@ import pytest
 import torch
 
 from clear_strategies.core.points import PointCloud
-from clear_strategies.geometry.cleaning import averaged_in_voxels, remove_outliers
+from clear_strategies.geometry.cleaning import averaged_in_voxels, without_outliers
 from rasterizers.interface import BackendUnavailable
 
 
-def test_a_stray_point_is_removed() -> None:
-    # Mean distance to the 2 nearest, itself included: 1/2 four times and 96/2 once. Average 10, deviation 21.2.
-    line = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [99, 0, 0]])
-    assert remove_outliers(line, 2, 1.7).tolist() == [0, 1, 2, 3]  # the limit is 46.1
-    assert remove_outliers(line, 2, 1.8).tolist() == [0, 1, 2, 3, 4]  # 48.3
-
-
-def test_a_point_on_its_nearest_one_is_removed() -> None:
-    line = torch.tensor([[0.0, 0, 0], [0, 0, 0], [1, 0, 0], [2, 0, 0]])
-    assert remove_outliers(line, 2, 3.0).tolist() == [2, 3]
-
-
-def test_tiny_clouds_are_left_alone() -> None:
-    for n in (0, 1):
-        assert len(remove_outliers(torch.zeros(n, 3), 16, 3.0)) == n
+@pytest.mark.parametrize(
+    ("line", "ratio", "kept"),
+    [
+        # Mean distance to the 2 nearest, itself included: 1/2 four times and 96/2 once. Average 10, deviation 21.2.
+        ([0, 1, 2, 3, 99], 1.7, [0, 1, 2, 3]),  # the limit is 46.1
+        ([0, 1, 2, 3, 99], 1.8, [0, 1, 2, 3, 99]),  # 48.3
+        ([0, 0, 1, 2], 3.0, [1, 2]),  # a point on its nearest one
+        ([0, 0, 0], 3.0, [0, 0, 0]),  # all would be removed
+        ([0, 9], 0.1, [0, 9]),
+        ([], 3.0, []),
+    ],
+)
+def test_outliers_are_removed(line: list[float], ratio: float, kept: list[float]) -> None:
+    means = torch.tensor(line)[:, None] * torch.tensor([1.0, 0, 0])
+    assert without_outliers(PointCloud(means, means * 0, "given"), 2, ratio).means[:, 0].tolist() == kept
 
 
 def test_voxels_hold_the_averages_of_their_points_in_the_order_of_the_cubes():

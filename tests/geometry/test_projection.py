@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from clear_strategies.geometry.projection import sample_colors
-from clear_strategies.geometry.visibility import times_seen
+from clear_strategies.geometry.projection import sample_colors, times_seen
 from rasterizers.interface import Camera
 from tests.helpers import planes
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from clear_strategies.geometry.dense_stereo.depth import Estimate
+from clear_strategies.geometry.dense_stereo.image import Estimate
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.libraries import missing
 

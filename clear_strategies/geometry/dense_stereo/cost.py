@@ -98,7 +98,8 @@ def _cost(reference: _Windows, other: _Swept, inverse_depths: Float[Tensor, " P"
         mean, variance = _moments(drawn, window)
         covariance = torch.where(seen, box_mean(image * drawn, window) - reference.mean * mean, 0.0)
     deviation = variance.clamp_min_(0).add_(_VARIANCE_FLOOR).sqrt_()
-    return (1 - covariance.div_(deviation.mul_(reference.deviation))).div_(2)
+    cost: Tensor = (1 - covariance.div_(deviation.mul_(reference.deviation))).div_(2)
+    return cost
 
 
 def _moments(images: Float[Tensor, "P H W"], window: int) -> tuple[Float[Tensor, "P H W"], Float[Tensor, "P H W"]]:

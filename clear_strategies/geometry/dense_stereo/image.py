@@ -1,4 +1,4 @@
-"""The grey images that stereo compares."""
+"""The grey images that stereo compares, and the depth that it finds of them."""
 
 from __future__ import annotations
 
@@ -38,6 +38,15 @@ class Grey:
         x = (torch.arange(self.camera.width, dtype=torch.float64) + 0.5)[None, :, None]
         y = (torch.arange(self.camera.height, dtype=torch.float64) + 0.5)[:, None, None]
         return (x * H[:, 0] + y * H[:, 1] + H[:, 2]).to(self.image), shift.to(self.image)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The depth of one photo, before it is compared with that of others."""
+
+    image: Grey
+    inverse_depth: Float[Tensor, "H W"]  # 1 / z, 1 / world units
+    correlation: Float[Tensor, "H W"]  # ZNCC of the windows at that depth, in [-1, 1]
 
 
 def grey(photo: Photo, enlarge: int, max_pixels: int) -> Grey:

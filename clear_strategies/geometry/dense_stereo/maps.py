@@ -13,10 +13,11 @@ from torch import Tensor
 from clear_strategies.core.progress import Progress
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.dense_stereo.consistency import confirm, speckles
-from clear_strategies.geometry.dense_stereo.depth import Estimate, plane_sweep
-from clear_strategies.geometry.dense_stereo.image import Grey, grey
+from clear_strategies.geometry.dense_stereo.cost import cost_volume
+from clear_strategies.geometry.dense_stereo.image import Estimate, Grey, grey
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
-from clear_strategies.geometry.dense_stereo.sources import Comparison, comparisons
+from clear_strategies.geometry.dense_stereo.smoothing import smooth
+from clear_strategies.geometry.dense_stereo.sources import Comparison, comparisons, plane_count
 from clear_strategies.geometry.projection import is_background, seen_pixels
 from clear_strategies.geometry.sift import features_of
 from rasterizers.interface import Color
@@ -92,6 +93,29 @@ def _estimates(
         _log.debug("stereo: photo %d against %s.", i, comparison.others[: settings.sources])
         progress(i + 1)
     return estimates
+
+
+def plane_sweep(image: Grey, others: list[Grey], comparison: Comparison, settings: StereoSettings) -> Estimate:
+    """Planes uniform in inverse depth, the minimum of the smoothed cost, and a parabola through its neighbours."""
+    count = plane_count(image.camera, [other.camera for other in others], comparison, settings)
+    planes = torch.linspace(comparison.far, comparison.near, count, dtype=torch.float64)
+    cost = cost_volume(image, others, planes.to(image.image), settings.window)
+    smoothed = smooth(cost, image.image, settings.small_step, settings.large_step)
+    best = smoothed.argmin(dim=-1, keepdim=True)
+    correlation = 1 - 2 * cost.gather(-1, best)[..., 0]
+    step = (comparison.near - comparison.far) / (count - 1)
+    position = best[..., 0].double() + parabola_minimum(smoothed, best).double()
+    return Estimate(image, (comparison.far + step * position).float(), correlation)
+
+
+def parabola_minimum(cost: Float[Tensor, "H W D"], best: Tensor) -> Float[Tensor, "H W"]:
+    """Where the parabola through the minimum and its two neighbours is lowest, in [-0.5, 0.5] planes from the minimum."""
+    last = cost.shape[-1] - 1
+    before, here, after = (cost.gather(-1, (best + k).clamp(0, last))[..., 0] for k in (-1, 0, 1))
+    curvature = (before - 2 * here + after).clamp_min(1e-9)
+    offset = ((before - after) / (2 * curvature)).clamp(-0.5, 0.5)
+    inside = (best[..., 0] > 0) & (best[..., 0] < last)
+    return torch.where(inside, offset, 0.0)
 
 
 def _on_photo(estimate: Estimate, photo: Photo) -> Estimate:
