@@ -1,6 +1,7 @@
 """The pictures of the documentation.
 
 python docs/figures.py                     those of the evidence pages, from their CSV files
+python docs/figures.py training_time SWEEP   that of experiment=training_time, its CSV file and its table
 python docs/figures.py demo [OVERRIDE …]   the first tutorial's: trains the demo without strategies and with clear
 python docs/figures.py host                the README's: trains in a gsplat loop, without strategies and with best
 python docs/figures.py notebook            runs docs/tutorial/notebook.ipynb and keeps the outputs of its cells
@@ -149,8 +150,60 @@ def conflict(folder: Path) -> None:
     write(figure, folder, "conflict")
 
 
+def training_time(folder: Path) -> None:
+    """PSNR of the test views against processor seconds of training, of one stage and of two."""
+    rows = table("training_time")
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    figure, all_axes = plt.subplots(1, len(scenes), figsize=(7, 2.4), squeeze=False)
+    for axes, scene in zip(all_axes[0], scenes, strict=True):
+        for method in dict.fromkeys(row["method"] for row in rows):
+            axes.plot(*curve(rows, scene, method), marker=".", label=method)
+        axes.set_title(scene)
+        axes.set_xlabel("processor seconds")
+    all_axes[0][0].set_ylabel("PSNR of the test views, dB")
+    all_axes[0][0].legend(fontsize=7, frameon=False)
+    write(figure, folder, "training_time")
+
+
+def curve(rows: list[dict[str, str]], scene: str, method: str) -> tuple[list[float], list[float]]:
+    """Seconds and PSNR of a run of `training_time.csv`."""
+    of_run = [row for row in rows if (row["scene"], row["method"]) == (scene, method)]
+    return [float(row["processor seconds"]) for row in of_run], [float(row["PSNR (dB)"]) for row in of_run]
+
+
+def collect_training_time(sweep: Path) -> None:
+    """Write `training_time.csv` from the runs of experiment=training_time, and print their table."""
+    import pandas as pd
+
+    from clear_strategies.report.runs import collect
+
+    tables, stages = [], {}
+    for run in collect([sweep]):
+        history = pd.read_csv(run.folder / "history.csv")
+        probed = history.dropna(subset="psnr_test")
+        seconds, psnr = probed["processor_seconds"].round(1), probed["psnr_test"].round(3)
+        tables.append(
+            pd.DataFrame({"scene": run.scene, "method": run.name, "processor seconds": seconds, "PSNR (dB)": psnr})
+        )
+        runs = pd.read_csv(run.folder / "timing.csv").set_index("stage")["runs"]
+        whole = history["processor_seconds"].iloc[-1]
+        first = history[history["t"] <= runs.get("first stage", 0)]["processor_seconds"].max()
+        stages[run.scene, run.name] = [whole] if pd.isna(first) else [first, whole - first]
+    pd.concat(tables).to_csv(DOCS / "data" / "evidence" / "training_time.csv", index=False)
+    rows = table("training_time")
+    lines = ["| scene | method | processor seconds | PSNR (dB) | seconds to equal PSNR |", "|---|---|---|---|---|"]
+    for scene in dict.fromkeys(scene for scene, _ in stages):
+        curves = {method: curve(rows, scene, method) for of, method in stages if of == scene}
+        equal = min(max(psnr) for _, psnr in curves.values())
+        for method, (seconds, psnr) in curves.items():
+            until = next(s for s, p in zip(seconds, psnr, strict=True) if p >= equal)
+            took = " + ".join(f"{of_stage:.0f}" for of_stage in stages[scene, method])
+            lines.append(f"| {scene} | {method} | {took} | {psnr[-1]:.2f} | {until:.0f}, to {equal:.2f} dB |")
+    sys.stdout.write("\n".join(lines) + "\n")
+
+
 def main(folder: Path) -> None:
-    for draw in (ablation, skips, best, hosts, conflict):
+    for draw in (ablation, skips, best, hosts, conflict, training_time):
         draw(folder)
 
 
@@ -255,6 +308,9 @@ if __name__ == "__main__":
     match sys.argv[1:]:
         case []:
             main(DOCS / "images")
+        case ["training_time", sweep]:
+            collect_training_time(Path(sweep))
+            training_time(DOCS / "images")
         case ["demo", *overrides]:
             demo(DOCS / "images", *overrides)
         case ["host"]:

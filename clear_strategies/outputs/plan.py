@@ -43,7 +43,7 @@ class Chosen:
         given = [self.method] if self.method else []
         for override in self.overrides or ():
             key, _, value = override.lstrip("+").partition("=")
-            if key == "method":  # replaces the strategies before it
+            if key == "method" and value != "[]":  # replaces the strategies before it
                 given = [value]
             elif key == "strategy":
                 given.append(value.strip("[]").replace(",", " + "))

@@ -153,6 +153,7 @@ EVIDENCE = {
     "evidence_geometry": (5 * 3 * 2 * 2, "AutoPrior"),
     "conflict_by_views": (6 * 2, "Onnx"),
     "conflict_in_training": (4, "Onnx"),
+    "training_time": (2 * 2, "Onnx"),
 }
 
 
