@@ -22,7 +22,7 @@ from clear_strategies.core.evidence import Evidence, PatchMaps
 from clear_strategies.core.gradients import Grads, Shot
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, View
-from rasterizers.interface import Camera, Color
+from rasterizers.interface import Color
 
 _DEVICE: Final = "device"
 
@@ -51,12 +51,12 @@ class Drawn:
 
     Args:
         means: of its Gaussians, not to be changed.
-        draw: what a camera sees of it, over the colour of the iteration, without dropout, f_det and gradient.
+        draw: what a camera sees of it, over the colour of the iteration, without f_det and gradient; `gate` as of `ExtraView`.
         enlarge: a picture as SR image, `factor` times as large, by the network of the run's prior; by bicubic without one.
     """
 
     means: Float[Tensor, "N 3"]
-    draw: Callable[[Camera], Float[Tensor, "h w 3"]]
+    draw: Callable[..., Float[Tensor, "h w 3"]]  # (camera, gate=None)
     enlarge: Callable[[Float[Tensor, "h w 3"], int], Float[Tensor, "H W 3"]]
 
 

@@ -213,7 +213,7 @@ def _situation(seed: int) -> tuple[StubShot, StubShot, View, dict[str, Tensor]]:
 def _drawn() -> Drawn:
     """A field that shows by each camera the same grey, so that a strategy that draws late sees what it would have seen."""
 
-    def grey(camera: Camera) -> Tensor:
+    def grey(camera: Camera, gate: Any = None) -> Tensor:
         return torch.full((camera.height, camera.width, 3), 0.5)
 
     return Drawn(torch.zeros(_N, 3), grey, lambda image, factor: images.upsample(image, factor, "nearest"))

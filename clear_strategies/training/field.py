@@ -106,14 +106,16 @@ class GaussianField(nn.Module):
         shots = {d: FieldShot(r, active, detail=d) for (d, _), r in zip(wanted, renderings, strict=True)}
         return shots.get(False), shots.get(True)
 
-    def shot(self, rasterizer: Rasterizer, camera: Camera) -> FieldShot:
-        """A rendering to learn from, of all Gaussians, without f_det."""
-        active = self._activate(None)
+    def shot(self, rasterizer: Rasterizer, camera: Camera, gate: Float[Tensor, " N"] | None = None) -> FieldShot:
+        """A rendering to learn from, of all Gaussians unless `gate` drops some, without f_det."""
+        active = self._activate(gate)
         return FieldShot(rasterizer(active.splats(detail=False), camera), active, detail=False)
 
-    def render(self, rasterizer: Rasterizer, camera: Camera, *, detail: bool = True) -> Float[Tensor, "H W 3"]:
-        """An image for evaluation: no dropout, f = base + det, not clamped."""
-        return rasterizer(self._activate(None).splats(detail=detail), camera).image
+    def render(
+        self, rasterizer: Rasterizer, camera: Camera, *, detail: bool = True, gate: Float[Tensor, " N"] | None = None
+    ) -> Float[Tensor, "H W 3"]:
+        """An image for evaluation: no dropout but `gate`, f = base + det, not clamped."""
+        return rasterizer(self._activate(gate).splats(detail=detail), camera).image
 
     def update_filter(self, cameras: Sequence[Camera], variance: float, near: float = NEAR) -> None:
         """Recompute the 3D filter from the present means."""

@@ -32,7 +32,7 @@ from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_o
 from clear_strategies.training.signals import Interrupted, deferred_signals, foremost
 from clear_strategies.training.state import TrainState
 from rasterizers import native
-from rasterizers.interface import Rasterizer, over
+from rasterizers.interface import Camera, Rasterizer, over
 
 EXTRA_LOSS: Final = "loss_extra"
 """The column of the history: the LR loss of the iteration's last extra view."""
@@ -92,7 +92,11 @@ def drawn_of(s: TrainState, rasterizer: Rasterizer) -> Drawn:
         network = network_of(s.conductor.sr) or Bicubic()
         return network("a drawn picture", images.quantize(image.cpu()), factor).to(image.device)
 
-    return Drawn(field.means.data, lambda camera: field.render(rasterizer, camera, detail=False), enlarged)
+    def draw(camera: Camera, gate: Callable[[int], Tensor] | None = None) -> Tensor:
+        z = None if gate is None else gate(len(field))
+        return field.render(rasterizer, camera, detail=False, gate=z)
+
+    return Drawn(field.means.data, draw, enlarged)
 
 
 def extra_steps(s: TrainState, rasterizer: Rasterizer, extra_views: Sequence[ExtraView]) -> dict[str, Number]:
@@ -109,7 +113,7 @@ def extra_steps(s: TrainState, rasterizer: Rasterizer, extra_views: Sequence[Ext
     θ, steps, where = s.field, s.optimizer.steps, f"t={s.t}, an extra view: the gradient"
     for extra in extra_views:
         with s.conductor.work_log.stage("extra views"):
-            shot = θ.shot(rasterizer, extra.photo.camera)
+            shot = θ.shot(rasterizer, extra.photo.camera, None if extra.gate is None else extra.gate(len(θ)))
             losses = s.conductor.extra_loss(shot.image, extra, s.t)
             if s.compiled_step is not None:
                 (g,) = s.compiled_step.vjp(shot, losses.cotangents)

@@ -63,7 +63,7 @@ def staged(settings: SRStage) -> SRStage:
 
 
 def looked_at(seen: list[Camera]) -> Drawn:
-    def draw(camera):
+    def draw(camera, gate=None):
         seen.append(camera)
         return torch.full((camera.height, camera.width, 3), 0.25)
 
