@@ -47,9 +47,6 @@ def main(overrides: Sequence[str] | None = None) -> None:
 
     Args:
         overrides: in place of the program's arguments.
-
-    Raises:
-        SettingError: an override names no setting, a flag is unknown, or a library of the trainer is not installed.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     arguments = sys.argv[1:] if overrides is None else overrides

@@ -34,13 +34,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run.
+    """A finished run; a DataError where the folder holds none.
 
     Args:
         folder: of its files, which `docs/reference/files.md` lists.
-
-    Raises:
-        DataError: the folder holds no finished run.
     """
 
     folder: Path
@@ -57,9 +54,7 @@ class Run:
 
     @cached_property
     def splats(self) -> Mapping[str, Tensor]:
-        """The Gaussians by gsplat's names, on the CPU: means [N, 3], quats [N, 4] (w, x, y, z), log scales [N, 3], logit
-        opacities [N], sh0 [N, 1, 3] and shN [N, K, 3]. f_det and the 3D filter are part of them, as in point_cloud.ply.
-        """
+        """The Gaussians by gsplat's names, on the CPU; f_det and the 3D filter are part of them, as in point_cloud.ply."""
         gaussians = read_gaussians(self.folder / "point_cloud.ply")
         return {name: getattr(gaussians, name) for name in PARAMETERS}
 
@@ -98,18 +93,18 @@ def train(photos: str | Path | None = None, *settings: str, folder: str | Path |
     overrides = list(settings) if photos is None else train_command.overrides([str(photos), *settings])
     if photos is None and not any(word.startswith(train_command.CHOOSE_STRATEGIES) for word in settings):
         overrides.append("+strategy=best")
-    if word := next((word for word in overrides if word.lstrip("+~").startswith(("hydra.", "hydra/"))), None):
-        key, _, value = word.partition("=")
-        refuse(
-            key, "must be left out, since Hydra takes no part in a run from Python", value, "folder=… is for its files"
-        )
-    name = "demo" if photos is None else Path(photos).resolve().stem
-    now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S-%f")
-    into = Path(folder) if folder is not None else Path("outputs") / name / now
+    for word in overrides:
+        key, _, value = word.lstrip("+~").partition("=")
+        if key.startswith(("hydra.", "hydra/")):
+            rule = "must be left out, since Hydra takes no part in a run from Python"
+            refuse(key, rule, value, "folder=… is for its files")
     config = composed(overrides, "config")
     if (lr := config.data.get("save_lr")) is not None:
         rule = "must be null, since a run that writes LR images does not train"
         refuse("data.save_lr", rule, lr, f"clear-strategies train PHOTOS data.save_lr={lr} on the command line")
+    name = "demo" if photos is None else Path(photos).resolve().stem
+    now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S-%f")
+    into = Path(folder) if folder is not None else Path("outputs") / name / now
     into.mkdir(parents=True, exist_ok=True)
     threads = torch.get_num_threads()
     try:

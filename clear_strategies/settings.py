@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import difflib
 import functools
-import importlib
 import inspect
 import math
+import pkgutil
 import types
 import typing
 import warnings
@@ -38,7 +38,7 @@ _MISSING: Final = "???"
 CHANGES_NO_RESULT: Final = frozenset(
     f"fit.{name}"
     for name in (
-        "checkpoint_every", "keep", "map_views", "memory", "page", "probe_every", "probe_views", "resume",
+        "checkpoint_every", "keep", "map_views", "memory", "probe_every", "probe_views", "resume",
         "threads", "verbose", "video", "viewer",
     )
 ) | {"rasterizer.memory"}  # fmt: skip
@@ -131,19 +131,12 @@ def _with_key(message: str, key: str, parameters: Mapping[str, Any]) -> str:
 
 
 def _located(target: Any) -> Callable[..., Any]:
-    """The class or function of a dotted name; an ImportError where it is not there."""
-    if not isinstance(target, str):
-        raise ImportError(f"{target!r} is no dotted name")
-    module, _, name = target.rpartition(".")
-    if not module:
-        raise ImportError("it names no module")
-    function = getattr(importlib.import_module(module), name)
-    if not callable(function):
-        raise ImportError("it is neither a class nor a function")
+    """The class or function of a dotted name; an ImportError or AttributeError where it is not there."""
     try:
+        function = pkgutil.resolve_name(target)
         inspect.signature(function)
-    except ValueError as error:  # of some that are built in
-        raise ImportError("its parameters are not known") from error
+    except (ValueError, TypeError) as error:  # no name, no function, or one that is built in
+        raise ImportError(f"it is no class or function whose parameters are known: {one_line(error)}") from error
     return typing.cast("Callable[..., Any]", function)
 
 

@@ -20,9 +20,10 @@ from clear_strategies.data.priors import BackProjected, Bicubic
 from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs import device
-from clear_strategies.jobs.settings import RunSettings, settings_of
+from clear_strategies.jobs.settings import settings_of
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.settings import TARGET, with_defaults
+from clear_strategies.training.settings import FitSettings
 from tests.helpers.configs import composed, options
 
 
@@ -112,7 +113,7 @@ def test_clear_on_the_command_line_is_clear_in_python():
     kinds = {"optim": run.optim, "mip": run.mip, "cloud": run.data.cloud}
     assert kinds == {k: type(v)() for k, v in kinds.items()}
     assert run.data.views == ViewSettings(photos_are="hr")  # the demo's
-    assert run.fit == RunSettings(iterations=850)  # the demo's
+    assert run.fit == FitSettings(iterations=850)  # the demo's
 
 
 def test_the_two_sets_of_readings_differ_where_they_say():

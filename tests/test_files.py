@@ -1,8 +1,7 @@
-"""A file is whole or as it was before; numbers that JSON and CSV do not have become null and empty."""
+"""A file is whole or as it was before; numbers that JSON does not have become null."""
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from pathlib import Path
@@ -49,14 +48,3 @@ def test_json_has_null_where_a_number_is_not_finite(tmp_path: Path) -> None:
         "a": [None, 1.5, [None]],
         "b": {"c": None, "3": "λ"},
     }
-
-
-def test_csv_leaves_a_missing_cell_and_a_nan_empty(tmp_path: Path) -> None:
-    rows: list[dict[str, object]] = [
-        {"t": 1, "loss": 0.5, "ignored": 9}, {"t": 2, "loss": math.nan}, {"t": 3, "why": 'a, "b"'},
-    ]  # fmt: skip
-    files.write_csv(tmp_path / "t.csv", rows, ["t", "loss", "why"])
-    with (tmp_path / "t.csv").open(newline="") as file:
-        assert list(csv.reader(file)) == [
-            ["t", "loss", "why"], ["1", "0.5", ""], ["2", "", ""], ["3", "", 'a, "b"'],
-        ]  # fmt: skip

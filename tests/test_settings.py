@@ -102,7 +102,7 @@ REFUSED = {
     "inner: it is too large.": {"share": 1, "inner": target(Inner, size=10)},
     "inner: nowhere.Mine cannot be imported": {"share": 1, "inner": {TARGET: "nowhere.Mine"}},
     "inner: builtins.nothing cannot be imported": {"share": 1, "inner": {TARGET: "builtins.nothing"}},
-    "inner: builtins.type cannot be imported (its parameters are not known)": {
+    "inner: builtins.type cannot be imported (it is no class or function whose parameters are known": {
         "share": 1,
         "inner": {TARGET: "builtins.type"},
     },

@@ -45,7 +45,7 @@ QUESTIONS: Final[Mapping[str, tuple[str, Options]]] = {
         "--preset": {"nargs": "+", "default": list(PRESETS), "choices": list(PRESETS), "help": "default: all"},
         **_TURNS,
     }),
-    "iteration": ("time and error of a training iteration, stage by stage", {
+    "iteration": ("time of a training iteration, stage by stage", {
         "--scene": {"default": "s100k", "metavar": "SCENE", "help": f"{_SCENES}; its image is the HR photo"},
         "--backend": {"metavar": "NAME", "help": "default: the fastest that runs here"},
         **_TURNS,

@@ -12,7 +12,6 @@ from torch import Tensor
 
 import rasterizers
 from clear_strategies.bench.scenes import SETTINGS, Workload
-from rasterizers.interface import Rasterizer
 
 ATTRIBUTES: Final = ("means", "scales", "quats", "opacities", "sh0", "shN")
 NO_CUT_OFFS: Final = {"alpha_min": 1e-9, "transmittance_min": 0.0}
@@ -27,13 +26,6 @@ def draw(render: Callable[[], Any], cotangent: Float[Tensor, "H W 3"]) -> Drawn:
     rendering = render()
     g = rendering.vjp(cotangent[None])
     return {"image": rendering.image.detach().cpu(), **{name: getattr(g, name)[0].cpu() for name in ATTRIBUTES}}
-
-
-def relative(measured: Tensor, truth: Tensor) -> float:
-    """The relative L2 error; the absolute one where the truth is 0."""
-    truth = truth.double()
-    size, error = float(truth.norm()), float((measured.to(truth) - truth).norm())
-    return error / size if size > 0 else error
 
 
 def errors(measured: Drawn, truth: Drawn) -> dict[str, float]:
@@ -51,7 +43,8 @@ def errors(measured: Drawn, truth: Drawn) -> dict[str, float]:
         x, expected = (drawn[name].double().reshape(len(truth[name]), -1) for drawn in (measured, truth))
         size = expected.norm(dim=1)
         of_each = ((x - expected).norm(dim=1) / size)[size > 0]
-        columns[f"{name}_relative"] = relative(x, expected)
+        whole, error = float(size.norm()), float((x - expected).norm())
+        columns[f"{name}_relative"] = error / whole if whole > 0 else error
         columns[f"{name}_median"] = float(of_each.median()) if len(of_each) else 0.0
     return columns
 
@@ -70,18 +63,13 @@ def truth_backend() -> str:
     return next(name for name in runs if torch.float64 in rasterizers.load(name).traits.dtypes)
 
 
-def in_float64(backend: str, workload: Workload, rules: Mapping[str, Any]) -> tuple[Rasterizer, Workload]:
-    """A rasterizer, and the workload in float64 on a device that it draws on.
+def truth(backend: str, workload: Workload, cotangent: Float[Tensor, "H W 3"], rules: Mapping[str, Any]) -> Drawn:
+    """Draw in float64, on the workload's device where the backend draws there.
 
     Args:
         rules: the cut-offs, and settings that differ from `SETTINGS`.
     """
     rasterizer = rasterizers.load(backend, **{**SETTINGS, **rules})
     device = workload.splats.means.device.type
-    return rasterizer, workload.to(device if device in rasterizer.traits.devices else "cpu", torch.float64)
-
-
-def truth(backend: str, workload: Workload, cotangent: Float[Tensor, "H W 3"], rules: Mapping[str, Any]) -> Drawn:
-    """Draw in float64."""
-    rasterizer, wide = in_float64(backend, workload, rules)
+    wide = workload.to(device if device in rasterizer.traits.devices else "cpu", torch.float64)
     return draw(lambda: rasterizer(wide.splats, wide.camera), cotangent.to(wide.splats.means))

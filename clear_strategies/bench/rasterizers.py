@@ -7,9 +7,7 @@ the cut-offs too.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final
 
 import pandas as pd
@@ -21,12 +19,13 @@ from torch import Tensor
 import rasterizers
 from clear_strategies.bench import accuracy, scenes
 from clear_strategies.bench.accuracy import NO_CUT_OFFS, Drawn, affordable
-from clear_strategies.bench.results import Results, line_chart
+from clear_strategies.bench.results import Results
 from clear_strategies.bench.scenes import SETTINGS, Workload
 from clear_strategies.bench.timing import interleaved, medians, milliseconds, queued
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import DataError
-from rasterizers.interface import PRESETS
+from clear_strategies.outputs.figures import new_figure
+from rasterizers.interface import PRESETS, Rendering
 
 COTANGENTS: Final = 3
 FORWARD, TOGETHER, SEPARATE, LATENCY = "forward", "lr_hr_together", "lr_hr_separate", "latency"
@@ -34,23 +33,53 @@ BACKWARD: Final = tuple(f"backward_k{k}" for k in range(1, COTANGENTS + 1))
 SAME, NONE = "same cut-offs", "no cut-offs"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Contestant:
-    """A backend at a preset on a scene.
+    """A backend at a preset on a scene. Called, it returns the milliseconds of every stage, once."""
 
-    Args:
-        names: the columns that say what a row of a table measured.
-        render: draws the scene.
-        stages: times more stages than forward and backward.
-    """
+    def __init__(self, workload: Workload, backend: str, preset: str) -> None:
+        self.rasterizer = rasterizers.load(backend, preset=preset, **SETTINGS)
+        self.workload, self.cotangents = workload, random_cotangents(workload)
+        module = getattr(self.rasterizer, "module", "")  # the instruction set of the compiled backend
+        self.names = {"scene": workload.name, "backend": backend, "module": module, "preset": preset}
+        self.label = " ".join(name for name in (backend, module, preset) if name)
 
-    names: Mapping[str, str]
-    render: Callable[[], Any]
-    stages: Callable[[WorkLog], None]
+    def render(self) -> Rendering:
+        return self.rasterizer(self.workload.splats, self.workload.camera)
 
-    @property
-    def label(self) -> str:
-        return " ".join(name for name in list(self.names.values())[1:] if name)
+    def __call__(self) -> dict[str, float]:
+        """Forward and backward passes, both scales together and one after the other; on CUDA also a forward and a backward pass
+        (K = 2) that start on an idle device, by the host's clock.
+        """
+        device, splats, hr = self.cotangents.device, self.workload.splats, self.workload.camera
+        work_log, lr = WorkLog(device), hr.scaled(1 / self.workload.lr_factor)
+        with queued(work_log, FORWARD):
+            rendering = self.render()
+        for k, stage in enumerate(BACKWARD, 1):
+            with queued(work_log, stage):
+                rendering.vjp(self.cotangents[:k])
+        del rendering
+        with queued(work_log, TOGETHER):
+            self.rasterizer.render_scales([(splats, lr), (splats, hr)])
+        with queued(work_log, SEPARATE):
+            self.rasterizer(splats, lr)
+            self.rasterizer(splats, hr)
+        ms = milliseconds(work_log)
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+            began = time.perf_counter()
+            self.render().vjp(self.cotangents[:2])
+            torch.cuda.synchronize(device)
+            ms[LATENCY] = 1e3 * (time.perf_counter() - began)
+        return ms
+
+    def peak_on_cuda(self) -> float:
+        """MiB that torch's allocator adds at the peak of a forward and a backward pass."""
+        torch.cuda.synchronize()
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+        self.render().vjp(self.cotangents[:2])
+        torch.cuda.synchronize()
+        return float(torch.cuda.max_memory_allocated() - before) / 2**20
 
 
 def measure(
@@ -60,9 +89,6 @@ def measure(
 
     Args:
         backend: none: all that run here.
-
-    Raises:
-        DataError: a name is unknown, or nothing that was asked for runs here.
     """
     require_device(device)
     backends, truth = usable(backend, device, results.note), accuracy.truth_backend()
@@ -71,13 +97,12 @@ def measure(
     for workload in workloads:
         results.log(f"{workload.name}: {len(workload.splats):,} Gaussians")
         affordable_here = [b for b in backends if affordable(b, workload, b, results.note)]
-        contestants = [backend_on(workload, b, p) for b in affordable_here for p in preset if p in presets_of(b)]
+        contestants = [Contestant(workload, b, p) for b in affordable_here for p in preset if p in presets_of(b)]
         if not contestants:
             continue
-        contenders = {c.label: partial(turn, c, random_cotangents(workload)) for c in contestants}
-        ms = interleaved(contenders, repeats, device=device, label=workload.name)
+        ms = interleaved({c.label: c for c in contestants}, repeats, device=device, label=workload.name)
         turns.append(ms.assign(scene=workload.name))
-        times += _time_rows(workload, contestants, medians(ms))
+        times += _time_rows(contestants, medians(ms))
         if affordable(truth, workload, "errors", results.note):
             errors += _error_rows(workload, contestants, truth)
     if not times:
@@ -89,13 +114,27 @@ def measure(
 
 
 def figure(time: pd.DataFrame, error: pd.DataFrame) -> Figure:
-    """A line per backend through its presets; lower left is better."""
+    """A panel per scene, a line per backend through its presets; lower left is better."""
     rows = time.merge(error[error["truth"] == NONE], on=["scene", "backend", "module", "preset"])
     rows["name"] = (rows["backend"] + " " + rows["module"].fillna("")).str.strip()  # empty in a CSV
-    rows["forward + backward, ms"] = rows["forward_ms"] + rows["backward_k1_ms"]
-    error_of = "error of the gradient of the means,\nrelative L2, against float64"
-    rows = rows.assign(line="").rename(columns={"preset": "mark", "means_relative": error_of})
-    return line_chart(rows, "forward + backward, ms", error_of, log=True)
+    rows["ms"] = rows["forward_ms"] + rows["backward_k1_ms"]
+    scenes, names = rows["scene"].unique(), rows["name"].unique()
+    drawn, (panels,) = new_figure(1, len(scenes), 1.2 + 3 * len(scenes), 4.2)
+    for axis, scene in zip(panels, scenes, strict=True):
+        for i, name in enumerate(names):
+            points = rows[(rows["scene"] == scene) & (rows["name"] == name)]
+            label = name if axis is panels[0] else None
+            axis.plot(points["ms"], points["means_relative"], "o-", markersize=3, color=f"C{i}", label=label)
+            for preset, *point in points[["preset", "ms", "means_relative"]].itertuples(index=False):
+                axis.annotate(preset, point, (5, 3), textcoords="offset points", fontsize=8, color="gray")
+        axis.set(title=scene, xlabel="forward + backward, ms", yscale="log")
+        if axis is not panels[0]:
+            axis.sharey(panels[0])
+        axis.margins(x=0.25, y=0.15)
+        axis.grid(alpha=0.25)
+    panels[0].set_ylabel("error of the gradient of the means,\nrelative L2, against float64")
+    drawn.legend(loc="outside lower left", fontsize=8, ncols=max(1, min(len(names), 2 * len(scenes))))
+    return drawn
 
 
 def require_device(device: str) -> None:
@@ -128,28 +167,6 @@ def presets_of(backend: str) -> Sequence[str]:
     return ["fast"] if backend == "gsplat" else list(PRESETS)
 
 
-def turn(contestant: Contestant, cotangents: Float[Tensor, "K H W 3"]) -> dict[str, float]:
-    """The milliseconds of every stage of a contestant, once; on CUDA also those of a forward and a backward pass (K = 2) that
-    start on an idle device, by the host's clock.
-    """
-    work_log, device = WorkLog(cotangents.device), cotangents.device
-    with queued(work_log, FORWARD):
-        rendering = contestant.render()
-    for k, stage in enumerate(BACKWARD, 1):
-        with queued(work_log, stage):
-            rendering.vjp(cotangents[:k])
-    del rendering
-    contestant.stages(work_log)
-    ms = milliseconds(work_log)
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-        began = time.perf_counter()
-        contestant.render().vjp(cotangents[:2])
-        torch.cuda.synchronize(device)
-        ms[LATENCY] = 1e3 * (time.perf_counter() - began)
-    return ms
-
-
 def random_cotangents(workload: Workload) -> Float[Tensor, "K H W 3"]:
     """Standard normal, the same for every contestant."""
     camera, generator = workload.camera, torch.Generator().manual_seed(0)
@@ -157,45 +174,15 @@ def random_cotangents(workload: Workload) -> Float[Tensor, "K H W 3"]:
     return values.to(workload.splats.means.device)
 
 
-def backend_on(workload: Workload, backend: str, preset: str) -> Contestant:
-    """A backend; it also times both scales, together and one after the other."""
-    rasterizer = rasterizers.load(backend, preset=preset, **SETTINGS)
-    splats, camera = workload.splats, workload.camera
-    lr = camera.scaled(1 / workload.lr_factor)
-
-    def stages(work_log: WorkLog) -> None:
-        with queued(work_log, TOGETHER):
-            rasterizer.render_scales([(splats, lr), (splats, camera)])
-        with queued(work_log, SEPARATE):
-            rasterizer(splats, lr)
-            rasterizer(splats, camera)
-
-    module = getattr(rasterizer, "module", "")  # the instruction set of the compiled backend
-    names = {"scene": workload.name, "backend": backend, "module": module, "preset": preset}
-    return Contestant(names, lambda: rasterizer(splats, camera), stages)
-
-
-def peak_on_cuda(c: Contestant, cotangents: Float[Tensor, "K H W 3"]) -> float:
-    """MiB that torch's allocator adds at the peak of a forward and a backward pass."""
-    torch.cuda.synchronize()
-    torch.cuda.reset_peak_memory_stats()
-    before = torch.cuda.memory_allocated()
-    c.render().vjp(cotangents)
-    torch.cuda.synchronize()
-    return float(torch.cuda.max_memory_allocated() - before) / 2**20
-
-
-def _time_rows(workload: Workload, contestants: Sequence[Contestant], median: pd.DataFrame) -> Iterator[dict[str, Any]]:
+def _time_rows(contestants: Sequence[Contestant], median: pd.DataFrame) -> Iterator[dict[str, Any]]:
     """Milliseconds, the ratios that say whether shared work pays, and on CUDA the peak of memory."""
-    cotangents = random_cotangents(workload)
     for c in contestants:
         ms = median.loc[c.label].dropna().to_dict()
         row: dict[str, Any] = {**c.names} | {f"{stage}_ms": value for stage, value in ms.items() if stage != SEPARATE}
         row |= {f"k{k}_over_k1": ms[BACKWARD[k - 1]] / ms[BACKWARD[0]] for k in range(2, COTANGENTS + 1)}
-        if SEPARATE in ms:
-            row["together_over_separate"] = ms[TOGETHER] / ms[SEPARATE]
-        if cotangents.is_cuda:
-            row["peak_mib"] = peak_on_cuda(c, cotangents[:2])
+        row["together_over_separate"] = ms[TOGETHER] / ms[SEPARATE]
+        if c.cotangents.is_cuda:
+            row["peak_mib"] = c.peak_on_cuda()
         yield row
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ from matplotlib.figure import Figure
 from torch.utils import collect_env
 
 from clear_strategies import files
-from clear_strategies.outputs.figures import new_figure, save_png
+from clear_strategies.outputs.figures import save_png
 from clear_strategies.outputs.provenance import provenance
 
 
@@ -60,32 +59,3 @@ class Results:
         del machine["command"]  # it may name a folder, or a user
         facts = {"options": options, "machine": machine, "notes": self.notes}
         files.write_json(self.out / f"{question}.json", facts)
-
-
-def line_chart(rows: pd.DataFrame, x: str, y: str, *, log: bool = False) -> Figure:
-    """One panel per scene, one colour per name, one line per name and line; a mark stands beside its point.
-
-    Args:
-        rows: a row per point, with the columns "scene", "name", "line", "mark", `x` and `y`.
-        x, y: columns, which also label the axes.
-        log: a logarithmic y axis, the same in all panels.
-    """
-    scenes, names = rows["scene"].unique(), list(rows["name"].unique())
-    figure, (panels,) = new_figure(1, len(scenes), 1.2 + 3 * len(scenes), 4.2)
-    for axis in panels[1:] if log else ():
-        axis.sharey(panels[0])
-    for axis, scene in zip(panels, scenes, strict=True):
-        for (name, _), points in rows[rows["scene"] == scene].groupby(["name", "line"], sort=False):
-            color = f"C{names.index(name)}"
-            axis.plot(points[x], points[y], "o-", markersize=3, color=color)
-            for mark, *point in points[["mark", x, y]].itertuples(index=False):
-                axis.annotate(mark, point, (5, 3), textcoords="offset points", fontsize=8, color="gray")
-        axis.set(title=scene, xlabel=x, yscale="log" if log else "linear")
-        axis.margins(x=0.25, y=0.15)
-        axis.grid(alpha=0.25)
-    panels[0].set_ylabel(y)
-    for i, name in enumerate(names):
-        panels[0].plot([], [], "o-", markersize=3, color=f"C{i}", label=textwrap.fill(name, 48 * len(scenes)))
-    columns = max(1, 40 * len(scenes) // max(map(len, names)))  # that the width holds
-    figure.legend(loc="outside lower left", fontsize=8, ncols=min(columns, len(names)))
-    return figure

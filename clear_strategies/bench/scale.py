@@ -32,7 +32,7 @@ from clear_strategies.training.loop import kernel_threads
 _WIDTH, _GAUSSIANS = 504, 100_000  # where the other size varies
 _MIB: Final = 1024 if sys.platform != "darwin" else 1 << 20  # units of ru_maxrss
 _RUN: Final = (
-    "data.reader.width=128", "data.reader.height=96", "fit.map_views=0", "fit.video=0", "fit.page=0",
+    "data.reader.width=128", "data.reader.height=96", "fit.map_views=0", "fit.video=0",
 )  # fmt: skip
 
 
@@ -50,9 +50,6 @@ def measure(
     Args:
         widths: of HR images of 4:3, px, multiples of 12.
         photos: training photos of a run of so many `iterations`.
-
-    Raises:
-        DataError: a run failed, or a width is not such a multiple.
     """
     if wrong := [width for width in widths if width % 12]:
         raise DataError("--widths", str(wrong[0]), "is no multiple of 12", "use one, such as 504")

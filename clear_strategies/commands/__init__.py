@@ -17,35 +17,19 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 from clear_strategies.errors import SettingError
 
-
-class Command(NamedTuple):
-    """A row of the table.
-
-    Args:
-        usage: the arguments behind its name.
-        summary: what it does, in one line.
-    """
-
-    usage: str
-    summary: str
-
-
+# Name and arguments, and what it does.
 COMMANDS: Final = {
-    "train": Command("PHOTOS [setting=value …]", "from photos or a capture to a splat and pictures"),
-    "render": Command("RUN", "a video of a saved run or a PLY file, or pictures from given cameras"),
-    "export": Command("RUN", "a saved run as a PLY file for viewers"),
-    "view": Command("RUN", "an interactive viewer in the browser of a saved run or a PLY file"),
-    "doctor": Command("", "what this machine has, what works, and what is missing"),
+    "train PHOTOS [setting=value …]": "from photos or a capture to a splat and pictures",
+    "render RUN": "a video of a saved run or a PLY file, or pictures from given cameras",
+    "export RUN": "a saved run as a PLY file for viewers",
+    "view RUN": "an interactive viewer in the browser of a saved run or a PLY file",
+    "doctor": "what this machine has, what works, and what is missing",
 }
-
-
-_HELP: Final = ("help", "--help", "-h")
-_OF_HYDRA: Final = ("-", "+", "~")  # how flags and overrides without "=" begin
-
+NAMES: Final = [usage.split()[0] for usage in COMMANDS]
 _RESEARCH: Final = {
     "clear-strategies +strategy=clear data=llff data.path=FOLDER": "one run of the whole configuration",
     "clear-strategies -m +strategy=clear,gco fit.seed=0,1": "a sweep: a run for every combination",
@@ -55,17 +39,13 @@ _RESEARCH: Final = {
 
 
 def named(arguments: Sequence[str]) -> Callable[[], None] | None:
-    """The call of the command that these arguments of the program name; None where they are Hydra's.
-
-    Raises:
-        SettingError: the first is a word that is neither a command nor Hydra's.
-    """
+    """The call of the command that these arguments of the program name; None where they are Hydra's."""
     name = arguments[0] if arguments else "help"
-    if name in _HELP:
+    if name in ("help", "--help", "-h"):
         return _help
-    if name in COMMANDS:
+    if name in NAMES:
         return lambda: import_module(f"{__name__}.{name}").main(list(arguments[1:]))
-    if name.startswith(_OF_HYDRA) or "=" in name:
+    if name.startswith(("-", "+", "~")) or "=" in name:  # how flags and overrides begin
         return None
     meant = _meant(name)
     remedy = (
@@ -81,14 +61,13 @@ def _meant(word: str) -> str | None:
         return f"clear-strategies view {quoted}"
     if "/" in word or Path(word).exists():
         return f"clear-strategies train {quoted}"
-    return next(iter(difflib.get_close_matches(word.lower(), COMMANDS, 1)), None)
+    return next(iter(difflib.get_close_matches(word.lower(), NAMES, 1)), None)
 
 
 def _help() -> None:
-    commands = {f"{name} {row.usage}".rstrip(): row.summary for name, row in COMMANDS.items()}
     sys.stdout.write(
         "clear-strategies COMMAND …; --help behind a command tells more.\n\n"
-        f"{_rows(commands)}\n"
+        f"{_rows(COMMANDS)}\n"
         "clear-strategies setting=value …, for research: any strategies, data and settings, and sweeps.\n\n"
         f"{_rows(_RESEARCH)}"
     )

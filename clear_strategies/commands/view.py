@@ -6,7 +6,6 @@ import logging
 import socket
 import webbrowser
 from collections.abc import Sequence
-from typing import Final
 
 from clear_strategies import console
 from clear_strategies.commands.options import parser_of
@@ -14,24 +13,19 @@ from clear_strategies.errors import SettingError
 
 _log = logging.getLogger(__name__)
 
-_LAST_PORT: Final = 65535
-
 
 def main(arguments: Sequence[str]) -> None:
     """Open the viewer and serve it until Ctrl-C."""
     parser = parser_of("view", "Look at a saved run, or a PLY file, in the browser. The run's own rasterizer draws.")
     parser.add_argument("--port", type=int, default=8080, help="%(default)s, or the next one that is free")
-    parser.add_argument(
-        "--host",
-        default="127.0.0.1",
-        help="%(default)s: this machine only; 0.0.0.0: every machine that reaches this one",
-    )
+    hosts = "%(default)s: this machine only; 0.0.0.0: every machine that reaches this one"
+    parser.add_argument("--host", default="127.0.0.1", help=hosts)
     parser.add_argument("--no-browser", action="store_true", help="do not open a browser")
     options = parser.parse_args(arguments)
     console.show(verbose=options.verbose)
     _require_own(options.host)
-    if not 0 <= options.port <= _LAST_PORT:
-        raise SettingError(f"--port: must be 0 to {_LAST_PORT}, got {options.port}.")
+    if not 0 <= options.port <= 65535:
+        raise SettingError(f"--port: must be 0 to 65535, got {options.port}.")
     from clear_strategies.jobs.saved import open_splat
     from clear_strategies.viewing import require_viewer
 
@@ -53,11 +47,8 @@ def main(arguments: Sequence[str]) -> None:
 def _require_own(host: str) -> None:
     """Raise a SettingError for an address of another machine, for which the viewer's server would wait for ever."""
     try:
-        family, kind, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind) as bound:
-            bound.bind(address)
+        socket.create_server((host, 0), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
     except OSError as error:
-        remedy = "Take 127.0.0.1, for this machine alone, or 0.0.0.0, for all that reach it."
-        raise SettingError(
-            f"--host: must be an address of this machine, got {host} ({error.strerror}). {remedy}"
-        ) from error
+        remedy = "Take 127.0.0.1, for this machine alone, or 0.0.0.0, for all that reach it"
+        rule = f"must be an address of this machine, got {host} ({error.strerror})"
+        raise SettingError(f"--host: {rule}. {remedy}.") from error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -20,6 +20,7 @@ from clear_strategies.density.threshold import count_passing, topk_mask
 from clear_strategies.errors import DensityError
 from clear_strategies.merging.iteration import Update
 from clear_strategies.schedules import milestone
+from clear_strategies.training.densifier import Densifier
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.optim import Adam
 from rasterizers.geometry import rotation_matrix
@@ -89,7 +90,7 @@ class DensitySettings:
         return Density(self, n, extent=extent, seed=seed, white_background=white_background, device=device)
 
 
-class Density:
+class Density(Densifier):
     """Accumulates statistics per Gaussian, and changes the structure by them.
 
     Args:
@@ -97,7 +98,7 @@ class Density:
         device: that of the field.
     """
 
-    name: Final = "density control"
+    name = "density control"
 
     def __init__(
         self,
@@ -109,19 +110,10 @@ class Density:
         white_background: bool = False,
         device: torch.device | str = "cpu",
     ) -> None:
-        self.settings, self.extent, self.seed, self.white_background = settings, extent, seed, white_background
+        self.settings: DensitySettings = settings
+        self.extent, self.seed, self.white_background = extent, seed, white_background
         self.score, self.ordinary, self.count = (torch.zeros(n, device=device) for _ in range(3))
-        self._warned_of_cap = False
-
-    @property
-    def cap(self) -> int:
-        return self.settings.max_gaussians
-
-    @property
-    def marks(self) -> Mapping[str, int]:
-        s = self.settings
-        reset = {"opacity reset": s.reset_every} if 0 < s.reset_every < s.stop else {}
-        return {"densify until": s.stop, **reset}
+        self.cap, self._warned_of_cap = settings.max_gaussians, False
 
     def accumulate(self, update: Update, shot: Shot, t: int) -> None:
         """Add the scores of this view's visible Gaussians; dropped ones are not visible."""
@@ -155,12 +147,7 @@ class Density:
         return due
 
     def restructure(self, field: GaussianField, optimizer: Adam, t: int) -> Int[Tensor, " M"]:
-        """Clone, split, prune: returns parents[M], row i of everything per Gaussian now comes from row parents[i].
-
-        Raises:
-            DensityError: fewer than min_gaussians would be left.
-            DivergedError: a parameter is not finite.
-        """
+        """Clone, split, prune: returns parents[M], row i of everything per Gaussian now comes from row parents[i]."""
         s, n = self.settings, len(field)
         # NaN fails every comparison: such a Gaussian would be pruned as if it were faint.
         require_finite(f"t={t}: before densification, the parameter", field.raw())

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -19,15 +19,15 @@ from torch import Tensor
 
 from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.finite import require_finite
-from clear_strategies.core.gradients import Shot
 from clear_strategies.core.seeds import hashed_generator_at
 from clear_strategies.core.view import View
 from clear_strategies.errors import DensityError
 from clear_strategies.geometry.pseudo_views import cut_out
-from clear_strategies.merging.iteration import Update
 from clear_strategies.schedules import LogLinear, milestone
 from clear_strategies.strategies.base import Strategy
-from clear_strategies.training.densifier import Gaussians, Moments
+from clear_strategies.training.densifier import Densifier
+from clear_strategies.training.field import GaussianField
+from clear_strategies.training.optim import Adam
 from rasterizers.geometry import rotation_matrix
 from rasterizers.interface import Camera
 
@@ -59,9 +59,6 @@ class MCMC(Strategy):
         noise: strength of the noise. A Gaussian of covariance Σ moves by noise(t) σ(100 (dead_opacity - opacity)) Σ η / s̃ after
             each iteration until `stop`, with η ~ N(0, I) and s̃ the median of the Gaussians' largest scales; 0: none moves.
         cooling: noise(t) / noise, which falls as the learning rate of the positions does.
-
-    Raises:
-        SettingError: a setting is outside its range.
     """
 
     start: int = milestone(500)
@@ -82,7 +79,7 @@ class MCMC(Strategy):
             require_number(name, getattr(self, name), least=least)
         require_number("dead_opacity", self.dead_opacity, above=0, below=1)
 
-    def densifier(self, field: Gaussians, views: Sequence[View], seed: int) -> Sampler | None:
+    def densifier(self, field: GaussianField, views: Sequence[View], seed: int) -> Sampler | None:
         """The sampler; None, and a message with the reason, where sampling would be of no use."""
         if self.stop < _SHORT_RUN:
             reason = f"until t={self.stop} there is less time than sampling needs ({_SHORT_RUN})"
@@ -99,35 +96,26 @@ class MCMC(Strategy):
         return None
 
 
-class Sampler:
+class Sampler(Densifier):
     """Changes the structure by sampling; what it does at t is a function of the field, (seed, t) and the cap.
 
     Args:
         n: Gaussians at the start.
     """
 
-    name: Final = "MCMC"
+    name = "MCMC"
 
     def __init__(self, settings: MCMC, n: int, *, seed: int) -> None:
-        self.settings, self.seed = settings, seed
-        self.cap = min(settings.max_gaussians, math.ceil(settings.per_point * n))
-
-    @property
-    def marks(self) -> Mapping[str, int]:
-        return {"densify until": self.settings.stop}
-
-    def accumulate(self, update: Update, shot: Shot, t: int) -> None:
-        """Nothing: rounds use the opacity alone."""
+        self.settings: MCMC = settings
+        self.seed = seed
+        self.cap: int = min(settings.max_gaussians, math.ceil(settings.per_point * n))
 
     def due(self, t: int) -> bool:
         """Whether a round falls on t."""
         s = self.settings
         return s.start < t < s.stop and t % s.every == 0
 
-    def reset_due(self, t: int) -> bool:
-        return False
-
-    def step(self, field: Gaussians, optimizer: Moments, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
+    def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
         if t >= self.settings.stop:
             return False
         generator = hashed_generator_at(self.seed, t, field.means.device)
@@ -139,14 +127,9 @@ class Sampler:
         return parents is not None
 
     def _round(
-        self, field: Gaussians, optimizer: Moments, t: int, generator: torch.Generator
+        self, field: GaussianField, optimizer: Adam, t: int, generator: torch.Generator
     ) -> Int[Tensor, " M"] | None:
-        """Move the dead and add copies: returns parents[M], or None where nothing changes.
-
-        Raises:
-            DensityError: fewer than min_gaussians are visible.
-            DivergedError: a parameter is not finite.
-        """
+        """Move the dead and add copies: returns parents[M], or None where nothing changes."""
         s, n = self.settings, len(field)
         require_finite(f"t={t}: before densification, the parameter", field.raw())
         opacities = field.opacities.data.sigmoid()
@@ -173,7 +156,7 @@ class Sampler:
         _log.debug("t=%d: %d moved, %d added: %d -> %d Gaussians.", t, len(dead), added, n, len(parents))
         return parents
 
-    def _wander(self, field: Gaussians, t: int, generator: torch.Generator) -> None:
+    def _wander(self, field: GaussianField, t: int, generator: torch.Generator) -> None:
         """Add the noise."""
         s = self.settings
         gate = torch.sigmoid(_GATE * (s.dead_opacity - field.opacities.data.sigmoid()))
@@ -193,7 +176,7 @@ class Sampler:
         self.cap = int(tensors["cap"])
 
 
-def _spacing(field: Gaussians, cameras: Sequence[Camera]) -> float:
+def _spacing(field: GaussianField, cameras: Sequence[Camera]) -> float:
     """The median distance of initial points, in pixels of the camera that is nearest to each."""
     centers = torch.stack([camera.center.to(field.means.data) for camera in cameras])
     focal = field.means.data.new_tensor([camera.fx for camera in cameras])

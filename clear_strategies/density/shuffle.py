@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -26,8 +26,6 @@ _CHILDREN: Final = 6  # one at each side of the centre, along each axis
 _ASIDE: Final = 0.5  # of the axis's scale
 _ALONG: Final = 4.0  # what the scale of the axis is divided by,
 _ACROSS: Final = 1.9  # and the two others
-SECOND_STAGE: Final = "second stage"
-"""The mark of the iteration at which the second stage begins."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +57,8 @@ class ShuffleSplit(Density):
     is_split = False
 
     @property
-    def marks(self) -> Mapping[str, int]:
-        return {**super().marks, SECOND_STAGE: self.settings.split_at + 1}
+    def second_stage(self) -> int:
+        return self.settings.split_at + 1
 
     def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
         if self.is_split:

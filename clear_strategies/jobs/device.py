@@ -6,8 +6,8 @@ import functools
 import logging
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Final, Literal
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, Final
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -18,12 +18,12 @@ import rasterizers
 from clear_strategies.core.points import spread
 from clear_strategies.errors import SettingError
 from clear_strategies.settings import TARGET
+from clear_strategies.training.settings import Device
 from rasterizers.interface import BackendUnavailable, Color, Rasterizer, RasterSettings
 
 _log = logging.getLogger(__name__)
 
 _SHARED: Final = RasterSettings()
-Device = Literal["cpu", "cuda"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,40 +90,32 @@ class Drawing:
     rasterizer: Rasterizer
     name: str
     device: Device
-    kernel: float
     make: functools.partial[Rasterizer]
 
     @property
-    def antialiased(self) -> bool:
-        """Whether opacities are compensated, see `RasterSettings`."""
-        return bool(self.make.keywords.get("antialiased", _SHARED.antialiased))
+    def rules(self) -> RasterSettings:
+        """The settings that every rasterizer has."""
+        given = self.make.keywords
+        return RasterSettings(**{f.name: given[f.name] for f in fields(RasterSettings) if f.name in given})
 
-    @property
-    def near(self) -> float:
-        """The near plane, world units."""
-        return float(self.make.keywords.get("near", _SHARED.near))
+    def having(self, **settings: Any) -> Drawing:
+        """The same with other settings."""
+        make = functools.partial(self.make, **settings)
+        return replace(self, rasterizer=make(), make=make)
 
     def over(self, background: Color) -> Drawing:
         """The same over the data set's background, unless the settings name one."""
-        if "background" in self.make.keywords:
-            return self
-        make = functools.partial(self.make, background=background)
-        return replace(self, rasterizer=make(), make=make)
+        return self if "background" in self.make.keywords else self.having(background=background)
 
     def among(self, means: Float[Tensor, "N 3"]) -> Drawing:
         """The same for a scene of these points: where they spread less than 1, the default near plane is as much nearer."""
         if self.make.keywords.get("near") != _SHARED.near or not len(means) or not 0 < (size := spread(means)) < 1:
             return self
-        make = functools.partial(self.make, near=_SHARED.near * size)
-        return replace(self, rasterizer=make(), make=make)
+        return self.having(near=_SHARED.near * size)
 
 
 def drawing(settings: RasterizerSettings | functools.partial[Rasterizer], asked: Device | None) -> Drawing:
-    """The rasterizer of the settings on the device that was asked for.
-
-    Raises:
-        SettingError: the rasterizer is not installed or refuses a setting, or does not draw on that device.
-    """
+    """The rasterizer of the settings on the device that was asked for."""
     if asked == "cuda" and not torch.cuda.is_available():
         raise SettingError(
             "fit.device: is cuda, and torch finds no CUDA device. Install NVIDIA's driver and a torch built for CUDA, or "
@@ -131,10 +123,8 @@ def drawing(settings: RasterizerSettings | functools.partial[Rasterizer], asked:
         )
     try:
         if isinstance(settings, RasterizerSettings):
-            kernel = settings.kernel
             name, make = settings.load(asked)
         else:
-            kernel = settings.keywords.get("kernel", _SHARED.kernel)
             name, make = settings.func.__name__, settings
         rasterizer = make()
     except (ValueError, TypeError, BackendUnavailable) as error:
@@ -144,25 +134,20 @@ def drawing(settings: RasterizerSettings | functools.partial[Rasterizer], asked:
             f"rasterizer: {name} is no Rasterizer. rasterizers.testing.check_rasterizer says what is missing."
         )
     device = drawn_on(rasterizer.traits.devices, name, asked)
-    return Drawing(rasterizer, name if device == "cpu" else f"{name} on {device}", device, kernel, make)
+    return Drawing(rasterizer, name if device == "cpu" else f"{name} on {device}", device, make)
 
 
 def log_choice(settings: RasterizerSettings | functools.partial[Rasterizer], chosen: Drawing) -> None:
     """Log why the other backends were not chosen, where `auto` found neither CUDA nor compiled kernels."""
-    if isinstance(settings, RasterizerSettings) and settings.name == "auto":
-        if chosen.device == "cuda" or chosen.rasterizer.traits.native_threads:
-            return  # nothing faster is missing, and asking the others would import their libraries
+    auto = isinstance(settings, RasterizerSettings) and settings.name == "auto"
+    if auto and chosen.device == "cpu" and not chosen.rasterizer.traits.native_threads:
         for name, reason in rasterizers.available().items():
             if reason is not None:
                 _log.info("rasterizer %s is not available: %s", name, reason)
 
 
 def drawn_on(devices: frozenset[str], name: str, asked: Device | None) -> Device:
-    """The device that was asked for, or else the best that this rasterizer draws on.
-
-    Raises:
-        SettingError: the rasterizer does not draw on the device that was asked for.
-    """
+    """The device that was asked for, or else the best that this rasterizer draws on."""
     if asked is None:
         return "cuda" if "cuda" in devices and torch.cuda.is_available() else "cpu"
     if asked not in devices:
@@ -174,11 +159,17 @@ def drawn_on(devices: frozenset[str], name: str, asked: Device | None) -> Device
 
 
 def threads(asked: int | None) -> tuple[int, str]:
-    """How many threads a job has, and why."""
+    """How many threads a job has, and why: at most torch's own number, which OMP_NUM_THREADS sets.
+
+    Two jobs must not use the same core: OpenMP's threads wait by spinning, so two jobs of two threads on two cores are
+    tens of times slower than two jobs of one thread.
+    """
     if asked is not None:
         return asked, "fit.threads"
-    jobs, reason = jobs_at_once(), f"of {cores()} here"
-    return threads_of_each(jobs), reason if jobs == 1 else f"{reason}, hydra.launcher.n_jobs={jobs}"
+    jobs, here = jobs_at_once(), cores()
+    at_once = jobs if jobs > 0 else max(1, here + 1 + jobs)  # as joblib counts: -1 is one job per core, -2 one fewer
+    reason = f"of {here} here" if jobs == 1 else f"of {here} here, hydra.launcher.n_jobs={jobs}"
+    return max(1, min(_threads_of_torch(), here // at_once)), reason
 
 
 def jobs_at_once() -> int:
@@ -190,20 +181,6 @@ def jobs_at_once() -> int:
 def cores() -> int:
     """The cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def threads_of_each(jobs: int) -> int:
-    """Threads per job when `jobs` run at once on this machine; at most torch's own number, which OMP_NUM_THREADS sets.
-
-    Two jobs must not use the same core: OpenMP's threads wait by spinning, so two jobs of two threads on two cores are
-    tens of times slower than two jobs of one thread.
-
-    Args:
-        jobs: at once; a negative number counts as joblib does: -1 is one job per core, -2 one fewer.
-    """
-    here = cores()
-    at_once = jobs if jobs > 0 else max(1, here + 1 + jobs)
-    return max(1, min(_threads_of_torch(), here // at_once))
 
 
 @functools.cache

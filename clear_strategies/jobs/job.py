@@ -39,57 +39,6 @@ from clear_strategies.viewing.look import Painter
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class _Place:
-    """The scene and the machine of a job.
-
-    Args:
-        scene: on the CPU. device_scene: the same scene on the device of `drawing`.
-    """
-
-    scene: Scene
-    device_scene: Scene
-    drawing: device.Drawing
-
-
-@dataclass(frozen=True, slots=True)
-class _Training:
-    """The training of a job.
-
-    Args:
-        compared: the configuration from `resume.comparable`, which a resumed run must have in common.
-        folder: for its files.
-        overrides: of the command line, for the report; None: unknown.
-        claim: called once `folder` is this run's, see `run`.
-    """
-
-    settings: JobSettings
-    conductor: Conductor
-    compared: Mapping[str, Any]
-    folder: Path
-    overrides: Sequence[str] | None
-    claim: Callable[[], None]
-
-    @property
-    def chosen(self) -> plan.Chosen:
-        return plan.Chosen(self.settings.method, list(self.settings.strategies), self.overrides)
-
-    def start(self, place: _Place) -> TrainState:
-        """The state that training starts from: the initial one, or the checkpoint that `fit.resume` names."""
-        settings, stretch = self.settings, self.settings.fit.stretch
-        state = TrainState.start(
-            place.device_scene,
-            self.conductor,
-            settings=scaled(settings.fit, stretch),
-            density=scaled(settings.density, stretch),
-            rates=scaled(settings.optim, stretch).of_run(settings.fit.iterations),
-            mip=scaled(settings.mip, stretch),
-            near=place.drawing.near,
-        )
-        resume.resume(state, place.scene, settings.fit.resume, self.folder, self.compared)
-        return state
-
-
 def run(
     config: DictConfig, folder: Path, overrides: Sequence[str] | None = None, claim: Callable[[], None] = lambda: None
 ) -> float | None:
@@ -113,107 +62,135 @@ def run(
     """
     values = tree(config)
     settings = settings_of(values)
-    fit = settings.fit
-    if fit.viewer:
+    if settings.fit.viewer:
         viewing.require_viewer()
-    training = _Training(settings, settings.conductor(fit.stretch), resume.comparable(values), folder, overrides, claim)
-    drawing = device.drawing(settings.rasterizer, fit.device)
+    conductor = settings.conductor(settings.fit.stretch)
+    drawing = device.drawing(settings.rasterizer, settings.fit.device)
     with hold(folder), signals.interrupted("before training began"):
         if not resume.begun(folder):
             claim()
-        return _run(training, drawing)
+        return _Job(settings, conductor, drawing, resume.comparable(values), folder, overrides, claim).run()
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    """A job whose settings have been checked, in its locked folder.
+
+    Args:
+        compared: the configuration from `resume.comparable`, which a resumed run must have in common.
+    """
+
+    settings: JobSettings
+    conductor: Conductor
+    drawing: device.Drawing
+    compared: Mapping[str, Any]
+    folder: Path
+    overrides: Sequence[str] | None
+    claim: Callable[[], None]
+
+    @property
+    def chosen(self) -> plan.Chosen:
+        return plan.Chosen(self.settings.method, list(self.settings.strategies), self.overrides)
+
+    def run(self) -> float | None:
+        settings, folder = self.settings, self.folder
+        threads, reason = device.threads(settings.fit.threads)
+        torch.set_num_threads(threads)
+        load = functools.partial(scenes.load, settings.data, settings.prior, settings.fit.seed, self.conductor.prior)
+        if settings.fit.resume == resume.AUTO:
+            finished = resume.finished(folder, self.compared, load)
+            if finished is not None:
+                score = finished.shown.mean.get("ours")
+                return None if score is None else score.psnr
+        scene = load()
+        if few := scene.notes.get(scenes.FEW_PLACED):
+            _log.warning("%s.", few)
+        if settings.data.save_lr is not None:
+            save_lr(scene, Path(settings.data.save_lr))
+            return None
+        device.log_choice(settings.rasterizer, self.drawing)
+        drawing = self.drawing.over(scene.background).among(scene.cloud.means)
+        there = scene.to(drawing.device)
+        state = self._start(scene, there, drawing)
+        self.claim()
+        files.sweep(folder)
+        # In a sweep the console shows one line per job; the rest is in run.log.
+        level = logging.DEBUG if _in_sweep() else logging.INFO
+        self._announce(scene, state, drawing, f"{threads} ({reason})", level)
+        results.remove_earlier(folder, all_files=state.t == 1)
+        evaluation, seconds = self._train(scene, there, state, drawing)
+        _log.log(level, "%s", score_table.describe(folder, evaluation, seconds))
+        if _in_sweep():
+            _log.info("%s", score_table.describe_job(HydraConfig.get().job.num, folder, evaluation, seconds))
+        if few:
+            _log.warning("%s.", few)
+        mean = evaluation.mean("test") or evaluation.mean("train")
+        return None if mean is None else mean.psnr
+
+    def _start(self, scene: Scene, there: Scene, drawing: device.Drawing) -> TrainState:
+        """The state that training starts from: the initial one, or the checkpoint that `fit.resume` names.
+
+        Args:
+            scene: on the CPU. there: the same on the device of the drawing.
+        """
+        settings, stretch = self.settings, self.settings.fit.stretch
+        rates = scaled(settings.optim, stretch).of_run(settings.fit.iterations)
+        state = TrainState.start(
+            there, self.conductor, settings=scaled(settings.fit, stretch), density=scaled(settings.density, stretch),
+            rates=rates, mip=scaled(settings.mip, stretch), near=drawing.rules.near,
+        )  # fmt: skip
+        resume.resume(state, scene, settings.fit.resume, self.folder, self.compared)
+        return state
+
+    def _announce(self, scene: Scene, state: TrainState, drawing: device.Drawing, threads: str, level: int) -> None:
+        """Log the plan, and what was set in vain. A SettingError if the run does not fit into memory."""
+        memory.release()
+        machine = {
+            "rasterizer": f"{drawing.name}, kernel {drawing.rules.kernel} px²",
+            "threads": threads,
+            "memory": memory.require(state, self.settings.fit.memory),
+        }
+        short, details = plan.describe(scene, state, self.chosen, machine)
+        _log.log(level, "%s", short)
+        _log.debug("%s", details)
+        idle = [override for override in self.overrides or () if override.lstrip("+").startswith("density.")]
+        if idle and not isinstance(state.density.settings, type(self.settings.density)):
+            _log.warning("%s has no effect: %s densifies in place of it.", ", ".join(idle), state.density.name)
+
+    @contextmanager
+    def _watched(self, scene: Scene, state: TrainState, painter: Painter) -> Iterator[Callable[[], None] | None]:
+        """Open the viewer if `fit.viewer` asks for it, and yield a function to call after each iteration."""
+        if not self.settings.fit.viewer:
+            yield None
+            return
+        from clear_strategies.viewing.server import watched
+
+        cameras = [view.hr.camera for view in scene.train]
+        with watched(painter, cameras, f"{scene.name} · {self.chosen.title}") as turn:
+            yield lambda: turn(state.t - 1)
+
+    def _train(
+        self, scene: Scene, there: Scene, state: TrainState, drawing: device.Drawing
+    ) -> tuple[Evaluation, float]:
+        """Train to the end and write the files; return the scores and the seconds of training."""
+        title, alone, painter = self.chosen.title, device.jobs_at_once() == 1, Painter(state.field, drawing.make)
+        began = time.perf_counter() - state.seconds  # with what a resumed run took before
+        with signals.interrupted("before the run was finished", lambda: resume.newest(self.folder)):
+            write_cameras(self.folder, scene)
+            watched = self._watched(scene, state, painter)
+            with watched as after_step, progress_bar(state, after_step, title, shown=alone) as progress:
+                checkpoints = self.folder / CHECKPOINTS
+                fit(state, there, drawing.rasterizer, checkpoints=checkpoints, config=self.compared, progress=progress)
+            seconds = time.perf_counter() - began
+            self.conductor.on_fit_end()  # its memory is for the results
+            state.second = state.other = None
+            memory.release()
+            evaluation = results.write_results(
+                self.folder, scene, state, drawing.rasterizer, painter, self.chosen, backend=drawing.name, seconds=seconds,
+                down=self.settings.data.views.downsample, config=self.compared, antialiased=drawing.rules.antialiased,
+            )  # fmt: skip
+        return evaluation, seconds
 
 
 def _in_sweep() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
-
-
-def _run(training: _Training, drawing: device.Drawing) -> float | None:
-    settings = training.settings
-    threads, reason = device.threads(settings.fit.threads)
-    torch.set_num_threads(threads)
-    load = functools.partial(scenes.load, settings.data, settings.prior, settings.fit.seed, training.conductor.prior)
-    if settings.fit.resume == resume.AUTO:
-        finished = resume.finished(training.folder, training.compared, load)
-        if finished is not None:
-            score = finished.shown.mean.get("ours")
-            return None if score is None else score.psnr
-    scene = load()
-    few = scene.notes.get(scenes.FEW_PLACED)
-    if few:
-        _log.warning("%s.", few)
-    if settings.data.save_lr is not None:
-        save_lr(scene, Path(settings.data.save_lr))
-        return None
-    device.log_choice(settings.rasterizer, drawing)
-    drawing = drawing.over(scene.background).among(scene.cloud.means)
-    place = _Place(scene, scene.to(drawing.device), drawing)
-    state = training.start(place)
-    training.claim()
-    files.sweep(training.folder)
-    _announce(training, state, place, f"{threads} ({reason})")
-    # In a sweep the console shows one line per job; the rest is in run.log.
-    level = logging.DEBUG if _in_sweep() else logging.INFO
-    results.remove_earlier(training.folder, all_files=state.t == 1)
-    evaluation, seconds = _train(training, state, place)
-    _log.log(level, "%s", score_table.describe(training.folder, evaluation, seconds))
-    if _in_sweep():
-        _log.info("%s", score_table.describe_job(HydraConfig.get().job.num, training.folder, evaluation, seconds))
-    if few:
-        _log.warning("%s.", few)
-    mean = evaluation.mean("test") or evaluation.mean("train")
-    return None if mean is None else mean.psnr
-
-
-def _announce(training: _Training, state: TrainState, place: _Place, threads: str) -> None:
-    """Log the plan, and what was set in vain. A SettingError if the run does not fit into memory."""
-    memory.release()
-    machine = {
-        "rasterizer": f"{place.drawing.name}, kernel {place.drawing.kernel} px²",
-        "threads": threads,
-        "memory": memory.require(state, training.settings.fit.memory),
-    }
-    described = plan.describe(place.scene, state, training.chosen, machine)
-    _log.log(logging.DEBUG if _in_sweep() else logging.INFO, "%s", described.short)
-    _log.debug("%s", described.details)
-    idle = [override for override in training.overrides or () if override.lstrip("+").startswith("density.")]
-    if idle and not isinstance(state.density.settings, type(training.settings.density)):
-        _log.warning("%s has no effect: %s densifies in place of it.", ", ".join(idle), state.density.name)
-
-
-@contextmanager
-def _watched(training: _Training, state: TrainState, place: _Place) -> Iterator[Callable[[], None] | None]:
-    """Open the viewer if `fit.viewer` asks for it, and yield a function to call after each iteration."""
-    if not training.settings.fit.viewer:
-        yield None
-        return
-    from clear_strategies.viewing.server import watched
-
-    painter, cameras = Painter(state.field, place.drawing.make), [view.hr.camera for view in place.scene.train]
-    tell = functools.partial(_log.info, "look while it trains: %s")
-    with watched(painter, cameras, f"{place.scene.name} · {training.chosen.title}", tell) as turn:
-        yield lambda: turn(state.t - 1)
-
-
-def _train(training: _Training, state: TrainState, place: _Place) -> tuple[Evaluation, float]:
-    """Train to the end and write the files; return the scores and the seconds of training."""
-    settings, rasterizer, alone = training.settings, place.drawing.rasterizer, device.jobs_at_once() == 1
-    began = time.perf_counter() - state.seconds  # with what a resumed run took before
-    with signals.interrupted("before the run was finished", lambda: resume.newest(training.folder)):
-        write_cameras(training.folder, place.scene)
-        watched = _watched(training, state, place)
-        with watched as after_step, progress_bar(state, after_step, training.chosen.title, shown=alone) as progress:
-            folder = training.folder / CHECKPOINTS
-            fit(state, place.device_scene, rasterizer, checkpoints=folder, config=training.compared, progress=progress)
-        seconds = time.perf_counter() - began
-        training.conductor.on_fit_end()  # its memory is for the results
-        state.second = state.other = None
-        memory.release()
-        evaluation = results.write_results(
-            training.folder, place.scene, state, rasterizer, training.chosen,
-            backend=place.drawing.name, down=settings.data.views.downsample,
-            painter=Painter(state.field, place.drawing.make), seconds=seconds, config=training.compared,
-            pictures=results.Pictures(settings.fit.map_views, settings.fit.video, settings.fit.page),
-            antialiased=place.drawing.antialiased,
-        )  # fmt: skip
-    return evaluation, seconds

@@ -23,12 +23,7 @@ class HeldError(DataError):
 
 @contextmanager
 def hold(folder: Path) -> Iterator[None]:
-    """Hold the lock of `folder`, which is created if it does not exist.
-
-    Raises:
-        HeldError: another job holds it, in this process or another.
-        OSError: the lock cannot be written there.
-    """
+    """Hold the lock of `folder`, which is created if it does not exist."""
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / NAME, timeout=0)
     try:

@@ -65,9 +65,6 @@ def finished(folder: Path, config: Mapping[str, Any], scene: Callable[[], Scene]
 
     Args:
         scene: reads that of `config`, if its place is another.
-
-    Raises:
-        DataError: it was another configuration's, or its metrics.json is damaged.
     """
     path = folder / "metrics.json"
     if not path.exists():
@@ -88,9 +85,6 @@ def resume(state: TrainState, scene: Scene, source: str | None, folder: Path, co
     Args:
         scene: of the state.
         source: a run's folder or one of its checkpoints; "auto": the newest checkpoint in `folder` that is whole, or none.
-
-    Raises:
-        DataError: the checkpoint is damaged, or another configuration's.
     """
     if source is None:
         return

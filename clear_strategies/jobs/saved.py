@@ -64,20 +64,34 @@ def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
 
     Args:
         rasterizer: by name; None: the one that the run trained with, or else the fastest here.
-
-    Raises:
-        DataError: nothing that can be drawn is there, or it is damaged.
-        SettingError: there is no such rasterizer here.
     """
-    if path.is_file() and path.suffix != checkpoint.SUFFIX:
-        return _of_ply(path, rasterizer)
-    folder = folder_of(path)
-    if checkpoint.saved(folder / CHECKPOINTS):
-        return _of_checkpoint(path, folder, rasterizer)
-    files = [folder / PLY, *sorted(folder.glob(f"point_cloud/iteration_*/{PLY}"), key=lambda p: len(p.parent.name))]
-    if (ply := next((p for p in reversed(files) if p.is_file()), None)) is not None:
-        return _of_ply(ply, rasterizer)
-    raise DataError(path, "run", "has neither a checkpoint nor a point_cloud.ply", "give a run's folder or a PLY file")
+    folder, above = folder_of(path), 0
+    is_ply = path.is_file() and path.suffix != checkpoint.SUFFIX
+    if not is_ply and checkpoint.saved(folder / CHECKPOINTS):
+        saved = checkpoint.load(path)
+        field, source, name = _field_of(saved, path), f"{folder}, {saved.t - 1} iterations", folder.name
+        settings = {
+            key.removeprefix("rasterizer."): value
+            for key, value in saved.config.items()
+            if key.startswith("rasterizer.") and value is not None  # the default, also of a field of an earlier version
+        }
+    else:
+        ply = path if is_ply else _ply_in(folder, path)
+        gaussians = read_gaussians(ply)
+        if not len(gaussians):
+            raise DataError(ply, "element vertex", "has no Gaussians", "export it again")
+        raw = {name: getattr(gaussians, name) for name in PARAMETERS}
+        field = GaussianField(raw | {"detail": torch.zeros_like(gaussians.means)})
+        field.degree = field.max_degree
+        settings = {} if gaussians.antialiased else {"kernel": 0.3, "antialiased": False}
+        folder, above, source = ply.parent, _DEPTH, str(ply)
+        name = folder.name if ply.name == PLY else ply.stem
+    cameras = _cameras_near(folder, above)
+    background = cameras[0].background if cameras else (0.0, 0.0, 0.0)
+    drawing = _drawing(settings, rasterizer).over(background).among(field.means.data)
+    painter = Painter(field.to(drawing.device), drawing.make)
+    source += f", {len(field):,} Gaussians"
+    return SavedSplat(folder, name or "splat", source, painter, cameras, bool(settings.get("antialiased", True)))
 
 
 def overview(field: GaussianField) -> Camera:
@@ -96,47 +110,24 @@ def overview(field: GaussianField) -> Camera:
     return Camera(torch.from_numpy(pose), float(height), float(height), width / 2, height / 2, width, height)
 
 
-def _of_checkpoint(path: Path, folder: Path, rasterizer: str | None) -> SavedSplat:
-    saved = checkpoint.load(path)
+def _field_of(saved: checkpoint.Checkpoint, path: Path) -> GaussianField:
     parameters = {name.removeprefix("field/"): v for name, v in saved.tensors.items() if name.startswith("field/")}
     try:
         field = GaussianField(parameters, degree=int(saved.facts["degree"]))
         field.filter_3d = parameters["filter_3d"].clone()
     except (KeyError, ValueError, TypeError) as error:
         raise DataError(path, "tensors", f"hold no field ({error})", "give a run of this program") from error
-    cameras = _cameras_near(folder, 0)
-    settings = {
-        key.removeprefix("rasterizer."): value
-        for key, value in saved.config.items()
-        if key.startswith("rasterizer.") and value is not None  # the default, also of a field of an earlier version
-    }
-    source = f"{folder}, {saved.t - 1} iterations, {len(field):,} Gaussians"
-    painter = _painter(field, _drawing(settings, rasterizer), cameras)
-    antialiased = bool(settings.get("antialiased", True))
-    return SavedSplat(folder, _name(folder), source, painter, cameras, antialiased)
+    return field
 
 
-def _of_ply(path: Path, rasterizer: str | None) -> SavedSplat:
-    g = read_gaussians(path)
-    if not len(g):
-        raise DataError(path, "element vertex", "has no Gaussians", "export it again")
-    field = GaussianField({name: getattr(g, name) for name in PARAMETERS} | {"detail": torch.zeros_like(g.means)})
-    field.degree = field.max_degree
-    cameras = _cameras_near(path.parent, _DEPTH)
-    drawing = _drawing({} if g.antialiased else {"kernel": 0.3, "antialiased": False}, rasterizer)
-    source = f"{path}, {len(field):,} Gaussians"
-    name = _name(path.parent) if path.name == PLY else path.stem
-    return SavedSplat(path.parent, name, source, _painter(field, drawing, cameras), cameras, g.antialiased)
-
-
-def _name(folder: Path) -> str:
-    return folder.name or "splat"
-
-
-def _painter(field: GaussianField, drawing: Drawing, cameras: Sequence[SavedCamera]) -> Painter:
-    """Draws the field over the background of the cameras; black where there are none."""
-    drawing = drawing.over(cameras[0].background if cameras else (0.0, 0.0, 0.0)).among(field.means.data)
-    return Painter(field.to(drawing.device), drawing.make)
+def _ply_in(folder: Path, path: Path) -> Path:
+    """The PLY file of a run's folder, or of a model's of Inria's 3DGS."""
+    last = sorted(folder.glob(f"point_cloud/iteration_*/{PLY}"), key=lambda p: len(p.parent.name))
+    if (ply := next((p for p in reversed([folder / PLY, *last]) if p.is_file()), None)) is None:
+        raise DataError(
+            path, "run", "has neither a checkpoint nor a point_cloud.ply", "give a run's folder or a PLY file"
+        )
+    return ply
 
 
 def _drawing(settings: Mapping[str, Any], name: str | None) -> Drawing:

@@ -17,13 +17,13 @@ from clear_strategies.outputs import figures
 from clear_strategies.viewing.cameras import at_most
 from clear_strategies.viewing.look import Painter
 
-_ENOUGH: Final = 3  # photos that see a surface; more of them change little
 _COMPARED: Final = 64  # photos whose depth is compared, at most
 _LONGER_SIDE: Final = 96  # px, of the depth of a photo
 _SOLID: Final = 0.3  # opacity of the Gaussians that count as surface
 _MOST_POINTS: Final = 60_000  # on the map
-_COLORS: Final = (figures.RED, figures.YELLOW, figures.CYAN, figures.BLUE)
-_SEEN: Final = ("no photo", "one photo", "two photos", f"{_ENOUGH} or more")
+_COLORS: Final = {
+    "no photo": figures.RED, "one photo": figures.YELLOW, "two photos": figures.CYAN, "3 or more": figures.BLUE,
+}  # fmt: skip
 _CROP: Final = 0.03  # share of the points that lie beyond each side of the map
 _NOTE: Final = 400  # characters below the map
 
@@ -39,31 +39,25 @@ def coverage_of(scene: Scene, painter: Painter) -> tuple[Float[Tensor, "N 3"], I
 
 def write_coverage(path: Path, scene: Scene, painter: Painter, title: str) -> None:
     """Draw the points in the colours of how many photos see them, and the cameras; what fewer photos see lies on top."""
-    from matplotlib.lines import Line2D
-
     points, times = coverage_of(scene, painter)
-    times = times.clamp(max=_ENOUGH)
-    figure, axes = figures.new_figure(1, 1, 8, 7)
-    axis = axes[0, 0]
+    times = times.clamp(max=len(_COLORS) - 1)
+    figure, ((axis,),) = figures.new_figure(1, 1, 8, 7)
     poses = torch.stack([view.hr.camera.world_to_camera[:3, :3].double().cpu() for view in scene.train])
     places = torch.stack([view.hr.camera.center.double().cpu() for view in scene.train])
     plane = _from_above(poses)
     flat, centers, ahead = (x.numpy() @ plane for x in (points.double(), places, poses[:, 2]))
-    for seen in reversed(range(_ENOUGH + 1)):
-        x, y = flat[(times == seen).numpy()].T
-        axis.scatter(x, y, s=4, color=_COLORS[seen], linewidths=0)
+    for seen, (name, color) in reversed([*enumerate(_COLORS.items())]):
+        those = (times == seen).numpy()
+        share = those.mean() if len(those) else 0
+        axis.scatter(*flat[those].T, s=4, marker="s", color=color, linewidths=0, label=f"seen by {name}: {share:.0%}")
     axis.quiver(*centers.T, *ahead.T, color=figures.INK, angles="xy", scale=18, width=0.005)
-    low, high = np.quantile(flat, (_CROP, 1 - _CROP), axis=0) if len(flat) else (centers.min(0), centers.max(0))
-    low, high = np.minimum(low, centers.min(0)), np.maximum(high, centers.max(0))
-    margin = max(0.06 * float((high - low).max()), 1e-6)
-    axis.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), aspect="equal")
+    inner = np.quantile(flat, (_CROP, 1 - _CROP), axis=0) if len(flat) else centers
+    shown = np.concatenate([inner, centers])
+    margin = max(0.06 * float(np.ptp(inner, axis=0).max()), 1e-6)
+    low, high = shown.min(0) - margin, shown.max(0) + margin
+    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     axis.set_axis_off()
-    shares = [float((times == seen).double().mean()) if len(times) else 0.0 for seen in range(_ENOUGH + 1)]
-    legend = [
-        Line2D([], [], linestyle="", marker="s", color=color, label=f"seen by {name}: {share:.0%}")
-        for color, name, share in zip(_COLORS, _SEEN, shares, strict=True)
-    ]
-    figure.legend(handles=legend, loc="outside lower left", ncols=2, fontsize=8, frameon=False)
+    figure.legend(loc="outside lower left", ncols=2, fontsize=8, frameon=False, markerscale=4, reverse=True)
     if scene.unplaced:
         listed = "; ".join(f"{name}: {why}" for name, why in scene.unplaced.items())
         note = textwrap.fill(textwrap.shorten(f"without a pose, so not used: {listed}", _NOTE, placeholder=" …"), 110)

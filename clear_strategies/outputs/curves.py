@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+
+import pandas as pd
 
 from clear_strategies.outputs import figures
-from clear_strategies.outputs.figures import History, save_png
 
-_COLOURS: Final = (figures.BLUE, figures.RED, figures.GREEN, figures.YELLOW, figures.CYAN, figures.PURPLE)
-_DASHES: Final = ("-", "--", ":")
 # Title, column of history.csv, what it is drawn over, whether as a running mean.
 _CHARTS: Final = (
     ("LR loss (running mean)", "loss_lr", "t", True),
@@ -22,9 +22,11 @@ _CHARTS: Final = (
     ("number of Gaussians", "n_gaussians", "t", False),
 )
 _AXIS: Final = {"t": "iteration", "seconds": "training time, s"}
+_COLOURS: Final = (figures.BLUE, figures.RED, figures.GREEN, figures.YELLOW, figures.CYAN, figures.PURPLE)
+_STYLES: Final = [{"color": color, "linestyle": dash} for dash, color in product(("-", "--", ":"), _COLOURS)]
 
 
-def write_curves(path: Path, histories: Mapping[str, History], title: str) -> None:
+def write_curves(path: Path, histories: Mapping[str, pd.DataFrame], title: str) -> None:
     """Draw six charts with one line per run, and one legend below them."""
     figure, axes = figures.new_figure(2, 3, 15, 8)
     known = {}
@@ -32,16 +34,15 @@ def write_curves(path: Path, histories: Mapping[str, History], title: str) -> No
         axis.set_title(name)
         axis.set_xlabel(_AXIS[over], fontsize=8, color=figures.FAINT)
         for i, (run, history) in enumerate(histories.items()):
-            x, y = figures.curve(history, column, over=over, smooth=smooth)
-            if len(x):
-                (known[run],) = axis.plot(
-                    x, y, color=_COLOURS[i % len(_COLOURS)], linewidth=1.4,
-                    linestyle=_DASHES[i // len(_COLOURS) % len(_DASHES)],
-                    marker="o" if column == "psnr_test" else None, markersize=3.5,
-                )  # fmt: skip
-        if axis.lines:
-            axis.set_xlim(left=0)
-        figures.finish(axis)
+            points = history.reindex(columns=[over, column]).dropna()
+            y = points[column]
+            if smooth:  # over a 50th of the rows
+                y = y.rolling(max(1, len(y) // 50)).mean()
+            if len(y):
+                marker = "o" if column == "psnr_test" else None
+                style = {"linewidth": 1.4, "marker": marker, "markersize": 3.5, **_STYLES[i % len(_STYLES)]}
+                (known[run],) = axis.plot(points[over], y, **style)
+        _finish(axis)
     if known:
         names = [textwrap.fill(run, width=60) for run in known]
         legend = figure.legend(
@@ -51,4 +52,18 @@ def write_curves(path: Path, histories: Mapping[str, History], title: str) -> No
         for text in legend.get_texts():
             text.set(**figures.AS_WRITTEN)
     figures.set_title(figure, title)
-    save_png(figure, path)
+    figures.save_png(figure, path)
+
+
+def _finish(axis: Any) -> None:
+    """Style the axes so that the data stands out; axes without data say "not measured"."""
+    axis.title.set(fontsize=10, color=figures.INK)
+    axis.tick_params(which="both", labelsize=8, colors=figures.FAINT)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.spines[["left", "bottom"]].set_color(figures.RULE)
+    if axis.lines:
+        axis.set_xlim(left=0)
+        axis.grid(alpha=0.25, linewidth=0.5)
+    else:
+        axis.text(0.5, 0.5, "not measured", fontsize=9, color=figures.FAINT, ha="center", transform=axis.transAxes)
+        axis.set(xticks=[], yticks=[])

@@ -51,9 +51,6 @@ class Truth:
 
     Args:
         shown: False at pixels that do not count: there an image is taken to be right. One at least is shown. None: all are.
-
-    Raises:
-        ValueError: it is too small.
     """
 
     def __init__(self, image: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None = None) -> None:
@@ -65,11 +62,7 @@ class Truth:
         self.edges, self.blur = _gradient_at_half_size(grey), _blur(grey)
 
     def score(self, image: Float[Tensor, "H W 3"]) -> ImageScores:
-        """Compare an image, clamped to [0, 1], with the truth. All scores of an image that is not finite are NaN.
-
-        Raises:
-            ValueError: its size is not the truth's.
-        """
+        """Compare an image, clamped to [0, 1], with the truth. All scores of an image that is not finite are NaN."""
         if image.shape != self.image.shape:
             sizes = f"{tuple(image.shape)} and {tuple(self.image.shape)}"
             raise ValueError(f"images must have the same size, got {sizes}.")

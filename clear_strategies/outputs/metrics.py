@@ -101,11 +101,7 @@ class Metrics(msgspec.Struct):
 
 
 def read(path: Path, remedy: str) -> Metrics:
-    """The content of metrics.json.
-
-    Raises:
-        DataError: it cannot be read, or is not that of a finished run; the message ends with `remedy`.
-    """
+    """The content of metrics.json."""
     return typed(path, read_object(path), Metrics, remedy=remedy)
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import torch
 
 from clear_strategies.data.scene import Scene
-from clear_strategies.merging.conductor import Conductor
 from clear_strategies.schedules import milestones
 from clear_strategies.training.state import TrainState
 
@@ -50,28 +49,22 @@ class Chosen:
         return " + ".join(given or self.strategies) or "baseline"
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """A line for each fact: `short` for the console, `details` for `-v` and run.log."""
-
-    short: str
-    details: str
-
-
-def describe(scene: Scene, state: TrainState, chosen: Chosen, machine: Mapping[str, str]) -> Plan:
-    """The plan: the data, the strategies, the milestones and what is skipped. Strategies without effect give a warning.
+def describe(scene: Scene, state: TrainState, chosen: Chosen, machine: Mapping[str, str]) -> tuple[str, str]:
+    """The plan, a line for each fact: what the console shows, and the details for `-v` and run.log. Strategies without effect
+    give a warning.
 
     Args:
         machine: label -> fact: the rasterizer, the threads, the memory.
     """
     settings, conductor = state.settings, state.conductor
     named = list(zip(chosen.strategies, conductor.strategies, strict=True))
-    strategies = ", ".join(f"{name} ({type(s).__name__})" for name, s in named)
+    none = "none (the paper's baseline)" if chosen.method is None else "none"
+    on_cuda = state.device.type == "cuda"
     lines = {
         **scene.notes,
         **({} if chosen.method is None else {"method": f"{chosen.method}; strategies named before it take no part"}),
-        "strategies": strategies or ("none (the paper's baseline)" if chosen.method is None else "none"),
-        "device": _device_name(state.device),
+        "strategies": ", ".join(f"{name} ({type(s).__name__})" for name, s in named) or none,
+        "device": f"cuda, {torch.cuda.get_device_name(state.device)}" if on_cuda else state.device.type,
         **machine,
         "per-Gaussian pass": "readable" if state.compiled_step is None else "compiled",
         "iterations": f"{settings.iterations}, seed {settings.seed}",
@@ -83,11 +76,16 @@ def describe(scene: Scene, state: TrainState, chosen: Chosen, machine: Mapping[s
         if (summary := s.summary()) is not None:
             lines[name.replace("_", " ")] = summary
     lines["skipped"] = "; ".join(_skipped(state)) or "nothing"
-    _warn_of_idle_strategies(conductor, settings.iterations)
+    objective = conductor.objective
+    largest = max(map(objective.lambda_hr, range(1, settings.iterations + 1)))
+    for s in conductor.strategies:
+        why = s.without_effect(lambda_lr=objective.lambda_lr, lambda_hr=largest, lambda_hf=objective.lambda_hf)
+        if why is not None:
+            _log.warning("%s has no effect: %s.", type(s).__name__, why)
     short = {label: lines[label] for label in _SHORT if label in lines}
     details = {label: text for label, text in lines.items() if label not in short}
     short["more"] = f"{len(details)} lines in run.log, or here with -v"
-    return Plan(_table(short), _table(details))
+    return _table(short), _table(details)
 
 
 def _table(lines: Mapping[str, str]) -> str:
@@ -95,44 +93,27 @@ def _table(lines: Mapping[str, str]) -> str:
     return "\n".join(f"  {label:<{width}}  {text}" for label, text in lines.items())
 
 
-def _skipped(state: TrainState) -> list[str]:
+def _skipped(state: TrainState) -> Iterator[str]:
     """The work that this configuration never does, a phrase each."""
-    conductor, objective = state.conductor, state.conductor.objective
-    skipped = []
-    if not conductor.wants_lr:
+    objective, hr = state.conductor.objective, state.conductor.objective.lambda_hr
+    if not state.conductor.wants_lr:
         used = "is the area mean of the HR render" if objective.lambda_lr > 0 else "plays no part"
-        skipped.append(f"LR render (LR {used})")
+        yield f"LR render (LR {used})"
     if objective.lambda_hf == 0:
-        skipped.append("high-frequency loss (lambda_hf = 0)")
-    hr = objective.lambda_hr
+        yield "high-frequency loss (lambda_hf = 0)"
     if hr.peak == hr.final == 0:
-        skipped.append("HR scale throughout (lambda_HR = 0)")
+        yield "HR scale throughout (lambda_HR = 0)"
     elif hr.start > 0:
-        skipped.append(f"HR scale until iteration {hr.start} (lambda_HR = 0)")
+        yield f"HR scale until iteration {hr.start} (lambda_HR = 0)"
     if state.mip.variance == 0:
-        skipped.append("3D filter (variance 0)")
-    return skipped + state.conductor.skips.descriptions(state.views)
-
-
-def _warn_of_idle_strategies(conductor: Conductor, iterations: int) -> None:
-    objective = conductor.objective
-    largest = max(map(objective.lambda_hr, range(1, iterations + 1)))
-    for s in conductor.strategies:
-        why = s.without_effect(lambda_lr=objective.lambda_lr, lambda_hr=largest, lambda_hf=objective.lambda_hf)
-        if why is not None:
-            _log.warning("%s has no effect: %s.", type(s).__name__, why)
-
-
-def _device_name(device: torch.device) -> str:
-    return f"{device.type}, {torch.cuda.get_device_name(device)}" if device.type == "cuda" else device.type
+        yield "3D filter (variance 0)"
+    yield from state.conductor.skips.descriptions(state.views)
 
 
 def _marks(state: TrainState) -> dict[str, int]:
-    """Iterations by name: of λ_HR, of densification and of the strategies."""
+    """Iterations by name: of λ_HR and of the strategies."""
     hr = state.conductor.objective.lambda_hr
-    at = {"HR from": hr.start, "HR full": hr.full, **state.density.marks}
-    if hr.final != hr.peak:
-        at["HR decays"] = hr.decay_from
+    at = {"HR from": hr.start, "HR full": hr.full} | ({"HR decays": hr.decay_from} if hr.final != hr.peak else {})
     for s in state.conductor.strategies:
         at |= {f"{type(s).__name__} {name}": t for name, t in milestones(s).items()}
     return at

@@ -31,31 +31,12 @@ def progress_bar(
     """
     from tqdm import tqdm
 
-    numbers: dict[str, str] = {}
-    total, done, in_lines = state.settings.iterations, state.t - 1, shown and not sys.stderr.isatty()
-    between = max(1, total // _LINES)
-    screen = io.StringIO() if in_lines else sys.stderr
+    total, in_lines = state.settings.iterations, shown and not sys.stderr.isatty()
+    between, last_read, numbers = max(1, total // _LINES), -math.inf, dict[str, str]()
     with tqdm(
-        desc=name,
-        total=total,
-        initial=done,
-        unit="it",
-        dynamic_ncols=True,
-        mininterval=0.5,
-        disable=not shown,
-        file=screen,
-    ) as bar:
-        last_read = -math.inf
-
-        def show(row: Mapping[str, float]) -> None:
-            λ_lr, λ_hr = state.conductor.objective.lambda_lr, row["lambda_hr"]
-            numbers["loss"] = f"{λ_lr * row['loss_lr'] + λ_hr * row.get('loss_base', 0.0):.4f}"
-            numbers["N"] = f"{int(row['n_gaussians']):,}"
-            if not math.isnan(row.get("conflict", math.nan)):
-                numbers["conflict"] = f"{row['conflict']:.2f}"
-            if "psnr_test" in row:
-                numbers["psnr"] = f"{row['psnr_test']:.2f} dB"
-            bar.set_postfix(numbers, refresh=False)
+        desc=name, total=total, initial=state.t - 1, unit="it", dynamic_ncols=True, mininterval=0.5, disable=not shown,
+        file=io.StringIO() if in_lines else sys.stderr,
+    ) as bar:  # fmt: skip
 
         def update(state: TrainState) -> None:
             nonlocal last_read
@@ -63,7 +44,8 @@ def progress_bar(
             line = in_lines and (state.ended or (bar.n + ran) // between > bar.n // between)
             at_once = line or state.ended or "psnr_test" in state.history[-1]
             if at_once or time.monotonic() - last_read >= _READ_EVERY:
-                show(state.history_as_floats()[-1])
+                numbers.update(_numbers(state.history_as_floats()[-1], state.conductor.objective.lambda_lr))
+                bar.set_postfix(numbers, refresh=False)
                 last_read = time.monotonic()
             bar.update(ran)
             if line:
@@ -72,3 +54,12 @@ def progress_bar(
                 after_step()
 
         yield update
+
+
+def _numbers(row: Mapping[str, float], lambda_lr: float) -> dict[str, str]:
+    """What the bar shows of a row of the history."""
+    loss = lambda_lr * row["loss_lr"] + row["lambda_hr"] * row.get("loss_base", 0.0)
+    numbers = {"loss": f"{loss:.4f}", "N": f"{int(row['n_gaussians']):,}"}
+    if not math.isnan(row.get("conflict", math.nan)):
+        numbers["conflict"] = f"{row['conflict']:.2f}"
+    return numbers | ({"psnr": f"{row['psnr_test']:.2f} dB"} if "psnr_test" in row else {})

@@ -24,7 +24,7 @@ def provenance(**facts: Any) -> dict[str, Any]:
 
 
 def origin() -> dict[str, Any]:
-    """The facts that need no torch: when, by which versions, on which machine, from which source, by which command."""
+    """When, on which machine, from which source, by which command."""
     return {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "versions": {name: version for name in _PACKAGES if (version := _version(name)) is not None},
@@ -55,14 +55,10 @@ def _git() -> str:
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return "no checkout"
+    # Reading must not take the lock of a checkout that someone is working in.
+    described = ("describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+dirty")
+    command = ["git", "--no-optional-locks", "-C", str(root), *described]
     try:
-        commit = _run(root, "rev-parse", "HEAD").strip()
-        return commit + ("+dirty" if _run(root, "status", "--porcelain").strip() else "")
+        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()  # noqa: S603
     except (OSError, subprocess.SubprocessError):
         return "unknown"
-
-
-def _run(root: Path, *arguments: str) -> str:
-    # Reading must not take the lock of a checkout that someone is working in.
-    command = ["git", "--no-optional-locks", "-C", str(root), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout  # noqa: S603

@@ -33,8 +33,7 @@ def describe(folder: Path, evaluation: Evaluation, seconds: float) -> str:
         lines.append(
             f"  train: {len(evaluation.train)} of the {evaluation.train_views} views, evenly spaced, are scored."
         )
-    page = f"{folder / 'splat.html'} in a browser, " if (folder / "splat.html").exists() else ""
-    look = f"{page}{folder / 'contact_sheet.png'}, or clear-strategies view {shlex.quote(str(folder))}"
+    look = f"{folder / 'contact_sheet.png'}, or clear-strategies view {shlex.quote(str(folder))}"
     return "\n".join([*lines, f"  look next: {look}"])
 
 

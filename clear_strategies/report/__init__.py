@@ -26,8 +26,8 @@ import pandas as pd
 from clear_strategies import console, files
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.errors import ClearError, DataError
+from clear_strategies.outputs.contact_sheet import SheetRow, write_contact_sheet
 from clear_strategies.outputs.curves import write_curves
-from clear_strategies.report.pictures import write_comparison
 from clear_strategies.report.runs import Run, collect, history
 from clear_strategies.report.table import compare, layout, markdown, notes
 
@@ -36,6 +36,7 @@ __all__ = ["Run", "collect", "compare", "layout", "main", "markdown", "notes", "
 _log = logging.getLogger(__name__)
 
 _LONGEST: Final = 60  # characters of a scene in the name of a file
+_ENLARGED: Final = 4  # how many times larger the part of a comparison is shown
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +74,7 @@ def write(runs: Sequence[Run], out: Path) -> str:
     table = compare(runs)
     text = markdown(layout(table), notes(table, runs))
     files.write_text(out / "report.md", text)
-    records = table.drop(columns=["name", "baseline", "average", "run"])
+    records = table.drop(columns=["average", "run"])
     files.write_text(out / "report.csv", records.to_csv(index=False))
 
     sections: list[_Section] = []
@@ -83,8 +84,7 @@ def write(runs: Sequence[Run], out: Path) -> str:
         if rows["average"].any():
             sections.insert(0, section)
             continue
-        methods = rows[~rows["baseline"]]
-        shown = dict(zip(methods["method"], methods["run"], strict=True))  # of several seeds the first
+        shown = dict(zip(rows["method"], rows["run"], strict=True))  # of several seeds the first
         pictures = [f"{kind}_{name}.png" for kind in ("comparison", "curves")]
         compared = _compare_renders(out / pictures[0], scene, shown)
         write_curves(out / pictures[1], {method: history(run.folder) for method, run in shown.items()}, scene)
@@ -115,7 +115,7 @@ def _file_names(scenes: Iterable[str]) -> dict[str, str]:
 
 
 def _compare_renders(path: Path, scene: str, runs: Mapping[str, Run]) -> bool:
-    """Draw a test view that all runs rendered, the truth beside it where it is known; returns whether there is one."""
+    """Draw a test view that all runs rendered, and the truth where it is known; returns whether there is one."""
     names = [{file.name for file in (run.folder / "renders").glob("*.png")} for run in runs.values()]
     shared = sorted(set.intersection(*names))
     truths = {
@@ -131,14 +131,30 @@ def _compare_renders(path: Path, scene: str, runs: Mapping[str, Run]) -> bool:
     view = shared[len(shared) // 2]
     try:
         tiles = {method: np.asarray(read_image(run.folder / "renders" / view)) for method, run in runs.items()}
-        truth = np.asarray(read_image(truths[view])) if view in truths else None
+        truth = {"truth": np.asarray(read_image(truths[view]))} if view in truths else {}
     except DataError as error:
         _log.warning("%s; there is no comparison image.", error)
         return False
-    shapes = {tile.shape for tile in tiles.values()} | (set() if truth is None else {truth.shape})
-    if len(shapes) > 1:
+    if len({tile.shape for tile in (*tiles.values(), *truth.values())}) > 1:
         _log.warning("%s: the runs rendered at different sizes, so there is no comparison image.", scene)
         return False
-    captions = {method: f"mean of its views: {run.scores['ours']['psnr']:.2f} dB" for method, run in runs.items()}
-    write_comparison(path, tiles, captions, f"{scene} · {Path(view).stem}", truth)
+    captions = {method: f"mean of its views: {run.numbers['psnr']:.2f} dB" for method, run in runs.items()}
+    write_contact_sheet(path, _whole_and_part(tiles, truth, captions), f"{scene} · {Path(view).stem}")
     return True
+
+
+def _whole_and_part(
+    tiles: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], captions: Mapping[str, str]
+) -> list[SheetRow]:
+    """The images, and below each the window where the tiles differ most, enlarged; the central one where all are equal."""
+    deviation = np.stack(list(tiles.values())).std(axis=0).mean(axis=-1)
+    h, w = (max(1, size // _ENLARGED) for size in deviation.shape)
+    tops, lefts = (
+        range(0, size - part + 1, max(1, part // 4)) for size, part in zip(deviation.shape, (h, w), strict=True)
+    )
+    windows = [(slice(top, top + h), slice(left, left + w)) for top in tops for left in lefts]
+    middle = windows[len(windows) // 2]
+    window = max(windows, key=lambda window: float(deviation[window].sum())) if deviation.any() else middle
+    whole = {**tiles, **truth}
+    part = {name: tile[window].repeat(_ENLARGED, 0).repeat(_ENLARGED, 1) for name, tile in whole.items()}
+    return [SheetRow("", whole, frame=window), SheetRow("", part, captions)]

@@ -8,21 +8,16 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import pandas as pd
 
-from clear_strategies.data.view_names import file_stem
 from clear_strategies.errors import DataError
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.plan import Chosen
 from clear_strategies.settings import CHANGES_NO_RESULT
 
 _log = logging.getLogger(__name__)
-
-SCORES: Final = ("psnr", "ssim", "gmsd", "blur")
-FACTS: Final = ("conflict", "gaussians", "seconds")
-BASELINES: Final = ("bicubic", "prior")
 
 _HYDRA: Final = ".hydra"
 _SEED: Final = "fit.seed="
@@ -41,11 +36,8 @@ class Run:
         marks: that the prior is synthetic, that the scores are of training views, that they are against LR photos.
         name: method or strategies as given on the command line ("clear"), else as they are named in the run ("gco + p2g").
         settings: the other overrides, without the seed and those that change no result.
-        scores: image ("ours", "bicubic", "prior") -> score -> mean over the test views; over the training views where
-            there are no test views.
-        views: view -> PSNR of ours, dB, by the names of the files in renders/.
-        facts: the numbers in `FACTS`; NaN where unknown.
-        config: the configuration, flat, without what changes no result.
+        numbers: mean scores of the test views, or of the training views where there are no test views; "bicubic", "prior":
+            PSNR of these images; conflict, gaussians, seconds. NaN where unknown.
     """
 
     folder: Path
@@ -54,55 +46,40 @@ class Run:
     name: str
     settings: tuple[str, ...]
     seed: int
-    iterations: int
-    scores: Mapping[str, Mapping[str, float]]
-    views: Mapping[str, float]
-    facts: Mapping[str, float]
-    config: Mapping[str, Any]
+    numbers: Mapping[str, float]
 
     @classmethod
     def read(cls, folder: Path) -> Run:
-        """Read a run's folder.
-
-        Raises:
-            DataError: metrics.json is damaged.
-        """
+        """Read a run's folder."""
         path = folder / "metrics.json"
         content = metrics.read(path, "train the run again")
-        overrides = content.overrides or []
-        part = content.shown
+        overrides, part = content.overrides or [], content.shown
+        if "ours" not in part.mean:
+            raise DataError(path, "ours", "is missing", "train the run again")
         marks = ["synthetic prior"] * content.synthetic_prior
         marks += [] if part is content.test else ["training views"]
         marks += [f"against {part.against}"] if "LR" in part.against else []
-        images = ("ours", *(image for image in BASELINES if image in part.mean))
-        try:
-            return cls(
-                folder=folder,
-                scene=content.scene + (f" ({', '.join(marks)})" if marks else ""),
-                marks=", ".join(marks),
-                name=Chosen(None, content.strategies, overrides).title,
-                settings=tuple(filter(_is_setting, overrides)),
-                seed=content.seed,
-                iterations=content.iterations,
-                scores={image: asdict(part.mean[image].numbers) for image in images},
-                views={file_stem(view): metrics.as_float(scores["ours"].psnr) for view, scores in part.views.items()},
-                facts={
-                    "conflict": metrics.as_float(content.conflict.get("gaussian")),
-                    "gaussians": content.gaussians,
-                    "seconds": content.seconds,
-                },
-                config=content.config,
-            )
-        except KeyError as error:
-            raise DataError(path, str(error), "is missing", "train the run again") from error
+        psnr = {image: scores.numbers.psnr for image, scores in part.mean.items()}
+        return cls(
+            folder=folder,
+            scene=content.scene + (f" ({', '.join(marks)})" if marks else ""),
+            marks=", ".join(marks),
+            name=Chosen(None, content.strategies, overrides).title,
+            settings=tuple(filter(_is_setting, overrides)),
+            seed=content.seed,
+            numbers={
+                **asdict(part.mean["ours"].numbers),
+                **{image: psnr.get(image, math.nan) for image in ("bicubic", "prior")},
+                "conflict": metrics.as_float(content.conflict.get("gaussian")),
+                "gaussians": content.gaussians,
+                "seconds": content.seconds,
+            },
+        )
 
 
 def collect(folders: Iterable[Path]) -> list[Run]:
     """Every finished run at or below the folders and the links in them: the jobs of a sweep by number, other runs by path.
     Unfinished and damaged runs are logged and left out.
-
-    Raises:
-        DataError: there is no finished run.
     """
     folders = list(folders)
     folders += [link for folder in folders for link in _sorted(folder.glob("*")) if link.is_symlink() and link.is_dir()]
@@ -127,14 +104,13 @@ def collect(folders: Iterable[Path]) -> list[Run]:
     return runs
 
 
-def history(folder: Path) -> list[dict[str, float]]:
+def history(folder: Path) -> pd.DataFrame:
     """history.csv, one row per iteration; empty, with a warning, where it cannot be read."""
     try:
-        table = pd.read_csv(folder / "history.csv", dtype=float)
+        return pd.read_csv(folder / "history.csv", dtype=float)
     except (OSError, ValueError) as error:
         _log.warning("%s: its history cannot be drawn (%s).", folder, error)
-        return []
-    return [{name: x for name, x in row.items() if not math.isnan(x)} for row in table.to_dict("records")]
+        return pd.DataFrame()
 
 
 def _is_setting(override: str) -> bool:

@@ -15,29 +15,27 @@ from typing import Any, Final
 import pandas as pd
 
 from clear_strategies.outputs.metrics import NOTE
-from clear_strategies.report.runs import BASELINES, SCORES, Run
+from clear_strategies.report.runs import Run
 
 _log = logging.getLogger(__name__)
 
 # Quantity -> header of its column, and how its numbers are written.
 _QUANTITIES: Final = {
     "psnr": ("PSNR (dB) ↑", ".2f"), "ssim": ("SSIM ↑", ".4f"), "gmsd": ("GMSD ↓", ".4f"), "blur": ("blur → 0", "+.4f"),
-    "conflict": ("conflict", ".3f"), "gaussians": ("Gaussians", ",.0f"), "seconds": ("seconds", ",.0f"),
+    "bicubic": ("bicubic (dB)", ".2f"), "prior": ("prior (dB)", ".2f"), "conflict": ("conflict", ".3f"),
+    "gaussians": ("Gaussians", ",.0f"), "seconds": ("seconds", ",.0f"),
 }  # fmt: skip
-# Overrides that choose what the baselines see.
-_INPUT: Final = ("data", "prior", "experiment", "protocol")
-_DECORATORS: Final = "decorators."
 
 
 def compare(runs: Sequence[Run]) -> pd.DataFrame:
-    """For each scene, in the order of the runs, its baselines and one row per method; then the averages over scenes.
+    """For each scene, in the order of the runs, one row per method; then the averages over scenes.
 
     Returns:
-        scene; method: its name, then the settings that not all runs of the scene share; name; baseline, average: what kind of
-        row it is; run: the first of a method; runs: how many; seeds. Of each quantity the mean, and over the seeds of a method
-        its standard deviation `_std`. Of PSNR also the best seed `_best`, and the difference from the first method of the
-        scene `_delta`, its standard error `_delta_error` and the number of its pairs `_delta_pairs`: runs of one seed, of an
-        average of one scene and seed.
+        scene; method: its name, then the settings that not all runs of the scene share; average: whether the row is one; run:
+        the first of a method; runs: how many; seeds. Of each quantity the mean, and over the seeds of a method its standard
+        deviation `_std`. Of PSNR also the best seed `_best`, and the difference from the first method of the scene `_delta`,
+        its standard error `_delta_error` and the number of its pairs `_delta_pairs`: runs of one seed, of an average of one
+        scene and seed.
     """
     single = pd.DataFrame([row for of_scene in _by_scene(runs).values() for row in _single(of_scene)])
     tables = [_summary(rows) for _, rows in single.groupby("scene", sort=False)]
@@ -46,11 +44,6 @@ def compare(runs: Sequence[Run]) -> pd.DataFrame:
         if (count := alike["scene"].nunique()) > 1:
             tables.append(_average(alike, f"average of {count} scenes" + (f" ({marks})" if marks else "")))
     return pd.concat(tables, ignore_index=True).astype({"psnr_delta_pairs": "Int64"})
-
-
-def shared_settings(runs: Sequence[Run]) -> list[str]:
-    """The settings that all runs have."""
-    return _in_all([run.settings for run in runs])
 
 
 def layout(table: pd.DataFrame) -> pd.DataFrame:
@@ -69,7 +62,7 @@ def layout(table: pd.DataFrame) -> pd.DataFrame:
 
 def notes(table: pd.DataFrame, runs: Sequence[Run]) -> list[str]:
     """What a reader of the table has to know about it."""
-    lines = [f"{NOTE[0].upper()}{NOTE[1:]}."]
+    lines = [f"bicubic, prior: PSNR of the enlarged LR photos and of the SR images. {NOTE[0].upper()}{NOTE[1:]}."]
     if (table["psnr_delta"].abs() > 0).any():
         error = "; its ±: standard error of the differences seed by seed" * int(table["psnr_delta_error"].notna().any())
         lines.append(f"Δ: PSNR over the scene's first method, dB{error}.")
@@ -78,7 +71,7 @@ def notes(table: pd.DataFrame, runs: Sequence[Run]) -> list[str]:
     if table["average"].any():
         lines.append("Averages are means of the scenes' means; their Δ is paired over scenes and seeds.")
     for scene, of_scene in _by_scene(runs).items():
-        if scene in set(table["scene"]) and (shared := shared_settings(of_scene)):
+        if scene in set(table["scene"]) and (shared := _in_all([run.settings for run in of_scene])):
             lines.append(f"All runs of {scene}: `{' '.join(shared)}`.")
     return lines
 
@@ -114,89 +107,71 @@ def _by_scene(runs: Sequence[Run]) -> dict[str, list[Run]]:
 
 
 def _single(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Of one scene: a row for each run of a method, after one for each baseline of each run.
+    """Of one scene: a row for each run.
 
     `key` is name and settings, a line each; `identity`, the key of an average, leaves out the `data` settings that all runs of
     the scene share, which describe the scene.
     """
-    shared = shared_settings(runs)
-    of_scene = [s for s in shared if _is_input(s, ("data",))]
-
-    def row(run: Run, name: str, settings: Sequence[str], known: Sequence[str]) -> dict[str, Any]:
-        identity = "\n".join((name, *sorted(s for s in settings if s not in of_scene)))
-        facts = {"scene": run.scene, "marks": run.marks, "name": name, "seed": run.seed, "identity": identity}
-        facts["run"] = None if name in BASELINES else run
-        return {**facts, "method": _label(name, settings, known), "key": "\n".join((name, *sorted(settings)))}
-
+    shared = _in_all([run.settings for run in runs])
     rows = []
-    for baseline in BASELINES:
-        inputs = {run: _inputs(run, baseline) for run in runs if baseline in run.scores}
-        known = _in_all(list(inputs.values()))
-        rows += [
-            {**row(run, baseline, chosen, known), "baseline": True, **run.scores[baseline]}
-            for run, chosen in inputs.items()
-        ]
     for run in runs:
-        rows.append({**row(run, run.name, run.settings, shared), "baseline": False, **run.scores["ours"], **run.facts})
+        of_all = [s for s in run.settings if s not in shared or not s.lstrip("+~").startswith("data")]
+        key, identity = ("\n".join((run.name, *sorted(settings))) for settings in (run.settings, of_all))
+        facts = {
+            "scene": run.scene,
+            "marks": run.marks,
+            "method": _label(run.name, run.settings, shared),
+            "seed": run.seed,
+        }
+        rows.append({**facts, "key": key, "identity": identity, "run": run, **run.numbers})
     return rows
 
 
 def _summary(single: pd.DataFrame) -> pd.DataFrame:
-    """Of one scene: a row for each baseline and method."""
-    # Runs with the same input have the same baseline, unless the prior depends on the seed.
-    repeated = single["baseline"] & single.duplicated(["key", *SCORES])
-    groups = single[~repeated].groupby("key", sort=False)
-    table = groups[["scene", "method", "name", "baseline", "run"]].first().assign(average=False, runs=groups.size())
-    for method, of_method in groups:
-        if of_method["baseline"].any():
-            continue
-        label = f"{table.loc[[method], 'scene'].iloc[0]}, {table.loc[[method], 'method'].iloc[0]}"
+    """Of one scene: a row for each method."""
+    groups = single.groupby("key", sort=False)
+    table = groups[["scene", "method", "run"]].first().assign(average=False, runs=groups.size())
+    for _, of_method in groups:
+        label = f"{of_method['scene'].iloc[0]}, {of_method['method'].iloc[0]}"
         if of_method["seed"].duplicated().any():
             _log.warning("%s: a row holds several runs with the same seed.", label)
         if of_method["psnr"].isna().any():
             _log.warning("%s: runs without a finite PSNR are left out of its mean.", label)
-    seeds = groups["seed"].agg(lambda seeds: ", ".join(map(str, sorted(set(seeds)))))
-    table["seeds"] = seeds.where(~table["baseline"], "")
+    table["seeds"] = groups["seed"].agg(lambda seeds: ", ".join(map(str, sorted(set(seeds)))))
     for quantity in _QUANTITIES:
         table[quantity], table[f"{quantity}_std"] = groups[quantity].mean(), groups[quantity].std()
-    table["psnr_best"] = groups["psnr"].max().where(~table["baseline"] & (groups["psnr"].count() > 1))
+    table["psnr_best"] = groups["psnr"].max().where(groups["psnr"].count() > 1)
     return table.join(_differences(single, "key", table["psnr"])).reset_index(drop=True)
 
 
 def _average(single: pd.DataFrame, title: str) -> pd.DataFrame:
     """A row for each method that all scenes have."""
     scenes = single["scene"].nunique()
-    of_scenes = single.groupby(["identity", "scene"], sort=False)
-    in_all = of_scenes.size().groupby("identity", sort=False).size() == scenes
+    in_all = single.groupby("identity", sort=False)["scene"].nunique() == scenes
     if left_out := list(dict.fromkeys(single.loc[~single["identity"].map(in_all), "method"])):
         _log.info("%s: left out, because not all scenes have it: %s.", title, "; ".join(left_out))
     single = single[single["identity"].map(in_all)]
-    of_scenes = single.groupby(["identity", "scene"], sort=False)
-    quantities = [*_QUANTITIES]
-    means = of_scenes[quantities].mean().groupby("identity", sort=False)
-    table = single.groupby("identity", sort=False)[["name", "baseline"]].first().assign(average=True, runs=0, seeds="")
+    means = single.groupby(["identity", "scene"], sort=False)[[*_QUANTITIES]].mean().groupby("identity", sort=False)
     # A quantity that one scene lacks has no average.
-    table = table.join(means.mean().where(means.count() == scenes))
-    shared = _in_all([identity.split("\n")[1:] for identity in table.index[~table["baseline"]]])
+    table = means.mean().where(means.count() == scenes).assign(average=True, runs=0, seeds="", scene=title)
+    shared = _in_all([identity.split("\n")[1:] for identity in table.index])
     table["method"] = [_label(name, settings, shared) for name, *settings in table.index.str.split("\n")]
-    table = table.join(_differences(single, "identity", table["psnr"])).assign(scene=title)
-    return table.sort_values("baseline", ascending=False, kind="stable").reset_index(drop=True)
+    return table.join(_differences(single, "identity", table["psnr"])).reset_index(drop=True)
 
 
 def _differences(single: pd.DataFrame, key: str, means: pd.Series[float]) -> pd.DataFrame:
     """PSNR of each method minus that of the first: over the pairs of one scene and seed, or, with fewer than two pairs, the
     difference of the two means, without an error.
     """
-    methods = single[~single["baseline"]]
     # A method whose PSNR is never finite has a column as well.
-    by_seed = methods.groupby([key, "scene", "seed"], sort=False)["psnr"].mean().unstack(key, sort=False)
-    first = methods[key].iloc[0]
+    by_seed = single.groupby([key, "scene", "seed"], sort=False)["psnr"].mean().unstack(key, sort=False)
+    first = by_seed.columns[0]
     pairs = by_seed.sub(by_seed[first], axis=0)
     table = pd.DataFrame(
         {"psnr_delta": pairs.mean(), "psnr_delta_error": pairs.sem(), "psnr_delta_pairs": pairs.count()}
     )
     few = table["psnr_delta_pairs"] < 2
-    table.loc[few, "psnr_delta"] = means[few[few].index] - means[[first]].iloc[0]
+    table.loc[few, "psnr_delta"] = means[few[few].index] - means[first]
     table.loc[table.index == first, ["psnr_delta", "psnr_delta_error"]] = 0.0, math.nan
     return table
 
@@ -204,21 +179,6 @@ def _differences(single: pd.DataFrame, key: str, means: pd.Series[float]) -> pd.
 def _in_all(lists: Sequence[Sequence[str]]) -> list[str]:
     """What every list holds, in the order of the first."""
     return [setting for setting in lists[0] if all(setting in other for other in lists)] if lists else []
-
-
-def _inputs(run: Run, baseline: str) -> list[str]:
-    """What the images of a baseline depend on: the settings of data and prior; for the SR images also their decorators,
-    which a strategy may bring.
-    """
-    inputs = [s for s in run.settings if _is_input(s)]
-    if baseline != "prior":
-        return inputs
-    decorators = {key.split(".")[1] for key in run.config if key.startswith(_DECORATORS)}
-    return [*inputs, *sorted(decorators), *(s for s in run.settings if _is_input(s, (_DECORATORS,)))]
-
-
-def _is_input(setting: str, groups: tuple[str, ...] = _INPUT) -> bool:
-    return setting.lstrip("+~").startswith(groups)
 
 
 def _label(name: str, settings: Sequence[str], shared: Sequence[str]) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 import os
 import re
 import shutil
@@ -26,16 +27,15 @@ from torch import Tensor
 
 from clear_strategies.errors import DataError
 from clear_strategies.files import flush, partial_of, read_bytes
-from clear_strategies.training.history import packed, unpacked
 
 _log = logging.getLogger(__name__)
 
-FORMAT: Final = "3"
+FORMAT: Final = "4"
 CHECKPOINTS: Final = "checkpoints"
 """The folder of a run's checkpoints."""
 SUFFIX: Final = ".safetensors"
 _PREFIX: Final = "step_"
-_KINDS, _NUMBERS = "history/kinds", "history/numbers"
+_HISTORY: Final = "history"
 _USE_ANOTHER: Final = "resume from another checkpoint of the run, or start a new run"
 
 
@@ -47,7 +47,7 @@ class _Stated(msgspec.Struct):
     facts: dict[str, float]
     work_log: dict[str, dict[str, Any]]
     device: Literal["cpu", "cuda"]
-    columns: list[list[str]]
+    columns: list[str]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,11 +77,10 @@ def save(folder: Path, checkpoint: Checkpoint, *, keep: int = 3) -> Path:
         OSError: the disk is full or read-only; earlier checkpoints are untouched.
     """
     c, target = checkpoint, folder / f"{_PREFIX}{checkpoint.t:07d}{SUFFIX}"
-    columns, kinds, numbers = packed(c.history)
-    tensors = {name: x.detach().cpu().contiguous() for name, x in c.tensors.items()} | {
-        _KINDS: kinds,
-        _NUMBERS: numbers,
-    }
+    columns = list(dict.fromkeys(name for row in c.history for name in row))
+    rows = [[row.get(name, math.nan) for name in columns] for row in c.history]
+    tensors = {name: x.detach().cpu().contiguous() for name, x in c.tensors.items()}
+    tensors[_HISTORY] = torch.tensor(rows, dtype=torch.float64)
     stated = _Stated(c.t, dict(c.config), dict(c.facts), dict(c.work_log), c.device, columns)  # type: ignore[arg-type]
     text = msgspec.json.encode(stated).decode()
     partial = partial_of(target)  # a folder, since the library writes beside the path that it is given
@@ -129,8 +128,9 @@ def load(path: Path) -> Checkpoint:
         if metadata.get("sha256") != _seal(metadata["stated"], tensors):
             raise DataError(file, "sha256", "is not that of the content: the file was altered", _USE_ANOTHER)
         stated = msgspec.json.decode(metadata["stated"], type=_Stated)
-        history = unpacked(stated.columns, tensors.pop(_KINDS), tensors.pop(_NUMBERS))
-    except (SafetensorError, msgspec.MsgspecError, KeyError, ValueError, RecursionError) as error:
+        rows = [zip(stated.columns, row, strict=True) for row in tensors.pop(_HISTORY).tolist()]
+        history = [{name: x for name, x in row if not math.isnan(x)} for row in rows]
+    except (SafetensorError, msgspec.MsgspecError, KeyError, TypeError, ValueError, RecursionError) as error:
         if isinstance(error, DataError):
             raise
         raise DataError(file, "file", f"is no whole checkpoint ({error})", _USE_ANOTHER) from error

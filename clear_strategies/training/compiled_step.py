@@ -71,11 +71,7 @@ def _why_not(conductor: Conductor, optimizer: Adam, mode: FusedMode) -> Iterator
 
 
 def gaussian_pass(optimizer: Adam) -> GaussianPass:
-    """The pass for the device of the optimizer's moments.
-
-    Raises:
-        BackendUnavailable: C++ was not compiled for the CPU, or Warp is not installed for CUDA.
-    """
+    """The pass for the device of the optimizer's moments."""
     device = optimizer.first["means"].device.type
     if device == "cpu":
         load_kernels("clear_strategies.kernels")
@@ -113,9 +109,6 @@ class CompiledStep:
     Args:
         skips: for tests: False visits every row. The result has the same bits.
         passes: what computes; None: what runs on the device of the optimizer's moments.
-
-    Raises:
-        BackendUnavailable: nothing runs there.
     """
 
     stage: Final = "per-Gaussian pass"

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.core.gradients import Shot
@@ -15,69 +15,25 @@ from clear_strategies.training.field import GaussianField
 from clear_strategies.training.optim import Adam
 
 
-@runtime_checkable
-class Gaussians(Protocol):
-    """Raw parameters, whose rows a densifier gathers and whose values it changes in place: a `GaussianField`, or those of
-    another trainer, which have nothing else.
+class Densifier:
+    """Changes the structure of the field while it trains.
+
+    Attributes:
+        name: in the printed plan. settings: a dataclass; its milestones are printed.
+        cap: the most Gaussians that it lets the field have; None: any number.
     """
 
-    @property
-    def means(self) -> Float[Tensor, "N 3"]: ...
+    name: str
+    settings: Any
+    cap: int | None = None
 
     @property
-    def quats(self) -> Float[Tensor, "N 4"]: ...
-
-    @property
-    def scales(self) -> Float[Tensor, "N 3"]: ...
-
-    @property
-    def opacities(self) -> Float[Tensor, " N"]: ...
-
-    def __len__(self) -> int: ...
-
-    def raw(self) -> Mapping[str, Tensor]: ...
-
-    def take(self, parents: Int[Tensor, " M"], fresh: Bool[Tensor, " M"]) -> None:
-        """Row i becomes a copy of row parents[i]."""
-        ...
-
-
-@runtime_checkable
-class Moments(Protocol):
-    """What an optimizer keeps per Gaussian."""
-
-    def take(self, parents: Int[Tensor, " M"], fresh: Bool[Tensor, " M"]) -> None:
-        """Gather it, after the Gaussians; fresh rows start without momentum."""
-        ...
-
-
-@runtime_checkable
-class Densifier(Protocol):
-    """Changes the structure of the field while it trains."""
-
-    @property
-    def name(self) -> str:
-        """Its name in the printed plan."""
-        ...
-
-    @property
-    def settings(self) -> Any:
-        """A dataclass; its milestones are printed."""
-        ...
-
-    @property
-    def cap(self) -> int | None:
-        """The most Gaussians that it lets the field have; None: any number."""
-        ...
-
-    @property
-    def marks(self) -> Mapping[str, int]:
-        """The iterations worth a mark on a curve."""
-        ...
+    def second_stage(self) -> int | None:
+        """The iteration at which the second stage of a method of two begins."""
+        return None
 
     def accumulate(self, update: Update, shot: Shot, t: int) -> None:
         """Accumulate the scores of iteration t; `shot` is the rendering that they belong to."""
-        ...
 
     def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
         """Do what is due at t, after the optimizer's step; returns whether the structure changed.
@@ -86,15 +42,18 @@ class Densifier(Protocol):
             resized: called with parents[M] once field and optimizer have been gathered; row i of everything else per
                 Gaussian now comes from row parents[i].
         """
-        ...
+        raise NotImplementedError
 
     def reset_due(self, t: int) -> bool:
         """Whether opacities are lowered at t; renders right after that do not show how good the field is."""
-        ...
+        return False
 
-    def state_dict(self) -> dict[str, Tensor]: ...
+    def state_dict(self) -> dict[str, Tensor]:
+        """What a checkpoint keeps of it."""
+        return {}
 
-    def load_state_dict(self, tensors: dict[str, Tensor]) -> None: ...
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        """Take up what `state_dict` returned."""
 
 
 @runtime_checkable

@@ -56,11 +56,7 @@ class GaussianField(nn.Module):
 
     @classmethod
     def from_cloud(cls, cloud: PointCloud, *, max_degree: int = 3) -> GaussianField:
-        """The initial field of 3DGS: isotropic, as large as the distance to the neighbours, opacity 0.1, the points' colours.
-
-        Raises:
-            ValueError: the cloud holds no point.
-        """
+        """The initial field of 3DGS: isotropic, as large as the distance to the neighbours, opacity 0.1, the points' colours."""
         n = len(cloud)
         if n == 0:
             raise ValueError(f"an initial cloud needs at least one point, {cloud.source!r} has none.")

@@ -20,26 +20,18 @@ from clear_strategies.training.state import TrainState
 _log = logging.getLogger(__name__)
 
 _COPIES: Final = 5  # of a Gaussian's parameters: themselves, Adam's two moments, a change of structure, an anchor
-_GAUSSIAN: Final = (
-    1536  # bytes of an iteration per Gaussian: projection, gradients of three losses, the rasterizer's lists
-)
+_GAUSSIAN: Final = 1536  # bytes of an iteration per Gaussian: projection, gradients, the rasterizer's lists
 _PIXEL: Final = 168  # bytes of an iteration per pixel of HR: the render, its cotangents, what the losses hold
 
 
 def require(state: TrainState, limit: int | None) -> str:
-    """Refuse a run whose first Gaussians do not fit, and warn where it cannot grow as far as it may.
+    """Refuse a run whose first Gaussians do not fit, and warn where it cannot grow as far as it may; returns a line for the plan.
 
     Args:
         limit: MiB, `fit.memory`; None: what is free on this machine, if that is known.
-
-    Returns:
-        A line for the run's printed plan.
-
-    Raises:
-        SettingError: the first Gaussians need more.
     """
     cuda, n, most = state.device.type == "cuda", len(state.field), state.density.cap
-    now = torch.cuda.memory_allocated(state.device) if cuda else resident()
+    now = torch.cuda.memory_allocated(state.device) if cuda else system_bytes("/proc/self/status", "VmRSS") or 0
     each = _COPIES * sum(x.nbytes for x in state.field.raw().values()) // n + _GAUSSIAN
     each *= 1 if state.second is None else 2
     fixed = now + _PIXEL * max(view.hr.image[..., 0].numel() for view in state.views)
@@ -62,14 +54,8 @@ def require(state: TrainState, limit: int | None) -> str:
 def release() -> None:
     """Give the system what has been freed, which the C library keeps: loading and training leave hundreds of MiB."""
     gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
-    if trim is not None:  # glibc
+    if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:  # glibc
         trim(0)
-
-
-def resident() -> int:
-    """Bytes that the process holds now; 0 without /proc."""
-    return system_bytes("/proc/self/status", "VmRSS") or 0
 
 
 def system_bytes(file: str, name: str) -> int | None:

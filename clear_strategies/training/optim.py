@@ -37,9 +37,6 @@ class LearningRates:
         cool_from, end: between these iterations all rates but that of the means, which falls all along, fall linearly to 0, so
             that a run ends on what its views agree on and not on the last of them. Equal, no rate does.
         eps: Adam's. Gradients of mean losses are near 1e-6, so torch's default of 1e-8 would freeze the small ones.
-
-    Raises:
-        SettingError: a setting is outside its range.
     """
 
     means: LogLinear = field(default_factory=LogLinear)

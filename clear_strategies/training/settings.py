@@ -1,18 +1,20 @@
-"""How long a run is, and what it saves and evaluates on the way."""
+"""The settings of a run, `fit.*`: how long it is, what it evaluates and saves on the way, and where it computes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import get_args
+from typing import Literal, get_args
 
 from clear_strategies.core.checks import refuse, require_whole
 from clear_strategies.schedules import REFERENCE_ITERATIONS, milestone
 from clear_strategies.training.compiled_step import FusedMode
 
+Device = Literal["cpu", "cuda"]
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FitSettings:
-    """Settings of the training loop. Milestones are iterations of a 10,000-iteration run.
+    """Settings of a run. Milestones are iterations of a 10,000-iteration run.
 
     Args:
         iterations: optimizer steps, one view each.
@@ -28,9 +30,16 @@ class FitSettings:
             first iteration.
         fused: "auto" merges, corrects, anchors and steps in one compiled pass where it can, and skips rows that would
             not move; "off" takes the readable path.
-
-    Raises:
-        SettingError: a setting is outside its range.
+        map_views: number of training views with maps of reliability and correction in maps/; 0: none.
+        video: number of frames of path.mp4, a loop through the training cameras, 24 a second; 0: none.
+        verbose: also show on the console the details that run.log holds; `-v` on the command line.
+        viewer: look at the field in the browser while it trains; the address is logged. Extra [view].
+        resume: a run's folder or one of its checkpoints: continue from there, bit for bit. auto: look into the run's own
+            folder. If the run is finished, train nothing; if it has checkpoints, continue from the newest one; else start
+            from the beginning.
+        device: cpu or cuda: where field, views and optimizer are. None: cuda if torch finds it and the rasterizer draws
+            there, else cpu. A run may be resumed on another device; its bits then differ.
+        threads: number of threads of torch and the kernels. None: all cores, divided by the jobs that run at once (joblib).
     """
 
     iterations: int = 10_000
@@ -44,13 +53,22 @@ class FitSettings:
     keep: int = 3
     memory: int | None = None
     fused: FusedMode = "auto"
+    map_views: int = 3
+    video: int = 72
+    verbose: bool = False
+    viewer: bool = False
+    resume: str | None = None
+    device: Device | None = None
+    threads: int | None = None
 
     def __post_init__(self) -> None:
         require_whole("iterations", self.iterations, least=1)
         require_whole("max_degree", self.max_degree, least=0, most=3)
         require_whole("keep", self.keep, least=1)
-        for name in ("degree_every", "probe_every", "probe_views", "checkpoint_every"):
+        for name in ("degree_every", "probe_every", "probe_views", "checkpoint_every", "map_views", "video"):
             require_whole(name, getattr(self, name), least=0)
+        if self.threads is not None:
+            require_whole("threads", self.threads, least=1)
         if self.memory is not None and self.memory < 1:
             refuse("memory", "must be at least 1 MiB", self.memory, "null takes what is free")
         if self.fused not in get_args(FusedMode):

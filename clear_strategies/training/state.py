@@ -157,11 +157,7 @@ class TrainState:
         return self.t % self.mip.every == 0 and self.t <= self.settings.iterations - self.mip.last
 
     def checkpoint(self, config: Mapping[str, Any]) -> Checkpoint:
-        """What a run needs to continue.
-
-        Raises:
-            DivergedError: a parameter or moment is not finite.
-        """
+        """What a run needs to continue."""
         self.require_finite()
         tensors: dict[str, Tensor] = {}
         for prefix, table in (
@@ -179,11 +175,7 @@ class TrainState:
         return Checkpoint(self.t, tensors, config, facts, history, work_log, self.device.type)
 
     def restore(self, saved: Checkpoint, source: Path) -> None:
-        """Continue from a checkpoint, which may come from another device.
-
-        Raises:
-            DataError: its tensors do not belong to this run.
-        """
+        """Continue from a checkpoint, which may come from another device."""
         tables: dict[str, dict[str, Tensor]] = {}
         for name, value in saved.tensors.items():
             prefix, _, rest = name.partition("/")
@@ -209,11 +201,7 @@ class TrainState:
             self.second.follow(self)
 
     def _require_rows(self, tables: Mapping[str, Mapping[str, Tensor]], saved: Checkpoint) -> None:
-        """Check that all restored tensors have a row for each Gaussian, and the width and type that this run has.
-
-        Raises:
-            ValueError, KeyError: it is not.
-        """
+        """Check that all restored tensors have a row for each Gaussian, and the width and type that this run has."""
         if not (1 <= saved.t <= self.settings.iterations + 1 and saved.facts["degree"] <= self.field.max_degree):
             raise ValueError(f"t={saved.t} and degree={saved.facts['degree']:g} do not occur in it")
         field, n = tables["field"], len(tables["field"]["means"])

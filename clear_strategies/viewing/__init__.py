@@ -1,4 +1,4 @@
-"""Showing a field: its rendering, the cameras of a run and a path through them, a video, a page and a viewer."""
+"""Showing a field: its rendering, the cameras of a run and a path through them, a video and a viewer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FPS: Final = 24.0  # of a video along a path
 
 
 def missing() -> str | None:
-    """Why no viewer and no page can be shown, with the remedy; None where the extra [view] is installed."""
+    """Why no viewer can be shown, with the remedy; None where the extra [view] is installed."""
     lacks = [name for name in ("viser", "nerfview", "splines") if find_spec(name) is None]
     return f"the viewer needs {' and '.join(lacks)}: pip install 'clear-strategies[view]'" if lacks else None
 

@@ -23,9 +23,6 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
     The path goes from each camera to the nearest that is left, and passes at most `_MOST_KEYS` of them. A single camera sways
     to both sides. All frames have the first camera's lens and size.
-
-    Raises:
-        SettingError: there is no camera, or less than one frame.
     """
     if not cameras:
         raise SettingError("a camera path needs at least one camera.")

@@ -54,7 +54,8 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         warnings.filterwarnings("ignore", message=".*it will never be delivered")
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its address; whoever opens it does
             server = viser.ViserServer(host=host, port=port, verbose=False, label=title)
-        aim(server, cameras)
+        if cameras:
+            _aim(server, cameras)
         super().__init__(server, self._render, output_dir=out, mode=mode)
         server.gui.set_panel_label(title)
 
@@ -115,19 +116,14 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
 
 
 @contextlib.contextmanager
-def watched(
-    painter: Painter, cameras: Sequence[Camera], title: str, report: Callable[[str], None]
-) -> Iterator[Callable[[int], None]]:
+def watched(painter: Painter, cameras: Sequence[Camera], title: str) -> Iterator[Callable[[int], None]]:
     """A viewer while a run trains. Yields a function to call after each iteration, with its number.
 
     The caller holds nerfview's lock, except in that function: the field is never drawn while an iteration changes it, and the
     run's bits are those of a run without a viewer.
-
-    Args:
-        report: called with the viewer's address.
     """
     viewer = SplatViewer(painter, cameras, title=title, mode="training")
-    report(viewer.address)
+    _log.info("look while it trains: %s", viewer.address)
     viewer.lock.acquire()
     began = time.monotonic()
 
@@ -153,22 +149,13 @@ def watched(
         viewer.close()
 
 
-def aim(server: viser.ViserServer, cameras: Sequence[Camera], scale: float = 1.0) -> None:
-    """Look from the first camera at the distance of the point that all of them look at; without cameras, do nothing.
-
-    Args:
-        scale: of what the server shows, in world units of the cameras.
-    """
-    if not cameras:
-        return
-    axes = torch.stack([camera.world_to_camera[:3, :3].double() for camera in cameras])
-    up = -axes[:, 1].mean(0)
+def _aim(server: viser.ViserServer, cameras: Sequence[Camera]) -> None:
+    """Look from the first camera at the distance of the point that all of them look at."""
+    poses, first, start = [camera.world_to_camera.double() for camera in cameras], cameras[0], server.initial_camera
+    up = -torch.stack(poses)[:, 1, :3].mean(0)
     server.scene.set_up_direction(tuple((up / up.norm().clamp_min(1e-9)).tolist()))
-    first = cameras[0]
     distance = float(np.linalg.norm(paths.look_at(cameras) - first.center.double().numpy()))
-    start = server.initial_camera
-    start.position = tuple((scale * first.center).tolist())
-    focus = first.center.double() + distance * first.world_to_camera[2, :3].double()
-    start.look_at = tuple((scale * focus).tolist())
-    start.up = tuple((-first.world_to_camera[1, :3]).tolist())
+    start.position = tuple(first.center.tolist())
+    start.look_at = tuple((first.center.double() + distance * poses[0][2, :3]).tolist())
+    start.up = tuple((-poses[0][1, :3]).tolist())
     start.fov = 2 * math.atan(first.height / 2 / first.fy)

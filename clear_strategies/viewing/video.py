@@ -38,9 +38,6 @@ def write_video(path: Path, frames: Iterable[Pixels], *, fps: float) -> None:
 
     Args:
         frames: all of one size, with an even height and width.
-
-    Raises:
-        SettingError: ffmpeg is missing, the suffix is another one, or there is no frame.
     """
     if (problem := missing()) is not None:
         raise SettingError(f"{problem}.")

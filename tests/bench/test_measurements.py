@@ -91,7 +91,7 @@ def test_errors_are_those_of_their_definitions():
 def test_finer_cut_offs_have_smaller_errors(tiny):
     v = drawing.random_cotangents(tiny)[0]
     truth = accuracy.truth("torch", tiny, v, accuracy.NO_CUT_OFFS)
-    renders = [drawing.backend_on(tiny, "torch", preset).render for preset in rasterizers.PRESETS]
+    renders = [drawing.Contestant(tiny, "torch", preset).render for preset in rasterizers.PRESETS]
     found = [accuracy.errors(accuracy.draw(render, v), truth) for render in renders]
     for name in accuracy.ATTRIBUTES:
         fast, accurate, exact = (errors[f"{name}_relative"] for errors in found)
@@ -114,10 +114,9 @@ def test_an_iteration_trains_clear_and_moves_nothing(tiny, reference):
 def test_an_iteration_is_measured_with_and_without_hr():
     tables = measured(iteration, scene="tiny", backend="torch", repeats=1, device="cpu").tables
     table = tables["iteration"].set_index("stage")
-    assert list(table.columns) == ["lr_and_hr_ms", "without_l_hf_ms", "lr_only_ms", "error"]
-    stages = ["render", "losses LR", "backward LR", "losses HR", "backward HR", "per-Gaussian pass"]
-    assert 0 < table.loc[stages, "error"].max() < 1e-4
-    assert math.isnan(table.loc["evidence", "error"])
+    assert list(table.columns) == ["lr_and_hr_ms", "without_l_hf_ms", "lr_only_ms"]
+    stages = ["render", "losses LR", "backward LR", "losses HR", "backward HR", "evidence", "per-Gaussian pass"]
+    assert table.loc[stages, "lr_and_hr_ms"].min() > 0
     assert list(table.index[-2:]) == [iteration.REST, iteration.TOTAL]
     assert math.isnan(table.loc["backward HR", "lr_only_ms"])
 

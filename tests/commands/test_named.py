@@ -23,7 +23,7 @@ def test_help_lists_the_commands_and_then_where_research_begins(arguments, capsy
     commands.named(arguments)()
     said = capsys.readouterr().out
     rows = [line.split()[0] for line in said.splitlines() if line.startswith("  ")]
-    assert rows[: len(commands.COMMANDS)] == list(commands.COMMANDS)
+    assert rows[: len(commands.NAMES)] == commands.NAMES
     for word in ("+strategy=clear", "-m ", "--cfg job", "--hydra-help"):
         assert word in said[said.index("research") :]
 
@@ -54,7 +54,7 @@ def test_another_word_is_refused_with_what_was_meant(word, meant, tmp_path, monk
 
 
 QUICK = {
-    "": 0, "--help": 0, **{f"{name} --help": 0 for name in commands.COMMANDS}, "trian kit": 2, "photos/": 2,
+    "": 0, "--help": 0, **{f"{name} --help": 0 for name in commands.NAMES}, "trian kit": 2, "photos/": 2,
     "train nowhere": 2, "render": 2, "export run --sh nothing": 2,
 }  # fmt: skip
 REPORTED = f"""

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tests.helpers.forked import ROOT, Forked
 
-ALONE = ["fit.page=0", "fit.video=0", "fit.map_views=0"]
+ALONE = ["fit.video=0", "fit.map_views=0"]
 """A run that writes little beside its field."""
 TINY = [
     "data.reader.width=64", "data.reader.height=48", "data.reader.views=5", "data.reader.train=2", "data.views.train=2",

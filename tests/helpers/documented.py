@@ -17,7 +17,7 @@ from PIL import Image
 from clear_strategies import run
 from tests.helpers import captures, networks
 
-TINY = ["fit.iterations=4", "fit.page=0", "fit.video=0", "fit.map_views=0", "data.cloud.init=random",
+TINY = ["fit.iterations=4", "fit.video=0", "fit.map_views=0", "data.cloud.init=random",
         "data.cloud.random_points=60"]  # fmt: skip
 OF_DEMO = [
     "data.reader.width=64", "data.reader.height=48", "data.reader.views=3", "data.reader.train=2",

@@ -32,7 +32,7 @@ def make_run(
     files.write_json(folder / "metrics.json", content)
     (folder / ".hydra").mkdir(exist_ok=True)
     rows = [{"t": t, "psnr_test": 15 + t, "n_gaussians": 1000 + t, "seconds": t / 2} for t in range(1, 6)]
-    files.write_csv(folder / "history.csv", rows, ["t", "psnr_test", "n_gaussians", "seconds", "conflict"])
+    pd.DataFrame(rows).to_csv(folder / "history.csv", index=False)
     write_png(folder / "renders" / "view.png", torch.rand(24, 32, 3, generator=torch.Generator().manual_seed(seed)))
     write_png(folder / "views" / "view_truth.png", torch.full((24, 32, 3), 0.5))
     return folder

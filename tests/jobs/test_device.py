@@ -73,14 +73,19 @@ def test_warp_gets_the_device_of_the_job(monkeypatch):
 
 @pytest.mark.parametrize("chosen", [(), ("+method=3dgs_lr",)])
 def test_the_method_says_whether_opacities_are_compensated(chosen: tuple[str, ...]):
-    assert device.drawing(settings(*chosen).rasterizer, None).antialiased == (not chosen)
+    assert device.drawing(settings(*chosen).rasterizer, None).rules.antialiased == (not chosen)
 
 
 def test_a_rasterizer_of_another_package_is_a_target_with_the_same_settings():
     target = f"rasterizer._target_={__name__}.Theirs"
     found = settings(target, "rasterizer.kernel=0.3", "rasterizer.near=1e-5", "+rasterizer.sharpness=2").rasterizer
     drawing = device.drawing(found, None).over((1.0, 1.0, 1.0))
-    assert (type(drawing.rasterizer), drawing.name, drawing.kernel, drawing.near) == (Theirs, "Theirs", 0.3, 1e-5)
+    assert (type(drawing.rasterizer), drawing.name, drawing.rules.kernel, drawing.rules.near) == (
+        Theirs,
+        "Theirs",
+        0.3,
+        1e-5,
+    )
     assert (drawing.rasterizer.sharpness, drawing.rasterizer.background) == (2, (1.0, 1.0, 1.0))
     assert drawing.make().background == (1.0, 1.0, 1.0)
     own = device.drawing(settings(target, "rasterizer.background=[0,0,1]").rasterizer, None).over((1.0, 1.0, 1.0))

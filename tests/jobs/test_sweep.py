@@ -71,16 +71,20 @@ def test_a_killed_run_goes_on_from_the_newest_whole_checkpoint_and_ends_the_same
 
 
 def test_torch_and_kernels_divide_the_cores_among_the_jobs_whatever_an_earlier_job_has_set(monkeypatch):
-    before, default = torch.get_num_threads(), device.threads_of_each(1)
-    torch.set_num_threads(default + 1)  # fit.threads of the job before, in this process
-    later = device.threads_of_each(1)
+    before, default = torch.get_num_threads(), device.threads(None)
+    torch.set_num_threads(default[0] + 1)  # fit.threads of the job before, in this process
+    later = device.threads(None)
     torch.set_num_threads(before)
     assert later == default
     monkeypatch.setattr(device, "_threads_of_torch", lambda: 16)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: set(range(12)), raising=False)
-    assert [device.threads_of_each(jobs) for jobs in (1, 2, 5, 12, 40, -1, -2)] == [12, 6, 2, 1, 1, 1, 1]
+    for jobs, each in zip((1, 2, 5, 12, 40, -1, -2), (12, 6, 2, 1, 1, 1, 1), strict=True):
+        monkeypatch.setattr(device, "jobs_at_once", lambda jobs=jobs: jobs)
+        assert device.threads(None)[0] == each
+    monkeypatch.setattr(device, "jobs_at_once", lambda: 1)
     monkeypatch.setattr(device, "_threads_of_torch", lambda: 2)  # OMP_NUM_THREADS=2
-    assert device.threads_of_each(1) == 2
+    assert device.threads(None) == (2, "of 12 here")
+    assert device.threads(3) == (3, "fit.threads")
 
 
 @pytest.mark.slow

@@ -10,16 +10,16 @@ from typing import Any
 
 import pytest
 
-from clear_strategies import GCO, P2G, files, report
+from clear_strategies import GCO, P2G, files
 from clear_strategies.core.view import View
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.data.scene import Scene
 from clear_strategies.merging.objective import Objective
 from clear_strategies.outputs import results
-from clear_strategies.outputs.figures import magnification
+from clear_strategies.outputs.contact_sheet import magnification
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.plan import Chosen
-from clear_strategies.outputs.results import Pictures, write_results
+from clear_strategies.outputs.results import write_results
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.state import TrainState
@@ -30,7 +30,6 @@ from tests.helpers.image_files import holds, read
 
 OBJECTIVE = Objective(lambda_hr=WarmupDecay(start=0, full=1), kernels="torch")
 SCENE = toy.scene()
-PICTURES = Pictures(map_views=1, video_frames=2, page_gaussians=1000)
 
 
 @pytest.fixture(scope="module")
@@ -41,14 +40,11 @@ def state() -> TrainState:
     return state
 
 
-NO_PICTURES = Pictures(map_views=0, video_frames=0, page_gaussians=0)
-
-
-def write(folder: Path, state: TrainState, *, scene: Scene = SCENE, pictures: Pictures = PICTURES) -> Evaluation:
+def write(folder: Path, state: TrainState, *, scene: Scene = SCENE, map_views: int = 0, video: int = 0) -> Evaluation:
+    state = replace(state, settings=replace(state.settings, map_views=map_views, video=video))
     return write_results(
-        folder, scene, state, toy.RASTERIZER, Chosen(None, ["gco", "p2g"]), backend="torch", down="bicubic",
-        painter=Painter(state.field, lambda **_: toy.RASTERIZER), pictures=pictures, seconds=1.5, config={"fit": {"seed": 0}},
-        antialiased=False,
+        folder, scene, state, toy.RASTERIZER, Painter(state.field, lambda **_: toy.RASTERIZER), Chosen(None, ["gco", "p2g"]),
+        backend="torch", down="bicubic", seconds=1.5, config={"fit": {"seed": 0}}, antialiased=False,
     )  # fmt: skip
 
 
@@ -57,7 +53,7 @@ def names(folder: Path) -> set[str]:
 
 
 def test_conflict_csv_holds_columns_of_history_csv_and_the_ply_says_how_it_was_drawn(tmp_path, state) -> None:
-    evaluation = write(tmp_path, state, pictures=NO_PICTURES)
+    evaluation = write(tmp_path, state)
     history, conflict = (
         list(csv.DictReader((tmp_path / f"{name}.csv").open(newline=""))) for name in ("history", "conflict")
     )
@@ -77,13 +73,12 @@ def test_a_run_without_test_views_shows_training_views_and_what_is_not_wanted_or
     monkeypatch.setattr("clear_strategies.viewing.video.find_spec", lambda _: None)
     scene = replace(SCENE, test=(), train=SCENE.train * 2)
     with caplog.at_level("DEBUG"):
-        write(tmp_path, state, scene=scene, pictures=Pictures(map_views=0, video_frames=2, page_gaussians=1))
+        write(tmp_path, state, scene=scene, video=2)
     assert names(tmp_path / "renders") == {f"{view.name}.png" for view in SCENE.train}
     times = round(magnification(SCENE.train[0].hr.image.shape[1]))
     assert holds(read(tmp_path / "contact_sheet.png"), SCENE.train[0].hr.image.numpy(), times=times)
     assert "pip install imageio-ffmpeg" in caplog.text
-    assert "no splat.html is written" in caplog.text
-    assert not names(tmp_path) & {"maps/", "path.mp4", "splat.html"}
+    assert not names(tmp_path) & {"maps/", "path.mp4"}
 
 
 def test_photos_of_two_cameras_with_one_file_name_have_files_of_their_own(tmp_path, state, monkeypatch):
@@ -93,17 +88,16 @@ def test_photos_of_two_cameras_with_one_file_name_have_files_of_their_own(tmp_pa
     views = tuple(replace(view, name=name) for view, name in zip(SCENE.train, rig, strict=False))
     scene = replace(SCENE, train=views, test=views)
     monkeypatch.setattr(state, "views", views)
-    write(tmp_path, state, scene=scene, pictures=Pictures(map_views=2, video_frames=0, page_gaussians=0))
+    write(tmp_path, state, scene=scene, map_views=2)
     write_cameras(tmp_path, scene)
     stems = {"left_0000", "right_0000"}
     assert names(tmp_path / "renders") == {f"{stem}.png" for stem in stems}
     assert {name.rpartition("_")[0] for name in names(tmp_path / "views")} == stems
     assert names(tmp_path / "maps") == {"maps.json", "coverage.png", *(f"{stem}/" for stem in stems)}
-    assert set(report.Run.read(tmp_path).views) == stems
 
 
 def test_an_earlier_run_goes_with_all_of_its_files_and_no_other(tmp_path: Path, state: TrainState) -> None:
-    write(tmp_path, state, pictures=replace(PICTURES, video_frames=0, page_gaussians=0))
+    write(tmp_path, state, map_views=1)
     write_cameras(tmp_path, SCENE)
     kept = {tmp_path / "notes.txt", tmp_path / "renders" / "measured.png", tmp_path / "checkpoints" / "step_0000004"}
     for path in kept:
@@ -125,9 +119,9 @@ def test_the_sheet_of_photos_at_hr_shows_no_sr(tmp_path, state, monkeypatch):
     monkeypatch.setattr(results, "write_curves", lambda *_: None)
     monkeypatch.setattr(results, "write_contact_sheet", lambda path, rows, title, note: sheets.append((rows, note)))
     scene = replace(SCENE, train=tuple(map(photos, SCENE.train)), test=tuple(map(photos, SCENE.test)))
-    write(tmp_path, state, scene=scene, pictures=NO_PICTURES)
+    write(tmp_path, state, scene=scene)
     (((row,), note),) = sheets
-    assert list(row.images) == ["ours"]
+    assert list(row.images) == ["ours", "ground truth", "error of ours"]
     assert note == ""
 
 
@@ -135,7 +129,7 @@ def test_metrics_json_is_missing_where_another_file_could_not_be_written(tmp_pat
     def full(*arguments: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(files, "write_csv", full)
+    monkeypatch.setattr(results, "write_curves", full)
     with pytest.raises(OSError, match="No space left"):
-        write(tmp_path, state, pictures=NO_PICTURES)
+        write(tmp_path, state)
     assert not (tmp_path / "metrics.json").exists()

@@ -159,7 +159,7 @@ def _write_all(folder: Path, value: float) -> None:
     field.detail.data.fill_(value)
     export_ply(folder / "point_cloud.ply", field)
     write_png(folder / "renders" / "view1.png", _SCENE.test[0].lr.image * value)
-    files.write_csv(folder / "history.csv", [{"t": 1.0, "loss": value}], ["t", "loss"])
+    files.write_text(folder / "history.csv", f"t,loss\n1.0,{value}\n")
     files.write_json(folder / "metrics.json", {"psnr": value})
 
 

@@ -60,7 +60,7 @@ def run(iterations: int) -> list[Row]:
                 evaluate(state, scene, rasterizer, t)
                 checkpoint.save(Path(folder), state.checkpoint({}))
                 gc.collect()
-                resident.append(memory.resident())
+                resident.append(memory.system_bytes("/proc/self/status", "VmRSS"))
                 files.append(len(os.listdir("/proc/self/fd")))  # noqa: PTH208
     settled = len(resident) // 5
     before, after = resident[settled - 1], max(resident[settled:])

@@ -28,7 +28,7 @@ TENSORS = {f"{name} of {dtype}": (torch.arange(5) - 1).to(dtype) for dtype in TY
     "every other": torch.arange(12.0).reshape(4, 3)[::2],
     "turned": torch.arange(6.0).reshape(2, 3).T,
 }
-HISTORY = [{"t": 1.0, "loss": 1 / 3}, {"loss": math.inf, "t": 2.0, "psnr": -0.0}, {}, {"t": 3.0, "loss": 1e-300}]
+HISTORY = [{"t": 1.0, "loss": 1 / 3}, {"t": 2.0, "loss": math.inf, "psnr": -0.0}, {}, {"t": 3.0, "loss": 1e-300}]
 CONFIG = {"fit.seed": 1, "data.views.train": None, "b": [1, 2.5, "μ\n\""], "on": True}  # fmt: skip
 
 

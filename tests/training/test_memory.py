@@ -29,7 +29,7 @@ def test_a_run_whose_start_does_not_fit_is_refused_and_one_that_may_outgrow_the_
     ):
         memory.require(state, 99)
     assert not caplog.text
-    state.density.settings = state.density.settings.__class__(max_gaussians=100_000)
+    state.density.cap = 100_000
     with caplog.at_level(logging.WARNING):
         memory.require(state, None)
     assert "100000 Gaussians, the most that there may be, need about " in caplog.text
@@ -40,11 +40,11 @@ def test_the_estimate_holds_the_parameters_and_their_moments(monkeypatch):
     state, n = start(("gco", "p2g", "svs")), 1_000_000
     tables = (state.field.raw(), state.optimizer.state_dict())
     least = sum(x.nbytes for table in tables for x in table.values()) // len(state.field) * n
-    state.density.settings = state.density.settings.__class__(max_gaussians=n)
+    state.density.cap = n
     each = float(memory.require(state, 10**6).split("start, ")[1].split()[0])
     assert least < each * 1024 * n < 10 * least
 
 
 def test_the_system_tells_what_the_process_holds():
-    assert memory.resident() > 0
+    assert memory.system_bytes("/proc/self/status", "VmRSS") > 0
     assert memory.system_bytes("/proc/nothing", "VmRSS") is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 
 import pytest
 import torch
@@ -21,7 +22,10 @@ EVERYWHERE, SOME = (2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 19), (6, 10,
 
 
 def without_time(history: list[dict[str, float]]) -> str:
-    return json.dumps([{k: v for k, v in row.items() if not k.endswith(WALL)} for row in history])
+    return json.dumps(
+        [{k: v for k, v in row.items() if not k.endswith(WALL) and not math.isnan(v)} for row in history],
+        sort_keys=True,
+    )
 
 
 STATES = {

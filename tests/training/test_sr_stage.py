@@ -9,7 +9,7 @@ import torch
 
 from clear_strategies import Conductor, ExtraView, Objective, SRStage
 from clear_strategies.core import images
-from clear_strategies.density.shuffle import SECOND_STAGE, ShuffleSettings
+from clear_strategies.density.shuffle import ShuffleSettings
 from clear_strategies.strategies.base import Drawn
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.optim import Adam, LearningRates
@@ -43,7 +43,7 @@ def test_an_opaque_gaussian_becomes_six_thinner_ones_around_it():
     assert torch.allclose(theta.scales.data[2].exp(), torch.tensor([0.4 / 4, 0.2 / 1.9, 0.1 / 1.9]))
     assert torch.allclose(theta.opacities.data[2:].sigmoid(), torch.tensor(0.6))  # two of them are as opaque as one was
     assert len(density.score) == len(theta) == 8
-    assert density.marks[SECOND_STAGE] == 11
+    assert density.second_stage == 11
 
 
 def test_the_cap_leaves_the_most_opaque_and_a_resumed_run_does_not_split_again():

@@ -1,9 +1,8 @@
-"""The viewer and the pages of a run in a real browser: each shows something, and a drag turns it."""
+"""The viewer in a real browser shows something, and a drag turns it."""
 
 from __future__ import annotations
 
 import base64
-import contextlib
 import io
 import shutil
 import time
@@ -13,7 +12,6 @@ import pytest
 from PIL import Image
 
 from clear_strategies.jobs.saved import open_splat
-from clear_strategies.viewing.page import write_page
 from tests.helpers import saved_run
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="apt install chromium && pip install playwright")
@@ -61,35 +59,17 @@ def require_that_a_drag_turns_it(page) -> None:
     until(after_a_drag, lambda shown: np.abs(shown - before).mean() > 1)
 
 
-@contextlib.contextmanager
-def opened(**context):
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
-        page = browser.new_page(viewport={"width": 640, "height": 420}, **context)
-        page.set_default_timeout(1000 * PATIENCE)
-        yield page
-        browser.close()
-
-
 def test_the_viewer_shows_the_splat_and_a_drag_turns_it(tmp_path):
     saved_run.write(tmp_path)
     splat = open_splat(tmp_path)
     viewer = server.SplatViewer(splat.painter, [], title="toy", port=8421, out=tmp_path)
     try:
-        with opened() as page:
+        with sync_api.sync_playwright() as playwright:
+            page = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE).new_page(
+                viewport={"width": 640, "height": 420}
+            )
+            page.set_default_timeout(1000 * PATIENCE)
             page.goto(viewer.address)
             require_that_a_drag_turns_it(page)
     finally:
         viewer.close()
-
-
-def test_the_page_of_a_run_does_so_from_the_disk_without_a_network(tmp_path):
-    field = saved_run.write(tmp_path)
-    path, cameras = tmp_path / "splat.html", [view.hr.camera for view in saved_run.SCENE.train]
-    write_page(path, field.baked(), cameras, "toy", (0.0, 0.0, 0.0))
-    with opened(offline=True) as page:
-        asked: list[str] = []
-        page.on("request", lambda request: asked.append(request.url))
-        page.goto(path.as_uri())
-        require_that_a_drag_turns_it(page)
-    assert not [url for url in asked if url.startswith(("http", "ws"))]

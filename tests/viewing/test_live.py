@@ -31,15 +31,15 @@ def test_a_viewer_is_there_while_a_run_trains_and_draws_between_two_iterations_a
 
     monkeypatch.setattr(server, "SplatViewer", remembered)
     saved_run.write(tmp_path)
-    splat, addresses = open_splat(tmp_path), []
+    splat = open_splat(tmp_path)
 
     def draw() -> None:  # as nerfview's threads do
         with viewers[0].lock:
             drawn.set()
 
-    with server.watched(splat.painter, splat.poses(), "toy", addresses.append) as after_step:
+    with server.watched(splat.painter, splat.poses(), "toy") as after_step:
         after_step(1)
-        assert b"<html" in urlopen(addresses[0], timeout=20).read()  # noqa: S310 - our own address
+        assert b"<html" in urlopen(viewers[0].address, timeout=20).read()  # noqa: S310 - our own address
         threading.Thread(target=draw).start()
         assert not drawn.wait(0.2)  # an iteration is under way
         monkeypatch.setattr(viewers[0].server, "get_clients", lambda: {0: None})
@@ -52,4 +52,4 @@ def test_a_viewer_is_there_while_a_run_trains_and_draws_between_two_iterations_a
         after_step(3)
         assert time.monotonic() - began > 0.25
     with pytest.raises(OSError, match="refused"):
-        urlopen(addresses[0], timeout=20)  # noqa: S310
+        urlopen(viewers[0].address, timeout=20)  # noqa: S310

@@ -32,7 +32,6 @@ _REFUSED: dict[str, str] = {
     "fit.fused=sometimes": "auto",
     "fit.map_views=-1": "at least 0",
     "fit.video=-1": "at least 0",
-    "fit.page=-1": "at least 0, got -1",
     "fit.threads=0": "at least 1",
     "fit.device=tpu": "cpu",
     "fit.seed=x": "whole number",
