@@ -32,16 +32,8 @@ class Host:
     """Parameters, optimizers and LR photos (name -> camera and image) of a gsplat-style trainer."""
 
     def __init__(
-        self,
-        scene,
-        extent=1.0,
-        strategy=None,
-        scaler=None,
-        accumulation=1,
-        eps=1e-15,
-        rasterization=rasterization,
-        **call,
-    ):
+        self, scene, extent=1.0, strategy=None, scaler=None, accumulation=1, eps=1e-15, rasterization=rasterization, **call
+    ):  # fmt: skip
         self.rasterization, self.call = rasterization, {"packed": False, **call}
         self.photos = {v.name: v.lr for v in scene.train}
         raw = GaussianField.from_cloud(scene.cloud).raw()

@@ -117,12 +117,8 @@ class Recorder(Strategy):
 
 
 def started(
-    *strategies: Strategy,
-    objective: Objective | None = None,
-    of: Scene | None = None,
-    near: float = NEAR,
-    **settings: object,
-) -> TrainState:
+    *strategies: Strategy, objective: Objective | None = None, of: Scene | None = None, near: float = NEAR, **settings: object
+) -> TrainState:  # fmt: skip
     """A run on the toy scene, or on another, before its first iteration; the readable path unless `settings` say otherwise."""
     return TrainState.start(
         of or scene(), Conductor(*strategies, objective=objective or Objective(kernels="torch")),

@@ -111,15 +111,6 @@ def test_its_own_render_py_shows_what_training_evaluated(host, scene, tmp_path):
     assert float((-10 * np.log10(squared)).mean()) == pytest.approx(evaluated, abs=0.05)
 
 
-def test_photos_are_written_as_they_are_trained_on(host, scene, tmp_path):
-    run(host, "-m", "integration.inria", "--save-lr", tmp_path / "lr", "train.py", "-s", scene, "-m", tmp_path / "model",
-        *training(host), "-r", 2)  # fmt: skip
-    written = sorted((tmp_path / "lr").iterdir())
-    assert [file.name for file in written] == ["b1.png", "b2.png", "b3.png"]
-    assert {Image.open(file).size for file in written} == {(12, 8)}
-    assert not (tmp_path / "model" / "point_cloud").exists()
-
-
 @pytest.mark.parametrize("hidden_by", ["alpha of the photos", "--train_test_exp"])
 def test_what_3dgs_hides_is_learned_from_no_sr_image(hidden_by, scene, tmp_path):
     host, extra = checkout("3dgs", "train.py"), []
@@ -133,17 +124,3 @@ def test_what_3dgs_hides_is_learned_from_no_sr_image(hidden_by, scene, tmp_path)
     launched(host, scene, tmp_path / "spoilt", *extra)
     whole, spoilt = cloud(tmp_path / "whole"), cloud(tmp_path / "spoilt")
     assert all(torch.equal(getattr(whole, name), getattr(spoilt, name)) for name in ("means", "opacities", "sh0"))
-
-
-@pytest.mark.parametrize("name", ["3dgs", "dropgaussian"])
-def test_a_random_background_is_the_same_at_both_scales(name, scene, tmp_path):
-    """It is an argument of `render`."""
-    said = launched(checkout(name, "train.py"), scene, tmp_path / "model", "--random_background")
-    assert "30 merges" in said
-
-
-def test_mip_splattings_ray_jitter_is_refused_before_the_first_step(scene, tmp_path):
-    host = checkout("mip-splatting", "train.py")
-    said = launched(host, scene, tmp_path / "model", "--ray_jitter", status=2)
-    assert "rays are jittered, and two scales of a view cannot share that" in said
-    assert not (tmp_path / "model" / "point_cloud").exists()

@@ -10,9 +10,6 @@ import torch
 
 import rasterizers
 from clear_strategies import Conductor, FadingOpacity
-from clear_strategies.compose import conductor as composed_conductor
-from clear_strategies.data.priors import Bicubic
-from integration.gsplat import attach
 from integration.inria.attached import _ATTRIBUTES
 from rasterizers import Splats
 from tests.helpers import gsplat_host, inria, toy
@@ -152,17 +149,6 @@ def test_opacities_fade_in_a_gsplat_host():
         after[len(strategies)] = a_host.splats["opacities"].detach().sigmoid()
     assert after[1].mean() < 0.4 * after[0].mean()  # three steps, and what the optimizer gives back
     assert after[1].min() > 0.005
-
-
-def test_views_that_were_made_without_a_decorator_are_warned_of(caplog):
-    scene = toy.scene(20)
-    for prior_asked in (False, True):
-        caplog.clear()
-        conductor, a_host = composed_conductor("back_projected"), Host(scene)
-        if prior_asked:
-            conductor.prior(Bicubic())
-        attach(a_host.splats, a_host.optimizers, scene.train, conductor).remove()
-        assert ("BackProjected has no effect: the views were made without it" in caplog.text) != prior_asked
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ import torch
 
 from clear_strategies import P2G, Conductor, RandomBackground
 from clear_strategies.core.view import View
-from clear_strategies.errors import SettingError
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.merging.in_place import InPlaceMerge
 from integration import HostError
@@ -216,13 +215,6 @@ def test_a_detail_feature_that_no_optimizer_steps_on_gives_a_warning(stepped, ca
         if stepped:
             host.optimizers["detail"].step()
     assert caplog.text.count("f_det has no effect") == (0 if stepped else 1)
-
-
-def test_several_processes_are_refused_since_each_would_merge_on_its_own(monkeypatch):
-    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
-    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
-    with pytest.raises(SettingError, match="in one process, got 2"):
-        started()
 
 
 @pytest.mark.parametrize("own_background", [False, True])

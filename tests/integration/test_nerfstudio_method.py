@@ -118,13 +118,6 @@ def trainer(config):
     return made
 
 
-def test_the_registry_finds_it_by_its_environment_variable(monkeypatch):
-    monkeypatch.setenv("NERFSTUDIO_METHOD_CONFIGS", "clear-splatfacto=integration.nerfstudio:clear_splatfacto")
-    methods, descriptions = discover_methods()
-    assert isinstance(methods["clear-splatfacto"].pipeline.model, ClearSplatfactoModelConfig)
-    assert "CLEAR" in descriptions["clear-splatfacto"]
-
-
 def test_the_registry_finds_it_by_its_entry_point(monkeypatch):
     points = importlib.metadata.entry_points(group="nerfstudio.method_configs")
     if "clear-splatfacto" not in points.names:

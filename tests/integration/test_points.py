@@ -17,7 +17,6 @@ from clear_strategies.geometry.projection import intrinsics
 from integration import HostError
 from integration import points as initial
 from integration.gsplat import points as gsplat_points
-from integration.inria.__main__ import main as inria_main
 from integration.inria.from_options import install as install_in_inria
 from integration.points import stereo_points
 from integration.views import HostPhoto
@@ -184,14 +183,3 @@ def test_a_fork_of_another_shape_is_refused_with_the_file_as_remedy(message, inr
     with pytest.raises(HostError, match=message) as refused:
         install_stereo(gaussians, scene, opt, inria_capture)
     assert "docs/how-to/stereo.md" in str(refused.value)
-
-
-def test_the_launchers_name_the_flag_and_refuse_other_words_before_the_host_starts(capsys, caplog):
-    from integration.gsplat.__main__ import main as gsplat_main
-
-    for main in (inria_main, gsplat_main):
-        with pytest.raises(SystemExit):
-            main(["--help"])
-        assert "--points own|stereo" in capsys.readouterr().out
-        assert main(["--points", "colmap", "--sr", ".", str(SCRIPT)]) == 2
-    assert caplog.text.count("points: must be own (the host's) or stereo") == 2

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from clear_strategies import GCO, P2G, SVS, Conductor
-from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for, gaussian_pass
+from clear_strategies import GCO, P2G, SVS
+from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.optim import Adam, LearningRates
 from rasterizers.interface import BackendUnavailable
 from rasterizers.warp_runtime import require_warp
@@ -85,32 +83,6 @@ def test_the_host_does_not_wait_for_the_device(warp_step):
         conflict = step.step(c.fields[1].raw(), *factors, T + 1)
     assert recorded.operations == []
     assert all(0 <= share <= 1 for share in as_floats(conflict).values())
-
-
-@pytest.fixture
-def adam_on_cuda() -> Adam:
-    """An optimizer whose moments say that they are on CUDA."""
-    adam = Adam({}, LearningRates(), 1.0)
-    adam.first = {"means": SimpleNamespace(device=torch.device("cuda"), dtype=torch.float32)}
-    return adam
-
-
-def test_cuda_fields_use_warp(warp_step, adam_on_cuda, monkeypatch):
-    required = []
-    monkeypatch.setattr("clear_strategies.training.compiled_step.require_warp", lambda *asked: required.append(asked))
-    assert gaussian_pass(adam_on_cuda) is warp_step.WarpGaussianStep
-    assert [device for _, device, _ in required] == ["cuda"]
-
-
-def test_cuda_fields_without_warp_use_the_readable_path_and_log_why(adam_on_cuda, monkeypatch, caplog):
-    def missing(what, device, otherwise):
-        raise BackendUnavailable(f"{what} needs NVIDIA Warp, which is not installed.")
-
-    monkeypatch.setattr("clear_strategies.training.compiled_step.require_warp", missing)
-    with caplog.at_level("DEBUG"):
-        assert compiled_step_for(Conductor(), adam_on_cuda) is None
-    (message,) = caplog.messages
-    assert message.endswith("slower: the compiled pass needs NVIDIA Warp, which is not installed.")
 
 
 @pytest.mark.slow

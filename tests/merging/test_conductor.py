@@ -230,11 +230,6 @@ def test_a_scale_that_the_objective_needs_is_asked_for(drawn):
         Objective(lambda_lr=0.0)
 
 
-def test_a_weight_without_warm_up_is_constant_from_the_first_iteration():
-    constant = WarmupDecay(peak=0.4, final=0.4, start=0, full=0)
-    assert {constant(t) for t in (1, 2, 5_000, 5_001, 9_999, 10_000, 20_000)} == {0.4}
-
-
 def test_routing_weighs_the_high_frequency_gradient_only(drawn):
     """By which alone the detail feature moves."""
     _, view, lr, hr = drawn
@@ -276,15 +271,6 @@ def test_conflict_is_measured_before_correction_and_for_the_baseline_too(drawn):
     assert plain == corrected
     assert set(plain) == {"means", "sh0", "shN", "opacities", "scales", "quats", "gaussian"}
     assert 0 < max(plain.values()) < 1
-
-
-def test_a_strategy_without_hooks_is_warned_of(caplog):
-    @dataclass(frozen=True)
-    class Idle(Strategy):
-        pass
-
-    Conductor(Idle())
-    assert "Idle implements no hook" in caplog.text
 
 
 def test_two_strategies_of_one_class_keep_their_states_apart():

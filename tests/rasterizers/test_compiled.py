@@ -9,11 +9,11 @@ from functools import cache
 import pytest
 import torch
 
+import rasterizers
 from rasterizers import Camera, Splats
 from rasterizers.geometry import SH_C0
 from rasterizers.reference import ReferenceRasterizer
 from rasterizers.testing import CHECKS, gradient_of, magnitude, pixels_of, scene, select, to
-from tests.helpers.agreement import require_gradient, require_image, require_same_bits
 from tests.helpers.backends import (
     ATTRIBUTES,
     CLEAN,
@@ -24,6 +24,9 @@ from tests.helpers.backends import (
     dense_scene,
     everything,
     exact,
+    require_gradient,
+    require_image,
+    require_same_bits,
 )
 
 WITH_DEPTH = pytest.mark.parametrize("depth", [False, True], ids=["image", "depth"])
@@ -258,3 +261,49 @@ def test_a_black_gaussian_gets_the_gradient_of_its_colour(backend):
     gradient = backend()(black, view).vjp(torch.ones(1, 16, 16, 3)).sh0[0, 0, 0]
     assert torch.allclose(gradient[:2], gradient[2:].expand(2), rtol=1e-5)
     assert float(gradient[2]) > 0
+
+
+# ---- values ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("opacity", "x"), [(0.9, 0.0), (0.01, 0.0), (0.6, 2.0)])
+def test_a_ball_has_its_depth_along_the_camera_s_axis_wherever_it_is_seen(opacity, x):
+    ball = replace(balls(3.0, opacity=opacity), means=torch.tensor([[x, 0.0, 3.0]], dtype=torch.float64))
+    rendering = rasterizers.load("torch")(ball, camera(21, 21), depth=True)
+    seen = rendering.alpha > 0
+    assert seen.any()
+    assert torch.allclose(rendering.depth[seen], torch.tensor(3.0, dtype=torch.float64), rtol=1e-12)
+    assert not rendering.depth[~seen].any()
+
+
+def test_depth_is_the_mean_by_blending_weight():
+    # Equal ellipses of opacity a: the weights are a and (1 - a) a wherever both are drawn.
+    rendering = rasterizers.load("torch", kernel=0.0)(balls(2.0, 5.0, scale=1e3), camera(21, 21), depth=True)
+    assert float(rendering.depth[10, 10]) == pytest.approx((2 + 0.4 * 5) / 1.4, rel=1e-5)
+    assert float(rendering.alpha[10, 10]) == pytest.approx(1 - 0.4**2, rel=1e-5)
+
+
+# ---- agreement ---------------------------------------------------------------------------------------------------
+
+
+@backends(dtype=torch.float32)
+def test_the_faintest_pixel_has_a_depth(backend):
+    # Where alpha is 1e-6, 1 - T has one digit left in float32.
+    splats = to(balls(2.0, 6.0, opacity=1e-6, scale=10.0), torch.float32)
+    found = backend(**CLEAN)(splats, camera(8, 8), depth=True)
+    expected = exact(splats, camera(8, 8), depth=True, **CLEAN)
+    assert torch.allclose(found.depth.double(), expected.depth, rtol=1e-5)
+
+
+# ---- beside the image --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("k", [1, 2, 3, 4])
+@backends()
+def test_depth_does_not_change_the_image_or_its_gradients(backend, k):
+    splats, view = dense_scene(800)
+    v = cotangents(k, view.height, view.width)
+    without, drawn = backend()(splats, view), backend()(splats, view, depth=True)
+    assert without.depth is None
+    assert torch.equal(drawn.image, without.image)
+    require_same_bits(everything(drawn, v)[1:], everything(without, v)[1:])

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import functools
+from contextlib import suppress
 from dataclasses import replace
 
 import pytest
 import torch
 
 import rasterizers
-from rasterizers import Camera, native
+from rasterizers import BackendUnavailable, Camera, native
 from rasterizers.cpp import CppRasterizer
 from rasterizers.testing import check_rasterizer, scene
-from tests.helpers.agreement import require_same_bits
-from tests.helpers.backends import camera, cotangents, dense_scene, everything, needs
+from tests.helpers.backends import camera, cotangents, dense_scene, everything, needs, require_same_bits
 
 pytestmark = needs("cpp")
 
@@ -87,3 +87,34 @@ def test_the_longest_side_is_drawn_and_a_longer_one_refused(size):
 def test_threads_out_of_range_are_refused():
     with pytest.raises(ValueError, match="at least 1"):
         cpp(threads=0)
+
+
+def test_kernels_use_as_many_threads_as_torch_outside_of_kernel_threads_which_an_error_leaves_too():
+    before = torch.get_num_threads()
+    assert native.threads() == before
+    with suppress(RuntimeError), native.kernel_threads(3):
+        assert (native.threads(), torch.get_num_threads()) == (3, 1)
+        with native.kernel_threads(2):
+            assert native.threads() == 2
+        assert (native.threads(), torch.get_num_threads()) == (3, 1)
+        raise RuntimeError
+    assert (native.threads(), torch.get_num_threads()) == (before, before)
+
+
+def test_without_compiled_kernels_the_error_says_what_to_install():
+    with pytest.raises(BackendUnavailable, match=r"C\+\+20 compiler"):
+        native.load_kernels("rasterizers.reference")
+
+
+def test_an_instruction_set_that_the_processor_lacks_is_refused(monkeypatch):
+    try:
+        native.load_kernels("rasterizers.cpp")
+    except BackendUnavailable as reason:
+        pytest.skip(str(reason))
+    with pytest.raises(BackendUnavailable, match="isa=z80 cannot run here"):
+        native.load_kernels("rasterizers.cpp", "z80")
+    monkeypatch.setenv("CLEAR_ISA", "z80")
+    native.load_kernels.cache_clear()
+    with pytest.raises(BackendUnavailable, match="CLEAR_ISA=z80"):
+        native.load_kernels("rasterizers.cpp")
+    native.load_kernels.cache_clear()

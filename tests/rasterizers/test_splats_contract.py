@@ -11,8 +11,7 @@ import torch
 from rasterizers.cpp import CppRasterizer
 from rasterizers.interface import Splats
 from rasterizers.testing import scene
-from tests.helpers.agreement import require_same_bits
-from tests.helpers.backends import EVERY, camera, cotangents, everything, needs
+from tests.helpers.backends import EVERY, camera, cotangents, everything, needs, require_same_bits
 
 OTHERS = ("quats", "scales", "opacities", "sh0", "shN", "rgb_offset")
 

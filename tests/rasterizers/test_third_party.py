@@ -13,7 +13,6 @@ import rasterizers
 from rasterizers import Camera, Rasterizer, RasterSettings, Rendering, Splats, Traits, autograd
 from rasterizers.reference import ReferenceRasterizer
 from rasterizers.testing import check_rasterizer, scene
-from tests.helpers.backends import needs
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,16 +73,3 @@ def test_a_rasterizer_without_depth_passes_the_checks_and_is_refused_by_name_whe
     assert autograd.draw(Flat(), splats, camera).depth is None
     with pytest.raises(ValueError, match=r"Flat draws no depth \(its traits\.depth is False\)"):
         autograd.draw(Flat(), splats, camera, depth=True)
-
-
-@pytest.mark.parametrize(
-    ("name", "path"),
-    [
-        ("torch", "rasterizers.reference.ReferenceRasterizer"),
-        pytest.param("cpp", "rasterizers.cpp.CppRasterizer", marks=needs("cpp")),
-        pytest.param("warp", "rasterizers.warp_backend.WarpRasterizer", marks=needs("warp")),
-    ],
-)
-def test_the_backends_are_built_by_their_paths(name, path):
-    settings = {"near": 0.01, "kernel": 0.3, "antialiased": False}
-    assert instantiate({"_target_": path, **settings}) == rasterizers.load(name, **settings)
