@@ -62,17 +62,15 @@ class Lens:
     def check(self, file: Path, where: str) -> Lens:
         """The lens itself, if its numbers are plausible; a DataError if one is not finite, or no camera has it."""
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
-        if not all(math.isfinite(x) and abs(x) < 1e12 for x in numbers):
+        if not all(abs(x) < FARTHEST for x in numbers):  # not for nan
             raise DataError(file, where, f"has intrinsics that are not finite: {numbers}", "estimate the cameras again")
         if not (0 < self.width < _LARGEST_SIDE and 0 < self.height < _LARGEST_SIDE):
             raise DataError(file, where, f"has size {self.width}x{self.height}", "check the camera")
         shortest = min(self.fx / self.width, self.fy / self.height)
         in_sides = 0 < max(self.cx, self.cy) <= 1 < min(self.width, self.height) / 8
         if not (shortest > _SHORTEST and max(self.fx, self.fy) / self.width < 1e6) or in_sides:
-            problem = (
-                f"has focal lengths {self.fx:g}, {self.fy:g} and principal point ({self.cx:g}, {self.cy:g}) "
-                f"where the image is {self.width}x{self.height}; all must be pixels"
-            )
+            lengths = f"focal lengths {self.fx:g}, {self.fy:g} and principal point ({self.cx:g}, {self.cy:g})"
+            problem = f"has {lengths} where the image is {self.width}x{self.height}; all must be pixels"
             sides = shortest > 0 and "multiply what is in units of the image by its width (x) and height (y)"
             raise DataError(file, where, problem, sides or "estimate the cameras again")
         if not (-self.width < self.cx < 2 * self.width and -self.height < self.cy < 2 * self.height):
@@ -161,15 +159,13 @@ def pose_from_opengl(file: Path, where: str, matrix: object) -> Float[Tensor, "4
     """World-to-camera (OpenCV axes) from a camera-to-world matrix with OpenGL axes (x right, y up, z back)."""
     remedy = "write camera-to-world matrices: a rotation, a translation, last row 0 0 0 1"
     try:
-        rows = msgspec.convert(matrix, _Rows)
+        rows = np.array(msgspec.convert(matrix, _Rows))
     except msgspec.ValidationError as error:
         raise DataError(file, where, "is no 3x4 or 4x4 matrix of finite numbers", remedy) from error
-    full = np.eye(4)
-    full[: len(rows)] = rows
-    if np.abs(full[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise DataError(file, where, f"has the last row {full[3].tolist()}", remedy)
-    rotation = full[:3, :3] * np.array([1.0, -1.0, -1.0])  # OpenGL's y and z axes are opposite
-    return rigid_inverse(file, where, rotation, full[:3, 3])
+    if len(rows) == 4 and np.abs(rows[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise DataError(file, where, f"has the last row {rows[3].tolist()}", remedy)
+    rotation = rows[:3, :3] * np.array([1.0, -1.0, -1.0])  # OpenGL's y and z axes are opposite
+    return rigid_inverse(file, where, rotation, rows[:3, 3])
 
 
 def rigid_inverse(file: Path, where: str, rotation: np.ndarray, center: np.ndarray) -> Float[Tensor, "4 4"]:

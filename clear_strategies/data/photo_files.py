@@ -47,11 +47,7 @@ _NCLX_TRANSFER: Final = (1, 2, 6, 13, 14, 15)  # BT.709's in all its names, unkn
 
 
 def read_image(
-    path: Path,
-    *,
-    background: Color | None = None,
-    expect: tuple[int, int] | None = None,
-    turn: bool | None = None,
+    path: Path, *, background: Color | None = None, expect: tuple[int, int] | None = None, turn: bool | None = None
 ) -> Float[Tensor, "H W 3"]:
     """RGB in [0, 1], float32.
 

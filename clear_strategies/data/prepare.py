@@ -24,7 +24,7 @@ from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.capture import NO_PARALLAX, STEP_ASIDE, Capture, Frame
 from clear_strategies.data.cloud import CloudSettings, initial_points, require_source
 from clear_strategies.data.lenses import forget_maps
-from clear_strategies.data.photo_files import image_size, read_image
+from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.priors import Bicubic, Prior
 from clear_strategies.data.priors.cache import kept_network_of
 from clear_strategies.data.priors.interface import SuperResolved, super_resolved, warn_if_far_from_lr
@@ -98,14 +98,9 @@ def check_headers(frames: Sequence[Frame], views: ViewSettings) -> dict[str, Pat
             raise DataError(frame.name, "size", f"is {size}, where scores need {SMALLEST} pixels a side", remedy)
     if views.lr_folder is None:
         return {}
-    files, lr_files = ViewFiles(Path(views.lr_folder), "LR image", "name the LR images like the photos"), {}
-    for frame in frames:
-        width, height = lr_size(frame.camera, views)
-        file = lr_files[frame.name] = files.file(frame.name)
-        if (given := image_size(file)) != (width, height):
-            problem = f"is {given[0]}x{given[1]} where {width}x{height} is expected"
-            raise DataError(file, "size", problem, "see data.views for the LR size")
-    return lr_files
+    remedies = "name the LR images like the photos", "see data.views for the LR size"
+    files = ViewFiles(Path(views.lr_folder), "LR image", *remedies)
+    return {frame.name: files.file(frame.name, *lr_size(frame.camera, views)) for frame in frames}
 
 
 def save_lr(scene: Scene, folder: Path) -> None:

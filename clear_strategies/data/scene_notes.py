@@ -73,16 +73,14 @@ def _lr_source(views: ViewSettings) -> str:
 
 
 def _masks(views: Sequence[View]) -> dict[str, str]:
-    hidden = [float((~view.lr.shown).float().mean()) for view in views if view.lr.shown is not None]
-    if not hidden:
+    if not (hidden := [float((~view.lr.shown).float().mean()) for view in views if view.lr.shown is not None]):
         return {}
     mean = sum(hidden) / len(hidden)
     return {"masks": f"{len(hidden)} of {len(views)} training photos have one, which hides {mean:.1%} of it"}
 
 
 def _back_projection(views: Sequence[View], down: DownKernel) -> dict[str, str]:
-    before = [view.disagreement for view in views if view.disagreement is not None]
-    if not before:
+    if not (before := [view.disagreement for view in views if view.disagreement is not None]):
         return {}
     after = ((images.downsample(view.hr.image, view.factor, down) - view.lr.image).abs() for view in views)
     text = f"SR images differed from the LR photos by {_grey_levels(before):.2f} grey levels, now by {_grey_levels(after):.2f}"

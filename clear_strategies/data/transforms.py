@@ -48,38 +48,30 @@ class Transform(msgspec.Struct):
     p1: Number = 0.0
     p2: Number = 0.0
 
-    def pinhole(self, path: Path, where: str, width: float, height: float) -> tuple[float, float, float, float]:
-        """(fx, fy, cx, cy) of an image of this size.
-
-        Args:
-            path, where: of this frame, for the message.
-        """
-        fx, fy = self.fl_x, self.fl_y
-        if fx is None:
-            if self.camera_angle_x is None:
-                remedy = "give it or camera_angle_x"
-                raise DataError(path, f"{where}.fl_x", "is missing, for the frame and for all", remedy)
-            fx = _focal(path, f"{where}.camera_angle_x", self.camera_angle_x, width)
-        if fy is None:
-            angle = self.camera_angle_y
-            fy = fx if angle is None else _focal(path, f"{where}.camera_angle_y", angle, height)
-        return fx, fy, width / 2 if self.cx is None else self.cx, height / 2 if self.cy is None else self.cy
-
     def lens(self, path: Path, where: str, image: Path) -> Lens:
-        """The lens, for the sizes that the frame gives, else for the size of its image.
-
-        Args:
-            path, where: of this frame, for the message.
-        """
+        """The lens, for the sizes that the frame gives, else for the size of its image; `path`, `where`: of this frame."""
         # If the photo is turned, only given sizes show whether the lens is that of the stored pixels.
         real = (0, 0) if self.w is not None and self.h is not None else image_size(image)
-        width, height = (
-            float(size) if given is None else given for given, size in zip((self.w, self.h), real, strict=True)
-        )
-        fx, fy, cx, cy = self.pinhole(path, where, width, height)
+        width, height = real[0] if self.w is None else self.w, real[1] if self.h is None else self.h
+
+        def focal(length: float | None, angle: float | None, axis: str, size: float) -> float | None:
+            if length is None and angle is not None:
+                if not 0 < angle < math.pi:
+                    problem = f"is {angle:g}; it must lie in (0, pi) radians"
+                    raise DataError(path, f"{where}.camera_angle_{axis}", problem, "correct the field")
+                return size / (2 * math.tan(angle / 2))
+            return length
+
+        fx = focal(self.fl_x, self.camera_angle_x, "x", width)
+        fy = focal(self.fl_y, self.camera_angle_y, "y", height)
+        if fx is None:
+            remedy = "give it or camera_angle_x"
+            raise DataError(path, f"{where}.fl_x", "is missing, for the frame and for all", remedy)
+        cx, cy = width / 2 if self.cx is None else self.cx, height / 2 if self.cy is None else self.cy
         model = "OPENCV_FISHEYE" if self.is_fisheye else self.camera_model
         terms = {key: value for key in _COEFFICIENTS if (value := getattr(self, key)) != 0}
-        return lens_of(path, where, model, (round(width), round(height)), (fx, fy, cx, cy), terms)
+        size, pinhole = (round(width), round(height)), (fx, fx if fy is None else fy, cx, cy)
+        return lens_of(path, where, model, size, pinhole, terms)
 
 
 class _Points(msgspec.Struct):
@@ -132,10 +124,3 @@ def points_of(file: Path, content: Mapping[str, Any]) -> SfmPoints | None:
         return None
     cloud, none = read_points(finder(file.parent)(name)), torch.zeros(0, dtype=torch.long)
     return SfmPoints(cloud.means, cloud.colors, none, none, f"{name}, {len(cloud):,} points without tracks")
-
-
-def _focal(path: Path, where: str, angle: float, size: float) -> float:
-    """The focal length, pixels, of an image that spans `angle` radians along its `size` pixels."""
-    if not 0 < angle < math.pi:
-        raise DataError(path, where, f"is {angle:g}; it must lie in (0, pi) radians", "correct the field")
-    return size / (2 * math.tan(angle / 2))

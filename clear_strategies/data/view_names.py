@@ -9,7 +9,7 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.data.photo_files import SUFFIXES, write_png
+from clear_strategies.data.photo_files import SUFFIXES, image_size, write_png
 from clear_strategies.data.photo_folders import by_stem, list_images
 from clear_strategies.errors import DataError
 
@@ -51,12 +51,13 @@ class ViewFiles:
     folder: Path
     what: str  # a noun for one of the images, for messages
     remedy: str  # for a missing file
+    resize: str  # the remedy for one of another size
     suffix: str = ""  # of the files' stems
     _view_of: dict[Path, str] = field(default_factory=dict, init=False)
     _listed: dict[Path, dict[str, list[Path]]] = field(default_factory=dict, init=False)
 
-    def file(self, name: str) -> Path:
-        """The image of the view; a DataError where it has none or several, or one that another view was given."""
+    def file(self, name: str, width: int, height: int) -> Path:
+        """The image of the view; a DataError where it has none or several, one of another view, or of another size."""
         view = bare(name)
         below, stem = self.folder / view.rpartition("/")[0], _file(view) + self.suffix
         folder = below if below.is_dir() else self.folder
@@ -72,6 +73,9 @@ class ViewFiles:
             problem = f"would be that of two views, {other} and {view}"
             remedy = f"put the {self.what}s into subfolders like those of the photos"
             raise DataError(files[0], self.what, problem, remedy)
+        if (size := image_size(files[0])) != (width, height):
+            problem = f"is {size[0]}x{size[1]} where {width}x{height} is expected"
+            raise DataError(files[0], "size", problem, self.resize)
         return files[0]
 
 

@@ -53,8 +53,7 @@ def test_the_cloud_of_the_demo_is_the_trainers_to_the_bit() -> None:
     photos = [Photo(frame.camera, frame.load()) for frame in frames]
     trained = initial_points(CloudSettings(init="stereo", densify=True), photos)
     assert same(
-        reconstruct(photos, settings=None),
-        Stereo(trained.depths, trained.cloud.means, trained.cloud.colors, ""),
+        reconstruct(photos, settings=None), Stereo(trained.depths, trained.cloud.means, trained.cloud.colors, "")
     )
 
 

@@ -148,7 +148,7 @@ def initial_points(
     shown, initial = [blackened(photo) for photo in photos], None
     match settings.init:
         case "ply":
-            initial = _cleaned(settings, from_ply(Path(str(settings.path))), photos, background)
+            initial = _cleaned(settings, _from_ply(Path(str(settings.path))), photos, background)
         case "sfm" if sfm is not None:
             initial = _cleaned(settings, from_sfm(sfm), photos, background)
         case "sfm_train" if sfm is not None:
@@ -238,8 +238,7 @@ def _cleaned(
     return InitialPoints(cloud)
 
 
-def from_ply(path: Path) -> PointCloud:
-    """The points of a PLY file."""
+def _from_ply(path: Path) -> PointCloud:
     cloud = read_points(path)
     if len(cloud) == 0:
         raise DataError(path, "element vertex", "has no points", "give another file, or use another init")

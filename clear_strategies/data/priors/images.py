@@ -8,10 +8,9 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.data.photo_files import image_size, read_image
+from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.priors.interface import compared, require_path
 from clear_strategies.data.view_names import ViewFiles
-from clear_strategies.errors import DataError
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,17 +31,13 @@ class Images:
     def __post_init__(self) -> None:
         require_path(self.path, "the folder of the SR images")
         remedy = "name the SR images like the views, or set prior.suffix"
-        object.__setattr__(self, "_files", ViewFiles(Path(self.path), "SR image", remedy, self.suffix))
+        resize = "super-resolve the very LR images that this run trains on (data.save_lr writes them)"
+        object.__setattr__(self, "_files", ViewFiles(Path(self.path), "SR image", remedy, resize, self.suffix))
 
     @property
     def label(self) -> str:
         return f"images {self.path}"
 
     def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
-        file, height, width = self._files.file(name), lr.shape[0] * factor, lr.shape[1] * factor
-        size = image_size(file)
-        if size != (width, height):
-            problem = f"is {size[0]}x{size[1]}, but {factor} times the LR image is {width}x{height}"
-            remedy = "super-resolve the very LR images that this run trains on (data.save_lr writes them)"
-            raise DataError(file, "size", problem, remedy)
+        file = self._files.file(name, lr.shape[1] * factor, lr.shape[0] * factor)
         return compared(file.name, read_image(file), lr, factor)

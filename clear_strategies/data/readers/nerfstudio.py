@@ -5,14 +5,14 @@ from __future__ import annotations
 import logging
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path, PureWindowsPath
 from typing import Final
 
 import msgspec
 
 from clear_strategies.core.checks import as_color
-from clear_strategies.data.capture import BLACK, Capture, Frame, lens_notes, sorted_by_name
+from clear_strategies.data.capture import BLACK, Capture, lens_notes, sorted_by_name
 from clear_strategies.data.photo_files import image_size
 from clear_strategies.data.photo_folders import finder, image_folder, named
 from clear_strategies.data.strict_json import read_object, typed
@@ -60,16 +60,25 @@ def read(
         find = _in_place_of_first(image_folder(folder, images))
     paths = [find(transform.file_path) for transform in transforms]
     lists = typed(file, content, _Lists)
-    splits = _splits(file, lists, find)
+    splits: dict[Path, str] = {}
+    for key, side in _SIDES.items():
+        for name in getattr(lists, key):
+            if splits.setdefault(find(name), side) != side:
+                raise DataError(file, key, f"{name!r} is for training, too", "list each photo once")
+            if find(name) not in paths:
+                raise DataError(file, "split", f"lists {name!r}, which is no frame's file_path", "correct the lists")
     shared = os.path.commonprefix([path.parent.parts for path in paths])  # noqa: RUF071 - compares tuples of folders
     photos = [("/".join(path.parts[len(shared) :]), path, splits.get(path)) for path in paths]
     frames = frames_of({file: transforms}, {file: photos}, background=background, skip_faulty=skip_faulty)
     notes = {"poses": f"{file.name}, {len(frames)} images", **lens_notes(frames)}
     if splits:
-        if strangers := [name for key in _SIDES for name in getattr(lists, key) if find(name) not in paths]:
-            problem = f"lists {strangers[0]!r}, which is no frame's file_path"
-            raise DataError(file, "split", problem, "correct the lists")
-        notes["split"] = _split_note(file, frames)
+        counts = Counter(frame.split for frame in frames)
+        notes["split"] = f"the file's own: {counts['train']} train, {counts['test']} test, {counts[None]} in neither"
+        if counts[None]:
+            message = (
+                "%s: %d frames are in none of its split lists and are not used; data.views.own_split=false uses them."
+            )
+            _log.warning(message, file, counts[None])
     return Capture(folder.resolve().name, sorted_by_name(frames, file), points_of(file, content), background, notes)
 
 
@@ -85,22 +94,3 @@ def _sized(transform: Transform, find: Callable[[str], Path]) -> Transform:
         return transform
     width, height = image_size(find(transform.file_path))
     return msgspec.structs.replace(transform, w=float(width), h=float(height))
-
-
-def _splits(file: Path, lists: _Lists, find: Callable[[str], Path]) -> dict[Path, str]:
-    """The side of each photo in the file's lists, "train" or "test"."""
-    splits: dict[Path, str] = {}
-    for key, side in _SIDES.items():
-        for name in getattr(lists, key):
-            if splits.setdefault(find(name), side) != side:
-                raise DataError(file, key, f"{name!r} is for training, too", "list each photo once")
-    return splits
-
-
-def _split_note(file: Path, frames: Sequence[Frame]) -> str:
-    """How many frames the file's own lists assign to each side. Frames in none of them are logged."""
-    counts = Counter(frame.split for frame in frames)
-    if counts[None]:
-        message = "%s: %d frames are in none of its split lists and are not used; data.views.own_split=false uses them."
-        _log.warning(message, file, counts[None])
-    return f"the file's own: {counts['train']} train, {counts['test']} test, {counts[None]} in neither"

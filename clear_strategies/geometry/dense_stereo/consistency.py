@@ -42,10 +42,7 @@ def confirm(
 
 
 def carry(
-    estimate: Estimate,
-    other: Estimate,
-    inverse_depth: Float[Tensor, "H W"],
-    at: tuple[Tensor, Tensor] | None = None,
+    estimate: Estimate, other: Estimate, inverse_depth: Float[Tensor, "H W"], at: tuple[Tensor, Tensor] | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """(column, row, depth, whether inside) in the other estimate of the points at these inverse depths, behind every pixel or
     those `at` (rows, columns). Columns and rows are in pixels and clamped into the other photo.

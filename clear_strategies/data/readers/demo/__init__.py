@@ -32,15 +32,8 @@ _TARGET: Final = np.array([0.0, 0.15, 5.0])
 
 
 def read(*, width: int = 256, height: int = 192, views: int = 12, train: int = 3) -> Capture:
-    """The room from cameras on an arc. `train` evenly spaced views are for training, the others for testing.
-
-    Args:
-        width, height: of the HR images, px.
-        views: number of views, training views included.
-        train: number of training views, at least 2.
-
-    Raises:
-        SettingError: a number is outside its range.
+    """The room from cameras on an arc. `train` (2 or more) evenly spaced ones of the `views` are for training, the others for
+    testing; `width` and `height` are those of the HR images.
     """
     for name, value in (("width", width), ("height", height), ("views", views), ("train", train)):
         require_whole(f"data.reader.{name}", value, least=1)
@@ -54,13 +47,8 @@ def read(*, width: int = 256, height: int = 192, views: int = 12, train: int = 3
         camera = _camera(2 * i / (views - 1) - 1, width, height)
         load = lru_cache(maxsize=1)(partial(render, camera))
         frames.append(Frame(f"demo_{i:02d}", camera, load, split="train" if i in chosen else "test"))
-    return Capture(
-        "demo",
-        tuple(frames),
-        notes={"poses": "exact", "scene": "procedural room, photographs from scikit-image"},
-        own_prior=DemoPrior,
-        depth=depth,
-    )
+    notes = {"poses": "exact", "scene": "procedural room, photographs from scikit-image"}
+    return Capture("demo", tuple(frames), notes=notes, own_prior=DemoPrior, depth=depth)
 
 
 def render(camera: Camera) -> Float[Tensor, "H W 3"]:

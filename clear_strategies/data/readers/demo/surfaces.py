@@ -58,21 +58,16 @@ class Rays:
 
 @dataclass(frozen=True, slots=True)
 class Finish:
-    """How a surface looks.
+    """How a surface looks."""
 
-    Args:
-        texture: a photograph of scikit-image.
-        tint: factor of its colour.
-        repeat, shift: its scale and offset on the surface's chart. Every second repetition is mirrored, so that there
-            is no seam.
-        gloss: strength of the lamp's reflection.
-    """
-
-    texture: str
+    texture: str  # a photograph of scikit-image
     tint: Vector = (1.0, 1.0, 1.0)
-    repeat: tuple[float, float] = (1.0, 1.0)
+    repeat: tuple[float, float] = (
+        1.0,
+        1.0,
+    )  # on the surface's chart; every second one is mirrored, so that there is no seam
     shift: tuple[float, float] = (0.0, 0.0)
-    gloss: float = 0.0
+    gloss: float = 0.0  # strength of the lamp's reflection
 
 
 @dataclass(frozen=True, slots=True)
