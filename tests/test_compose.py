@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
-
 import pytest
-import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
-from omegaconf import OmegaConf
 
 from clear_strategies import GCO, P2G, SVS, Conductor
-from clear_strategies import compose as compose_module
-from clear_strategies.compose import CONF, conductor, flat, require_each_once, tree
+from clear_strategies.compose import CONF, conductor, tree
 from clear_strategies.data.priors import BackProjected, Bicubic
 from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs import device
 from clear_strategies.jobs.settings import settings_of
 from clear_strategies.merging.detail import DetailRates
-from clear_strategies.settings import TARGET, with_defaults
 from clear_strategies.training.settings import FitSettings
 from tests.helpers.configs import composed, options
 
@@ -71,26 +62,6 @@ def test_overrides_reach_strategies_and_objective_and_milestones_stretch_to_the_
 def test_what_does_not_exist_is_named(said, named):
     with pytest.raises(SettingError, match=named):
         conductor(*said)
-
-
-def test_a_strategy_is_found_twice_however_deep_it_is_named(tmp_path, monkeypatch):
-    """conf/strategy/*.yaml that name others, which name others."""
-    options = {
-        "gco": [], "p2g": [], "extra": [], "clear": ["gco", "p2g"], "best": ["clear", "extra", "_self_"],
-        "all": ["/readings/literal", "best"],
-    }  # fmt: skip
-    for name, parts in options.items():
-        file = tmp_path / "strategy" / f"{name}.yaml"
-        file.parent.mkdir(exist_ok=True)
-        file.write_text(f"defaults: {json.dumps(parts)}\n" if parts else "{}\n")
-    monkeypatch.setattr(compose_module, "CONF", tmp_path)
-    require_each_once(["+strategy=all"])
-    require_each_once(["+strategy=[clear,extra]"])
-    for said, twice in (
-        ("[p2g,all]", "p2g"), ("[extra,best]", "extra"), ("[all,clear]", "gco"), ("[best,best]", "gco"),
-    ):  # fmt: skip
-        with pytest.raises(SettingError, match=f"got {twice} twice"):
-            require_each_once([f"+strategy={said}"])
 
 
 def test_a_hydra_application_keeps_its_own_state():
@@ -156,48 +127,6 @@ def test_every_option_composes_into_settings(group):
         chosen = f"{'+' * (group in ('strategy', 'method'))}{group}={name}"
         config = composed(chosen, *([NEEDED[chosen]] if chosen in NEEDED else []))
         assert isinstance(settings_of(tree(config)).conductor(1.0), Conductor), name
-
-
-def written() -> Iterator[tuple[Path, tuple[str, ...], Any]]:
-    """Every value in conf/, with its file and its path in the whole configuration."""
-    for file in sorted(CONF.rglob("*.yaml")):
-        group = file.parent.relative_to(CONF).parts
-        if group[:1] == ("hydra",):
-            continue
-        text = file.read_text()
-        header = text.split("\n")[0].removeprefix("# @package ") if text.startswith("# @package") else None
-        package = () if header == "_global_" else (header,) if header else group
-        for key, value in flat(yaml.safe_load(text) or {}).items():
-            inner = tuple(key.split("."))
-            if inner[0] not in ("defaults", "hydra"):
-                yield file, (*package, *inner), value
-
-
-def default_at(path: tuple[str, ...], whole: Any) -> Any:
-    """What the innermost `_target_` above a path gives for it by default; ... where there is none."""
-    node, default = whole, ...
-    for key in path:
-        if isinstance(node, dict) and node.get(TARGET) is not None:
-            default = with_defaults({TARGET: node[TARGET]})
-        default = default.get(key, ...) if isinstance(default, dict) else ...
-        node = node.get(key) if isinstance(node, dict) else None
-    return default
-
-
-@pytest.mark.slow
-def test_no_default_stands_in_a_class_and_in_conf():
-    """A file may give a class's default only where it takes back what another file says."""
-    chosen = [f"{'+' * (group in ('strategy', 'method'))}{group}={name}" for group in GROUPS for name in options(group)]
-    whole = [OmegaConf.to_container(composed(option)) for option in chosen]
-    everything, repeated = list(written()), []
-    for file, path, value in everything:
-        if path[-1].startswith("_") or value in ("???",):
-            continue
-        if any(value == default_at(path, config) for config in whole):
-            others = [v for f, p, v in everything if p == path and f != file and v != value]
-            if not others:
-                repeated.append(f"{file.relative_to(CONF)}: {'.'.join(path)} = {value!r}")
-    assert not repeated, "\n".join(repeated)
 
 
 REFUSED = {

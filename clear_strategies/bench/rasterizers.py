@@ -7,9 +7,10 @@ the cut-offs too.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
+import numpy as np
 import pandas as pd
 import torch
 from jaxtyping import Float
@@ -17,8 +18,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 import rasterizers
-from clear_strategies.bench import accuracy, scenes
-from clear_strategies.bench.accuracy import NO_CUT_OFFS, Drawn, affordable
+from clear_strategies.bench import scenes
 from clear_strategies.bench.results import Results
 from clear_strategies.bench.scenes import SETTINGS, Workload
 from clear_strategies.bench.timing import interleaved, medians, milliseconds, queued
@@ -31,6 +31,14 @@ COTANGENTS: Final = 3
 FORWARD, TOGETHER, SEPARATE, LATENCY = "forward", "lr_hr_together", "lr_hr_separate", "latency"
 BACKWARD: Final = tuple(f"backward_k{k}" for k in range(1, COTANGENTS + 1))
 SAME, NONE = "same cut-offs", "no cut-offs"
+
+
+ATTRIBUTES: Final = ("means", "scales", "quats", "opacities", "sh0", "shN")
+NO_CUT_OFFS: Final = {"alpha_min": 1e-9, "transmittance_min": 0.0}
+REFERENCE_LIMIT: Final = 10_000  # Gaussians; with more, the pure-torch reference takes minutes per turn
+
+Drawn = Mapping[str, Tensor]
+"""An image, and the gradients of one cotangent by attribute, in main memory."""
 
 
 class Contestant:
@@ -91,7 +99,7 @@ def measure(
         backend: none: all that run here.
     """
     require_device(device)
-    backends, truth = usable(backend, device, results.note), accuracy.truth_backend()
+    backends, truth = usable(backend, device, results.note), truth_backend()
     workloads = [scenes.load(name).to(device) for name in scene]
     times, errors, turns = list[dict[str, Any]](), list[dict[str, Any]](), list[pd.DataFrame]()
     for workload in workloads:
@@ -191,9 +199,63 @@ def _error_rows(workload: Workload, contestants: Sequence[Contestant], backend: 
     cotangent = random_cotangents(workload)[0]
     truths: dict[tuple[Any, ...], Drawn] = {}
     for c in contestants:
-        drawn = accuracy.draw(c.render, cotangent)
+        drawn = draw(c.render, cotangent)
         for against, cut_offs in ((SAME, PRESETS[c.names["preset"]]), (NONE, NO_CUT_OFFS)):
             key = tuple(sorted(cut_offs.items()))
             if key not in truths:
-                truths[key] = accuracy.truth(backend, workload, cotangent, cut_offs)
-            yield {**c.names, "truth": against, **accuracy.errors(drawn, truths[key])}
+                truths[key] = truth_of(backend, workload, cotangent, cut_offs)
+            yield {**c.names, "truth": against, **errors_of(drawn, truths[key])}
+
+
+def draw(render: Callable[[], Any], cotangent: Float[Tensor, "H W 3"]) -> Drawn:
+    """`render` returns an object with `image`, and `vjp` of K cotangents."""
+    rendering = render()
+    g = rendering.vjp(cotangent[None])
+    return {"image": rendering.image.detach().cpu(), **{name: getattr(g, name)[0].cpu() for name in ATTRIBUTES}}
+
+
+def errors_of(measured: Drawn, truth: Drawn) -> dict[str, float]:
+    """Table columns: absolute errors of the image, and relative L2 errors of each attribute's gradient.
+
+    `<attribute>_relative` is over all Gaussians, `<attribute>_median` the median of the Gaussians' relative errors.
+    """
+    difference = (measured["image"].double() - truth["image"].double()).abs().numpy()
+    columns = {
+        "image_max": float(difference.max()),
+        "image_p99.99": float(np.quantile(difference, 0.9999)),
+        "image_mean": float(difference.mean()),
+    }
+    for name in ATTRIBUTES:
+        x, expected = (drawn[name].double().reshape(len(truth[name]), -1) for drawn in (measured, truth))
+        size = expected.norm(dim=1)
+        of_each = ((x - expected).norm(dim=1) / size)[size > 0]
+        whole, error = float(size.norm()), float((x - expected).norm())
+        columns[f"{name}_relative"] = error / whole if whole > 0 else error
+        columns[f"{name}_median"] = float(of_each.median()) if len(of_each) else 0.0
+    return columns
+
+
+def affordable(backend: str, workload: Workload, what: str, note: Callable[[str], None]) -> bool:
+    """Whether a backend draws this scene in seconds; if not, `note` gets the reason."""
+    if backend != "torch" or len(workload.splats) <= REFERENCE_LIMIT:
+        return True
+    note(f"{what}, {workload.name}: the torch reference takes at most {REFERENCE_LIMIT:,} Gaussians here.")
+    return False
+
+
+def truth_backend() -> str:
+    """The fastest backend here that computes in float64, on any device."""
+    runs = (name for name, why_not in rasterizers.available().items() if why_not is None)
+    return next(name for name in runs if torch.float64 in rasterizers.load(name).traits.dtypes)
+
+
+def truth_of(backend: str, workload: Workload, cotangent: Float[Tensor, "H W 3"], rules: Mapping[str, Any]) -> Drawn:
+    """Draw in float64, on the workload's device where the backend draws there.
+
+    Args:
+        rules: the cut-offs, and settings that differ from `SETTINGS`.
+    """
+    rasterizer = rasterizers.load(backend, **{**SETTINGS, **rules})
+    device = workload.splats.means.device.type
+    wide = workload.to(device if device in rasterizer.traits.devices else "cpu", torch.float64)
+    return draw(lambda: rasterizer(wide.splats, wide.camera), cotangent.to(wide.splats.means))

@@ -75,7 +75,12 @@ def finished(folder: Path, config: Mapping[str, Any], scene: Callable[[], Scene]
         _require_same_cameras(folder, scene())
     mean = content.shown.mean.get("ours")
     score = "no PSNR" if mean is None or mean.psnr is None else f"PSNR {mean.psnr:.2f} dB"
-    _log.info("%s: this run finished on %s (%s); nothing is trained.", folder, content.provenance.date, score)
+    _log.info(
+        "%s: this run finished on %s (%s); nothing is trained.",
+        folder,
+        content.provenance.get("date", "an unknown date"),
+        score,
+    )
     return content
 
 
@@ -128,19 +133,15 @@ def restore(state: TrainState, scene: Scene, saved: Checkpoint, source: Path, co
 
 
 def _require_same(source: Path, then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    moved = {key for key in {*then, *now} if key + _HELD in then and key + _HELD in now}  # what they hold is compared
+    keys = then.keys() | now.keys()
+    moved = {key for key in keys if key + _HELD in then and key + _HELD in now}  # what they hold is compared
     moved |= {*_DATA} if (folder_of(source) / CAMERAS).is_file() else set()
-    moved |= {key for key in {*then, *now} if key.endswith(_HELD) and not (key in then and key in now)}
-    differences = [
-        f"{key}: {then.get(key)!r} then, {now.get(key)!r} now"
-        for key in sorted({*then, *now} - moved)
-        if then.get(key) != now.get(key)
-    ]
-    if differences:
-        raise DataError(
-            source, "config", "this is not the configuration that wrote it: " + "; ".join(differences[:5]),
-            "resume with the same overrides, or start a new run",
-        )  # fmt: skip
+    moved |= {key for key in then.keys() ^ now.keys() if key.endswith(_HELD)}
+    differ = [key for key in sorted(keys - moved) if then.get(key) != now.get(key)]
+    if differ:
+        listed = "; ".join(f"{key}: {then.get(key)!r} then, {now.get(key)!r} now" for key in differ[:5])
+        problem = f"this is not the configuration that wrote it: {listed}"
+        raise DataError(source, "config", problem, "resume with the same overrides, or start a new run")
 
 
 def _require_same_cameras(source: Path, scene: Scene) -> None:
@@ -152,22 +153,14 @@ def _require_same_cameras(source: Path, scene: Scene) -> None:
     now = {view.name: view.hr.camera for view in (*scene.train, *scene.test)}
     centers = torch.stack([camera.center.double() for camera in then.values()])
     near = _SAME * float((centers - centers.mean(0)).norm(dim=1).max()) + _ROUNDED * float(centers.norm(dim=1).max())
-    changed = [
-        name
-        for name in sorted({*then, *now})
-        if not (name in then and name in now and _same(then[name], now[name], near))
-    ]
-    if changed:
+
+    def same(a: Camera, b: Camera) -> bool:
+        turned = float((a.world_to_camera.double()[:3, :3] - b.world_to_camera.double()[:3, :3]).abs().max())
+        moved = float((a.center.double() - b.center.double()).norm())
+        sizes = (a.width, a.height) == (b.width, b.height)
+        return sizes and abs(a.fx / b.fx - 1) <= _SAME and turned <= _SAME and moved <= near
+
+    both = then.keys() & now.keys()
+    if changed := sorted((then.keys() ^ now.keys()) | {name for name in both if not same(then[name], now[name])}):
         problem = f"{len(changed)} of {len(now)} photos have another name, size or pose than in this run, such as {changed[0]}"
         raise DataError(source, "data", problem, "give the same data, at whatever path, or start a new run")
-
-
-def _same(a: Camera, b: Camera, near: float) -> bool:
-    turned = float((a.world_to_camera.double()[:3, :3] - b.world_to_camera.double()[:3, :3]).abs().max())
-    moved = float((a.center.double() - b.center.double()).norm())
-    return (
-        (a.width, a.height) == (b.width, b.height)
-        and abs(a.fx / b.fx - 1) <= _SAME
-        and turned <= _SAME
-        and moved <= near
-    )

@@ -16,9 +16,9 @@ from __future__ import annotations
 import copy
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Final, cast
+from typing import Final, NamedTuple, cast
 
 import torch
 from jaxtyping import Bool, Float
@@ -58,14 +58,9 @@ _NOTE: Final = (
 _ALWAYS_ON: Final = WarmupDecay(start=0, full=1, decay_from=1, end=1)  # λ_HR = 1 from the first iteration
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ViewMaps:
-    """The maps of one training view.
-
-    Args:
-        maps: by the names in `MAPS`, at HR, in [0, 1]; "corrected" only where a strategy corrects, those of
-            patch evidence only where a strategy has it.
-        means: by the same names, over pixels for the patch maps and over Gaussians for the others.
+class ViewMaps(NamedTuple):
+    """The maps of one training view at HR, in [0, 1], and their means over pixels or Gaussians, by the names in `MAPS`:
+    "corrected" only where a strategy corrects, those of patch evidence only where a strategy has it.
     """
 
     maps: Mapping[str, Float[Tensor, "H W"]]
@@ -91,13 +86,9 @@ def write_maps(
     if corrector is None:
         _log.debug("maps: no strategy of this run corrects, so there is no corrected.png.")
     evidence = _evidence(conductor, views[0])
-    content = {
-        "note": _NOTE,
-        "corrector": None if corrector is None else type(corrector).__name__,
-        "evidence": None if evidence is None else type(evidence[0]).__name__,
-        "views": means,
-    }
-    files.write_json(folder / "maps.json", content)
+    makers = {"corrector": corrector, "evidence": None if evidence is None else evidence[0]}
+    named = {part: None if maker is None else type(maker).__name__ for part, maker in makers.items()}
+    files.write_json(folder / "maps.json", {"note": _NOTE, **named, "views": means})
 
 
 def view_maps(painter: Painter, conductor: Conductor, rasterizer: Rasterizer, view: View, t: int) -> ViewMaps:
@@ -109,13 +100,9 @@ def view_maps(painter: Painter, conductor: Conductor, rasterizer: Rasterizer, vi
     evidence = _evidence(conductor, view)
     patches = {} if evidence is None else _enlarged(evidence[1], view)
     numbers, compared = _compare(*_gradients(painter.field, conductor, rasterizer, view, t))
-    maps = {
-        **patches,
-        **{name: painter.numbers(view.hr.camera, values).clamp(0, 1) for name, values in numbers.items()},
-    }
+    drawn = {name: painter.numbers(view.hr.camera, values).clamp(0, 1) for name, values in numbers.items()}
     means = {name: float(patch.mean()) for name, patch in patches.items()}
-    means |= {name: float(values[compared].mean()) for name, values in numbers.items()}
-    return ViewMaps(maps, means)
+    return ViewMaps(patches | drawn, means | {name: float(values[compared].mean()) for name, values in numbers.items()})
 
 
 def _write_picture(path: Path, view: View, found: ViewMaps) -> None:
@@ -190,9 +177,7 @@ def _compare(lr: Grads, hr: Grads, corrected: Grads | None) -> tuple[dict[str, T
     numbers = {}
     if corrected is not None:
         step = corrected + hr * -1.0
-        share = (
-            GradientColumns.of(step, step).products().l2.sum(1) / hr2.clamp_min(torch.finfo(hr2.dtype).tiny)
-        ).sqrt()
-        numbers["corrected"] = torch.where(compared, share.clamp(0, 1), 0.0)
+        lost = GradientColumns.of(step, step).products().l2.sum(1) / hr2.clamp_min(torch.finfo(hr2.dtype).tiny)
+        numbers["corrected"] = torch.where(compared, lost.sqrt().clamp(0, 1), 0.0)
     numbers["conflict"] = ((dot < 0) & compared).to(dot)
     return numbers, compared

@@ -71,12 +71,6 @@ class Part(msgspec.Struct):
     mean: dict[str, Scores]
 
 
-class Provenance(msgspec.Struct):
-    """The facts of `provenance` that are read again."""
-
-    date: str = "an unknown date"
-
-
 class Metrics(msgspec.Struct):
     """The fields of metrics.json that are read again."""
 
@@ -90,7 +84,7 @@ class Metrics(msgspec.Struct):
     synthetic_prior: bool
     test: Part
     train: Part
-    provenance: Provenance
+    provenance: dict[str, Any]
     config: dict[str, Any] = msgspec.field(default_factory=dict)
     overrides: list[str] | None = None
 

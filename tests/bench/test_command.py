@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
-from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -12,8 +10,6 @@ import torch
 
 from clear_strategies.bench import rasterizers
 from clear_strategies.bench.__main__ import main
-
-DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
 def test_rasterizers_writes_every_stage_both_errors_a_figure_and_the_machine(tmp_path, capsys):
@@ -64,15 +60,6 @@ def test_bad_arguments_have_exit_code_2(arguments):
     with pytest.raises(SystemExit) as stopped:
         main(arguments.split())
     assert stopped.value.code == 2
-
-
-def test_the_page_links_to_every_published_table_and_a_figure_is_drawn_from_them():
-    data = DOCS / "data" / "benchmarks"
-    linked = set(re.findall(r"\(\.\./data/benchmarks/(\w+\.csv)\)", (DOCS / "explanation/benchmarks.md").read_text()))
-    assert linked == {path.name for path in data.glob("*.csv")}
-    time, error = (pd.read_csv(data / f"rasterizers_{table}.csv") for table in ("time", "error"))
-    figure = rasterizers.figure(time, error)
-    assert [axis.get_title() for axis in figure.axes] == ["small", "s100k", "s100k-lr", "garden", "s500k"]
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import rasterizers
-from clear_strategies.bench import accuracy, iteration, scale, scenes, timing
+from clear_strategies.bench import iteration, scale, scenes, timing
 from clear_strategies.bench import rasterizers as drawing
 from clear_strategies.bench.results import Results
 from clear_strategies.errors import DataError
@@ -76,12 +76,12 @@ def test_unavailable_backends_are_noted(monkeypatch):
 
 
 def test_errors_are_those_of_their_definitions():
-    def drawn(image: list[float], gradient: list[list[float]]) -> accuracy.Drawn:
-        return {"image": torch.tensor(image), **dict.fromkeys(accuracy.ATTRIBUTES, torch.tensor(gradient))}
+    def drawn(image: list[float], gradient: list[list[float]]) -> drawing.Drawn:
+        return {"image": torch.tensor(image), **dict.fromkeys(drawing.ATTRIBUTES, torch.tensor(gradient))}
 
     truth = drawn([0.0, 0, 0], [[3.0, 4], [0, 0], [1, 0]])
     found = drawn([0.3, 0, 0], [[3.0, 4], [0, 1], [2, 0]])
-    errors = accuracy.errors(found, truth)
+    errors = drawing.errors_of(found, truth)
     assert errors["image_max"] == pytest.approx(0.3)
     assert errors["image_mean"] == pytest.approx(0.1)
     assert errors["means_relative"] == pytest.approx(math.sqrt(2 / 26))
@@ -90,10 +90,10 @@ def test_errors_are_those_of_their_definitions():
 
 def test_finer_cut_offs_have_smaller_errors(tiny):
     v = drawing.random_cotangents(tiny)[0]
-    truth = accuracy.truth("torch", tiny, v, accuracy.NO_CUT_OFFS)
+    truth = drawing.truth_of("torch", tiny, v, drawing.NO_CUT_OFFS)
     renders = [drawing.Contestant(tiny, "torch", preset).render for preset in rasterizers.PRESETS]
-    found = [accuracy.errors(accuracy.draw(render, v), truth) for render in renders]
-    for name in accuracy.ATTRIBUTES:
+    found = [drawing.errors_of(drawing.draw(render, v), truth) for render in renders]
+    for name in drawing.ATTRIBUTES:
         fast, accurate, exact = (errors[f"{name}_relative"] for errors in found)
         assert fast > 3 * accurate > 9 * exact, name
         assert exact < 1e-4

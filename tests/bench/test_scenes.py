@@ -9,7 +9,7 @@ import torch
 
 import rasterizers
 from clear_strategies.bench import iteration, scenes
-from clear_strategies.bench.accuracy import ATTRIBUTES
+from clear_strategies.bench.rasterizers import ATTRIBUTES
 from clear_strategies.outputs.export import export_ply
 from tests.helpers import toy
 
