@@ -54,9 +54,8 @@ NAMED = ("a.png", "a.PNG", "a.jpg", "A.png", "a.png.png", "dynamic_mask_a.png", 
 @pytest.mark.parametrize("name", NAMED)
 @pytest.mark.parametrize("reader", ["colmap", "nerfstudio", "blender"])
 def test_a_mask_is_found_by_the_names_that_tools_give_it(tmp_path: Path, reader: str, name: str, caplog) -> None:
-    read = {"colmap": colmap.read, "nerfstudio": nerfstudio.read, "blender": blender.read}[reader]
     save(tiny.GOOD[reader](tmp_path) / "masks" / name, 255 * LEFT)
-    first = read(tmp_path).frames[0]
+    first = tiny.READERS[reader](tmp_path).frames[0]
     assert first.shown is not None
     assert torch.equal(first.shown(), torch.from_numpy(LEFT))
     assert "belong to no photo" not in caplog.text
@@ -72,7 +71,7 @@ def test_masks_may_lie_beside_the_photos_or_in_their_folder(tmp_path: Path, fold
 @pytest.mark.parametrize("reader", ["colmap", "nerfstudio"])
 def test_marked_masks_may_lie_among_the_photos(tmp_path: Path, reader: str, name: str) -> None:
     save(tiny.GOOD[reader](tmp_path) / "images" / name, 255 * LEFT)
-    capture = {"colmap": colmap.read, "nerfstudio": nerfstudio.read}[reader](tmp_path)
+    capture = tiny.READERS[reader](tmp_path)
     assert [frame.shown is not None for frame in capture.frames] == [False, True, False]
     assert "without pose" not in capture.notes
 

@@ -19,7 +19,9 @@ from PIL import Image
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.photo_files import write_png
-from clear_strategies.data.readers import demo
+from clear_strategies.data.readers import blender as read_blender
+from clear_strategies.data.readers import colmap, demo
+from clear_strategies.data.readers import nerfstudio as read_nerfstudio
 from clear_strategies.data.view_settings import ViewSettings
 from rasterizers import Camera
 
@@ -42,6 +44,16 @@ def world_to_camera(view: int) -> np.ndarray:
     pose[:3, :3] = [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]]
     pose[:3, 3] = TRANSLATIONS[view]
     return pose
+
+
+def require_poses(capture: Capture) -> None:
+    """The cameras of a capture are those here."""
+    assert len(capture.frames) == len(NAMES)
+    for i, frame in enumerate(capture.frames):
+        camera = frame.camera
+        np.testing.assert_allclose(camera.world_to_camera.numpy(), world_to_camera(i), atol=1e-12)
+        intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+        np.testing.assert_allclose(intrinsics, (FOCAL, FOCAL, 8, 6, WIDTH, HEIGHT))
 
 
 def opengl(view: int) -> list[list[float]]:
@@ -131,18 +143,22 @@ def colmap_bin(root: Path, model: str = "PINHOLE", parameters: tuple[float, ...]
     return root
 
 
-def colmap_txt(root: Path) -> Path:
-    """The same scene in COLMAP's text layout."""
+def images_txt(names: Sequence[str] = NAMES, points: str | None = None, header: str = "") -> str:
+    """The poses of photos, each with a line of 2D points."""
+    rows = [" ".join(map(str, (i + 1, *QUATERNIONS[i], *TRANSLATIONS[i], 1, name))) for i, name in enumerate(names)]
+    lines = [points] * len(rows) if points is not None else ["\n", *["8.0 6.0 -1\n"] * (len(rows) - 1)]
+    return header + "".join(f"{row}\n{line}" for row, line in zip(rows, lines, strict=True))
+
+
+def colmap_txt(root: Path, listed: Callable[[str], str] = str) -> Path:
+    """The same scene in COLMAP's text layout, with photos by the names that `listed` makes of theirs."""
     write_photos(root / "images")
     sparse = root / "sparse" / "0"
     sparse.mkdir(parents=True)
     cameras = f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} 8 6\n"
     (sparse / "cameras.txt").write_text(cameras)
-    images = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n"
-    for i, name in enumerate(NAMES):
-        images += " ".join(map(repr, (i + 1, *QUATERNIONS[i], *TRANSLATIONS[i], 1))) + f" {name}\n"
-        images += "8.0 6.0 -1\n" if i else "\n"
-    (sparse / "images.txt").write_text(images)
+    header = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n"
+    (sparse / "images.txt").write_text(images_txt([listed(name) for name in NAMES], header=header))
     points = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n"
     for i, (xyz, rgb, track) in enumerate(zip(POINTS, COLORS, TRACKS, strict=True)):
         points += " ".join(map(str, (i + 1, *xyz, *rgb, 0.5))) + "".join(f" {image} 0" for image in track) + "\n"
@@ -158,20 +174,20 @@ def llff(root: Path) -> Path:
     return root
 
 
-def blender(root: Path) -> Path:
+def blender(root: Path, listed: Callable[[str], str] = lambda name: f"./{name[:-4]}") -> Path:
     """Two training views and a test view, RGBA."""
     write_photos(root / "train", mode="RGBA")
     angle = 2 * math.atan(WIDTH / (2 * FOCAL))
     for split, views in (("train", (0, 1)), ("test", (2,))):
-        frames = [{"file_path": f"./train/{NAMES[i][0]}", "transform_matrix": opengl(i)} for i in views]
+        frames = [{"file_path": listed(f"train/{NAMES[i]}"), "transform_matrix": opengl(i)} for i in views]
         write_json(root / f"transforms_{split}.json", {"camera_angle_x": angle, "frames": frames})
     return root
 
 
-def nerfstudio(root: Path) -> Path:
+def nerfstudio(root: Path, listed: Callable[[str], str] = str) -> Path:
     """images/ and transforms.json with shared intrinsics and no distortion."""
     write_photos(root / "images")
-    frames = [{"file_path": f"images/{name}", "transform_matrix": opengl(i)} for i, name in enumerate(NAMES)]
+    frames = [{"file_path": listed(f"images/{name}"), "transform_matrix": opengl(i)} for i, name in enumerate(NAMES)]
     shared = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 8.0, "cy": 6.0, "w": WIDTH, "h": HEIGHT, "camera_model": "OPENCV"}
     write_json(root / "transforms.json", {**shared, "frames": frames})
     return root
@@ -192,9 +208,7 @@ def demo_on_disk(
     frames = []
     for i, frame in enumerate(views_of := demo.read(width=size[0], height=size[1], views=views, train=2).frames):
         write_png(root / f"images/{i}.png", frame.load())
-        matrix = np.linalg.inv(views_of[pose(i)].camera.world_to_camera.double().numpy()) @ np.diag(
-            [1.0, -1.0, -1.0, 1.0]
-        )
+        matrix = np.linalg.inv(views_of[pose(i)].camera.world_to_camera.double().numpy()) @ np.diag([1.0, -1, -1, 1])
         matrix[:3, 3] *= scale
         frames.append({"file_path": f"images/{i}.png", "transform_matrix": matrix.tolist()})
     camera = views_of[0].camera
@@ -210,10 +224,14 @@ def edit(file: Path, change: Callable[[dict[str, Any]], object]) -> None:
     write_json(file, value)
 
 
-GOOD: dict[str, Callable[[Path], Path]] = {
+GOOD: dict[str, Callable[..., Path]] = {
     "colmap": colmap_bin, "colmap_txt": colmap_txt, "blender": blender, "nerfstudio": nerfstudio,
 }  # fmt: skip
 """What writes each of them."""
+READERS: dict[str, Callable[..., Capture]] = {
+    "colmap": colmap.read, "colmap_txt": colmap.read, "blender": read_blender.read, "nerfstudio": read_nerfstudio.read,
+}  # fmt: skip
+"""What reads them."""
 
 
 def write_json(path: Path, value: object) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,9 +13,8 @@ import torch
 from PIL import Image
 
 from clear_strategies.commands.train import detect
-from clear_strategies.data.capture import Capture
 from clear_strategies.data.ply import write_points
-from clear_strategies.data.readers import blender, colmap, nerfstudio, photos
+from clear_strategies.data.readers import photos
 from clear_strategies.errors import DataError
 from tests.helpers import captures as tiny
 from tests.helpers.captures import FOCAL, HEIGHT, NAMES, WIDTH
@@ -22,11 +22,6 @@ from tests.helpers.captures import FOCAL, HEIGHT, NAMES, WIDTH
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "how-to" / "captures.md"
 ROW = re.compile(r"^\| (?P<tool>[^|]+) \| [^|]+ \| (?:`data=(?P<kind>\w+)`|–) \| [^|]+ \|$")
 ROWS = {found["tool"]: found["kind"] for line in PAGE.read_text().splitlines() if (found := ROW.match(line))}
-READ: dict[str, Callable[[Path], Capture]] = {
-    "colmap": colmap.read,
-    "nerfstudio": nerfstudio.read,
-    "blender": blender.read,
-}
 LENS = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2, "w": WIDTH, "h": HEIGHT}
 
 
@@ -45,10 +40,15 @@ def colmap4(root: Path) -> None:
 
 
 def reality_capture(root: Path) -> None:
+    """Capital letters, a byte order mark, lines as on Windows, and the photos beside them."""
     tiny.colmap_txt(root)
     for name in ("Cameras", "Images", "Points3D"):
-        (root / f"sparse/0/{name[0].lower()}{name[1:]}.txt").rename(root / f"{name}.txt")
-    (root / "sparse/0").rmdir()
+        text = (root / f"sparse/0/{name[0].lower()}{name[1:]}.txt").read_bytes()
+        (root / f"{name}.txt").write_bytes(b"\xef\xbb\xbf" + text.replace(b"\n", b"\r\n"))
+    shutil.rmtree(root / "sparse")
+    for photo in (root / "images").iterdir():
+        photo.rename(root / photo.name)
+    (root / "images").rmdir()
 
 
 def of_each_frame(root: Path) -> None:
@@ -56,26 +56,18 @@ def of_each_frame(root: Path) -> None:
     root.mkdir(parents=True)
     tiny.write_photos(root / "images")
     frames = [
-        {
-            **LENS,
-            "file_path": f"./images/{name}",
-            "depth_file_path": f"./depth/{name}",
-            "transform_matrix": tiny.opengl(i),
-        }
-        for i, name in enumerate(NAMES)
+        {**LENS, "file_path": f"./images/{n}", "depth_file_path": f"./depth/{n}", "transform_matrix": tiny.opengl(i)}
+        for i, n in enumerate(NAMES)
     ]
-    tiny.write_json(
-        root / "transforms.json",
-        {"camera_model": "OPENCV", "k1": 0, "frames": frames, "applied_transform": [[1, 0, 0, 0]]},
-    )
+    more = {"camera_model": "OPENCV", "k1": 0, "applied_transform": [[1, 0, 0, 0]]}
+    tiny.write_json(root / "transforms.json", {**more, "frames": frames})
 
 
 def nerfstudio_own(root: Path) -> None:
     tiny.nerfstudio(root)
     write_points(root / "sparse_pc.ply", torch.ones(2, 3), torch.zeros(2, 3))
-    tiny.edit(
-        root / "transforms.json", lambda v: v.update(ply_file_path="sparse_pc.ply", train_filenames=["images/a.png"])
-    )
+    more = {"ply_file_path": "sparse_pc.ply", "train_filenames": ["images/a.png"]}
+    tiny.edit(root / "transforms.json", lambda v: v.update(more))
 
 
 def instant_ngp(root: Path) -> None:
@@ -84,8 +76,7 @@ def instant_ngp(root: Path) -> None:
         {"file_path": f"./images/{name[:-4]}", "sharpness": 30.1, "transform_matrix": tiny.opengl(i)}
         for i, name in enumerate(NAMES)
     ]
-    angle = 2 * np.arctan(WIDTH / 2 / FOCAL)
-    lens = {**LENS, "camera_angle_x": angle, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0, "is_fisheye": False}
+    lens = {"camera_angle_x": 2 * np.arctan(WIDTH / 2 / FOCAL), "k1": 0.0, "k2": 0.0, "is_fisheye": False}
     tiny.write_json(root / "transforms.json", {**lens, "w": 16.0, "h": 12.0, "aabb_scale": 32, "frames": frames})
 
 
@@ -114,11 +105,8 @@ def test_a_tools_files_are_read_as_the_table_says(tool: str, tmp_path: Path) -> 
     root = tmp_path / "capture"
     WRITE[tool](root)
     assert detect(root) == ROWS[tool]
-    capture = READ[ROWS[tool]](root)
-    assert len(capture.frames) == 3
-    for i, frame in enumerate(capture.frames):
-        np.testing.assert_allclose(frame.camera.world_to_camera.numpy(), tiny.world_to_camera(i), atol=1e-12)
-        assert (frame.camera.fx, frame.camera.cx, frame.camera.width) == pytest.approx((FOCAL, WIDTH / 2, WIDTH))
+    capture = tiny.READERS[ROWS[tool]](root)
+    tiny.require_poses(capture)
     assert (capture.points is not None and len(capture.points.means) == 2) == (tool in POINTS)
 
 

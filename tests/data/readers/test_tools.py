@@ -14,27 +14,17 @@ import torch
 from PIL import Image
 
 from clear_strategies.commands.train import detect
-from clear_strategies.data.capture import Capture
 from clear_strategies.data.cloud import CloudSettings
-from clear_strategies.data.lenses import Lens
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.ply import write_points
 from clear_strategies.data.prepare import prepare
 from clear_strategies.data.priors import Bicubic
-from clear_strategies.data.readers import blender, colmap, demo, nerfstudio, photos
+from clear_strategies.data.readers import colmap, demo, nerfstudio, photos
 from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.errors import DataError
 from clear_strategies.jobs import scene
 from tests.helpers import captures as tiny
-from tests.helpers.captures import GOOD, NAMES
-from tests.stress.bad_inputs.scenes import READERS
-
-
-def poses_are_those_of_the_tiny_scene(capture: Capture) -> None:
-    assert len(capture.frames) == 3
-    for i, frame in enumerate(capture.frames):
-        np.testing.assert_allclose(frame.camera.world_to_camera.numpy(), tiny.world_to_camera(i), atol=1e-12)
-
+from tests.helpers.captures import GOOD, NAMES, READERS
 
 # ---- names: one rule for all readers
 
@@ -53,38 +43,16 @@ NAMED: dict[str, tuple[Callable[[str], str], Callable[[Path], object]]] = {
 }
 
 
-@pytest.mark.parametrize("kind", GOOD)
+@pytest.mark.parametrize("kind", ["colmap_txt", "blender", "nerfstudio"])
 @pytest.mark.parametrize("case", [*NAMED, "absolute"])
 def test_a_photo_is_found_however_its_name_is_written(kind: str, case: str, tmp_path: Path) -> None:
-    root = GOOD[kind](tmp_path / "scene")
-    folder = root / ("train" if kind == "blender" else "images")
+    folder = tmp_path / "scene" / ("train" if kind == "blender" else "images")
     rename, spoil = NAMED.get(case, (lambda name: f"{folder}/{Path(name).name}", lambda _: None))
-    if kind == "colmap":  # as text, whose names may have any length
-        poses = [(i + 1, *tiny.QUATERNIONS[i], *tiny.TRANSLATIONS[i], 1, rename(name)) for i, name in enumerate(NAMES)]
-        for file in (root / "sparse/0").glob("*.bin"):
-            file.unlink()
-        tiny.colmap_txt(tmp_path / "txt")
-        (tmp_path / "txt/sparse/0").replace(root / "sparse/0")
-        (root / "sparse/0/images.txt").write_text("".join(" ".join(map(str, pose)) + "\n\n" for pose in poses))
-    elif kind == "colmap_txt":
-        listing = root / "sparse/0/images.txt"
-        text = listing.read_text()
-        for name in NAMES:
-            text = text.replace(f" {name}\n", f" {rename(name)}\n")
-        listing.write_text(text)
-    else:
-        for file in root.glob("*.json"):
-            tiny.edit(
-                file,
-                lambda v: [
-                    f.update(file_path=rename(f["file_path"].removeprefix("./").removesuffix(".png") + ".png"))
-                    for f in v["frames"]
-                ],
-            )
+    root = GOOD[kind](tmp_path / "scene", rename)
     for name in NAMES:
         spoil(folder / name)
-    capture = READERS[kind.removesuffix("_txt")](root)
-    poses_are_those_of_the_tiny_scene(capture)
+    capture = READERS[kind](root)
+    tiny.require_poses(capture)
     assert [Path(frame.name).stem for frame in capture.frames] == ["a", "b", "c"]
 
 
@@ -145,22 +113,7 @@ def test_where_photos_have_an_ending_that_is_not_read_the_message_names_it(tmp_p
         nerfstudio.read(root)
 
 
-# ---- RealityCapture's model, and poses that no reader reads beside photos
-
-
-@pytest.mark.parametrize("photos_in", ["images", "."])
-def test_reality_captures_model_is_read_beside_the_photos(photos_in: str, tmp_path: Path) -> None:
-    made, root = tiny.colmap_txt(tmp_path / "made"), tmp_path / "export"
-    root.mkdir()
-    for name in ("Cameras", "Images", "Points3D"):
-        text = (made / f"sparse/0/{name[0].lower()}{name[1:]}.txt").read_text()
-        (root / f"{name}.txt").write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
-    tiny.write_photos(root / photos_in)
-    assert detect(root) == "colmap"
-    capture = colmap.read(root)
-    poses_are_those_of_the_tiny_scene(capture)
-    assert len(capture.points.means) == 2
-
+# ---- poses that no reader reads beside photos
 
 BESIDE: dict[str, tuple[str, str, str]] = {
     "transform_train.json": ("transform_train.json", '{"frames": []}', "clear-strategies train .*transform_train.json"),
@@ -222,18 +175,10 @@ def test_transforms_under_any_name_are_read_when_the_file_is_named(tmp_path: Pat
     file = tiny.nerfstudio(tmp_path) / "transforms.json"
     file = file.rename(tmp_path / "transform_train.json")
     assert detect(file) == "nerfstudio"
-    poses_are_those_of_the_tiny_scene(nerfstudio.read(file))
+    tiny.require_poses(nerfstudio.read(file))
 
 
 # ---- nothing is dropped in silence
-
-
-def images_txt(root: Path, names: tuple[str, ...], points: str = "", header: str = "") -> Path:
-    """images.txt in which each pose is followed by `points`."""
-    rows = [" ".join(map(str, (i + 1, *tiny.QUATERNIONS[i], *tiny.TRANSLATIONS[i], 1, n))) for i, n in enumerate(names)]
-    file = root / "sparse/0/images.txt"
-    file.write_text(header + "".join(f"{row}\n{points}" for row in rows))
-    return file
 
 
 @pytest.mark.parametrize("names", [NAMES, ("a photo 1.png", "b photo 2.png", "c photo 3.png")])
@@ -242,17 +187,18 @@ def test_images_without_a_line_of_points_are_all_read(names: tuple[str, ...], po
     root = tiny.colmap_txt(tmp_path)
     for old, new in zip(NAMES, names, strict=True):
         (root / "images" / old).rename(root / "images" / new)
-    images_txt(root, names, points)
-    poses_are_those_of_the_tiny_scene(colmap.read(root))
+    (root / "sparse/0/images.txt").write_text(tiny.images_txt(names, points))
+    tiny.require_poses(colmap.read(root))
 
 
 def test_of_a_line_that_could_be_a_pose_or_points_the_header_decides(tmp_path: Path) -> None:
     root, names = tiny.colmap_txt(tmp_path), ("0 0 1", "0 0 2", "0 0 3")
     for old, new in zip(NAMES, names, strict=True):
         (root / "images" / old).rename(root / "images" / f"{new}.png")
-    images_txt(root, names, header="# Number of images: 3, mean observations per image: 0\n")
-    poses_are_those_of_the_tiny_scene(colmap.read(root))
-    images_txt(root, names)
+    listing, header = root / "sparse/0/images.txt", "# Number of images: 3, mean observations per image: 0\n"
+    listing.write_text(tiny.images_txt(names, "", header))
+    tiny.require_poses(colmap.read(root))
+    listing.write_text(tiny.images_txt(names, ""))
     with pytest.raises(DataError, match=r"images\.txt: line 2: could be an image's pose or the 2D points"):
         colmap.read(root)
 
@@ -260,19 +206,12 @@ def test_of_a_line_that_could_be_a_pose_or_points_the_header_decides(tmp_path: P
 def test_a_text_model_that_has_fewer_images_than_its_header_says_is_told(tmp_path: Path, caplog) -> None:
     root = tiny.colmap_txt(tmp_path)
     (root / "sparse/0/points3D.txt").unlink()
-    images_txt(root, NAMES[:2], header="# Number of images: 3\n")
+    (root / "sparse/0/images.txt").write_text(tiny.images_txt(NAMES[:2], "", "# Number of images: 3\n"))
     assert len(colmap.read(root).frames) == 2
     (root / "sparse/0/points3D.txt").write_text("# Number of points: 9, mean track length: 2\n1 0 0 3 0 0 0 0.5 1 0\n")
     assert len(colmap.read(root).points.means) == 1
     assert "images.txt: its header says 3, and 2 are there" in caplog.text
     assert "points3D.txt: its header says 9, and 1 are there" in caplog.text
-
-
-def test_the_points_that_a_blender_file_names_are_read(tmp_path: Path) -> None:
-    root = tiny.blender(tmp_path)
-    write_points(root / "points3d.ply", torch.tensor([[1.0, 2, 3]]), torch.zeros(1, 3))
-    tiny.edit(root / "transforms_train.json", lambda value: value.update(ply_file_path="points3d.ply"))
-    assert blender.read(root).points.means.tolist() == [[1, 2, 3]]
 
 
 # ---- lenses: units, and COLMAP's camera models
@@ -301,15 +240,11 @@ def test_a_lens_in_units_of_the_image_is_refused(lens: dict[str, float], tmp_pat
     assert len(nerfstudio.read(root).frames) == 3  # the remedy
 
 
-PERSPECTIVE, FISHEYE = Lens(16, 12, 20, 20, 8, 6), Lens(16, 12, 20, 20, 8, 6, (0.1, 0.0, 0.0, 0.0), fisheye=True)
-SUPPORTED = {
-    "FOV": ((20, 20, 8, 6, 0), PERSPECTIVE), "SIMPLE_DIVISION": ((20, 8, 6, 0), PERSPECTIVE),
-    "DIVISION": ((20, 20, 8, 6, 0), PERSPECTIVE), "EUCM": ((20, 20, 8, 6, 0, 1), PERSPECTIVE),
-    "SIMPLE_FISHEYE": ((20, 8, 6), Lens(16, 12, 20, 20, 8, 6, fisheye=True)),
-    "FISHEYE": ((20, 20, 8, 6), Lens(16, 12, 20, 20, 8, 6, fisheye=True)),
-    "OPENCV_FISHEYE": ((20, 20, 8, 6, 0.1, 0, 0, 0), FISHEYE),
-    "THIN_PRISM_FISHEYE": ((20, 20, 8, 6, 0.1, *[0] * 7), FISHEYE),
-    "RAD_TAN_THIN_PRISM_FISHEYE": ((20, 20, 8, 6, 0.1, *[0] * 11), FISHEYE),
+SUPPORTED = {  # the parameters, and k1 of a fisheye
+    "FOV": ((20, 20, 8, 6, 0), None), "SIMPLE_DIVISION": ((20, 8, 6, 0), None), "DIVISION": ((20, 20, 8, 6, 0), None),
+    "EUCM": ((20, 20, 8, 6, 0, 1), None), "SIMPLE_FISHEYE": ((20, 8, 6), 0.0), "FISHEYE": ((20, 20, 8, 6), 0.0),
+    "OPENCV_FISHEYE": ((20, 20, 8, 6, 0.1, 0, 0, 0), 0.1), "THIN_PRISM_FISHEYE": ((20, 20, 8, 6, 0.1, *[0] * 7), 0.1),
+    "RAD_TAN_THIN_PRISM_FISHEYE": ((20, 20, 8, 6, 0.1, *[0] * 11), 0.1),
 }  # fmt: skip
 
 
@@ -330,17 +265,16 @@ def with_model(root: Path, model: str, parameters: tuple[float, ...], layout: st
 
 @pytest.mark.parametrize("model", SUPPORTED)
 def test_models_with_coefficients_of_zero_are_those_that_opencv_has(model: str, tmp_path: Path) -> None:
-    parameters, lens = SUPPORTED[model]
+    parameters, k1 = SUPPORTED[model]
     frame = colmap.read(with_model(tmp_path, model, parameters, "txt")).frames[0]
-    assert (frame.lens.fx, frame.lens.cx, frame.lens.fisheye) == (20, 8, lens.fisheye)
+    assert (frame.lens.fx, frame.lens.cx, frame.lens.fisheye) == (20, 8, k1 is not None)
     import pycolmap
 
     camera = pycolmap.Camera(model=model, width=16, height=12, params=parameters)
     ray = np.array([[0.3, -0.2, 1.0]])
     theirs = camera.img_from_cam(ray)[0]
     angle = math.atan2(math.hypot(0.3, 0.2), 1.0)
-    k1 = lens.distortion[0] if lens.distortion else 0.0
-    along = angle * (1 + k1 * angle**2) if lens.fisheye else math.tan(angle)
+    along = math.tan(angle) if k1 is None else angle * (1 + k1 * angle**2)
     ours = np.array([8, 6]) + 20 * along * np.array([0.3, -0.2]) / math.hypot(0.3, 0.2)
     np.testing.assert_allclose(theirs, ours, atol=1e-6)
 

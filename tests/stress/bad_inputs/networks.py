@@ -78,7 +78,10 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "SR image without its suffix": (_images(lambda sr: None, suffix="_x4"), "a: has no SR image a_x4"),
     "two SR images of one view": (_images(lambda sr: (sr / "a.jpg").write_bytes(b"twin")), "for one view: keep one"),
     "one SR image of two views": (_two_views_of_one_image, "would be that of two views"),
-    "SR image of the LR size": (_images(lambda sr: write_png(sr / "a.png", photo(*_LR))), "is 12x8 where 48x32 is expected"),
+    "SR image of the LR size": (
+        _images(lambda sr: write_png(sr / "a.png", photo(*_LR))),
+        "is 12x8 where 48x32 is expected",
+    ),
     "SR image turned": (_images(lambda sr: write_png(sr / "a.png", photo(48, 32))), "a.png: size: is 32x48"),
 }
 INPUTS = [BadInput("SR model", name, give, pattern) for name, (give, pattern) in _CASES.items()]

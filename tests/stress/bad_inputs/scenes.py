@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -11,30 +10,22 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from clear_strategies.data.capture import Capture
-from clear_strategies.data.readers import blender, colmap, nerfstudio
 from tests.helpers import captures as tiny
 from tests.stress.bad_inputs import BadInput
 
-READERS: dict[str, Callable[[Path], Capture]] = {
-    "colmap": colmap.read,
-    "blender": blender.read,
-    "nerfstudio": nerfstudio.read,
-}
 Spoil = Callable[[Path], object]
 
 
 def case(name: str, good: str, spoil: Spoil, pattern: str) -> BadInput:
     """A sound scene by its name in `GOOD`, after a change to its folder."""
-    surface = good.removesuffix("_txt")
 
     def give(folder: Path) -> None:
         root = tiny.GOOD[good](folder / "scene")
         spoil(root)
-        for frame in READERS[surface](root).frames:
+        for frame in tiny.READERS[good](root).frames:
             frame.load()
 
-    return BadInput(surface, name, give, pattern)
+    return BadInput(good.removesuffix("_txt"), name, give, pattern)
 
 
 def remove(name: str) -> Spoil:
@@ -79,13 +70,7 @@ def replace(name: str, old: str, new: str) -> Spoil:
 
 def edit(name: str, change: Callable[[dict[str, Any]], object]) -> Spoil:
     """Change a JSON file's object in place."""
-
-    def spoil(root: Path) -> None:
-        value = json.loads((root / name).read_text())
-        change(value)
-        tiny.write_json(root / name, value)
-
-    return spoil
+    return lambda root: tiny.edit(root / name, change)
 
 
 def edit_frame(name: str, **values: object) -> Spoil:
