@@ -68,14 +68,6 @@ def require_text(names: Iterable[str]) -> None:
             raise DataError(shown, "name", "must be UTF-8, has another byte", "rename this folder or photo")
 
 
-def by_stem(paths: Iterable[Path]) -> dict[str, list[Path]]:
-    """The files by their names without endings."""
-    stems: dict[str, list[Path]] = {}
-    for path in paths:
-        stems.setdefault(path.stem, []).append(path)
-    return stems
-
-
 def named(folder: Path, name: str) -> Path:
     """What lies in a folder under this name, whatever the case of its letters; a path to nothing where it does not."""
     path = folder / name

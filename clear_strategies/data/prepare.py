@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -27,7 +27,7 @@ from clear_strategies.data.lenses import forget_maps
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.priors import Bicubic, Prior
 from clear_strategies.data.priors.cache import kept_network_of
-from clear_strategies.data.priors.interface import SuperResolved, super_resolved, warn_if_far_from_lr
+from clear_strategies.data.priors.interface import super_resolved, warn_if_far_from_lr
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.scene_notes import scene_notes, size_of
 from clear_strategies.data.shown import require_shown
@@ -54,14 +54,14 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     """
     train_frames, test_frames = split(capture, views)
     frames = [*train_frames, *(replace(frame, transparency=None) for frame in test_frames)]  # only training needs it
-    lr_files = check_headers(frames, views)
+    maker = _Views(capture, views, prior, check_headers(frames, views))
     require_source(cloud, capture.points)
     _check_places(capture, [frame.camera for frame in train_frames], cloud)
     progress = Progress("photos and their SR images", "photos", len(frames))
     made, work_log = list[View](), WorkLog()
     with work_log.stage("photos and SR images"):
         for frame, photo in zip(frames, photos_of(frames, views), strict=True):
-            made.append(_view(frame, photo, capture, views, prior, lr_files, required=len(made) < len(train_frames)))
+            made.append(maker.view(frame, photo, required=len(made) < len(train_frames)))
             progress(len(made))
     train, test = tuple(made[: len(train_frames)]), tuple(made[len(train_frames) :])
     require_shown(train)
@@ -126,68 +126,55 @@ def at_hr(capture: Capture, views: ViewSettings) -> Capture:
     return replace(capture, frames=tuple(replace(f, load=partial(pixels, f)) for f in capture.frames))
 
 
-def _lr(frame: Frame, photo: Photo, capture: Capture, views: ViewSettings, lr_files: Mapping[str, Path]) -> Photo:
-    """The LR photo of a frame; `photo` as `photos_of` gives it."""
-    if views.photos_are == "lr":
-        return photo
-    camera = photo.camera.scaled(1 / views.sr_scale)
-    if frame.name not in lr_files:
-        down = partial(images.downsample, factor=views.sr_scale, kernel=views.downsample)
-        return Photo(camera, down(photo.image), transparency=_of_layer(down, photo.transparency))
-    file = lr_files[frame.name]
-    image = read_image(file, background=capture.background, expect=(camera.width, camera.height))
-    check = f"{file} shows this view, undistorted as data.save_lr writes it"
-    warn_if_far_from_lr(f"{frame.name}: the photo", photo.image, image, views.sr_scale, check)
-    return Photo(camera, image)
+@dataclass(frozen=True, slots=True)
+class _Views:
+    """What makes the views of a capture; photos as `photos_of` gives them."""
 
+    capture: Capture
+    settings: ViewSettings
+    prior: Prior
+    lr_files: Mapping[str, Path]
 
-def _view(
-    frame: Frame,
-    photo: Photo,
-    capture: Capture,
-    views: ViewSettings,
-    prior: Prior,
-    lr_files: Mapping[str, Path],
-    *,
-    required: bool,
-) -> View:
-    """The view of a frame; `photo` as `photos_of` gives it. Unless it is `required`, bicubic replaces a missing SR image."""
-    lr = _lr(frame, photo, capture, views, lr_files)
-    hr_camera, truth = (photo.camera.scaled(views.sr_scale), None) if lr is photo else (photo.camera, photo.image)
-    if views.photos_are == "both":
-        hr, sr_source, disagreement = replace(photo, shown=None), "the photos themselves", None
-    else:
-        sr, sr_source = _super_resolved(frame.name, lr, views, prior, required=required)
-        hr = Photo(hr_camera, sr.image, transparency=_enlarged(lr.transparency, frame.name, prior, views.sr_scale))
-        disagreement = sr.disagreement
-    view = View(
-        frame.name, lr, hr, truth, sr_source=sr_source, disagreement=disagreement, background=capture.background
-    )
-    shown = None if photo.shown is None else photo.reduced(photo.camera.width // lr.camera.width).shown
-    return view if shown is None else view.hiding(shown)
+    def view(self, frame: Frame, photo: Photo, *, required: bool) -> View:
+        """The view of a frame. Unless it is `required`, bicubic replaces an SR image that the prior lacks."""
+        lr, factor, prior = self.lr(frame, photo), self.settings.sr_scale, self.prior
+        hr_camera, truth = (photo.camera.scaled(factor), None) if lr is photo else (photo.camera, photo.image)
+        hr, source, disagreement = replace(photo, shown=None), "the photos themselves", None
+        if self.settings.photos_are != "both":
+            try:
+                sr = super_resolved(prior, frame.name, lr.image, factor)
+            except DataError as missing:
+                if required:
+                    raise
+                _log.info("%s: no SR image for this test view (%s); bicubic replaces it.", frame.name, missing.problem)
+                prior = Bicubic()
+                sr = super_resolved(prior, frame.name, lr.image, factor)
+            hr = Photo(hr_camera, sr.image, transparency=self.enlarged(lr.transparency, frame.name))
+            source, disagreement = prior.label, sr.disagreement
+        background = self.capture.background
+        view = View(frame.name, lr, hr, truth, source, disagreement=disagreement, background=background)
+        shown = None if photo.shown is None else photo.reduced(photo.camera.width // lr.camera.width).shown
+        return view if shown is None else view.hiding(shown)
 
+    def lr(self, frame: Frame, photo: Photo) -> Photo:
+        factor, camera = self.settings.sr_scale, photo.camera
+        if self.settings.photos_are == "lr":
+            return photo
+        camera = camera.scaled(1 / factor)
+        if frame.name not in self.lr_files:
+            down = partial(images.downsample, factor=factor, kernel=self.settings.downsample)
+            return Photo(camera, down(photo.image), transparency=_of_layer(down, photo.transparency))
+        file = self.lr_files[frame.name]
+        image = read_image(file, background=self.capture.background, expect=(camera.width, camera.height))
+        check = f"{file} shows this view, undistorted as data.save_lr writes it"
+        warn_if_far_from_lr(f"{frame.name}: the photo", photo.image, image, factor, check)
+        return Photo(camera, image)
 
-def _super_resolved(
-    name: str, lr: Photo, views: ViewSettings, prior: Prior, *, required: bool
-) -> tuple[SuperResolved, str]:
-    """The SR image of a view and its source; `required` as of `_view`."""
-    try:
-        return super_resolved(prior, name, lr.image, views.sr_scale), prior.label
-    except DataError as missing:
-        if required:
-            raise
-        _log.info("%s: no SR image for this test view (%s); bicubic replaces it.", name, missing.problem)
-        bicubic = Bicubic()
-        return super_resolved(bicubic, name, lr.image, views.sr_scale), bicubic.label
-
-
-def _enlarged(
-    transparency: Float[Tensor, "h w"] | None, name: str, prior: Prior, factor: int
-) -> Float[Tensor, "H W"] | None:
-    """Transparency at HR, enlarged by the prior's network; by bicubic where there is no network, or every pixel is opaque."""
-    transparent = transparency is not None and bool(transparency.any())
-    enlarge = (kept_network_of(prior) if transparent else None) or Bicubic()
-    return _of_layer(lambda image: enlarge(name, image, factor), transparency)
+    def enlarged(self, transparency: Float[Tensor, "h w"] | None, name: str) -> Float[Tensor, "H W"] | None:
+        """Transparency at HR, by the prior's network; by bicubic where there is no network, or every pixel is opaque."""
+        transparent = transparency is not None and bool(transparency.any())
+        enlarge = (kept_network_of(self.prior) if transparent else None) or Bicubic()
+        return _of_layer(lambda image: enlarge(name, image, self.settings.sr_scale), transparency)
 
 
 def _of_layer(

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.data.photo_files import SUFFIXES, image_size, write_png
-from clear_strategies.data.photo_folders import by_stem, list_images
+from clear_strategies.data.photo_folders import list_images
 from clear_strategies.errors import DataError
 
 
@@ -62,7 +62,9 @@ class ViewFiles:
         below, stem = self.folder / view.rpartition("/")[0], _file(view) + self.suffix
         folder = below if below.is_dir() else self.folder
         if stem not in self._listed.get(folder, {}):
-            self._listed[folder] = by_stem(list_images(folder))
+            self._listed[folder] = {}
+            for path in list_images(folder):
+                self._listed[folder].setdefault(path.stem, []).append(path)
         files = self._listed[folder].get(stem, [])
         if not files:
             raise DataError(folder, _file(view), f"has no {self.what} {stem} ({', '.join(SUFFIXES)})", self.remedy)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -60,19 +59,3 @@ def partners(cameras: Sequence[Camera]) -> list[list[int]]:
 def distance_to(camera: Camera, means: Float[Tensor, "N 3"]) -> float:
     """From the camera to the middle of the points, the median of each coordinate; 1 for a camera that is there."""
     return float(torch.linalg.vector_norm(camera.center.double() - means.median(dim=0).values.cpu().double())) or 1.0
-
-
-def moved(camera: Camera, step: Float[Tensor, " 3"], *, aim: float) -> Camera:
-    """The camera moved by `step`, along its axes right, down and forward, and turned to keep in its middle what it saw there at
-    the depth `aim`; in world units.
-    """
-    pose = camera.world_to_camera.double()
-    axes, centre = pose[:3, :3], camera.center.double()
-    target = centre + axes[2] * aim
-    centre = centre + axes.T @ step
-    z = torch.nn.functional.normalize(target - centre, dim=0)
-    x = torch.nn.functional.normalize(torch.linalg.cross(axes[1], z), dim=0)
-    axes = torch.stack((x, torch.linalg.cross(z, x), z))
-    turned = torch.eye(4, dtype=torch.float64)
-    turned[:3, :3], turned[:3, 3] = axes, -axes @ centre
-    return replace(camera, world_to_camera=turned.to(camera.world_to_camera))

@@ -17,7 +17,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo
-from clear_strategies.geometry.cameras import moved
 from clear_strategies.geometry.projection import (
     back_project,
     inside_of,
@@ -114,7 +113,16 @@ def moved_aside(camera: Camera, distance: float, reach: float, generator: torch.
     length = torch.rand((), generator=generator, dtype=torch.float64)
     direction = direction / torch.linalg.vector_norm(direction) * length
     direction[2] *= _ALONG
-    return moved(camera, direction * reach * distance, aim=distance)
+    pose = camera.world_to_camera.double()
+    axes, centre = pose[:3, :3], camera.center.double()
+    target = centre + axes[2] * distance
+    centre = centre + axes.T @ (direction * reach * distance)
+    z = F.normalize(target - centre, dim=0)
+    x = F.normalize(torch.linalg.cross(axes[1], z), dim=0)
+    axes = torch.stack((x, torch.linalg.cross(z, x), z))
+    turned = torch.eye(4, dtype=torch.float64)
+    turned[:3, :3], turned[:3, 3] = axes, -axes @ centre
+    return replace(camera, world_to_camera=turned.to(camera.world_to_camera))
 
 
 def _source(photo: Photo, depth_map: DepthMap, background: Color) -> _Source:

@@ -42,7 +42,6 @@ _NEARLY_ALL: Final = 0.9  # of the pairs
 _TURN: Final = 0.03  # entries by which a map between two photos may differ from a turn's, as distortion makes it
 _LISTED: Final = 3  # photos without a pose in the warning, at most
 _DIAGONAL_35MM: Final = math.hypot(36, 24)  # mm
-_MEGA: Final = 1 << 20
 _DISTANCES: Final = 4  # bytes of each pair of features that are compared
 _MEMORY: Final = 4 << 30  # bytes that all threads together may take in matching
 
@@ -78,10 +77,7 @@ def reconstruct(root: Path, photos: Mapping[Path, float | None], folder: Path, s
     pycolmap = _pycolmap()
     folder.parent.mkdir(parents=True, exist_ok=True)
     count = len(photos)
-    _log.info(
-        "%s: estimating the poses of %d photos: up to %d features each, %d pairs, about %d MB in matching.",
-        root, count, settings.max_features, count * (count - 1) // 2, settings.matchers * settings.memory // _MEGA,
-    )  # fmt: skip
+    _log.info("%s: estimating the poses of %d photos, up to %d features each.", root, count, settings.max_features)
     try:
         with tempfile.TemporaryDirectory(prefix=f"{folder.name}.", dir=folder.parent) as work:
             models = sorted(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -104,7 +105,5 @@ def _best_per_square(
     square, confidence = squares.reshape(-1), depth_map.confidence.cpu().reshape(-1)
     free = torch.nonzero((confidence > 0) & ~covered[square])[:, 0]
     order = free[torch.argsort(confidence[free], descending=True, stable=True)]
-    order = order[torch.argsort(square[order], stable=True)]
-    first = torch.ones(len(order), dtype=torch.bool)
-    first[1:] = square[order[1:]] != square[order[:-1]]
-    return order[first]
+    _, first = np.unique(square[order].numpy(), return_index=True)
+    return order[torch.from_numpy(first)]
