@@ -34,7 +34,7 @@ from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.objective import Objective
 from clear_strategies.merging.skips import Skips
 from clear_strategies.schedules import REFERENCE_ITERATIONS, scaled
-from clear_strategies.settings import CHANGES_NO_RESULT, TARGET, build, with_defaults
+from clear_strategies.settings import CHANGES_NO_RESULT, TARGET, build, missing, with_defaults
 from clear_strategies.strategies.base import Strategy
 
 _PACKAGE: Final = Path(__file__).resolve().parent
@@ -125,8 +125,8 @@ def tree(config: DictConfig, without: Iterable[str] = ()) -> dict[str, Any]:
         SettingError: an interpolation leads to nothing, or to a value that is missing.
     """
     values: dict[str, Any] = OmegaConf.to_container(config)  # type: ignore[assignment]
-    if missing := next((key for key, value in flat(values).items() if value == "???"), None):
-        raise SettingError(f"{missing}: is needed and missing. Add {missing}=….")
+    if (absent := next((key for key, value in flat(values).items() if value == "???"), None)) is not None:
+        raise missing(absent)
     try:
         values = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
     except OmegaConfBaseException as error:

@@ -13,6 +13,7 @@ import logging
 import os
 import signal
 import sys
+from importlib import import_module
 
 from clear_strategies import commands
 from clear_strategies.jobs import exit_codes
@@ -23,7 +24,8 @@ def main() -> None:
     atexit.register(gc.freeze)  # else Python looks through all of torch's objects before it ends, for 0.3 s
     logging.captureWarnings(True)  # of libraries: they are for run.log
     try:
-        (commands.named(sys.argv[1:]) or _of_hydra)()
+        command = commands.named(sys.argv[1:])
+        command() if command is not None else import_module("clear_strategies.hydra_app").main()
         sys.stdout.flush()
     except BrokenPipeError:  # who read the output has left, as head does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left of it goes there when Python ends
@@ -33,12 +35,6 @@ def main() -> None:
             raise
         sys.stderr.write(f"{ending.message}\n")  # logging is set up for jobs only
         sys.exit(ending.code)
-
-
-def _of_hydra() -> None:
-    from clear_strategies import hydra_app
-
-    hydra_app.main()
 
 
 if __name__ == "__main__":

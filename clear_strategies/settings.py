@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import difflib
 import functools
+import importlib
 import inspect
 import math
-import pkgutil
 import types
 import typing
 import warnings
@@ -87,10 +87,15 @@ def build(node: Any, key: str = "") -> Any:
     if isinstance(node, list):
         return [build(value, f"{key}[{i}]") for i, value in enumerate(node)]
     if node == _MISSING:
-        raise SettingError(f"{key}: is needed and missing. Add {key}=….")
+        raise missing(key)
     if isinstance(node, float) and not math.isfinite(node):
         raise SettingError(f"{key}: must be a finite number, got {node}.")
     return node
+
+
+def missing(key: str) -> SettingError:
+    """The error for a setting that has no default."""
+    return SettingError(f"{key}: is needed and missing. Add {key}=….")
 
 
 def _called(node: Mapping[str, Any], key: str) -> Any:
@@ -113,8 +118,8 @@ def _called(node: Mapping[str, Any], key: str) -> Any:
     if node.get(_PARTIAL):
         return partial
     needed = {name for name, p in parameters.items() if p.default is _EMPTY and p.kind not in _VARIADIC}
-    if missing := sorted(needed - set(arguments)):
-        raise SettingError(f"{_joined(key, missing[0])}: is needed and missing. Add {_joined(key, missing[0])}=….")
+    if absent := sorted(needed - set(arguments)):
+        raise missing(_joined(key, absent[0]))
     try:
         return partial()
     except DataError:
@@ -133,7 +138,8 @@ def _with_key(message: str, key: str, parameters: Mapping[str, Any]) -> str:
 def _located(target: Any) -> Callable[..., Any]:
     """The class or function of a dotted name; an ImportError or AttributeError where it is not there."""
     try:
-        function = pkgutil.resolve_name(target)
+        module, _, name = str(target).rpartition(".")
+        function = getattr(importlib.import_module(module), name)
         inspect.signature(function)
     except (ValueError, TypeError) as error:  # no name, no function, or one that is built in
         raise ImportError(f"it is no class or function whose parameters are known: {one_line(error)}") from error

@@ -6,17 +6,17 @@ its peak. Photos are those of the demo; of a run of them the processor time coun
 
 from __future__ import annotations
 
-import math
 import os
 import resource
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import Any, Final
 
+import numpy as np
 import pandas as pd
 import torch
 
@@ -37,14 +37,8 @@ _RUN: Final = (
 
 
 def measure(
-    results: Results,
-    *,
-    gaussians: Sequence[int],
-    widths: Sequence[int],
-    photos: Sequence[int],
-    iterations: int,
-    repeats: int,
-) -> None:
+    results: Results, *, gaussians: Sequence[int], widths: Sequence[int], photos: Sequence[int], iterations: int, repeats: int
+) -> None:  # fmt: skip
     """Measure each size.
 
     Args:
@@ -59,7 +53,8 @@ def measure(
         rows = [one.submit(_iteration, *size, repeats, torch.get_num_threads()).result() for size in sizes]
     rows += [_run(n, iterations) for n in sorted(photos)]
     table = pd.DataFrame(rows, columns=["of", "size", "ms", "mib"])
-    table["exponent"] = list(_exponents(rows))
+    steps = np.log(table[["ms", "size"]].astype(float)).groupby(table["of"], sort=False).diff()
+    table["exponent"] = steps["ms"] / steps["size"]
     results.tables["scale"] = table
     size = f"{_WIDTH}x{_WIDTH * 3 // 4}"
     results.note(
@@ -89,8 +84,3 @@ def _run(photos: int, iterations: int) -> tuple[Any, ...]:
     if child.returncode:
         raise DataError("--photos", str(photos), f"its run ended with code {child.returncode}", " ".join(program[1:-1]))
     return "photos", photos, 1e3 * (used.ru_utime + used.ru_stime), used.ru_maxrss / _MIB
-
-
-def _exponents(rows: Sequence[tuple[Any, ...]]) -> Iterator[float]:
-    for (of, size, ms, _), (of_before, size_before, ms_before, _) in zip(rows, [("", 0, 0, 0), *rows], strict=False):
-        yield math.log(ms / ms_before) / math.log(size / size_before) if of == of_before else math.nan

@@ -86,10 +86,7 @@ def _photos(capture: Capture) -> dict[str, Callable[[], Any]]:
 
 
 def load(
-    data: DataSettings,
-    prior: PriorSettings,
-    seed: int,
-    decorate: Callable[[Prior], Prior] = lambda prior: prior,
+    data: DataSettings, prior: PriorSettings, seed: int, decorate: Callable[[Prior], Prior] = lambda prior: prior
 ) -> Scene:
     """Read the data set and prepare its views and its initial points.
 
@@ -99,8 +96,12 @@ def load(
     capture, views = read(data, prior)
     if data.save_lr is not None:
         chosen: Prior = Bicubic()  # the images that the prior itself reads may not exist yet
+    elif isinstance(prior, AutoPrior):
+        chosen = prior.of(at_hr(capture, views), views.sr_scale)
+    elif isinstance(prior, functools.partial):
+        chosen = prior(truth=_photos(at_hr(capture, views)))
     else:
-        chosen = _chosen(prior, at_hr(capture, views), views.sr_scale)
+        chosen = cast("Prior", prior)
     scene = prepare(capture, views, decorate(cached(chosen)), data.cloud, seed=seed)
     # Logged once the photos are known to be usable.
     if isinstance(prior, AutoPrior) and data.save_lr is None and views.photos_are != "both":
@@ -119,22 +120,13 @@ def read(data: DataSettings, prior: PriorSettings) -> tuple[Capture, ViewSetting
     if placed < _ENOUGH * photos:
         few = f"{placed} of {photos} photos ({placed / photos:.0%}) have a pose, and the others are not used: {MORE_PHOTOS}"
         capture = replace(capture, notes={**capture.notes, FEW_PLACED: few})
-    auto = isinstance(prior, AutoPrior) and data.save_lr is None
-    return within_limit(capture, data.views, reaches=_reach(prior, auto), super_resolve=not auto)
+    auto, network = isinstance(prior, AutoPrior) and data.save_lr is None, network_of(prior)
 
+    def reaches(factor: int) -> bool:
+        """Of an unknown prior only `sr_scale` is expected."""
+        return factor in factors(network.model) if isinstance(network, Ncnn) else auto or isinstance(prior, Bicubic)
 
-def _chosen(prior: PriorSettings, capture: Capture, factor: int) -> Prior:
-    if isinstance(prior, AutoPrior):
-        return prior.of(capture, factor)
-    return prior(truth=_photos(capture)) if isinstance(prior, functools.partial) else cast("Prior", prior)
-
-
-def _reach(prior: PriorSettings, auto: bool) -> Callable[[int], bool]:
-    """Whether a prior enlarges by a factor; of an unknown one only `sr_scale` is expected."""
-    network = network_of(prior)
-    if isinstance(network, Ncnn):
-        return lambda factor: factor in factors(network.model)
-    return lambda _: auto or isinstance(prior, Bicubic)
+    return within_limit(capture, data.views, reaches=reaches, super_resolve=not auto)
 
 
 def _remedy(factor: int) -> str:

@@ -79,13 +79,6 @@ class Truth:
         return ImageScores(psnr, _ssim(image, self.image, self.shown), gmsd, _blur(grey) - self.blur)
 
 
-def score(
-    image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None = None
-) -> ImageScores:
-    """`Truth(truth, shown).score(image)`."""
-    return Truth(truth, shown).score(image)
-
-
 def mean_scores(scores: Sequence[ImageScores]) -> ImageScores | None:
     """The mean of each number; None for an empty sequence."""
     if not scores:

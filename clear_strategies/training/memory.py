@@ -1,7 +1,4 @@
-"""The memory of training: an estimate before the first iteration, by which a run that cannot fit is refused at once.
-
-What the process holds already, the photos and what loading them took, is measured; what training adds is estimated.
-"""
+"""The memory of training: what the process holds is measured, what training adds is estimated, and what cannot fit is refused."""
 
 from __future__ import annotations
 
@@ -25,15 +22,13 @@ _PIXEL: Final = 168  # bytes of an iteration per pixel of HR: the render, its co
 
 
 def require(state: TrainState, limit: int | None) -> str:
-    """Refuse a run whose first Gaussians do not fit, and warn where it cannot grow as far as it may; returns a line for the plan.
-
-    Args:
-        limit: MiB, `fit.memory`; None: what is free on this machine, if that is known.
+    """Refuse a run whose first Gaussians do not fit into `limit` MiB (None: what is free on this machine, if that is known), and
+    warn where it cannot grow as far as it may; returns a line for the plan.
     """
     cuda, n, most = state.device.type == "cuda", len(state.field), state.density.cap
     now = torch.cuda.memory_allocated(state.device) if cuda else system_bytes("/proc/self/status", "VmRSS") or 0
-    each = _COPIES * sum(x.nbytes for x in state.field.raw().values()) // n + _GAUSSIAN
-    each *= 1 if state.second is None else 2
+    fields = 1 if state.second is None else 2
+    each = fields * (_COPIES * sum(x.nbytes for x in state.field.raw().values()) // n + _GAUSSIAN)
     fixed = now + _PIXEL * max(view.hr.image[..., 0].numel() for view in state.views)
     start, grown = ((fixed + each * count) >> 20 for count in (n, most or n))
     free = torch.cuda.mem_get_info()[0] if cuda else system_bytes("/proc/meminfo", "MemAvailable")
@@ -45,9 +40,8 @@ def require(state: TrainState, limit: int | None) -> str:
             "lower fit.max_degree or data.cloud.max_points, or raise fit.memory."
         )
     if allowed is not None and grown > allowed:
-        _log.warning(
-            "%d Gaussians, the most that there may be, need about %d MiB, and %d MiB %s.", most, grown, allowed, source
-        )
+        need = f"{most} Gaussians, the most that there may be, need about {grown} MiB"
+        _log.warning("%s, and %d MiB %s.", need, allowed, source)
     return f"about {start} MiB at the start, {each / 1024:.1f} KiB for each further Gaussian"
 
 

@@ -10,13 +10,7 @@ from clear_strategies.errors import SettingError
 FPS: Final = 24.0  # of a video along a path
 
 
-def missing() -> str | None:
-    """Why no viewer can be shown, with the remedy; None where the extra [view] is installed."""
-    lacks = [name for name in ("viser", "nerfview", "splines") if find_spec(name) is None]
-    return f"the viewer needs {' and '.join(lacks)}: pip install 'clear-strategies[view]'" if lacks else None
-
-
 def require_viewer() -> None:
     """Raise a SettingError where one of the viewer's libraries is not installed."""
-    if (problem := missing()) is not None:
-        raise SettingError(f"{problem}.")
+    if lacks := [name for name in ("viser", "nerfview", "splines") if find_spec(name) is None]:
+        raise SettingError(f"the viewer needs {' and '.join(lacks)}: pip install 'clear-strategies[view]'.")

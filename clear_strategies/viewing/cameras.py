@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import msgspec
 import numpy as np
@@ -75,13 +75,16 @@ def at_most(camera: Camera, longest: int | None) -> Camera:
     return resized(camera, *(max(2, 2 * round(times * size / 2)) for size in (camera.width, camera.height)))
 
 
+_Vector = tuple[Number, Number, Number]
+
+
 class _Entry(msgspec.Struct):
     width: Number
     height: Number
     fx: Number
     fy: Number
-    rotation: list[Any]
-    position: tuple[Number, Number, Number]
+    rotation: tuple[_Vector, _Vector, _Vector]
+    position: _Vector
     cx: Number | None = None
     cy: Number | None = None
     img_name: str | None = None
@@ -90,12 +93,8 @@ class _Entry(msgspec.Struct):
 
 
 def _saved_camera(path: Path, i: int, entry: _Entry) -> SavedCamera:
-    try:
-        rotation = np.array(entry.rotation, float).reshape(3, 3)
-    except (TypeError, ValueError) as error:
-        raise DataError(path, f"[{i}].rotation", f"must be a 3x3 matrix ({error})", "write the file again") from error
     width, height = round(entry.width), round(entry.height)
-    pose = rigid_inverse(path, f"[{i}].rotation", rotation, np.array(entry.position))
+    pose = rigid_inverse(path, f"[{i}].rotation", np.array(entry.rotation), np.array(entry.position))
     cx = width / 2 if entry.cx is None else entry.cx
     cy = height / 2 if entry.cy is None else entry.cy
     try:

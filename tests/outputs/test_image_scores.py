@@ -15,8 +15,12 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from clear_strategies.core import images
-from clear_strategies.outputs.image_scores import PSNR_CAP, ImageScores, score
+from clear_strategies.outputs.image_scores import PSNR_CAP, ImageScores, Truth
 from tests.helpers.image_files import noise
+
+
+def score(image: Tensor, truth: Tensor, shown: Tensor | None = None) -> ImageScores:
+    return Truth(truth, shown).score(image)
 
 
 def grey(level: float, height: int = 16, width: int = 16) -> Tensor:
@@ -98,9 +102,9 @@ def test_an_image_that_is_not_finite_has_no_score(poison: float) -> None:
 
 
 def test_images_of_different_or_tiny_size_are_refused() -> None:
-    unchecked = inspect.unwrap(score)  # else the annotations, checked in tests only, speak first
+    unchecked = inspect.unwrap(Truth.score)  # else the annotations, checked in tests only, speak first
     with pytest.raises(ValueError, match=r"the same size, got \(16, 16, 3\) and \(16, 18, 3\)"):
-        unchecked(grey(0.5), grey(0.5, 16, 18))
+        unchecked(Truth(grey(0.5, 16, 18)), grey(0.5))
     with pytest.raises(ValueError, match=r"at least 12 pixels on each side, got \(11, 16, 3\)"):
         score(grey(0.5, 11), grey(0.5, 11))
 

@@ -17,7 +17,7 @@ from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.scene import Scene
 from clear_strategies.outputs import metrics
-from clear_strategies.outputs.image_scores import PSNR_CAP, ImageScores, score
+from clear_strategies.outputs.image_scores import PSNR_CAP, ImageScores, Truth
 from clear_strategies.outputs.metrics import NOTE, Evaluation, Table
 from clear_strategies.outputs.score_table import describe
 from rasterizers.interface import Camera
@@ -42,8 +42,8 @@ def test_each_view_is_scored_by_method_and_the_mean_is_over_views_if_there_are_a
     evaluation = metrics.evaluate(scene((a,), (a, b)), lambda camera: a.truth)  # type: ignore[arg-type,return-value]
     assert set(evaluation.renders) == {"a", "b"}
     assert evaluation.test["a"]["ours"].psnr == PSNR_CAP
-    assert evaluation.test["b"]["bicubic"] == score(images.upsample(b.lr.image, 4), noise(1, 48, 64))
-    assert evaluation.test["b"]["prior"] == score(b.hr.image, noise(1, 48, 64))
+    assert evaluation.test["b"]["bicubic"] == Truth(noise(1, 48, 64)).score(images.upsample(b.lr.image, 4))
+    assert evaluation.test["b"]["prior"] == Truth(noise(1, 48, 64)).score(b.hr.image)
     mean = evaluation.mean("test")
     assert mean.psnr == pytest.approx((PSNR_CAP + evaluation.test["b"]["ours"].psnr) / 2)
     assert evaluation.against == {"test": "HR photos", "train": "HR photos"}
