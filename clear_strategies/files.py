@@ -34,7 +34,8 @@ def write_bytes(path: Path, data: bytes) -> None:
 def replacing(path: Path) -> Iterator[Path]:
     """The path that a library writes to in place of `path`, with the same suffix; renamed to it afterwards, or removed."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem[:_KEPT]}.{_unique()}{_PARTIAL}{path.suffix}")
+    # No process number: in containers, which may share a cache, every program has the same one.
+    partial = path.with_name(f".{path.stem[:_KEPT]}.{secrets.token_hex(4)}{_PARTIAL}{path.suffix}")
     try:
         yield partial
         partial.replace(path)
@@ -64,16 +65,6 @@ def install(complete: Path, folder: Path, last: str) -> None:
     except OSError:
         if not (folder / last).is_file():
             raise
-
-
-def partial_of(path: Path) -> Path:
-    """Where one call writes what will be renamed to `path`; each time another."""
-    return path.with_name(f".{path.name[:_KEPT]}.{_unique()}{_PARTIAL}")
-
-
-def _unique() -> str:
-    """No process number: in containers, which may share a cache, every program has the same one."""
-    return secrets.token_hex(4)
 
 
 def require_regular(path: Path, *, most: int = _LARGEST) -> None:

@@ -36,10 +36,7 @@ class Evidence:
 
 
 def lift(
-    patch_maps: Float[Tensor, "C ph pw"],
-    centers: Float[Tensor, "N 2"],
-    visible: Bool[Tensor, " N"],
-    patch: float,
+    patch_maps: Float[Tensor, "C ph pw"], centers: Float[Tensor, "N 2"], visible: Bool[Tensor, " N"], patch: float
 ) -> Float[Tensor, "C N"]:
     """Look up the patch p(u_i) that contains each projected centre, in several maps at once.  Eq. 10
 

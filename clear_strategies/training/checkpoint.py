@@ -10,9 +10,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
-import os
-import re
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,11 +19,11 @@ import msgspec
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load as tensors_of
-from safetensors.torch import save_file
+from safetensors.torch import save as serialized
 from torch import Tensor
 
 from clear_strategies.errors import DataError
-from clear_strategies.files import flush, partial_of, read_bytes
+from clear_strategies.files import flush, read_bytes, write_bytes
 
 _log = logging.getLogger(__name__)
 
@@ -83,17 +80,8 @@ def save(folder: Path, checkpoint: Checkpoint, *, keep: int = 3) -> Path:
     tensors[_HISTORY] = torch.tensor(rows, dtype=torch.float64)
     stated = _Stated(c.t, dict(c.config), dict(c.facts), dict(c.work_log), c.device, columns)  # type: ignore[arg-type]
     text = msgspec.json.encode(stated).decode()
-    partial = partial_of(target)  # a folder, since the library writes beside the path that it is given
-    partial.mkdir(parents=True)
-    try:
-        written = partial / target.name
-        _write(written, tensors, {"format": FORMAT, "stated": text, "sha256": _seal(text, tensors)})
-        written.chmod(partial.stat().st_mode & 0o666)  # the library lets nobody else read it
-        flush(written)
-        written.replace(target)
-        flush(folder)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    write_bytes(target, serialized(tensors, {"format": FORMAT, "stated": text, "sha256": _seal(text, tensors)}))
+    flush(folder)
     # Later ones belong to another run, or to a try that this run does not continue.
     others = [path for path in saved(folder) if path != target]
     earlier = [path for path in others if path < target]
@@ -142,20 +130,9 @@ def _seal(text: str, tensors: Mapping[str, Tensor]) -> str:
     digest = hashlib.sha256(text.encode())
     for name, x in sorted(tensors.items()):
         digest.update(f"{name} {x.dtype} {tuple(x.shape)}".encode())
-        digest.update(
-            x.as_strided((x.numel(),), (1,)).view(torch.uint8).numpy().data
-        )  # contiguous, of any stride if it is empty
+        # It is contiguous, of any stride if it is empty.
+        digest.update(x.as_strided((x.numel(),), (1,)).view(torch.uint8).numpy().data)
     return digest.hexdigest()
-
-
-def _write(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:
-    """As the library does, without a copy of the tensors; an OSError where it cannot."""
-    try:
-        save_file(tensors, path, metadata)
-    except SafetensorError as error:
-        if (code := re.search(r"os error (\d+)", str(error))) is None:
-            raise
-        raise OSError(int(code[1]), os.strerror(int(code[1])), str(path)) from error
 
 
 def _newest(path: Path) -> Path:

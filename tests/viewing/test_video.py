@@ -41,8 +41,7 @@ def test_a_video_that_breaks_leaves_nothing(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "frames", "message"),
-    [("a.avi", FRAMES, "a video must be .mp4"), ("a.mp4", [], "needs at least 1 frame")],
+    ("name", "frames", "message"), [("a.avi", FRAMES, "a video must be .mp4"), ("a.mp4", [], "needs at least 1 frame")]
 )
 def test_what_gives_no_video_is_refused(tmp_path, name, frames, message):
     with pytest.raises(SettingError, match=message):
