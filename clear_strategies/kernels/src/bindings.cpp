@@ -8,6 +8,7 @@
 #include "bind_step.hpp"
 #include "filter.hpp"
 #include "isa.hpp"
+#include "smooth.hpp"
 #include "sweep.hpp"
 
 NB_MODULE(CLEAR_MODULE, m) {
@@ -19,4 +20,5 @@ NB_MODULE(CLEAR_MODULE, m) {
   clear::bind_step(m);
   clear::bind_filter(m);
   clear::bind_sweep(m);
+  clear::bind_smooth(m);
 }

@@ -42,6 +42,16 @@ def test_the_compiled_sweep_is_the_readable_one(window: int, monkeypatch: pytest
     assert difference.max() < 0.01  # where there is next to no contrast
 
 
+@pytest.mark.parametrize("shape", [(5, 7, 16), (9, 4, 21), (1, 6, 3)])
+def test_the_compiled_smoothing_is_the_readable_one(
+    shape: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    volume, image = torch.rand(shape), torch.rand(shape[:2])
+    compiled = smooth(volume, image, 0.08, 0.6)
+    monkeypatch.setattr(cost.cpp, "available", lambda: False)
+    assert torch.equal(compiled, smooth(volume, image, 0.08, 0.6))
+
+
 def test_smoothing_agrees_with_the_recursion_written_out() -> None:
     g = torch.Generator().manual_seed(0)
     cost, image = torch.rand(4, 5, 6, generator=g), torch.rand(4, 5, generator=g)
