@@ -127,11 +127,9 @@ def main(local_rank, world_rank, world_size, cfg):
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("--result_dir")
-    parser.add_argument("--max_steps", type=int, default=8)
-    parser.add_argument("--pose_noise", type=float, default=0.0)
     parser.add_argument("--app_opt", action="store_true")
-    parser.add_argument("--init_type", default="sfm")
-    parser.add_argument("--refine_stop_iter", type=int, default=7)
+    for name, value in {"max_steps": 8, "pose_noise": 0.0, "init_type": "sfm", "refine_stop_iter": 7}.items():
+        parser.add_argument(f"--{name}", type=type(value), default=value)
     options = vars(parser.parse_args())
     stop = options.pop("refine_stop_iter")
     cfg = Config(**options)

@@ -59,3 +59,14 @@ def test_strategies_train_in_a_gsplat_loop_elsewhere():
     ran = run(["-m", "tests.helpers.gsplat_elsewhere", *STRATEGIES])
     assert ran.returncode == 0, ran.stderr
     assert [line.split()[0] for line in ran.stdout.splitlines()] == STRATEGIES
+
+
+@pytest.mark.slow  # gsplat compiles its kernels
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
+@pytest.mark.parametrize("strategies", [None, "gco", "p2g", "svs", "clear", "best"])
+def test_gsplats_loop_trains_on_cuda(strategies):
+    pytest.importorskip("gsplat")
+    from integration.examples.gsplat_loop import main
+
+    torch.manual_seed(0)
+    assert main(100, strategies) > 18

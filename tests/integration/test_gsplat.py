@@ -86,27 +86,11 @@ def test_gradient_scaling_and_accumulation_do_not_change_the_merge(accumulation)
     scene = toy.scene(30)
     plain, _ = first_gradient(scene, subset("gco"))
 
-    class Scaler:
-        """The calls of a torch.amp gradient scaler."""
-
-        def scale(self, loss):
-            return loss * 1024.0
-
-        def step(self, optimizer):
-            for group in optimizer.param_groups:
-                for p in group["params"]:
-                    p.grad /= 1024.0
-            optimizer.step()
-
-        def update(self):
-            pass
-
-    host = Host(scene, scaler=Scaler(), accumulation=accumulation)
+    scaler = torch.amp.GradScaler("cpu", init_scale=1024.0)
+    host = Host(scene, scaler=scaler, accumulation=accumulation)
     host.degree = lambda step: 0
-    clear = attached(
-        host, scene, Conductor(GCO(), objective=HR_FROM_START),
-        loss_scale=lambda: 1024.0, accumulation=accumulation,
-    )  # fmt: skip
+    conductor = Conductor(GCO(), objective=HR_FROM_START)
+    clear = attached(host, scene, conductor, loss_scale=scaler.get_scale, accumulation=accumulation)
     host.train([scene.train[0].name] * accumulation)
     assert clear.attachment.counts["merges"] == accumulation
     for name, g in plain.items():

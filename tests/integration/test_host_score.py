@@ -1,4 +1,4 @@
-"""Densification scores in hosts: the tensor that holds them, their scale, and what a 3DGS-style densifier reads."""
+"""Densification in hosts: the tensor of the score, its scale, what a 3DGS-style densifier reads, and where it ends."""
 
 from __future__ import annotations
 

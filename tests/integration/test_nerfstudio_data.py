@@ -76,7 +76,7 @@ def test_sr_images_are_found_by_the_photos_stem(tmp_path):
         write_png(tmp_path / f"{i}.png", torch.full((64, 96, 3), 0.2 * i))
     for i, view in enumerate(views_from_datamanager(DataManager(), prior(tmp_path), 4)):
         assert view.hr.image.unique().tolist() == pytest.approx([0.2 * i])
-    with pytest.raises(DataError, match="96x64, but 2 times"):
+    with pytest.raises(DataError, match="is 96x64 where 48x32 is expected"):
         views_from_datamanager(DataManager(), prior(tmp_path), 2)
 
 

@@ -1,4 +1,4 @@
-"""The compiled backends: the public checks, agreement with float64, reproducible bits, and hard inputs."""
+"""The compiled backends: the public checks, agreement with float64, reproducible bits, hard inputs, expected depth."""
 
 from __future__ import annotations
 

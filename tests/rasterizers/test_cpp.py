@@ -84,11 +84,6 @@ def test_the_longest_side_is_drawn_and_a_longer_one_refused(size):
         cpp()(splats, Camera(torch.eye(4), 10.0, 10.0, 1.0, 1.0, *(side + (side > 1) for side in size)))
 
 
-def test_threads_out_of_range_are_refused():
-    with pytest.raises(ValueError, match="at least 1"):
-        cpp(threads=0)
-
-
 def test_kernels_use_as_many_threads_as_torch_outside_of_kernel_threads_which_an_error_leaves_too():
     before = torch.get_num_threads()
     assert native.threads() == before

@@ -70,20 +70,15 @@ def loop(opt, gaussians, scene, names=None, between=lambda iteration: None, firs
 def parser():
     p = argparse.ArgumentParser()
     p.add_argument("-s", "--source_path")
-    p.add_argument("--save")
-    p.add_argument("--iterations", type=int, default=30)
-    p.add_argument("--position_lr", type=float, default=1.6e-4)
-    p.add_argument("--extent", type=float, default=4.0)
-    p.add_argument("--densify_grad_threshold", type=float, default=2e-4)
-    p.add_argument("--densify_from_iter", type=int, default=4)
-    p.add_argument("--densify_until_iter", type=int, default=24)
-    p.add_argument("--densification_interval", type=int, default=5)
-    p.add_argument("--opacity_reset_interval", type=int, default=1000)
-    p.add_argument("--sh_interval", type=int, default=10)
     p.add_argument("--step_first", action="store_true")
-    p.add_argument("--start_checkpoint")
-    p.add_argument("--checkpoint")
-    p.add_argument("--checkpoint_iteration", type=int)
+    for name in ("save", "start_checkpoint", "checkpoint"):
+        p.add_argument(f"--{name}")
+    for name, value in {
+        "iterations": 30, "position_lr": 1.6e-4, "extent": 4.0, "densify_grad_threshold": 2e-4, "densify_from_iter": 4,
+        "densify_until_iter": 24, "densification_interval": 5, "opacity_reset_interval": 1000, "sh_interval": 10,
+        "checkpoint_iteration": 0,
+    }.items():  # fmt: skip
+        p.add_argument(f"--{name}", type=type(value), default=value)
     return p
 
 
