@@ -59,25 +59,6 @@ class Lens:
     distortion: tuple[float, ...] = ()
     fisheye: bool = False
 
-    def check(self, file: Path, where: str) -> Lens:
-        """The lens itself, if its numbers are plausible; a DataError if one is not finite, or no camera has it."""
-        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
-        if not all(abs(x) < FARTHEST for x in numbers):  # not for nan
-            raise DataError(file, where, f"has intrinsics that are not finite: {numbers}", "estimate the cameras again")
-        if not (0 < self.width < _LARGEST_SIDE and 0 < self.height < _LARGEST_SIDE):
-            raise DataError(file, where, f"has size {self.width}x{self.height}", "check the camera")
-        shortest = min(self.fx / self.width, self.fy / self.height)
-        in_sides = 0 < max(self.cx, self.cy) <= 1 < min(self.width, self.height) / 8
-        if not (shortest > _SHORTEST and max(self.fx, self.fy) / self.width < 1e6) or in_sides:
-            lengths = f"focal lengths {self.fx:g}, {self.fy:g} and principal point ({self.cx:g}, {self.cy:g})"
-            problem = f"has {lengths} where the image is {self.width}x{self.height}; all must be pixels"
-            sides = shortest > 0 and "multiply what is in units of the image by its width (x) and height (y)"
-            raise DataError(file, where, problem, sides or "estimate the cameras again")
-        if not (-self.width < self.cx < 2 * self.width and -self.height < self.cy < 2 * self.height):
-            problem = f"has its principal point ({self.cx:g}, {self.cy:g}) px far outside the image"
-            raise DataError(file, where, problem, "check the camera")
-        return self
-
     @property
     def distorts(self) -> bool:
         return self.fisheye or any(k != 0 for k in self.distortion)
@@ -143,8 +124,24 @@ def lens_of(
     if rest := [name for name, value in terms.items() if value != 0 and name not in kept]:
         problem = f"has {rest[0]} = {terms[rest[0]]:g}; of the camera model {model} it must be 0"
         raise DataError(file, where, problem, f"check the model, or undistort the photos first: {_UNDISTORT}")
-    distortion = tuple(terms.get(name, 0.0) for name in kept)
-    return Lens(*size, *pinhole, distortion, "FISHEYE" in model).check(file, where)
+    lens = Lens(*size, *pinhole, tuple(terms.get(name, 0.0) for name in kept), "FISHEYE" in model)
+    (width, height), (fx, fy, cx, cy) = size, pinhole
+    if not all(abs(x) < FARTHEST for x in (*pinhole, *lens.distortion)):  # not for nan
+        problem = f"has intrinsics that are not finite: {(*pinhole, *lens.distortion)}"
+        raise DataError(file, where, problem, "estimate the cameras again")
+    if not (0 < width < _LARGEST_SIDE and 0 < height < _LARGEST_SIDE):
+        raise DataError(file, where, f"has size {width}x{height}", "check the camera")
+    shortest, in_sides = min(fx / width, fy / height), 0 < max(cx, cy) <= 1 < min(width, height) / 8
+    if not (shortest > _SHORTEST and max(fx, fy) / width < 1e6) or in_sides:
+        lengths = f"focal lengths {fx:g}, {fy:g} and principal point ({cx:g}, {cy:g})"
+        sides = shortest > 0 and "multiply what is in units of the image by its width (x) and height (y)"
+        problem = f"has {lengths} where the image is {width}x{height}; all must be pixels"
+        raise DataError(file, where, problem, sides or "estimate the cameras again")
+    if not (-width < cx < 2 * width and -height < cy < 2 * height):
+        raise DataError(
+            file, where, f"has its principal point ({cx:g}, {cy:g}) px far outside the image", "check the camera"
+        )
+    return lens
 
 
 def terms_of(file: Path, where: str, model: str) -> tuple[str, ...]:

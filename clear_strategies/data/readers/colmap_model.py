@@ -38,7 +38,7 @@ _MODELS: Final = {  # by COLMAP's numbers, with their parameters; p and k are co
     "DIVISION": _TWO + "k", "SIMPLE_FISHEYE": _ONE, "FISHEYE": _TWO, "EUCM": _TWO + "alpha beta", "EQUIRECTANGULAR": "",
 }  # fmt: skip
 _LONGEST_NAME: Final = 4096
-_SAID: Final = re.compile(r"# Number of \w+: (\d+)")  # of a text file's header
+_SAID: Final = re.compile(r"^# Number of \w+: (\d+)", re.MULTILINE)  # of a text file's header
 _NUMERIC: Final = "0123456789.+-eE \t"  # letters of a line of numbers
 
 _COUNT, _CAMERA, _IMAGE = map(struct.Struct, ("<Q", "<iiQQ", "<i7di"))
@@ -292,11 +292,8 @@ def _text_images(path: Path) -> Iterator[Image]:
     A line that could be either is taken as the number of images in the file's header says.
     """
     poses, either = list[tuple[int, str]](), list[tuple[int, str]]()
-    said, above = -1, False  # the number of images in the header; whether the line above is a pose
-    for line, text in _lines(path):
-        if text.startswith("#"):
-            said = int(header[1]) if (header := _SAID.match(text)) else said
-            continue
+    above, (said, lines) = False, _lines(path)  # whether the line above is a pose
+    for line, text in lines:
         pose = _could_be_pose(text)
         points = above and len(text.split()) % 3 == 0 and not (pose and text.strip(_NUMERIC))
         if points and pose:
@@ -340,23 +337,22 @@ def _text_points(path: Path) -> Iterator[_Point]:
         yield _numbers(path, line, cells[:1], _whole)[0], _numbers(path, line, cells[1:4], float), color, track
 
 
-def _lines(path: Path) -> list[tuple[int, str]]:
+def _lines(path: Path) -> tuple[int, list[tuple[int, str]]]:
+    """How many records the header says, else -1; the numbered lines without comments."""
     try:
         text = io.StringIO(read_bytes(path).decode("utf-8-sig"), newline=None).read()  # with every line break as \n
     except UnicodeDecodeError as error:
         raise _damaged(path, "file", "is no UTF-8 text") from error
-    return list(enumerate(text.split("\n"), start=1))
+    said = _SAID.findall(text)
+    lines = [(line, row) for line, row in enumerate(text.split("\n"), start=1) if not row.startswith("#")]
+    return int(said[-1]) if said else -1, lines
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    said, count = -1, 0
-    for line, text in _lines(path):
-        if text.startswith("#"):
-            said = int(header[1]) if (header := _SAID.match(text)) else said
-        elif text.strip():
-            count += 1
-            yield line, text.split()
-    _warn_if_cut(path, said, count)
+    said, lines = _lines(path)
+    rows = [(line, text) for line, text in lines if text.strip()]
+    _warn_if_cut(path, said, len(rows))
+    return ((line, text.split()) for line, text in rows)
 
 
 def _warn_if_cut(path: Path, said: int, count: int) -> None:

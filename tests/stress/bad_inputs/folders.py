@@ -11,10 +11,9 @@ from clear_strategies.data.readers import colmap
 from clear_strategies.jobs import resume
 from clear_strategies.jobs.lock import hold
 from clear_strategies.jobs.saved import open_splat
-from tests.helpers.captures import GOOD
+from tests.helpers.captures import GOOD, READERS
 from tests.helpers.short_run import SCENE
 from tests.stress.bad_inputs import BadInput, at
-from tests.stress.bad_inputs.scenes import READERS
 
 
 def _held_twice(folder: Path) -> None:
