@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
+import pandas as pd
 import pytest
 import torch
 
 from clear_strategies import Conductor, ExtraView, Objective, SRStage
 from clear_strategies.core import images
 from clear_strategies.density.shuffle import ShuffleSettings
+from clear_strategies.outputs import results
 from clear_strategies.strategies.base import Drawn
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.optim import Adam, LearningRates
 from rasterizers import Camera
 from tests.helpers import toy
-from tests.helpers.short_run import SCENE
+from tests.helpers.short_run import SCENE, start
 
 AT_10 = ShuffleSettings(start=20, stop=20, split_at=10, min_gaussians=1)
 
@@ -101,6 +104,13 @@ def test_a_robust_picture_counts_less_where_the_field_contradicts_it():
     render = torch.rand(photo.image.shape, generator=torch.Generator().manual_seed(1))
     plain, robust = (conductor.extra_loss(render, ExtraView(photo, one, robust=r), 1).cotangents for r in (False, True))
     assert torch.allclose(robust, plain * images.agreement(render, photo.image))
+
+
+def test_timing_has_iterations_and_seconds_of_both_stages():
+    state, history = start(()), pd.DataFrame({"t": range(1, 6), "seconds": [2.0, 4.0, 6.0, 8.0, 10.0]})
+    assert results._two_stages(state, history) == []
+    state.t, state.density = 6, replace(AT_10, split_at=2).densifier(3, extent=1.0, seed=0, white_background=False)
+    assert [(row["runs"], row["seconds"]) for row in results._two_stages(state, history)] == [(2, 4.0), (3, 6.0)]
 
 
 @pytest.mark.parametrize("changed", [{"count": -1}, {"reach": 0.0}, {"weight": 0.0}])
