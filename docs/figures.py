@@ -203,7 +203,7 @@ def collect_training_time(sweep: Path) -> None:
 
 
 def main(folder: Path) -> None:
-    for draw in (ablation, skips, best, hosts, conflict):
+    for draw in (ablation, skips, best, hosts, conflict, training_time):
         draw(folder)
 
 
