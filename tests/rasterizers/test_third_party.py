@@ -1,4 +1,4 @@
-"""Rasterizers of others: a third party's class by its path, and the backend "gsplat" with our function, since gsplat's needs CUDA."""
+"""Rasterizers of others: a third party's class by its path, and the backend "gsplat" with our function in place of its own."""
 
 from __future__ import annotations
 

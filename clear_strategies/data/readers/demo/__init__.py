@@ -32,8 +32,12 @@ _TARGET: Final = np.array([0.0, 0.15, 5.0])
 
 
 def read(*, width: int = 256, height: int = 192, views: int = 12, train: int = 3) -> Capture:
-    """The room from cameras on an arc. `train` (2 or more) evenly spaced ones of the `views` are for training, the others for
-    testing; `width` and `height` are those of the HR images.
+    """The room from cameras on an arc.
+
+    Args:
+        width, height: of the HR images.
+        views: how many cameras there are.
+        train: how many of them, evenly spaced, are for training, at least 2; the others are for testing.
     """
     for name, value in (("width", width), ("height", height), ("views", views), ("train", train)):
         require_whole(f"data.reader.{name}", value, least=1)
