@@ -83,7 +83,7 @@ def test_a_strategy_of_another_package(tmp_path):
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["strategies"] == ["p2g", "mine"]
 
 
-HEAVY = {"cv2", "scipy", "skimage", "kornia", "matplotlib"}
+HEAVY = {"cv2", "scipy", "skimage", "kornia", "matplotlib", "pandas"}
 
 
 @pytest.mark.slow

@@ -6,11 +6,12 @@ import textwrap
 from collections.abc import Mapping
 from itertools import product
 from pathlib import Path
-from typing import Any, Final
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any, Final
 
 from clear_strategies.outputs import figures
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # Title, column of history.csv, what it is drawn over, whether as a running mean.
 _CHARTS: Final = (

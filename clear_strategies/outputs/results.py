@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-import pandas as pd
 from torch import Tensor
 
 from clear_strategies import files, viewing
@@ -34,6 +33,9 @@ from clear_strategies.training.state import TrainState
 from clear_strategies.viewing import cameras, paths, video
 from clear_strategies.viewing.look import Painter
 from rasterizers.interface import Camera, Rasterizer
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _log = logging.getLogger(__name__)
 
@@ -69,6 +71,8 @@ def write_results(
         down: D, by which the LR images were made.
         antialiased: the rasterizer compensates opacities, see `RasterSettings`.
     """
+    import pandas as pd  # here, as those whose settings are refused need not wait for it
+
     field, work_log, settings = state.field, state.conductor.work_log, state.settings
     history = pd.DataFrame(list(state.history_as_floats()))
     with work_log.stage("evaluate"):
@@ -88,7 +92,8 @@ def write_results(
         write_curves(folder / "curves.png", {chosen.title: history}, title)
     with work_log.stage("video"):
         _write_video(folder / "path.mp4", [view.hr.camera for view in scene.train], painter, settings.video)
-    _write_tables(folder, history, [*scene.work_log.rows(), *_two_stages(state, history), *work_log.rows()])
+    stages = pd.DataFrame([*scene.work_log.rows(), *_two_stages(state, history), *work_log.rows()])
+    _write_tables(folder, history, stages)
     files.write_json(
         folder / _METRICS,
         metrics.to_json(
@@ -158,12 +163,12 @@ def _write_sheet(folder: Path, scene: Scene, evaluation: Evaluation, title: str)
     write_contact_sheet(folder / "contact_sheet.png", rows, title, note)
 
 
-def _write_tables(folder: Path, history: pd.DataFrame, stages: Sequence[Mapping[str, str | int | float]]) -> None:
+def _write_tables(folder: Path, history: pd.DataFrame, stages: pd.DataFrame) -> None:
     shares = [name for prefix in ("conflict", "corrected") for name in history if name.startswith(prefix)]
     means = [name for name in ("mean_q", "mean_w", "mean_omega") if name in history]
     compared = history[history["conflict"].notna()] if "conflict" in history else history[:0]
     conflict = compared.reindex(columns=["t", *dict.fromkeys(["conflict", *shares, *means])])
-    for name, table in {"history": history, "conflict": conflict, "timing": pd.DataFrame(stages)}.items():
+    for name, table in {"history": history, "conflict": conflict, "timing": stages}.items():
         files.write_text(folder / f"{name}.csv", table.to_csv(index=False))
 
 

@@ -10,8 +10,6 @@ from typing import Final
 WALL: Final = "seconds"
 PROCESSOR: Final = "processor_seconds"
 """Columns of the history. On a busy machine processor seconds are the better measure."""
-PROBE: Final = "probe_"
-"""Before a column's name: the seconds of a row's evaluation of test views, which are not in that column."""
 
 
 class Clock:
@@ -22,24 +20,20 @@ class Clock:
     """
 
     def __init__(self, before: Mapping[str, float]) -> None:
-        self._start(before)
+        self._began = {name: now - before.get(name, 0.0) for name, now in _now().items()}
 
     def read(self) -> dict[str, float]:
         """The seconds until now, by the history's columns."""
         return {name: now - self._began[name] for name, now in _now().items()}
 
     @contextmanager
-    def paused(self) -> Iterator[dict[str, float]]:
-        """A context whose time does not count; it yields what holds that time afterwards, by the columns with `PROBE`."""
-        before, spent = self.read(), dict[str, float]()
+    def paused(self) -> Iterator[None]:
+        """A context whose time does not count."""
+        before = self.read()
         try:
-            yield spent
+            yield
         finally:
-            spent |= {PROBE + name: now - before[name] for name, now in self.read().items()}
-            self._start(before)
-
-    def _start(self, before: Mapping[str, float]) -> None:
-        self._began = {name: now - before.get(name, 0.0) for name, now in _now().items()}
+            self._began = Clock(before)._began
 
 
 def _now() -> dict[str, float]:

@@ -191,9 +191,8 @@ def fit(
             ended = state.ended
             state.history[-1].update(clock.read())
             if settings.probe_every and (done % settings.probe_every == 0 or ended):
-                with clock.paused() as spent:
+                with clock.paused():
                     evaluate(state, scene, rasterizer, done)
-                state.history[-1].update(spent)
             if progress is not None:
                 progress(state)
             if pending:
