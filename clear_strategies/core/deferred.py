@@ -86,16 +86,10 @@ def added(*numbers: float) -> float:
     return sum(numbers)
 
 
-# Statistics of chosen rows. Gathering them would wait for their number on a device, and costs more than zeros on the CPU.
-
-
-def total(values: Float[Tensor, " N"], chosen: Bool[Tensor, " N"]) -> Scalar:
-    """The sum over the chosen rows."""
-    return scalar(values.masked_fill(~chosen, 0).sum())
-
-
 def mean(values: Float[Tensor, " N"], chosen: Bool[Tensor, " N"]) -> Scalar:
-    """The mean over the chosen rows; NaN where there are none."""
+    """The mean over the chosen rows; NaN where there are none. Gathering them would wait for their number on a device, and costs
+    more than zeros on the CPU.
+    """
     return scalar(values.masked_fill(~chosen, 0).sum() / chosen.sum())
 
 

@@ -78,13 +78,12 @@ def test_a_recipe_may_have_an_effect_and_runs_once(on_a_device):
 
 
 @pytest.mark.parametrize("chosen", [[True, False, True, True], [False] * 4, [False, True, False, True]])
-@pytest.mark.parametrize("statistic", [deferred.total, deferred.mean])
-def test_statistics_of_chosen_rows_are_the_same_without_counting_them(statistic, chosen, monkeypatch):
+def test_the_mean_of_chosen_rows_is_the_same_without_counting_them(chosen, monkeypatch):
     values, chosen = torch.tensor([4.0, 2.0, 1.0, 3.0]), torch.tensor(chosen)
     values[~chosen] = math.inf  # which must not leak in
-    expected = statistic(values, chosen)
+    expected = deferred.mean(values, chosen)
     monkeypatch.setattr(deferred, "is_immediate", lambda x: False)
     with Reads() as reads:
-        result = statistic(values, chosen)
+        result = deferred.mean(values, chosen)
     assert reads.count == 0
     assert deferred.read([result]) == pytest.approx([expected], nan_ok=True)
