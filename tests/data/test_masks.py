@@ -118,9 +118,7 @@ def test_nerfstudios_reduced_photos_keep_their_masks_splits_and_lenses(tmp_path:
 
 def test_a_mask_of_another_shape_is_refused_before_any_photo_is_read(tmp_path: Path) -> None:
     save(tiny.colmap_bin(tmp_path) / "masks/a.png", np.ones((16, 12), int))
-    with pytest.raises(
-        DataError, match=r"masks/a\.png: mask: size: is 12x16, but its camera is for 16x12: another shape"
-    ):
+    with pytest.raises(DataError, match=r"masks/a\.png: mask: size: is 12x16, but its camera is for 16x12: another"):
         colmap.read(tmp_path)
 
 
@@ -130,9 +128,7 @@ def test_a_mask_that_cannot_be_read_is_refused_with_what_helps_a_mask(tmp_path: 
     whole = mask.read_bytes()
     for content, message in ((b"no image", "is no readable image"), (whole[:-30], "cannot be decoded")):
         mask.write_bytes(content)
-        with pytest.raises(
-            DataError, match=rf"a\.png: mask: .*{message}.*: put a mask of the photo's shape there, or remove it"
-        ):
+        with pytest.raises(DataError, match=rf"a\.png: mask: .*{message}.*: put a mask of the photo's shape there"):
             [frame.shown() for frame in colmap.read(tmp_path, skip_faulty=True).frames if frame.shown is not None]
     mask.unlink()
     assert not any(frame.shown for frame in colmap.read(tmp_path).frames)
@@ -161,7 +157,7 @@ def test_masks_that_hide_all_photos_are_refused_and_of_one_are_told(tmp_path: Pa
             assert "1 of 3 photos teach nothing" in caplog.text
             assert "a.png" in caplog.text
     with pytest.raises(
-        DataError, match=r"a\.png: masks or alpha: show nothing of 3 of 3 photos: a\.png.*: a mask is 0 where"
+        DataError, match=r"a\.png: masks or alpha: show nothing of 3 of 3 photos: a.*: a mask is 0 where"
     ):
         prepared(tmp_path, colmap.read)
     for name in tiny.NAMES:

@@ -10,12 +10,11 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.core.view import DepthMap, Photo, View
-from clear_strategies.geometry import exposure, exposure_gains
+from clear_strategies.geometry import exposure_gains
 from clear_strategies.strategies.p2g import P2G
 from tests.helpers import planes, toy
 
 DEPTH = 4.0
-NOTHING = torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
 CASTS = torch.tensor([[1.1, 1.0, 0.95], [0.92, 1.0, 1.08], [1.0, 1.04, 1.0]])
 
 
@@ -79,14 +78,3 @@ def test_the_reliability_of_a_brightened_view_is_that_of_its_brightened_images()
     stored = replace(view, hr=moved, disagreement=differed).brightened(gain)
     result, expected = (P2G(patch=8).patch_maps(v).reliability for v in (stored, view.brightened(gain)))
     assert torch.allclose(result, expected, atol=0.05)  # up to rounding to 8 bits
-
-
-def test_with_many_photos_each_is_compared_with_twelve(monkeypatch):
-    asked = []
-    monkeypatch.setattr(exposure, "_ratio", lambda photo, _, other, __: asked.append((photo, other)) or NOTHING)
-    row = [
-        replace(photo, camera=replace(photo.camera, world_to_camera=planes.camera(float(i)).world_to_camera))
-        for i, photo in enumerate(planes.plane_photos(1) * 40)
-    ]
-    exposure_gains(row, depths(40))
-    assert len(asked) == 40 * 12

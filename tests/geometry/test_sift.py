@@ -12,16 +12,7 @@ from hypothesis import strategies as st
 from clear_strategies.core.view import Photo
 from clear_strategies.geometry import sift
 from clear_strategies.geometry.projection import project, sample_colors
-from clear_strategies.geometry.sift import (
-    Features,
-    Pairs,
-    TriangulationSettings,
-    find_features,
-    match,
-    one_per_track,
-    triangulate,
-    triangulate_pair,
-)
+from clear_strategies.geometry.sift import Features, Pairs, TriangulationSettings, match, one_per_track, triangulate
 from rasterizers.interface import Camera
 from tests.helpers.planes import camera, plane_photos
 
@@ -48,8 +39,8 @@ def test_a_point_seen_by_three_views_is_one_point() -> None:
 
 def test_of_too_many_features_the_strongest_are_taken() -> None:
     photo = plane_photos(1)[0]
-    every = find_features(photo, TriangulationSettings(max_features=None))
-    some = find_features(photo, TriangulationSettings(max_features=50))
+    every = sift.find_features(photo, TriangulationSettings(max_features=None))
+    some = sift.find_features(photo, TriangulationSettings(max_features=50))
     assert 50 <= len(some.pixels) < len(every.pixels)  # OpenCV keeps all that are as strong as the last
     assert len(some.pixels) < 60
     result = {tuple(pixel) for pixel in every.pixels.tolist()}
@@ -77,7 +68,7 @@ def triangulated(x: tuple[float, float], y: tuple[float, float], **limits: float
     """Cameras at x = 0 and x = 1; (point, angle, accepted)."""
     settings = TriangulationSettings(**limits)  # type: ignore[arg-type]
     pixels = (torch.tensor([p], dtype=torch.float64) for p in (x, y))
-    points, angle, good = triangulate_pair(camera(0), camera(1), *pixels, settings)
+    points, angle, good = sift.triangulate_pair(camera(0), camera(1), *pixels, settings)
     return points[0].tolist(), float(angle[0]), bool(good[0])
 
 
@@ -106,7 +97,7 @@ def test_each_filter_alone_rejects(x: tuple[float, float], y: tuple[float, float
 
 def test_rays_from_one_centre_are_rejected() -> None:
     pixel = torch.tensor([[60.0, 50.0]], dtype=torch.float64)
-    assert not triangulate_pair(camera(0), camera(0), pixel, pixel, TriangulationSettings())[2].any()
+    assert not sift.triangulate_pair(camera(0), camera(0), pixel, pixel, TriangulationSettings())[2].any()
 
 
 @settings(max_examples=50, deadline=None)
@@ -120,7 +111,7 @@ def test_triangulation_inverts_projection(point: tuple[float, float, float], tur
     a, b = camera(0), Camera(turned, 90.0, 110.0, 40.0, 60.0, 100, 100)
     world = torch.tensor([point], dtype=torch.float64)
     (x, _), (y, _) = project(a, world), project(b, world)
-    result, _, _ = triangulate_pair(a, b, x, y, TriangulationSettings())
+    result, _, _ = sift.triangulate_pair(a, b, x, y, TriangulationSettings())
     assert torch.allclose(result, world, atol=1e-5)
 
 
@@ -131,7 +122,7 @@ def test_a_blob_is_found_at_its_centre(center: tuple[float, float], enlarge: int
     y, x = torch.meshgrid(torch.arange(60) + 0.5, torch.arange(80) + 0.5, indexing="ij")
     blob = torch.exp(-((x - center[0]) ** 2 + (y - center[1]) ** 2) / 8)
     view = Photo(camera(0, 80, 60), blob[..., None].expand(60, 80, 3))
-    result = find_features(view, TriangulationSettings(enlarge=enlarge)).pixels
+    result = sift.find_features(view, TriangulationSettings(enlarge=enlarge)).pixels
     assert torch.linalg.vector_norm(result - torch.tensor(center), dim=1).min() < 0.05
 
 

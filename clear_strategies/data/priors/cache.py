@@ -13,8 +13,9 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import read_image, write_png
-from clear_strategies.data.priors.interface import Network, Prior, layers, require_file
+from clear_strategies.data.priors.interface import Network, Prior, layers
 from clear_strategies.errors import DataError
+from clear_strategies.files import read_bytes
 
 _log = logging.getLogger(__name__)
 
@@ -73,6 +74,5 @@ class Cached:
         digest = hashlib.sha256(repr(identity).encode())
         digest.update(lr.cpu().contiguous().numpy().tobytes())
         for file in self.prior.files:
-            require_file(file, "the model")
-            digest.update(hashlib.sha256(file.read_bytes()).digest())
+            digest.update(hashlib.sha256(read_bytes(file, remedy="set prior.path to the model")).digest())
         return digest.hexdigest()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -98,14 +97,6 @@ def require_path(path: object, what: str) -> None:
     """Raise a SettingError unless a path has been given."""
     if not isinstance(path, str) or not path:
         raise SettingError(f"prior.path: must be {what}, got {path!r}: add prior.path=…")
-
-
-def require_file(path: Path, what: str) -> None:
-    """Raise a DataError unless the file exists and can be read."""
-    if not path.is_file():
-        raise DataError(path, "file", "is not there", f"set prior.path to {what}")
-    if not os.access(path, os.R_OK):
-        raise DataError(path, "file", "cannot be read", "check its permissions")
 
 
 def warn_if_far_from_lr(

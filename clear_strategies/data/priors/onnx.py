@@ -12,9 +12,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.data.priors.interface import compared, require_file, require_path
+from clear_strategies.data.priors.interface import compared, require_path
 from clear_strategies.data.priors.tiling import require_tiles, tiled
 from clear_strategies.errors import DataError
+from clear_strategies.files import read_bytes
 
 _LARGEST_FILE: Final = 2 << 30  # bytes; protobuf's own limit
 _LARGEST_VALUE: Final = 1e6  # neither a [0, 1] nor a [0, 255] network gives more
@@ -76,10 +77,7 @@ class Onnx:
 def _read_network(path: Path) -> Any:
     import cv2
 
-    require_file(path, "a network in ONNX")
-    if path.stat().st_size > _LARGEST_FILE:
-        raise DataError(path, "size", "is more than 2 GiB, which no ONNX file is", "check the path")
-    data = path.read_bytes()
+    data = read_bytes(path, most=_LARGEST_FILE, remedy="set prior.path to a network in ONNX")
     if _EXTERNAL_DATA.search(data):
         problem = "lie in other files (ONNX external data)"
         raise DataError(path, "weights", problem, "save the model with its weights inside")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from functools import cache
 
@@ -60,17 +59,11 @@ def test_a_network_inside_is_cached_and_the_config_builds_it(tmp_path):
     assert (prior.prior.prior.path, prior.share) == ("net.onnx", 0.5)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "values"),
-    [("share", (1.5, -0.1, math.nan)), ("strength", (-1.0, math.nan)), ("patch", (0, 2.5)), ("seed", (-1,))],
-)
-@pytest.mark.parametrize("prior", [Corrupted(Sharp()), DemoPrior({})], ids=["Corrupted", "DemoPrior"])
-def test_settings_out_of_range_are_refused_by_name(prior, wrong, values):
-    for value in values:
-        changed = copy.copy(prior)
-        object.__setattr__(changed, wrong, value)  # past the type checks, which only tests have
-        with pytest.raises(SettingError, match=rf"prior\.{wrong}: must .*, got "):
-            changed.__post_init__()
+@pytest.mark.parametrize("wrong", [{"share": 1.5}, {"share": math.nan}, {"strength": -1.0}, {"patch": 0}, {"seed": -1}])
+def test_settings_out_of_range_are_refused_by_name(wrong):
+    for made in (lambda: Corrupted(Sharp(), **wrong), lambda: DemoPrior({}, **wrong)):
+        with pytest.raises(SettingError, match=rf"prior\.{next(iter(wrong))}: must .*, got "):
+            made()
 
 
 # --- the demo's prior ------------------------------------------------------------------------------------------------

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from clear_strategies.data import photo_files
 from clear_strategies.data.lenses import Lens
@@ -51,18 +50,6 @@ def test_smaller_photos_rescale_their_cameras_per_axis(tmp_path: Path) -> None:
     assert (camera.fx, camera.cx, camera.cy, camera.width, camera.height) == (10, 4, 3.5, 8, 7)
     assert camera.fy == pytest.approx(20 * 7 / 12)
     assert "16x12 to 8x7" in capture.notes["cameras"]
-
-
-def test_a_folder_is_listed_once_however_many_endings_differ(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    photos = tiny.colmap_bin(tmp_path) / "images"
-    for name in tiny.NAMES:
-        Image.open(photos / name).save((photos / name).with_suffix(".jpg"))
-        (photos / name).unlink()
-    listed: list[Path] = []
-    original = Path.glob
-    monkeypatch.setattr(Path, "glob", lambda self, pattern: listed.append(self) or original(self, pattern))
-    assert [frame.name for frame in colmap.read(tmp_path).frames] == ["a.jpg", "b.jpg", "c.jpg"]
-    assert listed.count(photos) <= 2  # for the endings, and for photos without a pose
 
 
 def test_photos_may_all_lie_in_subfolders_with_masks_in_subfolders_of_the_same_names(tmp_path: Path) -> None:

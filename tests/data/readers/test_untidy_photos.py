@@ -9,7 +9,6 @@ import shutil
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 import torch
@@ -108,37 +107,30 @@ def test_untidy_photos_that_can_be_read_are_read(of_photos, name, caplog):
     assert all(bool(frame.load().isfinite().all()) for frame in capture.frames)
 
 
-class Refusal(NamedTuple):
-    """What is done to the folder, parts of the message, and the setting that goes on without the photo, if there is one."""
-
-    spoil: Callable[[Path], object]
-    message: tuple[str, ...]
-    setting: dict[str, object] | None = None
-
-
 SKIP, BROKEN = {"skip_faulty": True}, "data.reader.skip_faulty=true"
-REFUSED = {
-    "a truncated photo": Refusal(lambda f: (f / "d.png").write_bytes((f / "b.png").read_bytes()[:200]), ("d.png", BROKEN), SKIP),
-    "an empty file": Refusal(lambda f: (f / "d.jpg").touch(), ("d.jpg", BROKEN), SKIP),
-    "colours for print": Refusal(
+# What is done to the folder, parts of the message, and the setting that goes on without the photo, if there is one.
+REFUSED: dict[str, tuple[Callable[[Path], object], tuple[str, ...], dict[str, object] | None]] = {
+    "a truncated photo": (lambda f: (f / "d.png").write_bytes((f / "b.png").read_bytes()[:200]), ("d.png", BROKEN), SKIP),
+    "an empty file": (lambda f: (f / "d.jpg").touch(), ("d.jpg", BROKEN), SKIP),
+    "colours for print": (
         lambda f: image_of(f / "a.png").convert("CMYK").save(f / "d.jpg"), ("d.jpg", "CMYK", "convert the image"), SKIP
     ),
-    "two files of one name": Refusal(lambda f: image_of(f / "a.png").save(f / "a.jpg"), ("'a' has several files", "keep one")),
-    "two photos": Refusal(lambda f: (f / "b.png").unlink(), ("there are 2, poses need at least 3", "take more photos")),
+    "two files of one name": (lambda f: image_of(f / "a.png").save(f / "a.jpg"), ("'a' has several files", "keep one"), None),
+    "two photos": (lambda f: (f / "b.png").unlink(), ("there are 2, poses need at least 3", "take more photos"), None),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_the_others_are_refused_in_one_line_with_the_file_and_the_remedy(of_photos, name):
     folder, read = of_photos
-    case = REFUSED[name]
-    case.spoil(folder)
+    spoil, message, setting = REFUSED[name]
+    spoil(folder)
     with pytest.raises(DataError) as refusal:
         [frame.load() for frame in read().frames]
     assert "\n" not in str(refusal.value)
-    assert all(part in str(refusal.value) for part in case.message), str(refusal.value)
-    if case.setting is not None:
-        capture = read(**case.setting)
+    assert all(part in str(refusal.value) for part in message), str(refusal.value)
+    if setting is not None:
+        capture = read(**setting)
         assert len(capture.frames) == 3
         assert all(bool(frame.load().isfinite().all()) for frame in capture.frames)
 

@@ -84,14 +84,9 @@ def save_image(name: str, **options: Any) -> Spoil:
     return lambda root: Image.new(mode, size).save(root / name, **options)
 
 
-def photo_outside(root: Path) -> None:
-    (root / "images/a.png").rename(root / "outside.png")
-    replace(IMAGES_TXT, "a.png", "../outside.png")(root)
-
-
-def photo_at_absolute_path(root: Path) -> None:
-    (root / "images/a.png").rename(root / "outside.png")
-    replace(IMAGES_TXT, "a.png", str(root / "outside.png"))(root)
+def photo_outside(root: Path, absolute: bool = False) -> None:
+    outside = (root / "images/a.png").rename(root / "outside.png")
+    replace(IMAGES_TXT, "a.png", str(outside) if absolute else "../outside.png")(root)
 
 
 def link_in_circle(name: str) -> Spoil:
@@ -170,7 +165,8 @@ INPUTS = [
     case("txt colour 300", "colmap_txt", replace(POINTS_TXT, "255", "300"), r"points3D\.txt: line 2: has the colour"),
     case("txt 5000 digits", "colmap_txt", replace(CAMERAS_TXT, "16", "1" * 5000), r"cameras\.txt: line 2: is not numeric"),
     case("txt id of 20 digits", "colmap_txt", replace(POINTS_TXT, "0.5 1 0", f"0.5 {10**20} 0"), r"line 2: .*64 bits"),
-    case("txt absolute path", "colmap_txt", photo_at_absolute_path, r"images\.txt: file name: '/.*outside\.png' leads out"),
+    case("txt absolute path", "colmap_txt", lambda root: photo_outside(root, absolute=True),
+         r"images\.txt: file name: '/.*outside\.png' leads out"),
     case("txt path traversal", "colmap_txt", photo_outside, r"images\.txt: file name: '\.\./outside\.png' leads out"),
     # Blender
     case("JSON absent", "blender", remove(TRAIN), r"transforms_train\.json: file"),
