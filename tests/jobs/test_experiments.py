@@ -39,9 +39,9 @@ def jobs(*arguments: str) -> tuple[list[dict[str, str]], Callable[[dict[str, str
 def pieces(config: DictConfig, stretch: float = 1.0):
     """What `run` builds of a configuration, without data."""
     values = OmegaConf.to_container(config)
-    built = [build(values[key], key) for key in ("objective", "density", "optim", "mip")]
+    built = [build(values[key], key) for key in ("objective", "density", "optim", "mip", "fit")]
     strategies = build(OmegaConf.to_container(config.strategies, resolve=True), "strategies")
-    return [scaled(s, stretch) for s in strategies.values()], *(scaled(thing, stretch) for thing in built)
+    return [scaled(s, stretch) for s in strategies.values()], *(scaled(thing, stretch) for thing in built[:-1])
 
 
 @pytest.mark.parametrize("name", options("method"))
