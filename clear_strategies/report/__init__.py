@@ -16,12 +16,10 @@ import logging
 import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
-import pandas as pd
 
 from clear_strategies import console, files
 from clear_strategies.data.photo_files import read_image
@@ -37,16 +35,6 @@ _log = logging.getLogger(__name__)
 
 _LONGEST: Final = 60  # characters of a scene in the name of a file
 _ENLARGED: Final = 4  # how many times larger the part of a comparison is shown
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Section:
-    """A scene on the page, or the average over scenes, which has no pictures."""
-
-    title: str
-    cells: pd.DataFrame
-    notes: Sequence[str]
-    pictures: Sequence[str] = ()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -77,28 +65,29 @@ def write(runs: Sequence[Run], out: Path) -> str:
     records = table.drop(columns=["average", "run"])
     files.write_text(out / "report.csv", records.to_csv(index=False))
 
-    sections: list[_Section] = []
+    sections: list[dict[str, Any]] = []  # of the page: a scene, or first the average over scenes, which has no pictures
     for scene, name in _file_names(table["scene"]).items():
-        rows = table[table["scene"] == scene]
-        section = _Section(scene, layout(rows).drop(columns="scene"), notes(rows, runs))
+        rows, pictures = table[table["scene"] == scene], list[str]()
+        cells = {"title": scene, "cells": layout(rows).drop(columns="scene"), "notes": notes(rows, runs)}
         if rows["average"].any():
-            sections.insert(0, section)
+            sections.insert(0, cells)
             continue
         shown = dict(zip(rows["method"], rows["run"], strict=True))  # of several seeds the first
-        pictures = [f"{kind}_{name}.png" for kind in ("comparison", "curves")]
-        compared = _compare_renders(out / pictures[0], scene, shown)
-        write_curves(out / pictures[1], {method: history(run.folder) for method, run in shown.items()}, scene)
-        sections.append(_Section(scene, section.cells, section.notes, pictures[not compared :]))
+        if _compare_renders(out / f"comparison_{name}.png", scene, shown):
+            pictures.append(f"comparison_{name}.png")
+        pictures.append(f"curves_{name}.png")
+        write_curves(out / pictures[-1], {method: history(run.folder) for method, run in shown.items()}, scene)
+        sections.append({**cells, "pictures": pictures})
     _write_page(out / "report.html", sections)
     _log.info("report of %d runs: %s (report.html opens in any browser)", len(runs), out)
     return text
 
 
-def _write_page(path: Path, sections: Sequence[_Section]) -> None:
+def _write_page(path: Path, sections: Sequence[Mapping[str, Any]]) -> None:
     from jinja2 import Environment, FileSystemLoader
 
     environment = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True)
-    scenes = [section.title for section in sections if section.pictures]
+    scenes = [section["title"] for section in sections if "pictures" in section]
     title = f"Report: {', '.join(scenes) if len(scenes) < 4 else f'{len(scenes)} scenes'}"
     files.write_text(path, environment.get_template("page.html.j2").render(title=title, sections=sections))
 

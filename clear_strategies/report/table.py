@@ -62,7 +62,7 @@ def layout(table: pd.DataFrame) -> pd.DataFrame:
 
 def notes(table: pd.DataFrame, runs: Sequence[Run]) -> list[str]:
     """What a reader of the table has to know about it."""
-    lines = [f"bicubic, prior: PSNR of the enlarged LR photos and of the SR images. {NOTE[0].upper()}{NOTE[1:]}."]
+    lines = [f"bicubic, prior: PSNR of the enlarged LR photos and of the SR images; {NOTE}."]
     if (table["psnr_delta"].abs() > 0).any():
         error = "; its ±: standard error of the differences seed by seed" * int(table["psnr_delta_error"].notna().any())
         lines.append(f"Δ: PSNR over the scene's first method, dB{error}.")
