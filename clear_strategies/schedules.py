@@ -67,6 +67,9 @@ class WarmupDecay:
         peak: weight between `full` and `decay_from`. final: weight from `end` on; equal to `peak`, there is no decay.
         decay: shape of the decay.
         start, full, decay_from, end: iterations of a 10,000-iteration run.
+
+    Raises:
+        SettingError: the milestones are out of order, or a weight is negative.
     """
 
     peak: float = 1.0
@@ -112,6 +115,9 @@ class Ramp:
         maximum: share of Gaussians, in [0, 1).
         shape: "linear", or "constant", at `maximum` from the first iteration on (F37).
         full: iteration at which the linear rate reaches `maximum`.
+
+    Raises:
+        SettingError: `maximum` is outside [0, 1).
     """
 
     maximum: float = 0.2

@@ -35,6 +35,9 @@ def downsample(image: Float[Tensor, "H W 3"], factor: int, kernel: DownKernel = 
 
     "bicubic", "bilinear" and "lanczos" are PIL's resize with 8 bits per pass, as in the published protocols. "area" is
     the mean of each block, not rounded. Not differentiable.
+
+    Raises:
+        ValueError: unknown kernel, or a size that is not a multiple of `factor`.
     """
     height, width = image.shape[:2]
     if height % factor or width % factor:
@@ -45,7 +48,11 @@ def downsample(image: Float[Tensor, "H W 3"], factor: int, kernel: DownKernel = 
 def resize(
     image: Float[Tensor, "H W 3"], size: tuple[int, int], kernel: DownKernel = "bicubic"
 ) -> Float[Tensor, "h w 3"]:
-    """D to any size (width, height), by the operators of `downsample`; the result lies in [0, 1]."""
+    """D to any size (width, height), by the operators of `downsample`; the result lies in [0, 1].
+
+    Raises:
+        ValueError: unknown kernel, or a size that is not positive.
+    """
     require_choice("kernel", kernel, get_args(DownKernel))
     width, height = size
     if width < 1 or height < 1:
@@ -71,7 +78,11 @@ def area_mean_transposed(cotangents: Float[Tensor, "K h w C"], factor: int) -> F
 
 
 def upsample(image: Float[Tensor, "h w C"], factor: int, kernel: UpKernel = "bicubic") -> Float[Tensor, "H W C"]:
-    """U: enlarge by a whole factor, clamped to [0, 1]. "bicubic" is PIL's kernel (a = -0.5)."""
+    """U: enlarge by a whole factor, clamped to [0, 1]. "bicubic" is PIL's kernel (a = -0.5).
+
+    Raises:
+        ValueError: unknown kernel.
+    """
     return _enlarged(image, factor, kernel).clamp(0, 1)
 
 

@@ -147,7 +147,12 @@ class Density(Densifier):
         return due
 
     def restructure(self, field: GaussianField, optimizer: Adam, t: int) -> Int[Tensor, " M"]:
-        """Clone, split, prune: returns parents[M], row i of everything per Gaussian now comes from row parents[i]."""
+        """Clone, split, prune: returns parents[M], row i of everything per Gaussian now comes from row parents[i].
+
+        Raises:
+            DensityError: fewer than min_gaussians would be left.
+            DivergedError: a parameter is not finite.
+        """
         s, n = self.settings, len(field)
         # NaN fails every comparison: such a Gaussian would be pruned as if it were faint.
         require_finite(f"t={t}: before densification, the parameter", field.raw())

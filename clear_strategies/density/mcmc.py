@@ -59,6 +59,9 @@ class MCMC(Strategy):
         noise: strength of the noise. A Gaussian of covariance Σ moves by noise(t) σ(100 (dead_opacity - opacity)) Σ η / s̃ after
             each iteration until `stop`, with η ~ N(0, I) and s̃ the median of the Gaussians' largest scales; 0: none moves.
         cooling: noise(t) / noise, which falls as the learning rate of the positions does.
+
+    Raises:
+        SettingError: a setting is outside its range.
     """
 
     start: int = milestone(500)

@@ -50,6 +50,9 @@ def without_outliers(cloud: PointCloud, neighbours: int, ratio: float) -> PointC
 def averaged_in_voxels(cloud: PointCloud, edge: float) -> PointCloud:
     """One point per occupied cube of this edge (world units): the averages of its positions and colours, ordered by cube. The
     grid starts half a cube below the smallest coordinates.
+
+    Raises:
+        BackendUnavailable: Open3D is not installed, or a library of the system that it needs.
     """
     try:
         import open3d

@@ -45,6 +45,9 @@ class TriangulationSettings:
         epipolar: largest distance from the epipolar lines, root mean square over both views, LR px.
         reprojection: largest reprojection error in either view, LR px.
         angle: smallest angle between the two rays, degrees.
+
+    Raises:
+        SettingError: a number is outside its range.
     """
 
     enlarge: int = 2

@@ -36,6 +36,9 @@ class FadingOpacity(Strategy):
             of them it is lower in proportion, so that a Gaussian fades equally between two looks at one view. Where `until`
             comes before 1,350, it is lower in proportion, too: opacities start low, and a short run must first raise them.
         until: the iteration after which opacities are left alone.
+
+    Raises:
+        SettingError: a setting is outside its range.
     """
 
     rate: float = 0.005

@@ -42,6 +42,9 @@ class GCO(Strategy):
     There is no ε: norms and products are in float64, where those of float32 gradients do not vanish, and a zero norm is no
     conflict (F27). The opacity group has one dimension: its cosine is ±1, so every disagreement is a full conflict.
     Without evidence q = 0, and the LR gradient prevails (F32).
+
+    Raises:
+        SettingError: a setting is outside its range.
     """
 
     tolerance: float = 0.05

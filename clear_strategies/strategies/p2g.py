@@ -45,6 +45,9 @@ class P2G(Strategy):
         detail_eps: ε of Eq. 9, image units; below it (1/40 of a grey level) differences are rounding, not detail (F23).
         score_by: the densification score: "evidence" S_i alone (the paper; large splats of a sparse initial cloud then
             rarely split), the ordinary "gradient", or their "sum" at equal mean (F9).
+
+    Raises:
+        SettingError: a setting is outside its range.
     """
 
     reliability_scale: float | str = 0.01

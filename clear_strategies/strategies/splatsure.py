@@ -40,6 +40,9 @@ class SplatSuRe(Strategy):
         ratio: τ, the ratio of the finest to the coarsest sampling rate at which half of the HR gradient is withheld.
         softness: of the sigmoid around τ, > 0.
         min_views: Gaussians that are visible in fewer views keep all of their HR gradient.
+
+    Raises:
+        SettingError: a setting is outside its range.
     """
 
     ratio: float = 1.1

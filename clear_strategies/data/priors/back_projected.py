@@ -28,6 +28,9 @@ class BackProjected:
         prior: any other prior; a network is cached.
         rounds: of back-projection, in [1, 100].
         down: D, the operator by which LR photos are made.
+
+    Raises:
+        SettingError: a setting is outside its range.
     """
 
     prior: Prior

@@ -37,6 +37,9 @@ class SeededErrors:
         seed: of the errors; not the run's.
         hidden: leave of the errors only what the LR photo cannot show: the wrong patches shrink to the same LR pixels as
             the right ones would. No comparison with the photo finds them.
+
+    Raises:
+        SettingError: a number is outside its range.
     """
 
     share: float = 0.3

@@ -22,6 +22,10 @@ class Images:
     Args:
         path: the folder.
         suffix: what the SR program appended to the file names, e.g. "_x4".
+
+    Raises:
+        SettingError: no path is given.
+        DataError: at a call, if a view has no file, or shares one with another view.
     """
 
     path: str = ""

@@ -65,6 +65,9 @@ class Ncnn:
         model: waifu2x (factors 2 and 4) or realesrgan (factor 4).
         tile: edge of the tiles into which larger images are cut, LR px; it bounds the memory.
         overlap: see `tiling.tiled`, LR px. 11 and more make no difference to waifu2x.
+
+    Raises:
+        SettingError: the model is another, the extra is not installed, or the tiles would be all overlap.
     """
 
     model: str = "waifu2x"

@@ -32,6 +32,9 @@ class Onnx:
         path: the .onnx file.
         tile: edge of the tiles into which larger images are cut, LR px.
         overlap: see `tiling.tiled`, LR px.
+
+    Raises:
+        SettingError: no path is given, or the tiles would be all overlap.
     """
 
     path: str = ""

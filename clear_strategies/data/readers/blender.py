@@ -33,6 +33,10 @@ def read(root: str | Path, *, background: Color = _WHITE, skip_faulty: bool = Fa
     Args:
         background: RGB in [0, 1], behind transparent pixels.
         skip_faulty: leave out photos that are missing or damaged, with a warning for each; else they are an error.
+
+    Raises:
+        SettingError: the background is no colour.
+        DataError: something is missing or not what it should be.
     """
     root, background = Path(root), as_color("data.reader.background", background)
     if not root.is_dir():

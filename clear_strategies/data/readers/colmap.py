@@ -37,6 +37,10 @@ def read(
             poses_bounds.npy, as many photos under other names are matched by their order.
         background: RGB in [0, 1] behind transparent pixels.
         skip_faulty: leave out photos that are missing or damaged, with a warning for each; else they are an error.
+
+    Raises:
+        SettingError: the background is no colour.
+        DataError: the model or an image cannot be used.
     """
     root, background = Path(root), as_color("data.reader.background", background)
     model = read_model(find_model(root))
@@ -68,6 +72,9 @@ def capture(
     Args:
         upright: see `Frame.of_photo`.
         points: where its points come from, for the plan; empty: from the model's own place.
+
+    Raises:
+        DataError: an image cannot be used.
     """
     listing = model.listing
     kept = usable(listing, model.images, lambda image: paths[image.name], skip_faulty=skip_faulty)

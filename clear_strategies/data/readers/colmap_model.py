@@ -106,7 +106,11 @@ def _files(folder: Path, ending: str | None = None) -> list[Path]:
 
 
 def find_model(root: Path) -> Path:
-    """The folder of the sparse model; of the several that COLMAP's mapper may leave in `sparse`, the one with most photos."""
+    """The folder of the sparse model; of the several that COLMAP's mapper may leave in `sparse`, the one with most photos.
+
+    Raises:
+        DataError: there is none, or one of several cannot be read.
+    """
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
     folder = next(filter(is_model, model_folders(root)), None)
@@ -130,7 +134,11 @@ def find_model(root: Path) -> Path:
 
 
 def read_model(folder: Path) -> Model:
-    """Cameras, images and points of a model folder; a DataError where a file is missing or not what it should be."""
+    """Cameras, images and points of a model folder; a DataError where a file is missing or not what it should be.
+
+    Raises:
+        DataError: a file is missing or not what it should be.
+    """
     cameras, listing, points3d = _files(folder)
     lenses, images = read_cameras(cameras), read_images(listing)
     if not images:

@@ -49,6 +49,10 @@ def read(
             reduced photos. None: the photos that the frames name.
         background: RGB in [0, 1] behind transparent pixels.
         skip_faulty: leave out photos that are missing or damaged, with a warning for each; else they are an error.
+
+    Raises:
+        SettingError: the background is no colour.
+        DataError: something is missing or not what it should be.
     """
     root, background = Path(root), as_color("data.reader.background", background)
     file = root if root.suffix == ".json" else named(root, _FILE)

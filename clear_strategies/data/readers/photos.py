@@ -76,6 +76,10 @@ def read(
         threads: of COLMAP; -1: all. With more than one, the poses' last digits may change from run to run.
         seed: of COLMAP's random samples.
         skip_faulty: leave out photos that are missing or damaged, with a warning for each; else they are an error.
+
+    Raises:
+        SettingError: a number is outside its range.
+        DataError: too few photos, too few can be related to each other, or pycolmap is not installed.
     """
     require_whole("data.reader.max_side", max_side, least=1)
     require_whole("data.reader.max_features", max_features, least=1)

@@ -73,6 +73,9 @@ def reconstruct(root: Path, photos: Mapping[Path, float | None], folder: Path, s
 
     Args:
         photos: with their focal lengths on 35 mm film, as `focal_35mm` gives them.
+
+    Raises:
+        DataError: pycolmap is not installed, or too few photos can be placed.
     """
     pycolmap = _pycolmap()
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -106,7 +109,11 @@ def copy_name(index: int) -> str:
 
 
 def require_placed(root: Path, placed: int, count: int, least: float = 0.0) -> None:
-    """Raise a DataError where fewer than `FEWEST` of `count` photos are placed, or a smaller share than `least`."""
+    """Raise a DataError where fewer than `FEWEST` of `count` photos are placed, or a smaller share than `least`.
+
+    Raises:
+        DataError: fewer than `FEWEST` of `count` photos are placed, or a smaller share.
+    """
     if placed >= FEWEST and placed / count >= least:
         return
     remedy = MORE_PHOTOS

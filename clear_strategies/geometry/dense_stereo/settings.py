@@ -34,6 +34,9 @@ class StereoSettings:
         speckle: fewer connected pixels of similar depth than these are unknown; 0: none are. Needs SciPy.
         spacing: distance of the points on the surface, LR px of the photo that sees them.
         trust: a photo is used whose stereo covers at least this share of its pixels.
+
+    Raises:
+        SettingError: a number is outside its range.
     """
 
     enlarge: int = 2

@@ -38,6 +38,9 @@ def read(*, width: int = 256, height: int = 192, views: int = 12, train: int = 3
         width, height: of the HR images.
         views: how many cameras there are.
         train: how many of them, evenly spaced, are for training, at least 2; the others are for testing.
+
+    Raises:
+        SettingError: a number is outside its range.
     """
     for name, value in (("width", width), ("height", height), ("views", views), ("train", train)):
         require_whole(f"data.reader.{name}", value, least=1)
