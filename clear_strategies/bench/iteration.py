@@ -1,15 +1,22 @@
-"""The time of one training iteration of CLEAR, stage by stage, without L_HF and without HR."""
+"""Time and error of one training iteration of CLEAR, stage by stage, and the time without L_HF and without HR.
+
+The truth is the same iteration in float64 by the readable path, at the same cut-offs; each of its stages gets the inputs of the
+measured stage. The outputs of the stages are compared: images, their cotangents, the gradients of the Gaussians, and the merged
+gradient, as Adam's first moment holds it after a step.
+"""
 
 from __future__ import annotations
 
-from typing import Final
+from dataclasses import fields, replace
+from types import SimpleNamespace
+from typing import Any, Final
 
 import torch
 from torch import Tensor
 
 import rasterizers
 from clear_strategies.bench import scenes
-from clear_strategies.bench.rasterizers import require_device, usable
+from clear_strategies.bench.rasterizers import affordable, in_float64, relative, require_device, truth_backend, usable
 from clear_strategies.bench.results import Results
 from clear_strategies.bench.scenes import SETTINGS, Workload
 from clear_strategies.bench.timing import interleaved, medians, milliseconds, queued
@@ -23,14 +30,14 @@ from clear_strategies.schedules import LogLinear, WarmupDecay
 from clear_strategies.strategies.gco import GCO
 from clear_strategies.strategies.p2g import P2G
 from clear_strategies.strategies.svs import SVS
-from clear_strategies.training.compiled_step import compiled_step_for
+from clear_strategies.training.compiled_step import FusedMode, compiled_step_for
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.loop import iterate, kernel_threads
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
-from rasterizers.interface import Rasterizer, Splats
+from rasterizers.interface import PRESETS, Camera, Rasterizer, Rendering, SplatGradients, Splats
 
 FROZEN: Final = LearningRates(LogLinear(1e-30, 1e-30), *(0.0,) * 6, detail_decay=0.002)
 """Adam does all its work, and the scene stays the same from turn to turn."""
@@ -46,19 +53,32 @@ _PRESET: Final = "fast"
 _NOISE: Final = 0.02  # standard deviation in the photos
 
 
+Outputs = dict[str, dict[str, Tensor]]
+"""Stage of an iteration -> name -> tensor."""
+
+
 class Training:
     """CLEAR after densification: HR at full weight, dropout, correction and evidence are all on."""
 
-    def __init__(self, workload: Workload, view: View, rasterizer: Rasterizer, objective: Objective) -> None:
+    def __init__(
+        self,
+        workload: Workload,
+        view: View,
+        rasterizer: Rasterizer,
+        objective: Objective,
+        *,
+        dropout: bool = True,
+        fused: FusedMode = "auto",
+    ) -> None:
         field, device = field_of(workload.splats), workload.splats.means.device
-        conductor = Conductor(GCO(), P2G(), SVS(), objective=objective)
+        conductor = Conductor(GCO(), P2G(), *([SVS()] if dropout else []), objective=objective)
         # Statistics are gathered, although no round of densification follows.
         density = Density(DensitySettings(stop=10_000), len(field), extent=1.0, seed=0, device=device)
         conductor.on_fit_start(1, 0, device)
         optimizer = Adam(field.raw(), FROZEN, 1.0)
         self.state = TrainState(
             field, conductor, optimizer, density, FitSettings(degree_every=1), MipFilter(), (view,),
-            t=SVS().anchor_start, compiled_step=compiled_step_for(conductor, optimizer),
+            t=SVS().anchor_start, compiled_step=compiled_step_for(conductor, optimizer, fused),
         )  # fmt: skip
         self.state.refilter()
         self.rasterizer = rasterizer
@@ -84,6 +104,9 @@ def measure(results: Results, *, scene: str, backend: str | None, repeats: int, 
 
     Args:
         backend: None: the fastest that runs here.
+
+    Raises:
+        DataError: a name is unknown, or there is no such device.
     """
     require_device(device)
     workload = scenes.load(scene).to(device)
@@ -96,12 +119,66 @@ def measure(results: Results, *, scene: str, backend: str | None, repeats: int, 
     table = medians(turns).T.add_suffix("_ms")
     order = [stage for stage in table.index if stage not in (REST, TOTAL)] + [REST, TOTAL]
     table = table.loc[order].rename_axis("stage").reset_index()
+    if affordable(truth_backend(), workload, "errors", results.note):
+        table["error"] = table["stage"].map(errors(workload, view, rasterizer))
     results.tables |= {"iteration": table, "iteration_turns": turns}
     lr, hr = view.lr.camera, view.hr.camera
     results.note(
         f"{workload.name}: {len(workload.splats):,} Gaussians, LR {lr.width}x{lr.height} and HR {hr.width}x{hr.height}, "
         f"{backend} {_PRESET}. Medians by stage, so they need not add up to the total."
     )
+
+
+def errors(workload: Workload, view: View, rasterizer: Rasterizer) -> dict[str, float]:
+    """The largest relative L2 error of a stage's images, or of the attributes of its gradients."""
+    truth, wide = in_float64(truth_backend(), workload, PRESETS[_PRESET])
+    lr, hr = (replace(photo, image=photo.image.to(wide.splats.means)) for photo in (view.lr, view.hr))
+    measured = _outputs(workload, view, rasterizer, "auto")
+    expected = _outputs(wide, replace(view, lr=lr, hr=hr), truth, "off", given=measured)
+    return {
+        # The basis is no gradient, and has any value where a Gaussian is not seen.
+        stage: max(relative(x, expected[stage][name]) for name, x in tensors.items() if name != "basis")
+        for stage, tensors in measured.items()
+    }
+
+
+def _outputs(
+    workload: Workload, view: View, rasterizer: Rasterizer, fused: FusedMode, given: Outputs | None = None
+) -> Outputs:
+    """The outputs of the stages of an iteration without dropout, whose masks differ between devices.
+
+    Args:
+        given: the outputs of another iteration; each stage gets them as inputs in place of this iteration's own.
+    """
+    outputs: Outputs = {"render": {}}
+
+    def watched(r: Rendering, scale: str) -> Any:
+        outputs["render"][scale] = r.image
+        image = r.image if given is None else given["render"][scale].to(r.image)
+
+        def vjp(cotangents: Tensor) -> SplatGradients:
+            outputs[f"losses {scale}"] = {"cotangents": cotangents.clone()}
+            g = r.vjp(cotangents if given is None else given[f"losses {scale}"]["cotangents"].to(image))
+            outputs[f"backward {scale}"] = {f.name: getattr(g, f.name).clone() for f in fields(g)}
+            if given is None:
+                return g
+            return SplatGradients(**{name: x.to(image) for name, x in given[f"backward {scale}"].items()})
+
+        kept = {name: getattr(r, name) for name in ("alpha", "depth", "means2d", "visible")}
+        return SimpleNamespace(**kept, image=image, vjp=vjp)
+
+    def render_scales(jobs: Any, **options: Any) -> list[Any]:
+        return list(map(watched, rasterizer.render_scales(jobs, **options), ("LR", "HR")))
+
+    watching = _Rasterizer(traits=rasterizer.traits, render_scales=render_scales)
+    state = Training(workload, view, watching, Objective(), dropout=False, fused=fused).state
+    iterate(state, watching)
+    return outputs | dict.fromkeys(("per-Gaussian pass", "optimizer"), state.optimizer.first)
+
+
+class _Rasterizer(SimpleNamespace):
+    def __call__(self, splats: Splats, camera: Camera, *, depth: bool = False) -> Any:
+        return self.render_scales([(splats, camera)], depth=[depth])[0]
 
 
 def field_of(splats: Splats) -> GaussianField:

@@ -25,7 +25,7 @@ from clear_strategies.bench.timing import interleaved, medians, milliseconds, qu
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import DataError
 from clear_strategies.outputs.figures import new_figure
-from rasterizers.interface import PRESETS, Rendering
+from rasterizers.interface import PRESETS, Rasterizer, Rendering
 
 COTANGENTS: Final = 3
 FORWARD, TOGETHER, SEPARATE, LATENCY = "forward", "lr_hr_together", "lr_hr_separate", "latency"
@@ -229,10 +229,16 @@ def errors_of(measured: Drawn, truth: Drawn) -> dict[str, float]:
         x, expected = (drawn[name].double().reshape(len(truth[name]), -1) for drawn in (measured, truth))
         size = expected.norm(dim=1)
         of_each = ((x - expected).norm(dim=1) / size)[size > 0]
-        whole, error = float(size.norm()), float((x - expected).norm())
-        columns[f"{name}_relative"] = error / whole if whole > 0 else error
+        columns[f"{name}_relative"] = relative(x, expected)
         columns[f"{name}_median"] = float(of_each.median()) if len(of_each) else 0.0
     return columns
+
+
+def relative(measured: Tensor, truth: Tensor) -> float:
+    """The relative L2 error; the absolute one where the truth is 0."""
+    truth = truth.double()
+    size, error = float(truth.norm()), float((measured.to(truth) - truth).norm())
+    return error / size if size > 0 else error
 
 
 def affordable(backend: str, workload: Workload, what: str, note: Callable[[str], None]) -> bool:
@@ -249,13 +255,18 @@ def truth_backend() -> str:
     return next(name for name in runs if torch.float64 in rasterizers.load(name).traits.dtypes)
 
 
-def truth_of(backend: str, workload: Workload, cotangent: Float[Tensor, "H W 3"], rules: Mapping[str, Any]) -> Drawn:
-    """Draw in float64, on the workload's device where the backend draws there.
+def in_float64(backend: str, workload: Workload, rules: Mapping[str, Any]) -> tuple[Rasterizer, Workload]:
+    """A rasterizer, and the workload in float64 on its device, where the rasterizer draws there.
 
     Args:
         rules: the cut-offs, and settings that differ from `SETTINGS`.
     """
     rasterizer = rasterizers.load(backend, **{**SETTINGS, **rules})
     device = workload.splats.means.device.type
-    wide = workload.to(device if device in rasterizer.traits.devices else "cpu", torch.float64)
+    return rasterizer, workload.to(device if device in rasterizer.traits.devices else "cpu", torch.float64)
+
+
+def truth_of(backend: str, workload: Workload, cotangent: Float[Tensor, "H W 3"], rules: Mapping[str, Any]) -> Drawn:
+    """Draw in float64."""
+    rasterizer, wide = in_float64(backend, workload, rules)
     return draw(lambda: rasterizer(wide.splats, wide.camera), cotangent.to(wide.splats.means))

@@ -77,6 +77,35 @@ def test_every_method_trains(name, fused):
     assert float(state.field.detail.data.abs().max()) == 0  # no baseline has the detail feature
 
 
+def test_what_the_methods_are():
+    """Weights, filters and dropout, row by row of docs/how-to/baselines.md."""
+    found = {}
+    for name in options("method"):
+        c = composed(f"+method={name}")
+        hr = c.objective.lambda_hr
+        assert hr.peak == hr.final
+        assert hr.peak == 0 or (hr.start, hr.full) == (0, 0)
+        assert c.objective.lambda_hf == 0
+        found[name] = (
+            hr.peak, c.objective.lambda_lr, c.objective.lr_from, c.rasterizer.kernel, c.mip.variance, c.mip.cameras,
+        )  # fmt: skip
+        assert all(
+            (c.strategies[s].anchor_strength, c.strategies[s].looks) == (0, 0) for s in c.strategies if s == "svs"
+        )
+        assert ("svs" in c.strategies) == name.startswith("dropgaussian")
+        assert ("splatsure" in c.strategies) == name.endswith("splatsure")
+    mip, on_lr, on_hr = (0.1, 0.2, "lr"), (0.0, 1.0, "lr"), (0.1, 0.2, "hr")
+    assert found == {
+        "3dgs_lr": (*on_lr, 0.3, 0.0, "hr"), "mip_splatting_lr": (*on_lr, *mip), "dropgaussian": (*on_lr, *mip),
+        "srgs": (1.0, 0.0, "lr", *on_hr), "dropgaussian_srgs": (1.0, 0.0, "lr", *on_hr),
+        "srgs_lr": (0.4, 0.6, "hr", *on_hr), "binocular3dgs_srgs": (0.4, 0.6, "hr", *on_hr),
+        "splatsure": (0.4, 0.6, "hr", *on_hr), "dropgaussian_splatsure": (0.4, 0.6, "hr", *on_hr),
+        "cor_gs_srgs": (0.4, 0.6, "hr", *on_hr), "s2gaussian": (*on_lr, *on_hr),
+    }  # fmt: skip
+    assert composed("+method=3dgs_lr").rasterizer.antialiased is False
+    assert list(composed("+method=binocular3dgs_srgs").strategies) == ["fading_opacity", "pseudo_views"]
+
+
 def test_a_method_is_the_same_whatever_strategies_are_named_before_it():
     """The decorator of best would change the SR images of srgs, the λ_HR of clear_paper train 3dgs_lr on SR images."""
     assert list(composed("+strategy=clear", "+method=dropgaussian").strategies) == ["svs"]
