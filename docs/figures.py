@@ -17,7 +17,6 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from statistics import fmean
 from typing import Any, Final
 
 import matplotlib as mpl
@@ -114,21 +113,18 @@ def best(folder: Path) -> None:
 
 
 def hosts(folder: Path) -> None:
-    rows = [row for row in table("hosts_best") if row["measured"] < "2026-11-26"]  # HR drawn whole
-    names = list(dict.fromkeys(row["host"] for row in rows))
+    means = {  # the last of several
+        (row["host"], row["points"], row["strategies"]): float(row["PSNR at HR (dB)"])
+        for row in table("hosts_best")
+        if row["scene"] == "both"
+    }
+    names = list(dict.fromkeys(host for host, *_ in means))
     series = (("own", "none"), ("stereo", "clear"), ("stereo", "best"))
     figure, axes = plt.subplots(figsize=(7, 2.4))
     for k, (points, strategies) in enumerate(series):
-        means = [
-            fmean(
-                float(row["PSNR at HR (dB)"])
-                for row in rows
-                if (row["host"], row["points"], row["strategies"], row["seed"]) == (name, points, strategies, "0")
-            )
-            for name in names
-        ]
+        heights = [means[name, points, strategies] for name in names]
         label = "alone, its own points" if strategies == "none" else f"{strategies}, from stereo"
-        axes.bar([i + 0.25 * (k - 1) for i in range(len(names))], means, width=0.23, label=label)
+        axes.bar([i + 0.25 * (k - 1) for i in range(len(names))], heights, width=0.23, label=label)
     axes.set_xticks(range(len(names)), names)
     axes.set_ylim(14, None)
     axes.set_ylabel("PSNR at HR, dB")
