@@ -50,8 +50,6 @@ def test_every_method_trains(name, fused):
     """Few iterations of a toy, through every phase; the loss that it is about falls."""
     # After a reset the loss has to fall anew; a toy that doubles its Gaussians in 24 iterations does not settle.
     config = composed(f"+method={name}", "density.reset_every=0", "density.threshold=1.5e-3")
-    if name == "cor_gs_srgs":  # a toy of 40 points has neighbours at a third of its size
-        config.strategies.two_fields.alone = 1.0
     assert config.method == name
     settings = FitSettings(iterations=24, max_degree=1, probe_every=0, checkpoint_every=0, fused=fused)
     strategies, objective, density, rates, mip = pieces(config, settings.stretch)
