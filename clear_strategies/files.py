@@ -90,6 +90,8 @@ def read_bytes(path: Path, *, most: int = _LARGEST, remedy: str = "check the pat
     require_regular(path, most=most)
     try:
         return path.read_bytes()
+    except FileNotFoundError as error:
+        raise DataError(path, "file", "is not there", remedy) from error
     except OSError as error:
         raise DataError(path, "file", f"cannot be read ({error.strerror})", remedy) from error
 
