@@ -155,8 +155,8 @@ def test_shapes_that_do_not_belong_together_are_refused() -> None:
 
 
 def test_a_missing_file_and_a_folder_get_one_line(tmp_path: Path) -> None:
-    for path in (tmp_path / "absent.ply", tmp_path):
-        with pytest.raises(DataError, match="file: is not there"):
+    for path, problem in ((tmp_path / "absent.ply", "is not there"), (tmp_path, "cannot be read")):
+        with pytest.raises(DataError, match=f"file: {problem}"):
             read_points(path)
 
 
