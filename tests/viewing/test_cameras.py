@@ -51,7 +51,7 @@ TURNED = [{"width": 4, "height": 4, "fx": 4, "fy": 4, "rotation": [[1, 0], [0, 1
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (None, "cannot be read"), ("", "is not valid"), ("[{", "is not valid"), ("[]", "is an empty list"),
+        (None, "is not there"), ("", "is not valid"), ("[{", "is not valid"), ("[]", "is an empty list"),
         ("[1]", "must be"), ("[{}]", "is missing"), ("{}", "must be `array`"),
         (json.dumps(TURNED), r"\[0\]\.rotation: must be `array` of length 3"),
     ],
