@@ -8,6 +8,7 @@ a tensor that forgets where it belongs cannot be reckoned with.
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass, replace
 
 import pytest
@@ -254,7 +255,12 @@ def test_every_tensor_is_made_where_the_field_lies_and_late_numbers_are_the_same
         if not now.get("corrected", 0.0) > 0:  # that is known too late to leave the share out
             then.pop("omega_at_lower_bound", None)
             now.pop("omega_at_lower_bound", None)
-        assert now == pytest.approx(then, rel=1e-6, nan_ok=True)
+        assert known(now) == pytest.approx(known(then), rel=1e-6)
+
+
+def known(row: dict[str, float]) -> dict[str, float]:
+    """Without NaNs, which a row loses with its place among the newest, and in a checkpoint."""
+    return {name: x for name, x in row.items() if not math.isnan(x)}
 
 
 def test_a_scene_moves_as_one_and_its_cameras_and_cloud_stay():
