@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TypeVar
+
 import torch
+from jaxtyping import Float
+from torch import Tensor
+
+T = TypeVar("T")
 
 
 def generator_at(seed: int, t: int, device: torch.device | str = "cpu") -> torch.Generator:
@@ -19,3 +26,15 @@ def hashed_generator_at(seed: int, t: int, device: torch.device | str = "cpu") -
     x = (seed * 0x9E3779B97F4A7C15 + t * 0xBF58476D1CE4E5B9) & (2**64 - 1)
     x = (x ^ (x >> 31)) * 0x94D049BB133111EB & (2**64 - 1)
     return torch.Generator(device).manual_seed((x ^ (x >> 29)) >> 1)
+
+
+def one_of(items: Sequence[T], generator: torch.Generator) -> T:
+    """One of them, each as likely as another."""
+    return items[int(torch.randint(len(items), (), generator=generator))]
+
+
+def dropout_mask(n: int, p: float, seed: int, t: int, device: torch.device | str = "cpu") -> Float[Tensor, " N"]:
+    """Bernoulli(1 - p) / (1 - p) for n Gaussians, drawn on `device` and reproducible there from (seed, t).  Eq. 15"""
+    generator = hashed_generator_at(seed, t, device)
+    kept = torch.rand(n, generator=generator, device=device) >= p
+    return kept.to(torch.get_default_dtype()) / (1 - p)

@@ -81,6 +81,7 @@ class Conductor:
             if owners:
                 self._owner[hook] = owners[0]
         self.regularizers = [s for s in strategies if overrides(s, "regularize")]
+        self._that_look = [s for s in strategies if overrides(s, "drawn_views")]
         others = ("regularize", "extra_views", "drawn_views", "may_densify", "after_step")
         for s in strategies:
             if not any(overrides(s, hook) for hook in (*_ONE_ANSWER, *others)):
@@ -239,8 +240,8 @@ class Conductor:
         if self.objective.lambda_lr == 0:
             return []
         views = [extra for s in self.strategies for extra in s.extra_views(t)]
-        for s in self.strategies:
-            if drawn is not None and overrides(s, "drawn_views"):
+        if drawn is not None:
+            for s in self._that_look:
                 with self.work_log.stage("pictures drawn"):
                     views += s.drawn_views(t, drawn)
         return views

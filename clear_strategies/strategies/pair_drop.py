@@ -11,11 +11,9 @@ from dataclasses import dataclass
 from functools import partial
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from clear_strategies.core.checks import require_number, require_whole
-from clear_strategies.core.seeds import generator_at, hashed_generator_at
+from clear_strategies.core.seeds import dropout_mask, generator_at, one_of
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.schedules import milestone
 from clear_strategies.strategies.base import Drawn, Strategy
@@ -59,13 +57,7 @@ class PairDrop(Strategy):
         seed, cameras = self.cache["seed"], self.cache["cameras"]
         if t < self.start or t % self.every or not cameras:
             return ()
-        camera = cameras[int(torch.randint(len(cameras), (), generator=generator_at(seed, t)))]
-        one, other = (partial(subset, share=self.share, seed=seed, draw=2 * t + k, device=self.device) for k in (0, 1))
+        camera = one_of(cameras, generator_at(seed, t))
+        one, other = (partial(dropout_mask, p=self.share, seed=~seed, t=2 * t + k, device=self.device) for k in (0, 1))
         image = drawn.draw(camera, other)
         return (ExtraView(Photo(camera, image), torch.full_like(image[..., 0], self.weight), gate=one),)
-
-
-def subset(n: int, *, share: float, seed: int, draw: int, device: torch.device) -> Float[Tensor, " N"]:
-    """0 for the dropped of n Gaussians, 1 / (1 - share) for the others."""
-    kept = torch.rand(n, generator=hashed_generator_at(~seed, draw, device), device=device) >= share
-    return kept.float() / (1 - share)

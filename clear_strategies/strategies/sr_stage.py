@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 
 from clear_strategies.core.checks import require_number, require_whole
-from clear_strategies.core.seeds import hashed_generator_at
+from clear_strategies.core.seeds import hashed_generator_at, one_of
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.geometry.cameras import distance_to
 from clear_strategies.geometry.pseudo_views import moved_aside
@@ -69,7 +69,7 @@ class SRStage(Strategy):
             self.cache["pictures"] = [self._picture(views[i % len(views)], i, drawn) for i in range(self.count)]
         photos = [view.hr for view in views] if t % 2 or not self.count else self.cache["pictures"]
         generator = hashed_generator_at(self.cache["seed"], t)
-        photo: Photo = photos[int(torch.randint(len(photos), (), generator=generator))]
+        photo: Photo = one_of(photos, generator)
         weight = torch.full_like(photo.image[..., 0], self.weight)
         weight = weight if photo.shown is None else weight * photo.shown
         return (ExtraView(photo, weight, views[0].background, robust=True),)

@@ -19,7 +19,7 @@ from clear_strategies.core.checks import require_choice, require_number, require
 from clear_strategies.core.compiled_rules import Anchor
 from clear_strategies.core.gradients import ATTRIBUTES, Grads
 from clear_strategies.core.points import spread
-from clear_strategies.core.seeds import hashed_generator_at
+from clear_strategies.core.seeds import dropout_mask
 from clear_strategies.core.step import Step
 from clear_strategies.errors import AnchorError
 from clear_strategies.schedules import Ramp, milestone
@@ -149,10 +149,3 @@ class SVS(Strategy):
                 "densification at t_a (gsplat: refine_stop_iter; Inria: densify_until_iter) or raise "
                 "strategies.svs.anchor_start."
             )
-
-
-def dropout_mask(n: int, p: float, seed: int, t: int, device: torch.device | str = "cpu") -> Float[Tensor, " N"]:
-    """Bernoulli(1 - p) / (1 - p) for n Gaussians, drawn on `device` and reproducible there from (seed, t).  Eq. 15"""
-    generator = hashed_generator_at(seed, t, device)
-    kept = torch.rand(n, generator=generator, device=device) >= p
-    return kept.to(torch.get_default_dtype()) / (1 - p)

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.points import spread
-from clear_strategies.core.seeds import hashed_generator_at
+from clear_strategies.core.seeds import hashed_generator_at, one_of
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.geometry.cameras import distance_to
@@ -84,8 +84,7 @@ class TwoFields(Strategy):
         if t < self.start or t % self.every or not self.cache["cameras"]:
             return ()
         generator = hashed_generator_at(self.cache["seed"], t)
-        cameras: Sequence[Camera] = self.cache["cameras"]
-        camera = cameras[int(torch.randint(len(cameras), (), generator=generator))]
+        camera: Camera = one_of(self.cache["cameras"], generator)
         camera = moved_aside(camera, distance_to(camera, drawn.means), self.reach, generator)
         image = drawn.draw(camera)
         return (ExtraView(Photo(camera, image), torch.full_like(image[..., 0], self.weight)),)

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from clear_strategies import PairDrop
+from clear_strategies.core.seeds import dropout_mask
 from clear_strategies.strategies.base import Drawn
-from clear_strategies.strategies.pair_drop import subset
 from clear_strategies.training.loop import EXTRA_LOSS, iterate
 from tests.helpers import toy
 from tests.helpers.short_run import SCENE, start
@@ -15,7 +15,7 @@ from tests.helpers.short_run import SCENE, start
 
 def test_a_subset_is_a_function_of_seed_and_draw_and_keeps_the_mean_opacity():
     def mask(seed: int, draw: int) -> torch.Tensor:
-        return subset(4_000, share=0.25, seed=seed, draw=draw, device=torch.device("cpu"))
+        return dropout_mask(4_000, p=0.25, seed=seed, t=draw)
 
     assert sorted(set(mask(0, 1).tolist())) == pytest.approx([0, 1 / 0.75])
     assert float(mask(0, 1).mean()) == pytest.approx(1, abs=0.03)

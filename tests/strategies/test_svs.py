@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clear_strategies import SVS, AnchorError
+from clear_strategies.core.seeds import dropout_mask
 from clear_strategies.schedules import Ramp
-from clear_strategies.strategies.svs import dropout_mask
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
 

@@ -12,11 +12,10 @@ from torch import Tensor
 from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule
 from clear_strategies.core.conflicts import ConflictCounts
 from clear_strategies.core.gradients import CONFLICT_GROUPS
-from clear_strategies.kernels.merge.interface import Colour, Merged, Rows
+from clear_strategies.kernels.merge.interface import FIRST_BANDS, Colour, Merged, Rows
 from rasterizers.native import load_kernels, threads
 
 GROUPS: Final = {name: k for k, name in enumerate((*CONFLICT_GROUPS, "detail"))}
-FIRST_BANDS: Final = {"sh0": 0, "shN": 1}
 
 
 def merge(

@@ -17,6 +17,10 @@ WIDEST: Final = 45
 """Numbers of a Gaussian in one attribute, at most: three degrees of spherical harmonics."""
 
 
+FIRST_BANDS: Final = {"sh0": 0, "shN": 1}
+"""The first band of the attributes that are spherical harmonics."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
     """One attribute's gradients, contiguous float32 [N, …]; None is 0.

@@ -258,5 +258,5 @@ def _rows(name: str, rows: interface.Rows | None) -> Any:
     return struct(
         Rows, tensors, has=sum(1 << k for k, field in enumerate(_ROWS[1:]) if tensors[field] is not None),
         width=rows.out.shape[1:].numel(), stiffness=rows.stiffness,
-        first_band={"sh0": 0, "shN": 1}.get(name, -1),
+        first_band=interface.FIRST_BANDS.get(name, -1),
     )  # fmt: skip
