@@ -18,7 +18,7 @@ from torch.nn import functional as F
 from torch.utils._python_dispatch import TorchDispatchMode
 from tqdm import tqdm
 
-from clear_strategies.bench.rasterizers import require_device
+from clear_strategies.bench.rasterizers import relative, require_device
 from clear_strategies.bench.results import Results
 from clear_strategies.compose import conductor
 from clear_strategies.core.deferred import Number
@@ -189,9 +189,7 @@ def _error(strategies: str) -> dict[str, Any]:
     pairs: list[tuple[str, Tensor, Tensor]] = [
         (name, gradients[0][name], exact) for name, exact in gradients[1].items()
     ]
-    return {"loop": strategies} | {
-        name: float((g - exact).norm() / exact.norm()) for name, g, exact in pairs if exact.any()
-    }
+    return {"loop": strategies} | {name: relative(g, exact) for name, g, exact in pairs if exact.any()}
 
 
 def _rasterization(device: str) -> Callable[..., Any]:

@@ -41,7 +41,7 @@ class TrainState:
         near: the near plane of the rasterizer, world units.
         history: one row per iteration; read it by `history_as_floats`, since on a device its numbers are deferred.
         second: a second field that trains beside this one, if a strategy asks for it (`Strategy.second_seed`).
-        other: the state whose field strategies look at, of two: the second one of the first, the first one of the second.
+        first: of a second field, the state that it trains beside.
     """
 
     field: GaussianField
@@ -56,7 +56,7 @@ class TrainState:
     history: History = field(default_factory=History)
     compiled_step: CompiledStep | None = None
     second: TrainState | None = None
-    other: TrainState | None = None
+    first: TrainState | None = None
 
     @classmethod
     def start(
@@ -91,16 +91,21 @@ class TrainState:
             )
         optimizer = Adam(theta.raw(), rates, extent)
         conductor.on_fit_start(len(scene.train), settings.seed, device, scene.train)
-        state = cls(theta, conductor, optimizer, densifier, settings, mip, scene.train, near, other=first)
+        state = cls(theta, conductor, optimizer, densifier, settings, mip, scene.train, near, first=first)
         state.compiled_step = compiled_step_for(conductor, optimizer, settings.fused)
         state.refilter()
         owner = conductor.owner("second_seed") if first is None else None
         if owner is not None and (seed := owner.second_seed(settings.seed)) is not None:
-            state.second = state.other = cls.start(
+            state.second = cls.start(
                 scene, conductor.copy(), settings=replace(settings, seed=seed), density=density, rates=rates, mip=mip, near=near,
                 first=state,
             )  # fmt: skip
         return state
+
+    @property
+    def other(self) -> TrainState | None:
+        """The other one of two; strategies look at its field."""
+        return self.second or self.first
 
     @property
     def device(self) -> torch.device:
