@@ -46,6 +46,15 @@ def shared_data() -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def saved_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
+    """The folder of a small run as it was saved, and its field."""
+    from tests.helpers import saved_run
+
+    folder = tmp_path_factory.mktemp("run")
+    return folder, saved_run.write(folder)
+
+
 @pytest.fixture
 def blocks_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[str, int], int], None]:
     """Lets the kernels of a table of lanes run with this many threads per block, as on CUDA, where lanes sum together."""

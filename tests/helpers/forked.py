@@ -14,12 +14,13 @@ import signal
 import socket
 import subprocess
 import sys
-from contextlib import nullcontext, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from pathlib import Path
 from typing import IO, Any
 
-from tests.helpers import pictures
+import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 # What a run imports. None of them starts a thread or asks for a GPU, which no fork would have.
@@ -64,6 +65,17 @@ class Forked:
 
     def kill(self) -> None:
         self.send_signal(signal.SIGKILL)
+
+
+@contextmanager
+def not_drawn() -> Iterator[None]:
+    """A run without its pictures, which matplotlib draws in nine tenths of so short a run, by what writes all files."""
+    from clear_strategies.outputs import results
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("write_curves", "write_contact_sheet", "write_coverage"):
+            patch.setattr(results, name, lambda *_: None)
+        yield
 
 
 def _received(status: socket.socket) -> int:
@@ -139,7 +151,7 @@ def main() -> None:
         return
     kind, program, *arguments = request["arguments"]
     sys.argv = ["-c", *arguments]
-    with nullcontext() if request["drawn"] else pictures.not_drawn():
+    with nullcontext() if request["drawn"] else not_drawn():
         if kind == "-c":
             exec(program, {"__name__": "__main__"})  # noqa: S102 - a test's own
         else:

@@ -13,8 +13,7 @@ from clear_strategies.training.optim import LearningRates
 from integration.gsplat import Attached, attach
 from rasterizers import autograd
 from tests.helpers import toy
-from tests.helpers.host_parts import photometric
-from tests.helpers.inria import HR_FROM_START
+from tests.helpers.host_parts import HR_FROM_START, photometric
 
 rasterization = functools.partial(autograd.rasterization, backend="torch")
 

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 from torch import Tensor
 
+from clear_strategies import Objective
 from clear_strategies.kernels import losses
+from clear_strategies.schedules import WarmupDecay
 
 FROM_START = ["objective.lambda_hr.start=0", "objective.lambda_hr.full=0", "strategies.p2g.patch=4"]
 """Settings of a run that is too short for the warm-up, and photos that are too small for P2G's patches."""
+FOLDER = Path(__file__).parent / "inria_host"
+N = 24  # Gaussians of the 3DGS-style host in FOLDER
+HR_FROM_START = Objective(lambda_hr=WarmupDecay(start=0, full=1, decay_from=100, end=100))
+WITHOUT_HR = Objective(lambda_hr=WarmupDecay(peak=0, final=0))
 
 
 def photometric(image: Tensor, target: Tensor) -> Tensor:
@@ -35,3 +43,20 @@ class InNdc(torch.autograd.Function):
         elif ctx.absolute:  # and Mip-Splatting keeps their norm in the third column
             ndc[:, 2] = 3 * ndc[:, :2].norm(dim=1)
         return ndc, None, None, None
+
+
+def options(host, folder, **settings):
+    """The options of the host's train.py."""
+    opt = host.parser().parse_args(["-s", str(folder)])
+    for name, value in settings.items():
+        setattr(opt, name, value)
+    return opt
+
+
+def loop(host, clear, opt, gaussians, scene, **settings):
+    """The host's loop with its global `render` replaced; the host's own function is back afterwards."""
+    own, host.render = host.render, clear.wrap(host.render)
+    try:
+        host.loop(opt, gaussians, scene, **settings)
+    finally:
+        host.render = own

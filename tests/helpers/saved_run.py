@@ -6,16 +6,10 @@ from pathlib import Path
 
 import torch
 
-from clear_strategies import GCO, Conductor
-from clear_strategies.density.adaptive import DensitySettings
-from clear_strategies.merging.objective import Objective
+from clear_strategies import GCO
 from clear_strategies.outputs.export import export_ply
 from clear_strategies.training import checkpoint
 from clear_strategies.training.field import GaussianField
-from clear_strategies.training.mip import MipFilter
-from clear_strategies.training.optim import LearningRates
-from clear_strategies.training.settings import FitSettings
-from clear_strategies.training.state import TrainState
 from clear_strategies.viewing.cameras import write_cameras
 from tests.helpers import toy
 
@@ -24,10 +18,7 @@ SCENE = toy.scene()
 
 def write(folder: Path) -> GaussianField:
     """Write checkpoint, cameras and PLY; returns the field."""
-    state = TrainState.start(
-        SCENE, Conductor(GCO(), objective=Objective(kernels="torch")), settings=FitSettings(iterations=3, fused="off"),
-        density=DensitySettings(), rates=LearningRates(), mip=MipFilter(),
-    )  # fmt: skip
+    state = toy.started(GCO(), of=SCENE, iterations=3, max_degree=3)
     g = torch.Generator().manual_seed(3)
     for name, amount in (("detail", 0.2), ("shN", 0.3)):
         value = getattr(state.field, name)

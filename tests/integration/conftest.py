@@ -11,14 +11,14 @@ from safetensors.torch import load_file
 from clear_strategies import Conductor
 from integration.inria import attach
 from integration.inria.__main__ import main
-from tests.helpers import inria, toy
-from tests.helpers.host_parts import FROM_START
+from tests.helpers import host_parts, toy
+from tests.helpers.host_parts import FOLDER, FROM_START
 
 
 @pytest.fixture
 def inria_host(monkeypatch):
     """Its train.py as a module. Its modules are unloaded after the test, since their names are common."""
-    monkeypatch.syspath_prepend(str(inria.FOLDER))
+    monkeypatch.syspath_prepend(str(FOLDER))
     yield importlib.import_module("train")
     for name in [m for m in sys.modules if m.split(".")[0] in ("train", "scene", "gaussian_renderer")]:
         del sys.modules[name]
@@ -27,7 +27,7 @@ def inria_host(monkeypatch):
 @pytest.fixture
 def inria_capture(inria_host, tmp_path):
     """A folder with the LR photos and SR images of the toy scene."""
-    importlib.import_module("scene").write(tmp_path, toy.scene(inria.N))
+    importlib.import_module("scene").write(tmp_path, toy.scene(host_parts.N))
     return tmp_path
 
 
@@ -35,8 +35,8 @@ def inria_capture(inria_host, tmp_path):
 def inria_attached(inria_host, inria_capture):
     """`made(*strategies)`: CLEAR attached to a fresh model of the host, the model, and its scene."""
 
-    def made(*strategies, objective=inria.HR_FROM_START, sr=inria_capture / "sr", **settings):
-        gaussians, scene = inria_host.setup(inria.options(inria_host, inria_capture))
+    def made(*strategies, objective=host_parts.HR_FROM_START, sr=inria_capture / "sr", **settings):
+        gaussians, scene = inria_host.setup(host_parts.options(inria_host, inria_capture))
         conductor = Conductor(*strategies, objective=objective)
         return attach(gaussians, scene.cameras, conductor, sr=sr, **settings), gaussians, scene
 
@@ -50,7 +50,7 @@ def inria_launched(inria_host, inria_capture):
     def run(name, *arguments, points="own"):
         file = inria_capture / name
         clear = ["--points", points, "--sr", str(inria_capture / "sr"), *(f"--overrides={row}" for row in FROM_START)]
-        script = [str(inria.FOLDER / "train.py"), "-s", str(inria_capture), "--save", str(file)]
+        script = [str(FOLDER / "train.py"), "-s", str(inria_capture), "--save", str(file)]
         assert main([*clear, *script, "--densify_until_iter", "0", *arguments]) == 0
         return load_file(file)
 

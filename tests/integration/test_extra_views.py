@@ -12,7 +12,7 @@ import rasterizers
 from clear_strategies import Conductor, FadingOpacity
 from integration.inria.attached import _ATTRIBUTES
 from rasterizers import Splats
-from tests.helpers import gsplat_host, inria, toy
+from tests.helpers import gsplat_host, host_parts, toy
 from tests.helpers.gsplat_host import Host, started
 from tests.integration.test_inria import trained as trained_inria
 
@@ -42,7 +42,7 @@ def reference(params, camera, degree, **settings):
 
 
 def dark():
-    return Conductor(toy.ShowsDark(), objective=inria.HR_FROM_START)
+    return Conductor(toy.ShowsDark(), objective=host_parts.HR_FROM_START)
 
 
 def test_gsplat_draws_it_and_steps_once_more_on_its_gradient(drawn):
@@ -57,7 +57,7 @@ def test_gsplat_draws_it_and_steps_once_more_on_its_gradient(drawn):
     assert clear.attachment.counts["extra views"] == 1
 
     gradient = extra_gradient(alone, camera)
-    gsplat_host.trained(alone, scene, Conductor(objective=inria.HR_FROM_START), [scene.train[0].name])
+    gsplat_host.trained(alone, scene, Conductor(objective=host_parts.HR_FROM_START), [scene.train[0].name])
     for name, optimizer in alone.optimizers.items():
         if name in gradient:
             alone.splats[name].grad = gradient[name]
@@ -130,7 +130,7 @@ def test_a_scaler_of_losses_leaves_the_extra_step_of_a_fused_adam_as_it_is():
 
 
 def test_an_inria_style_host_draws_any_camera(inria_host, inria_capture, drawn):
-    opt = inria.options(inria_host, inria_capture, iterations=1)
+    opt = host_parts.options(inria_host, inria_capture, iterations=1)
     _, clear, _ = trained_inria(inria_host, inria_capture, [toy.ShowsDark()], iterations=1)
     image, camera = drawn[0]
     assert image.shape == (camera.height, camera.width, 3)
@@ -145,7 +145,7 @@ def test_opacities_fade_in_a_gsplat_host():
     for strategies in ((), (FadingOpacity(rate=0.5),)):
         a_host = Host(scene)
         names = [scene.train[i % 3].name for i in range(4)]
-        gsplat_host.trained(a_host, scene, Conductor(*strategies, objective=inria.HR_FROM_START), names)
+        gsplat_host.trained(a_host, scene, Conductor(*strategies, objective=host_parts.HR_FROM_START), names)
         after[len(strategies)] = a_host.splats["opacities"].detach().sigmoid()
     assert after[1].mean() < 0.4 * after[0].mean()  # three steps, and what the optimizer gives back
     assert after[1].min() > 0.005

@@ -22,7 +22,7 @@ from integration.gsplat import attach
 from rasterizers import autograd
 from tests.helpers import toy
 from tests.helpers.gsplat_host import Host, attached, rasterization, started, trained
-from tests.helpers.inria import HR_FROM_START
+from tests.helpers.host_parts import HR_FROM_START
 from tests.helpers.own_trainer import RASTERIZER, in_double
 
 STEPS = 50

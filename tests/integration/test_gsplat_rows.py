@@ -14,7 +14,7 @@ from integration.gsplat import attach
 from integration.lineage import ROWS
 from tests.helpers import gsplat_host, toy
 from tests.helpers.gsplat_host import Host
-from tests.helpers.inria import HR_FROM_START
+from tests.helpers.host_parts import HR_FROM_START
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from integration.densification import end_with_strategies, require_end
 from integration.host_score import ScoreScaler, score_for_host
 from integration.inria import attach
 from tests.helpers import gsplat_host
-from tests.helpers.inria import HR_FROM_START, WITHOUT_HR, N, options
+from tests.helpers.host_parts import HR_FROM_START, WITHOUT_HR, N, options
 
 # ---- the tensor in which a host keeps the screen gradient
 

@@ -23,7 +23,7 @@ from integration import HostError
 from integration.inria import attach
 from integration.inria.cameras import HostViews, intrinsics
 from tests.helpers import toy
-from tests.helpers.inria import HR_FROM_START, WITHOUT_HR, N, loop, options
+from tests.helpers.host_parts import HR_FROM_START, WITHOUT_HR, N, loop, options
 from tests.helpers.own_trainer import RASTERIZER, in_double
 
 STEPS = 25

@@ -14,8 +14,7 @@ from safetensors.torch import load_file
 from integration import HostError
 from integration.inria.__main__ import main
 from integration.inria.from_options import install
-from tests.helpers.host_parts import FROM_START
-from tests.helpers.inria import FOLDER, N, options
+from tests.helpers.host_parts import FOLDER, FROM_START, N, options
 
 SETUP = "    gaussians.training_setup(opt)\n"
 

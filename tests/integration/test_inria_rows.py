@@ -8,7 +8,7 @@ import torch
 from integration.inria.rows import CarriedRows, find_change
 from integration.lineage import change_of
 from tests.helpers import toy
-from tests.helpers.inria import N, loop, options
+from tests.helpers.host_parts import N, loop, options
 
 ROWS = torch.arange(N)
 

@@ -10,7 +10,7 @@ from clear_strategies.training.field import GaussianField
 from integration import AutogradShot, ScoreScaler, extra_loss, joint_loss
 from rasterizers import Splats, autograd
 from tests.helpers import toy
-from tests.helpers.inria import HR_FROM_START
+from tests.helpers.host_parts import HR_FROM_START
 
 
 class Host:

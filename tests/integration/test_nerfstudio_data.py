@@ -29,7 +29,7 @@ from integration.nerfstudio.data import (
 from integration.views import save_photos
 from tests.helpers import gsplat_host, toy
 from tests.helpers.gsplat_host import Host
-from tests.helpers.inria import HR_FROM_START
+from tests.helpers.host_parts import HR_FROM_START
 
 
 class DataManager:

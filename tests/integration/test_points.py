@@ -22,8 +22,7 @@ from integration.points import stereo_points
 from integration.views import HostPhoto
 from rasterizers.geometry import SH_C0
 from tests.helpers import toy
-from tests.helpers.host_parts import FROM_START
-from tests.helpers.inria import N, options
+from tests.helpers.host_parts import FROM_START, N, options
 
 SCRIPT = Path(__file__).parents[1] / "helpers" / "simple_trainer.py"
 

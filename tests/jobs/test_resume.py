@@ -16,7 +16,7 @@ from clear_strategies.jobs import job, resume
 from clear_strategies.jobs import scene as scenes
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.signals import Interrupted
-from tests.helpers import captures, pictures, toy
+from tests.helpers import captures, forked, toy
 from tests.helpers.command_line import ALONE, TINY, run
 from tests.helpers.configs import composed
 from tests.helpers.short_run import SCENE, start
@@ -66,7 +66,7 @@ def test_a_setting_of_density_has_no_effect_beside_a_strategy_that_densifies(tmp
             "fit.iterations=3",
             "density.every=50",
         ]
-        with pictures.not_drawn():
+        with forked.not_drawn():
             job.run(composed(*chosen, "fit.scale_schedule=false"), tmp_path / strategy, chosen)
     assert caplog.text.count("density.every=50 has no effect: MCMC densifies in place of it.") == 1
 
@@ -83,7 +83,7 @@ MOVED = [
 
 def train_on(photos: Path, folder: Path, *more: str) -> None:
     words = ["data=nerfstudio", f"data.path={photos}", *MOVED, *more]
-    with pictures.not_drawn():
+    with forked.not_drawn():
         job.run(composed(*words), folder, words)
 
 

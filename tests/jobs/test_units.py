@@ -10,7 +10,7 @@ import pytest
 from clear_strategies.core.points import spread
 from clear_strategies.jobs import job
 from clear_strategies.jobs.saved import open_splat
-from tests.helpers import captures, pictures
+from tests.helpers import captures, forked
 from tests.helpers.command_line import ALONE
 from tests.helpers.configs import composed
 
@@ -28,7 +28,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory):
         here = tmp_path_factory.mktemp("units")
         root = captures.demo_on_disk(here / "room", scale, views=6, size=(96, 72))
         words = ["data=nerfstudio", f"data.path={root}", *SETTINGS]
-        with pictures.not_drawn():
+        with forked.not_drawn():
             return job.run(composed(*words), here / "run", words), here / "run"
 
     return train

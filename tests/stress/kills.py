@@ -20,7 +20,7 @@ from clear_strategies.errors import DataError
 from clear_strategies.jobs import job
 from clear_strategies.jobs.resume import CHECKPOINTS
 from clear_strategies.training import checkpoint
-from tests.helpers import pictures
+from tests.helpers import forked
 from tests.helpers.command_line import TINY
 from tests.helpers.configs import composed
 from tests.stress.rows import Row, Worst
@@ -34,7 +34,7 @@ _RUN = [
 _MOST_KILLS = 6  # of one run, before it may end
 
 
-@pictures.not_drawn()
+@forked.not_drawn()
 def measure(folder: Path, kills: int) -> Row:
     """Kill runs `kills` times in all; a failure is a checkpoint lost, a rest after the end, or another result."""
     config = composed(*_RUN)

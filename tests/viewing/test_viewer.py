@@ -1,0 +1,136 @@
+"""What a painter shows is what the metrics see; the viewer draws what its panel asks for, and between iterations alone."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from dataclasses import replace
+from urllib.request import urlopen
+
+import numpy as np
+import pytest
+import torch
+
+import rasterizers
+from clear_strategies import viewing
+from clear_strategies.commands import view
+from clear_strategies.core.images import to_bytes
+from clear_strategies.errors import SettingError
+from clear_strategies.jobs.saved import open_splat
+from clear_strategies.training.field import GaussianField
+from clear_strategies.viewing.look import DepthScale, Painter
+from tests.helpers import toy, wall
+
+SERVER = "clear_strategies.viewing.server"
+CAMERA = toy.camera(0.2)
+POSE = np.linalg.inv(CAMERA.world_to_camera.double().numpy())
+FOV = 2 * math.atan(CAMERA.height / 2 / CAMERA.fy)
+
+
+def make(**settings):
+    return rasterizers.load("torch", **{"background": (0.2, 0.4, 0.6), **settings})
+
+
+@pytest.fixture
+def field(saved_run) -> GaussianField:
+    return saved_run[1]
+
+
+def test_the_picture_is_the_one_that_is_measured(field):
+    exact = field.render(make(), CAMERA).clamp(0, 1)
+    assert torch.equal(Painter(field, make).color(CAMERA), exact)
+
+
+def test_depth_is_the_distance_of_what_is_seen():
+    """A wall at z = 4, over a background that must not count."""
+    depth = Painter(wall.painter().field, make).depth(wall.at(0.0))
+    torch.testing.assert_close(depth, torch.full((40, 60), 4.0), atol=0.02, rtol=0)
+
+
+def test_depth_is_unknown_where_nothing_is(field):
+    turned = replace(CAMERA, world_to_camera=torch.diag(torch.tensor([1.0, -1, -1, 1])) @ CAMERA.world_to_camera)
+    depth = Painter(field, make).depth(turned)
+    assert depth.isnan().all()
+    picture = DepthScale.of(Painter(field, make), [turned]).picture(depth)
+    assert (picture[0, 0] == 204).all()
+
+
+def test_numbers_are_blended_over_black(field):
+    painter = Painter(field, make)
+    ones = painter.numbers(CAMERA, torch.ones(len(field)))
+    assert float(ones.min()) >= 0
+    assert float(ones.max()) <= 1 + 1e-6
+    torch.testing.assert_close(painter.numbers(CAMERA, torch.full((len(field),), 0.5)), ones / 2)
+
+
+# ---- the viewer
+
+
+def close(found, exact):
+    assert found.shape == exact.shape
+    assert np.abs(found.astype(int) - exact).max() <= 1
+
+
+def test_the_viewer_shows_what_is_measured_or_its_depth_and_closes(saved_run, tmp_path):
+    server, splat = pytest.importorskip(SERVER, exc_type=ImportError), open_splat(saved_run[0])
+    viewer = server.SplatViewer(splat.painter, splat.poses(), title="toy", port=8321, out=tmp_path)
+    try:
+        assert viewer.address.startswith("http://127.0.0.1:")
+        close(viewer.draw(POSE, FOV, (96, 64)), to_bytes(splat.painter.color(CAMERA)))
+        viewer._depth.value = True
+        close(viewer.draw(POSE, FOV, (96, 64)), viewer.depth_scale.picture(splat.painter.depth(CAMERA)))
+    finally:
+        viewer.close()
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "rule"),
+    [
+        ("--port", "-1", "0 to 65535"), ("--port", "65536", "0 to 65535"),
+        ("--host", "192.0.2.1", "an address of this machine"),
+    ],
+)  # fmt: skip
+def test_a_port_that_no_machine_has_and_an_address_of_another_machine_are_refused(option, value, rule):
+    with pytest.raises(SettingError, match=f"^{option}: must be {rule}, got {value}"):
+        view.main(["nowhere", option, value])
+
+
+def test_missing_libraries_are_named(monkeypatch):
+    monkeypatch.setattr(viewing, "find_spec", lambda name: None if name == "viser" else object())
+    with pytest.raises(SettingError, match=r"the viewer needs viser: pip install 'clear-strategies\[view\]'"):
+        viewing.require_viewer()
+
+
+def test_a_viewer_is_there_while_a_run_trains_and_draws_between_two_iterations_alone(saved_run, monkeypatch):
+    server = pytest.importorskip(SERVER, exc_type=ImportError)
+    viewers, drawn = [], threading.Event()
+    opened = server.SplatViewer
+
+    def remembered(*arguments, **options):
+        viewers.append(opened(*arguments, **options))
+        return viewers[-1]
+
+    monkeypatch.setattr(server, "SplatViewer", remembered)
+    splat = open_splat(saved_run[0])
+
+    def draw() -> None:  # as nerfview's threads do
+        with viewers[0].lock:
+            drawn.set()
+
+    with server.watched(splat.painter, splat.poses(), "toy") as after_step:
+        after_step(1)
+        assert b"<html" in urlopen(viewers[0].address, timeout=20).read()  # noqa: S310 - our own address
+        threading.Thread(target=draw).start()
+        assert not drawn.wait(0.2)  # an iteration is under way
+        monkeypatch.setattr(viewers[0].server, "get_clients", lambda: {0: None})
+        monkeypatch.setattr(server, "_TURN", 0.5)
+        after_step(2)
+        assert drawn.is_set()
+        viewers[0].state = "paused"
+        threading.Timer(0.3, lambda: setattr(viewers[0], "state", "training")).start()
+        began = time.monotonic()
+        after_step(3)
+        assert time.monotonic() - began > 0.25
+    with pytest.raises(OSError, match="refused"):
+        urlopen(viewers[0].address, timeout=20)  # noqa: S310
