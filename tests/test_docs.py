@@ -154,13 +154,8 @@ def test_the_readmes_diff_stands_in_the_example():
     added = "".join(line[1:] for line in diff.splitlines() if line.startswith("+"))
     example = (ROOT / "integration/examples/gsplat_loop.py").read_text()
     marked = "".join(line.partition("#")[0].strip() for line in example.splitlines() if line.endswith("# +"))
-    renamed = {
-        "strategies,": '"best",',
-        ", seed=seed": "",
-        "attached = ": "rasterization = ",
-        "rasterization = attached": "",
-    }
-    for there, here in renamed.items():
+    renamed = {"strategies,": '"best",', ", seed=seed": "", "attached = ": "rasterization = "}
+    for there, here in (renamed | {"rasterization = attached": ""}).items():
         marked = marked.replace(there, here)
     assert marked == added
 

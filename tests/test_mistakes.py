@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import re
 import shlex
 from pathlib import Path
@@ -59,45 +58,28 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     captures.demo_on_disk(here / "turned", scale=0.0)
     (captures.nerfstudio(here / "renamed") / "images").rename(here / "renamed/photos")
-    for name, lens in (
-        ("units", {"fl_x": 0.9, "fl_y": 1.2, "cx": 0.5, "cy": 0.5}),
-        ("panoramas", {"camera_model": "EQUIRECTANGULAR"}),
-    ):
-        file = captures.nerfstudio(here / name) / "transforms.json"
-        captures.write_json(file, json.loads(file.read_text()) | lens)
-    for folder, file, text in (
-        ("polycam", "keyframes/cameras/1.json", '{"t_00": 1}'),
-        ("record3d", "metadata", '{"poses": []}'),
-    ):
-        (here / folder / file).parent.mkdir(parents=True)
-        (here / folder / file).write_text(text)
+    halves, panorama = {"fl_x": 0.9, "fl_y": 1.2, "cx": 0.5, "cy": 0.5}, {"camera_model": "EQUIRECTANGULAR"}
+    for name, lens in (("units", halves), ("panoramas", panorama)):
+        captures.edit(captures.nerfstudio(here / name) / "transforms.json", lambda value, lens=lens: value.update(lens))
+    for file, text in (("polycam/keyframes/cameras/1.json", '{"t_00": 1}'), ("record3d/metadata", '{"poses": []}')):
+        (here / file).parent.mkdir(parents=True)
+        (here / file).write_text(text)
     return here
 
 
-@pytest.mark.parametrize(
-    "row",
-    [
-        pytest.param(
-            row,
-            id=row["command"],
-            marks=[pytest.mark.slow] * any(name in row["command"].split() for name in OF_POSES)
-            + [pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")] * ("cuda" in row["command"]),
-        )
-        for row in ROWS
-    ],
-)
+def marks(command: str) -> list[pytest.MarkDecorator]:
+    no_gpu = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+    return [pytest.mark.slow] * (not {*OF_POSES}.isdisjoint(command.split())) + [no_gpu] * ("cuda" in command)
+
+
+@pytest.mark.parametrize("row", [pytest.param(row, id=row["command"], marks=marks(row["command"])) for row in ROWS])
 def test_a_mistake_is_told_with_its_remedy(row: dict[str, str], folder: Path) -> None:
     before = {path for path in folder.iterdir() if path.name not in ("outputs", "cache")}
     ended = command_line.run(*shlex.split(row["command"]), cwd=folder)
     assert ended.returncode == int(row["code"]), ended.stdout + ended.stderr
-    told = [
-        line
-        for line in (ended.stdout + ended.stderr).splitlines()
-        if line and not line.startswith("clear-strategies +")
-    ]
-    progress = (
-        r".*: estimating the poses|features of |matching |placing |SR |.*: \d+ of \d+ "  # the last on a slow machine
-    )
+    told = list(filter(None, (ended.stdout + ended.stderr).splitlines()))
+    # The last but one on a slow machine, the last before a run of photos.
+    progress = r".*: estimating the poses|features of |matching |placing |SR |.*: \d+ of \d+ |clear-strategies \+"
     error = [line for line in told if not re.match(progress, line)]
     assert 1 <= len(error) <= 3, told
     assert row["message"] in " ".join(error)

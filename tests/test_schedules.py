@@ -30,9 +30,3 @@ def test_milestones_stretch_with_the_run_and_nothing_else_does():
     assert (short.lambda_hf, short.lambda_hr.final) == (0.2, 0.1)
     assert [short.lambda_hr(t // 10) for t in (500, 1750, 7500)] == pytest.approx([0, 0.5, 0.55])
     assert scaled(Ramp(), 0.5).full == 5000
-
-
-def test_an_exponential_decay_to_zero_is_refused():
-    """tests/stress/bad_inputs/settings.py has the other settings outside their range."""
-    with pytest.raises(ValueError, match="exponential"):
-        WarmupDecay(decay="exponential", final=0.0)

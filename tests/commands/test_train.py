@@ -7,20 +7,6 @@ import pytest
 from clear_strategies import compose, hydra_app
 from clear_strategies.commands import train
 from clear_strategies.compose import composed, tree
-from clear_strategies.errors import SettingError
-
-
-@pytest.mark.parametrize(
-    ("file", "kind"),
-    [
-        ("transforms_train.json", "blender"), ("transforms.json", "nerfstudio"),
-        ("sparse/0/cameras.bin", "colmap"), ("sparse/cameras.txt", "colmap"), ("photo.jpg", "photos"),
-    ],
-)  # fmt: skip
-def test_the_reader_is_the_one_of_what_lies_in_the_folder(tmp_path, file, kind):
-    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
-    (tmp_path / file).touch()
-    assert train.detect(tmp_path) == kind
 
 
 def test_of_several_formats_the_one_that_may_hold_the_others_is_read(tmp_path):
@@ -81,9 +67,3 @@ def test_strategies_that_are_named_replace_the_whole_method(tmp_path):
     assert "+strategy=best" not in train.overrides([str(tmp_path), "+strategy=gco"])
     assert "+strategy=best" in train.overrides([str(tmp_path)])
     assert not any(o.startswith("fit.iterations") for o in train.overrides([str(tmp_path), "+protocol=llff_x4"]))
-
-
-@pytest.mark.parametrize("arguments", [[], ["fit.iterations=3"], ["nowhere"], ["--cfg", "job"]])
-def test_a_missing_folder_is_refused_in_one_line(arguments):
-    with pytest.raises(SettingError, match=r"train.*folder"):
-        train.overrides(arguments)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from clear_strategies import SplatSuRe
+from clear_strategies import PairDrop, SplatSuRe, SRStage
 from clear_strategies.core.checks import as_color, require_choice, require_number, require_whole
 from clear_strategies.data.readers import blender, colmap, demo, nerfstudio, photos
 from clear_strategies.errors import SettingError
@@ -44,13 +44,10 @@ def test_numbers_are_finite_and_in_range(limits: dict[str, float], rule: str, re
         require_number("a.b", value, **limits)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("value", "nearest"), [(-1, 0), (101, 100)])
-def test_the_remedy_is_the_nearest_number_in_range(value: float, nearest: int) -> None:
-    with pytest.raises(SettingError, match=rf"^a\.b: must lie in \[0, 100\], got {value}: a\.b={nearest}$"):
-        require_number("a.b", value, most=100)
-
-
-def test_choices_are_listed() -> None:
+def test_choices_are_listed_and_the_remedy_is_the_nearest_number_in_range() -> None:
+    for value, nearest in ((-1, 0), (101, 100)):
+        with pytest.raises(SettingError, match=rf"^a\.b: must lie in \[0, 100\], got {value}: a\.b={nearest}$"):
+            require_number("a.b", value, most=100)
     require_choice("a.b", "x", ("x", "y"))
     with pytest.raises(SettingError, match=r"^a\.b: must be one of x, y, got 'z': a\.b=x$"):
         require_choice("a.b", "z", ("x", "y"))
@@ -63,21 +60,14 @@ def test_colours_are_three_numbers_between_0_and_1(value: object) -> None:
         as_color("a.b", value)
 
 
-@pytest.mark.parametrize(
-    ("read", "named"),
-    [
-        (lambda: demo.read(width=0), "width"),
-        (lambda: demo.read(views=-3), "views"),
-        (lambda: photos.read("nowhere", max_side=0), "max_side"),
-        (lambda: photos.read("nowhere", threads=-2), "threads"),
-        (lambda: blender.read("nowhere", background=(2.0, 0.0, 0.0)), "background"),
-        (lambda: colmap.read(Path("nowhere"), background=(-1.0, 0.0, 0.0)), "background"),
-        (lambda: nerfstudio.read("nowhere", background=(0.0, 0.0, 1.5)), "background"),
-    ],
-)
-def test_readers_refuse_their_arguments_before_files(read: Callable[[], object], named: str) -> None:
-    with pytest.raises(SettingError, match=rf"^data\.reader\.{named}: "):
-        read()
+def test_readers_refuse_their_arguments_before_files() -> None:
+    cases = [(reader.read, {"background": (2.0, 0.0, 0.0)}) for reader in (blender, colmap, nerfstudio)]
+    for read, wrong in (*cases, (photos.read, {"max_side": 0}), (photos.read, {"threads": -2})):
+        with pytest.raises(SettingError, match=rf"^data\.reader\.{next(iter(wrong))}: "):
+            read(Path("nowhere"), **wrong)
+    for wrong in ({"width": 0}, {"views": -3}):
+        with pytest.raises(SettingError, match=rf"^data\.reader\.{next(iter(wrong))}: "):
+            demo.read(**wrong)
 
 
 REFUSED: dict[Callable[..., object], dict[str, object]] = {
@@ -86,6 +76,8 @@ REFUSED: dict[Callable[..., object], dict[str, object]] = {
         "enlarge": 0, "max_features": 0, "contrast": 0.0, "ratio": 1.1, "epipolar": -1.0, "reprojection": math.nan, "angle": 0.0,
     },
     SplatSuRe: {"ratio": 0.9, "softness": 0.0, "min_views": 0},
+    SRStage: {"count": -1, "reach": 0.0, "weight": 0.0},
+    PairDrop: {"share": 1.0, "weight": 0.0, "reduced": 0, "every": 0},
     WarmupDecay: {"peak": -1.0},
     LogLinear: {"final": 101.0},
 }  # fmt: skip

@@ -59,15 +59,6 @@ def test_counts_beyond_float32_stay_exact(on_a_device):
     assert deferred.read([deferred.scalar(large), torch.tensor(0.5)]) == [2**24 + 1, 0.5]
 
 
-def test_rows_before_one_that_was_read_are_not_looked_at(monkeypatch):
-    looked = []
-    monkeypatch.setattr(
-        deferred, "_is_unread", lambda row, real=deferred._is_unread: looked.append(row["t"]) or real(row)
-    )
-    deferred.resolve([{"t": float(t), "x": 0.0 if t < 7 else torch.tensor(0.0)} for t in range(10)])
-    assert looked == [9, 8, 7, 6]
-
-
 def test_a_recipe_may_have_an_effect_and_runs_once(on_a_device):
     calls = []
     row = {"x": deferred.defer(lambda x: calls.append(x) or x, torch.tensor(7.0))}

@@ -116,12 +116,6 @@ def test_nerfstudios_reduced_photos_keep_their_masks_splits_and_lenses(tmp_path:
         nerfstudio.read(tmp_path, images="images_4")
 
 
-def test_a_mask_of_another_shape_is_refused_before_any_photo_is_read(tmp_path: Path) -> None:
-    save(tiny.colmap_bin(tmp_path) / "masks/a.png", np.ones((16, 12), int))
-    with pytest.raises(DataError, match=r"masks/a\.png: mask: size: is 12x16, but its camera is for 16x12: another"):
-        colmap.read(tmp_path)
-
-
 def test_a_mask_that_cannot_be_read_is_refused_with_what_helps_a_mask(tmp_path: Path) -> None:
     mask = tiny.colmap_bin(tmp_path) / "masks/a.png"
     save(mask, 255 * LEFT)
@@ -132,16 +126,6 @@ def test_a_mask_that_cannot_be_read_is_refused_with_what_helps_a_mask(tmp_path: 
             [frame.shown() for frame in colmap.read(tmp_path, skip_faulty=True).frames if frame.shown is not None]
     mask.unlink()
     assert not any(frame.shown for frame in colmap.read(tmp_path).frames)
-
-
-def test_masks_that_the_frames_name_belong_to_them_whatever_their_names(tmp_path: Path, caplog) -> None:
-    content = json.loads((tiny.nerfstudio(tmp_path) / "transforms.json").read_text())
-    for i, frame in enumerate(content["frames"]):
-        frame["mask_path"] = f".\\Masks\\{i}.PNG"
-        save(tmp_path / f"masks/{i}.png", 255 * LEFT)
-    tiny.write_json(tmp_path / "transforms.json", content)
-    assert all(torch.equal(frame.shown(), torch.from_numpy(LEFT)) for frame in nerfstudio.read(tmp_path).frames)
-    assert not caplog.text
 
 
 def prepared(root: Path, read: Callable[[Path], Capture]) -> None:

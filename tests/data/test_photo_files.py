@@ -66,15 +66,6 @@ def test_sixteen_bit_grey_with_alpha_is_composited(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_the_header_tells_the_size(ending: str, tmp_path: Path) -> None:
-    path = save(tmp_path / f"a{ending}", np.zeros((12, 16, 3), np.uint8))
-    assert photo_files.image_size(path) == (16, 12)
-    assert photo_files.read_image(path, expect=(16, 12)).shape == (12, 16, 3)
-    with pytest.raises(DataError, match="is 16x12 where 12x16 is expected"):
-        photo_files.read_image(path, expect=(12, 16))
-
-
-@pytest.mark.parametrize("ending", ENDINGS)
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_turned_photo_is_read_as_it_is_stored_or_upright(ending: str, orientation: int, tmp_path: Path) -> None:
     left_above = np.zeros((12, 16, 3), np.uint8)

@@ -12,21 +12,16 @@ from clear_strategies.geometry.cleaning import averaged_in_voxels, without_outli
 from rasterizers.interface import BackendUnavailable
 
 
-@pytest.mark.parametrize(
-    ("line", "ratio", "kept"),
-    [
+def test_outliers_are_removed() -> None:
+    for line, ratio, kept in (
         # Mean distance to the 2 nearest, itself included: 1/2 four times and 96/2 once. Average 10, deviation 21.2.
         ([0, 1, 2, 3, 99], 1.7, [0, 1, 2, 3]),  # the limit is 46.1
         ([0, 1, 2, 3, 99], 1.8, [0, 1, 2, 3, 99]),  # 48.3
         ([0, 0, 1, 2], 3.0, [1, 2]),  # a point on its nearest one
-        ([0, 0, 0], 3.0, [0, 0, 0]),  # all would be removed
-        ([0, 9], 0.1, [0, 9]),
-        ([], 3.0, []),
-    ],
-)
-def test_outliers_are_removed(line: list[float], ratio: float, kept: list[float]) -> None:
-    means = torch.tensor(line)[:, None] * torch.tensor([1.0, 0, 0])
-    assert without_outliers(PointCloud(means, means * 0, "given"), 2, ratio).means[:, 0].tolist() == kept
+        ([0, 0, 0], 3.0, [0, 0, 0]), ([0, 9], 0.1, [0, 9]), ([], 3.0, []),  # all would be removed
+    ):  # fmt: skip
+        means = torch.tensor(line)[:, None] * torch.tensor([1.0, 0, 0])
+        assert without_outliers(PointCloud(means, means * 0, "given"), 2, ratio).means[:, 0].tolist() == kept
 
 
 def test_voxels_hold_the_averages_of_their_points_in_the_order_of_the_cubes():

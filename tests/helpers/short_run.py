@@ -12,18 +12,7 @@ from dataclasses import replace
 
 import torch
 
-from clear_strategies import (
-    GCO,
-    P2G,
-    SVS,
-    Conductor,
-    FadingOpacity,
-    Objective,
-    PseudoViews,
-    RandomBackground,
-    Strategy,
-    TwoFields,
-)  # fmt: skip
+import clear_strategies as cs
 from clear_strategies.core.view import DepthMap
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
@@ -59,24 +48,23 @@ def with_depth(scene: Scene, depth: float = 4.0) -> Scene:
 
 
 def start(
-    names: tuple[str, ...], iterations: int = ITERATIONS, *, more: Sequence[Strategy] = (), fused: FusedMode = "auto",
+    names: tuple[str, ...], iterations: int = ITERATIONS, *, more: Sequence[cs.Strategy] = (), fused: FusedMode = "auto",
 ) -> TrainState:  # fmt: skip
     make = {
-        "gco": GCO,
-        "p2g": P2G,
-        "svs": lambda: SVS(
+        "gco": cs.GCO, "p2g": cs.P2G,
+        "svs": lambda: cs.SVS(
             dropout=Ramp(full=ITERATIONS), anchor_start=12, anchor_strength=0.01,
             anchor_weights={"means": 1.0, "scales": 1.0, "sh0": 0.1, "detail": 0.1},
         ),
-        "pseudo_views": lambda: PseudoViews(count=8, reach=0.1),
-        "fading_opacity": lambda: FadingOpacity(rate=0.02, until=1_350),
-        "random_background": lambda: RandomBackground(until=1_350),
-        "two_fields": lambda: TwoFields(start=4, alone=0.2, compare_every=5, compare_until=12),
+        "pseudo_views": lambda: cs.PseudoViews(count=8, reach=0.1),
+        "fading_opacity": lambda: cs.FadingOpacity(rate=0.02, until=1_350),
+        "random_background": lambda: cs.RandomBackground(until=1_350),
+        "two_fields": lambda: cs.TwoFields(start=4, alone=0.2, compare_every=5, compare_until=12),
     }  # fmt: skip
-    objective = Objective(lambda_hr=WarmupDecay(final=0.1, start=3, full=8, decay_from=14, end=ITERATIONS))
+    objective = cs.Objective(lambda_hr=WarmupDecay(final=0.1, start=3, full=8, decay_from=14, end=ITERATIONS))
     return TrainState.start(
         with_depth(SCENE) if "pseudo_views" in names else SCENE,
-        Conductor(*(make[name]() for name in names), *more, objective=objective, statistics_from=1),
+        cs.Conductor(*(make[name]() for name in names), *more, objective=objective, statistics_from=1),
         settings=FitSettings(
             iterations=iterations, scale_schedule=False, degree_every=6, probe_every=0, checkpoint_every=0, seed=5,
             fused=fused,

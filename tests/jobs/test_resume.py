@@ -58,27 +58,15 @@ def test_ctrl_c_after_training_names_the_checkpoint_that_was_saved(tmp_path: Pat
 
 def test_a_setting_of_density_has_no_effect_beside_a_strategy_that_densifies(tmp_path: Path, caplog):
     for strategy in ("mcmc", "gco"):
-        chosen = [
-            *TINY,
-            f"+strategy={strategy}",
-            "prior=bicubic",
-            "fit.threads=1",
-            "fit.iterations=3",
-            "density.every=50",
-        ]
+        settings = "prior=bicubic fit.threads=1 fit.iterations=3 density.every=50"
+        chosen = [*TINY, f"+strategy={strategy}", *settings.split()]
         with forked.not_drawn():
             job.run(composed(*chosen, "fit.scale_schedule=false"), tmp_path / strategy, chosen)
     assert caplog.text.count("density.every=50 has no effect: MCMC densifies in place of it.") == 1
 
 
-MOVED = [
-    *ALONE,
-    "prior=bicubic",
-    "data.cloud.init=random",
-    "data.cloud.random_points=60",
-    "fit.max_degree=1",
-    "fit.iterations=4",
-]
+OF_POINTS = "prior=bicubic data.cloud.init=random data.cloud.random_points=60 fit.max_degree=1 fit.iterations=4"
+MOVED = [*ALONE, *OF_POINTS.split()]
 
 
 def train_on(photos: Path, folder: Path, *more: str) -> None:
@@ -109,12 +97,11 @@ def test_a_run_goes_on_where_its_data_moved_and_not_on_other_data(there: str, tm
 
 def test_that_few_photos_have_a_pose_is_said_first_and_last(tmp_path: Path, monkeypatch, caplog) -> None:
     caplog.set_level("INFO")
-    load = scenes.load
-    monkeypatch.setattr(
-        scenes,
-        "load",
-        lambda *words: replace(scene := load(*words), notes={**scene.notes, scenes.FEW_PLACED: "3 of 9 photos"}),
-    )
+
+    def few_placed(*words, load=scenes.load):
+        return replace(scene := load(*words), notes={**scene.notes, scenes.FEW_PLACED: "3 of 9 photos"})
+
+    monkeypatch.setattr(scenes, "load", few_placed)
     train_on(captures.demo_on_disk(tmp_path / "here"), tmp_path / "run")
     said = [record.getMessage() for record in caplog.records]
     warned = [i for i, message in enumerate(said) if message == "3 of 9 photos."]

@@ -8,24 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from clear_strategies import (
-    GCO,
-    MCMC,
-    P2G,
-    SVS,
-    Conductor,
-    FadingOpacity,
-    Grads,
-    Objective,
-    PairDrop,
-    PseudoViews,
-    RandomBackground,
-    SplatSuRe,
-    SRStage,
-    Strategy,
-    StrategyConflict,
-    TwoFields,
-)
+import clear_strategies
+from clear_strategies import GCO, P2G, SVS, Conductor, Grads, Objective, Strategy, StrategyConflict
 from clear_strategies.core.view import Photo
 from clear_strategies.kernels.losses import reference
 from clear_strategies.schedules import WarmupDecay
@@ -50,25 +34,11 @@ def anchoring() -> SVS:
     return SVS(anchor_strength=0.01)
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        GCO,
-        P2G,
-        SVS,
-        anchoring,
-        SplatSuRe,
-        PseudoViews,
-        FadingOpacity,
-        MCMC,
-        RandomBackground,
-        TwoFields,
-        SRStage,
-        PairDrop,
-        Halve,
-    ],
-    ids=lambda make: make.__name__,
-)
+PUBLIC = [found for name in clear_strategies.__all__ if isinstance(found := getattr(clear_strategies, name), type)]
+OURS = [made for made in PUBLIC if issubclass(made, Strategy) and made is not Strategy]
+
+
+@pytest.mark.parametrize("make", [*OURS, anchoring, Halve], ids=lambda make: make.__name__)
 @pytest.mark.parametrize("check", CHECKS, ids=lambda c: c.__name__)
 def test_contract(make, check):
     check(make)

@@ -66,15 +66,12 @@ def test_huge_images_are_reduced_and_dollars_in_names_are_no_mathematics(tmp_pat
 
 
 def test_truth_and_error_are_shown_where_they_are_known(tmp_path: Path) -> None:
-    for name, rows in {
-        "none": [row("a", 0, truth=False)],
-        "some": [row("a", 0, truth=False), row("b", 10)],
-        "all": [row("a", 0), row("b", 10)],
-    }.items():
+    unknown, a, b = row("a", 0, truth=False), row("a", 0), row("b", 10)
+    for name, rows in {"none": [unknown], "some": [unknown, b], "all": [a, b]}.items():
         write_contact_sheet(tmp_path / f"{name}.png", rows, "scene")
     none, some, both = (read(tmp_path / f"{name}.png") for name in ("none", "some", "all"))
     assert none.shape[1] < some.shape[1] == both.shape[1]
-    assert holds(some, row("b", 10).images["ground truth"], times=4)
+    assert holds(some, b.images["ground truth"], times=4)
 
 
 @pytest.mark.parametrize(

@@ -222,12 +222,8 @@ def test_packed_ellipses_are_those_of_the_projection_and_have_gradients(rasteriz
         splats.means, covariances, pose, intrinsics(view).double()[None], 40, 30, calc_compensations=True
     )
     factor = compensations[0, i] if rasterize_mode == "antialiased" else 1
-    expected = {
-        "means2d": means2d[0, i],
-        "depths": depths[0, i],
-        "conics": conics[0, i],
-        "opacities": splats.opacities[i] * factor,
-    }
+    expected = {"means2d": means2d[0, i], "depths": depths[0, i], "conics": conics[0, i]}
+    expected["opacities"] = splats.opacities[i] * factor
     for name, value in expected.items():
         assert torch.allclose(info[name], value, rtol=1e-6), name
     assert (info["radii"] <= radii[0, i] + 1).all()  # they reach as far as the opacity lets them

@@ -156,23 +156,16 @@ def test_lists_beyond_the_memory_budget_are_refused(backend):
         backend(memory=0)
 
 
-@pytest.mark.parametrize(
-    ("factor", "depths"),
-    [
-        (2, (True, False)),
-        (3, (False, False)),
-        (4, (False, True)),
-        (4, (False, False)),
-        (7, (True, True)),
-        (8, (True, True)),
-    ],
-    ids=str,
-)  # 1/3 and 1/7 are rounded
+SCALES = [(2, (1, 0)), (3, (0, 0)), (4, (0, 1)), (4, (0, 0)), (7, (1, 1)), (8, (1, 1))]  # 1/3 and 1/7 are rounded
+
+
+@pytest.mark.parametrize(("factor", "depths"), SCALES, ids=str)
 @backends()
 def test_scales_drawn_together_equal_scales_drawn_alone(backend, depths, factor):
     splats, hr = scene(500, bands=15), camera(32 * factor, 24 * factor)
     plain = replace(splats, rgb_offset=None, opacities=splats.opacities * 0.9)
     jobs = [(plain, hr.scaled(1 / factor)), (splats, hr)]
+    depths = list(map(bool, depths))
     for rendering, job, depth in zip(backend().render_scales(jobs, depth=depths), jobs, depths, strict=True):
         assert (rendering.depth is not None) == depth
         v = cotangents(2, job[1].height, job[1].width)

@@ -132,11 +132,8 @@ def history(**columns: float) -> pd.DataFrame:
 @pytest.mark.filterwarnings("error")
 def test_runs_without_history_are_not_drawn_and_dollars_are_no_mathematics(tmp_path: Path) -> None:
     runs = {f"run {i} $20_$": history(psnr_test=20.0 + i, conflict=0.1 * i, n_gaussians=100.0) for i in range(9)}
-    for name, shown in {
-        "nine": runs,
-        "ten": {**runs, "empty": pd.DataFrame()},
-        "none": {"empty": pd.DataFrame()},
-    }.items():
+    empty = {"empty": pd.DataFrame()}
+    for name, shown in {"nine": runs, "ten": runs | empty, "none": empty}.items():
         write_curves(tmp_path / f"{name}.png", shown, "$20_$")
     nine, ten, none = (read(tmp_path / f"{name}.png") for name in ("nine", "ten", "none"))
     assert np.array_equal(nine, ten)

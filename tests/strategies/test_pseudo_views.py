@@ -103,14 +103,9 @@ def test_a_loop_that_gives_no_views_is_warned(caplog):
 
 
 def test_an_object_cut_out_of_its_surroundings_needs_none(caplog):
-    white = tuple(
-        replace(
-            view,
-            lr=replace(view.lr, image=torch.where(torch.arange(24)[None, :, None] < 12, view.lr.image, 1.0)),
-            background=(1.0, 1.0, 1.0),
-        )
-        for view in SCENE.train
-    )
+    left = torch.arange(24)[None, :, None] < 12
+    cut_out = [replace(view.lr, image=torch.where(left, view.lr.image, 1.0)) for view in SCENE.train]
+    white = tuple(replace(v, lr=lr, background=(1.0, 1.0, 1.0)) for v, lr in zip(SCENE.train, cut_out, strict=True))
     views = with_depth(replace(SCENE, train=white)).train
     with caplog.at_level(logging.INFO):
         assert prepared(views).summary() is None

@@ -37,8 +37,3 @@ def test_numbers_on_a_device_are_kept_until_they_are_read():
     assert [row["loss"] for row in deferred.resolve(history)] == [t / 2 for t in range(300)]
     history.append({"t": 300.0, "loss": 150.0})
     assert [row["loss"] for row in history] == [t / 2 for t in range(301)]
-
-
-def test_a_row_takes_a_tenth_of_a_dict():
-    history = History({f"column {k}": float(t * k) for k in range(25)} for t in range(5_000))
-    assert sum(x.itemsize * len(x) for x in history._columns.values()) < len(history) * 25 * 8

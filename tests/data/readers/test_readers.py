@@ -140,19 +140,6 @@ def test_the_masks_it_names_hide_their_black_pixels_and_are_undistorted_with_the
         assert found[:, 6:].all()
 
 
-def test_photos_of_one_name_keep_their_subfolders_and_masks_lie_in_the_same(tmp_path: Path) -> None:
-    def rig(value: dict[str, Any]) -> None:
-        for folder, frame in zip(("back", "left", "right"), value["frames"], strict=True):
-            (tmp_path / "images" / folder).mkdir()
-            (tmp_path / frame["file_path"]).rename(tmp_path / "images" / folder / "1.png")
-            write_png(tmp_path / "masks" / folder / "1.png", torch.zeros(12, 16))
-            frame["file_path"] = f"images/{folder}/1.png"
-
-    frames = nerfstudio.read(changed(tmp_path, rig)).frames
-    assert [frame.name for frame in frames] == ["back/1.png", "left/1.png", "right/1.png"]
-    assert all(frame.shown is not None and not frame.shown().any() for frame in frames)
-
-
 def test_points_of_a_ply_have_no_tracks(tmp_path: Path) -> None:
     changed(tmp_path, lambda value: value.update(ply_file_path="points.ply", applied_transform=[[1, 0, 0, 5]]))
     write_points(tmp_path / "points.ply", torch.tensor([[1.0, 2, 3]]), torch.tensor([[1, 0, 0.2]]))

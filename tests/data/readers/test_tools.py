@@ -145,23 +145,6 @@ def test_poses_that_are_not_read_are_told_before_new_ones_are_estimated(what, tm
     assert name in warning
 
 
-@pytest.mark.parametrize(
-    ("name", "photo", "text", "command"),
-    [
-        ("keyframes/cameras/1.json", "keyframes/images/1.jpg", '{"t_00": 1.0}', "Polycam.*ns-process-data polycam --data"),
-        ("metadata.json", "rgb/1.jpg", '{"poses": []}', "Record3D.*ns-process-data record3d --data"),
-        ("metadata", "rgbd/1.jpg", '{"K": [], "poses": []}', "Record3D.*ns-process-data record3d --data"),
-    ],
-)  # fmt: skip
-def test_raw_folders_of_phones_are_refused_with_what_converts_them(name, photo, text, command, tmp_path):
-    for file in (name, photo):
-        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
-    Image.new("RGB", (16, 12)).save(tmp_path / photo)
-    (tmp_path / name).write_text(text)
-    with pytest.raises(DataError, match=command):
-        photos.read(tmp_path)
-
-
 def test_transforms_under_any_name_are_read_when_the_file_is_named(tmp_path: Path) -> None:
     file = tiny.nerfstudio(tmp_path) / "transforms.json"
     file = file.rename(tmp_path / "transform_train.json")
