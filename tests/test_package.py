@@ -1,17 +1,25 @@
-"""`clear_strategies` itself: its names are there as ever, and imported only when they are asked for."""
+"""`clear_strategies` from Python: its names, what `train` returns, a package with its own strategy, and what imports bring."""
 
 from __future__ import annotations
 
 import ast
+import importlib
 import pickle
 import subprocess
 import sys
+import tomllib
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
 import pytest
+import torch
 
 import clear_strategies
+import clear_strategies as cs
+from clear_strategies.compose import OPTIONS, conductor
+from clear_strategies.errors import DataError, SettingError
+from tests.helpers.command_line import TINY, started
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -51,3 +59,131 @@ def test_importing_the_package_imports_no_torch_and_a_name_what_it_needs():
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
     assert result.stdout.strip() == "False False True True"
+
+
+# ---- training from Python: what `train` returns
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> cs.Run:
+    folder = tmp_path_factory.mktemp("notebook") / "run"
+    threads = torch.get_num_threads()
+    made = cs.train(None, *TINY, "fit.checkpoint_every=0", "prior=bicubic", folder=folder)
+    assert torch.get_num_threads() == threads
+    return made
+
+
+def test_a_run_has_its_numbers_and_its_gaussians_by_gsplats_names(run: cs.Run) -> None:
+    n = run.metrics["gaussians"]
+    widths = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (3, 3)}
+    assert {name: tuple(rows.shape) for name, rows in run.splats.items()} == {k: (n, *w) for k, w in widths.items()}
+    assert {"pseudo_views", "fading_opacity"} <= set(run.metrics["strategies"])  # best, unless another is chosen
+    assert {"+strategy=best", "prior=bicubic"} <= set(run.metrics["overrides"])
+    assert "threads" in (run.folder / "run.log").read_text()  # a line that the console shows with -v alone
+
+
+def test_it_renders_what_the_run_rendered_and_from_anywhere_else(run: cs.Run) -> None:
+    camera = run.cameras[0]
+    picture = run.render()
+    assert picture.shape == (camera.height, camera.width, 3)
+    pose = camera.world_to_camera.clone()
+    pose[0, 3] += 0.3
+    moved = run.render(replace(camera, world_to_camera=pose))
+    assert not torch.equal(moved, picture)
+
+
+def test_a_folder_without_a_finished_run_and_a_wrong_setting_are_told(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no run has finished here"):
+        cs.Run(tmp_path)
+    with pytest.raises(SettingError, match="iteration"):
+        cs.train(None, "fit.iteration=3", folder=tmp_path / "run")
+    with pytest.raises(SettingError, match=r"data\.save_lr: must be null, since .* on the command line"):
+        cs.train(None, f"data.save_lr={tmp_path / 'lr'}", folder=tmp_path / "run")
+    for key, value in (("hydra.run.dir", tmp_path / "elsewhere"), ("hydra/launcher", "basic")):
+        with pytest.raises(SettingError, match=rf"{key}: must be left out, .*folder=… is for its files"):
+            cs.train(None, "fit.iterations=1", f"{key}={value}", folder=tmp_path / "run")
+    assert not (tmp_path / "lr").exists()
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(SettingError, match="is not there"):
+        cs.train(tmp_path / "nothing")
+
+
+# ---- docs/template, a package with a strategy of its own, works when it is installed
+
+
+TEMPLATE = ROOT / "docs" / "template"
+
+
+def install(folder: Path, monkeypatch: pytest.MonkeyPatch, points: dict[str, str]) -> None:
+    """What pip leaves for a package with these entry points."""
+    info = folder / "clear_veto-0.1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: clear-veto\nVersion: 0.1.0\n")
+    (info / "entry_points.txt").write_text(f"[{OPTIONS}]\n" + "".join(f"{k} = {v}\n" for k, v in points.items()))
+    monkeypatch.syspath_prepend(folder)
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    project = tomllib.loads((TEMPLATE / "pyproject.toml").read_text())["project"]
+    install(tmp_path / "site", monkeypatch, project["entry-points"][OPTIONS])
+    monkeypatch.syspath_prepend(TEMPLATE)
+
+
+def test_its_own_tests_pass(installed: None) -> None:
+    spec = importlib.util.spec_from_file_location("test_veto", TEMPLATE / "tests" / "test_veto.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    tests = [getattr(module, name) for name in dir(module) if name.startswith("test_")]
+    assert len(tests) == 2
+    for test in tests:
+        test()
+
+
+def test_it_trains_by_its_name_and_composes_with_others(installed: None, tmp_path: Path) -> None:
+    of_veto = ("+strategy=[veto,svs]", "strategies.veto.start=5", "prior=bicubic")
+    run = cs.train(None, *TINY, *of_veto, folder=tmp_path / "run")
+    assert run.metrics["strategies"] == ["veto", "svs"]
+    assert run.metrics["config"]["strategies.veto.start"] == 5
+    (veto, _) = conductor("veto,svs", iterations=1_000).strategies
+    assert (type(veto).__name__, veto.start) == ("Veto", 200)
+
+
+def test_an_entry_point_without_a_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(tmp_path, monkeypatch, {"lost": "nowhere.conf"})
+    with pytest.raises(SettingError, match=r"lost = 'nowhere.conf'.*pip show -f clear-veto"):
+        conductor("clear")
+
+
+# ---- importing the library, an adapter or the geometry brings no heavy library into the host
+
+
+HEAVY = {
+    *["cv2", "gsplat", "hydra", "kornia", "matplotlib", "msgspec", "nerfstudio", "open3d", "scipy", "skimage", "warp"]
+}
+HOSTS = [f"integration.{host}" for host in ("gsplat", "inria", "nerfstudio")]
+MODULES = ["clear_strategies", "rasterizers", "integration", *HOSTS, "clear_strategies.geometry"]
+
+
+def test_importing_is_light():
+    code = (
+        "import importlib, sys\n"
+        f"for module in {MODULES}:\n"
+        "    importlib.import_module(module)\n"
+        f"    assert not sys.modules.keys() & {HEAVY}, module\n"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.slow
+def test_messages_are_shown_where_the_host_has_not_configured_logging(tmp_path):
+    setup, said = (
+        "logging.basicConfig(format='theirs %(message)s', level='INFO')",
+        "logging.getLogger('integration.x').info('said')",
+    )
+    alone = f"import logging; from clear_strategies.console import show_in_host; show_in_host(); {said}"
+    configured = alone.replace("show_in_host();", f"{setup}; show_in_host();")
+    for name, code, shown in (("alone", alone, "[clear] said\n"), ("configured", configured, "theirs said\n")):
+        assert started("-c", code, cwd=tmp_path, said=tmp_path / name).wait() == 0
+        assert (tmp_path / name).read_text() == shown

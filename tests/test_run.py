@@ -1,8 +1,10 @@
-"""The doors, as a user goes through them: the command line, its outputs, and what it says to bad input."""
+"""The doors, as a user goes through them: the command line, its outputs, what it says to bad input, and its exit codes."""
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import resource
 import signal
 import subprocess
@@ -11,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from clear_strategies.jobs import exit_codes
 from tests.helpers.command_line import TINY, environment, run, started, stopped_by, wait_for
 
 
@@ -145,3 +148,29 @@ def test_ctrl_c_while_data_is_prepared_is_one_line(tmp_path):
 def test_the_package_itself_is_the_command_line(tmp_path):
     result = run(cwd=tmp_path, module="clear_strategies")
     assert (result.returncode, result.stdout.split()[0]) == (0, "clear-strategies")
+
+
+ENDINGS = {
+    KeyboardInterrupt(): (130, "stopped by SIGINT."),  # a job says what it has saved
+    OSError(errno.ENOSPC, "No space", "x"): (3, "x: No space. Free space, or write elsewhere (hydra.run.dir=FOLDER"),
+    OSError(errno.EROFS, "Read-only", "x"): (
+        3,
+        "x: Read-only. Write elsewhere (hydra.run.dir=FOLDER of a run, --out of",
+    ),
+    OSError("Broken pipe\n\nCOMMAND:\nffmpeg"): (3, "output: Broken pipe COMMAND: ffmpeg. Write elsewhere"),
+}
+
+
+@pytest.mark.parametrize(("error", "ending"), ENDINGS.items(), ids=repr)
+def test_an_error_that_the_user_can_solve_is_one_line_and_an_exit_code(error, ending) -> None:
+    code, message = exit_codes.describe(error)
+    assert (code, message[: len(ending[1])]) == ending
+
+
+def test_a_reader_that_leaves_is_no_error(tmp_path: Path) -> None:
+    reads, writes = os.pipe()
+    os.close(reads)
+    with os.fdopen(writes, "w") as gone:
+        ended = subprocess.run([sys.executable, "-m", "clear_strategies.run", "--help"], stdout=gone, cwd=tmp_path,
+                               env=environment(tmp_path), stderr=subprocess.PIPE, text=True, check=False)  # fmt: skip
+    assert (ended.returncode, ended.stderr) == (141, "")

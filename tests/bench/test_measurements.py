@@ -1,4 +1,4 @@
-"""How the benchmark measures: turns, errors, and what each question times. No test asserts how long anything takes."""
+"""How the benchmark measures: scenes, turns, errors, and what each question times. No test asserts how long anything takes."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ import torch
 import rasterizers
 from clear_strategies.bench import iteration, scale, scenes, timing
 from clear_strategies.bench import rasterizers as drawing
+from clear_strategies.bench.rasterizers import ATTRIBUTES
 from clear_strategies.bench.results import Results
 from clear_strategies.errors import DataError
 from clear_strategies.merging.objective import Objective
+from clear_strategies.outputs.export import export_ply
 from clear_strategies.strategies.gco import GCO
 from clear_strategies.strategies.p2g import P2G
 from clear_strategies.strategies.svs import SVS
+from tests.helpers import toy
 from tests.helpers.backends import why_not
 
 
@@ -127,3 +130,34 @@ def test_growth_has_an_exponent_for_each_step_and_none_across_what_grows():
     assert list(table["size"]) == [100, 200, 96 * 72]
     assert [math.isnan(p) for p in table["exponent"]] == [True, False, True]
     assert table["exponent"][1] == pytest.approx(math.log2(table["ms"][1] / table["ms"][0]))
+
+
+# ---- what the benchmark draws
+
+
+def test_a_generated_scene_is_the_same_every_time_and_has_its_stated_statistics():
+    scene, again = (scenes.surfaces("s", 20_000, 1008, 756, radius=5.5) for _ in range(2))
+    for name in ATTRIBUTES:
+        assert torch.equal(getattr(scene.splats, name), getattr(again.splats, name)), name
+    splats, camera = scene.splats, scene.camera
+    pose = camera.world_to_camera
+    x, y, z = (splats.means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
+    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    inside = (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height) & (z > 0)
+    radius = 3 * splats.scales.amax(-1) * camera.fx / z
+    spread = float(radius[inside].quantile(0.9) / radius[inside].median())
+    assert 0.78 < float(inside.float().mean()) < 0.88
+    assert float(radius[inside].median()) == pytest.approx(5.5, rel=0.05)
+    assert spread == pytest.approx(math.exp(0.8 * 1.2816), rel=0.05)  # lognormal, σ = 0.8
+    assert float(splats.opacities.median()) == pytest.approx(1 / (1 + math.exp(-0.8)), abs=0.02)
+    assert splats.shN.shape == (20_000, 15, 3)
+
+
+def test_an_exported_field_is_drawn_as_the_field_draws_itself(tmp_path):
+    field = iteration.field_of(toy.splats(30))
+    export_ply(tmp_path / "field.ply", field)
+    workload = scenes.load(str(tmp_path / "field.ply"))
+    rasterizer = rasterizers.load("torch", preset="exact", **scenes.SETTINGS)
+    found = rasterizer(workload.splats, workload.camera)
+    torch.testing.assert_close(found.image, field.render(rasterizer, workload.camera), atol=1e-4, rtol=0)
+    assert float(found.visible.float().mean()) > 0.7

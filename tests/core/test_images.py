@@ -1,4 +1,4 @@
-"""Operators on images: resizing agrees with downsampling, and the area mean with its VJP."""
+"""Operators on images, photos before another background, and reduced depth maps."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import pytest
 import torch
 
 from clear_strategies.core import images
+from clear_strategies.core.view import DepthMap, Photo, View
+from tests.helpers import toy
 
 
 def test_resizing_is_downsampling_where_the_factor_is_whole():
@@ -42,3 +44,46 @@ def test_back_projection_moves_an_image_until_it_shrinks_to_the_photo(down):
     left = torch.zeros(64, 80, 1)
     left[:, :40] = 1
     assert torch.equal(images.back_projected(sr, lr, 4, 3, down, where=left)[:, 40:], sr[:, 40:])
+
+
+# ---- photos before another background; the depth map of a photo at a smaller size
+
+
+def test_a_reduced_depth_map_holds_the_median_of_each_block_of_which_enough_is_known():
+    depth = torch.full((4, 6), torch.nan)
+    confidence = torch.zeros(4, 6)
+    depth[:2, 0], depth[0, 1] = torch.tensor([1.0, 2.0]), 9.0  # three of four pixels: a median that no outlier moves
+    confidence[:2, 0], confidence[0, 1] = 0.5, 0.8
+    depth[2, 2], confidence[2, 2] = 3.0, 1.0  # one of four: too few
+    small = DepthMap(depth, confidence).reduced(2)
+    assert small.depth.shape == (2, 3)
+    assert small.depth[0, 0] == 2.0
+    assert torch.isclose(small.confidence[0, 0], torch.tensor(0.6))
+    assert int(small.known.sum()) == 1
+    assert bool(small.depth.isfinite().sum() == 1)
+
+
+def test_a_depth_map_is_completed_only_where_it_knows_nothing():
+    mine = DepthMap(torch.tensor([[1.0, torch.nan]]), torch.tensor([[0.5, 0.0]]))
+    whole = mine.completed_by(DepthMap(torch.tensor([[7.0, 8.0]]), torch.tensor([[0.9, 0.4]])))
+    assert whole.depth.tolist() == [[1.0, 8.0]]
+    assert torch.equal(whole.confidence, torch.tensor([[0.5, 0.4]]))
+
+
+def test_a_photo_before_another_background_is_composited_over_it():
+    camera, generator = toy.camera(0.0), torch.Generator().manual_seed(0)
+    size = (camera.height, camera.width)
+    rgb, alpha = torch.rand(*size, 3, generator=generator), torch.rand(*size, generator=generator)
+
+    def over(color):
+        image = rgb * alpha[..., None] + torch.tensor(color) * (1 - alpha)[..., None]
+        return Photo(camera, image, transparency=1 - alpha)
+
+    white, sky = (1.0, 1.0, 1.0), (0.2, 0.5, 0.9)
+    torch.testing.assert_close(over(white).over(sky, white).image, over(sky).image)
+    torch.testing.assert_close(over(white).reduced(2).over(sky, white).image, over(sky).reduced(2).image)
+    photo = over(white)
+    assert photo.over(None, white) is photo
+    assert torch.equal(Photo(camera, rgb).over(sky, white).image, rgb)
+    view = View("photo", photo.reduced(2), photo, background=white)
+    assert view.brightened(torch.full((3,), 0.5)).lr.transparency is None

@@ -1,8 +1,9 @@
-"""The work log on a device: events instead of clocks, no wait while there is work, nothing lost."""
+"""What work says of itself: the log of stages, on a device by events instead of clocks, and lines of progress."""
 
 from __future__ import annotations
 
 import json
+import logging
 import math
 from dataclasses import dataclass
 
@@ -10,7 +11,9 @@ import pytest
 import torch
 
 from clear_strategies import Conductor
+from clear_strategies.core import progress
 from clear_strategies.core import work_log as module
+from clear_strategies.core.progress import EVERY, Progress
 from clear_strategies.core.work_log import WorkLog
 
 
@@ -135,3 +138,17 @@ def test_the_work_log_of_a_run_is_on_its_device():
     assert conductor.work_log.device.type == "cpu"
     conductor.on_fit_start(1, 0, "cuda")
     assert conductor.work_log.device.type == "cuda"
+
+
+# ---- long work says how far it is, and short work nothing
+
+
+def test_a_line_now_and_then_and_only_where_something_has_happened(monkeypatch, caplog):
+    clock = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
+    counter = Progress("features", "photos", 10)
+    with caplog.at_level(logging.INFO):
+        for seconds, done in ((0, 1), (EVERY / 2, 2), (EVERY / 2, 3), (EVERY, 3), (1, 4), (EVERY, 5), (EVERY, 10)):
+            clock[0] += seconds
+            counter(done)
+    assert caplog.messages == ["features: 3 of 10 photos", "features: 4 of 10 photos", "features: 5 of 10 photos"]

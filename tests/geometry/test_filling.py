@@ -1,7 +1,8 @@
-"""Densification: exact on planes, occlusion-aware, and none on the background."""
+"""Points: densification, outliers and voxels, and those of depth maps."""
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import pytest
@@ -9,8 +10,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clear_strategies.geometry.filling import densify
+from clear_strategies.core.points import PointCloud
+from clear_strategies.core.view import DepthMap, Photo
+from clear_strategies.geometry.cleaning import averaged_in_voxels, without_outliers
+from clear_strategies.geometry.dense_stereo.cloud import points_of
+from clear_strategies.geometry.filling import densify, grid_points
 from clear_strategies.geometry.projection import project
+from rasterizers.interface import BackendUnavailable
 from tests.helpers.planes import cloud_of, photo
 
 
@@ -71,3 +77,81 @@ def test_without_points_in_view_nothing_is_added_and_said(caplog: pytest.LogCapt
     assert densify(cloud, [photo()], 2) is cloud
     assert "only 0 points project into it" in caplog.text
     assert "added no point" in caplog.text
+
+
+# ---- outliers and voxels: small cases by hand
+
+
+def test_outliers_are_removed() -> None:
+    for line, ratio, kept in (
+        # Mean distance to the 2 nearest, itself included: 1/2 four times and 96/2 once. Average 10, deviation 21.2.
+        ([0, 1, 2, 3, 99], 1.7, [0, 1, 2, 3]),  # the limit is 46.1
+        ([0, 1, 2, 3, 99], 1.8, [0, 1, 2, 3, 99]),  # 48.3
+        ([0, 0, 1, 2], 3.0, [1, 2]),  # a point on its nearest one
+        ([0, 0, 0], 3.0, [0, 0, 0]), ([0, 9], 0.1, [0, 9]), ([], 3.0, []),  # all would be removed
+    ):  # fmt: skip
+        means = torch.tensor(line)[:, None] * torch.tensor([1.0, 0, 0])
+        assert without_outliers(PointCloud(means, means * 0, "given"), 2, ratio).means[:, 0].tolist() == kept
+
+
+def test_voxels_hold_the_averages_of_their_points_in_the_order_of_the_cubes():
+    pytest.importorskip("open3d")
+    means = torch.tensor([[0.0, 0, 0], [5.0, 0, 0], [0.2, 0.1, 0], [0.0, 5, 0]])
+    cloud = averaged_in_voxels(PointCloud(means, means / 5, "given"), 1.0)
+    assert torch.allclose(cloud.means, torch.tensor([[0.1, 0.05, 0], [0.0, 5, 0], [5.0, 0, 0]]))
+    assert torch.allclose(cloud.colors, cloud.means / 5)
+    assert cloud.source == "given, in voxels of 1"
+
+
+def test_voxels_without_open3d_say_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)  # makes its import fail
+    with pytest.raises(BackendUnavailable, match=r"data\.cloud\.voxel needs Open3D.*pip install .*\[open3d\]"):
+        averaged_in_voxels(PointCloud(torch.rand(4, 3), torch.rand(4, 3), "given"), 0.1)
+
+
+# ---- points from depth maps: their spacing, what several photos see, and what fills the rest
+
+
+def flat(view: Photo, depth: float) -> DepthMap:
+    shape = view.image.shape[:2]
+    return DepthMap(torch.full(shape, depth), torch.ones(shape))
+
+
+def unknown(view: Photo) -> DepthMap:
+    shape = view.image.shape[:2]
+    return DepthMap(torch.full(shape, torch.nan), torch.zeros(shape))
+
+
+@pytest.mark.parametrize(("spacing", "count"), [(1.0, 1600), (2.0, 400), (1.6, 625)])
+def test_there_is_one_point_per_square(spacing: float, count: int) -> None:
+    view = photo()
+    means, colors = points_of([view], [flat(view, 5.0)], spacing, 0.02)
+    assert len(means) == len(colors) == count
+    assert torch.allclose(means[:, 2], torch.tensor(5.0))
+
+
+def test_what_two_photos_see_gets_its_points_once() -> None:
+    views = [photo(), photo()]
+    assert len(points_of(views, [flat(v, 5.0) for v in views], 2.0, 0.02)[0]) == 400
+    apart = [flat(views[0], 5.0), flat(views[1], 6.0)]
+    assert len(points_of(views, apart, 2.0, 0.02)[0]) == 800
+
+
+def test_the_most_confident_pixel_of_a_square_is_taken() -> None:
+    view = photo()
+    result = flat(view, 5.0)
+    result.confidence[:] = 0.5
+    result.depth[1::2, 1::2] = 7.0
+    result.confidence[1::2, 1::2] = 0.6
+    assert (points_of([view], [result], 2.0, 0.02)[0][:, 2] == 7).all()
+
+
+def test_only_unknown_pixels_are_filled_and_never_in_known_free_space() -> None:
+    views = [photo(), photo(0.1)]
+    samples = torch.cat((torch.rand(60, 2) - 0.5, torch.full((60, 1), 3.0)), dim=1)
+    assert len(grid_points(samples, views, 2, maps=[flat(v, 5.0) for v in views])[0]) == 0
+    assert len(grid_points(samples, views, 2, maps=[unknown(v) for v in views])[0]) == 800
+    floating = grid_points(samples, views, 2, maps=[unknown(views[0]), flat(views[1], 5.0)])[0]
+    assert len(floating) < 100
+    close = grid_points(samples, views, 2, maps=[unknown(views[0]), flat(views[1], 3.1)])[0]
+    assert len(close) == 400  # within 5 % of what the other photo knows

@@ -1,4 +1,4 @@
-"""The report: its command, its files, its table, its pictures."""
+"""The report: its command, its files, its table, its pictures, its rows, and the runs that it finds."""
 
 from __future__ import annotations
 
@@ -9,15 +9,18 @@ import statistics
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from clear_strategies import report
+from clear_strategies import files, report
+from clear_strategies.errors import DataError
 from clear_strategies.outputs.contact_sheet import write_contact_sheet
 from clear_strategies.outputs.curves import write_curves
-from tests.helpers.finished_run import make_run, table_of
+from clear_strategies.settings import CHANGES_NO_RESULT
+from tests.helpers.finished_run import averages_of, cells, make_run, rows_of, scores, table_of
 from tests.helpers.image_files import array, holds, read
 
 # ---- the command and its files
@@ -138,3 +141,171 @@ def test_runs_without_history_are_not_drawn_and_dollars_are_no_mathematics(tmp_p
     nine, ten, none = (read(tmp_path / f"{name}.png") for name in ("nine", "ten", "none"))
     assert np.array_equal(nine, ten)
     assert not np.array_equal(nine, none)
+
+
+# ---- seeds are averaged, settings are distinguished, and differences are paired
+
+
+def test_runs_that_differ_in_their_seed_share_a_row(tmp_path: Path) -> None:
+    for seed, psnr in enumerate((20.0, 21.0, 25.0)):
+        make_run(tmp_path / str(seed), "+strategy=clear", seed=seed, psnr=psnr)
+    assert rows_of(tmp_path)["clear"]["psnr"] == 22.0
+    (line,) = (c for c in cells(table_of(tmp_path)) if c["method"] == "clear")
+    assert line["PSNR (dB) ↑"] == "22.00 ± 2.65"  # deviations -2, -1, 3: sqrt(14 / 2)
+    assert (line["best"], line["seeds"], line["Gaussians"]) == ("25.00", "0, 1, 2", "1,200 ± 0")
+
+
+@pytest.mark.parametrize(
+    "setting", ["prior=onnx", "strategies.gco.tolerance=0.1", "~strategies.p2g", "data.cloud.path=dense.ply"]
+)
+def test_runs_that_differ_in_a_setting_have_rows_that_name_it(tmp_path: Path, setting: str) -> None:
+    make_run(tmp_path / "0", "+strategy=clear", "data=llff")
+    make_run(tmp_path / "1", "+strategy=clear", "data=llff", setting)
+    assert {"clear", f"clear, {setting}"} <= set(rows_of(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("settings", "others"),
+    [
+        (["fit.threads=1", "hydra.run.dir=here"], [f"{key}=2" for key in CHANGES_NO_RESULT]),
+        (["+scene=fern"], ["data.path=elsewhere/fern", "data.reader.path=x"]),
+        (["mip.every=9", "density.every=50"], ["density.every=50", "mip.every=9"]),
+    ],
+    ids=["without influence", "paths and scenes", "order"],
+)
+def test_what_changes_no_result_does_not_separate_runs(tmp_path: Path, settings: list[str], others: list[str]) -> None:
+    make_run(tmp_path / "0", "+method=srgs", *settings)
+    make_run(tmp_path / "1", "+method=srgs", *others, seed=1)
+    assert rows_of(tmp_path)["srgs"]["seeds"] == "0, 1"
+
+
+def test_one_seed_twice_and_a_score_that_is_not_finite_give_a_warning(tmp_path, caplog):
+    for i, psnr in enumerate((20.0, 20.0, None)):
+        make_run(tmp_path / str(i), "+strategy=gco", psnr=psnr)
+    assert rows_of(tmp_path)["gco"]["psnr"] == 20.0
+    assert "demo, gco: a row holds several runs with the same seed" in caplog.text
+    assert "demo, gco: runs without a finite PSNR are left out of its mean" in caplog.text
+
+
+def test_each_method_has_the_psnr_of_its_own_sr_images_and_of_bicubic(tmp_path: Path) -> None:
+    for scene in ("fern", "horns"):
+        make_run(tmp_path / f"{scene}0", "+strategy=clear", scene=scene)
+        make_run(tmp_path / f"{scene}1", "+strategy=best", scene=scene, bicubic=20.0)
+    rows = rows_of(tmp_path / "fern0", tmp_path / "fern1")
+    for name, bicubic in {"clear": 18.0, "best": 20.0}.items():
+        for row in (rows[name], averages_of(tmp_path).loc[name]):
+            assert (row["bicubic"], row["prior"]) == (bicubic, bicubic + 1)
+
+
+def test_scores_of_training_views_or_against_lr_photos_are_marked(tmp_path: Path) -> None:
+    lr = {"against": "LR photos", "views": {}, "mean": {"ours": scores(20.0), "prior": scores(21.0)}}
+    nothing: dict[str, Any] = {"against": "nothing", "views": {}, "mean": {}}
+    make_run(tmp_path / "a", test=lr, scene="a")
+    make_run(tmp_path / "b", test=nothing, train=lr, scene="b")
+    scenes = set(report.compare(report.collect([tmp_path]))["scene"])
+    assert scenes == {"a (against LR photos)", "b (training views, against LR photos)"}
+
+
+def test_methods_are_compared_with_the_first_of_their_scene(tmp_path: Path) -> None:
+    for job, (strategy, psnr) in enumerate([("baseline", 20.0), *[("gco", 20.5)] * 9, ("clear", 19.25)]):
+        make_run(tmp_path / str(job), f"+strategy={strategy}", psnr=psnr, seed=job)
+    make_run(tmp_path / "fern", "+strategy=gco", psnr=25.0, scene="fern", synthetic_prior=True)
+    lines = cells(table_of(tmp_path))
+    assert [line["method"] for line in lines if line["scene"] == "demo"] == ["baseline", "gco", "clear"]
+    assert [line["Δ"] for line in lines if line["scene"] == "demo"] == ["+0.00", "+0.50", "-0.75"]
+    assert lines[0]["bicubic (dB)"] == "18.00"
+    fern = [line for line in lines if line["scene"] == "fern (synthetic prior)"]
+    assert (fern[-1]["method"], fern[-1]["Δ"]) == ("gco", "+0.00")
+
+
+def test_differences_are_paired_by_seed(tmp_path: Path) -> None:
+    for seed, (first, second) in enumerate(((20.0, 20.5), (22.0, 22.25), (21.0, 22.5))):
+        make_run(tmp_path / f"a{seed}", "+strategy=baseline", seed=seed, psnr=first)
+        make_run(tmp_path / f"b{seed}", "+strategy=gco", seed=seed, psnr=second)
+    gco = rows_of(tmp_path)["gco"]
+    # Differences 0.5, 0.25, 1.5: mean 0.75, deviations -0.25, -0.5, 0.75, so √(0.875 / 2) / √3.
+    assert (gco["psnr_delta"], gco["psnr_delta_pairs"]) == (0.75, 3)
+    assert gco["psnr_delta_error"] == pytest.approx((0.875 / 2 / 3) ** 0.5)
+    lines = {line["method"]: line for line in cells(table_of(tmp_path))}
+    assert (lines["baseline"]["Δ"], lines["gco"]["Δ"]) == ("+0.00", "+0.75 ± 0.38")
+
+
+def test_averages_are_means_of_scene_means_with_paired_differences(tmp_path: Path) -> None:
+    for scene, offset in (("fern", 0.0), ("horns", 4.0)):
+        for seed in (0, 1, 2)[: 3 if scene == "fern" else 1]:
+            psnr = 20.0 + offset + seed
+            make_run(tmp_path / f"{scene}a{seed}", "+strategy=baseline", seed=seed, psnr=psnr, scene=scene)
+            make_run(tmp_path / f"{scene}b{seed}", "+strategy=gco", seed=seed, psnr=psnr + 1 + offset, scene=scene)
+    averages = averages_of(tmp_path)
+    assert set(averages["scene"]) == {"average of 2 scenes"}
+    assert list(averages.index) == ["baseline", "gco"]
+    assert averages.loc["baseline", "psnr"] == 22.5  # 21 and 24: each scene counts once, however many seeds it has
+    gco = averages.loc["gco"]
+    assert (gco["psnr_delta"], gco["psnr_delta_pairs"]) == (2.0, 4)  # 1, 1, 1, 5
+    assert gco["psnr_delta_error"] == pytest.approx(1.0)  # s = 2
+    line = cells(table_of(tmp_path))[-1]
+    assert (line["PSNR (dB) ↑"], line["Δ"]) == ("25.50", "+2.00 ± 1.00")
+
+
+def test_scenes_with_different_data_settings_are_averaged(tmp_path: Path) -> None:
+    for scene, shrink in (("fern", 2), ("horns", 4)):
+        for job, strategy in enumerate(("baseline", "gco")):
+            make_run(tmp_path / f"{scene}{job}", f"+strategy={strategy}", f"data.views.shrink={shrink}", scene=scene)
+    make_run(tmp_path / "only_here", "+strategy=gco", "density.threshold=1", "data.views.shrink=2", scene="fern")
+    assert list(averages_of(tmp_path).index) == ["baseline", "gco"]
+
+
+# ---- finished runs are found, named and read; others are left out with a warning
+
+
+@pytest.mark.parametrize(
+    ("overrides", "facts", "name"),
+    [
+        (["+strategy=baseline"], {}, "baseline"),
+        (["+strategy=[gco,p2g]"], {}, "gco + p2g"),
+        (["+strategy=clear_paper"], {"strategies": ["gco", "p2g", "svs"]}, "clear_paper"),
+        ([], {"strategies": ["mine", "svs"]}, "mine + svs"),
+        (["+strategy=clear", "+method=srgs"], {}, "srgs"),
+    ],
+    ids=["none", "list", "preset", "without overrides", "a method replaces"],
+)
+def test_a_run_is_named_by_its_strategies_as_given_on_the_command_line(tmp_path, overrides, facts, name):
+    folder = make_run(tmp_path, *overrides, **facts, **({} if overrides else {"overrides": None}))
+    run = report.Run.read(folder)
+    assert (run.name, run.settings) == (name, ())
+
+
+def test_runs_of_a_sweep_are_in_the_order_of_their_jobs(tmp_path: Path) -> None:
+    for number, name in ((2, "a_clear"), (10, "b_more"), (0, "z_baseline")):
+        folder = make_run(tmp_path / name, f"+strategy={name[2:]}")
+        files.write_text(folder / ".hydra" / "hydra.yaml", f"hydra:\n  job:\n    num: {number}\n")
+    assert [run.name for run in report.collect([tmp_path])] == ["baseline", "clear", "more"]
+
+
+def test_runs_that_are_linked_into_a_folder_belong_to_it_and_count_once(tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    ours = make_run(runs / "ours", "+strategy=gco")
+    (runs / "latest").symlink_to(ours)
+    (runs / "sweep").symlink_to(make_run(tmp_path / "disk" / "sweep" / "0", "+strategy=clear").parent)
+    assert [run.name for run in report.collect([runs, ours, runs / ".." / "runs" / "ours"])] == ["gco", "clear"]
+
+
+def test_damaged_and_unfinished_runs_are_left_out_with_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    make_run(tmp_path / "good", "+strategy=gco")
+    (make_run(tmp_path / "truncated") / "metrics.json").write_text('{"scene": "de')
+    (make_run(tmp_path / "list") / "metrics.json").write_text("[]")
+    make_run(tmp_path / "no_scores", test={"mean": {"prior": scores(3.0)}})
+    make_run(tmp_path / "wrong_type", gaussians="many")
+    (tmp_path / "unfinished" / ".hydra").mkdir(parents=True)
+    assert [run.folder.name for run in report.collect([tmp_path])] == ["good"]
+    for name in ("truncated", "list", "no_scores", "wrong_type", "unfinished"):
+        (message,) = (r.getMessage() for r in caplog.records if str(tmp_path / name) in r.getMessage())
+        assert "left out" in message
+        assert "\n" not in message
+
+
+def test_a_folder_without_a_finished_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="there is no finished run here: give the folder of a run or of a sweep"):
+        report.collect([tmp_path, tmp_path / "absent"])

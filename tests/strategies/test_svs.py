@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clear_strategies import SVS, AnchorError
-from clear_strategies.core.seeds import dropout_mask
+from clear_strategies.core.seeds import dropout_mask, generator_at, hashed_generator_at
 from clear_strategies.schedules import Ramp
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
@@ -138,3 +138,11 @@ def test_an_iteration_that_a_skip_jumped_over_takes_the_anchor_once():
     svs.after_step(at_seven, toy.step(7))
     svs.after_step({name: p + 1 for name, p in at_seven.items()}, toy.step(8))
     assert torch.equal(svs.state["means"], at_seven["means"])
+
+
+@pytest.mark.parametrize("at", [generator_at, hashed_generator_at])
+@pytest.mark.parametrize("seed", [0, 20261126014022, 2**63, -1])
+def test_any_whole_number_is_a_seed(at, seed):
+    first, again, next_t = (torch.rand(4, generator=at(seed, t)) for t in (7, 7, 8))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, next_t)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -17,12 +17,14 @@ from clear_strategies.core import deferred
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.kernels.gaussian_step.cpp import CppGaussianStep
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
-from clear_strategies.training.compiled_step import CompiledStep
+from clear_strategies.strategies.base import describes
+from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
+from rasterizers.interface import BackendUnavailable
 from tests.helpers import toy
 from tests.helpers.compiled_step_cases import (
     ANCHORING,
@@ -314,3 +316,77 @@ def test_thirty_iterations_are_those_of_the_readable_path(passes, readable):
     assert stages["per-Gaussian pass"].runs == 30
     assert "optimizer" not in stages
     assert set(CONFLICT_GROUPS) <= {key.removeprefix("conflict_") for row in compiled.history for key in row}
+
+
+# ---- which runs get the compiled per-Gaussian step, and that a run which does not says why
+
+
+@dataclass(frozen=True)
+class Tuned(GCO):
+    """Other defaults, the same arithmetic."""
+
+    tolerance: float = 0.2
+
+
+@dataclass(frozen=True)
+class Bolder(GCO):
+    def correct(self, lr, hr, step=None):
+        return super().correct(lr, hr, step) * 2.0
+
+
+class Doubling:
+    def correct(self, lr, hr, step=None):
+        return hr * 2.0
+
+
+@dataclass(frozen=True)
+class Mixed(Doubling, GCO):
+    pass
+
+
+@dataclass(frozen=True)
+class Known(GCO):
+    """States anew that its correction is that of the rule."""
+
+    def correct(self, lr, hr, step=None):
+        return super().correct(lr, hr, step)
+
+    def correction_rule(self):
+        return super().correction_rule()
+
+
+def test_a_class_that_changes_what_a_strategy_does_loses_its_kernel():
+    assert all(describes(c(), "correction_rule") for c in (GCO, Tuned, Known))
+    assert not any(describes(c(), "correction_rule") for c in (Bolder, Mixed, P2G))
+    assert describes(SVS(), "anchor")
+
+
+class OwnAdam(Adam):
+    pass
+
+
+def test_the_readable_path_is_taken_where_it_must_be_and_that_is_said_once(caplog, monkeypatch):
+    field = case(4).fields[0]
+    adam = Adam(field.raw(), LearningRates(), 1.0)
+    double = Adam(field.double().raw(), LearningRates(), 1.0)
+    cases = [
+        ((Conductor(GCO(), P2G()), adam, "off"), "fit.fused=off"),
+        ((Conductor(Bolder()), adam), "Bolder does not state its arithmetic as data"),
+        ((Conductor(), OwnAdam(field.raw(), LearningRates(), 1.0)), "OwnAdam may compute something else than Adam"),
+        ((Conductor(), double), "means is torch.float64 on cpu, not float32"),
+    ]
+    for arguments, reason in cases:
+        caplog.clear()
+        with caplog.at_level("DEBUG"):
+            assert compiled_step_for(*arguments) is None
+        assert [reason in message for message in caplog.messages] == [True]
+
+    def missing(_):
+        raise BackendUnavailable("the compiled kernels are not installed.")
+
+    monkeypatch.setattr("clear_strategies.training.compiled_step.load_kernels", missing)
+    caplog.clear()
+    with caplog.at_level("DEBUG"):
+        assert compiled_step_for(Conductor(), adam) is None
+    path = "The per-Gaussian step takes the readable path, which is several times slower: "
+    assert caplog.messages == [path + "the compiled kernels are not installed."]

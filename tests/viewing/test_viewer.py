@@ -1,4 +1,4 @@
-"""What a painter shows is what the metrics see; the viewer draws what its panel asks for, and between iterations alone."""
+"""What a painter shows is what the metrics see; the viewer draws what its panel asks for, and changes nothing of a run."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from dataclasses import replace
+from pathlib import Path
 from urllib.request import urlopen
 
 import numpy as np
@@ -21,6 +22,7 @@ from clear_strategies.jobs.saved import open_splat
 from clear_strategies.training.field import GaussianField
 from clear_strategies.viewing.look import DepthScale, Painter
 from tests.helpers import toy, wall
+from tests.helpers.command_line import TINY, run
 
 SERVER = "clear_strategies.viewing.server"
 CAMERA = toy.camera(0.2)
@@ -134,3 +136,20 @@ def test_a_viewer_is_there_while_a_run_trains_and_draws_between_two_iterations_a
         assert time.monotonic() - began > 0.25
     with pytest.raises(OSError, match="refused"):
         urlopen(viewers[0].address, timeout=20)  # noqa: S310
+
+
+SMALL = [*TINY, "fit.probe_every=5000", "fit.threads=1", "prior=bicubic", "+strategy=gco"]
+
+
+@pytest.mark.slow
+def test_a_run_with_a_viewer_has_the_bits_of_one_without(tmp_path: Path):
+    pytest.importorskip("clear_strategies.viewing.server", exc_type=ImportError)
+    said = {}
+    for name, overrides in {"plain": [], "viewed": ["fit.viewer=true"]}.items():
+        done = run(*SMALL, *overrides, f"hydra.run.dir={name}", cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        said[name] = done.stdout + done.stderr
+    assert "look while it trains" not in said["plain"]
+    assert "look while it trains: http://127.0.0.1:" in said["viewed"]
+    viewed, plain = ((tmp_path / name / "point_cloud.ply").read_bytes() for name in ("viewed", "plain"))
+    assert viewed == plain

@@ -1,22 +1,26 @@
-"""Priors: ONNX networks, SR images from a folder, and what holds for several."""
+"""Priors: ONNX networks, SR images from a folder, the cache, tiles, and what holds for several."""
 
 from __future__ import annotations
 
 import logging
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import read_image, write_png
-from clear_strategies.data.priors import Bicubic, Images, Onnx
+from clear_strategies.data.priors import Bicubic, Cached, Images, Onnx, cache_folder
 from clear_strategies.data.priors.interface import super_resolved
+from clear_strategies.data.priors.tiling import tiled
 from clear_strategies.errors import DataError
-from tests.helpers.networks import onnx_bytes, photo, psnr, upscaling_weight
+from tests.helpers.networks import Counting, onnx_bytes, photo, psnr, upscaling_weight
 
 # ---- what holds for several priors: paths, missing models, and the quality of real networks on a real photo
 
@@ -119,3 +123,111 @@ def test_no_array_is_shared_with_the_network(network: Path) -> None:
     prior("b", 1 - lr, 4)
     assert torch.equal(first, kept)
     assert not np.shares_memory(first.numpy(), prior("a", lr, 4).numpy())
+
+
+# ---- sR images are computed once per content, and computed again if the entry is damaged
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    path = tmp_path / "model.bin"
+    path.write_bytes(b"weights")
+    return path
+
+
+def worked(counting: Counting, folder: Path, lr: Tensor, factor: int = 2) -> bool:
+    """Did the prior have to work, or was the result in the cache?"""
+    Cached(counting, folder)("view", lr, factor)
+    return bool(counting.calls)
+
+
+def test_a_result_is_computed_once_and_is_the_same_from_the_cache(model: Path, tmp_path: Path) -> None:
+    counting, lr = Counting(str(model)), photo(5, 6)
+    cached = Cached(counting, tmp_path / "cache")
+    first, again = (cached(name, lr, 2) for name in ("a", "b"))
+    assert torch.equal(first, again)
+    assert first.stride() == again.stride()  # sums over another layout would have another order
+    assert counting.calls == ["a"]
+    assert torch.equal(first, images.quantize(first))
+    assert cached.label == "counting"
+
+
+def test_what_changes_the_result_changes_the_key_and_nothing_else_does(model: Path, tmp_path: Path) -> None:
+    folder, lr = tmp_path / "cache", photo(5, 6)
+    assert worked(Counting(str(model)), folder, lr)
+    assert not worked(Counting(str(model)), folder, lr)
+    assert not worked(Counting(str(shutil.copy(model, tmp_path / "moved.bin"))), folder, lr)
+    assert worked(Counting(str(model), setting=1), folder, lr)
+    assert worked(Counting(str(model)), folder, lr, factor=3)
+    assert worked(Counting(str(model)), folder, lr + 1 / 255)
+    assert worked(Counting(str(model)), folder, lr.reshape(6, 5, 3))
+    model.write_bytes(b"other weights")
+    assert worked(Counting(str(model)), folder, lr)
+
+
+@pytest.mark.parametrize("damage", ["truncated", "garbage", "another size"])
+def test_a_damaged_entry_is_logged_and_computed_again(model, tmp_path, damage, caplog):
+    folder, lr = tmp_path / "cache", photo(16, 16)
+    counting = Counting(str(model))
+    first = Cached(counting, folder)("view", lr, 2)
+    (entry,) = folder.iterdir()
+    if damage == "another size":
+        write_png(entry, photo(3, 3))
+    else:
+        entry.write_bytes(entry.read_bytes()[:-40] if damage == "truncated" else b"garbage")
+    assert torch.equal(Cached(counting, folder)("view", lr, 2), first)
+    assert len(counting.calls) == 2
+    assert "a cached SR image is damaged and is computed again" in caplog.text
+    assert torch.equal(read_image(entry), first)
+
+
+def test_a_cache_that_cannot_be_written_costs_time_but_no_result(model, tmp_path, caplog):
+    (tmp_path / "file").write_bytes(b"in the way of a folder")
+    lr = photo(5, 6)
+    assert Cached(Counting(str(model)), tmp_path / "file" / "cache")("view", lr, 2).shape == (10, 12, 3)
+    assert "cannot be cached" in caplog.text
+
+
+def test_the_cache_is_where_the_environment_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("CLEAR_CACHE", str(tmp_path))
+    assert cache_folder() == tmp_path
+    assert Cached(Counting("")).folder == tmp_path / "sr"
+    monkeypatch.delenv("CLEAR_CACHE")
+    assert cache_folder() == Path.home() / ".cache" / "clear-strategies"
+
+
+# ---- tiles join without seams, and equal the whole image where the overlap covers the receptive field
+
+
+@given(
+    height=st.integers(1, 40), width=st.integers(1, 40), overlap=st.integers(0, 4), more=st.integers(1, 20),
+    factor=st.sampled_from([1, 2, 4]), seed=st.integers(0, 9),
+)  # fmt: skip
+@settings(max_examples=40, deadline=None)
+def test_tiles_join_to_the_whole_where_the_overlap_reaches_as_far_as_the_network_sees(
+    height: int, width: int, overlap: int, more: int, factor: int, seed: int
+) -> None:
+    kernel = torch.randn(3, 1, 2 * overlap + 1, 2 * overlap + 1, generator=torch.Generator().manual_seed(seed))
+    tile = 4 * overlap + more
+
+    def upscale(lr: Tensor) -> Tensor:
+        assert whole_image or max(lr.shape[:2]) <= tile
+        blurred = F.conv2d(lr.permute(2, 0, 1)[None], kernel, padding=overlap, groups=3)
+        return F.interpolate(blurred, scale_factor=factor)[0].permute(1, 2, 0)
+
+    lr = photo(height, width, seed)
+    whole_image = False
+    joined = tiled(upscale, lr, factor, tile, overlap)
+    whole_image = True
+    assert torch.allclose(joined, upscale(lr), atol=1e-4)
+
+
+def test_tiles_that_differ_are_faded_into_each_other() -> None:
+    """Two tiles of different grey: along a row, the result changes by one ramp's slope per pixel."""
+    greys = iter([0.0, 1.0])
+    joined = tiled(lambda lr: torch.full((4 * lr.shape[0], 4 * lr.shape[1], 3), next(greys)), photo(8, 80), 4, 72, 8)
+    row = joined[0, :, 0]
+    # The shares meet at LR 40, HR 160; 8 LR pixels on both sides are 64 HR pixels of ramp.
+    assert torch.all(row[:128] == 0)
+    assert torch.all(row[192:] == 1)
+    assert torch.allclose(row[128:192], (torch.arange(64) + 0.5) / 64)

@@ -1,15 +1,20 @@
-"""What each format with poses has of its own: NeRF-synthetic, LLFF, transforms.json."""
+"""What each format with poses has of its own: NeRF-synthetic, LLFF, transforms.json, COLMAP models."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from PIL import Image
 
+from clear_strategies.data import photo_files
+from clear_strategies.data.lenses import Lens
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.ply import write_points
 from clear_strategies.data.readers import blender, colmap, nerfstudio
@@ -148,3 +153,154 @@ def test_points_of_a_ply_have_no_tracks(tmp_path: Path) -> None:
     assert points.colors[0].tolist() == pytest.approx([1, 0, 0.2])
     assert len(points.track_point) == len(points.track_image) == 0
     assert points.source == "points.ply, 1 points without tracks"
+
+
+# ---- cOLMAP models: both layouts give the same scene, lenses are straightened, photos are found
+
+
+LAYOUTS = {"bin": tiny.colmap_bin, "txt": tiny.colmap_txt}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_photos_and_points_are_those_of_the_files(layout: str, tmp_path: Path) -> None:
+    capture = colmap.read(LAYOUTS[layout](tmp_path))
+    assert [frame.name for frame in capture.frames] == list(tiny.NAMES)
+    assert [frame.sfm_id for frame in capture.frames] == [1, 2, 3]
+    for frame in capture.frames:
+        assert torch.equal(frame.load(), photo_files.read_image(tmp_path / "images" / frame.name))
+    points = capture.points
+    assert points.means.tolist() == [list(p) for p in tiny.POINTS]
+    torch.testing.assert_close(points.colors, torch.tensor([[1.0, 0.0, 0.2], [0.0, 0.4, 1.0]]))
+    pairs = sorted(zip(points.track_point.tolist(), points.track_image.tolist(), strict=True))
+    assert pairs == [(0, 1), (0, 2), (1, 2), (1, 3)]
+    assert points.source == "COLMAP sparse/0, 2 points, triangulated from all 3 images"
+    assert capture.notes["poses"] == f"COLMAP sparse/0 ({layout}), 3 images"
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
+def test_the_model_is_found_in_every_usual_place(place: str, tmp_path: Path) -> None:
+    tiny.colmap_bin(tmp_path / "made")
+    (tmp_path / "scene").mkdir()
+    shutil.copytree(tmp_path / "made/sparse/0", tmp_path / "scene" / place, dirs_exist_ok=True)
+    shutil.copytree(tmp_path / "made/images", tmp_path / "scene/images")
+    assert len(colmap.read(tmp_path / "scene").frames) == 3
+
+
+def test_smaller_photos_rescale_their_cameras_per_axis(tmp_path: Path) -> None:
+    tiny.write_photos(tiny.colmap_bin(tmp_path) / "images_2", size=(8, 7))
+    capture = colmap.read(tmp_path, images="images_2")
+    camera = capture.frames[0].camera
+    assert (camera.fx, camera.cx, camera.cy, camera.width, camera.height) == (10, 4, 3.5, 8, 7)
+    assert camera.fy == pytest.approx(20 * 7 / 12)
+    assert "16x12 to 8x7" in capture.notes["cameras"]
+
+
+def test_photos_may_all_lie_in_subfolders_with_masks_in_subfolders_of_the_same_names(tmp_path: Path) -> None:
+    listing = tiny.colmap_txt(tmp_path) / "sparse/0/images.txt"
+    text = listing.read_text()
+    for name in tiny.NAMES:
+        (tmp_path / f"images/cam_{name[0]}").mkdir()
+        (tmp_path / "images" / name).rename(tmp_path / f"images/cam_{name[0]}/1.png")
+        text = text.replace(f" {name}\n", f" cam_{name[0]}/1.png\n")
+    listing.write_text(text)
+    for place, grey in (("cam_a/1.png.png", 0.0), ("cam_b/1.png", 1.0)):
+        photo_files.write_png(tmp_path / "masks" / place, torch.full((12, 16), grey))
+    shutil.copytree(tmp_path / "images/cam_a", tmp_path / "images/cam_d")
+    capture = colmap.read(tmp_path)
+    assert [frame.name for frame in capture.frames] == ["cam_a/1.png", "cam_b/1.png", "cam_c/1.png"]
+    assert capture.notes["without pose"] == "1 photos, not used: cam_d/1.png"
+    a, b, c = (frame.shown for frame in capture.frames)
+    assert (bool(a().any()), bool(b().all()), c) == (False, True, None)
+
+
+def test_of_several_models_the_one_with_most_photos_is_read(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    tiny.colmap_txt(tmp_path)
+    small = tmp_path / "sparse/0"
+    shutil.copytree(small, tmp_path / "sparse/1")
+    lines = (small / "images.txt").read_text().splitlines(keepends=True)
+    (small / "images.txt").write_text("".join(lines[:-2]))  # an image has two lines
+    (small / "points3D.txt").unlink()
+    with caplog.at_level("WARNING"):
+        assert len(colmap.read(tmp_path).frames) == 3
+    assert "The largest, 1 with 3 photos, is used; the others are not: 0 with 2." in caplog.text
+
+
+def test_a_missing_file_of_points_and_a_quaternion_of_another_length_are_noted(tmp_path: Path) -> None:
+    file = tiny.colmap_txt(tmp_path) / "sparse/0/images.txt"
+    file.write_text(file.read_text().replace("1 1.0 0.0 0.0 0.0", "1 1.5 0.0 0.0 0.0"))
+    (tmp_path / "sparse/0/points3D.txt").unlink()
+    capture = colmap.read(tmp_path)
+    assert capture.points is None
+    assert capture.notes["points"] == "the model has none"
+    np.testing.assert_allclose(capture.frames[0].camera.world_to_camera.numpy(), tiny.world_to_camera(0))
+    assert capture.notes["rotations"].startswith("1 quaternions")
+
+
+LENSES = [
+    Lens(160, 120, 150.0, 140.0, 82.0, 57.0, (-0.2, 0.05, 0.002, -0.001)),
+    Lens(160, 120, 150.0, 150.0, 80.0, 60.0, (0.15, 0.0, 0.0, 0.0)),
+    Lens(160, 120, 100.0, 100.0, 80.0, 60.0, (0.05, -0.01, 0.002, 0.0), fisheye=True),
+]
+
+
+def distorted(lens: Lens, rays: np.ndarray) -> np.ndarray:
+    """Where OpenCV's lens images the rays (x, y, 1)."""
+    K = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
+    if lens.fisheye:
+        return cv2.fisheye.distortPoints(rays, K, np.array(lens.distortion))
+    points = np.concatenate((rays, np.ones_like(rays[..., :1])), -1).reshape(-1, 3)
+    return cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(lens.distortion))[0].reshape(rays.shape)
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=["opencv", "radial", "fisheye"])
+def test_undistortion_is_the_lens_formula_and_leaves_no_border(lens: Lens) -> None:
+    """A smooth function of the distorted position, sampled through the new pinhole's rays, is what `undistort` gives."""
+    file = Path("scene")
+    pinhole = lens.undistorted(file)
+    v, u = np.meshgrid(np.arange(120) + 0.5, np.arange(160) + 0.5, indexing="ij")
+
+    def picture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.stack((x / 160, y / 120, 0.5 + 0.4 * np.sin(x / 15) * np.cos(y / 12)), -1)
+
+    photo = torch.from_numpy(picture(u, v).astype(np.float32))
+    rays = np.stack(((u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy), -1)
+    source = distorted(lens, rays)
+    assert source.min() > -1
+    assert (source < [161, 121]).all()
+    expected = picture(source[..., 0], source[..., 1])[2:-2, 2:-2]
+    found = lens.undistort(photo, pinhole).numpy()[2:-2, 2:-2]
+    assert np.abs(found - expected).max() < 5e-3
+
+
+@pytest.mark.parametrize(
+    ("model", "parameters"),
+    [
+        ("SIMPLE_RADIAL", (20.0, 8.0, 6.0, 0.1)),
+        ("OPENCV", (20.0, 20.0, 8.0, 6.0, 0.1, 0.01, 0.001, 0.0)),
+        ("OPENCV_FISHEYE", (20.0, 20.0, 8.0, 6.0, 0.1, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_distorted_models_become_pinholes_and_are_noted(model, parameters, tmp_path):
+    capture = colmap.read(tiny.colmap_bin(tmp_path, model, parameters))
+    assert capture.notes["lens"].startswith("3 of 3 photos undistorted by OpenCV")
+    raw = photo_files.read_image(tmp_path / "images/a.png")
+    assert capture.frames[0].load().shape == raw.shape
+    assert not torch.equal(capture.frames[0].load(), raw)
+    assert capture.frames[0].camera.fx != 20
+
+
+@pytest.mark.parametrize("scene", ["kitchen360", "real_room", "strecha_fountain"])
+def test_real_points_project_into_the_photos_that_observe_them(scene: str, shared_data: Path) -> None:
+    capture = colmap.read(shared_data / scene)
+    points = capture.points
+    for frame in capture.frames:
+        camera = frame.camera
+        observed = points.means[points.track_point[points.track_image == frame.sfm_id]].double()
+        local = observed @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        x, y = camera.fx * local[:, 0] / local[:, 2] + camera.cx, camera.fy * local[:, 1] / local[:, 2] + camera.cy
+        inside = (local[:, 2] > 0) & (x > -3) & (x < camera.width + 3) & (y > -3) & (y < camera.height + 3)
+        assert len(observed) > 0
+        assert inside.float().mean() > 0.99
+    assert cv2.imread(str(shared_data / scene / "images" / capture.frames[0].name)).shape == tuple(
+        capture.frames[0].load().shape
+    )

@@ -1,4 +1,4 @@
-"""Depth maps: right on surfaces that are known, unknown where nothing tells depth, the same bits every time."""
+"""Depth maps: right on known surfaces, unknown where nothing tells depth, the same bits every time; their completion."""
 
 from __future__ import annotations
 
@@ -6,13 +6,18 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import Tensor
 
 from clear_strategies.core.view import Photo
-from clear_strategies.geometry.dense_stereo import consistency, sources
+from clear_strategies.geometry.completion import completed
+from clear_strategies.geometry.dense_stereo import consistency, cost, sources
 from clear_strategies.geometry.dense_stereo.consistency import speckles
+from clear_strategies.geometry.dense_stereo.cost import cost_volume
+from clear_strategies.geometry.dense_stereo.image import Grey
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
-from tests.helpers.planes import same_maps
+from clear_strategies.geometry.dense_stereo.smoothing import smooth
+from tests.helpers.planes import plane_photos, same_maps
 from tests.helpers.textured import Surface, bump, camera, cast, slanted
 
 NONE = torch.zeros(0, 3)
@@ -144,3 +149,124 @@ def test_what_is_alike_depends_on_the_ratio_of_depths_alone() -> None:
 def test_without_scipy_every_depth_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(consistency, "missing", lambda *_: "scipy")
     assert not speckles(map_with_islands(), 5, 0.05).any()
+
+
+# ---- completed depth: planes go on, surfaces end where colours change, outliers do not count
+
+
+H, W = 24, 32
+V, U = torch.meshgrid(torch.arange(H).double(), torch.arange(W).double(), indexing="ij")
+PLANE = 0.5 + 0.004 * U - 0.006 * V
+
+
+def grey(values: Tensor) -> Tensor:
+    return values[..., None].expand(-1, -1, 3).float()
+
+
+def complete(known: Tensor, image: Tensor | None = None) -> Tensor:
+    return completed(known, torch.ones(H, W), grey(torch.full((H, W), 0.5)) if image is None else image)
+
+
+def test_a_plane_is_completed_inside_and_continued_outside() -> None:
+    known = PLANE.clone()
+    known[8:16, 10:20] = torch.nan
+    known[:, 26:] = torch.nan
+    error = (complete(known) / PLANE - 1).abs()
+    assert error[:, :26].max() < 1e-3
+    assert error.max() < 0.03
+
+
+def test_two_surfaces_meet_where_the_colour_changes() -> None:
+    right = U >= 18
+    image = grey(right.double())
+    known = torch.where(right, 1.0, 0.2).double()
+    known[:, 6:26] = torch.nan  # the edge itself is not known
+    result = complete(known, image)
+    assert (result[:, :17] - 0.2).abs().max() < 0.01
+    assert (result[:, 19:] - 1.0).abs().max() < 0.01
+
+
+def test_an_outlier_does_not_count() -> None:
+    known = PLANE.clone()
+    known[U % 3 > 0] = torch.nan
+    wrong = known.clone()
+    wrong[12, 15] = 3.0
+    assert (complete(wrong) - complete(known)).abs().max() < 0.01
+
+
+def test_one_known_pixel_is_the_depth_of_all_of_a_photo_of_any_size() -> None:
+    for h, w in ((1, 1), (1, 2), (2, 2), (2, 5), (H, W)):
+        known = torch.full((h, w), torch.nan, dtype=torch.float64)
+        known[h // 2, w // 2] = 0.25
+        result = completed(known, torch.ones(h, w), torch.rand(h, w, 3))
+        assert torch.allclose(result, torch.tensor(0.25, dtype=torch.float64), rtol=1e-6)
+
+
+# ---- the cost volume and its smoothing
+
+
+def test_the_better_half_of_the_other_photos_decides() -> None:
+    first, second, third = (Grey(p.camera, p.image.mean(2)) for p in plane_photos(3))
+    planes = torch.tensor([1 / 8, 1 / 4, 1 / 3])
+    each = torch.stack([cost_volume(first, [other], planes, 5) for other in (second, third, first, third)])
+    found = cost_volume(first, [second, third, first, third], planes, 5)
+    assert torch.allclose(found, each.sort(0).values[:2].mean(0))
+
+
+def test_the_true_plane_costs_next_to_nothing_whatever_the_brightness() -> None:
+    first, second = (Grey(p.camera, p.image.mean(2)) for p in plane_photos(2))
+    planes = torch.tensor([1 / 8, 1 / 4, 1 / 3])
+    for image in (second.image, 0.5 * second.image + 0.2):
+        cost = cost_volume(first, [Grey(second.camera, image)], planes, 5)
+        seen = cost[5:-5, 20:-5]
+        assert seen[..., 1].mean() < 0.03
+        assert (seen[..., 0] > seen[..., 1]).float().mean() > 0.95
+        assert torch.equal(cost[:, :10, 1], torch.full_like(cost[:, :10, 1], 0.5))  # not in the other photo
+
+
+@pytest.mark.parametrize("window", [3, 7])
+def test_the_compiled_sweep_is_the_readable_one(window: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = (Grey(p.camera, p.image.mean(2)) for p in plane_photos(2, 77, 71))
+    planes = torch.tensor([1 / 8, 1 / 4.1, 1 / 3, 3.0])
+    compiled = cost_volume(first, [second], planes, window)
+    monkeypatch.setattr(cost.cpp, "available", lambda: False)
+    difference = (cost_volume(first, [second], planes, window) - compiled).abs()
+    assert difference.median() < 1e-6
+    assert difference.max() < 0.01  # where there is next to no contrast
+
+
+@pytest.mark.parametrize("shape", [(5, 7, 16), (9, 4, 21), (1, 6, 3)])
+def test_the_compiled_smoothing_is_the_readable_one(
+    shape: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    volume, image = torch.rand(shape), torch.rand(shape[:2])
+    compiled = smooth(volume, image, 0.08, 0.6)
+    monkeypatch.setattr(cost.cpp, "available", lambda: False)
+    assert torch.equal(compiled, smooth(volume, image, 0.08, 0.6))
+
+
+def test_smoothing_agrees_with_the_recursion_written_out() -> None:
+    g = torch.Generator().manual_seed(0)
+    cost, image = torch.rand(4, 5, 6, generator=g), torch.rand(4, 5, generator=g)
+    expected = torch.zeros_like(cost)
+    for dy in (-1, 0, 1):
+        for dx in (-1, 0, 1):
+            if dy or dx:
+                expected += along(cost, image, dy, dx)
+    assert torch.allclose(smooth(cost, image, 0.08, 0.6), expected / 8, atol=1e-5)
+
+
+def along(cost: torch.Tensor, image: torch.Tensor, dy: int, dx: int) -> torch.Tensor:
+    height, width, planes = cost.shape
+    result = torch.zeros_like(cost)
+    for y in range(height)[:: 1 if dy >= 0 else -1]:
+        for x in range(width)[:: 1 if dx >= 0 else -1]:
+            result[y, x] = cost[y, x]
+            if not (0 <= y - dy < height and 0 <= x - dx < width):
+                continue
+            before = result[y - dy, x - dx]
+            jump = max(0.08, float(0.6 / (1 + 20 * (image[y, x] - image[y - dy, x - dx]).abs())))
+            for d in range(planes):
+                near = [float(before[k]) + 0.08 for k in (d - 1, d + 1) if 0 <= k < planes]
+                result[y, x, d] += min(float(before[d]), *near, float(before.min()) + jump) - float(before.min())
+    return result
