@@ -81,7 +81,6 @@ def blend(depth: bool, lanes: int) -> Any:  # noqa: PLR0915 - a kernel
         starts: wp.array[wp.int32],
         ends: wp.array[wp.int32],
         image: wp.array2d[wp.vec3],
-        alpha: wp.array2d[wp.float32],
         transmittance: wp.array2d[wp.float32],
         ended: wp.array2d[wp.int32],
         marks: wp.array2d[wp.vec4],
@@ -139,7 +138,6 @@ def blend(depth: bool, lanes: int) -> Any:  # noqa: PLR0915 - a kernel
                     marks[mark, within] = wp.vec4(rgb[0], rgb[1], rgb[2], segment[3])
                     rgb += wp.vec3(segment[0], segment[1], segment[2])
                 image[pixel[1], pixel[0]] = rgb
-                alpha[pixel[1], pixel[0]] = 1.0 - through[j]
                 transmittance[pixel[1], pixel[0]] = through[j]
                 ended[pixel[1], pixel[0]] = stop[j]
                 if depth:

@@ -31,7 +31,7 @@ from rasterizers.warp_backend.blend import blend, blend_vjp
 from rasterizers.warp_backend.colour import basis
 from rasterizers.warp_backend.project import fold, project, project_vjp
 from rasterizers.warp_backend.settings import PAIR_BYTES, SUMS_BYTES, TILE, WarpSettings, mebibytes, padded
-from rasterizers.warp_runtime import array, launch, on_stream
+from rasterizers.warp_runtime import launch, on_stream
 
 _ROW: Final = len(types.Row())
 DEFERRED_COUNTS: Final = {"cuda": True, "cpu": False}
@@ -49,14 +49,13 @@ class _View:
         n, like = len(splats), splats.means
         self.camera, self.has_depth = camera, has_depth
         self.columns, self.rows_of_tiles = -(-camera.width // TILE), -(-camera.height // TILE)
-        self.opacities = splats.opacities.detach().contiguous()
-        self.offsets = None if splats.rgb_offset is None else splats.rgb_offset.detach().contiguous()
+        self.opacities = splats.opacities.contiguous()
+        self.offsets = None if splats.rgb_offset is None else splats.rgb_offset.contiguous()
         self.grid = _grid_struct(camera, self.columns, self.rows_of_tiles)
-        self.ellipses = like.new_empty(n, _ROW)
-        self.means2d = like.new_empty(n, 2)
+        self.ellipses, self.means2d = like.new_empty(n, _ROW), like.new_empty(n, 2)
         self.visible = like.new_empty(n, dtype=torch.bool)
-        self.counts = like.new_empty(n, dtype=torch.int32)  # tiles of each Gaussian
-        self.firsts = like.new_empty(n, dtype=torch.int32)  # its first pair
+        # Tiles of each Gaussian, and its first pair.
+        self.counts, self.firsts = like.new_empty(2, n, dtype=torch.int32).unbind()
         self.ends = like.new_zeros(n + 1, dtype=torch.int64)  # pairs up to each Gaussian, front to back
         self.pairs = 0  # set by `Frame.resolve_counts`
         self.lists: _Lists  # set by `Frame._list`
@@ -84,29 +83,25 @@ class Frame:
         splats, camera = jobs[0]
         for job, _ in jobs:
             require_splats(job, settings.traits)
-        self.settings, self.jobs, self.n, self.like = settings, jobs, len(splats), splats.means.detach()
+        self.settings, self.jobs, self.n, self.like = settings, jobs, len(splats), splats.means
         self.pose, self.cuts = _pose_struct(camera), _cuts_struct(settings)
-        self.means, self.quats, self.scales = (
-            x.detach().contiguous() for x in (splats.means, splats.quats, splats.scales)
-        )
-        self.sh0, self.shN = packed_rows(splats.sh0.detach())[:, 0], packed_rows(splats.shN.detach())
+        self.means, self.quats, self.scales = (x.contiguous() for x in (splats.means, splats.quats, splats.scales))
+        self.sh0, self.shN = packed_rows(splats.sh0), packed_rows(splats.shN)
         self.bands = self.shN.shape[1]
         self.colours = self.empty(self.n, 3)
         self.slopes = self.empty(self.n if self.bands else 0, 3, 3)
         self.depths = self.empty(self.n if any(depth) else 0)
         self.views = [_View(*job, has_depth=z) for job, z in zip(jobs, depth, strict=True)]
         self._basis: Tensor | None = None
-        self._resolved = False
+        self.resolved = False
 
     def draw(self) -> list[WarpRendering]:
         """An image on each grid. Errors in the input may be raised only when an image is first accessed."""
         with on_stream(self.like.device):
-            keys, flags = self.project()
-            places = torch.arange(2 * self.n, dtype=torch.int32, device=self.like.device)
+            keys, places, flags = self.project()
             self._order = _sorted(keys, places, self.n, 31)[1]
-            front_to_back = self._order.long()
             for view in self.views:
-                torch.cumsum(view.counts[front_to_back], 0, out=view.ends[1:])
+                torch.cumsum(view.counts.index_select(0, self._order), 0, out=view.ends[1:])
             self.totals = torch.cat([*(view.ends[-1:] for view in self.views), flags])
             self._read = _read_deferred(self.totals)
             capacities = [self.settings.capacity(view.camera) for view in self.views]
@@ -124,7 +119,7 @@ class Frame:
             ValueError: a number is not finite.
             MemoryError: the lists of an image would exceed the budget.
         """
-        if self._resolved:
+        if self.resolved:
             return
         *pairs, not_finite, is_long, is_longer = self._read()
         self.folds = (1,) * is_long + (types.SEGMENT,) * is_longer
@@ -137,7 +132,7 @@ class Frame:
             view.pairs = count
             if view.capacity < count:
                 self._list(nth, count)
-        self._resolved = True
+        self.resolved = True
 
     def launch(self, kernel: Any, threads: int, *arguments: Any) -> None:
         """Launch a kernel with one thread per Gaussian, place or pair."""
@@ -155,26 +150,21 @@ class Frame:
         if self._basis is None:
             visible = torch.stack([view.visible for view in self.views]).any(0)
             self._basis = self.like.new_zeros(self.n, self.bands + 1)
-            arguments = (self.pose, array(self.means, wp.vec3), array(visible), array(self._basis))
+            arguments = (self.pose, self.means, visible, self._basis)
             self.launch(basis, self.n, *arguments)
         return self._basis
 
-    def project(self) -> tuple[Tensor, Tensor]:
-        """Project onto each grid. Returns the depth keys, with space for sorting them, and the kernel's flags."""
-        keys = self.empty(2 * self.n, dtype=torch.int32)
+    def project(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Project onto each grid. Returns depth keys and their Gaussians, with space for sorting, and the kernel's flags."""
+        keys, places = (self.empty(2 * self.n, dtype=torch.int32) for _ in range(2))
         flags = self.like.new_zeros(3, dtype=torch.int64)
         for nth, view in enumerate(self.views):
             self.launch(
-                project, self.n, self.pose, view.grid, self.cuts,
-                array(self.means, wp.vec3), array(self.quats, wp.vec4), array(self.scales, wp.vec3),
-                array(view.opacities), array(self.sh0, wp.vec3), array(self.shN, wp.vec3),
-                view.offsets is not None, array(view.offsets, wp.vec3),
-                nth == 0,
-                array(keys), array(self.colours, wp.vec3), array(self.slopes, wp.mat33),
-                array(self.depths), array(view.ellipses, types.Row), array(view.means2d, wp.vec2), array(view.visible),
-                array(view.counts), array(flags),
+                project, self.n, self.pose, view.grid, self.cuts, self.means, self.quats, self.scales, view.opacities, self.sh0,
+                self.shN, view.offsets is not None, view.offsets, nth == 0, keys, places, self.colours, self.slopes, self.depths,
+                view.ellipses, view.means2d, view.visible, view.counts, flags,
             )  # fmt: skip
-        return keys, flags
+        return keys, places, flags
 
     def _require_memory(self, view: _View, count: int) -> None:
         """Refuse counts beyond the budget. Counts are 64-bit up to here, and fit 32 bits after it."""
@@ -196,14 +186,10 @@ class Frame:
         n_tiles = view.columns * view.rows_of_tiles
         starts, ends = self.like.new_zeros(2, n_tiles + 1, dtype=torch.int32)
         self.launch(
-            list_pairs, capacity, array(self._order), array(view.ends), array(view.ellipses, types.Row),
-            view.grid, array(view.firsts), array(tiles), array(places), array(splats),
-        )  # fmt: skip
+            list_pairs, capacity, self._order, view.ends, view.ellipses, view.grid, view.firsts, tiles, places, splats
+        )
         tiles, places = _sorted(tiles, places, capacity, n_tiles.bit_length())
-        self.launch(
-            find_tiles, capacity, array(tiles), array(places), array(splats), array(self.totals), nth, capacity,
-            array(gaussians), array(starts), array(ends),
-        )  # fmt: skip
+        self.launch(find_tiles, capacity, tiles, places, splats, self.totals, nth, capacity, gaussians, starts, ends)
         view.capacity, view.lists = capacity, _Lists(splats, tiles, gaussians, places, starts, ends)
 
 
@@ -215,8 +201,7 @@ class WarpRendering:
         height, width = view.camera.height, view.camera.width
         self.means2d: Float[Tensor, "N 2"] = view.means2d
         self.visible: Bool[Tensor, " N"] = view.visible
-        self._image, self._alpha = frame.empty(height, width, 3), frame.empty(height, width)
-        self._transmittance = frame.empty(height, width)
+        self._image, self._transmittance = frame.empty(height, width, 3), frame.empty(height, width)
         self._ended = frame.empty(height, width, dtype=torch.int32)
         self._depth = frame.empty(height, width) if view.has_depth else None
         self._blend()
@@ -229,7 +214,7 @@ class WarpRendering:
     @property
     def alpha(self) -> Float[Tensor, "H W"]:
         self._resolve()
-        return self._alpha
+        return 1 - self._transmittance
 
     @property
     def depth(self) -> Float[Tensor, "H W"] | None:
@@ -237,8 +222,11 @@ class WarpRendering:
         return self._depth
 
     def _resolve(self) -> None:
-        with on_stream(self._frame.like.device):
-            self._frame.resolve_counts()
+        frame = self._frame
+        if frame.resolved and self._drawn_from is self._view.lists:
+            return
+        with on_stream(frame.like.device):
+            frame.resolve_counts()
             if self._drawn_from is not self._view.lists:
                 self._blend()
 
@@ -248,62 +236,65 @@ class WarpRendering:
         self._marks = frame.empty(view.capacity // types.SEGMENT + 1, types.PIXELS, 4)
         lanes = TILE_LANES[frame.settings.device]
         frame.launch_blocks(
-            blend(view.has_depth, lanes), view.columns * view.rows_of_tiles, lanes, view.grid, frame.cuts,
-            array(view.ellipses, types.Row), array(frame.depths), array(lists.gaussians), array(lists.starts),
-            array(lists.ends),
-            array(self._image, wp.vec3), array(self._alpha), array(self._transmittance), array(self._ended),
-            array(self._marks, wp.vec4), array(self._depth),
+            blend(view.has_depth, lanes), view.columns * view.rows_of_tiles, lanes, view.grid, frame.cuts, view.ellipses,
+            frame.depths, lists.gaussians, lists.starts, lists.ends, self._image, self._transmittance, self._ended, self._marks,
+            self._depth,
         )  # fmt: skip
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
         """One pass for up to three cotangents; see `Rendering.vjp`."""
         require_cotangents(cotangents, self.image)
         k, n, frame = len(cotangents), len(self.visible), self._frame
-        v = cotangents.detach().to(self._image).contiguous()
-        means, quats, scales, screen, rgb = (frame.empty(k, n, width) for width in (3, 4, 3, 2, 3))
-        opacities = frame.empty(k, n)
+        v = cotangents.to(self._image).contiguous()
+        out = means, quats, scales, opacities, screen, rgb = (
+            frame.empty(k, n, 3), frame.empty(k, n, 4), frame.empty(k, n, 3), frame.empty(k, n), frame.empty(k, n, 2),
+            frame.empty(k, n, 3),
+        )  # fmt: skip
         capacity = padded(self._view.pairs)
         together = max(1, min(3, ((frame.settings.memory << 20) - capacity * PAIR_BYTES) // (capacity * SUMS_BYTES)))
         with on_stream(frame.like.device):
-            for part in range(0, k, together):
-                some = slice(part, part + together)
-                out = (x[some] for x in (means, quats, scales, opacities, screen, rgb))
-                self._fill(v[some], *out)
+            if k <= together:
+                self._fill(v, *out)
+            else:
+                for part in zip(*(torch.split(x, together) for x in (v, *out)), strict=True):
+                    self._fill(*part)
             return SplatGradients(means, quats, scales, opacities, screen, rgb, frame.basis())
 
     def _fill(self, v: Tensor, *out: Tensor) -> None:
         """Fill the gradients for one to three cotangents."""
         frame, view, lists, k = self._frame, self._view, self._drawn_from, len(v)
-        width = k * (types.SUMS + 3)
-        pair_sums = frame.empty(padded(view.pairs), width)
-        row = wp.types.vector(length=width, dtype=wp.float32)
+        pair_sums = frame.empty(padded(view.pairs), k * (types.SUMS + 3))
         lanes = LANES[frame.settings.device]
         frame.launch_blocks(
             blend_vjp(k, lanes, frame.settings.device == "cuda"), -(-view.pairs // types.SEGMENT), lanes, view.grid, frame.cuts,
-            array(view.ellipses, types.Row), array(lists.tiles), array(lists.gaussians), array(lists.places),
-            array(lists.ends), array(self._transmittance), array(self._ended), array(self._marks, wp.vec4),
-            array(v, wp.vec3), view.pairs, array(pair_sums),
+            view.ellipses, lists.tiles, lists.gaussians, lists.places, lists.ends, self._transmittance, self._ended, self._marks,
+            v, view.pairs, pair_sums,
         )  # fmt: skip
         for stride in frame.folds:
-            frame.launch(
-                fold(k), view.pairs, array(view.counts), array(view.firsts), array(lists.splats), stride,
-                array(pair_sums, row),
-            )  # fmt: skip
-        widths = (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec2, wp.vec3)
+            frame.launch(fold(k), view.pairs, view.counts, view.firsts, lists.splats, stride, pair_sums)
         frame.launch(
-            project_vjp(k), frame.n, frame.pose, view.grid, frame.cuts,
-            array(frame.means, wp.vec3), array(frame.quats, wp.vec4), array(frame.scales, wp.vec3),
-            array(view.opacities), array(frame.slopes, wp.mat33), frame.bands > 0,
-            array(view.ellipses, types.Row), array(view.counts), array(view.firsts), array(pair_sums, row),
-            *(array(x, width) for x, width in zip(out, widths, strict=True)),
+            project_vjp(k), frame.n, frame.pose, view.grid, frame.cuts, frame.means, frame.quats, frame.scales, view.opacities,
+            frame.slopes, frame.bands > 0, view.ellipses, view.counts, view.firsts, pair_sums, *out,
         )  # fmt: skip
 
 
 def _sorted(keys: Tensor, values: Tensor, count: int, bits: int) -> tuple[Tensor, Tensor]:
     """The first `count` keys and values in a stable order by key; both tensors have twice that length, for scratch."""
     if count:
-        wp.utils.radix_sort_pairs(wp.from_torch(keys), wp.from_torch(values), count, end_bit=bits)
+        wp.utils.radix_sort_pairs(_sortable(keys), _sortable(values), count, end_bit=bits)
     return keys[:count], values[:count]
+
+
+def _sortable(numbers: Tensor) -> Any:
+    return _array_at(numbers.data_ptr(), len(numbers), str(numbers.device))
+
+
+@lru_cache(maxsize=64)
+def _array_at(address: int, length: int, device: str) -> Any:
+    """Memory of torch as Warp's array of int32. Kept by address, which torch gives out again: making one takes as long as a small
+    sort.
+    """
+    return wp.array(ptr=address, shape=length, dtype=wp.int32, device=device)
 
 
 def _read_deferred(numbers: Tensor) -> Any:

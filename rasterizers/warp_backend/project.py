@@ -66,6 +66,7 @@ def project(
     offsets: wp.array[wp.vec3],
     first: wp.bool,
     keys: wp.array[wp.int32],
+    places: wp.array[wp.int32],
     colours: wp.array[wp.vec3],
     slopes: wp.array[wp.mat33],
     depths: wp.array[wp.float32],
@@ -88,6 +89,7 @@ def project(
     )
     if first:
         keys[i] = FAR
+        places[i] = i
     means2d[i] = wp.vec2(0.0, 0.0)
     visible[i] = False
     counts[i] = 0

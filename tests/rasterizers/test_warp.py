@@ -20,20 +20,47 @@ no_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="there is CUDA")
 
 @installed
 @pytest.mark.parametrize(
-    ("tensor", "dtype"),
+    ("tensor", "dtype", "n"),
     [
-        (torch.rand(5), None), (torch.rand(6, 8), None), (torch.zeros(4, dtype=torch.bool), None), (torch.rand(0, 3), "vec3"),
-        (torch.rand(5, 3), "vec3"), (torch.rand(5, 2, 3)[:, 0], "vec3"), (torch.rand(6, 8, 3), "vec3"),
-        (torch.rand(5, 3, 3), "mat33"), (torch.rand(5, 4)[1:], "vec4"),
+        (torch.rand(5), "float32", 1), (torch.rand(6, 8), "float32", 2), (torch.zeros(4, dtype=torch.bool), "bool", 1),
+        (torch.rand(0, 3), "vec3", 1), (torch.rand(5, 3), "vec3", 1), (torch.rand(5, 2, 3)[:, 0], "vec3", 1),
+        (torch.rand(6, 8, 3), "vec3", 2), (torch.rand(5, 3, 3), "mat33", 1), (torch.rand(5, 4)[1:], "vec4", 1),
     ],
 )  # fmt: skip
-def test_a_tensor_is_described_as_warp_describes_it(tensor, dtype):
+def test_a_tensor_is_described_as_warp_describes_it(tensor, dtype, n):
     import warp as wp
 
     from rasterizers.warp_runtime import array
 
-    kind = None if dtype is None else getattr(wp, dtype)
-    assert bytes(array(tensor, kind)) == bytes(wp.from_torch(tensor, kind, return_ctype=True))
+    kind = getattr(wp, dtype)
+    assert bytes(array(tensor, wp.array(dtype=kind, ndim=n))) == bytes(wp.from_torch(tensor, kind, return_ctype=True))
+
+
+@installed
+def test_the_last_dimension_of_an_array_goes_through_several_of_a_tensor():
+    import warp as wp
+
+    from rasterizers.warp_runtime import array
+
+    sh, flat, rows = torch.rand(5, 16, 3), wp.array(dtype=wp.float32, ndim=1), wp.array(dtype=wp.vec3, ndim=1)
+    assert bytes(array(sh, flat)) == bytes(array(sh.view(-1), flat))
+    assert bytes(array(sh[:, :1], rows)) == bytes(array(sh[:, 0], rows))
+    assert bytes(array(torch.zeros(()), flat))[16:] == bytes(array(torch.zeros(1), flat))[16:]
+    for tensor, kind in ((sh[:, :2], flat), (sh[:, :2], rows), (torch.rand(3, 5).T, rows)):
+        with pytest.raises(ValueError, match="copy it"):
+            array(tensor, kind)
+
+
+@installed
+def test_a_structure_is_made_once_for_the_same_memory_and_numbers():
+    from clear_strategies.kernels.gaussian_step.warp import adam
+    from rasterizers.warp_runtime import struct
+
+    p, m = torch.rand(5, 3), torch.rand(5, 3)
+    one = struct(adam.Attribute, {"p": p, "m": m, "v": None}, width=3)
+    assert struct(adam.Attribute, {"p": p.view(5, 3), "m": m, "v": None}, width=3) is one
+    others = ({"p": m, "m": p}, {"p": p, "v": m}, {"p": p[:4], "m": m}, {"p": p.view(3, 5), "m": m})
+    assert len({bytes(struct(adam.Attribute, rows, width=3)) for rows in others} | {bytes(one)}) == 4
 
 
 @installed
@@ -101,10 +128,10 @@ def test_unused_places_do_not_change_the_image(monkeypatch, sevens):
     unused = torch.arange(200) % 3
 
     def counting_too_many(self):
-        keys, flags = project(self)
+        found = project(self)
         counts = self.views[0].counts
         counts += unused * (counts > 0)
-        return keys, flags
+        return found
 
     monkeypatch.setattr(frame.Frame, "project", counting_too_many)
     require_same_bits(everything(rasterizers.load("warp", device="cpu")(splats, view), v), expected)

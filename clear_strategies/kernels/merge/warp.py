@@ -35,7 +35,7 @@ from clear_strategies.kernels.gaussian_step.warp.conflict import (
     rule_of,
 )
 from clear_strategies.kernels.merge import interface
-from rasterizers.warp_runtime import array, launch, on_stream, struct
+from rasterizers.warp_runtime import launch, on_stream, struct
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -230,11 +230,8 @@ def merge(
     omegas, multiples = (like.new_empty(k, 6, dtype=torch.float64) for k in (blocks, n if blocks else 0))
     finite = like.new_ones(1, dtype=torch.int32)
     reliability = None if q is None else q.float().contiguous()
-    decided = (
-        *rows[:-1], o, rule_of(rule, reliability), array(reliability), array(multiples, Six),
-        array(counts, Counts), array(omegas, Six),
-    )  # fmt: skip
-    combined = *rows, o, array(multiples, Six), array(finite)
+    decided = *rows[:-1], o, rule_of(rule, reliability), reliability, multiples, counts, omegas
+    combined = *rows, o, multiples, finite
     with on_stream(device):
         launch(decide, [blocks], decided, device, block=lanes, together=True)
         launch(combine, [n, sum(row.width for row in rows)], combined, device, block=lanes)
@@ -244,10 +241,10 @@ def merge(
     return interface.Merged(ConflictCounts(comparable, opposed, corrected, omega, at_lower_bound), finite[0])
 
 
-def _factors(colour: interface.Colour | None) -> Any:
+def _factors(colour: interface.Colour | None) -> bytes:
     if colour is None:
-        return struct(Factors, {})
-    return struct(Factors, colour._asdict(), bases=colour.basis.shape[1])
+        return bytes(struct(Factors, {}))
+    return bytes(struct(Factors, colour._asdict(), bases=colour.basis.shape[1]))
 
 
 def _rows(name: str, rows: interface.Rows | None) -> Any:

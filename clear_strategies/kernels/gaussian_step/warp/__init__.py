@@ -17,7 +17,7 @@ from clear_strategies.core.compiled_rules import CorrectionRule
 from clear_strategies.core.conflicts import ConflictCounts
 from clear_strategies.kernels.gaussian_step import Attribute, StepCounts, StepSettings
 from clear_strategies.kernels.gaussian_step.warp import adam, conflict, passes, raw_gradients
-from rasterizers.warp_runtime import array, launch, on_stream, struct
+from rasterizers.warp_runtime import launch, on_stream, struct
 
 LANES: Final = {"cuda": 128, "cpu": 1}
 """Threads per block; on a CPU, Warp's blocks have one."""
@@ -86,16 +86,13 @@ class WarpGaussianStep:
         colours = self._like.new_empty(1 if self._one_basis else 2, self._n, 3)
         moving = self._like.new_empty(self._n, dtype=torch.bool)
         counts, omegas = self._blocks(conflict.Counts, torch.int32), self._blocks(conflict.Six, torch.float64)
-        adam_step = _adam(settings)
+        adam_step = _adam(settings, attributes)
         device, lanes = self._like.device, self._lanes
         step = (
-            *self._gradients, conflict.rule_of(rule, q), array(q), _options(self._has_base, rule is not None, settings),
-            adam_step, *parameters, bands,
-            array(colours), array(moving), array(counts, conflict.Counts), array(omegas, conflict.Six),
+            *self._gradients, conflict.rule_of(rule, q), q, _options(self._has_base, rule is not None, settings), adam_step,
+            *parameters, bands, colours, moving, counts, omegas,
         )  # fmt: skip
-        of_bands = (
-            self._gradients[-1], array(self._like), array(self._hr_basis), array(colours), array(moving), adam_step, bands,
-        )  # fmt: skip
+        of_bands = self._gradients[-1], self._like, self._hr_basis, colours, moving, adam_step, bands
         with on_stream(device):
             launch(passes.step, [len(counts)], step, device, block=lanes, together=True)
             launch(passes.step_bands, [self._n, settings.width], of_bands, device, block=lanes)
@@ -120,7 +117,7 @@ class WarpGaussianStep:
         return self._rows(
             adam.Attribute, tensors, dict.fromkeys(tensors, width), optional=("anchor", "merged"),
             width=width, anchored=a.anchor is not None, merges=a.merged is not None,
-            bounded=a.keep != 1 or a.limit != math.inf, stiffness=a.stiffness, rate=-a.rate, keep=a.keep, limit=a.limit,
+            bounded=a.keep != 1 or a.limit != math.inf, stiffness=a.stiffness, keep=a.keep, limit=a.limit,
         )  # fmt: skip
 
     def _rows(
@@ -132,22 +129,19 @@ class WarpGaussianStep:
         **numbers: float,
     ) -> Any:
         """A structure of type `kind` over tensors of n rows with `widths` numbers each, for which it checks them."""
-        rows = {
-            name: self._required(name, tensors[name], width)
-            for name, width in widths.items()
-            if name not in optional or tensors[name] is not None
-        }
-        return struct(kind, rows, **numbers)
+        for name, width in widths.items():
+            if name not in optional or tensors[name] is not None:
+                self._required(name, tensors[name], width)
+        return struct(kind, tensors, **numbers)
 
-    def _required(self, name: str, tensor: Tensor | None, width: int) -> Tensor:
-        """The tensor, if it has a row of `width` numbers for each Gaussian."""
+    def _required(self, name: str, tensor: Tensor | None, width: int) -> None:
+        """Check that a tensor has a row of `width` numbers for each Gaussian."""
         device = self._like.device
         if tensor is None or tensor.dtype != torch.float32 or tensor.device != device or not tensor.is_contiguous():
             where = "in the CPU's memory" if device.type == "cpu" else f"on {device}"
             raise TypeError(f"{name} must be a contiguous float32 tensor {where}.")
         if tensor.dim() == 0 or tensor.shape[0] != self._n or tensor.numel() != self._n * width:
             raise ValueError(f"{name} must have {self._n} rows of {width} numbers, got shape {tuple(tensor.shape)}.")
-        return tensor
 
 
 def _options(has_hr: bool, corrects: bool, settings: StepSettings) -> Any:
@@ -157,14 +151,9 @@ def _options(has_hr: bool, corrects: bool, settings: StepSettings) -> Any:
     )  # fmt: skip
 
 
-def _adam(s: StepSettings) -> Any:
+def _adam(s: StepSettings, attributes: Mapping[str, Attribute]) -> Any:
+    rates = bytes(struct(adam.Rates, {}, **{name: -a.rate for name, a in attributes.items()}))
     return struct(
-        adam.AdamStep,
-        {},
-        beta1=s.beta1,
-        beta2=s.beta2,
-        gain1=1 - s.beta1,
-        gain2=1 - s.beta2,
-        per_bias2=1 / s.bias2,
-        eps=s.eps,
-    )
+        adam.AdamStep, {}, rates=rates, beta1=s.beta1, beta2=s.beta2, gain1=1 - s.beta1, gain2=1 - s.beta2,
+        per_bias2=1 / s.bias2, eps=s.eps,
+    )  # fmt: skip

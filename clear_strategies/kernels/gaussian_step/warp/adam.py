@@ -8,8 +8,23 @@ import warp as wp
 
 
 @wp.struct
+class Rates:
+    """Of each attribute, - learning rate / bias of the first moment."""
+
+    means: wp.float32
+    quats: wp.float32
+    scales: wp.float32
+    opacities: wp.float32
+    sh0: wp.float32
+    shN: wp.float32  # noqa: N815 - gsplat's name
+    detail: wp.float32
+
+
+@wp.struct
 class AdamStep:
-    """The settings that all attributes share."""
+    """What changes from step to step, and the settings that all attributes share."""
+
+    rates: Rates
 
     beta1: wp.float32
     beta2: wp.float32
@@ -33,13 +48,14 @@ class Attribute:
     merges: wp.bool
     bounded: wp.bool  # a row that takes no step may still decay or be clamped
     stiffness: wp.float32  # 2 λ_stab W
-    rate: wp.float32  # - learning rate / bias of the first moment
     keep: wp.float32  # factor of the decay per step (f_det), 1: none
     limit: wp.float32
 
 
 @wp.func
-def step_number(adam: AdamStep, a: Attribute, at: wp.int32, gradient: wp.float32, moves: wp.bool) -> None:
+def step_number(
+    adam: AdamStep, a: Attribute, rate: wp.float32, at: wp.int32, gradient: wp.float32, moves: wp.bool
+) -> None:
     """Decay, step and clamp one number; with `moves` False only decay and clamp it."""
     if not (moves or a.bounded):
         return
@@ -56,7 +72,7 @@ def step_number(adam: AdamStep, a: Attribute, at: wp.int32, gradient: wp.float32
         v = g * adam.gain2 * g + a.v[at] * adam.beta2
         a.m[at] = m
         a.v[at] = v
-        after += m * a.rate / (wp.sqrt(v * adam.per_bias2) + adam.eps)
+        after += m * rate / (wp.sqrt(v * adam.per_bias2) + adam.eps)
     if after > a.limit:  # False for NaN, which stays
         after = a.limit
     elif after < -a.limit:

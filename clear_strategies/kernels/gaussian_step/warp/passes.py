@@ -119,13 +119,13 @@ def step(
         if not view.one_basis:
             colours[1, i, channel] = rgb_hr[channel]
     for d in range(3):
-        step_number(adam, means, 3 * i + d, d_means[d], moves)
-        step_number(adam, scales, 3 * i + d, d_scales[d], moves)
-        step_number(adam, sh0, 3 * i + d, d_sh0[d], moves)
-        step_number(adam, detail, 3 * i + d, d_detail[d], moves)
+        step_number(adam, means, adam.rates.means, 3 * i + d, d_means[d], moves)
+        step_number(adam, scales, adam.rates.scales, 3 * i + d, d_scales[d], moves)
+        step_number(adam, sh0, adam.rates.sh0, 3 * i + d, d_sh0[d], moves)
+        step_number(adam, detail, adam.rates.detail, 3 * i + d, d_detail[d], moves)
     for d in range(4):
-        step_number(adam, quats, 4 * i + d, d_quats[d], moves)
-    step_number(adam, opacities, i, d_opacity, moves)
+        step_number(adam, quats, adam.rates.quats, 4 * i + d, d_quats[d], moves)
+    step_number(adam, opacities, adam.rates.opacities, i, d_opacity, moves)
 
 
 @wp.kernel
@@ -148,4 +148,4 @@ def step_bands(
         gradient = lr_basis[i, band] * colours[0, i, channel]
         if view.has_base and not view.one_basis:
             gradient += hr_basis[i, band] * colours[1, i, channel]
-    step_number(adam, shN, shN.width * i + j, gradient, True)
+    step_number(adam, shN, adam.rates.shN, shN.width * i + j, gradient, True)

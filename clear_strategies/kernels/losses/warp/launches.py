@@ -6,34 +6,30 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import torch
-import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.kernels.losses.images import ImagePair
 from clear_strategies.kernels.losses.warp import haar, similarity, sums
-from rasterizers.warp_runtime import array, launch, on_stream
+from rasterizers.warp_runtime import launch, on_stream
 
 LANES: Final = {"cuda": 256, "cpu": 1}  # threads per block; on a CPU, Warp's blocks have one
 
 
 def photometric(images: ImagePair, l1: float, dssim: float) -> Float[Tensor, ""]:
     """The value l1 · mean |x - y| + dssim · (1 - SSIM); with dssim = 0 no SSIM is computed."""
-    x, y, out = (image.flatten(1) for image in images)
-    height, width = x.shape
+    x, y, out = images
+    height, width = x.shape[0], 3 * x.shape[1]
     l1_share, dssim_share = l1 / x.numel(), dssim / x.numel()
     with on_stream(x.device):
         if dssim == 0:
             parts = _parts(x, height)
-            _launch(sums.absolute, [height], x.device, array(x), array(y), l1_share, l1_share, array(out), array(parts))
+            _launch(sums.absolute, [height], x.device, x, y, l1_share, l1_share, out, parts)
         else:
             blocks = [-(-height // similarity.ROWS), -(-width // similarity.STRIDE)]
             parts, maps = _parts(x, blocks[0] * blocks[1]), x.new_empty(similarity.MAPS, height, width)
-            _launch(similarity.similarity, blocks, x.device, array(x), array(y), dssim_share, array(maps), array(parts))
-            _launch(
-                similarity.gradient, blocks, x.device, array(x), array(y), array(maps), l1_share, l1_share,
-                -dssim_share, array(out), array(parts),
-            )  # fmt: skip
+            _launch(similarity.similarity, blocks, x.device, x, y, dssim_share, maps, parts)
+            _launch(similarity.gradient, blocks, x.device, x, y, maps, l1_share, l1_share, -dssim_share, out, parts)
         return _total(parts)
 
 
@@ -45,8 +41,7 @@ def haar_l1(images: ImagePair, levels: int) -> Float[Tensor, ""]:
         for _ in range(levels - 1):
             finer = pyramid[-1]
             low = finer.new_empty(-(-finer.shape[0] // 2), -(-finer.shape[1] // 2), 3)
-            blocks = array(finer, wp.vec3), array(y, wp.vec3), finer is x, array(low, wp.vec3)
-            launch(haar.low_part, low.shape[:2], blocks, x.device)
+            launch(haar.low_part, low.shape[:2], (finer, y, finer is x, low), x.device)
             pyramid.append(low)
         rows = [-(-level.shape[0] // 2) for level in pyramid]  # of blocks
         parts, above = _parts(x, sum(rows)), None
@@ -54,8 +49,8 @@ def haar_l1(images: ImagePair, levels: int) -> Float[Tensor, ""]:
             gradient = out if level is x else torch.empty_like(level)
             weight = 1 / (9 * len(level_parts) * -(-level.shape[1] // 2) * levels)  # three details of three channels
             _launch(
-                haar.details, [len(level_parts)], x.device, array(level, wp.vec3), array(y, wp.vec3), level is x,
-                array(above, wp.vec3), above is None, weight, array(gradient, wp.vec3), array(level_parts),
+                haar.details, [len(level_parts)], x.device, level, y, level is x, above, above is None, weight, gradient,
+                level_parts,
             )  # fmt: skip
             above = gradient
         return _total(parts)
@@ -67,7 +62,7 @@ def _parts(like: Tensor, blocks: int) -> Tensor:
 
 def _total(parts: Tensor) -> Float[Tensor, ""]:
     value = parts.new_empty((), dtype=torch.float32)
-    _launch(sums.total, [1], parts.device, array(parts), array(value.view(1)))
+    _launch(sums.total, [1], parts.device, parts, value)
     return value
 
 
