@@ -9,16 +9,12 @@ import pytest
 import torch
 
 import rasterizers
+from clear_strategies import GCO, P2G, SVS, DataError, Objective
 from clear_strategies.bench import iteration, scale, scenes, timing
 from clear_strategies.bench import rasterizers as drawing
 from clear_strategies.bench.rasterizers import ATTRIBUTES
 from clear_strategies.bench.results import Results
-from clear_strategies.errors import DataError
-from clear_strategies.merging.objective import Objective
 from clear_strategies.outputs.export import export_ply
-from clear_strategies.strategies.gco import GCO
-from clear_strategies.strategies.p2g import P2G
-from clear_strategies.strategies.svs import SVS
 from tests.helpers import toy
 from tests.helpers.backends import why_not
 

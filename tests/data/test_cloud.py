@@ -8,13 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from clear_strategies import DataError, Photo
 from clear_strategies.core import images
-from clear_strategies.core.view import Photo
 from clear_strategies.data.cloud import CloudSettings, from_tracks, initial_points, random_cloud
 from clear_strategies.data.ply import write_points
 from clear_strategies.data.readers import colmap
 from clear_strategies.data.view_settings import ViewSettings, split
-from clear_strategies.errors import DataError
 from clear_strategies.geometry import StereoSettings, depth_maps
 from clear_strategies.geometry.projection import project
 from tests.helpers.planes import photo, plane_photos, sfm

@@ -10,8 +10,8 @@ import pytest
 import torch
 from PIL import Image
 
+from clear_strategies import P2G, DepthMap
 from clear_strategies.core import images
-from clear_strategies.core.view import DepthMap
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.prepare import prepare
@@ -19,7 +19,6 @@ from clear_strategies.data.priors import BackProjected, Bicubic, Cached, DemoPri
 from clear_strategies.data.readers import blender, demo
 from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
-from clear_strategies.strategies.p2g import P2G
 from tests.helpers import captures as tiny
 from tests.helpers.captures import POINTS_AT_RANDOM as POINTS
 from tests.helpers.captures import alike as capture

@@ -8,10 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from clear_strategies import P2G, DepthMap, Photo, View
 from clear_strategies.core import images
-from clear_strategies.core.view import DepthMap, Photo, View
 from clear_strategies.geometry import exposure_gains
-from clear_strategies.strategies.p2g import P2G
 from tests.helpers import planes, toy
 
 DEPTH = 4.0

@@ -10,16 +10,11 @@ import torch
 from torch import Tensor
 
 import rasterizers
+from clear_strategies import Conductor, Evidence, ExtraView, Objective, Photo, Step, Strategy, View
 from clear_strategies.core import images
-from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.points import PointCloud
-from clear_strategies.core.step import Step
-from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
-from clear_strategies.merging.conductor import Conductor
-from clear_strategies.merging.objective import Objective
-from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.mip import NEAR, MipFilter
 from clear_strategies.training.optim import LearningRates
 from clear_strategies.training.settings import FitSettings

@@ -9,9 +9,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clear_strategies import GCO, P2G, SVS, Conductor, Objective
+from clear_strategies import GCO, P2G, SVS, Conductor, Objective, Photo, View
 from clear_strategies.compose import conductor as composed_conductor
-from clear_strategies.core.view import Photo, View
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.schedules import scaled
 from clear_strategies.training.loop import iterate, view_at

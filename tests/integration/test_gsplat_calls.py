@@ -9,8 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clear_strategies import P2G, Conductor, RandomBackground
-from clear_strategies.core.view import View
+from clear_strategies import P2G, Conductor, RandomBackground, View
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.merging.in_place import InPlaceMerge
 from integration import HostError

@@ -11,9 +11,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clear_strategies import GCO, P2G, SVS, Conductor
+from clear_strategies import GCO, P2G, SVS, Conductor, Strategy
 from clear_strategies.errors import SettingError
-from clear_strategies.strategies.base import Strategy
 from integration.autograd_shot import ScreenGradientSlot
 from integration.densification import end_with_strategies, require_end
 from integration.host_score import ScoreScaler, score_for_host

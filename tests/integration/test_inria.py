@@ -11,8 +11,19 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from clear_strategies import GCO, P2G, SVS, AnchorError, Conductor, DataError, Objective, RandomBackground, SplatSuRe
-from clear_strategies.core.view import Photo, View
+from clear_strategies import (
+    GCO,
+    P2G,
+    SVS,
+    AnchorError,
+    Conductor,
+    DataError,
+    Objective,
+    Photo,
+    RandomBackground,
+    SplatSuRe,
+    View,
+)
 from clear_strategies.data.priors import Images
 from clear_strategies.errors import SettingError
 from clear_strategies.geometry import projection

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 import clear_strategies
-from clear_strategies import GCO, P2G, SVS, Conductor, Grads, Objective, Strategy, StrategyConflict
-from clear_strategies.core.view import Photo
+from clear_strategies import GCO, P2G, SVS, Conductor, Grads, Objective, Photo, Strategy, StrategyConflict
 from clear_strategies.kernels.losses import reference
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.testing import CHECKS, ContractError, check_strategy

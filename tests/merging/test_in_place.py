@@ -11,19 +11,14 @@ import torch
 from helpers import toy
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from clear_strategies import GCO, SVS, Conductor, Evidence, Grads, Objective
 from clear_strategies.core import deferred
-from clear_strategies.core.evidence import Evidence
-from clear_strategies.core.gradients import Grads
 from clear_strategies.errors import DivergedError
 from clear_strategies.kernels import merge as kernel
 from clear_strategies.kernels.merge import Colour
 from clear_strategies.merging import in_place
-from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.in_place import InPlaceMerge, RoutedGradients, dense
-from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import WarmupDecay
-from clear_strategies.strategies.gco import GCO
-from clear_strategies.strategies.svs import SVS
 from rasterizers.interface import BackendUnavailable
 from rasterizers.warp_runtime import require_warp
 

@@ -14,15 +14,11 @@ import torch
 from torch import Tensor
 
 import rasterizers
-from clear_strategies import GCO, P2G, SVS, Conductor, RandomBackground
+from clear_strategies import GCO, P2G, SVS, Conductor, DepthMap, Grads, Objective, RandomBackground, Strategy, View
 from clear_strategies.core.conflicts import conflict_ratio
-from clear_strategies.core.gradients import Grads
-from clear_strategies.core.view import DepthMap, View
 from clear_strategies.data.photo_files import read_image
-from clear_strategies.merging.objective import Objective
 from clear_strategies.outputs.maps import MAPS, ViewMaps, view_maps, write_maps
 from clear_strategies.schedules import WarmupDecay
-from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.state import TrainState
 from clear_strategies.viewing.look import Painter

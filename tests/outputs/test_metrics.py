@@ -16,10 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from clear_strategies import files
+from clear_strategies import Photo, View, files
 from clear_strategies.core import images
 from clear_strategies.core.points import PointCloud
-from clear_strategies.core.view import Photo, View
 from clear_strategies.data.scene import Scene
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.image_scores import PSNR_CAP, ImageScores, Truth

@@ -11,9 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from clear_strategies import GCO, P2G, SVS, Strategy
-from clear_strategies.core.gradients import Grads
-from clear_strategies.merging.objective import Objective
+from clear_strategies import GCO, P2G, SVS, Grads, Objective, Strategy
 from clear_strategies.outputs import plan
 from clear_strategies.outputs.progress import progress_bar
 from clear_strategies.outputs.provenance import provenance

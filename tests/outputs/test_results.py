@@ -10,11 +10,9 @@ from typing import Any
 
 import pytest
 
-from clear_strategies import GCO, P2G, files
-from clear_strategies.core.view import View
+from clear_strategies import GCO, P2G, Objective, View, files
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.data.scene import Scene
-from clear_strategies.merging.objective import Objective
 from clear_strategies.outputs import results
 from clear_strategies.outputs.contact_sheet import magnification
 from clear_strategies.outputs.metrics import Evaluation

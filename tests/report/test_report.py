@@ -15,8 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from clear_strategies import files, report
-from clear_strategies.errors import DataError
+from clear_strategies import DataError, files, report
 from clear_strategies.outputs.contact_sheet import write_contact_sheet
 from clear_strategies.outputs.curves import write_curves
 from clear_strategies.settings import CHANGES_NO_RESULT

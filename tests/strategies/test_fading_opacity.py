@@ -7,8 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clear_strategies import FadingOpacity
-from clear_strategies.core.step import Step
+from clear_strategies import FadingOpacity, Step
 from clear_strategies.schedules import scaled
 from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.loop import iterate

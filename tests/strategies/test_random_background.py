@@ -7,8 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clear_strategies import RandomBackground
-from clear_strategies.core.view import Photo
+from clear_strategies import Photo, RandomBackground
 from clear_strategies.training.loop import iterate, view_at
 from tests.helpers.short_run import SCENE, start
 from tests.helpers.toy import RASTERIZER

@@ -17,9 +17,8 @@ from pathlib import Path
 
 import torch
 
-from clear_strategies import files
+from clear_strategies import DataError, files
 from clear_strategies.data.photo_files import write_png
-from clear_strategies.errors import DataError
 from clear_strategies.outputs.export import export_ply
 from clear_strategies.training import checkpoint
 from clear_strategies.training.checkpoint import Checkpoint

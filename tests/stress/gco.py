@@ -5,8 +5,7 @@ from __future__ import annotations
 import mpmath
 import torch
 
-from clear_strategies import GCO
-from clear_strategies.core.gradients import Grads
+from clear_strategies import GCO, Grads
 from tests.stress.rows import Row, Worst
 
 DIMENSIONS = (1, 3, 4, 15, 45)

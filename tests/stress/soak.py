@@ -22,8 +22,7 @@ from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
-from rasterizers import load
-from rasterizers.interface import BackendUnavailable
+from rasterizers import BackendUnavailable, load
 from tests.helpers import toy
 from tests.stress.rows import Row
 

@@ -18,9 +18,8 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from clear_strategies import P2G, SVS, Conductor, SplatSuRe
+from clear_strategies import P2G, SVS, Conductor, Grads, SplatSuRe
 from clear_strategies.core import deferred
-from clear_strategies.core.gradients import Grads
 from clear_strategies.density.mcmc import MCMC, Sampler
 from clear_strategies.merging.skips import SkipPolicy, Skips
 from clear_strategies.training import checkpoint

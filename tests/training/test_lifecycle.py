@@ -10,10 +10,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clear_strategies import SVS, Update
-from clear_strategies.core.gradients import Grads
+from clear_strategies import SVS, Grads, Photo, Update
 from clear_strategies.core.points import PointCloud
-from clear_strategies.core.view import Photo
 from clear_strategies.density.adaptive import Density, DensitySettings
 from clear_strategies.errors import DensityError
 from clear_strategies.schedules import scaled

@@ -7,15 +7,14 @@ from dataclasses import replace
 import pytest
 import torch
 
+from clear_strategies import Objective, Photo, View
 from clear_strategies.core import deferred
-from clear_strategies.core.view import Photo, View
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.cloud import CloudSettings, initial_points
 from clear_strategies.data.prepare import prepare
 from clear_strategies.data.priors import Bicubic
 from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.geometry.pseudo_views import border_views
-from clear_strategies.merging.objective import Objective
 from clear_strategies.training.evaluation import psnr_of
 from clear_strategies.training.loop import iterate
 from tests.helpers import planes

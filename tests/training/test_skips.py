@@ -8,13 +8,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from clear_strategies import SVS, Conductor, Objective
 from clear_strategies.core import images
 from clear_strategies.core.work_log import WorkLog
-from clear_strategies.merging.conductor import Conductor
-from clear_strategies.merging.objective import Objective
 from clear_strategies.merging.skips import PLATEAU_LOSS, SkipPolicy, Skips
 from clear_strategies.schedules import Ramp, WarmupDecay, scaled
-from clear_strategies.strategies.svs import SVS
 from clear_strategies.training.evaluation import loss_of_views
 from clear_strategies.training.loop import fit, iterate
 from tests.helpers import toy
