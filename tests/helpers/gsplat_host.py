@@ -6,10 +6,17 @@ import functools
 
 import torch
 
+import rasterizers
 from clear_strategies import Conductor
+from clear_strategies.data.scene import Scene
+from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.geometry.projection import intrinsics
+from clear_strategies.schedules import LogLinear
 from clear_strategies.training.field import GaussianField
+from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
+from clear_strategies.training.settings import FitSettings
+from clear_strategies.training.state import TrainState
 from integration.gsplat import Attached, attach
 from rasterizers import autograd
 from tests.helpers import toy
@@ -120,3 +127,19 @@ def densified(
         host.optimizers["sh0"].param_groups[0]["lr"] = 0.0
     names = [scene.train[i % 3].name for i in range(steps)]
     return host, trained(host, scene, conductor, names, strategy=strategy)
+
+
+RASTERIZER = rasterizers.load("torch", near=0.01, kernel=0.3, antialiased=False)
+
+
+def in_double(scene: Scene, conductor: Conductor, steps: int, eps: float = 1e-15) -> TrainState:
+    """Before its first step, in float64: otherwise Adam follows the sign of gradients that consist of rounding errors."""
+    state = TrainState.start(
+        scene, conductor, settings=FitSettings(iterations=steps, degree_every=1, fused="off", scale_schedule=False),
+        density=DensitySettings(start=1_000, stop=1_001),
+        rates=LearningRates(means=LogLinear(1.6e-4, 1.6e-4, 1), eps=eps), mip=MipFilter(variance=0),
+    )  # fmt: skip
+    state.field.double()
+    adam = state.optimizer
+    adam.first, adam.second = ({k: v.double() for k, v in moments.items()} for moments in (adam.first, adam.second))
+    return state

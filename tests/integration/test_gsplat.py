@@ -20,9 +20,8 @@ from integration.autograd_shot import HostOutput
 from integration.gsplat import attach
 from rasterizers import autograd
 from tests.helpers import toy
-from tests.helpers.gsplat_host import Host, attached, rasterization, started, trained
+from tests.helpers.gsplat_host import RASTERIZER, Host, attached, in_double, rasterization, started, trained
 from tests.helpers.host_parts import HR_FROM_START
-from tests.helpers.own_trainer import RASTERIZER, in_double
 
 STEPS = 50
 EPS = 1e-10
