@@ -73,15 +73,13 @@ def test_nodes_below_recursive_false_stay_plain():
     assert build(node) == ("r", 2, False, {"inner": target(Inner)})
 
 
-def test_a_node_is_built_from_the_inside_out():
+def test_a_node_is_built_from_the_inside_out_and_a_partial_waits_for_what_is_missing():
     built = build(target(Outer, share=1, color=[0.5, 1], inner=target(Inner, size=4)))
     assert built == Outer(1, Inner(4), color=(0.5, 1))
     assert build({"a": [target(Inner)], "b": None}) == {"a": [Inner()], "b": None}
-
-
-def test_a_partial_waits_for_what_is_missing():
     waiting = build(target(call, depth=5, _partial_=True))
     assert waiting("r") == ("r", 5, False, {})
+    assert build(target(Outer, share=1.0, on=True)).on is True
 
 
 REFUSED = {
@@ -120,10 +118,6 @@ def test_a_setting_that_cannot_be_used_is_refused_by_its_key(message, values):
     with pytest.raises(SettingError) as refused:
         build({"it": target(Outer, **values)})
     assert str(refused.value).startswith(f"it.{message}")
-
-
-def test_true_and_false_are_taken_where_they_are_asked_for():
-    assert build(target(Outer, share=1.0, on=True)).on is True
 
 
 def test_files_keep_their_own_error_and_a_backend_that_is_not_there_is_a_setting():

@@ -61,14 +61,11 @@ def test_each_row_names_the_module_whose_kernels_ran():
         assert set(tables[table]["module"]) == {rasterizers.load("cpp").module}
 
 
-def test_the_reference_takes_no_part_in_large_scenes():
+def test_the_reference_takes_no_part_in_large_scenes_and_unavailable_backends_are_noted(monkeypatch):
     results = Results(lambda line: None)
     with pytest.raises(DataError, match="measures none of these scenes"):
         drawing.measure(results, scene=["s100k-lr"], backend=["torch"], preset=["fast"], repeats=1, device="cpu")
     assert any("at most 10,000 Gaussians" in note for note in results.notes)
-
-
-def test_unavailable_backends_are_noted(monkeypatch):
     monkeypatch.setattr(rasterizers, "available", lambda: {"quick": "no compiler", "torch": None})
     notes = []
     assert drawing.usable([], "cpu", notes.append) == ["torch"]

@@ -46,7 +46,7 @@ def test_elsewhere_nothing_is_read_until_it_is_asked_for(on_a_device):
     assert deferred.resolve(rows) == [{"t": 1.0, "share": 0.25, "part": 3.0}, {"t": 2.0, "share": 0.25}]
 
 
-def test_a_number_that_takes_part_in_several_crosses_once(on_a_device, monkeypatch):
+def test_numbers_cross_once_and_exactly_and_a_recipe_runs_once(on_a_device, monkeypatch):
     moved = []
     monkeypatch.setattr(torch, "stack", lambda tensors, real=torch.stack: moved.append(len(tensors)) or real(tensors))
     a, b = torch.tensor(1.0), torch.tensor(2.0)
@@ -54,14 +54,8 @@ def test_a_number_that_takes_part_in_several_crosses_once(on_a_device, monkeypat
         3.0, 0.5, 1.0, 5.0,
     ]  # fmt: skip
     assert moved == [2]
-
-
-def test_counts_beyond_float32_stay_exact(on_a_device):
     large = torch.tensor(2**24 + 1)
     assert deferred.read([deferred.scalar(large), torch.tensor(0.5)]) == [2**24 + 1, 0.5]
-
-
-def test_a_recipe_may_have_an_effect_and_runs_once(on_a_device):
     calls = []
     row = {"x": deferred.defer(lambda x: calls.append(x) or x, torch.tensor(7.0))}
     assert not calls

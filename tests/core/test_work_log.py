@@ -12,7 +12,6 @@ import torch
 
 from clear_strategies import Conductor
 from clear_strategies.core import progress
-from clear_strategies.core import work_log as module
 from clear_strategies.core.progress import EVERY, Progress
 from clear_strategies.core.work_log import WorkLog
 
@@ -60,7 +59,7 @@ def work(work_log: WorkLog, device: Device, name: str, ms: float) -> None:
         device.queued += ms
 
 
-def test_on_cuda_nobody_waits_until_somebody_looks(device):
+def test_on_cuda_nobody_waits_until_somebody_looks_and_a_failing_stage_is_stamped_too(device):
     work_log = WorkLog("cuda")
     for _ in range(3):
         work(work_log, device, "render", 2.0)
@@ -71,20 +70,6 @@ def test_on_cuda_nobody_waits_until_somebody_looks(device):
     assert (rows["render"]["runs"], rows["render"]["ms_each"], rows["render"]["seconds"]) == (3, 2.0, 0.006)
     assert rows["step"]["ms_each"] == 0.5
     assert list(rows) == ["render", "step"]
-
-
-def test_stamps_that_the_device_has_passed_are_read_without_waiting(device, monkeypatch):
-    monkeypatch.setattr(module, "_BATCH", 4)
-    work_log = WorkLog("cuda")
-    for n in range(4):
-        device.reached = 3.0  # of 1, 2, 3 and 4 ms
-        work(work_log, device, "render", 1.0)
-        assert len(work_log._stamped) == (n + 1 if n < 3 else 1)
-    assert device.waits == 0
-    assert work_log.entries["render"].seconds == pytest.approx(4e-3)
-
-
-def test_a_failing_stage_is_stamped_too(device):
     work_log = WorkLog("cuda")
     with pytest.raises(ZeroDivisionError), work_log.stage("render"):
         work(work_log, device, "inner", 1 / 0)
@@ -122,7 +107,7 @@ def test_skips_on_the_device_are_summed_late_and_nothing_skipped_leaves_no_line(
     assert work_log.rows()[0]["why"] == "still (7x)"
 
 
-def test_on_a_cpu_no_event_is_made(monkeypatch):
+def test_on_a_cpu_no_event_is_made_and_a_runs_log_is_on_its_device(monkeypatch):
     monkeypatch.setattr(torch.cuda, "Event", None)
     work_log = WorkLog()
     with work_log.stage("render"):
@@ -131,9 +116,6 @@ def test_on_a_cpu_no_event_is_made(monkeypatch):
     assert work_log.entries["render"].runs == 1
     assert 0 < work_log.entries["render"].seconds < 1
     assert work_log.entries["render"].skipped == {"nothing to see": 1}
-
-
-def test_the_work_log_of_a_run_is_on_its_device():
     conductor = Conductor()
     assert conductor.work_log.device.type == "cpu"
     conductor.on_fit_start(1, 0, "cuda")

@@ -97,14 +97,6 @@ def test_auto_falls_back_to_random_and_logs_it(caplog: pytest.LogCaptureFixture)
     assert "auto chose random points: the training LR images give only 0 (data.cloud.enough: 50)" in caplog.text
 
 
-def test_the_same_seed_gives_the_same_cloud() -> None:
-    settings = CloudSettings(init="triangulated", max_points=300)
-    one, two = (initial_points(settings, plane_photos(2), seed=3).cloud for _ in range(2))
-    assert len(one) == 300
-    assert torch.equal(one.means, two.means)
-    assert torch.equal(one.colors, two.colors)
-
-
 def test_a_given_file_is_read_and_refused_without_points(tmp_path: Path) -> None:
     file = tmp_path / "fused.ply"
     chosen = CloudSettings(init="ply", path=str(file), densify=False)
@@ -182,7 +174,7 @@ def test_missing_points_are_refused_in_one_line() -> None:
         initial_points(CloudSettings(init="sfm_train"), [photo()])
 
 
-def test_points_fill_the_given_box_with_near_grey() -> None:
+def test_points_fill_the_given_box_with_near_grey_and_the_same_seed_gives_the_same_cloud() -> None:
     cloud = random_cloud([photo()], 10_000, seed=0, box=1.3)
     assert cloud.means.shape == (10_000, 3)
     assert 1.25 < float(cloud.means.max()) <= 1.3
@@ -193,3 +185,8 @@ def test_points_fill_the_given_box_with_near_grey() -> None:
     one, other = (random_cloud([photo()], 10_000, seed, 1.3).means for seed in (0, 1))
     assert torch.equal(one, cloud.means)
     assert not torch.equal(other, cloud.means)
+    settings = CloudSettings(init="triangulated", max_points=300)
+    one, two = (initial_points(settings, plane_photos(2), seed=3).cloud for _ in range(2))
+    assert len(one) == 300
+    assert torch.equal(one.means, two.means)
+    assert torch.equal(one.colors, two.colors)

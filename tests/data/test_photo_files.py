@@ -86,14 +86,11 @@ def test_a_turned_photo_is_read_as_it_is_stored_or_upright(ending: str, orientat
         assert photo_files.image_size(path, turn=turn) == found.shape[1::-1]
 
 
-def test_images_are_listed_by_name_and_by_ending(tmp_path: Path) -> None:
+def test_images_are_listed_by_name_and_ending_and_the_first_of_the_usual_folders_is_taken(tmp_path: Path) -> None:
     for name in ("b.JPG", "a.png", "notes.txt", "c.tif"):
         (tmp_path / name).touch()
     (tmp_path / "folder.png").mkdir()
     assert [p.name for p in photo_folders.list_images(tmp_path)] == ["a.png", "b.JPG", "c.tif"]
-
-
-def test_the_first_of_the_usual_folders_is_taken_and_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="has none of the folders"):
         photo_folders.image_folder(tmp_path)
     (tmp_path / "images_8").mkdir()
@@ -223,7 +220,7 @@ def test_profiles_of_srgb_and_damaged_ones_change_no_bit(tmp_path: Path, mode: s
         assert ("colour profile that cannot be used" in caplog.text) is warned
 
 
-def test_hdr_photos_without_a_profile_are_told(tmp_path: Path, caplog) -> None:
+def test_hdr_without_a_profile_and_adobe_rgb_that_only_exif_tells_are_told(tmp_path: Path, caplog) -> None:
     path = write(tmp_path / "a.heic", LEVELS)
     photo_files.read_image(path)
     assert not caplog.text
@@ -231,9 +228,6 @@ def test_hdr_photos_without_a_profile_are_told(tmp_path: Path, caplog) -> None:
         image.info["nclx_profile"] = {"color_primaries": 9, "transfer_characteristics": 16}
         photo_files._to_srgb_of(image)
     assert "primaries 9 and the transfer 16 of ITU-T H.273 (HDR, or a wide gamut)" in caplog.text
-
-
-def test_adobe_rgb_that_only_exif_tells_is_told(tmp_path: Path, caplog) -> None:
     exif = Image.Exif()
     exif[0x8769] = {0xA005: {1: "R03"}}
     photo_files.read_image(write(tmp_path / "a.jpg", LEVELS, exif=exif))

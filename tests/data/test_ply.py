@@ -113,15 +113,12 @@ def test_a_point_is_read_from_every_layout(tmp_path, form, lines, body):
         assert len(read_points(tmp_path / "p.ply")) == 0
 
 
-def test_a_gaussian_files_colours_are_its_constant_band(tmp_path: Path) -> None:
+def test_a_gaussian_files_colours_are_its_constant_band_and_points_without_any_are_grey(tmp_path, caplog):
     g = gaussians(1, 3)
     g.sh0[:] = torch.tensor([0.0, 1.0, -9.0])
     write_gaussians(tmp_path / "g.ply", g)
     # 0.5 + f_dc · 1 / (2 √π), then into [0, 1]
     assert torch.allclose(read_points(tmp_path / "g.ply").colors, torch.tensor([[0.5, 0.7820948, 0.0]]))
-
-
-def test_points_without_colours_are_grey_with_a_warning(tmp_path, caplog):
     (tmp_path / "p.ply").write_bytes(header("element vertex 1", *XYZ) + struct.pack("<3f", 1, 2, 3))
     assert read_points(tmp_path / "p.ply").colors.tolist() == [[0.5, 0.5, 0.5]]
     assert "no colours, so its points are grey" in caplog.text
@@ -148,13 +145,10 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> 
     assert list(tmp_path.iterdir()) == [file]
 
 
-def test_shapes_that_do_not_belong_together_are_refused() -> None:
+def test_shapes_that_do_not_belong_together_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
     good = gaussians(2, 3)
     with pytest.raises(ValueError, match="shN must have 0, 3, 8 or 15 bands, got 4"):
         GaussianPly(good.means, good.sh0, torch.zeros(2, 4, 3), good.opacities, good.scales, good.quats)
-
-
-def test_a_missing_file_and_a_folder_get_one_line(tmp_path: Path) -> None:
     for path, problem in ((tmp_path / "absent.ply", "is not there"), (tmp_path, "cannot be read")):
         with pytest.raises(DataError, match=f"file: {problem}"):
             read_points(path)

@@ -155,7 +155,7 @@ def rig() -> Capture:
     ))  # fmt: skip
 
 
-def test_a_view_is_chosen_by_its_file_name_where_that_is_its_own():
+def test_a_view_is_chosen_by_its_file_name_where_that_is_its_own_and_not_that_of_a_test_view():
     views = ViewSettings(train_names=["cam2/0001", "0002", "rgb.0003", "cam1/0001.png"])
     assert [frame.name for frame in split(rig(), views)[0]] == [RIG[2], RIG[1], RIG[3], RIG[0]]
     with pytest.raises(DataError, match=r"'0001' may be 'cam1/0001.png' or 'cam2/0001.png'"):
@@ -164,14 +164,11 @@ def test_a_view_is_chosen_by_its_file_name_where_that_is_its_own():
         split(rig(), ViewSettings(train_names=["rgb"]))
     with pytest.raises(DataError, match=r"'cam1/0002\.png' is named twice"):
         split(rig(), ViewSettings(train_names=["0002", "cam2/0001", "cam1/0002.png"]))
-
-
-def test_a_training_view_is_not_taken_for_the_test_view_of_its_name():
     both = [replace(frame, name=name) for frame, name in zip(capture(2).frames, ("a", "test/a"), strict=True)]
     assert split(Capture("blender", tuple(both)), ViewSettings(train_names=["a"], own_split=False))[0] == [both[0]]
 
 
-def test_saved_lr_images_are_those_of_their_views_when_they_are_read(tmp_path):
+def test_saved_lr_images_are_those_of_their_views_and_no_two_are_saved_as_one(tmp_path):
     saved = prepare(rig(), papers(train=4, test_every=0), Bicubic(), POINTS)
     save_lr(saved, tmp_path / "lr")
     assert sorted(str(p.relative_to(tmp_path / "lr")) for p in (tmp_path / "lr").rglob("*.png")) == sorted(RIG)
@@ -182,9 +179,6 @@ def test_saved_lr_images_are_those_of_their_views_when_they_are_read(tmp_path):
         write_png(tmp_path / name, torch.zeros(4, 4, 3))
     with pytest.raises(DataError, match=r"0001.png: LR image: would be that of two views, cam1/0001 and cam2/0001"):
         check_headers(rig().frames, papers(lr_folder=str(tmp_path)))
-
-
-def test_two_photos_that_differ_by_their_ending_are_not_saved_as_one(tmp_path):
     both = [replace(frame, name=name) for frame, name in zip(capture(2).frames, ("a.png", "a.jpg"), strict=True)]
     scene = prepare(Capture("twins", tuple(both)), papers(train=2, test_every=0), Bicubic(), POINTS)
     with pytest.raises(DataError, match="is that of two photos"):

@@ -58,10 +58,13 @@ def test_back_projected_sr_images_shrink_to_the_photos_and_keep_how_far_they_wer
         assert float(R[2].min()) > 0.9
 
 
-def test_photos_that_are_the_hr_side_are_not_moved():
+def test_photos_that_are_the_hr_side_are_not_moved_and_equalize_has_no_effect_without_depth(caplog):
     scene = prepare(ROOM, ViewSettings(photos_are="both", train=2), BackProjected(wrong()), POINTS)
     assert all(view.hr.image is view.truth for view in scene.train)
     assert "back-projection" not in scene.notes
+    made = prepare(capture(), ViewSettings(sr_scale=2, equalize=True), Bicubic(), POINTS)
+    assert "data.views.equalize has no effect" in caplog.text
+    assert "equalized" not in made.notes
 
 
 @pytest.mark.parametrize(
@@ -112,12 +115,6 @@ def test_equalized_photos_lose_their_casts_at_both_scales_and_test_photos_keep_t
         assert torch.allclose(view.hr.image.mean((0, 1)), view.lr.image.mean((0, 1)), atol=2e-3)
     assert made.notes["equalized"].startswith("photos times 0.9")
     assert all(torch.equal(view.truth, shown[view.name]) for view in made.test)
-
-
-def test_without_depth_equalize_says_that_it_has_no_effect(caplog):
-    made = prepare(capture(), ViewSettings(sr_scale=2, equalize=True), Bicubic(), POINTS)
-    assert "data.views.equalize has no effect" in caplog.text
-    assert "equalized" not in made.notes
 
 
 @pytest.mark.parametrize("photos_are", ["hr", "lr", "both"])

@@ -115,7 +115,11 @@ def test_dead_gaussians_move_to_live_ones_and_start_without_momentum():
     assert bool((theta.opacities.data[~shared] == 0).all())
 
 
-def test_the_field_grows_to_a_multiple_of_its_points():
+def test_rounds_fall_between_start_and_stop_and_the_field_grows_to_a_multiple_of_its_points():
+    densifier = start_of_run(start=10, stop=40, every=10)[2]
+    assert isinstance(densifier, Densifier)
+    assert [t for t in range(60) if densifier.due(t)] == [20, 30]
+    assert not any(densifier.reset_due(t) for t in range(60))
     theta, optimizer, densifier = start_of_run(growth=0.5, per_point=2.0)
     sizes = []
     for t in range(1, 5):
@@ -128,23 +132,13 @@ def test_the_field_grows_to_a_multiple_of_its_points():
     assert start_of_run(per_point=2.0, max_gaussians=70)[2].cap == 70
 
 
-def test_rounds_fall_between_start_and_stop():
-    densifier = start_of_run(start=10, stop=40, every=10)[2]
-    assert isinstance(densifier, Densifier)
-    assert [t for t in range(60) if densifier.due(t)] == [20, 30]
-    assert not any(densifier.reset_due(t) for t in range(60))
-
-
-def test_noise_moves_the_faint_until_stop_and_leaves_the_opaque():
+def test_noise_moves_the_faint_along_their_covariance_as_far_as_the_scene_is_large_until_stop():
     theta, optimizer, densifier = start_of_run(noise=100.0, start=9)
     theta.opacities.data[:20] = -6.0
     moved = displacement(theta, optimizer, densifier).norm(dim=1)
     assert float(moved[:20].min()) > 0
     assert float(moved[20:].max()) < 1e-9
     assert not displacement(theta, optimizer, densifier, EVERY.stop).any()
-
-
-def test_noise_is_as_large_as_the_scene():
     offsets = []
     for size in (1.0, 8.0):
         theta, optimizer, densifier = start_of_run(noise=100.0, start=9, opacity=-6.0)
@@ -152,9 +146,6 @@ def test_noise_is_as_large_as_the_scene():
         theta.scales.data += torch.tensor(size).log()
         offsets.append(displacement(theta, optimizer, densifier) / size)
     assert torch.allclose(*offsets, rtol=1e-3, atol=1e-4)
-
-
-def test_noise_lies_along_the_covariance():
     theta, optimizer, densifier = start_of_run(noise=1e3, start=9, opacity=-6.0)
     theta.scales.data[:] = torch.tensor([0.0, -20.0, -20.0])  # needles along their first axis
     half = 0.5**0.5

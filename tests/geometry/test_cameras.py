@@ -51,13 +51,10 @@ def test_a_common_box_is_finite_and_has_a_volume(count: int, seed: int) -> None:
     assert bool(low.isfinite().all() and high.isfinite().all() and (high > low).all())
 
 
-def test_few_cameras_are_all_compared_and_of_many_the_nearest_and_some_far_ones() -> None:
+def test_few_cameras_are_all_compared_and_of_many_the_nearest_and_some_far_ones_of_other_places() -> None:
     assert partners([camera(0.0)]) == [[]]
     assert partners([camera(float(i)) for i in range(13)])[4] == [i for i in range(13) if i != 4]
     assert partners([camera(float(i)) for i in range(200)])[0] == [1, 2, 3, 4, 5, 6, 7, 8, 9, 25, 71, 199]
-
-
-def test_bursts_are_compared_with_photos_from_other_places() -> None:
     bursts = [camera(float(i // 15)) for i in range(60)]
     assert all(len({b // 15 for b in others}) > 1 for others in partners(bursts))
 

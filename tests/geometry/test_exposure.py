@@ -34,26 +34,20 @@ def test_casts_are_found_up_to_their_geometric_mean():
     assert torch.allclose(gains.log().mean(0), torch.zeros(3), atol=1e-5)
 
 
-def test_photos_that_do_not_differ_keep_their_colours():
+def test_photos_that_do_not_differ_keep_their_colours_and_clipped_pixels_tell_nothing():
     assert torch.allclose(exposure_gains(photos(torch.ones(3, 3)), depths()), torch.ones(3, 3), atol=1e-5)
-
-
-def test_clipped_pixels_tell_nothing():
     casts = torch.tensor([[1.9, 1.9, 1.9], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
     assert float((photos(casts)[0].image == 1).float().mean()) > 0.1
     gains = exposure_gains(photos(casts), depths())
     assert torch.allclose(gains[1] / gains[0], torch.full((3,), 1.9), atol=2e-3)
 
 
-def test_a_photo_that_shares_no_surface_keeps_its_colours_and_does_not_change_the_others():
+def test_a_photo_that_shares_no_surface_or_hides_it_keeps_its_colours_and_does_not_change_the_others():
     unknown = DepthMap(torch.full((90, 120), torch.nan), torch.zeros(90, 120))
     gains = exposure_gains(photos(CASTS), [*depths(2), unknown])
     assert gains[2].tolist() == pytest.approx([1, 1, 1])
     assert torch.allclose(gains[:2], exposure_gains(photos(CASTS)[:2], depths(2)), atol=1e-6)
     assert exposure_gains(photos(CASTS)[:1], depths(1)).tolist() == [[1, 1, 1]]
-
-
-def test_a_surface_that_another_photo_does_not_show_tells_nothing():
     behind = DepthMap(torch.full((90, 120), 1.5 * DEPTH), torch.ones(90, 120))
     assert exposure_gains(photos(CASTS)[:2], [depths()[0], behind]).tolist() == [[1, 1, 1]] * 2
 

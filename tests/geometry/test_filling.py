@@ -46,12 +46,15 @@ def test_a_new_point_has_the_colour_of_its_pixel() -> None:
     assert torch.allclose(cloud.colors[50:], view.image[row, column], atol=1e-4)
 
 
-def test_points_hidden_behind_a_surface_do_not_bend_it() -> None:
+def test_points_behind_a_surface_do_not_bend_it_and_points_on_a_line_are_enough() -> None:
     u, v = torch.meshgrid(torch.arange(-1, 1, 0.05), torch.arange(-1, 1, 0.05), indexing="ij")
     front = torch.stack((u, v, torch.full_like(u, 5.0)), -1).reshape(-1, 3)
     behind = front * torch.tensor([1, 1, 2.0]) + torch.tensor([0.01, 0.01, 0])
     new = densify(cloud_of(torch.cat((front, behind))), [photo()], 2).means[2 * len(front) :]
     assert torch.allclose(new[:, 2], torch.tensor(5.0), atol=1e-4)
+    line = torch.stack((torch.linspace(-0.5, 0.5, 30), torch.zeros(30), torch.full((30,), 5.0)), dim=1)
+    new = densify(cloud_of(line), [photo()], 2).means[30:]
+    assert torch.allclose(new[:, 2], torch.tensor(5.0))
 
 
 def test_the_background_and_what_a_mask_hides_get_no_points() -> None:
@@ -64,12 +67,6 @@ def test_the_background_and_what_a_mask_hides_get_no_points() -> None:
         assert len(new) == 10 * 40
         assert bool((project(view.camera, new)[0][:, 0] > 30).all())
     assert len(densify(points, [hiding, view], 1)) == 200 + 10 * 40 + 40 * 40
-
-
-def test_points_on_a_line_are_enough() -> None:
-    line = torch.stack((torch.linspace(-0.5, 0.5, 30), torch.zeros(30), torch.full((30,), 5.0)), dim=1)
-    new = densify(cloud_of(line), [photo()], 2).means[30:]
-    assert torch.allclose(new[:, 2], torch.tensor(5.0))
 
 
 def test_without_points_in_view_nothing_is_added_and_said(caplog: pytest.LogCaptureFixture) -> None:
@@ -130,14 +127,11 @@ def test_there_is_one_point_per_square(spacing: float, count: int) -> None:
     assert torch.allclose(means[:, 2], torch.tensor(5.0))
 
 
-def test_what_two_photos_see_gets_its_points_once() -> None:
+def test_what_two_photos_see_gets_its_points_once_from_the_most_confident_pixel_of_a_square() -> None:
     views = [photo(), photo()]
     assert len(points_of(views, [flat(v, 5.0) for v in views], 2.0, 0.02)[0]) == 400
     apart = [flat(views[0], 5.0), flat(views[1], 6.0)]
     assert len(points_of(views, apart, 2.0, 0.02)[0]) == 800
-
-
-def test_the_most_confident_pixel_of_a_square_is_taken() -> None:
     view = photo()
     result = flat(view, 5.0)
     result.confidence[:] = 0.5

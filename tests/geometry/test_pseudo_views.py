@@ -68,10 +68,14 @@ def test_a_plane_is_seen_as_its_photos_show_it():
         assert error[inside.any(0)].median() < 0.02
 
 
-def test_without_two_photos_with_depth_there_are_none():
+def test_without_two_photos_with_depth_there_are_none_and_large_ones_are_reduced():
     photos = plane(2)
     one = {"0.png": depth_of(photos["0.png"]), "1.png": depth_of(photos["1.png"], torch.nan)}
     assert views_of(photos, one) == views_of(photos, {}) == []
+    view = views_of(plane(), max_pixels=3_000)[0]
+    camera = view.photo.camera
+    assert (camera.width, camera.height, camera.fx) == (60, 45, 50.0)
+    assert view.known.float().mean() > 0.5
 
 
 def test_a_depth_that_no_photo_vouches_for_gives_no_colour():
@@ -95,13 +99,6 @@ def test_pixels_beside_the_background_give_no_colour():
     assert not known[:, 71:].any()  # photo 1 stands 10 px aside and shows the surface up to there
     assert known[:, 5:45].float().mean() > 0.9
     assert on_black[5:-5, 65:110].all()
-
-
-def test_large_photos_are_reduced_and_still_show_the_plane():
-    view = views_of(plane(), max_pixels=3_000)[0]
-    camera = view.photo.camera
-    assert (camera.width, camera.height, camera.fx) == (60, 45, 50.0)
-    assert view.known.float().mean() > 0.5
 
 
 @pytest.mark.parametrize("max_pixels", [10**6, 3_000])
@@ -146,7 +143,7 @@ def test_one_known_pixel_fills_a_picture_of_any_size_with_its_colour(shape):
     assert torch.allclose(continued(image, known), image[known].expand(*shape, 3), atol=1e-6)
 
 
-def test_a_hole_has_colours_between_those_around_it_without_an_edge():
+def test_a_hole_has_colours_between_those_around_it_without_an_edge_and_nothing_sharp_far_inside():
     ramp = torch.linspace(0, 1, 64)[None, :, None].expand(64, 64, 3)
     known = torch.ones(64, 64, dtype=torch.bool)
     known[20:44, 20:44] = False
@@ -156,9 +153,6 @@ def test_a_hole_has_colours_between_those_around_it_without_an_edge():
     assert inside.max() <= ramp[0, 45, 0]
     assert (inside - ramp[20:44, 20:44]).abs().max() < 0.15
     assert (filled[:, 1:] - filled[:, :-1]).abs().max() < 0.1
-
-
-def test_far_from_what_is_known_nothing_is_sharp():
     noise = picture(64, 128)
     known = torch.arange(128).expand(64, 128) < 64
     filled = continued(noise, known)

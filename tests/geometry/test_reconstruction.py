@@ -67,12 +67,16 @@ def test_means_lie_on_the_plane_and_the_summary_says_how_much_is_known(plane: St
     assert "without" not in plane.summary
 
 
-def test_one_tensor_is_a_list_of_photos_and_uint8_is_divided_by_255() -> None:
+def test_one_tensor_is_a_list_of_photos_uint8_is_divided_by_255_and_depth_maps_alone_are_those_of_stereo(
+    plane: Stereo,
+) -> None:
     photos = plane_photos(2, 64, 48)
     eight = [(photo.image * 255).round().to(torch.uint8) for photo in photos]
     listed = reconstruct(photos, images=[image.float() / 255 for image in eight])
     assert same(reconstruct(photos, images=torch.stack(eight)), listed)
     assert same(reconstruct(photos, images=eight), listed)
+    maps = depth_maps(plane_photos(3, 64, 48), settings=QUICK)
+    assert same(plane, Stereo(tuple(maps), plane.means, plane.colors, ""))
 
 
 def test_given_features_take_the_place_of_triangulated_ones() -> None:
@@ -133,11 +137,6 @@ def test_without_scipy_nothing_is_filled_or_removed(monkeypatch, caplog):
     assert len(result.means) > 500
     assert "neither cleaned nor filled without scipy" in result.summary
     assert sum("nothing is filled without scipy" in record.message for record in caplog.records) == 1
-
-
-def test_depth_maps_alone_are_those_of_stereo(plane: Stereo) -> None:
-    maps = depth_maps(plane_photos(3, 64, 48), settings=QUICK)
-    assert same(plane, Stereo(tuple(maps), plane.means, plane.colors, ""))
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {

@@ -47,21 +47,13 @@ def test_of_too_many_features_the_strongest_are_taken() -> None:
     assert all(tuple(pixel) in result for pixel in some.pixels.tolist())
 
 
-def test_with_many_photos_each_is_matched_with_a_few(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The features of all pairs of a hundred photos took an hour."""
-    matched, none = [], Features(torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 128))
-    monkeypatch.setattr(sift, "find_features", lambda *_: none)
-    monkeypatch.setattr(sift, "match", lambda *_: matched.append(1) or torch.zeros(0, 2, dtype=torch.long))
-    row = [Photo(camera(float(i), 8, 8), torch.zeros(8, 8, 3)) for i in range(40)]
-    triangulate(row)
-    assert 40 * 6 <= len(matched) <= 40 * 12
-
-
-def test_flat_images_and_one_photo_give_an_empty_cloud() -> None:
+def test_flat_images_one_photo_and_rays_from_one_centre_give_no_point() -> None:
     flat = [Photo(camera(0.1 * i), torch.full((100, 100, 3), 0.5)) for i in range(3)]
     for photos in (flat[:1], flat, plane_photos(1)):
         cloud = triangulate(photos)
         assert cloud.means.shape == cloud.colors.shape == (0, 3)
+    pixel = torch.tensor([[60.0, 50.0]], dtype=torch.float64)
+    assert not sift.triangulate_pair(camera(0), camera(0), pixel, pixel, TriangulationSettings())[2].any()
 
 
 def triangulated(x: tuple[float, float], y: tuple[float, float], **limits: float) -> tuple[list[float], float, bool]:
@@ -93,11 +85,6 @@ def test_each_filter_alone_rejects(x: tuple[float, float], y: tuple[float, float
     assert not triangulated(x, y, **limits)[2]
     loose = {"epipolar": 9.0, "reprojection": 9.0, "angle": 0.1}
     assert triangulated(x, y, **loose)[2] == (x[0] > y[0])
-
-
-def test_rays_from_one_centre_are_rejected() -> None:
-    pixel = torch.tensor([[60.0, 50.0]], dtype=torch.float64)
-    assert not sift.triangulate_pair(camera(0), camera(0), pixel, pixel, TriangulationSettings())[2].any()
 
 
 @settings(max_examples=50, deadline=None)

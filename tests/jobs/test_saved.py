@@ -28,7 +28,7 @@ def exact(field):
     return field.render(rasterizers.load("torch"), CAMERA).clamp(0, 1)
 
 
-def test_a_run_its_checkpoints_and_one_of_them_open_alike(saved_run):
+def test_a_run_its_checkpoints_one_of_them_and_its_ply_file_open_alike(saved_run):
     folder, field = saved_run
     for path in (folder, folder / "checkpoints", folder / "checkpoints" / "step_0000001.safetensors"):
         splat = open_splat(path)
@@ -36,6 +36,10 @@ def test_a_run_its_checkpoints_and_one_of_them_open_alike(saved_run):
         assert [saved.split for saved in splat.cameras] == ["train"] * 3 + ["test"]
         assert splat.folder == folder
         assert len(splat.poses()) == 3
+    folder, field = saved_run
+    splat = open_splat(folder / "point_cloud.ply", "torch")
+    torch.testing.assert_close(splat.painter.color(CAMERA), exact(field), atol=2e-5, rtol=0)
+    assert len(splat.cameras) == 4
 
 
 def test_a_run_is_drawn_over_the_background_of_its_photos(saved_run, tmp_path):
@@ -45,13 +49,6 @@ def test_a_run_is_drawn_over_the_background_of_its_photos(saved_run, tmp_path):
     white = field.render(rasterizers.load("torch", background=(1.0, 1.0, 1.0)), CAMERA).clamp(0, 1)
     assert not torch.equal(white, exact(field))
     assert torch.equal(open_splat(folder).painter.color(CAMERA), white)
-
-
-def test_a_ply_file_looks_the_same(saved_run):
-    folder, field = saved_run
-    splat = open_splat(folder / "point_cloud.ply", "torch")
-    torch.testing.assert_close(splat.painter.color(CAMERA), exact(field), atol=2e-5, rtol=0)
-    assert len(splat.cameras) == 4
 
 
 def test_a_ply_file_of_3dgs_is_drawn_with_its_blur(saved_run, tmp_path):

@@ -167,7 +167,7 @@ def test_failed_jobs_are_told_where_the_report_cannot_be_written(tmp_path, caplo
 # ---- one writer a folder: who holds it is respected while alive, and only then
 
 
-def test_a_held_folder_is_refused_and_it_is_released_even_when_the_job_fails(tmp_path):
+def test_a_held_folder_is_refused_released_when_the_job_fails_and_may_be_removed_by_hand(tmp_path):
     folder = tmp_path / "run"
     with (
         hold(folder),
@@ -178,6 +178,10 @@ def test_a_held_folder_is_refused_and_it_is_released_even_when_the_job_fails(tmp
     for _ in range(2):
         with pytest.raises(KeyError), hold(folder):
             raise KeyError
+    with hold(tmp_path):
+        (tmp_path / NAME).unlink()
+    with hold(tmp_path / "run"):
+        shutil.rmtree(tmp_path / "run")
 
 
 HOLD = """
@@ -199,10 +203,3 @@ def test_the_folder_of_a_living_process_is_refused_and_that_of_a_killed_one_is_f
         process.kill()
     with hold(tmp_path):
         pass
-
-
-def test_a_lock_or_a_folder_that_is_removed_by_hand_is_no_error(tmp_path):
-    with hold(tmp_path):
-        (tmp_path / NAME).unlink()
-    with hold(tmp_path / "run"):
-        shutil.rmtree(tmp_path / "run")

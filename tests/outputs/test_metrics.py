@@ -80,16 +80,15 @@ def test_of_many_training_views_a_sample_is_scored(monkeypatch: pytest.MonkeyPat
     assert metrics.to_json(evaluation)["train"]["of"] == 7
 
 
-def test_where_hr_is_unknown_the_reduced_render_is_compared_with_lr() -> None:
+def test_where_hr_is_unknown_the_reduced_render_is_compared_with_lr_and_where_it_is_photos_nothing_else_is_scored() -> (
+    None
+):
     truth = noise(2, 48, 64)
     known, unknown = view("known", truth), view("unknown", truth, known=False)
     evaluation = metrics.evaluate(scene((known, unknown), (unknown,)), lambda camera: truth)
     assert evaluation.test["unknown"]["ours"].psnr == PSNR_CAP
     assert set(evaluation.test["unknown"]) == {"ours", "prior"}
     assert evaluation.against == {"test": "LR photos", "train": "HR and LR photos"}
-
-
-def test_where_the_hr_side_is_photos_nothing_is_scored_but_the_render() -> None:
     made = view("a", noise(3, 48, 64))
     photos = replace(made, hr=replace(made.hr, image=made.truth))
     assert photos.hr_is_photo

@@ -55,18 +55,21 @@ def test_a_loss_of_the_image_has_the_gradient_of_the_vjp(depth):
     assert torch.allclose(splats.rgb_offset.grad, expected.rgb[0])
 
 
-def test_a_loss_of_depth_is_refused_rather_than_left_out():
+def test_losses_of_depth_and_of_gradients_and_splats_changed_in_place_are_refused_rather_than_left_out():
     drawn = autograd.draw(ReferenceRasterizer(), leaves(scene(60)), camera(40, 30), depth=True)
     with pytest.raises(NotImplementedError, match="the loss depends on a rendered depth, which has no gradient"):
         (drawn.image.sum() + drawn.depth.sum()).backward()
-
-
-def test_a_loss_of_gradients_is_refused_rather_than_left_out():
     splats = leaves(scene(60))
     image = autograd.draw(ReferenceRasterizer(), splats, camera(40, 30)).image
     (slope,) = torch.autograd.grad(image.square().sum(), splats.means, create_graph=True)
     with pytest.raises(RuntimeError, match="differentiate twice"):
         (image.sum() + slope.square().sum()).backward()
+    splats = leaves(scene(60))
+    image = autograd.draw(ReferenceRasterizer(), splats, camera(40, 30)).image
+    with torch.no_grad():
+        splats.means.add_(1)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        image.sum().backward()
 
 
 def test_the_stand_in_for_gsplats_rasterization_has_our_rasterizers_gradients():
@@ -94,15 +97,6 @@ def test_a_loss_of_alpha_has_the_gradient_of_another_background(background):
     expected = ReferenceRasterizer(background=background)(drawn_over, view).vjp(v[None])
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
         assert torch.allclose(getattr(composed, name).grad, 2 * getattr(expected, name)[0], rtol=1e-6, atol=1e-9), name
-
-
-def test_splats_changed_in_place_since_they_were_drawn_are_refused():
-    splats = leaves(scene(60))
-    image = autograd.draw(ReferenceRasterizer(), splats, camera(40, 30)).image
-    with torch.no_grad():
-        splats.means.add_(1)
-    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        image.sum().backward()
 
 
 @pytest.mark.parametrize(

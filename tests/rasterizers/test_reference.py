@@ -40,21 +40,15 @@ def test_a_ball_has_the_opacity_that_mip_splatting_gives_it():
     assert rendering.means2d[0].tolist() == [10.5, 10.5]
 
 
-def test_the_nearer_ball_covers_the_farther():
+def test_the_nearer_ball_covers_the_farther_alpha_is_capped_and_a_pixel_ends_before_its_limit():
     near, far = balls(2.0, opacity=0.5, color=1.0), balls(3.0, opacity=0.9, color=0.2)
     both = Splats(*(torch.cat((getattr(far, f), getattr(near, f))) for f in Splats.__slots__[:6]))
     settings = {"kernel": 0.0, "antialiased": False}
     pixel = rasterizers.load("torch", **settings)(both, odd_camera()).image[10, 10, 0]
     assert pixel == pytest.approx(0.5 * 1.0 + 0.5 * 0.9 * 0.2, rel=1e-12)
-
-
-def test_alpha_is_capped_and_opacity_is_not():
     rendering = rasterizers.load("torch", kernel=0.0)(balls(2.0, opacity=1.25, scale=0.05), odd_camera())
     assert rendering.alpha[10, 10] == pytest.approx(0.99)
     assert rendering.alpha[10, 12] == pytest.approx(1.25 * math.exp(-0.5), rel=1e-12)
-
-
-def test_a_pixel_ends_before_its_transmittance_falls_below_the_limit():
     five = balls(*[2.0] * 5, opacity=0.9)
     # The transmittance goes 0.1, 0.01, 0.001, …: the last one not below the limit stays.
     for limit, left in ((5e-4, 1e-3), (5e-3, 1e-2), (0.5, 1.0)):

@@ -101,14 +101,6 @@ def test_empty_columns_are_left_out_and_a_bar_in_a_name_does_not_break_the_table
     assert "a\\|b" in line
 
 
-def test_settings_that_all_runs_share_are_noted_once(tmp_path: Path) -> None:
-    make_run(tmp_path / "0", "+strategy=gco", "data=llff", "fit.iterations=600")
-    make_run(tmp_path / "1", "+strategy=clear", "data=llff", "fit.iterations=600")
-    text = table_of(tmp_path)
-    assert "All runs of demo: `data=llff fit.iterations=600`." in text
-    assert text.count("data=llff") == 1
-
-
 # ---- A comparison enlarges the window where runs differ; charts draw what was measured
 
 

@@ -83,12 +83,15 @@ def test_decisions_do_not_change_when_a_loss_is_scaled_by_a_power_of_two(seed, i
         assert torch.equal(scaled[group], result[group] * 2.0**j), group
 
 
-def test_zero_gradients_are_no_conflict():
+def test_zero_gradients_are_no_conflict_and_what_could_correct_nothing_is_refused():
     zero, some = torch.zeros(3), torch.tensor([1.0, 2, 3])
     for l, h in ((zero, some), (some, zero), (zero, zero)):
         result = GCO().correct(grads("means", l), grads("means", h), None)["means"]
         assert torch.equal(result[0], h)
         assert result.isfinite().all()
+    g = torch.ones(2, 3)
+    with pytest.raises(ValueError, match=r"compares the groups means, .* lr has _xyz, hr has _xyz\. Name them so"):
+        GCO().correct({"_xyz": g}, {"_xyz": -g})
 
 
 def test_rotation_noise_of_isotropic_gaussians_is_gated():
@@ -99,12 +102,6 @@ def test_rotation_noise_of_isotropic_gaussians_is_gated():
     assert torch.equal(result["quats"], hr["quats"])
     assert gco.logs["corrected_quats"] == 0
     assert gco.logs["corrected_scales"] > 0
-
-
-def test_what_could_correct_nothing_is_refused():
-    g = torch.ones(2, 3)
-    with pytest.raises(ValueError, match=r"compares the groups means, .* lr has _xyz, hr has _xyz\. Name them so"):
-        GCO().correct({"_xyz": g}, {"_xyz": -g})
 
 
 def test_a_prior_that_agrees_with_lr_leaves_omega_at_its_lower_bound():

@@ -83,16 +83,13 @@ def test_routing_as_printed_lies_between_the_floor_and_one(q, a, floor):
     assert float(m) == pytest.approx(floor + (1 - floor) * q * a, rel=1e-5, abs=1e-6)
 
 
-def test_normalized_routing_moves_detail_and_removes_none():
+def test_normalized_routing_moves_detail_and_removes_none_and_is_finite_where_none_is_visible():
     # The third is unreliable and visible all the same, the last is invisible.
     q, a = torch.tensor([1.0, 1.0, 0.0, 0.0]), torch.tensor([1.0, 0.2, 0.4, 0.0])
     step = toy.step(evidence=Evidence(q, a), visible=torch.tensor([True, True, True, False]))
     printed, m = (P2G(normalize=normalize).route(step) for normalize in (False, True))
     assert float(m[:3].mean()) == pytest.approx(1)
     assert torch.allclose(m[:3] / m[0], printed[:3] / printed[0])
-
-
-def test_normalized_routing_of_no_visible_gaussian_is_finite():
     none = torch.zeros(3, dtype=torch.bool)
     assert bool(P2G().route(toy.step(evidence=Evidence(torch.zeros(3), torch.zeros(3)), visible=none)).isfinite().all())
     assert bool(P2G(floor=0).route(toy.step(evidence=Evidence(torch.ones(3), torch.zeros(3)))).isfinite().all())

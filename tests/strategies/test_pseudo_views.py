@@ -56,15 +56,12 @@ def test_a_quarter_are_training_cameras_with_a_wider_field():
         assert all(none.extra_views(t)[0].photo.camera.width == width for t in range(2, 100, 2))
 
 
-def test_the_weight_is_that_of_the_settings_where_photos_tell_the_colour_and_small_elsewhere():
+def test_the_weight_is_that_of_the_settings_where_photos_tell_the_colour_and_small_or_none_elsewhere():
     made = prepared(settings=replace(FEW, weight=0.5, continued=0.2))
     extras = [made.extra_views(t)[0] for t in range(2, 60, 2)]
     assert {round(w, 6) for extra in extras for w in extra.weight.unique().tolist()} == {0.1, 0.5}
     black = (extras[0].photo.image == 0).all(-1)
     assert not black.any()
-
-
-def test_without_a_continuation_what_no_photo_tells_counts_nothing():
     extra = prepared(settings=replace(FEW, weight=0.5, continued=0.0)).extra_views(2)[0]
     assert set(extra.weight.unique().tolist()) <= {0.0, 0.5}
     assert not extra.photo.image[extra.weight == 0].any()
@@ -89,17 +86,16 @@ def test_views_without_depth_get_it_from_stereo():
     assert "8 beside the training cameras" in (made.summary() or "")
 
 
-def test_after_the_run_none_is_kept():
+def test_without_views_after_the_run_and_without_an_lr_loss_there_are_none(caplog):
+    made = prepared(())
+    assert "PseudoViews has no effect: this training loop does not give its views" in caplog.text
+    assert not made.extra_views(2)
     made = prepared()
     made.on_fit_end()
     assert made.summary() is None
     assert not made.extra_views(2)
-
-
-def test_a_loop_that_gives_no_views_is_warned(caplog):
-    made = prepared(())
-    assert "PseudoViews has no effect: this training loop does not give its views" in caplog.text
-    assert not made.extra_views(2)
+    assert "lambda_lr is 0" in (FEW.without_effect(lambda_lr=0.0, lambda_hr=1.0, lambda_hf=0.2) or "")
+    assert FEW.without_effect(lambda_lr=1.0, lambda_hr=0.0, lambda_hf=0.2) is None
 
 
 def test_an_object_cut_out_of_its_surroundings_needs_none(caplog):
@@ -111,8 +107,3 @@ def test_an_object_cut_out_of_its_surroundings_needs_none(caplog):
         assert prepared(views).summary() is None
     assert "plain background" in caplog.text
     assert prepared([replace(view, background=(0.5, 0.5, 0.5)) for view in views]).summary() is not None
-
-
-def test_without_an_lr_loss_it_has_no_effect():
-    assert "lambda_lr is 0" in (FEW.without_effect(lambda_lr=0.0, lambda_hr=1.0, lambda_hf=0.2) or "")
-    assert FEW.without_effect(lambda_lr=1.0, lambda_hr=0.0, lambda_hf=0.2) is None

@@ -51,11 +51,16 @@ def test_they_come_when_a_strategy_says_so_and_their_loss_is_in_the_history():
     assert state.conductor.work_log.entries["extra views"].runs == ITERATIONS // 2
 
 
-def test_every_strategy_is_asked_unless_there_is_no_lr_loss():
+def test_every_strategy_is_asked_unless_there_is_no_lr_loss_and_the_weight_scales_the_gradient():
     conductor = start((), more=[Dark(), Dark(every=3)]).conductor
     assert len(conductor.extra_views(6)) == 2
     object.__setattr__(conductor.objective, "lambda_lr", 0.0)
     assert conductor.extra_views(6) == []
+    state = start((), fused="off")
+    extra, shot = black(), state.field.shot(toy.RASTERIZER, black().photo.camera)
+    whole = state.conductor.extra_loss(shot.image, extra, 1).cotangents
+    third = state.conductor.extra_loss(shot.image, black(weight=0.25), 1).cotangents
+    assert torch.equal(third, 0.25 * whole)
 
 
 @pytest.mark.parametrize("fused", ["auto", "off"])
@@ -72,14 +77,6 @@ def test_only_weighted_pixels_teach_no_anchor_pulls_and_the_learning_rates_follo
     assert {"means", "scales", "opacities", "sh0"} <= moved
     assert "detail" not in moved
     assert state.optimizer.steps == steps
-
-
-def test_the_weight_scales_the_gradient():
-    state = start((), fused="off")
-    extra, shot = black(), state.field.shot(toy.RASTERIZER, black().photo.camera)
-    whole = state.conductor.extra_loss(shot.image, extra, 1).cotangents
-    third = state.conductor.extra_loss(shot.image, black(weight=0.25), 1).cotangents
-    assert torch.equal(third, 0.25 * whole)
 
 
 def test_the_readable_and_the_compiled_step_agree():

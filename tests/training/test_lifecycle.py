@@ -38,7 +38,7 @@ def tagged(n=12):
     return field, optimizer, density
 
 
-def test_start_as_in_3dgs():
+def test_start_and_extent_are_those_of_3dgs():
     points = PointCloud(torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]]), torch.full((4, 3), 0.75), "four")
     field = GaussianField.from_cloud(points)
     # Root mean square distance to the three others, from the first point: √((1 + 4 + 9) / 3).
@@ -47,6 +47,9 @@ def test_start_as_in_3dgs():
     assert torch.allclose(field.sh0.data[:, 0] * SH_C0 + 0.5, torch.full((4, 3), 0.75))
     assert not field.detail.data.any()
     assert field.max_degree == 3
+    centers = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 0, 0]])
+    assert cameras_extent(centers) == pytest.approx(1.1)
+    assert cameras_extent(centers[:1]) > 0
 
 
 @given(
@@ -189,7 +192,7 @@ def test_adam_is_torchs_adam():
         assert torch.allclose(value, theirs[name].detach(), rtol=1e-5, atol=1e-7), name
 
 
-def test_a_short_run_gives_f_det_a_share_of_its_rate(caplog):
+def test_a_short_run_moves_the_geometry_faster_and_f_det_slower_and_nothing_else(caplog):
     plain = LearningRates(geometry_steps=0)
     with caplog.at_level("DEBUG"):
         short = plain.of_run(300)
@@ -198,9 +201,6 @@ def test_a_short_run_gives_f_det_a_share_of_its_rate(caplog):
     assert "rate of 0.0005 instead of 0.0025: the run has 300 iterations" in caplog.text
     assert plain.of_run(1_500) == plain
     assert replace(plain, detail_steps=0).of_run(1) == replace(plain, detail_steps=0)
-
-
-def test_a_short_run_moves_the_geometry_faster_and_nothing_else():
     rates, plain = LearningRates(), LearningRates(geometry_steps=0)
     short = rates.of_run(3_750)
     assert (short.scales, short.quats) == pytest.approx((2 * plain.scales, 2 * plain.quats))
@@ -225,7 +225,7 @@ def test_in_the_last_tenth_all_rates_fall_to_zero_but_that_of_the_means_falls_al
     assert scaled(rates, 0.15).at(1_500, 1.0)["scales"] == pytest.approx(rates.scales / 151)
 
 
-def test_the_3d_filter_by_hand_and_unseen_gaussians_take_the_largest():
+def test_the_3d_filter_by_hand_unseen_gaussians_take_the_largest_and_the_compiled_one_is_the_same():
     camera = toy.camera(0.0)
     means = torch.tensor([[0.0, 0, 0], [0, 0, 4], [0, 0, -100]])  # depths 4, 8, behind
     f = filter_std(means, [camera], 0.2)
@@ -237,9 +237,6 @@ def test_the_3d_filter_by_hand_and_unseen_gaussians_take_the_largest():
     means[2, 2] = -3.8  # depth 0.2
     smaller = replace(camera, world_to_camera=pose)
     assert torch.allclose(filter_std(0.1 * means, [smaller], 0.2), 0.1 * filter_std(means, [camera], 0.2))
-
-
-def test_the_compiled_3d_filter_is_the_readable_one():
     cameras = [toy.camera(0.1 * i) for i in range(-20, 20)]
     means = torch.randn(1003, 3, generator=torch.Generator().manual_seed(0))
     readable = filter_std(means.double(), cameras, 0.2)
@@ -279,12 +276,6 @@ def test_lr_does_not_see_the_detail_feature():
     assert torch.equal(lr.image, plain_lr.image)
     assert not torch.equal(hr.image, plain_hr.image)
     assert "detail" not in lr.vjp(torch.ones(1, 16, 24, 3))[0]
-
-
-def test_extent_of_cameras():
-    centers = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 0, 0]])
-    assert cameras_extent(centers) == pytest.approx(1.1)
-    assert cameras_extent(centers[:1]) > 0
 
 
 def test_the_3d_filter_counts_what_the_rasterizer_of_the_run_draws():

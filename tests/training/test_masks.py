@@ -50,14 +50,11 @@ def test_a_field_does_not_depend_on_hidden_pixels(fused):
     assert all(torch.equal(a, trained[1][name]) for name, a in trained[0].items())
 
 
-def test_the_psnr_while_training_is_of_shown_pixels():
+def test_hidden_pixels_have_no_part_in_the_psnr_and_no_cotangent_and_shown_ones_keep_theirs():
     target, shown = torch.rand(8, 8, 3), torch.arange(8).expand(8, 8) < 5
     image = torch.where(shown[..., None], (target + 0.1).clamp(0, 1), 1 - target)
     alone = psnr_of(image[:, :5], target[:, :5], None)
     assert deferred.read([psnr_of(image, target, shown)]) == pytest.approx(deferred.read([alone]))
-
-
-def test_hidden_pixels_have_no_cotangent_and_shown_ones_keep_theirs():
     g = torch.Generator().manual_seed(0)
     image, target = torch.rand(32, 32, 3, generator=g), torch.rand(32, 32, 3, generator=g)
     shown = torch.ones(32, 32, dtype=torch.bool)
@@ -85,7 +82,7 @@ def test_an_lr_pixel_is_hidden_where_a_photo_pixel_below_it_is():
     assert view.hr.reduced(2).shown is not None
 
 
-def test_hidden_pixels_have_no_depth_and_give_no_points():
+def test_hidden_pixels_have_no_depth_give_no_points_and_the_border_continues_over_them():
     photos = planes.plane_photos(3)
     shown = torch.ones(90, 120, dtype=torch.bool)
     shown[20:60, 30:80] = False
@@ -93,9 +90,6 @@ def test_hidden_pixels_have_no_depth_and_give_no_points():
     for depth in made.depths:
         assert not depth.known[20:60, 30:80].any()
         assert depth.known[:, 85:].any()
-
-
-def test_the_border_of_a_photo_continues_over_what_it_hides():
     photo = replace(planes.photo(), shown=torch.arange(40).expand(40, 40) > 10)
     (wide,) = border_views([photo], field=1.5, max_pixels=10_000)
     assert torch.equal(wide.known[10:50, 10:50], photo.shown)

@@ -36,15 +36,12 @@ def test_a_run_whose_start_does_not_fit_is_refused_and_one_that_may_outgrow_the_
     assert "and 150 MiB is free on this machine" in caplog.text
 
 
-def test_the_estimate_holds_the_parameters_and_their_moments(monkeypatch):
+def test_the_estimate_holds_the_parameters_and_their_moments_and_the_system_tells_what_is_held(monkeypatch):
     state, n = start(("gco", "p2g", "svs")), 1_000_000
     tables = (state.field.raw(), state.optimizer.state_dict())
     least = sum(x.nbytes for table in tables for x in table.values()) // len(state.field) * n
     state.density.cap = n
     each = float(memory.require(state, 10**6).split("start, ")[1].split()[0])
     assert least < each * 1024 * n < 10 * least
-
-
-def test_the_system_tells_what_the_process_holds():
     assert memory.system_bytes("/proc/self/status", "VmRSS") > 0
     assert memory.system_bytes("/proc/nothing", "VmRSS") is None

@@ -23,11 +23,18 @@ def loss_rows(*losses: float, lambda_hr: float = 0.0) -> list[dict[str, float]]:
     return [{"t": float(t), "lambda_hr": lambda_hr, PLATEAU_LOSS: loss} for t, loss in enumerate(losses, 1)]
 
 
-def test_nothing_is_left_out_by_default():
+def test_by_default_and_of_photos_that_sr_does_not_enlarge_nothing_is_left_out_and_milestones_stretch():
     view, skip_policy, work_log = toy.scene().train[0], SkipPolicy(), WorkLog()
     assert skip_policy.view(view, 1) is view
     assert not skip_policy.settled(loss_rows(*[1.0] * 20_000), 20_000)
     assert not work_log.entries
+    view, work_log, skip_policy = toy.scene().train[0], WorkLog(), SkipPolicy(Skips(coarse_until=10))
+    same = replace(view, hr=view.lr)
+    assert skip_policy.view(same, 1) is same
+    assert skip_policy.lr_due(same, True, work_log)
+    assert not work_log.entries
+    short = scaled(Skips(coarse_until=3_000), 0.1)
+    assert (short.coarse_until, short.plateau_from, short.plateau_window, short.plateau_to) == (300, 500, 50, 800)
 
 
 def test_the_coarse_reference_is_the_mean_of_blocks_seen_by_the_scaled_camera():
@@ -42,14 +49,6 @@ def test_the_coarse_reference_is_the_mean_of_blocks_seen_by_the_scaled_camera():
     freed = weakref.ref(coarse.hr.image)
     del coarse
     assert freed() is None
-
-
-def test_photos_that_sr_does_not_enlarge_keep_their_reference_and_are_rendered_at_both_scales():
-    view, work_log, skip_policy = toy.scene().train[0], WorkLog(), SkipPolicy(Skips(coarse_until=10))
-    same = replace(view, hr=view.lr)
-    assert skip_policy.view(same, 1) is same
-    assert skip_policy.lr_due(same, True, work_log)
-    assert not work_log.entries
 
 
 def test_a_skip_that_cannot_act_is_a_warning_and_not_in_the_plan(caplog):
@@ -112,11 +111,6 @@ def test_what_raises_the_measured_loss_is_no_plateau():
     assert not policy.settled([*lr[:7], hr[7]], 8)  # HR sets in
     assert not policy.settled(hr, 8)  # HR becomes whole
     assert SkipPolicy(replace(policy.skips, coarse_until=0)).settled(hr, 8)
-
-
-def test_every_milestone_stretches_with_the_run():
-    short = scaled(Skips(coarse_until=3_000), 0.1)
-    assert (short.coarse_until, short.plateau_from, short.plateau_window, short.plateau_to) == (300, 500, 50, 800)
 
 
 def test_a_plateau_is_left_out_and_the_run_has_its_end(caplog):

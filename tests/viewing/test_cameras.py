@@ -27,16 +27,13 @@ def same(a, b):
     assert (a.fx, a.fy, a.cx, a.cy, a.width, a.height) == pytest.approx((b.fx, b.fy, b.cx, b.cy, b.width, b.height))
 
 
-def test_what_a_run_writes_is_what_is_read(tmp_path):
+def test_what_a_run_writes_and_what_inria_writes_is_read(tmp_path):
     cameras.write_cameras(tmp_path, SCENE)
     found = cameras.read_cameras(tmp_path / cameras.FILE)
     assert [saved.name for saved in found] == [view.name for view in (*SCENE.train, *SCENE.test)]
     assert [saved.split for saved in found] == ["train"] * 3 + ["test"]
     for saved, view in zip(found, (*SCENE.train, *SCENE.test), strict=True):
         same(saved.camera, view.hr.camera)
-
-
-def test_inrias_cameras_are_read(tmp_path):
     entry = {
         "id": 0, "img_name": "a", "width": 40, "height": 20, "position": [0, 0, -4], "rotation": np.eye(3).tolist(),
         "fx": 50, "fy": 50,
@@ -108,10 +105,13 @@ def test_a_path_passes_its_cameras_and_is_even_and_closed_and_looks_where_they_l
         torch.testing.assert_close(R @ R.T, torch.eye(3, dtype=R.dtype))
 
 
-def test_many_cameras_are_thinned():
+def test_many_cameras_are_thinned_and_the_point_that_they_look_at():
     dense = [at((3 * math.cos(a), 0.0, 3 * math.sin(a))) for a in np.arange(100) * math.tau / 100]
     steps = np.linalg.norm(np.diff(centers(paths.through(dense, 60)), axis=0), axis=1)
     assert steps.max() < 1.5 * steps.min()
+    np.testing.assert_allclose(paths.look_at(RING), 0, atol=1e-9)
+    parallel = [toy.camera(0.0), toy.camera(0.0)]
+    assert np.isfinite(paths.look_at(parallel)).all()
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
@@ -122,12 +122,6 @@ def test_few_cameras_and_cameras_at_one_place_give_a_path_too(count):
     assert np.isfinite(centers(path)).all()
     still = paths.through([RING[0]] * (count + 1), 5)  # several cameras at one place
     np.testing.assert_allclose(centers(still), np.tile(RING[0].center.numpy(), (5, 1)), atol=1e-6)
-
-
-def test_the_point_that_cameras_look_at():
-    np.testing.assert_allclose(paths.look_at(RING), 0, atol=1e-9)
-    parallel = [toy.camera(0.0), toy.camera(0.0)]
-    assert np.isfinite(paths.look_at(parallel)).all()
 
 
 @pytest.mark.parametrize(("cameras", "frames"), [([], 5), (RING, 0)])

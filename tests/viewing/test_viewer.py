@@ -50,15 +50,12 @@ def test_depth_is_the_distance_of_what_is_seen():
     torch.testing.assert_close(depth, torch.full((40, 60), 4.0), atol=0.02, rtol=0)
 
 
-def test_depth_is_unknown_where_nothing_is(field):
+def test_depth_is_unknown_where_nothing_is_and_numbers_are_blended_over_black(field):
     turned = replace(CAMERA, world_to_camera=torch.diag(torch.tensor([1.0, -1, -1, 1])) @ CAMERA.world_to_camera)
     depth = Painter(field, make).depth(turned)
     assert depth.isnan().all()
     picture = DepthScale.of(Painter(field, make), [turned]).picture(depth)
     assert (picture[0, 0] == 204).all()
-
-
-def test_numbers_are_blended_over_black(field):
     painter = Painter(field, make)
     ones = painter.numbers(CAMERA, torch.ones(len(field)))
     assert float(ones.min()) >= 0

@@ -37,13 +37,10 @@ def random_lr(seed: int = 0) -> Tensor:
     return torch.from_numpy(rng.random((24, 32, 3), dtype=np.float32))
 
 
-def test_without_share_or_strength_it_equals_the_prior():
+def test_errors_differ_between_views_and_seeds_and_without_share_or_strength_there_are_none():
     lr = random_lr()
     for none in ({"share": 0.0}, {"strength": 0.0}):
         assert torch.equal(Corrupted(Sharp(), **none)("a", lr, 4), Sharp()("a", lr, 4))
-
-
-def test_errors_differ_between_views_and_seeds():
     lr = random_lr()
     one, again, other = (Corrupted(Sharp(), patch=16, seed=seed)("a", lr, 4) for seed in (0, 0, 1))
     assert torch.equal(one, again)

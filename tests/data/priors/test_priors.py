@@ -181,14 +181,13 @@ def test_a_damaged_entry_is_logged_and_computed_again(model, tmp_path, damage, c
     assert torch.equal(read_image(entry), first)
 
 
-def test_a_cache_that_cannot_be_written_costs_time_but_no_result(model, tmp_path, caplog):
+def test_a_cache_that_cannot_be_written_costs_no_result_and_it_lies_where_the_environment_says(
+    model, tmp_path, caplog, monkeypatch
+):
     (tmp_path / "file").write_bytes(b"in the way of a folder")
     lr = photo(5, 6)
     assert Cached(Counting(str(model)), tmp_path / "file" / "cache")("view", lr, 2).shape == (10, 12, 3)
     assert "cannot be cached" in caplog.text
-
-
-def test_the_cache_is_where_the_environment_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("CLEAR_CACHE", str(tmp_path))
     assert cache_folder() == tmp_path
     assert Cached(Counting("")).folder == tmp_path / "sr"

@@ -172,15 +172,6 @@ def test_a_full_disk_is_not_taken_for_photos_without_overlap(estimate):
         estimate(full)
 
 
-@pytest.mark.parametrize("precise", [True, False])
-def test_the_memory_of_matching_is_bounded_on_machines_of_many_cores(monkeypatch, precise):
-    monkeypatch.setattr(os, "cpu_count", lambda: 64)
-    settings = SfmSettings(1600, 8192, precise, threads=-1, seed=0)
-    assert 3 << 30 < settings.matchers * settings.memory <= 4 << 30
-    assert SfmSettings(1600, 8192, precise, threads=2, seed=0).matchers == 2
-    assert SfmSettings(1600, 100_000, precise, threads=-1, seed=0).matchers == 1
-
-
 def test_no_photo_has_more_features_than_asked_for(tmp_path: Path) -> None:
     file = tmp_path / "database.db"
     found = database_of(file, {0: 3, 1: 7}, {})

@@ -105,13 +105,10 @@ def changed(root: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     return root
 
 
-def test_frames_are_sorted_by_name(tmp_path: Path) -> None:
+def test_frames_are_sorted_by_name_and_their_own_intrinsics_win_over_the_shared_ones(tmp_path: Path) -> None:
     capture = nerfstudio.read(changed(tmp_path, lambda value: value["frames"].reverse()))
     assert [frame.name for frame in capture.frames] == list(tiny.NAMES)
     assert nerfstudio.read(tmp_path / "transforms.json").frames[0].name == "a.png"
-
-
-def test_a_frames_own_intrinsics_win_over_the_shared_ones(tmp_path: Path) -> None:
     capture = nerfstudio.read(changed(tmp_path, lambda v: v["frames"][1].update(fl_x=30, cx=7.5)))
     assert [frame.camera.fx for frame in capture.frames] == [20, 30, 20]
     assert [frame.camera.cx for frame in capture.frames] == [8, 7.5, 8]
