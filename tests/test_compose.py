@@ -22,15 +22,12 @@ def names(c):
     return [type(s).__name__ for s in c.strategies]
 
 
-def test_names_are_those_of_the_command_line():
+def test_names_and_overrides_are_those_of_the_command_line_and_milestones_stretch_to_the_hosts_length():
     assert names(conductor("clear")) == ["GCO", "P2G", "SVS"]
     for said in ("gco, svs", "[gco,svs]", ["gco", "svs"]):
         assert names(conductor(said)) == ["GCO", "SVS"]
     assert names(conductor("baseline")) == []
     assert names(conductor("clear", "~strategies.p2g")) == ["GCO", "SVS"]
-
-
-def test_overrides_reach_strategies_and_objective_and_milestones_stretch_to_the_hosts_length():
     c = conductor("gco", "strategies.gco.tolerance=0.2", "objective=lr_only")
     assert c.strategies[0].tolerance == 0.2
     assert c.objective.lambda_hr(5_000) == 0
@@ -144,7 +141,7 @@ def test_a_setting_that_cannot_be_used_is_named_by_its_key(overrides, message):
     assert message in str(refused.value)
 
 
-def test_a_host_gets_the_strategies_and_the_decorators_of_best():
+def test_a_host_gets_the_strategies_the_decorators_and_the_rates_of_what_it_names():
     run = settings_of(tree(composed("+strategy=best")))
     best = conductor("best")
     assert [type(s) for s in best.strategies] == [type(s) for s in run.conductor(1.0).strategies]
@@ -152,14 +149,8 @@ def test_a_host_gets_the_strategies_and_the_decorators_of_best():
         "GCO", "P2G", "SVS", "PseudoViews", "FadingOpacity", "MCMC", "RandomBackground",
     ]  # fmt: skip
     assert best.prior(Bicubic()) == run.conductor(1.0).prior(Bicubic()) == BackProjected(Bicubic())
-
-
-def test_p2g_and_back_projection_reduce_by_the_operator_that_makes_the_lr_images():
     run = settings_of(tree(composed("+strategy=[p2g,back_projected]", "data.views.downsample=area")))
     assert run.strategies["p2g"].down == "area"
     assert run.conductor(1.0).prior(Bicubic()) == BackProjected(Bicubic(), down="area")
-
-
-def test_the_rates_of_f_det_in_a_host_are_those_of_its_readings():
     assert conductor("clear", iterations=300).detail == DetailRates().of_run(300)
     assert conductor("clear_paper", iterations=300).detail == DetailRates(steps=0, decay=0.0)

@@ -123,12 +123,9 @@ def test_the_exit_codes_of_a_whole_process(tmp_path):
     assert (bad.returncode, (bad.stdout + bad.stderr).count("\n")) == (2, 1), bad.stdout + bad.stderr
     # 2.4 s here; a wall clock counts others too
     assert took.ru_utime + took.ru_stime - began.ru_utime - began.ru_stime < 8
-    (tmp_path / "file").touch()
-    for folder in ("file/run", "/proc/run"):  # neither can be made, by root neither
-        unwritable = run(f"hydra.run.dir={folder}", cwd=tmp_path)
-        said = unwritable.stdout + unwritable.stderr
-        assert (unwritable.returncode, said.count("\n")) == (3, 1), said
-        assert folder.split("/")[0] in said or folder in said
+    unwritable = run("hydra.run.dir=/proc/run", cwd=tmp_path)  # by root neither
+    said = unwritable.stdout + unwritable.stderr
+    assert (unwritable.returncode, said.count("\n"), "/proc/run" in said) == (3, 1, True), said
 
 
 def test_ctrl_c_while_data_is_prepared_is_one_line(tmp_path):

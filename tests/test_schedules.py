@@ -8,16 +8,13 @@ from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay, milestones, scaled
 
 
-def test_lambda_hr_by_the_papers_milestones():
+def test_lambda_hr_by_the_papers_milestones_and_the_position_rate():
     schedule = WarmupDecay(final=0.1)
     expected = {1: 0, 500: 0, 501: 1 / 2500, 1750: 0.5, 3000: 1, 5000: 1, 7500: 0.55, 10_000: 0.1, 20_000: 0.1}
     for t, value in expected.items():
         assert schedule(t) == pytest.approx(value), t
     assert WarmupDecay(final=0.1, decay="cosine")(7500) == pytest.approx(0.55)
     assert WarmupDecay(final=0.1, decay="exponential")(7500) == pytest.approx(0.1**0.5)
-
-
-def test_position_rate_falls_log_linearly():
     rate = LogLinear()
     assert [rate(0), rate(5000), rate(10_000)] == pytest.approx([1.6e-4, 1.6e-5, 1.6e-6])
 

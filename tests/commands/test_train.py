@@ -9,11 +9,14 @@ from clear_strategies.commands import train
 from clear_strategies.compose import composed, tree
 
 
-def test_of_several_formats_the_one_that_may_hold_the_others_is_read(tmp_path):
+def test_of_several_formats_the_one_that_may_hold_the_others_is_read_and_named_strategies_replace_best(tmp_path):
     for file, kind in (("cameras.bin", "colmap"), ("transforms.json", "nerfstudio")):
         (tmp_path / file).touch()
         assert train.detect(tmp_path) == kind
     assert train.detect(tmp_path / "transforms.json") == "nerfstudio"
+    assert "+strategy=best" not in train.overrides([str(tmp_path), "+strategy=gco"])
+    assert "+strategy=best" in train.overrides([str(tmp_path)])
+    assert not any(o.startswith("fit.iterations") for o in train.overrides([str(tmp_path), "+protocol=llff_x4"]))
 
 
 def test_a_reader_that_another_package_brings_is_found_by_its_yaml_alone(tmp_path, monkeypatch):
@@ -61,9 +64,3 @@ def test_data_path_of_any_letters_needs_no_quotes_of_hydras(tmp_path, name):
     assert composed(["data=colmap", word], "config").data.path == str(tmp_path / name)
     for as_it_is in ("fit.seed=1,2", "+strategy=[gco,svs]", "~prior", "--cfg"):
         assert hydra_app.readable(as_it_is) == as_it_is
-
-
-def test_strategies_that_are_named_replace_the_whole_method(tmp_path):
-    assert "+strategy=best" not in train.overrides([str(tmp_path), "+strategy=gco"])
-    assert "+strategy=best" in train.overrides([str(tmp_path)])
-    assert not any(o.startswith("fit.iterations") for o in train.overrides([str(tmp_path), "+protocol=llff_x4"]))

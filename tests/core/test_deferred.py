@@ -7,22 +7,15 @@ import math
 
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from clear_strategies.core import deferred
 from clear_strategies.training.history import History
+from tests.helpers import toy
 
 
-class Reads(TorchDispatchMode):
-    """Counts what makes the host wait for a device."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.count = 0
-
-    def __torch_dispatch__(self, operation, types, arguments=(), keywords=None):
-        self.count += operation.overloadpacket in (torch.ops.aten._local_scalar_dense, torch.ops.aten.nonzero)
-        return operation(*arguments, **(keywords or {}))
+def reads(operations: toy.Operations) -> int:
+    """How often the host would wait for a device."""
+    return operations.count["_local_scalar_dense"] + operations.count["nonzero"]
 
 
 @pytest.fixture
@@ -38,11 +31,11 @@ def test_on_the_cpu_numbers_are_floats():
 
 
 def test_elsewhere_nothing_is_read_until_it_is_asked_for(on_a_device):
-    with Reads() as reads:
+    with toy.Operations() as done:
         part, whole = deferred.scalar(torch.tensor(3)), deferred.scalar(torch.tensor(4.0, dtype=torch.float64))
         share = deferred.defer(deferred.ratio, part, deferred.defer(deferred.added, whole, 8.0))
         rows = [{"t": 1.0, "share": share, "part": part}, {"t": 2.0, "share": share}]
-    assert reads.count == 0
+    assert reads(done) == 0
     assert deferred.resolve(rows) == [{"t": 1.0, "share": 0.25, "part": 3.0}, {"t": 2.0, "share": 0.25}]
 
 
@@ -70,9 +63,9 @@ def test_the_mean_of_chosen_rows_is_the_same_without_counting_them(chosen, monke
     values[~chosen] = math.inf  # which must not leak in
     expected = deferred.mean(values, chosen)
     monkeypatch.setattr(deferred, "is_immediate", lambda x: False)
-    with Reads() as reads:
+    with toy.Operations() as done:
         result = deferred.mean(values, chosen)
-    assert reads.count == 0
+    assert reads(done) == 0
     assert deferred.read([result]) == pytest.approx([expected], nan_ok=True)
 
 

@@ -157,14 +157,7 @@ def test_points_observed_by_enough_training_views_are_kept(ids: list[int], min_v
     assert torch.equal(cloud.colors, sfm().colors[kept])
 
 
-def test_sfm_points_are_marked_as_using_test_views_filtered_or_not() -> None:
-    for init in ("sfm", "sfm_train"):
-        cloud = initial_points(CloudSettings(init=init, densify=False), [photo()], sfm=sfm(), train_ids=[1, 2, 3]).cloud
-        assert cloud.uses_test_views == "yes"
-        assert "all of sparse/0" in cloud.source
-
-
-def test_missing_points_are_refused_in_one_line() -> None:
+def test_missing_points_are_refused_and_sfm_points_are_marked_as_using_test_views() -> None:
     with pytest.raises(DataError, match="none is observed by 4 of the 3 training views"):
         from_tracks(sfm(), [1, 2, 3], 4)
     none = torch.zeros(0, dtype=torch.long)
@@ -172,6 +165,10 @@ def test_missing_points_are_refused_in_one_line() -> None:
         from_tracks(replace(sfm(), track_point=none, track_image=none), [1], 1)
     with pytest.raises(DataError, match="there are none, but init=sfm_train"):
         initial_points(CloudSettings(init="sfm_train"), [photo()])
+    for init in ("sfm", "sfm_train"):
+        cloud = initial_points(CloudSettings(init=init, densify=False), [photo()], sfm=sfm(), train_ids=[1, 2, 3]).cloud
+        assert cloud.uses_test_views == "yes"
+        assert "all of sparse/0" in cloud.source
 
 
 def test_points_fill_the_given_box_with_near_grey_and_the_same_seed_gives_the_same_cloud() -> None:

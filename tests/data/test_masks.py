@@ -85,7 +85,7 @@ def test_files_among_the_masks_that_belong_to_no_photo_are_named(tmp_path: Path,
     assert "3 of 4 files belong to no photo and are not used: a_mask.png, b.npy, frame_7.png" in caplog.text
 
 
-def test_masks_follow_the_size_of_their_photos(tmp_path: Path) -> None:
+def test_masks_follow_the_size_and_the_folder_of_their_photos(tmp_path: Path) -> None:
     tiny.colmap_bin(tmp_path)
     tiny.write_photos(tmp_path / "images_2", (tiny.WIDTH // 2, tiny.HEIGHT // 2))
     for name in ("a", "b"):
@@ -96,6 +96,9 @@ def test_masks_follow_the_size_of_their_photos(tmp_path: Path) -> None:
     assert torch.equal(b.shown(), torch.from_numpy(~LEFT[::2, ::2]))
     whole = colmap.read(tmp_path).frames
     assert all(torch.equal(frame.shown(), torch.from_numpy(LEFT)) for frame in whole[:2])
+    tiny.write_photos(tmp_path / "elsewhere")
+    save(tmp_path / "elsewhere/masks/a.png", 1 * LEFT)
+    assert list(masks_of(tmp_path / "scene", [tmp_path / "elsewhere/a.png"])) == [tmp_path / "elsewhere/a.png"]
 
 
 @pytest.mark.parametrize("sized", [True, False])
@@ -158,9 +161,3 @@ def test_photos_that_are_transparent_everywhere_are_refused(tmp_path: Path, alph
         image.save(path)
     with pytest.raises(DataError, match=r"show nothing of 2 of 2 photos: a, b"):
         prepared(tmp_path, blender.read)
-
-
-def test_photos_outside_of_the_captures_folder_have_their_masks_in_their_own(tmp_path: Path) -> None:
-    tiny.write_photos(tmp_path / "elsewhere")
-    save(tmp_path / "elsewhere/masks/a.png", 1 * LEFT)
-    assert list(masks_of(tmp_path / "scene", [tmp_path / "elsewhere/a.png"])) == [tmp_path / "elsewhere/a.png"]

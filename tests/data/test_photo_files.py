@@ -87,10 +87,6 @@ def test_a_turned_photo_is_read_as_it_is_stored_or_upright(ending: str, orientat
 
 
 def test_images_are_listed_by_name_and_ending_and_the_first_of_the_usual_folders_is_taken(tmp_path: Path) -> None:
-    for name in ("b.JPG", "a.png", "notes.txt", "c.tif"):
-        (tmp_path / name).touch()
-    (tmp_path / "folder.png").mkdir()
-    assert [p.name for p in photo_folders.list_images(tmp_path)] == ["a.png", "b.JPG", "c.tif"]
     with pytest.raises(DataError, match="has none of the folders"):
         photo_folders.image_folder(tmp_path)
     (tmp_path / "images_8").mkdir()
@@ -100,6 +96,10 @@ def test_images_are_listed_by_name_and_ending_and_the_first_of_the_usual_folders
     assert photo_folders.image_folder(tmp_path, "images_8").name == "images_8"
     with pytest.raises(DataError, match="choose one of images_4, images_8"):
         photo_folders.image_folder(tmp_path, "images")
+    for name in ("b.JPG", "a.png", "notes.txt", "c.tif"):
+        (tmp_path / name).touch()
+    (tmp_path / "folder.png").mkdir()
+    assert [p.name for p in photo_folders.list_images(tmp_path)] == ["a.png", "b.JPG", "c.tif"]
 
 
 # ---- photos with a colour profile of their own become sRGB; photos of sRGB keep their bits

@@ -83,7 +83,7 @@ def made(sizes: str, width: int = 57, height: int = 43, **settings):
     return prepare(capture(2, width, height), papers(train=1, sizes=sizes, **settings), Bicubic(), POINTS).train[0]
 
 
-def test_rounded_sizes_keep_the_border_and_the_rays_through_it():
+def test_rounded_sizes_keep_the_border_and_its_rays_and_cropped_ones_the_focal_length():
     """57x43 at shrink 2, x4: 57/8 = 7.125 -> 7, 43/8 = 5.375 -> 5."""
     view, photo = made("round", shrink=2), capture(2, 57, 43).frames[1].camera
     assert view.truth.shape == (20, 28, 3)
@@ -92,9 +92,6 @@ def test_rounded_sizes_keep_the_border_and_the_rays_through_it():
         x, y = camera.width / photo.width, camera.height / photo.height  # the same field of view
         rays = (photo.fx * x, photo.fy * y, photo.cx * x, photo.cy * y)
         assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx(rays)
-
-
-def test_cropped_sizes_lose_the_border_and_keep_the_focal_length():
     view, photo = made("crop", shrink=2), capture(2, 57, 43).frames[1].camera
     assert (view.hr.camera.width, view.hr.camera.height) == (28, 20)
     assert (view.hr.camera.fx, view.hr.camera.cy) == pytest.approx((photo.fx / 2, photo.cy / 2))
@@ -231,14 +228,11 @@ def test_every_size_of_photo_keeps_the_hr_side_within_the_limit(size, photos_are
         assert (camera.width, camera.height) == size  # every pixel is used
 
 
-def test_a_prior_that_is_chosen_super_resolves_reduced_photos():
+def test_a_prior_that_is_chosen_super_resolves_reduced_photos_and_without_a_limit_nothing_changes():
     found, views = held((4032, 3024), super_resolve=True)
     camera = found.frames[0].camera
     assert (views.photos_are, views.sr_scale) == ("lr", 2) or views.sr_scale == 4
     assert 16 * camera.width * camera.height == pytest.approx(2.1e6, rel=0.01)
-
-
-def test_without_a_limit_and_under_the_protocols_nothing_changes():
     for settings in ({"max_hr_megapixels": None}, {"photos_are": "hr"}, {"photos_are": "both"}):
         found, views = held((4032, 3024), **settings)
         assert found.frames[0].camera.width == 4032

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from clear_strategies import Objective
+from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.kernels import losses
 from clear_strategies.schedules import WarmupDecay
 
@@ -24,6 +25,12 @@ def photometric(image: Tensor, target: Tensor) -> Tensor:
     return (
         image * losses.photometric(image.detach().contiguous(), target.contiguous(), 0.2, kernels="torch").gradient
     ).sum()
+
+
+def as_item(photo, i):
+    """A photo as the datasets of gsplat's examples give it."""
+    pose = torch.linalg.inv(photo.camera.world_to_camera)
+    return {"K": intrinsics(photo.camera).float(), "camtoworld": pose, "image": photo.image * 255, "image_id": i}
 
 
 class InNdc(torch.autograd.Function):

@@ -15,10 +15,9 @@ from gsplat.rendering import rasterization
 from gsplat.strategy import DefaultStrategy
 
 from clear_strategies.core.points import PointCloud
-from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
-from tests.helpers.host_parts import photometric
+from tests.helpers.host_parts import as_item, photometric
 
 
 @dataclass
@@ -51,11 +50,7 @@ class Dataset:
         return len(self.indices)
 
     def __getitem__(self, item):
-        photo = self.parser.scene.train[item].lr
-        return {
-            "K": intrinsics(photo.camera).float(), "camtoworld": torch.linalg.inv(photo.camera.world_to_camera),
-            "image": photo.image * 255, "image_id": item,
-        }  # fmt: skip
+        return as_item(self.parser.scene.train[item].lr, item)
 
 
 def create_splats_with_optimizers(parser, init_type="sfm", device="cpu"):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import rasterizers
 from clear_strategies import Conductor, Evidence, ExtraView, Objective, Photo, Step, Strategy, View
@@ -99,6 +101,18 @@ class ShowsDark(Strategy):
 
     def extra_views(self, t: int) -> Sequence[ExtraView]:
         return (self.cache["extra"],)
+
+
+class Operations(TorchDispatchMode):
+    """How many operations there were by name, but for those that are views."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count: Counter[str] = Counter()
+
+    def __torch_dispatch__(self, operation, types, arguments=(), keywords=None):
+        self.count[operation.overloadpacket.__name__] += not operation.is_view
+        return operation(*arguments, **(keywords or {}))
 
 
 @dataclass(frozen=True)

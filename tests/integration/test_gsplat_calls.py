@@ -51,13 +51,10 @@ def test_normals_beside_the_photo_have_no_detail_feature(named, grad):
     assert clear.attachment.counts["LR renders"] == 1
 
 
-def test_a_depth_pass_of_a_photo_is_part_of_its_step():
+def test_a_depth_pass_is_part_of_its_step_and_colours_without_spherical_harmonics_have_the_detail_feature():
     _, _, clear, render = with_detail()
     (render().mean() + render(render_mode="ED").mean()).backward()
     assert clear.attachment.counts["LR renders"] == clear.attachment.counts["merges"] == 1
-
-
-def test_colours_of_a_loop_without_spherical_harmonics_have_the_detail_feature():
     host, function, _, _ = with_detail()
     colors = torch.rand(20, 3)
     with torch.no_grad():
@@ -65,11 +62,15 @@ def test_colours_of_a_loop_without_spherical_harmonics_have_the_detail_feature()
         assert torch.equal(image, features(function, host, colors + host.splats["detail"]))
 
 
-def test_a_photo_rendered_with_a_part_of_the_gaussians_is_refused():
+def test_a_photo_of_a_part_of_the_gaussians_and_a_loop_without_backward_are_refused():
     host, _, _ = started()
     part = {name: p[:7] for name, p in host.splats.items()}
     with pytest.raises(HostError, match="view0 is rendered with 7 of 20 Gaussians"):
         gsplat_host.drawn(host.rasterization, part, host.photos["view0"].camera)
+    host, _, render = started()
+    host.splats["means"].grad = torch.autograd.grad(render(0).mean(), host.splats["means"])[0]
+    with pytest.raises(HostError, match=r"by loss\.backward"):
+        host.optimizers["means"].step()
 
 
 @pytest.mark.parametrize("origin", [0.0, 3e5], ids=["near the origin", "in coordinates of a map"])
@@ -137,13 +138,6 @@ def test_the_gradient_of_the_colours_comes_by_its_factors_but_where_a_hook_looks
         merged.append({name: p.grad for name, p in host.splats.items() if p.grad is not None})
     assert by_factors == [True, True, False, False]
     assert all(torch.allclose(g, merged[1][name], rtol=1e-5, atol=1e-9) for name, g in merged[0].items())
-
-
-def test_a_loop_without_backward_is_refused():
-    host, _, render = started()
-    host.splats["means"].grad = torch.autograd.grad(render(0).mean(), host.splats["means"])[0]
-    with pytest.raises(HostError, match=r"by loss\.backward"):
-        host.optimizers["means"].step()
 
 
 @pytest.mark.parametrize("named", [True, False], ids=["named as of no photo", "by the function that was wrapped"])

@@ -32,15 +32,12 @@ def test_written_norms_are_in_ndc(to_pixels):
     assert torch.allclose((pixels * torch.tensor([100.0, 50.0])).norm(dim=1), torch.tensor([0.5, 0.0, 2.0]))
 
 
-def test_packed_rows_are_those_of_their_gaussians():
+def test_packed_rows_are_those_of_their_gaussians_and_gsplats_absolute_gradient_is_written_too():
     tensor = torch.zeros(2, 2, requires_grad=True)
     slot = ScreenGradientSlot(tensor, (2, 2), rows=torch.tensor([3, 1]))
     assert slot.per_gaussian(torch.tensor([[1.0, 2.0], [3.0, 4.0]]), 4).tolist() == [[0, 0], [3, 4], [0, 0], [1, 2]]
     slot.write(torch.tensor([9.0, 5.0, 9.0, 7.0]))
     assert tensor.grad.tolist() == [[7, 0], [5, 0]]
-
-
-def test_gsplats_absolute_gradient_is_written_too():
     tensor = torch.zeros(1, 2, 2, requires_grad=True)
     tensor.absgrad = torch.ones(1, 2, 2)
     ScreenGradientSlot(tensor, (2, 2)).write(torch.tensor([1.0, 2.0]))
@@ -72,7 +69,7 @@ def test_none_passes_where_none_passes_by_the_ordinary_statistic_or_has_a_score(
     assert torch.equal(ScoreScaler(threshold=1.0)(zeros, torch.ones(5) * 2, everyone(5)), zeros)
 
 
-def test_the_factor_follows_recent_views_and_restarts_when_the_number_of_gaussians_changes():
+def test_the_factor_follows_recent_views_restarts_with_another_number_of_gaussians_and_is_restored():
     scaler = ScoreScaler(threshold=1.0, half_life=2)
     ordinary, score = torch.tensor([2.0, 2.0, 0.5, 0.5]), torch.tensor([4.0, 3.0, 2.0, 1.0])
     first = scaler(score, ordinary, everyone(4))
@@ -81,9 +78,6 @@ def test_the_factor_follows_recent_views_and_restarts_when_the_number_of_gaussia
         last = scaler(score / 100, ordinary, everyone(4))
     assert (last >= 1).tolist() == [True, True, False, False]
     assert len(scaler(torch.ones(7), torch.ones(7), everyone(7))) == 7
-
-
-def test_a_restored_factor_continues():
     views = [(torch.rand(9) / 9, torch.rand(9)) for _ in range(25)]
     whole, first, resumed = (ScoreScaler(threshold=0.5) for _ in range(3))
     for score, ordinary in views[:15]:

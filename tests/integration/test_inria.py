@@ -128,15 +128,6 @@ def test_its_steps_equal_those_of_our_own_trainer(more, inria_host, inria_captur
     assert clear.attachment.counts["HR renders"] == STEPS - 1  # lambda_HR is 0 until t = 1
 
 
-def test_other_colours_in_place_of_the_models_are_no_rendering_of_a_photo(inria_attached):
-    clear, gaussians, scene = inria_attached()
-    seen = []
-    wrapped = clear.wrap(lambda camera, pc, override_color=None: seen.append(pc))
-    wrapped(scene.cameras[0], gaussians, override_color=gaussians.get_xyz)
-    assert seen == [gaussians]
-    assert not clear.attachment.counts
-
-
 @pytest.mark.parametrize("step_first", [False, True], ids=["densify, step", "step, densify"])
 def test_everything_follows_the_densifier_before_or_after_the_step(step_first, inria_host, inria_capture):
     strategies = (GCO(), P2G(patch=4), SVS(dropout=Ramp(maximum=0.2, full=30), anchor_start=24, anchor_strength=0.01))
@@ -246,7 +237,7 @@ def test_a_renderer_that_does_not_read_the_getters_is_warned_of(inria_host, capl
     assert "detail feature has no effect" in caplog.text
 
 
-def test_a_training_camera_is_recognised_as_an_object_or_as_a_copy_but_not_by_its_name_alone(inria_attached):
+def test_a_training_camera_is_recognised_but_not_by_its_name_alone_nor_with_other_colours(inria_attached):
     clear, _, scene = inria_attached(GCO())
     camera, copied = scene.cameras[1], copy.copy(scene.cameras[1])
     assert clear.views.find(camera) is clear.views.find(copied)
@@ -254,6 +245,12 @@ def test_a_training_camera_is_recognised_as_an_object_or_as_a_copy_but_not_by_it
         copied.world_view_transform + 0.1
     )  # Blender's test photos have the names of training photos
     assert clear.views.find(copied) is None
+    clear, gaussians, scene = inria_attached()
+    seen = []
+    wrapped = clear.wrap(lambda camera, pc, override_color=None: seen.append(pc))
+    wrapped(scene.cameras[0], gaussians, override_color=gaussians.get_xyz)
+    assert seen == [gaussians]
+    assert not clear.attachment.counts
 
 
 def test_a_dropout_inside_the_hosts_render_drops_the_same_at_both_scales(inria_host, inria_attached):
@@ -327,7 +324,9 @@ def test_unsupported_calls_are_refused(inria_host, inria_capture, inria_attached
         attach(gaussians, scene.cameras, Conductor(GCO()), sr=inria_capture / "sr")
 
 
-def test_views_need_unique_names_and_sr_images_of_the_right_size(inria_host, inria_capture):
+def test_views_need_unique_names_and_sr_images_of_the_right_size_and_intrinsics_are_of_the_projection(
+    inria_host, inria_capture
+):
     gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
     with pytest.raises(SettingError, match="at least one training camera"):
         attach(gaussians, [], Conductor(), sr=inria_capture / "sr")
@@ -335,9 +334,6 @@ def test_views_need_unique_names_and_sr_images_of_the_right_size(inria_host, inr
         attach(gaussians, [scene.cameras[0]] * 2, Conductor(), sr=inria_capture / "sr")
     with pytest.raises(DataError, match="is 96x64 where 48x32 is expected"):
         attach(gaussians, scene.cameras, Conductor(), sr=inria_capture / "sr", factor=2)
-
-
-def test_intrinsics_are_read_from_the_projection(inria_host, inria_capture):
     _, scene = inria_host.setup(options(inria_host, inria_capture))
     expected = projection.intrinsics(toy.scene(N).train[0].lr.camera)
     assert torch.allclose(intrinsics(scene.cameras[0]), expected, atol=1e-4)

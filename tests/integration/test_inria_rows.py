@@ -129,19 +129,13 @@ def test_clones_splits_and_pruned_gaussians_are_found():
     assert change.fresh.tolist() == [False, False, True, True, True]
 
 
-def test_the_nearest_of_equal_colours_is_the_parent():
+def test_the_nearest_of_equal_colours_is_the_parent_and_a_new_colour_or_rotation_has_none():
     before = gaussians(1.0, 2.0, 3.0, colours=(7.0, 7.0, 7.0))
     change = find_change(before, gaussians(1.0, 2.0, 2.9, 1.2, colours=(7.0, 7.0, 7.0, 7.0)))
     assert change.parents.tolist() == [0, 1, 2, 0]
     assert change.fresh.tolist() == [False, False, True, True]
-
-
-def test_a_new_colour_or_rotation_has_no_parent():
     assert find_change(gaussians(1.0), gaussians(1.0, 5.0)).parents.tolist() == [0, -1]
     assert find_change(gaussians(1.0), gaussians(1.0, rotation=0.5)).parents.tolist() == [-1]
-
-
-def test_empty_sets_can_be_compared():
     empty = {name: tensor[:0] for name, tensor in gaussians(1.0).items()}
     assert find_change(empty, gaussians(1.0)).parents.tolist() == [-1]
     assert find_change(gaussians(1.0), empty).parents.tolist() == []
@@ -193,7 +187,7 @@ class Model:
         return torch.cat((self._features_dc, torch.zeros(N, 3, 3)), 1)
 
 
-def test_opacities_are_gated_once():
+def test_opacities_are_gated_once_and_the_detail_feature_is_added_to_the_constant_band():
     model, z = Model(), torch.arange(N) / N
     overrides = Overrides(gate=z)
     gated = proxy(model, overrides, ROLES)
@@ -205,16 +199,10 @@ def test_opacities_are_gated_once():
     assert torch.equal(scales, 2 * model.scaling)
     assert torch.equal(gated.get_opacities(3.0), 3.0 * model.get_opacity * z[:, None])
     assert overrides.used == {"gate"}
-
-
-def test_the_detail_feature_is_added_to_the_constant_band():
     model = Model()
     difference = proxy(model, Overrides(detail=torch.ones(N, 3)), ROLES).get_features - model.get_features
     assert torch.allclose(difference[:, 0], torch.full((N, 3), 1 / SH_C0))
     assert bool((difference[:, 1:] == 0).all())
-
-
-def test_an_attribute_that_the_model_lacks_is_still_missing():
     with pytest.raises(AttributeError, match="Model has no shs_dc"):
         _ = proxy(Model(), Overrides(), (("shs_dc", "detail"),)).shs_dc
 

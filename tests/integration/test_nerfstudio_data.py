@@ -86,7 +86,7 @@ def test_the_sr_setting_chooses_the_prior(tmp_path):
     assert isinstance(prior(tmp_path / "span.ONNX"), Cached)
 
 
-def test_masks_and_equal_stems_are_refused(tmp_path):
+def test_masks_equal_stems_and_photos_that_stay_on_disk_are_refused(tmp_path):
     with pytest.raises(DataError, match="mask"):
         views_from_datamanager(DataManager(mask=torch.ones(16, 24, 1)), Bicubic(), 4)
     twins = DataManager(files=("a/0.jpg", "b/0.png", "a/1.jpg"))
@@ -94,6 +94,10 @@ def test_masks_and_equal_stems_are_refused(tmp_path):
         views_from_datamanager(twins, Bicubic(), 4)
     with pytest.raises(DataError, match="is that of two photos"):
         save_photos(photos_of(twins), tmp_path)
+    manager = DataManager()
+    manager.config = SimpleNamespace(cache_images="disk")
+    with pytest.raises(SettingError, match="cache_images: clear-splatfacto needs cpu or gpu, got disk"):
+        views_from_datamanager(manager, Bicubic(), 4)
 
 
 def test_seed_points_are_the_stereo_cloud_of_the_undistorted_photos():
@@ -124,13 +128,6 @@ def test_hidden_pixels_give_no_seed_points(by):
     kind = (lambda image: image) if by == "mask" else with_alpha
     mask = {} if by == "alpha" else {"mask": half[..., None].bool()}
     assert 0 < len(stereo_cloud(DataManager(kind, **mask))) < 0.8 * len(stereo_cloud(DataManager()))
-
-
-def test_photos_that_stay_on_disk_are_refused():
-    manager = DataManager()
-    manager.config = SimpleNamespace(cache_images="disk")
-    with pytest.raises(SettingError, match="cache_images: clear-splatfacto needs cpu or gpu, got disk"):
-        views_from_datamanager(manager, Bicubic(), 4)
 
 
 def test_alpha_is_composited_over_black():

@@ -20,6 +20,7 @@ from integration.examples.demo import load_demo, splats_with_optimizers
 from integration.gsplat.data import photos_of, views_from_dataset
 from integration.views import by_name, save_photos, view
 from tests.helpers import gsplat_host, toy
+from tests.helpers.host_parts import as_item
 
 # ---- A host's photos as views: what a mask hides, and what is refused
 
@@ -99,7 +100,7 @@ def test_the_demo_has_photos_cameras_and_sr_images_that_fit():
     assert demo.psnr(lambda viewmat, K, w, h: next(truths) + 0.01) == pytest.approx(40, abs=1)
 
 
-def test_splats_start_as_those_of_the_trainer():
+def test_splats_start_as_those_of_the_trainer_and_a_single_point_has_a_size():
     points = torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
     splats, optimizers = splats_with_optimizers(points, points.flip(0))
     start = GaussianField.from_cloud(PointCloud(points, points.flip(0), "test")).raw()
@@ -107,9 +108,6 @@ def test_splats_start_as_those_of_the_trainer():
     for name, p in splats.items():
         assert torch.allclose(p, start[name], atol=2e-3), name
         assert optimizers[name].param_groups[0]["params"][0] is p
-
-
-def test_a_single_point_has_a_size():
     splats, _ = splats_with_optimizers(torch.zeros(1, 3), torch.zeros(1, 3))
     assert splats["scales"].isfinite().all()
 
@@ -129,11 +127,7 @@ class Dataset:
         return len(self.indices)
 
     def __getitem__(self, item):
-        photo = self.train[item].lr
-        found = {
-            "K": intrinsics(photo.camera).float(), "image": photo.image * 255, "image_id": item,
-            "camtoworld": torch.linalg.inv(photo.camera.world_to_camera),
-        }  # fmt: skip
+        found = as_item(self.train[item].lr, item)
         if item == 0:
             found["mask"] = torch.ones(16, 24, dtype=torch.bool)
             found["mask"][:, HIDDEN] = False

@@ -36,12 +36,20 @@ def test_resuming_on_another_device_is_logged(caplog):
     assert "this run trained on cuda until now and continues on cpu" in caplog.text
 
 
-def test_device_threads_and_memory_may_differ_and_defaults_are_compared_too():
+def test_device_threads_and_memory_may_differ_and_of_files_that_moved_names_and_sizes_are_compared(tmp_path):
     assert compared("fit.device=cpu", "fit.threads=1", "rasterizer.memory=512") == compared()
     assert compared()["fit.seed"] == 0  # a default of the class, which no file gives
     saved = replace(start(()).checkpoint({}), config=compared("density.every=50"))
     with pytest.raises(DataError, match=r"density\.every: 50 then, 100 now"):
         resume.restore(start(()), SCENE, saved, Path("there"), compared())
+    for name, content in (("a", b"1"), ("b", b"1"), ("c", b"22")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "0.png").write_bytes(content)
+    a, b, c = (compared("prior=images", f"prior.path={tmp_path / name}") for name in "abc")
+    saved = replace(start(()).checkpoint({}), config=a)
+    resume.restore(start(()), SCENE, saved, Path("there"), b)
+    with pytest.raises(DataError, match=r"prior\.path holds: "):
+        resume.restore(start(()), SCENE, saved, Path("there"), c)
 
 
 def test_ctrl_c_after_training_names_the_checkpoint_that_was_saved(tmp_path: Path, monkeypatch):
@@ -108,17 +116,6 @@ def test_that_few_photos_have_a_pose_is_said_first_and_last(tmp_path: Path, monk
     done = next(i for i, message in enumerate(said) if message.startswith("done in"))
     assert len(warned) == 2
     assert warned[0] < done < warned[1] == len(said) - 1
-
-
-def test_of_other_files_that_moved_names_and_sizes_are_compared(tmp_path: Path) -> None:
-    for name, content in (("a", b"1"), ("b", b"1"), ("c", b"22")):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "0.png").write_bytes(content)
-    a, b, c = (compared("prior=images", f"prior.path={tmp_path / name}") for name in "abc")
-    saved = replace(start(()).checkpoint({}), config=a)
-    resume.restore(start(()), SCENE, saved, Path("there"), b)
-    with pytest.raises(DataError, match=r"prior\.path holds: "):
-        resume.restore(start(()), SCENE, saved, Path("there"), c)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from clear_strategies.compose import tree
 from clear_strategies.core.points import spread
 from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.priors import Bicubic, Corrupted, DemoPrior, Ncnn, ncnn
-from clear_strategies.data.readers import blender, colmap, demo, nerfstudio
+from clear_strategies.data.readers import demo
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.view_settings import ViewSettings, split
 from clear_strategies.errors import DataError, SettingError
@@ -91,16 +91,10 @@ def test_the_demo_prior_without_errors_gives_the_hr_photos_whatever_their_size(s
         assert float((view.hr.image - view.truth).abs().max()) <= 0.51 / 255  # a prior's image has 8 bits
 
 
-@pytest.mark.parametrize(
-    ("write", "reader"),
-    [
-        (captures.colmap_bin, colmap.read), (captures.nerfstudio, nerfstudio.read),
-        (captures.blender, blender.read),
-    ],
-)  # fmt: skip
-def test_no_photos_of_a_folder_called_demo_are_taken_for_their_own_sr_images(write, reader, tmp_path, monkeypatch):
+@pytest.mark.parametrize("kind", ["colmap", "nerfstudio", "blender"])
+def test_no_photos_of_a_folder_called_demo_are_taken_for_their_own_sr_images(kind, tmp_path, monkeypatch):
     monkeypatch.setattr(ncnn, "find_spec", lambda name: None)
-    root = write(tmp_path / "demo")
+    root, reader = captures.GOOD[kind](tmp_path / "demo"), captures.READERS[kind]
     assert reader(root=str(root)).name == "demo"
     views = ViewSettings(photos_are="hr", sr_scale=2, train=2, test_limit=1)
     cloud = CloudSettings(init="random", random_points=20)

@@ -8,8 +8,6 @@ from functools import partial
 
 import pytest
 import torch
-from helpers import toy
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from clear_strategies import GCO, SVS, Conductor, Evidence, Grads, Objective
 from clear_strategies.core import deferred
@@ -21,6 +19,7 @@ from clear_strategies.merging.in_place import InPlaceMerge, RoutedGradients, den
 from clear_strategies.schedules import WarmupDecay
 from rasterizers.interface import BackendUnavailable
 from rasterizers.warp_runtime import require_warp
+from tests.helpers import toy
 
 T, N = 50, 1003  # N: a last block of sixteen that is not full, and more than one chunk of 1,024 numbers
 SHAPES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (15, 3), "detail": (3,)}
@@ -181,19 +180,6 @@ def test_what_is_not_finite_is_refused_but_under_a_gradient_scaler():
             run()
 
 
-class Count(TorchDispatchMode):
-    """Operations that are no views, by name."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.operations: Counter[str] = Counter()
-
-    def __torch_dispatch__(self, operation, types, arguments=(), keywords=None):
-        if not operation.is_view:
-            self.operations[operation.overloadpacket.__name__] += 1
-        return operation(*arguments, **(keywords or {}))
-
-
 def moved(params, before, hr, *, device: str):
     """The same setting on another device."""
     there = {name: torch.nn.Parameter(p.detach().to(device)) for name, p in params.items()}
@@ -226,9 +212,9 @@ def operations(n: int, device: str = "cpu") -> Counter[str]:
     params, before, hr = moved(*setting(torch.float32, n=n, accumulated=False, factors=True, scale=1.0), device=device)
     merge = InPlaceMerge(conductor())
     merge(params, hr, T, before=before)
-    with Count() as count:
+    with toy.Operations() as done:
         merge(params, hr, T, before=before)
-    return count.operations
+    return +done.count
 
 
 def test_the_number_of_operations_does_not_depend_on_that_of_gaussians(passes):

@@ -174,15 +174,13 @@ def enlarged(truth: Tensor, factor: int) -> Tensor:
 # ── the numbers ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_an_image_is_perfect_to_itself() -> None:
+def test_an_image_is_perfect_to_itself_two_greys_by_hand_and_what_exceeds_the_range_is_clamped() -> None:
     assert score(noise(0), noise(0)) == ImageScores(psnr=PSNR_CAP, ssim=1.0, gmsd=0.0, blur=0.0)
-
-
-def test_psnr_and_ssim_of_two_greys_by_hand() -> None:
     scores = score(grey(0.6).double(), grey(0.5).double())
     assert scores.psnr == pytest.approx(20.0)  # -10 log10(0.1²)
     assert scores.ssim == pytest.approx((2 * 0.6 * 0.5 + 1e-4) / (0.6**2 + 0.5**2 + 1e-4))  # no contrast is left
     assert (scores.gmsd, scores.blur) == (0.0, 0.0)  # nor an edge
+    assert score(noise(0) * 3 - 1, noise(1)) == score((noise(0) * 3 - 1).clamp(0, 1), noise(1))
 
 
 @pytest.mark.parametrize("size", [(12, 12), (13, 37), (97, 1301)])
@@ -220,10 +218,6 @@ def test_gmsd_agrees_with_opencv(photograph: Tensor) -> None:
 def test_exchanging_image_and_truth_changes_nothing_but_the_sign_of_blur(seed: int) -> None:
     there, back = score(noise(seed), noise(seed + 1)), score(noise(seed + 1), noise(seed))
     assert astuple(there) == pytest.approx(astuple(replace(back, blur=-back.blur)), abs=1e-7)  # SSIM is in float32
-
-
-def test_what_exceeds_the_range_is_clamped() -> None:
-    assert score(noise(0) * 3 - 1, noise(1)) == score((noise(0) * 3 - 1).clamp(0, 1), noise(1))
 
 
 @pytest.mark.parametrize("poison", [math.nan, math.inf])

@@ -151,15 +151,14 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monke
     assert list(tmp_path.iterdir()) == [target]
 
 
-def test_processes_of_one_number_in_two_containers_do_not_write_into_one_file(tmp_path: Path) -> None:
+def test_processes_of_one_number_do_not_write_into_one_file_and_folders_and_long_names_are_no_error(
+    tmp_path: Path,
+) -> None:
     with files.replacing(tmp_path / "sr.png") as first, files.replacing(tmp_path / "sr.png") as second:
         first.write_text("first")
         second.write_text("second")
     assert (tmp_path / "sr.png").read_text() == "first"  # the context that ends last
     assert list(tmp_path.iterdir()) == [tmp_path / "sr.png"]
-
-
-def test_missing_folders_are_made_and_an_old_file_is_replaced_whatever_the_length_of_its_name(tmp_path: Path) -> None:
     target = tmp_path / "a" / "b" / f"{'ω' * 125}.txt"  # the longest that a disk takes
     files.write_text(target, "1")
     files.write_text(target, "ω̃ = 2")

@@ -59,15 +59,12 @@ def covering(n):
     return replace(splats, scales=torch.full_like(splats.scales, 50.0), opacities=torch.full((n,), 0.01))
 
 
-def test_a_row_beyond_the_budget_is_drawn_in_parts():
+def test_a_row_beyond_the_budget_is_drawn_in_parts_and_what_gradients_cannot_have_is_refused_at_first():
     splats, view = covering(3000), camera(400, 40)
     v = cotangents(3, 40, 400)
     assert 3000 * 13 * 16 < 1 << 20 < 3000 * 13 * (16 + 3 * 64)  # a row of bins fits forward, and not backward
     parts = everything(cpp(memory=1)(splats, view), v)
     require_same_bits(parts, everything(cpp()(splats, view), v))
-
-
-def test_what_the_gradients_need_is_refused_before_the_image_is_drawn():
     splats, view = covering(9000), camera(64, 40)
     with pytest.raises(MemoryError, match=r"one bin of 32 px holds 9000 Gaussians, whose image and gradients need 2"):
         cpp(memory=1)(splats, view)

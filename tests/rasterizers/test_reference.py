@@ -95,7 +95,7 @@ def test_a_pose_that_is_not_rigid_is_refused(change):
         Camera(pose, 10.0, 10.0, 5.0, 5.0, 10, 10)
 
 
-def test_quaternions_of_any_norm_give_the_same_rotation():
+def test_quaternions_of_any_norm_give_the_same_rotation_and_spherical_harmonics_are_orthonormal():
     q = torch.tensor([[0.3, -0.2, 0.8, 0.1]])
     expected = rotation_matrix(q)
     for scale in (1e-30, 1e-10, 1e10, 1e18):
@@ -105,9 +105,6 @@ def test_quaternions_of_any_norm_give_the_same_rotation():
     assert torch.equal(matrix[0], torch.eye(3))
     (gradient,) = torch.autograd.grad(matrix.sum(), zero)
     assert torch.equal(gradient, torch.zeros(1, 4))
-
-
-def test_spherical_harmonics_are_orthonormal():
     g = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(200_000, 3, generator=g, dtype=torch.float64), dim=-1)
     Y = spherical_harmonics(directions, 15)

@@ -207,22 +207,6 @@ def test_errors_are_raised_when_an_image_is_accessed(deferred):
 
 
 @installed
-def test_the_capacity_follows_the_images(deferred):
-    splats, view = dense_scene(200)
-    rasterizer = rasterizers.load("warp", device="cpu")
-    rasterizer(splats, view).image  # noqa: B018
-    many = rasterizer.capacity(view)
-    assert rasterizer.capacity(camera(64, 48)) == -1
-    few = dataclasses.replace(splats, scales=splats.scales * 0.1)
-    capacities = []
-    for _ in range(200):
-        rasterizer(few, view).image  # noqa: B018
-        capacities.append(rasterizer.capacity(view))
-    assert capacities[0] == many * 63 // 64
-    assert capacities[-1] == capacities[-2] < many / 2
-
-
-@installed
 def test_a_copy_over_another_background_has_the_capacities(deferred):
     """Random backgrounds make one in every iteration; without them the host waited for the device each time."""
     splats, view = dense_scene(200)

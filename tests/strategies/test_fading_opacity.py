@@ -52,13 +52,10 @@ def test_the_more_views_and_the_shorter_the_run_the_slower_it_fades(views, until
     assert float(lost) == pytest.approx(rate, rel=1e-4)
 
 
-def test_after_nine_tenths_of_the_run_opacities_are_left_alone():
+def test_after_nine_tenths_of_the_run_and_without_a_rate_opacities_are_left_alone():
     short = scaled(FadingOpacity(), 0.15)
     assert not torch.equal(faded(short, t=1350)["opacities"], LOGITS)
     assert torch.equal(faded(short, t=1351)["opacities"], LOGITS)
-
-
-def test_without_a_rate_it_has_no_effect_and_says_so():
     off = FadingOpacity(rate=0.0)
     assert torch.equal(faded(off)["opacities"], LOGITS)
     assert "rate is 0" in (off.without_effect(lambda_lr=1.0, lambda_hr=1.0, lambda_hf=0.2) or "")

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from tests.helpers.backends import CLEAN, EVERY, why_not
-from tests.stress import bad_inputs, checkpoints, faults, fuzz, gco, kills, lifecycle, projection, soak
+from tests.stress import bad_inputs, faults, fuzz, gco, kills, lifecycle, projection, soak
 from tests.stress.rows import HEADER, Row
 
 _log = logging.getLogger("tests.stress")
@@ -35,7 +35,7 @@ MEASUREMENTS: dict[str, Callable[[float, Path], Iterable[Row]]] = {
     "lifecycle": lambda share, folder: [lifecycle.measure(round(500 * share))],
     "faults": lambda share, folder: [faults.measure(folder)],
     "kills": lambda share, folder: [kills.measure(folder, round(200 * share))],
-    "integrity": lambda share, folder: [checkpoints.integrity(folder, round(100_000 * share))],
+    "integrity": lambda share, folder: [faults.integrity(folder, round(100_000 * share))],
     "inputs": lambda share, folder: [bad_inputs.measure(folder)],
     "fuzz": lambda share, folder: [fuzz.measure(targets, round(n * share)) for targets, n in _MUTANTS.items()],
     "soak": lambda share, folder: soak.measure(round(10_000 * share)),

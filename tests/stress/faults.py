@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 import io
 import os
+import random
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -25,7 +26,7 @@ from clear_strategies.training.checkpoint import Checkpoint
 from clear_strategies.training.field import GaussianField
 from clear_strategies.viewing.cameras import write_cameras
 from tests.helpers import toy
-from tests.stress.rows import Row, failures
+from tests.stress.rows import Row, Worst, failures
 
 
 class Killed(BaseException):
@@ -283,3 +284,32 @@ def _whole(folder: Path, states: States) -> bool:
     known = all(content in states.get(name, ()) for name, content in _contents(folder).items())
     sound = all(bool((x == x[0, 0]).all()) and float(x[0, 0]) in (1.0, 2.0, 3.0, 4.0) for x in values)
     return bool(found) and sound and known and not rests
+
+
+def integrity(folder: Path, most: int) -> Row:
+    """Single bits flipped, and files cut short: each is a DataError.
+
+    Args:
+        most: of the bits, chosen at random; all of them where there are fewer.
+    """
+    path = checkpoint.save(folder, small(100, 1.0))
+    good, accepted = path.read_bytes(), Worst()
+    bits = range(8 * len(good))
+    for bit in bits if len(bits) <= most else random.Random(0).sample(bits, most):  # noqa: S311 - no secret
+        data = bytearray(good)
+        data[bit // 8] ^= 1 << bit % 8
+        accepted.add(_accepts(path, bytes(data)), f"bit {bit}")
+    for length in range(0, len(good), max(1, 40 * len(good) // most)):
+        accepted.add(_accepts(path, good[:length]), f"cut to {length} bytes")
+    return accepted.row("checkpoints with a flipped bit or cut short: accepted, or another error", "all", 0)
+
+
+def _accepts(path: Path, data: bytes) -> float:
+    path.write_bytes(data)
+    try:
+        checkpoint.load(path)
+    except DataError:
+        return 0.0
+    except Exception:
+        return 1.0
+    return 1.0

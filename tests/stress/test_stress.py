@@ -14,7 +14,7 @@ from clear_strategies.training.optim import Adam
 from clear_strategies.training.state import TrainState
 from rasterizers.reference import ReferenceRasterizer
 from tests.helpers.backends import CLEAN, EVERY, why_not
-from tests.stress import bad_inputs, checkpoints, faults, fuzz, gco, kills, lifecycle, projection, soak
+from tests.stress import bad_inputs, faults, fuzz, gco, kills, lifecycle, projection, soak
 from tests.stress.__main__ import main
 from tests.stress.bad_inputs import BadInput
 from tests.stress.rows import Worst
@@ -99,7 +99,7 @@ def test_killed_runs_end_as_one_that_was_not(tmp_path: Path) -> None:
 
 
 def test_altered_bits_and_cut_files_are_refused(tmp_path: Path) -> None:
-    checkpoints.integrity(tmp_path, 500).require()
+    faults.integrity(tmp_path, 500).require()
 
 
 @pytest.mark.parametrize("given", bad_inputs.inputs(), ids=lambda given: given.id)

@@ -77,7 +77,7 @@ def test_what_is_alone_becomes_invisible_where_fields_are_compared():
     assert torch.allclose(distances(means, others)[:5], torch.tensor(0.01 * 3**0.5), atol=1e-5)
 
 
-def test_the_second_conductor_has_the_settings_and_a_state_of_its_own():
+def test_the_second_conductor_has_a_state_of_its_own_and_without_the_lr_loss_there_is_no_effect():
     conductor = Conductor(MCMC(growth=0.1), EVERY, skips=Skips(plateau_gain=0.1), statistics_from=7)
     copy = conductor.copy()
     assert copy.strategies == conductor.strategies
@@ -86,9 +86,6 @@ def test_the_second_conductor_has_the_settings_and_a_state_of_its_own():
     )
     assert (copy.skips.skips.plateau_gain, copy.statistics_from) == (0.0, 7)
     assert copy.work_log is conductor.work_log
-
-
-def test_without_the_lr_loss_it_says_that_it_has_no_effect():
     assert "lambda_lr is 0" in TwoFields().without_effect(lambda_lr=0, lambda_hr=1, lambda_hf=0)
     assert TwoFields().without_effect(lambda_lr=1, lambda_hr=1, lambda_hf=0) is None
     assert TwoFields().summary() is None

@@ -98,7 +98,7 @@ def test_exactly_the_given_share_of_the_patches_is_wrong(share: float) -> None:
     assert torch.equal(truth, before)
 
 
-def test_some_errors_agree_with_lr_and_some_do_not_so_that_reliability_spreads() -> None:
+def test_some_errors_agree_with_lr_and_some_do_not_and_the_demo_prior_is_better_than_bicubic() -> None:
     reliability = []
     for lr, _, sr in enlarged():
         residual = (images.downsample(sr, FACTOR) - lr).abs()
@@ -107,9 +107,6 @@ def test_some_errors_agree_with_lr_and_some_do_not_so_that_reliability_spreads()
     assert found.median() > 0.95
     assert found.quantile(0.02) < 0.4
     assert ((found > 0.4) & (found < 0.9)).float().mean() > 0.1
-
-
-def test_the_demo_prior_is_better_than_bicubic_and_worse_than_the_truth() -> None:
     errors = []
     for lr, truth, sr in enlarged():
         smooth = images.upsample(lr, FACTOR)

@@ -99,15 +99,13 @@ def truth_and_lr() -> tuple[Tensor, Tensor]:
 
 
 @real
-def test_waifu2x_is_nearer_to_the_truth_than_bicubic() -> None:
+def test_waifu2x_is_nearer_to_the_truth_than_bicubic_and_realesrgan_is_another(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     truth, lr = truth_and_lr()
     assert psnr(Ncnn()("view", lr, 4), truth) > psnr(Bicubic()("view", lr, 4), truth) + 0.5
     half = images.downsample(truth, 2)
     assert psnr(Ncnn()("view", half, 2), truth) > psnr(Bicubic()("view", half, 2), truth) + 0.5
-
-
-@real
-def test_realesrgan_shows_the_photo_and_is_another_than_waifu2x(caplog: pytest.LogCaptureFixture) -> None:
     _, lr = truth_and_lr()
     sr = Ncnn("realesrgan")("view", lr, 4)
     assert psnr(images.downsample(sr, 4, "area"), lr) > 25

@@ -100,29 +100,26 @@ def by_torch(lr: Tensor, weight: Tensor) -> Tensor:
     return images.quantize(out[0].permute(1, 2, 0))
 
 
-def test_onnx_computes_what_torch_computes_without_a_warning(network: Path, caplog) -> None:
+def test_onnx_computes_what_torch_computes_without_a_warning_and_shares_no_array(network: Path, caplog) -> None:
     lr = photo(20, 31)
     sr = Onnx(str(network))("view", lr, 4)
     assert not caplog.text
     assert sr.shape == (80, 124, 3)
     assert (sr - by_torch(lr, upscaling_weight())).abs().max() <= 1.001 / 255
     assert torch.equal(sr, images.quantize(sr))
-
-
-def test_a_real_network_has_no_seams(shared_data: Path) -> None:
-    path = str(shared_data / "sr_weights" / "span_x4.onnx")
-    lr = photo(70, 90)
-    assert psnr(Onnx(path, tile=80)("view", lr, 4), Onnx(path, tile=1000)("view", lr, 4)) > 60
-
-
-def test_no_array_is_shared_with_the_network(network: Path) -> None:
-    """OpenCV writes its output buffer again at the next run."""
+    # OpenCV writes its output buffer again at the next run.
     prior, lr = Onnx(str(network)), photo(8, 12)
     first = prior("a", lr, 4)
     kept = first.clone()
     prior("b", 1 - lr, 4)
     assert torch.equal(first, kept)
     assert not np.shares_memory(first.numpy(), prior("a", lr, 4).numpy())
+
+
+def test_a_real_network_has_no_seams(shared_data: Path) -> None:
+    path = str(shared_data / "sr_weights" / "span_x4.onnx")
+    lr = photo(70, 90)
+    assert psnr(Onnx(path, tile=80)("view", lr, 4), Onnx(path, tile=1000)("view", lr, 4)) > 60
 
 
 # ---- sR images are computed once per content, and computed again if the entry is damaged
