@@ -19,10 +19,15 @@ from clear_strategies.compose import CONF, composed
 from tests.helpers.pages import DOCS, HOOKS, OURS, PAGES, ROOT, loaded, name
 
 
-def test_the_public_api_lists_what_the_package_exports():
+def test_the_public_api_lists_what_the_package_exports_and_tests_that_the_paper_page_names_exist():
     """`test_what_a_page_names_exists` checks that what it lists exists."""
     listed = set(re.findall(r"`clear_strategies\.(\w+)`", (DOCS / "reference" / "public-api.md").read_text()))
     assert set(clear_strategies.__all__) - listed == {"ATTRIBUTES", "CONFLICT_GROUPS"}
+    equations = (DOCS / "explanation" / "paper.md").read_text().split("## Readings")[0]
+    named = set(re.findall(r"`(test_\w+)`", equations))
+    source = "".join(p.read_text() for p in (ROOT / "tests").rglob("test_*.py"))
+    assert named
+    assert not {test for test in named if f"def {test}(" not in source}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
@@ -97,14 +102,6 @@ def test_pages_that_the_code_names_exist():
 
 
 CONFIG = composed(["+strategy=clear"], "config")
-
-
-def test_every_test_that_the_paper_page_names_exists():
-    equations = (DOCS / "explanation" / "paper.md").read_text().split("## Readings")[0]
-    named = set(re.findall(r"`(test_\w+)`", equations))
-    source = "".join(p.read_text() for p in (ROOT / "tests").rglob("test_*.py"))
-    assert named
-    assert not {test for test in named if f"def {test}(" not in source}
 
 
 def test_config_fields_that_pages_name_exist():

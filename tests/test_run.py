@@ -69,7 +69,7 @@ def test_a_sweep_goes_on_after_a_bad_job(tmp_path):
     assert len(list(tmp_path.glob("multirun/*/*/metrics.json"))) == 1
 
 
-def test_a_strategy_of_another_package(tmp_path):
+def test_a_strategy_of_another_package_trains_and_the_package_itself_is_the_command_line(tmp_path):
     (tmp_path / "theirs.py").write_text(
         "from dataclasses import dataclass\n"
         "from clear_strategies import Strategy\n\n\n"
@@ -84,6 +84,8 @@ def test_a_strategy_of_another_package(tmp_path):
     # `python -m` puts the current folder on the path, as a user expects.
     assert result.returncode == 0, result.stderr
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["strategies"] == ["p2g", "mine"]
+    result = run(cwd=tmp_path, module="clear_strategies")
+    assert (result.returncode, result.stdout.split()[0]) == (0, "clear-strategies")
 
 
 HEAVY = {"cv2", "scipy", "skimage", "kornia", "matplotlib", "pandas"}
@@ -140,11 +142,6 @@ def test_ctrl_c_while_data_is_prepared_is_one_line(tmp_path):
     process.send_signal(signal.SIGINT)
     assert process.wait() == 130, said.read_text()
     assert said.read_text() == "reading\nstopped by SIGINT before training began. Nothing was saved.\n"
-
-
-def test_the_package_itself_is_the_command_line(tmp_path):
-    result = run(cwd=tmp_path, module="clear_strategies")
-    assert (result.returncode, result.stdout.split()[0]) == (0, "clear-strategies")
 
 
 ENDINGS = {

@@ -115,7 +115,9 @@ def test_without_the_trainers_libraries_the_extra_is_named(monkeypatch):
 # ---- `clear-strategies doctor` says what is here, what is missing, and which backend draws something wrong
 
 
-def test_it_names_versions_memory_backends_and_missing_extras_with_what_they_add(capsys, monkeypatch):
+def test_doctor_names_versions_memory_backends_and_missing_extras_of_the_project_with_what_they_add(
+    capsys, monkeypatch
+):
     monkeypatch.setattr(doctor, "find_spec", lambda name: None if name == "pycolmap" else object())
     doctor.main([])
     said = capsys.readouterr().out
@@ -123,6 +125,8 @@ def test_it_names_versions_memory_backends_and_missing_extras_with_what_they_add
         assert word in said
     assert "torch                   works: differs from the reference by 0.0e+00" in said
     assert "poses for photos without any (data=photos): pip install 'clear-strategies[colmap]' (lacks pycolmap)" in said
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert set(doctor.EXTRAS) == set(extras) - {"photos", "docs", "dev"}
 
 
 def test_a_backend_that_draws_something_else_is_an_error(capsys, monkeypatch):
@@ -138,8 +142,3 @@ def test_a_backend_that_draws_something_else_is_an_error(capsys, monkeypatch):
     with pytest.raises(SettingError, match="torch draws something else than the reference"):
         doctor.main([])
     assert "WRONG" in capsys.readouterr().out
-
-
-def test_every_extra_is_one_of_the_projects():
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    assert set(doctor.EXTRAS) == set(extras) - {"photos", "docs", "dev"}

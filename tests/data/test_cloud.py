@@ -111,7 +111,7 @@ def test_a_given_file_is_read_and_refused_without_points(tmp_path: Path) -> None
         initial_points(chosen, [photo()])
 
 
-def test_auto_densifies_only_what_is_sparser_than_the_pixel_grid(tmp_path: Path) -> None:
+def test_auto_densifies_only_what_is_sparser_than_the_pixel_grid_after_outliers_are_removed(tmp_path: Path) -> None:
     view, file = photo(), tmp_path / "p.ply"
     for count, grows in ((390, True), (410, False)):  # the grid has 20 · 20 = 400
         write_points(file, *colored(torch.rand(count, 3) + torch.tensor([-0.5, -0.5, 5])))
@@ -119,9 +119,6 @@ def test_auto_densifies_only_what_is_sparser_than_the_pixel_grid(tmp_path: Path)
         assert (len(initial_points(chosen, [view]).cloud) > count) == grows
         assert len(initial_points(replace(chosen, densify=True), [view]).cloud) > count
         assert len(initial_points(replace(chosen, densify=False), [view]).cloud) == count
-
-
-def test_outliers_are_removed_before_densification(tmp_path: Path) -> None:
     stray = torch.cat((torch.rand(50, 3) * 0.1 + torch.tensor([0, 0, 5.0]), torch.tensor([[0, 0, 500.0]])))
     write_points(tmp_path / "p.ply", *colored(stray))
     chosen = CloudSettings(init="ply", path=str(tmp_path / "p.ply"))

@@ -37,13 +37,19 @@ def test_new_points_lie_on_the_plane_of_the_old_ones(a: float, b: float, stride:
     assert f"densified by {len(new):,}" in cloud.source
 
 
-def test_a_new_point_has_the_colour_of_its_pixel() -> None:
+def test_a_new_point_has_the_colour_of_its_pixel_and_without_points_in_view_there_is_none(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     view = photo()
     cloud = densify(cloud_of(torch.randn(50, 3) * 0.2 + torch.tensor([0, 0, 5.0])), [view], 1)
     pixels, _ = project(view.camera, cloud.means[50:])
     column, row = pixels.long().T
     assert torch.allclose(pixels - pixels.floor(), torch.full_like(pixels, 0.5), atol=1e-3)
     assert torch.allclose(cloud.colors[50:], view.image[row, column], atol=1e-4)
+    cloud = cloud_of(torch.tensor([[0.0, 0, -5]]).repeat(10, 1))
+    assert densify(cloud, [photo()], 2) is cloud
+    assert "only 0 points project into it" in caplog.text
+    assert "added no point" in caplog.text
 
 
 def test_points_behind_a_surface_do_not_bend_it_and_points_on_a_line_are_enough() -> None:
@@ -67,13 +73,6 @@ def test_the_background_and_what_a_mask_hides_get_no_points() -> None:
         assert len(new) == 10 * 40
         assert bool((project(view.camera, new)[0][:, 0] > 30).all())
     assert len(densify(points, [hiding, view], 1)) == 200 + 10 * 40 + 40 * 40
-
-
-def test_without_points_in_view_nothing_is_added_and_said(caplog: pytest.LogCaptureFixture) -> None:
-    cloud = cloud_of(torch.tensor([[0.0, 0, -5]]).repeat(10, 1))
-    assert densify(cloud, [photo()], 2) is cloud
-    assert "only 0 points project into it" in caplog.text
-    assert "added no point" in caplog.text
 
 
 # ---- outliers and voxels: small cases by hand

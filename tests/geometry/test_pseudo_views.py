@@ -78,7 +78,7 @@ def test_without_two_photos_with_depth_there_are_none_and_large_ones_are_reduced
     assert view.known.float().mean() > 0.5
 
 
-def test_a_depth_that_no_photo_vouches_for_gives_no_colour():
+def test_a_depth_that_no_photo_vouches_for_and_pixels_beside_the_background_give_no_colour():
     photos = plane(2)
     apart = {"0.png": depth_of(photos["0.png"], 4.0), "1.png": depth_of(photos["1.png"], 2.0)}
     view = views_of(photos, apart, reach=1e-6)[0]
@@ -90,9 +90,6 @@ def test_a_depth_that_no_photo_vouches_for_gives_no_colour():
     hidden = (pixels[:, 0] > 2) & (pixels[:, 0] < 118)
     assert hidden.any()
     assert error[hidden].median() < 0.02
-
-
-def test_pixels_beside_the_background_give_no_colour():
     right = torch.arange(120)[None, :, None] >= 60
     white = {name: Photo(p.camera, torch.where(right, 1.0, p.image)) for name, p in plane(2).items()}
     known, on_black = (views_of(white, reach=1e-6, background=color)[0].known for color in ((1.0,) * 3, (0.0,) * 3))

@@ -79,16 +79,13 @@ def test_one_tensor_is_a_list_of_photos_uint8_is_divided_by_255_and_depth_maps_a
     assert same(plane, Stereo(tuple(maps), plane.means, plane.colors, ""))
 
 
-def test_given_features_take_the_place_of_triangulated_ones() -> None:
+def test_given_features_take_the_place_of_triangulated_ones_and_the_background_gets_no_points() -> None:
     behind = torch.rand(30, 3, generator=torch.Generator().manual_seed(0)) * 0.1 - torch.tensor([0.0, 0, 5])
     given = reconstruct(plane_photos(3, 64, 48), features=(behind, torch.ones(30, 3)), fill=False)
     kept = (given.means[:, 2] < 0).nonzero()[:, 0]  # no photo sees them, so they stay
     assert len(kept) > 20
     assert (given.colors[kept] == 1).all()
     assert "filled" not in given.summary
-
-
-def test_pixels_of_the_background_get_no_points() -> None:
     photos = plane_photos(3, 64, 48)
     for photo in photos:
         photo.image[:10] = 1.0

@@ -32,12 +32,9 @@ def test_a_plane_is_found_where_it_is(count: int) -> None:
     assert torch.allclose(cloud.colors[inside], sample_colors(photos[0].image, pixels[inside]), atol=0.1)
 
 
-def test_a_point_seen_by_three_views_is_one_point() -> None:
+def test_a_point_seen_by_three_views_is_one_point_and_of_too_many_features_the_strongest_are_taken() -> None:
     pairwise = sum(len(triangulate([a, b])) for a, b in zip(plane_photos(3), plane_photos(3)[1:], strict=False))
     assert len(triangulate(plane_photos(3))) < pairwise
-
-
-def test_of_too_many_features_the_strongest_are_taken() -> None:
     photo = plane_photos(1)[0]
     every = sift.find_features(photo, TriangulationSettings(max_features=None))
     some = sift.find_features(photo, TriangulationSettings(max_features=50))

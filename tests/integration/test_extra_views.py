@@ -102,11 +102,18 @@ def stepped(make, scaler=None):
     return trainer.splats, clear.attachment.counts["extra views"]
 
 
-def test_an_adam_of_all_parameters_makes_one_extra_step():
+def test_an_adam_of_all_parameters_makes_one_extra_step_which_a_scaler_of_losses_leaves_as_it_is():
     one = stepped(lambda splats: dict.fromkeys(splats, torch.optim.Adam(list(splats.values()))))
     each = stepped(lambda splats: {name: torch.optim.Adam([p]) for name, p in splats.items()})
     assert one[1] == each[1] == 1
     assert all(torch.equal(p, one[0][name]) for name, p in each[0].items())
+
+    def fused(splats):
+        return {name: torch.optim.Adam([p], eps=1e-15, fused=True) for name, p in splats.items()}
+
+    scaled, plain = stepped(fused, torch.amp.GradScaler("cpu", init_scale=1024.0)), stepped(fused)
+    for name, p in plain[0].items():
+        assert torch.allclose(p, scaled[0][name], rtol=0, atol=1e-6), name
 
 
 def test_extra_views_that_no_optimizer_steps_on_give_a_warning(caplog):
@@ -118,15 +125,6 @@ def test_extra_views_that_no_optimizer_steps_on_give_a_warning(caplog):
         unknown.step()
     assert caplog.text.count("extra views have no effect") == 1
     assert clear.attachment.counts["extra views"] == 0
-
-
-def test_a_scaler_of_losses_leaves_the_extra_step_of_a_fused_adam_as_it_is():
-    def fused(splats):
-        return {name: torch.optim.Adam([p], eps=1e-15, fused=True) for name, p in splats.items()}
-
-    scaled, plain = stepped(fused, torch.amp.GradScaler("cpu", init_scale=1024.0)), stepped(fused)
-    for name, p in plain[0].items():
-        assert torch.allclose(p, scaled[0][name], rtol=0, atol=1e-6), name
 
 
 def test_an_inria_style_host_draws_any_camera(inria_host, inria_capture, drawn):

@@ -62,11 +62,18 @@ def test_as_many_pass_as_by_the_ordinary_statistic_and_in_the_scores_order(seed,
     assert set((scaled >= 5e-4).nonzero()[:, 0].tolist()) == set(score.argsort(descending=True)[:passing].tolist())
 
 
-def test_none_passes_where_none_passes_by_the_ordinary_statistic_or_has_a_score():
+def test_none_passes_without_a_score_and_absolute_gradients_decide_how_many_pass_with_one():
     scaled = ScoreScaler(threshold=1.0)(torch.rand(20) * 100, torch.rand(20) * 0.5, everyone(20))
     assert float(scaled.max()) < 1
     zeros = torch.zeros(5)
     assert torch.equal(ScoreScaler(threshold=1.0)(zeros, torch.ones(5) * 2, everyone(5)), zeros)
+    tensor = torch.zeros(1, 4, 2)
+    tensor.absgrad = torch.tensor([[[8.0, 0.0], [6.0, 0.0], [1.0, 0.0], [0.0, 0.0]]])  # 2x2 pixels: the same in NDC
+    slot = ScreenGradientSlot(tensor, (2, 2))
+    ordinary, score = torch.full((4,), 0.1), torch.tensor([0.4, 0.1, 0.3, 0.2])
+    assert score_for_host(slot, ordinary, ordinary, everyone(4), ScoreScaler(5.0)) is None
+    written = score_for_host(slot, score, ordinary, everyone(4), ScoreScaler(5.0))
+    assert (written >= 5).tolist() == [True, False, True, False]  # two pass, as by 8 and 6
 
 
 def test_the_factor_follows_recent_views_restarts_with_another_number_of_gaussians_and_is_restored():
@@ -88,16 +95,6 @@ def test_the_factor_follows_recent_views_restarts_with_another_number_of_gaussia
     ]
     assert torch.equal(*last)
     assert resumed.factor != 1
-
-
-def test_absolute_gradients_stay_without_a_score_and_decide_how_many_pass_with_one():
-    tensor = torch.zeros(1, 4, 2)
-    tensor.absgrad = torch.tensor([[[8.0, 0.0], [6.0, 0.0], [1.0, 0.0], [0.0, 0.0]]])  # 2x2 pixels: the same in NDC
-    slot = ScreenGradientSlot(tensor, (2, 2))
-    ordinary, score = torch.full((4,), 0.1), torch.tensor([0.4, 0.1, 0.3, 0.2])
-    assert score_for_host(slot, ordinary, ordinary, everyone(4), ScoreScaler(5.0)) is None
-    written = score_for_host(slot, score, ordinary, everyone(4), ScoreScaler(5.0))
-    assert (written >= 5).tolist() == [True, False, True, False]  # two pass, as by 8 and 6
 
 
 # ---- a 3DGS-style loop

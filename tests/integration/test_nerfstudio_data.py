@@ -71,16 +71,13 @@ def test_views_are_the_photos_that_splatfacto_trains_on():
         assert view.hr.image.shape == (64, 96, 3)
 
 
-def test_sr_images_are_found_by_the_photos_stem(tmp_path):
+def test_the_sr_setting_chooses_the_prior_and_sr_images_are_found_by_the_photos_stem(tmp_path):
     for i in range(3):
         write_png(tmp_path / f"{i}.png", torch.full((64, 96, 3), 0.2 * i))
     for i, view in enumerate(views_from_datamanager(DataManager(), prior(tmp_path), 4)):
         assert view.hr.image.unique().tolist() == pytest.approx([0.2 * i])
     with pytest.raises(DataError, match="is 96x64 where 48x32 is expected"):
         views_from_datamanager(DataManager(), prior(tmp_path), 2)
-
-
-def test_the_sr_setting_chooses_the_prior(tmp_path):
     assert isinstance(prior(None), Bicubic)
     assert isinstance(prior(tmp_path), Images)
     assert isinstance(prior(tmp_path / "span.ONNX"), Cached)

@@ -53,13 +53,10 @@ def test_a_hosts_masks_that_hide_everything_are_refused(level):
         gsplat_host.started(host=gsplat_host.Host(scene), scene=replace(scene, train=tuple(hidden)))
 
 
-def test_an_sr_image_may_overshoot_but_not_have_other_values():
+def test_sr_images_and_reduced_photos_may_overshoot_but_not_have_other_values():
     assert float(of_host(sr=lambda *a: torch.full((64, 96, 3), 1.03)).hr.image.max()) == 1
     with pytest.raises(DataError, match=r"SR image: must lie in \[0, 1\], has values from 200 to 200"):
         of_host(sr=lambda *a: torch.full((64, 96, 3), 200.0))
-
-
-def test_a_photo_that_overshoots_since_it_was_reduced_is_compared_in_its_range():
     sharp = of_host(image=1.1 * PHOTO.image - 0.03)
     assert float(sharp.lr.image.min()) >= 0
     P2G(patch=4).patch_maps(sharp)

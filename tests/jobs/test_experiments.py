@@ -193,7 +193,7 @@ def test_the_protocols_are_the_papers():
 HORNS = ("experiment=llff_x4", "data.root=here", "data.scene=horns")
 
 
-def test_the_command_line_takes_the_place_of_what_an_experiment_sweeps():
+def test_the_command_line_takes_the_place_of_what_an_experiment_sweeps_and_each_job_has_its_folder():
     (one,), composed_job = jobs(*HORNS, "fit.seed=7", "+strategy=[gco,p2g]")
     c = composed_job(one)
     assert (c.data.scene, c.fit.seed, list(c.strategies)) == ("horns", 7, ["gco", "p2g"])
@@ -202,16 +202,6 @@ def test_the_command_line_takes_the_place_of_what_an_experiment_sweeps():
         c = composed_job(job)
         assert (c.method, list(c.strategies)) == (method, strategies)
         assert c.hydra.sweep.subdir == f"+method={method},data.scene=horns,fit.seed=0"
-
-
-@pytest.mark.parametrize("rows", ["+strategy=clear", "+method=srgs"])
-def test_a_setting_that_changes_no_result_changes_no_folders_name(rows):
-    for more in ((), [f"{key}=1" for key in sorted(CHANGES_NO_RESULT)]):
-        (one,), composed_job = jobs(*HORNS, "fit.seed=0", rows, *more)
-        assert composed_job(one).hydra.sweep.subdir == f"{rows},data.scene=horns,fit.seed=0"
-
-
-def test_each_job_has_a_folder_of_its_own_whatever_path_or_number_of_settings_names_it():
     asked = ["experiment=leave_one_out", "~protocol", "fit.seed=0", "data=llff", "data.path=../../scenes/fern"]
     asked += [f"objective.lambda_hr.{name}=1.0" for name in ("peak", "final")]
     fields = ("start", "stop", "every", "statistics_from", "reset_every", "max_gaussians")
@@ -222,6 +212,13 @@ def test_each_job_has_a_folder_of_its_own_whatever_path_or_number_of_settings_na
         for job, name in zip(found, names, strict=True):
             assert name.startswith(f"+strategy={job['+strategy']},data.path=.._.._scenes_fern,")
             assert len(name.encode()) <= 255
+
+
+@pytest.mark.parametrize("rows", ["+strategy=clear", "+method=srgs"])
+def test_a_setting_that_changes_no_result_changes_no_folders_name(rows):
+    for more in ((), [f"{key}=1" for key in sorted(CHANGES_NO_RESULT)]):
+        (one,), composed_job = jobs(*HORNS, "fit.seed=0", rows, *more)
+        assert composed_job(one).hydra.sweep.subdir == f"{rows},data.scene=horns,fit.seed=0"
 
 
 @pytest.mark.slow

@@ -51,16 +51,13 @@ def test_a_run_is_drawn_over_the_background_of_its_photos(saved_run, tmp_path):
     assert torch.equal(open_splat(folder).painter.color(CAMERA), white)
 
 
-def test_a_ply_file_of_3dgs_is_drawn_with_its_blur(saved_run, tmp_path):
+def test_a_ply_file_of_3dgs_and_of_a_run_without_compensation_is_drawn_with_its_blur(saved_run, tmp_path):
     folder, _ = saved_run
     content = (folder / "point_cloud.ply").read_bytes()
     (tmp_path / "a.ply").write_bytes(content.replace(b"comment SplatRenderMode: mip\n", b""))
     plain, mip = (open_splat(path, "torch").painter for path in (tmp_path / "a.ply", folder / "point_cloud.ply"))
     rasterizer = rasterizers.load("torch", kernel=0.3, antialiased=False)
     assert torch.equal(plain.color(CAMERA), mip.field.render(rasterizer, CAMERA).clamp(0, 1))
-
-
-def test_a_run_without_compensation_has_a_ply_file_that_says_so(saved_run, tmp_path):
     _, field = saved_run
     export_ply(tmp_path / "run" / "point_cloud.ply", field, antialiased=False)
     export.main([str(tmp_path / "run"), "--out", str(tmp_path / "again.ply")])

@@ -232,11 +232,15 @@ def test_hr_is_wanted_only_while_it_has_a_use():
     assert not any(never.wants_hr(t) for t in range(0, 10_000, 100))
 
 
-def test_conflict_is_measured_before_correction_and_for_the_baseline_too(drawn):
+def test_conflict_is_measured_before_correction_and_what_was_logged_belongs_to_its_iteration(drawn):
     plain, corrected = (updated(drawn, *strategies).conflict for strategies in ((), (GCO(),)))
     assert plain == corrected
     assert set(plain) == {"means", "sh0", "shN", "opacities", "scales", "quats", "gaussian"}
     assert 0 < max(plain.values()) < 1
+    field, view, lr, hr = drawn
+    conductor = Conductor(P2G(), objective=Objective(lambda_hr=ALWAYS))
+    assert "mean_q" in conductor.update(field.raw(), lr, hr, view, 5).logs
+    assert not conductor.update(field.raw(), lr, None, view, 6).logs
 
 
 def test_two_strategies_of_one_class_keep_their_states_apart():
@@ -255,10 +259,3 @@ def test_two_strategies_of_one_class_keep_their_states_apart():
     second = Conductor(Remember(1.0), Remember(2.0))
     second.load_state_dict(first.state_dict())
     assert [s.state["kept"][0].item() for s in second.strategies] == [1.0, 2.0]
-
-
-def test_what_a_strategy_logged_belongs_to_its_iteration(drawn):
-    field, view, lr, hr = drawn
-    conductor = Conductor(P2G(), objective=Objective(lambda_hr=ALWAYS))
-    assert "mean_q" in conductor.update(field.raw(), lr, hr, view, 5).logs
-    assert not conductor.update(field.raw(), lr, None, view, 6).logs

@@ -73,7 +73,7 @@ def test_making_maps_does_not_change_the_run() -> None:
     assert state.conductor.work_log.entries == entries
 
 
-def test_patch_maps_are_p2gs_evidence_enlarged_to_hr() -> None:
+def test_patch_maps_are_p2gs_evidence_enlarged_to_hr_and_conflict_is_the_ratio_that_training_logs() -> None:
     p2g = P2G(patch=8, reliability_scale=0.02)
     state = trained(p2g)
     maps = maps_of(state).maps
@@ -82,9 +82,6 @@ def test_patch_maps_are_p2gs_evidence_enlarged_to_hr() -> None:
     assert maps["reliability"][31, 32] == R[0, 1]  # patches of 32 HR pixels
     assert maps["demand"][32, 95] == A[1, 2]
     assert torch.equal(maps["weight"], maps["reliability"] * maps["demand"])
-
-
-def test_conflict_is_the_ratio_that_training_logs() -> None:
     state = trained()
     view, found = state.views[0], maps_of(state)
     lr, hr = state.field.render_scales(toy.RASTERIZER, view)

@@ -248,11 +248,10 @@ def assert_ranked(*scores: ImageScores) -> None:
         assert abs(better.blur) < abs(worse.blur)
 
 
-def test_all_four_rank_truth_then_x2_then_x4_then_x8(photograph: Tensor) -> None:
+def test_all_four_rank_by_sharpness_and_blur_and_gmsd_tell_blur_texture_and_displacement_apart(
+    photograph: Tensor,
+) -> None:
     assert_ranked(*(score(enlarged(photograph, factor), photograph) for factor in (1, 2, 4, 8)))
-
-
-def test_blur_and_gmsd_tell_blur_invented_texture_and_displaced_structure_apart(photograph: Tensor) -> None:
     blurred, texture = enlarged(photograph, 4), noise(0, 256, 256) - 0.5
     of_blurred, of_both = score(blurred, photograph), score(blurred + 0.15 * texture, photograph)
     assert of_blurred.blur > 0.1

@@ -60,12 +60,9 @@ def row(name: str, seed: int, *, truth: bool = True, size: tuple[int, int] = (40
     return SheetRow(name, shown, {"ours": "20.00 dB, SSIM 0.500"})
 
 
-def test_huge_images_are_reduced_and_dollars_in_names_are_no_mathematics(tmp_path: Path) -> None:
+def test_huge_images_are_reduced_and_truth_and_error_are_shown_where_they_are_known(tmp_path: Path) -> None:
     write_contact_sheet(tmp_path / "sheet.png", [row("a$1_$.png", 0, size=(90, 2000))], "scan $20_$")
     assert read(tmp_path / "sheet.png").shape[1] < 4 * 700
-
-
-def test_truth_and_error_are_shown_where_they_are_known(tmp_path: Path) -> None:
     unknown, a, b = row("a", 0, truth=False), row("a", 0), row("b", 10)
     for name, rows in {"none": [unknown], "some": [unknown, b], "all": [a, b]}.items():
         write_contact_sheet(tmp_path / f"{name}.png", rows, "scene")

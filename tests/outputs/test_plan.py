@@ -97,13 +97,21 @@ def test_of_progress_that_goes_to_a_file_a_twentieth_is_a_line_and_jumps_are_fol
 # ---- provenance holds what can be found out, and never fails
 
 
-def test_provenance_holds_versions_machine_and_the_facts_of_the_run() -> None:
+def test_provenance_holds_versions_of_what_is_installed_machine_and_the_facts_of_the_run(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     found = provenance(seed=3, backend="torch")
     assert torch.__version__.startswith(found["versions"]["torch"])  # which leaves out +cu130 in PyPI's wheel
     assert found["threads"] == torch.get_num_threads()
     assert (found["seed"], found["backend"]) == (3, "torch")
     assert found["date"].endswith("+00:00")
     assert json.loads(json.dumps(found)) == found
+
+    def absent(name: str) -> str:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "version", absent)
+    assert provenance()["versions"] == {"clear-strategies": "source checkout"}
 
 
 @pytest.mark.parametrize("failure", [FileNotFoundError("git"), subprocess.TimeoutExpired("git", 10)])
@@ -113,14 +121,6 @@ def test_without_git_the_commit_is_unknown(monkeypatch: pytest.MonkeyPatch, fail
 
     monkeypatch.setattr(subprocess, "run", fails)
     assert provenance()["git"] in {"unknown", "no checkout"}
-
-
-def test_a_package_that_is_not_installed_is_not_listed(monkeypatch: pytest.MonkeyPatch) -> None:
-    def absent(name: str) -> str:
-        raise metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr(metadata, "version", absent)
-    assert provenance()["versions"] == {"clear-strategies": "source checkout"}
 
 
 def test_a_run_is_called_as_on_the_command_line() -> None:

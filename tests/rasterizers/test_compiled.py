@@ -175,24 +175,26 @@ def test_scales_drawn_together_equal_scales_drawn_alone(backend, depths, factor)
 
 
 @backends()
-def test_jobs_that_share_nothing_are_drawn_alone(backend):
+def test_jobs_that_share_nothing_are_drawn_alone_and_images_stay_valid_while_later_ones_are_drawn(backend):
     a, b, view = scene(50, seed=1), scene(50, seed=2), camera()
     for rendering, job in zip(backend().render_scales([(a, view), (b, view)]), (a, b), strict=True):
         assert torch.equal(rendering.image, backend()(job, view).image)
+    splats, view = scene(3000), camera(200, 150)
+    kept = backend()(splats, view).image
+    before = kept.clone()
+    for _ in range(5):
+        backend()(splats, view).vjp(cotangents(1, 150, 200))
+    assert torch.equal(kept, before)
 
 
 @backends()
-def test_equal_depths_are_ordered_by_index(backend):
+def test_equal_depths_are_ordered_by_index_and_long_lists_are_blended_to_the_end(backend):
     # With all Gaussians at one depth, the image follows the order of their indices.
     splats, view = scene(64), camera(32, 32)
     flat = replace(splats, means=torch.cat((splats.means[:, :2], torch.full((64, 1), 5.0)), dim=1))
     require_image(backend()(flat, view).image, ReferenceRasterizer()(to(flat, torch.float64), view).image)
     reverse = torch.arange(63, -1, -1)
     assert not torch.equal(backend()(select(flat, reverse), view).image, backend()(flat, view).image)
-
-
-@backends()
-def test_lists_longer_than_a_segment_are_blended_to_the_end(backend):
     # More Gaussians over a tile than a buffer holds (cpp: 2048), most of them faint, so that no pixel ends early.
     splats, view = scene(5000, bands=0, seed=3), camera(33, 31)
     faint = replace(splats, opacities=splats.opacities * 0.02)
@@ -231,16 +233,6 @@ def test_tensors_of_any_layout_are_drawn_like_copies(backend, layout):
     for name in (name for name in ATTRIBUTES if name != "screen"):
         other = replace(splats, **{name: layout(getattr(splats, name))})
         require_same_bits(everything(backend()(other, view), v), expected)
-
-
-@backends()
-def test_an_image_stays_valid_while_later_ones_are_drawn(backend):
-    splats, view = scene(3000), camera(200, 150)
-    kept = backend()(splats, view).image
-    before = kept.clone()
-    for _ in range(5):
-        backend()(splats, view).vjp(cotangents(1, 150, 200))
-    assert torch.equal(kept, before)
 
 
 @backends()

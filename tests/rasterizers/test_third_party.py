@@ -87,16 +87,13 @@ def test_it_passes_the_checks_that_need_no_other_cut_offs(check):
     check(gsplat)
 
 
-def test_settings_centres_and_visible_gaussians_are_those_of_the_underlying_rasterizer():
+def test_settings_centres_and_refusals_are_those_of_the_underlying_rasterizer():
     settings = {"background": (0.2, 0.5, 0.9), "kernel": 0.3, "antialiased": False}
     splats = replace(scene(60), rgb_offset=None)
     found, expected = (make(**settings)(splats, camera()) for make in (gsplat, ReferenceRasterizer))
     assert torch.allclose(found.image, expected.image, rtol=1e-4, atol=1e-5)
     assert torch.allclose(found.means2d, expected.means2d, atol=1e-4)
     assert torch.equal(found.visible, expected.visible)
-
-
-def test_bad_input_is_refused_with_the_messages_of_every_backend():
     splats = scene(10)
     with pytest.raises(ValueError, match="cotangents must be"):
         gsplat()(splats, camera(48, 32)).vjp(torch.zeros(1, 48, 32, 3))

@@ -58,11 +58,6 @@ def test_the_page_shows_every_table_note_and_picture_as_text_and_refers_to_files
     assert not re.search("http:|https:|<script", page)
 
 
-def test_scenes_whose_names_differ_by_a_sign_or_are_long_have_pictures_of_their_own() -> None:
-    names = report._file_names(("room 1", "room-1", 200 * "ω", "…", "room 1"))
-    assert list(names.values()) == ["room_1", "room_1_", 60 * "ω", "scene"]
-
-
 def test_runs_without_images_or_history_are_still_in_the_table(tmp_path, caplog):
     run = make_run(tmp_path / "0", "+strategy=gco")
     (run / "history.csv").write_text("t,psnr_test\n1,oops\n")
@@ -266,14 +261,11 @@ def test_a_run_is_named_by_its_strategies_as_given_on_the_command_line(tmp_path,
     assert (run.name, run.settings) == (name, ())
 
 
-def test_runs_of_a_sweep_are_in_the_order_of_their_jobs(tmp_path: Path) -> None:
+def test_runs_of_a_sweep_are_in_the_order_of_their_jobs_and_linked_ones_count_once(tmp_path: Path) -> None:
     for number, name in ((2, "a_clear"), (10, "b_more"), (0, "z_baseline")):
         folder = make_run(tmp_path / name, f"+strategy={name[2:]}")
         files.write_text(folder / ".hydra" / "hydra.yaml", f"hydra:\n  job:\n    num: {number}\n")
     assert [run.name for run in report.collect([tmp_path])] == ["baseline", "clear", "more"]
-
-
-def test_runs_that_are_linked_into_a_folder_belong_to_it_and_count_once(tmp_path: Path) -> None:
     runs = tmp_path / "runs"
     ours = make_run(runs / "ours", "+strategy=gco")
     (runs / "latest").symlink_to(ours)

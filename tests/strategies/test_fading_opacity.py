@@ -25,15 +25,12 @@ def faded(settings, t=1, views=3, opacities=LOGITS):
     return params
 
 
-def test_every_opacity_loses_the_same_share_and_nothing_else_changes():
+def test_every_opacity_loses_the_same_share_but_one_that_no_renderer_draws_so_that_logits_stay_finite():
     params = faded(FadingOpacity(rate=0.02))
     visible = LOGITS > -11.5
     expected = LOGITS.double().sigmoid() * 0.98
     assert torch.allclose(params["opacities"].double().sigmoid()[visible], expected[visible], rtol=1e-6)
     assert torch.equal(params["means"], torch.ones(len(LOGITS), 3))
-
-
-def test_an_opacity_that_no_renderer_draws_stays_as_it_is_so_that_logits_stay_finite():
     params = {"opacities": torch.tensor([-200.0, -11.6, 2.0])}
     strategy = FadingOpacity(rate=0.5)
     strategy.on_fit_start(3, seed=0)

@@ -33,12 +33,14 @@ def test_reliability_worked_out_by_hand():
     assert R[0].tolist() == pytest.approx([math.exp(-1), 1.0], rel=1e-5)
 
 
-def test_a_relative_scale_counts_in_the_views_own_disagreement():
+def test_a_relative_scale_counts_in_the_views_own_disagreement_and_eight_bit_units_are_refused():
     # 0.05 in the left half, 0 in the right: 0.025 on average; twice that is 0.05 again.
     lr, hr = torch.full((16, 32, 3), 0.4), torch.full((64, 128, 3), 0.4)
     hr[:, :64] += 0.05
     relative, absolute = (P2G(r, down="area").patch_evidence(lr, hr, 4)[0] for r in ("relative:2", 0.05))
     assert torch.allclose(relative, absolute, rtol=1e-5)
+    with pytest.raises(ValueError, match=r"I_HR must lie in \[0, 1\]"):
+        P2G().patch_evidence(torch.rand(16, 16, 3), 255 * torch.rand(64, 64, 3), 4)
 
 
 def test_one_textured_patch_of_a_flat_image_demands_everything():
@@ -53,11 +55,6 @@ def test_a_patch_with_the_mean_detail_demands_one_half():
     noise = torch.rand(128, 128, 3, generator=torch.Generator().manual_seed(0))
     _, A = P2G().patch_evidence(images.downsample(noise, 4), noise, 4)
     assert torch.allclose(A, torch.full_like(A, 0.5), atol=0.03)
-
-
-def test_images_in_eight_bit_units_are_refused():
-    with pytest.raises(ValueError, match=r"I_HR must lie in \[0, 1\]"):
-        P2G().patch_evidence(torch.rand(16, 16, 3), 255 * torch.rand(64, 64, 3), 4)
 
 
 def test_lifting_takes_the_patch_of_the_centre_and_the_border_outside():

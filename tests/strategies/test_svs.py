@@ -93,7 +93,7 @@ def test_anchor_pulls_back_with_twice_the_weighted_distance():
     assert torch.allclose(g["opacities"], torch.full((20,), 2 * 0.01 * 0.1 * 0.3), atol=1e-7)
 
 
-def test_anchored_positions_do_not_depend_on_the_unit_of_the_world():
+def test_anchored_positions_do_not_depend_on_the_unit_of_the_world_and_the_mean_divides_by_the_number():
     for unit in (1.0, 1000.0):
         svs = started(anchor_start=1, anchor_strength=0.01, anchor_weights=PAPER_WEIGHTS)
         theta = params()
@@ -104,9 +104,6 @@ def test_anchored_positions_do_not_depend_on_the_unit_of_the_world():
         if unit == 1.0:
             expected = vjp
     assert torch.allclose(vjp, expected, rtol=1e-4)
-
-
-def test_the_mean_reading_divides_by_the_number_of_gaussians():
     pulls = []
     for reduction in ("sum", "mean"):
         svs = started(anchor_start=1, anchor_strength=0.01, anchor_weights=PAPER_WEIGHTS, reduction=reduction)

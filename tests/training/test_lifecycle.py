@@ -81,7 +81,7 @@ def test_every_tensor_follows_its_gaussian(chosen, large, faint):
     assert torch.bincount(parents, minlength=12).tolist() == expected
 
 
-def test_split_children_are_smaller_and_lie_inside_their_parent_and_clones_are_copies():
+def test_split_children_lie_inside_their_parent_clones_are_copies_and_the_score_picks_as_many_as_the_rule():
     field, optimizer, density = tagged(2)
     field.scales.data[:] = torch.tensor([[0.5, 0.5, 0.5], [0.001, 0.001, 0.001]]).log()
     density.score[:] = density.ordinary[:] = 1.0
@@ -94,9 +94,6 @@ def test_split_children_are_smaller_and_lie_inside_their_parent_and_clones_are_c
     offset = (field.means.data[2:] - means[0]).norm(dim=1)
     assert ((offset > 0) & (offset < 0.5 * 6)).all()
     assert not torch.equal(field.means.data[2], field.means.data[3])
-
-
-def test_quantile_mode_picks_as_many_as_the_ordinary_rule_but_by_score():
     field, optimizer, density = tagged()
     density.count[:] = 1
     density.ordinary[:3] = 1.0  # three pass the threshold
@@ -115,7 +112,7 @@ def test_the_cap_binds_and_is_said(caplog):
     assert "the cap of 14 Gaussians binds: 12 want to densify, 2 may" in caplog.text
 
 
-def test_statistics_are_means_over_the_views_that_saw_a_gaussian():
+def test_statistics_are_means_over_the_views_that_saw_a_gaussian_and_at_least_ten_rounds_fit():
     density = Density(DensitySettings(start=0, stop=100, statistics_from=0), 3, extent=1.0, seed=0)
 
     seen = StubShot(torch.zeros(2, 2, 3), torch.zeros(3, 2), torch.tensor([True, True, False]), [])
@@ -126,9 +123,6 @@ def test_statistics_are_means_over_the_views_that_saw_a_gaussian():
     density.accumulate(Update(toy.step(), Grads(), torch.full((3,), 8.0), torch.zeros(3)), seen, 6)
     assert (density.score / density.count.clamp_min(1)).tolist() == pytest.approx([4, 2, 0])
     assert density.count.tolist() == [3, 2, 0]
-
-
-def test_rounds_fall_inside_the_window_and_at_least_ten_fit():
     settings = DensitySettings(start=50, stop=500)
     assert settings.interval == 45
     density = Density(settings, 1, extent=1.0, seed=0)

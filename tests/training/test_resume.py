@@ -78,7 +78,7 @@ def _assert_that_everything_happened(state: TrainState, names: tuple[str, ...], 
         assert any(row.get("mean_q", 0) > 0 for row in state.history)
 
 
-def test_the_same_seed_is_the_same_run_and_another_is_not():
+def test_the_same_seed_is_the_same_run_and_after_a_reset_of_opacities_nobody_looks_at_test_views():
     runs = []
     for seed in (5, 5, 6):
         state = start(("gco", "p2g", "svs"))
@@ -87,9 +87,6 @@ def test_the_same_seed_is_the_same_run_and_another_is_not():
         runs.append(tensors(state))
     assert all(torch.equal(runs[0][name], runs[1][name]) for name in runs[0])
     assert any(runs[0][n].shape != runs[2][n].shape or not torch.equal(runs[0][n], runs[2][n]) for n in runs[0])
-
-
-def test_nobody_looks_at_the_test_views_when_opacities_were_just_reset():
     state = start(())
     state.settings = FitSettings(iterations=13, scale_schedule=False, probe_every=3, checkpoint_every=0, seed=5)
     fit(state, SCENE, toy.RASTERIZER)

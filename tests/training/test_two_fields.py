@@ -115,7 +115,7 @@ def field_of(opacities: list[float]) -> tuple[GaussianField, Adam]:
     return theta, Adam(theta.raw(), LearningRates(), extent=1.0)
 
 
-def test_an_opaque_gaussian_becomes_six_thinner_ones_around_it():
+def test_an_opaque_gaussian_becomes_six_thinner_ones_once_and_the_cap_leaves_the_most_opaque():
     theta, optimizer = field_of([0.3, 0.84, 0.4])
     density, parents = AT_10.densifier(3, extent=1.0, seed=0, white_background=False), []
     before = theta.means.data.clone()
@@ -128,9 +128,6 @@ def test_an_opaque_gaussian_becomes_six_thinner_ones_around_it():
     assert torch.allclose(theta.opacities.data[2:].sigmoid(), torch.tensor(0.6))  # two of them are as opaque as one was
     assert len(density.score) == len(theta) == 8
     assert density.second_stage == 11
-
-
-def test_the_cap_leaves_the_most_opaque_and_a_resumed_run_does_not_split_again():
     theta, optimizer = field_of([0.6, 0.7, 0.9, 0.8])
     settings = ShuffleSettings(start=20, stop=20, split_at=10, min_gaussians=1, max_gaussians=14)
     density, parents = settings.densifier(4, extent=1.0, seed=0, white_background=False), []

@@ -25,7 +25,9 @@ from tests.helpers.networks import Counting, onnx_bytes, photo, psnr, upscaling_
 # ---- what holds for several priors: paths, missing models, and the quality of real networks on a real photo
 
 
-def test_real_networks_do_on_fern_what_is_known_of_them(shared_data: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_real_networks_do_on_fern_what_is_known_of_them_without_seams(
+    shared_data: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """504x376 from 126x94, a training view."""
     weights, photos = shared_data / "sr_weights", sorted((shared_data / "fern" / "images_4").iterdir())
     hr = images.downsample(images.crop_to_multiple(read_image(photos[10]), 8), 2)[:376, :504]
@@ -38,6 +40,9 @@ def test_real_networks_do_on_fern_what_is_known_of_them(shared_data: Path, caplo
     found = {prior: psnr(prior("fern", lr, 4), hr) for prior in expected}
     assert found == pytest.approx(expected, abs=0.03)
     assert not [record for record in caplog.records if record.levelno > logging.INFO]
+    path = str(shared_data / "sr_weights" / "span_x4.onnx")
+    lr = photo(70, 90)
+    assert psnr(Onnx(path, tile=80)("view", lr, 4), Onnx(path, tile=1000)("view", lr, 4)) > 60
 
 
 @pytest.mark.parametrize(
@@ -114,12 +119,6 @@ def test_onnx_computes_what_torch_computes_without_a_warning_and_shares_no_array
     prior("b", 1 - lr, 4)
     assert torch.equal(first, kept)
     assert not np.shares_memory(first.numpy(), prior("a", lr, 4).numpy())
-
-
-def test_a_real_network_has_no_seams(shared_data: Path) -> None:
-    path = str(shared_data / "sr_weights" / "span_x4.onnx")
-    lr = photo(70, 90)
-    assert psnr(Onnx(path, tile=80)("view", lr, 4), Onnx(path, tile=1000)("view", lr, 4)) > 60
 
 
 # ---- sR images are computed once per content, and computed again if the entry is damaged

@@ -198,15 +198,12 @@ def test_one_known_pixel_is_the_depth_of_all_of_a_photo_of_any_size() -> None:
 # ---- the cost volume and its smoothing
 
 
-def test_the_better_half_of_the_other_photos_decides() -> None:
+def test_the_better_half_of_the_photos_decides_and_the_true_plane_costs_next_to_nothing() -> None:
     first, second, third = (Grey(p.camera, p.image.mean(2)) for p in plane_photos(3))
     planes = torch.tensor([1 / 8, 1 / 4, 1 / 3])
     each = torch.stack([cost_volume(first, [other], planes, 5) for other in (second, third, first, third)])
     found = cost_volume(first, [second, third, first, third], planes, 5)
     assert torch.allclose(found, each.sort(0).values[:2].mean(0))
-
-
-def test_the_true_plane_costs_next_to_nothing_whatever_the_brightness() -> None:
     first, second = (Grey(p.camera, p.image.mean(2)) for p in plane_photos(2))
     planes = torch.tensor([1 / 8, 1 / 4, 1 / 3])
     for image in (second.image, 0.5 * second.image + 0.2):
