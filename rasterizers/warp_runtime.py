@@ -11,7 +11,7 @@ import math
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from functools import cache, lru_cache
+from functools import cache
 from itertools import pairwise
 from struct import Struct
 from typing import Any, Final
@@ -82,64 +82,92 @@ class _Launch:
 
         wp.init()
         self.command = wp.Launch(kernel, wp.device_from_torch(device), block_dim=block)
+        self.on_cuda = device.type == "cuda"
         self.size: tuple[int, ...] = ()
+        self.bounds: dict[tuple[int, ...], Any] = {}  # Warp's description of a size, for the sizes so far
+        # By argument: for an array its kind, and the structures of the shapes it had, of which only the address changes.
         kinds = [argument.type for argument in kernel.adj.args]
-        self.arrays = [_Described(kind) if wp.types.is_array(kind) else None for kind in kinds]
+        self.arrays: list[tuple[Any, dict[Any, Any]] | None] = [
+            (kind, {}) if wp.types.is_array(kind) else None for kind in kinds
+        ]
 
     def __call__(self, size: tuple[int, ...], arguments: Sequence[Any]) -> None:
         command = self.command
+        params = command.params  # the bounds, and the arguments
         if size != self.size:
-            command.set_dim(size)
-            self.size = size
-        # `params`: the size and the arguments; their addresses on CUDA alone.
-        params, addresses = command.params, command.params_addr
-        for index, (argument, array_of) in enumerate(zip(arguments, self.arrays, strict=True), 1):
-            if array_of is not None:
-                argument = array_of(argument)  # noqa: PLW2901
-            elif not isinstance(argument, ctypes.Structure):
+            self._resize(size)
+        for index, (argument, an_array) in enumerate(zip(arguments, self.arrays, strict=True), 1):
+            if an_array is not None:
+                params[index] = _written(argument, *an_array)
+            elif isinstance(argument, ctypes.Structure):
+                params[index] = argument
+            else:
                 params[index].value = argument
                 continue
-            params[index] = argument
-            if addresses:
-                addresses[index] = ctypes.addressof(argument)
+            if self.on_cuda:
+                command.params_addr[index] = ctypes.addressof(params[index])
         command.launch()
 
+    def _resize(self, size: tuple[int, ...]) -> None:
+        """As `set_dim`, which takes as long as the launch: at two scales the sizes alternate."""
+        command, self.size = self.command, size
+        bounds = self.bounds.get(size)
+        if bounds is None:
+            if len(self.bounds) >= _MOST_SHAPES:
+                self.bounds.clear()
+            command.set_dim(size)
+            self.bounds[size] = command.bounds
+            return
+        command.bounds = command.params[0] = bounds
+        if self.on_cuda:
+            command.params_addr[0] = ctypes.addressof(bounds)
 
-class _Described:
-    """Tensors as an array argument of a launch. The structure of each shape is kept, and receives the tensor's address; it holds
-    until the next tensor of that shape.
-    """
 
-    def __init__(self, kind: Any) -> None:
-        self.kind = kind
-        self.known: dict[tuple[tuple[int, ...], tuple[int, ...]], Any] = {}
-
-    def __call__(self, tensor: Tensor | None) -> Any:
-        if tensor is None:
-            return _empty_array()
-        layout = tensor.shape, tensor.stride()
-        known = self.known.get(layout)
-        if known is None:
-            if len(self.known) >= _MOST_SHAPES:
-                self.known.clear()
-            known = self.known[layout] = array(tensor, self.kind)
-        else:
-            known.data = tensor.data_ptr()
-        return known
+def _written(tensor: Tensor | None, kind: Any, known: dict[Any, Any]) -> Any:
+    """The `array` of `known` shapes, with the tensor's address; it holds until the next tensor of that shape."""
+    if tensor is None:
+        return _empty_array()
+    layout = tensor.shape, tensor.stride()
+    described = known.get(layout)
+    if described is None:
+        if len(known) >= _MOST_SHAPES:
+            known.clear()
+        described = known[layout] = array(tensor, kind)
+    described.data = tensor.data_ptr()
+    return described
 
 
 class _Recorded(threading.local):
-    """A thread's launches, by kernel, device and threads per block."""
+    """A thread's launches, by kernel, device and threads per block, and its arrays to be sorted, by length and device."""
 
     def __init__(self) -> None:
         self.launches: dict[tuple[Any, torch.device, int], _Launch] = {}
+        self.sorts: dict[tuple[int, torch.device], tuple[Any, ...]] = {}
 
 
 _recorded = _Recorded()
 _MOST_SHAPES: Final = 256  # the number of Gaussians, and so the shapes, change in a long training
-_MOST_STRUCTURES: Final = 4096
-_structures: dict[tuple[Any, ...], Any] = {}
-_ADDRESSES: Final = Struct("=QQ")  # of an array and of its gradient
+
+
+def sort_pairs(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
+    """Sort the first `count` keys and values by key, stably, in a scope of `on_stream`; both have twice that length, for scratch.
+
+    As `wp.utils.radix_sort_pairs` of `wp.from_torch` of both, which takes longer than that sort. Warp's arrays of a length are
+    kept, and receive the tensors' addresses.
+    """
+    import warp as wp
+
+    key = len(keys), keys.device
+    arrays = _recorded.sorts.get(key)
+    if arrays is None:
+        if len(_recorded.sorts) >= _MOST_SHAPES:
+            _recorded.sorts.clear()
+        device = wp.device_from_torch(keys.device)
+        arrays = _recorded.sorts[key] = tuple(
+            wp.array(ptr=x.data_ptr(), shape=len(x), dtype=wp.int32, device=device) for x in (keys, values)
+        )
+    arrays[0].ptr, arrays[1].ptr = keys.data_ptr(), values.data_ptr()
+    wp.utils.radix_sort_pairs(*arrays, count, end_bit=bits)
 
 
 def array(tensor: Tensor | None, kind: Any) -> Any:
@@ -150,62 +178,47 @@ def array(tensor: Tensor | None, kind: Any) -> Any:
     """
     if tensor is None:
         return _empty_array()
-    inner = getattr(kind.dtype, "_shape_", ())
-    layout = _layout(kind.ndim, inner, tensor.shape, tensor.stride(), tensor.element_size())
-    return type(_empty_array()).from_buffer_copy(_ADDRESSES.pack(tensor.data_ptr(), 0) + layout)
-
-
-def struct(kind: Any, rows: Mapping[str, Tensor | None], **values: Any) -> Any:
-    """A Warp structure as a kernel argument: `rows` as arrays, numbers, bytes of structures. What is not given is empty, or 0.
-
-    Equal structures are one object, which is made once: most of a training's iteration are those of the iteration before.
-    """
-    given = {name: x for name, x in rows.items() if x is not None}
-    key = kind, (*values.items(),), *[(name, x.data_ptr(), x.shape, x.stride()) for name, x in given.items()]
-    known = _structures.get(key)
-    if known is None:
-        if len(_structures) >= _MOST_STRUCTURES:
-            _structures.clear()
-        known = _structures[key] = _made(kind, given, values)
-    return known
-
-
-def _made(kind: Any, rows: Mapping[str, Tensor], values: Mapping[str, Any]) -> Any:
-    """The structure of `struct`."""
-    ctype, places = _places(kind)
-    memory = bytearray(ctypes.sizeof(ctype))
-    for name, tensor in rows.items():
-        start, end, _ = places[name]
-        memory[start:end] = array(tensor, kind.vars[name].type)
-    for name, value in values.items():
-        start, end, number = places[name]
-        if number is None:
-            memory[start:end] = value
-        else:
-            number.pack_into(memory, start, value)
-    return ctype.from_buffer(memory)
-
-
-@lru_cache(maxsize=4096)
-def _layout(n: int, inner: tuple[int, ...], shape: tuple[int, ...], strides: tuple[int, ...], size: int) -> bytes:
-    """What follows the addresses in Warp's structure of an array of n dimensions.
-
-    Args:
-        inner: dimensions of the array's vectors or matrices. size: of a number, bytes.
-    """
+    n, inner, shape, strides = kind.ndim, getattr(kind.dtype, "_shape_", ()), tensor.shape, tensor.stride()
     outer, dense = len(shape) - len(inner), tuple(math.prod(inner[k + 1 :]) for k in range(len(inner)))
     last = [
         (length, step) for length, step in zip(shape[n - 1 : outer], strides[n - 1 : outer], strict=True) if length != 1
     ]
     joined = 0 in shape or all(step == length * finer for (_, step), (length, finer) in pairwise(last))
-    if not joined or tuple(strides[outer:]) != dense:
+    if not joined or strides[outer:] != dense:
         raise ValueError(
             f"a tensor of shape {tuple(shape)} with strides {strides} is no array of {n} dimensions; copy it."
         )
     lengths = *shape[: n - 1], math.prod(length for length, _ in last)
     steps = *strides[: n - 1], last[-1][1] if last else math.prod(inner)
-    described = type(_empty_array())(0, 0, n, lengths, [step * size for step in steps])
-    return bytes(described)[_ADDRESSES.size :]
+    in_bytes = [step * tensor.element_size() for step in steps]
+    return type(_empty_array())(tensor.data_ptr(), 0, n, lengths, in_bytes)
+
+
+def struct(kind: Any, rows: Mapping[str, Tensor | None], **values: Any) -> Any:
+    """A Warp structure as a kernel argument: `rows` as arrays, numbers. What is not given is empty, or 0.
+
+    With rows, structures are kept by all but the addresses: most of a training's iteration are those of the iteration before.
+    """
+    given = {name: x for name, x in rows.items() if x is not None}
+    if not given:
+        return kind.ctype(**values)
+    key = kind, *given, *values, *values.values(), *[size for x in given.values() for size in (x.shape, x.stride())]
+    known = _structures.get(key)
+    if known is None:
+        if len(_structures) >= _MOST_STRUCTURES:
+            _structures.clear()
+        arrays = {name: array(x, kind.vars[name].type) for name, x in given.items()}
+        known = _structures[key] = bytes(kind.ctype(**arrays, **values))
+    memory = bytearray(known)
+    offsets = _offsets(kind)
+    for name, tensor in given.items():
+        _ADDRESS.pack_into(memory, offsets[name], tensor.data_ptr())
+    return kind.ctype.from_buffer(memory)
+
+
+_MOST_STRUCTURES: Final = 1024
+_structures: dict[tuple[Any, ...], bytes] = {}
+_ADDRESS: Final = Struct("=Q")  # the first field of an array
 
 
 @cache
@@ -217,14 +230,9 @@ def _empty_array() -> Any:
 
 
 @cache
-def _places(kind: Any) -> tuple[Any, Mapping[str, tuple[int, int, Struct | None]]]:
-    """A Warp structure's type, and where each field begins and ends in it; with the format of a number, None for another."""
-    ctype, places = kind.ctype, {}
-    for name, field in ctype._fields_:
-        at = getattr(ctype, name)
-        number = Struct(f"={field._type_}") if issubclass(field, ctypes._SimpleCData) else None
-        places[name] = at.offset, at.offset + at.size, number
-    return ctype, places
+def _offsets(kind: Any) -> Mapping[str, int]:
+    """Where each field of a Warp structure begins."""
+    return {name: getattr(kind.ctype, name).offset for name, _ in kind.ctype._fields_}
 
 
 def on_stream(device: torch.device) -> AbstractContextManager[Any]:

@@ -31,7 +31,7 @@ from rasterizers.warp_backend.blend import blend, blend_vjp
 from rasterizers.warp_backend.colour import basis
 from rasterizers.warp_backend.project import fold, project, project_vjp
 from rasterizers.warp_backend.settings import PAIR_BYTES, SUMS_BYTES, TILE, WarpSettings, mebibytes, padded
-from rasterizers.warp_runtime import launch, on_stream
+from rasterizers.warp_runtime import launch, on_stream, sort_pairs
 
 _ROW: Final = len(types.Row())
 DEFERRED_COUNTS: Final = {"cuda": True, "cpu": False}
@@ -142,7 +142,7 @@ class Frame:
         """Launch a kernel whose blocks of `lanes` threads work together."""
         launch(kernel, [blocks], arguments, self.like.device, block=lanes, together=True)
 
-    def empty(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    def empty(self, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
         return self.like.new_empty(shape, dtype=dtype)
 
     def basis(self) -> Float[Tensor, "N B1"]:
@@ -281,20 +281,8 @@ class WarpRendering:
 def _sorted(keys: Tensor, values: Tensor, count: int, bits: int) -> tuple[Tensor, Tensor]:
     """The first `count` keys and values in a stable order by key; both tensors have twice that length, for scratch."""
     if count:
-        wp.utils.radix_sort_pairs(_sortable(keys), _sortable(values), count, end_bit=bits)
+        sort_pairs(keys, values, count, bits)
     return keys[:count], values[:count]
-
-
-def _sortable(numbers: Tensor) -> Any:
-    return _array_at(numbers.data_ptr(), len(numbers), str(numbers.device))
-
-
-@lru_cache(maxsize=64)
-def _array_at(address: int, length: int, device: str) -> Any:
-    """Memory of torch as Warp's array of int32. Kept by address, which torch gives out again: making one takes as long as a small
-    sort.
-    """
-    return wp.array(ptr=address, shape=length, dtype=wp.int32, device=device)
 
 
 def _read_deferred(numbers: Tensor) -> Any:

@@ -22,6 +22,12 @@ PAIR_BYTES: Final = (
 SUMS_BYTES: Final = 36  # a pair's nine sums for one cotangent
 
 
+_TRAITS: Final = {
+    device: Traits(devices=frozenset({device}), dtypes=frozenset({torch.float32}), depth=True)
+    for device in ("cpu", "cuda")
+}
+
+
 def _default_device() -> str:
     return "cuda" if torch.cuda.is_available() else "cpu"
 
@@ -53,7 +59,7 @@ class WarpSettings(Backend):
 
     @property
     def traits(self) -> Traits:
-        return Traits(devices=frozenset({self.device}), dtypes=frozenset({torch.float32}), depth=True)
+        return _TRAITS[self.device]
 
     def with_background(self, background: Color) -> WarpSettings:
         """A copy with another background and the same `capacities`: the number of pairs does not depend on the background."""

@@ -52,15 +52,17 @@ def test_the_last_dimension_of_an_array_goes_through_several_of_a_tensor():
 
 
 @installed
-def test_a_structure_is_made_once_for_the_same_memory_and_numbers():
+def test_structures_of_the_same_shapes_have_their_own_addresses():
     from clear_strategies.kernels.gaussian_step.warp import adam
     from rasterizers.warp_runtime import struct
 
-    p, m = torch.rand(5, 3), torch.rand(5, 3)
-    one = struct(adam.Attribute, {"p": p, "m": m, "v": None}, width=3)
-    assert struct(adam.Attribute, {"p": p.view(5, 3), "m": m, "v": None}, width=3) is one
-    others = ({"p": m, "m": p}, {"p": p, "v": m}, {"p": p[:4], "m": m}, {"p": p.view(3, 5), "m": m})
-    assert len({bytes(struct(adam.Attribute, rows, width=3)) for rows in others} | {bytes(one)}) == 4
+    p, m, longer = torch.rand(5, 3), torch.rand(5, 3), torch.rand(6, 3)
+    made = [struct(adam.Attribute, {"p": x, "m": y, "v": None}, width=3) for x, y in ((p, m), (m, p), (longer, m))]
+    assert [(s.p.data, s.m.data, s.v.data) for s in made] == [
+        (x.data_ptr(), y.data_ptr(), 0) for x, y in ((p, m), (m, p), (longer, m))
+    ]
+    assert [s.p.shape[0] for s in made] == [15, 15, 18]
+    assert [struct(adam.Attribute, {"p": p}, width=k).width for k in (3, 4, 3)] == [3, 4, 3]
 
 
 @installed
@@ -111,9 +113,7 @@ def sevens(monkeypatch):
     from rasterizers.warp_backend import frame
 
     empty = frame.Frame.empty
-    monkeypatch.setattr(
-        frame.Frame, "empty", lambda self, *s, dtype=torch.float32: empty(self, *s, dtype=dtype).fill_(7)
-    )
+    monkeypatch.setattr(frame.Frame, "empty", lambda self, *s, dtype=None: empty(self, *s, dtype=dtype).fill_(7))
 
 
 @installed

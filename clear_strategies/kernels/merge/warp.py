@@ -15,9 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.compiled_rules import CorrectionRule
-from clear_strategies.core.conflicts import ConflictCounts
 from clear_strategies.kernels.gaussian_step.warp.conflict import (
-    GROUPS,
     MEANS,
     OPACITIES,
     QUATS,
@@ -32,6 +30,7 @@ from clear_strategies.kernels.gaussian_step.warp.conflict import (
     Six,
     correct,
     counted,
+    counts_of,
     rule_of,
 )
 from clear_strategies.kernels.merge import interface
@@ -235,16 +234,13 @@ def merge(
     with on_stream(device):
         launch(decide, [blocks], decided, device, block=lanes, together=True)
         launch(combine, [n, sum(row.width for row in rows)], combined, device, block=lanes)
-    seven, six = int(GROUPS) + 1, int(GROUPS)
-    sums = counts.sum(0).split_with_sizes([seven, seven, six, six, 1])[:4]
-    comparable, opposed, corrected, at_lower_bound, omega = (x.unbind() for x in (*sums, omegas.sum(0)))
-    return interface.Merged(ConflictCounts(comparable, opposed, corrected, omega, at_lower_bound), finite[0])
+    return interface.Merged(counts_of(counts.sum(0).unbind(), omegas.sum(0).unbind()), finite[0])
 
 
-def _factors(colour: interface.Colour | None) -> bytes:
+def _factors(colour: interface.Colour | None) -> Any:
     if colour is None:
-        return bytes(struct(Factors, {}))
-    return bytes(struct(Factors, colour._asdict(), bases=colour.basis.shape[1]))
+        return struct(Factors, {})
+    return struct(Factors, colour._asdict(), bases=colour.basis.shape[1])
 
 
 def _rows(name: str, rows: interface.Rows | None) -> Any:

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from clear_strategies.core.compiled_rules import CorrectionRule
-from clear_strategies.core.conflicts import ConflictCounts
 from clear_strategies.kernels.gaussian_step import Attribute, StepCounts, StepSettings
 from clear_strategies.kernels.gaussian_step.warp import adam, conflict, passes, raw_gradients
 from rasterizers.warp_runtime import launch, on_stream, struct
@@ -22,7 +21,6 @@ from rasterizers.warp_runtime import launch, on_stream, struct
 LANES: Final = {"cuda": 128, "cpu": 1}
 """Threads per block; on a CPU, Warp's blocks have one."""
 
-_GROUPS: Final = int(conflict.GROUPS)
 _WIDTHS: Final = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "sh0": 3, "detail": 3}
 
 
@@ -96,13 +94,8 @@ class WarpGaussianStep:
         with on_stream(device):
             launch(passes.step, [len(counts)], step, device, block=lanes, together=True)
             launch(passes.step_bands, [self._n, settings.width], of_bands, device, block=lanes)
-        comparable, opposed, corrected, at_lower_bound, (still,) = counts.sum(0).split_with_sizes(
-            [_GROUPS + 1, _GROUPS + 1, _GROUPS, _GROUPS, 1]
-        )
-        conflicts = ConflictCounts(
-            *(x.unbind() for x in (comparable, opposed, corrected, omegas.sum(0), at_lower_bound))
-        )
-        return StepCounts(conflicts, still if settings.skips else 0)
+        *numbers, still = counts.sum(0).unbind()
+        return StepCounts(conflict.counts_of(numbers, omegas.sum(0).unbind()), still if settings.skips else 0)
 
     @property
     def _lanes(self) -> int:
@@ -152,7 +145,7 @@ def _options(has_hr: bool, corrects: bool, settings: StepSettings) -> Any:
 
 
 def _adam(s: StepSettings, attributes: Mapping[str, Attribute]) -> Any:
-    rates = bytes(struct(adam.Rates, {}, **{name: -a.rate for name, a in attributes.items()}))
+    rates = struct(adam.Rates, {}, **{name: -a.rate for name, a in attributes.items()})
     return struct(
         adam.AdamStep, {}, rates=rates, beta1=s.beta1, beta2=s.beta2, gain1=1 - s.beta1, gain2=1 - s.beta2,
         per_bias2=1 / s.bias2, eps=s.eps,

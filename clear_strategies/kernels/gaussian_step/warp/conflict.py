@@ -6,12 +6,15 @@ core.gradients.CONFLICT_GROUPS, and the whole Gaussian is a seventh.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final
 
 import warp as wp
 from torch import Tensor
 
 from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule
+from clear_strategies.core.conflicts import ConflictCounts
+from clear_strategies.core.deferred import Number
 from clear_strategies.kernels.gaussian_step.warp.raw_gradients import Gradient, RawGradient, View, basis_products
 from rasterizers.warp_runtime import struct
 
@@ -59,6 +62,13 @@ def rule_of(rule: CorrectionRule | None, q: Tensor | None) -> Any:
         Rule, {}, groups=sum(on << k for k, on in enumerate(rule.corrects)), tolerance=rule.tolerance,
         weight_min=rule.weight_min, weight_max=rule.weight_max, rotation_noise=ROTATION_NOISE, has_reliability=q is not None,
     )  # fmt: skip
+
+
+def counts_of(counts: Sequence[Number], omegas: Sequence[Number]) -> ConflictCounts:
+    """The numbers of a sum of `Counts`, and those of ω, by what they count."""
+    seven, six = int(GROUPS) + 1, int(GROUPS)
+    comparable, opposed, rest = counts[:seven], counts[seven : 2 * seven], counts[2 * seven :]
+    return ConflictCounts(comparable, opposed, rest[:six], omegas, rest[six : 2 * six])
 
 
 @wp.struct
