@@ -16,7 +16,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
-from typing import cast
+from typing import Final, cast
 
 import torch
 from jaxtyping import Bool, Float
@@ -30,6 +30,8 @@ class Deferred:
     recipe: Callable[..., float]
     parts: tuple[Number, ...]
 
+
+_UNREAD: Final = (Tensor, Deferred)
 
 Scalar = float | Tensor
 """For arithmetic: a float, or a 0-dim tensor on a device that is never written to again."""
@@ -50,8 +52,9 @@ def scalar(x: Tensor) -> Scalar:
 
 def defer(recipe: Callable[..., float], *numbers: Number) -> Number:
     """recipe(*numbers), at once if all numbers are floats."""
-    if any(isinstance(x, Tensor | Deferred) for x in numbers):
-        return Deferred(recipe, numbers)
+    for x in numbers:
+        if isinstance(x, _UNREAD):
+            return Deferred(recipe, numbers)
     return recipe(*numbers)
 
 
@@ -113,4 +116,4 @@ def _transferred(tensors: Sequence[Tensor]) -> dict[int, float]:
 
 
 def _is_unread(row: Mapping[str, Number]) -> bool:
-    return any(isinstance(x, Tensor | Deferred) for x in row.values())
+    return any(isinstance(x, _UNREAD) for x in row.values())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -22,14 +23,14 @@ class PatchMaps:
     patch: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """q_i and a_i of one view, in [0, 1]; both are 0 for a Gaussian that is not visible in the view (F24)."""
 
     reliability: Float[Tensor, " N"]
     demand: Float[Tensor, " N"]
 
-    @property
+    @cached_property
     def weight(self) -> Float[Tensor, " N"]:
         """w_i = q_i a_i."""
         return self.reliability * self.demand  # Eq. 10

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any, Final, Protocol, runtime_checkable
 
 import torch
@@ -95,10 +96,13 @@ def conflict_columns(conflict: Mapping[str, Number]) -> dict[str, Number]:
 
 def to_ndc(screen: Float[Tensor, "N 2"], size: tuple[int, int]) -> Float[Tensor, "N 2"]:
     """∇_u in NDC from ∇_u in pixels of an image of `size` (width, height)."""
-    ndc = torch.empty_like(screen)
-    for axis, pixels in enumerate(size):
-        torch.mul(screen[:, axis], pixels / 2, out=ndc[:, axis])
-    return ndc
+    return screen * _half(size, screen.dtype, screen.device)
+
+
+@lru_cache(maxsize=64)
+def _half(size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Float[Tensor, " 2"]:
+    """Half the size of an image. It is written on the device; to copy it there the host would wait."""
+    return torch.cat([torch.full((1,), pixels / 2, dtype=dtype, device=device) for pixels in size])
 
 
 def screen_in_ndc(g: Any, size: tuple[int, int]) -> Float[Tensor, "N 2"]:

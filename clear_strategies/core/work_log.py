@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
@@ -53,22 +53,9 @@ class WorkLog:
                 self._add(name, reason, skips)
         return self._entries
 
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
+    def stage(self, name: str) -> AbstractContextManager[None]:
         """Count and time a block. Seconds are wall-clock on the CPU and device time on CUDA. Stages do not nest."""
-        on_cuda = self.device.type == "cuda"
-        start = _stamp() if on_cuda else time.perf_counter()
-        try:
-            yield
-        finally:
-            entry = self._entries.setdefault(name, Entry())
-            entry.runs += 1
-            if on_cuda:
-                self._stamped.append((entry, start, _stamp()))
-                if len(self._stamped) >= _BATCH:
-                    self._read_stamps(wait=False)
-            else:
-                entry.seconds += time.perf_counter() - start
+        return _Stage(self, name)
 
     def skip(self, name: str, reason: str, count: int | Shaped[Tensor, ""] = 1) -> None:
         """Count a skipped block, or `count` skipped rows of one; a count on the device is read later."""
@@ -107,6 +94,16 @@ class WorkLog:
         self._counted.clear()
         self._entries = {name: Entry(**entry) for name, entry in state.items()}
 
+    def _ended(self, name: str, start: Any) -> None:
+        entry = self._entries.setdefault(name, Entry())
+        entry.runs += 1
+        if self.device.type == "cuda":
+            self._stamped.append((entry, start, _stamp()))
+            if len(self._stamped) >= _BATCH:
+                self._read_stamps(wait=False)
+        else:
+            entry.seconds += time.perf_counter() - start
+
     def _add(self, name: str, reason: str, count: int) -> None:
         skipped = self._entries.setdefault(name, Entry()).skipped
         skipped[reason] = skipped.get(reason, 0) + count
@@ -117,6 +114,21 @@ class WorkLog:
             entry, start, end = self._stamped.popleft()
             end.synchronize()
             entry.seconds += start.elapsed_time(end) / 1e3
+
+
+class _Stage:
+    """A block that is timed. A generator in its place takes three times as long, in eight stages of every iteration."""
+
+    __slots__ = ("_log", "_name", "_start")
+
+    def __init__(self, log: WorkLog, name: str) -> None:
+        self._log, self._name = log, name
+
+    def __enter__(self) -> None:
+        self._start = _stamp() if self._log.device.type == "cuda" else time.perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self._log._ended(self._name, self._start)
 
 
 def _stamp() -> Any:

@@ -9,6 +9,7 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies.core import deferred
 from clear_strategies.core.deferred import Number, Scalar
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.finite import require_finite
@@ -107,7 +108,9 @@ class Stepper(Protocol[G]):
 
 
 def require_finite_parts(where: str, g_lr: Any, hr: HrGradients[Any] | None) -> None:
-    """Check what a `Stepper` merges: the gradients, and the weights of the strategies."""
+    """Check what a `Stepper` merges: the gradients, and the weights of the strategies; those on a device are not read."""
+    if not deferred.is_immediate(g_lr.screen):
+        return
     parts: dict[str, Mapping[str, Tensor]] = {"∇L_LR": g_lr.table()}
     if hr is not None:
         parts |= {"∇L_base": hr.base.table()} | ({} if hr.hf is None else {"∇L_HF": hr.hf.table()})

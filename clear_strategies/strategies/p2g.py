@@ -70,10 +70,11 @@ class P2G(Strategy):
         """q_i and a_i of every Gaussian that is visible in this view."""
         view = step.view
         q, a = lift(self._cached_patches(view), hr.means2d, hr.visible, self.patch * view.factor)
+        evidence, seen = Evidence(q, a), hr.visible.sum()
         # Both are 0 where a Gaussian is invisible.
-        self.log("mean_q", lambda: deferred.scalar(q.sum() / hr.visible.sum()))
-        self.log("mean_w", lambda: deferred.scalar((q * a).sum() / hr.visible.sum()))
-        return Evidence(q, a)
+        self.log("mean_q", lambda: deferred.scalar(q.sum() / seen))
+        self.log("mean_w", lambda: deferred.scalar(evidence.weight.sum() / seen))
+        return evidence
 
     def route(self, step: Step) -> Float[Tensor, " N"]:
         """m_i = q_min + (1 - q_min) w_i, over its mean where `normalize`; undefined for invisible Gaussians."""

@@ -42,6 +42,7 @@ FusedMode = Literal["auto", "off"]
 GaussianPass = Callable[..., kernel.GaussianStep]
 """`gaussian_step.cpp.CppGaussianStep`, or another class of its signature."""
 
+_ROWS: Final = ("means", "quats", "scales", "opacities", "rgb")
 _LIMITS: Final = {"opacities": LOGIT_LIMIT, "scales": LOG_SCALE_LIMIT}
 
 
@@ -84,20 +85,32 @@ def gaussian_pass(optimizer: Adam) -> GaussianPass:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Factors:
-    """One cotangent's gradient with respect to the drawn splats, colour as its rank-one factors."""
+    """One cotangent's gradient with respect to the drawn splats.
 
-    gradients: SplatGradients
-    k: int
+    Args:
+        rows: by attribute, colour as its rank-one factors "rgb" and "basis".
+    """
+
+    rows: Mapping[str, Tensor]
+    screen: Float[Tensor, "N 2"]
     activation: Activation
 
-    @property
-    def screen(self) -> Float[Tensor, "N 2"]:
-        return self.gradients.screen[self.k]
+    @classmethod
+    def of(cls, g: SplatGradients, activation: Activation) -> list[Factors]:
+        """One for each cotangent."""
+        basis = g.basis.contiguous()
+        each = zip(*(x.unbind() for x in (g.means, g.quats, g.scales, g.opacities, g.rgb, g.screen)), strict=True)
+        return [
+            cls(
+                {**{name: x.contiguous() for name, x in zip(_ROWS, rows, strict=True)}, "basis": basis},
+                screen,
+                activation,
+            )
+            for *rows, screen in each
+        ]
 
-    def table(self) -> dict[str, Tensor]:
-        g, k = self.gradients, self.k
-        rows = {"means": g.means, "quats": g.quats, "scales": g.scales, "opacities": g.opacities, "rgb": g.rgb}
-        return {name: value[k].contiguous() for name, value in rows.items()} | {"basis": g.basis.contiguous()}
+    def table(self) -> Mapping[str, Tensor]:
+        return self.rows
 
 
 class CompiledStep:
@@ -125,8 +138,7 @@ class CompiledStep:
         self._quiet = False
 
     def vjp(self, shot: FieldShot, cotangents: Float[Tensor, "K H W 3"]) -> list[Factors]:
-        g = shot.gradients(cotangents)
-        return [Factors(g, k, shot.activation) for k in range(len(cotangents))]
+        return Factors.of(shot.gradients(cotangents), shot.activation)
 
     def step(
         self, params: Mapping[str, Tensor], g_lr: Factors, hr: HrGradients[Factors] | None, t: int
@@ -175,7 +187,7 @@ class CompiledStep:
             for name, p in params.items()
         }  # fmt: skip
         skips = self.skips and merged is None
-        shN, active = params["shN"], g_lr.gradients.basis.shape[1] - 1
+        shN, active = params["shN"], g_lr.rows["basis"].shape[1] - 1
         bands = active if skips and self._above_is_quiet(shN, active, anchor.targets.get("shN")) else shN.shape[1]
         evidence = None if hr is None else hr.step.evidence
         q = None if evidence is None else evidence.reliability.float().contiguous()
@@ -194,8 +206,8 @@ class CompiledStep:
             "scales": a.scales, "filtered": a.filtered, "filter": a.filter_3d, "sigmoid": a.sigmoid,
             "factor": a.factor.contiguous(), "route": m.float().contiguous() if isinstance(m, Tensor) else None,
         }  # fmt: skip
-        base, hf = (None, None) if hr is None else (hr.base.table(), None if hr.hf is None else hr.hf.table())
-        return self._passes(activation, g_lr.table(), base, hf, self.conductor.objective.lambda_hf)
+        base, hf = (None, None) if hr is None else (hr.base.rows, None if hr.hf is None else hr.hf.rows)
+        return self._passes(activation, g_lr.rows, base, hf, self.conductor.objective.lambda_hf)
 
     def _anchor(self, n: int) -> Anchor:
         if self._regularizer is None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -51,13 +52,14 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     z = conductor.gate(t, len(θ))  # zᵗ             Eq. 15       SVS
     with stage(f"render {' + '.join(scale.upper() for scale, wanted in scales.items() if wanted)}"):
         lr, hr = θ.render_scales(over_color, view, gate=z, **scales)  # Î_LR, Î_HR     Eq. 2, 3
-    u = conductor.update(θ.raw(), lr, hr, view, t, s.compiled_step)
+    params = θ.raw()
+    u = conductor.update(params, lr, hr, view, t, s.compiled_step)
     if u.grads is not None:  # else the compiled step has made the step
         with stage("optimizer"):
-            s.optimizer.step(θ.raw(), u.grads)
+            s.optimizer.step(params, u.grads)
             θ.constrain()
     extra = extra_steps(s, over_color, conductor.extra_views(t, drawn_of(s, over_color)))
-    conductor.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS
+    conductor.after_step(params, u.step)  # θᵃ at t = t_a  Eq. 16       SVS
     *_, finest = (shot for shot in (lr, hr) if shot is not None)
     s.density.accumulate(u, finest, t)  # S^dens         Eq. 14
     with stage("density and filter"):
@@ -79,9 +81,13 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
 def view_at(s: TrainState) -> View:
     """The view of iteration t: every view once, in random order, then again in another."""
     epoch, position = divmod(s.t - 1, len(s.views))
-    generator = generator_at(s.settings.seed, epoch)
-    order = torch.randperm(len(s.views), generator=generator, device=generator.device)
-    return s.views[int(order[position])]
+    return s.views[_order_of_views(s.settings.seed, epoch, len(s.views))[position]]
+
+
+@lru_cache(maxsize=8)  # an epoch's iterations ask for the same order, those of two fields in turns
+def _order_of_views(seed: int, epoch: int, n: int) -> list[int]:
+    order: list[int] = torch.randperm(n, generator=generator_at(seed, epoch)).tolist()
+    return order
 
 
 def drawn_of(s: TrainState, rasterizer: Rasterizer) -> Drawn:

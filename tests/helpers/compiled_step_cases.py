@@ -41,8 +41,8 @@ class Case:
 
     def factors(self, use: int, hr: str = "both") -> tuple:
         a = self.fields[use]._activate(self.z)
-        lr = Factors(self.lr, 0, a)
-        return lr, self._bundle(*(Factors(self.hr, k, a) if k < HR_COTANGENTS[hr] else None for k in (0, 1)))
+        (lr,), both = Factors.of(self.lr, a), Factors.of(self.hr, a)
+        return lr, self._bundle(*(both[k] if k < HR_COTANGENTS[hr] else None for k in (0, 1)))
 
     def grads(self, use: int, hr: str = "both") -> tuple:
         a = self.fields[use]._activate(self.z)
