@@ -36,7 +36,10 @@ class Backend(RasterSettings):
         """See `Rasterizer.render_scales`. Jobs of different poses or tensor objects are drawn one by one."""
         depths = depth or [False] * len(jobs)
         if all(
-            torch.equal(from_a.world_to_camera, from_b.world_to_camera)
+            (
+                from_a.world_to_camera is from_b.world_to_camera
+                or torch.equal(from_a.world_to_camera, from_b.world_to_camera)
+            )
             and all(getattr(a, name) is getattr(b, name) for name in ("means", "quats", "scales", "sh0", "shN"))
             for (a, from_a), (b, from_b) in pairwise(jobs)
         ):
@@ -57,7 +60,7 @@ def require_splats(splats: Splats, traits: Traits) -> None:
         TypeError: a tensor's dtype or device is not the backend's, or is not that of the means.
         ValueError: a tensor has another shape than in `Splats`.
     """
-    means = splats.means
+    means, n = splats.means, len(splats)
     if means.dtype not in traits.dtypes or means.device.type not in traits.devices:
         drawn = " and ".join(sorted(str(dtype).removeprefix("torch.") for dtype in traits.dtypes))
         raise TypeError(
@@ -72,8 +75,8 @@ def require_splats(splats: Splats, traits: Traits) -> None:
             raise TypeError(
                 f"splats.{name} must be {_dtype_and_device(means)}, as splats.means is, got {_dtype_and_device(value)}."
             )
-        expected = (len(means), *row)
-        if value.dim() != len(expected) or any(e not in ("B", s) for s, e in zip(value.shape, expected, strict=True)):
+        expected = (n, *row)
+        if value.shape != expected and not (name == "shN" and value.dim() == 3 and value.shape[::2] == expected[::2]):
             raise ValueError(
                 f"splats.{name} must have the shape [{', '.join(map(str, expected))}], got {list(value.shape)}."
             )

@@ -85,28 +85,37 @@ class _Launch:
         self.on_cuda = device.type == "cuda"
         self.size: tuple[int, ...] = ()
         self.bounds: dict[tuple[int, ...], Any] = {}  # Warp's description of a size, for the sizes so far
-        # By argument: for an array its kind, and the structures of the shapes it had, of which only the address changes.
-        kinds = [argument.type for argument in kernel.adj.args]
-        self.arrays: list[tuple[Any, dict[Any, Any]] | None] = [
-            (kind, {}) if wp.types.is_array(kind) else None for kind in kinds
-        ]
+        self.kinds = [argument.type for argument in kernel.adj.args]
+        # For each argument that is an array: by shape and strides, its description, of which only the address changes.
+        self.arrays: list[dict[Any, Any] | None] = [{} if wp.types.is_array(kind) else None for kind in self.kinds]
 
     def __call__(self, size: tuple[int, ...], arguments: Sequence[Any]) -> None:
         command = self.command
         params = command.params  # the bounds, and the arguments
         if size != self.size:
             self._resize(size)
-        for index, (argument, an_array) in enumerate(zip(arguments, self.arrays, strict=True), 1):
-            if an_array is not None:
-                params[index] = _written(argument, *an_array)
-            elif isinstance(argument, ctypes.Structure):
-                params[index] = argument
-            else:
+        for index, (argument, known) in enumerate(zip(arguments, self.arrays, strict=True), 1):
+            if known is None and not isinstance(argument, ctypes.Structure):
                 params[index].value = argument
                 continue
+            if known is None:
+                params[index] = argument
+            elif argument is None:
+                params[index] = _empty_array()
+            else:
+                layout = argument.shape, argument.stride()
+                described = params[index] = known.get(layout) or self._described(index, layout, argument)
+                described.data = argument.data_ptr()
             if self.on_cuda:
                 command.params_addr[index] = ctypes.addressof(params[index])
         command.launch()
+
+    def _described(self, index: int, layout: Any, tensor: Tensor) -> Any:
+        known = self.arrays[index - 1]
+        if known is None or len(known) >= _MOST_SHAPES:
+            known = self.arrays[index - 1] = {}
+        known[layout] = array(tensor, self.kinds[index - 1])
+        return known[layout]
 
     def _resize(self, size: tuple[int, ...]) -> None:
         """As `set_dim`, which takes as long as the launch: at two scales the sizes alternate."""
@@ -121,20 +130,6 @@ class _Launch:
         command.bounds = command.params[0] = bounds
         if self.on_cuda:
             command.params_addr[0] = ctypes.addressof(bounds)
-
-
-def _written(tensor: Tensor | None, kind: Any, known: dict[Any, Any]) -> Any:
-    """The `array` of `known` shapes, with the tensor's address; it holds until the next tensor of that shape."""
-    if tensor is None:
-        return _empty_array()
-    layout = tensor.shape, tensor.stride()
-    described = known.get(layout)
-    if described is None:
-        if len(known) >= _MOST_SHAPES:
-            known.clear()
-        described = known[layout] = array(tensor, kind)
-    described.data = tensor.data_ptr()
-    return described
 
 
 class _Recorded(threading.local):

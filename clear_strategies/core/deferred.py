@@ -14,17 +14,15 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import takewhile
-from typing import Final, cast
+from typing import Final, NamedTuple, cast
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Deferred:
+class Deferred(NamedTuple):
     """A function of scalars that have not been read yet. The function may log."""
 
     recipe: Callable[..., float]

@@ -388,7 +388,8 @@ class Conductor:
         g_lr = None if lr_cotangents is None else gradients.pop(0)
         base, hf = gradients if len(gradients) > 1 else (gradients[0], None)
         with stage("evidence"):
-            step = replace(step, evidence=self._owner["observe"].observe(step, hr))  # q, a, w        Eq. 9, 10
+            evidence = self._owner["observe"].observe(step, hr)  # q, a, w        Eq. 9, 10
+            step = Step(step.t, step.view, step.visible, evidence)
             m = 1.0 if hf is None else self._owner["route"].route(step)  # m              Eq. 12
         return g_lr, HrGradients(base, hf, _size(hr.image), step, m, losses.values)
 

@@ -105,9 +105,10 @@ class Objective:
             reuse: cotangents of an earlier call that are needed no more; their memory is taken where it fits.
         """
         (compared, target), use = self._compared(image, target, shown), self.kernels
-        cotangents: Tensor = compared.new_empty(2 if self.lambda_hf > 0 else 1, *compared.shape)
-        if reuse is not None and all(getattr(reuse, a) == getattr(cotangents, a) for a in ("shape", "dtype", "device")):
-            cotangents = reuse
+        shape = (2 if self.lambda_hf > 0 else 1, *compared.shape)
+        if reuse is None or (reuse.shape, reuse.dtype, reuse.device) != (shape, compared.dtype, compared.device):
+            reuse = compared.new_empty(shape)
+        cotangents: Tensor = reuse
         base = kernels.photometric(compared, target, self.lambda_ssim_hr, kernels=use, out=cotangents[0])  # Eq. 5
         losses = {"base": base}
         if self.lambda_hf > 0:

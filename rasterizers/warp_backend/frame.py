@@ -244,7 +244,7 @@ class WarpRendering:
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
         """One pass for up to three cotangents; see `Rendering.vjp`."""
         require_cotangents(cotangents, self.image)
-        k, n, frame = len(cotangents), len(self.visible), self._frame
+        frame, k, n = self._frame, cotangents.shape[0], self._frame.n
         v = cotangents.to(self._image).contiguous()
         out = means, quats, scales, opacities, screen, rgb = (
             frame.empty(k, n, 3), frame.empty(k, n, 4), frame.empty(k, n, 3), frame.empty(k, n), frame.empty(k, n, 2),
@@ -262,7 +262,7 @@ class WarpRendering:
 
     def _fill(self, v: Tensor, *out: Tensor) -> None:
         """Fill the gradients for one to three cotangents."""
-        frame, view, lists, k = self._frame, self._view, self._drawn_from, len(v)
+        frame, view, lists, k = self._frame, self._view, self._drawn_from, v.shape[0]
         pair_sums = frame.empty(padded(view.pairs), k * (types.SUMS + 3))
         lanes = LANES[frame.settings.device]
         frame.launch_blocks(

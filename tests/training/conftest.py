@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
 from functools import partial
 
 import pytest
 import torch
 
+from clear_strategies.kernels.gaussian_step import Attribute
 from clear_strategies.kernels.gaussian_step.cpp import CppGaussianStep
 from rasterizers.interface import BackendUnavailable
 from rasterizers.native import load_kernels
@@ -49,11 +49,7 @@ class Elsewhere:
                 x.copy_(self.there.pop(id(x))[1])
 
     def step(self, attributes, rule, q, step):
-        def brought(thing):
-            return thing and replace(thing, **{f.name: self.bring(getattr(thing, f.name)) for f in fields(thing)})
-
-        found = self.passes.step(
-            {name: brought(a) for name, a in attributes.items()}, rule, self.bring(q), brought(step)
-        )
+        brought = {name: Attribute(*map(self.bring, a)) for name, a in attributes.items()}
+        found = self.passes.step(brought, rule, self.bring(q), step)
         self.fetch(*(x for a in attributes.values() for x in (a.p, a.m, a.v, a.merged)))
         return found

@@ -21,8 +21,7 @@ from clear_strategies.core.compiled_rules import CorrectionRule
 from clear_strategies.core.conflicts import ConflictCounts
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Attribute:
+class Attribute(NamedTuple):
     """A parameter with its Adam moments, [N, …] each, updated in place.
 
     Args:

@@ -42,10 +42,7 @@ class CppGaussianStep:
     def step(
         self, attributes: Mapping[str, Attribute], rule: CorrectionRule | None, q: Tensor | None, settings: StepSettings
     ) -> StepCounts:
-        tables = {
-            name: {slot: getattr(a, slot) for slot in Attribute.__slots__} | {"width": math.prod(a.p.shape[1:])}
-            for name, a in attributes.items()
-        }
+        tables = {name: a._asdict() | {"width": math.prod(a.p.shape[1:])} for name, a in attributes.items()}
         numbers = {slot: getattr(settings, slot) for slot in StepSettings.__slots__}
         conflicts, still = self._step.step(tables, correction_table(rule, q), numbers, threads())
         return StepCounts(ConflictCounts(*conflicts), still)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 from functools import cache
 from types import ModuleType
-from typing import Literal, get_args
+from typing import Final, Literal, get_args
 
 from jaxtyping import Float
 from torch import Tensor
@@ -26,6 +26,7 @@ __all__ = ["Choice", "LossAndGradient", "haar_l1", "photometric", "require", "ru
 _log = logging.getLogger(__name__)
 
 Choice = Literal["auto", "torch", "cpp", "warp"]
+_CHOICES: Final = get_args(Choice)
 
 
 def running_on(device: str = "cpu") -> list[Choice]:
@@ -45,8 +46,8 @@ def require(kernels: Choice) -> None:
         SettingError: there is no such implementation.
         BackendUnavailable: "cpp" was not compiled, or Warp is not installed; the message says what to do.
     """
-    if kernels not in get_args(Choice):
-        raise SettingError(f"kernels must be one of {', '.join(get_args(Choice))}, got {kernels!r}.")
+    if kernels not in _CHOICES:
+        raise SettingError(f"kernels must be one of {', '.join(_CHOICES)}, got {kernels!r}.")
     if kernels == "cpp":
         cpp.native()
     if kernels == "warp":

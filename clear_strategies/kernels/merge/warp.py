@@ -16,6 +16,7 @@ from torch import Tensor
 
 from clear_strategies.core.compiled_rules import CorrectionRule
 from clear_strategies.kernels.gaussian_step.warp.conflict import (
+    COUNTS,
     MEANS,
     OPACITIES,
     QUATS,
@@ -225,7 +226,7 @@ def merge(
         Options, {}, n=n, lr=_factors(lr), hr=_factors(hr), lambda_hr=lambda_hr, scale=scale, keeps_lr=keeps_lr, corrects=corrects
     )  # fmt: skip
     blocks = -(-n // lanes) if lambda_hr > 0 else 0
-    counts = like.new_empty(blocks, 27, dtype=torch.int32)
+    counts = like.new_empty(blocks, COUNTS, dtype=torch.int32)
     omegas, multiples = (like.new_empty(k, 6, dtype=torch.float64) for k in (blocks, n if blocks else 0))
     finite = like.new_ones(1, dtype=torch.int32)
     reliability = None if q is None else q.float().contiguous()

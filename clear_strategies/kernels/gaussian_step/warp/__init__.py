@@ -22,6 +22,8 @@ LANES: Final = {"cuda": 128, "cpu": 1}
 """Threads per block; on a CPU, Warp's blocks have one."""
 
 _WIDTHS: Final = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "sh0": 3, "detail": 3}
+_MOST_ATTRIBUTES: Final = 256
+_attributes: dict[tuple[Any, ...], Any] = {}
 
 
 class WarpGaussianStep:
@@ -73,7 +75,7 @@ class WarpGaussianStep:
         if self._n and rule is not None and not self._has_base:
             raise ValueError("there is no HR gradient to correct.")
         if q is not None:
-            self._required("reliability", q, 1)
+            self._require("reliability", q, 1)
         parameters = [self._attribute(attributes[name], width) for name, width in _WIDTHS.items()]
         bands = self._attribute(attributes["shN"], math.prod(attributes["shN"].p.shape[1:]))
         least, most = 3 * (self._bases - 1), min(bands.width, 45)
@@ -83,7 +85,9 @@ class WarpGaussianStep:
             )
         colours = self._like.new_empty(1 if self._one_basis else 2, self._n, 3)
         moving = self._like.new_empty(self._n, dtype=torch.bool)
-        counts, omegas = self._blocks(conflict.Counts, torch.int32), self._blocks(conflict.Six, torch.float64)
+        blocks = -(-self._n // self._lanes)
+        counts = self._like.new_empty(blocks, conflict.COUNTS, dtype=torch.int32)
+        omegas = self._like.new_empty(blocks, conflict.GROUPS, dtype=torch.float64)
         adam_step = _adam(settings, attributes)
         device, lanes = self._like.device, self._lanes
         step = (
@@ -92,7 +96,7 @@ class WarpGaussianStep:
         )  # fmt: skip
         of_bands = self._gradients[-1], self._like, self._hr_basis, colours, moving, adam_step, bands
         with on_stream(device):
-            launch(passes.step, [len(counts)], step, device, block=lanes, together=True)
+            launch(passes.step, [blocks], step, device, block=lanes, together=True)
             launch(passes.step_bands, [self._n, settings.width], of_bands, device, block=lanes)
         *numbers, still = counts.sum(0).unbind()
         return StepCounts(conflict.counts_of(numbers, omegas.sum(0).unbind()), still if settings.skips else 0)
@@ -101,17 +105,24 @@ class WarpGaussianStep:
     def _lanes(self) -> int:
         return LANES[self._like.device.type]
 
-    def _blocks(self, row: Any, dtype: torch.dtype) -> Tensor:
-        """A row per block for its counts."""
-        return self._like.new_empty(-(-self._n // self._lanes), len(row()), dtype=dtype)
-
     def _attribute(self, a: Attribute, width: int) -> Any:
+        """The kernels' structure. Between changes of the field it is the same in every iteration, and kept, as checked, by where
+        the tensors lie.
+        """
         tensors = {"p": a.p, "m": a.m, "v": a.v, "anchor": a.anchor, "merged": a.merged}
-        return self._rows(
-            adam.Attribute, tensors, dict.fromkeys(tensors, width), optional=("anchor", "merged"),
-            width=width, anchored=a.anchor is not None, merges=a.merged is not None,
-            bounded=a.keep != 1 or a.limit != math.inf, stiffness=a.stiffness, keep=a.keep, limit=a.limit,
-        )  # fmt: skip
+        where = [None if x is None else (x.data_ptr(), x.numel(), x.dtype) for x in tensors.values()]
+        key = *where, self._n, width, a.stiffness, a.keep, a.limit
+        if key not in _attributes:
+            for name, tensor in tensors.items():
+                if tensor is not None:
+                    self._require(name, tensor, width)
+            if len(_attributes) >= _MOST_ATTRIBUTES:
+                _attributes.clear()
+            _attributes[key] = struct(
+                adam.Attribute, tensors, width=width, anchored=a.anchor is not None, merges=a.merged is not None,
+                bounded=a.keep != 1 or a.limit != math.inf, stiffness=a.stiffness, keep=a.keep, limit=a.limit,
+            )  # fmt: skip
+        return _attributes[key]
 
     def _rows(
         self,
@@ -124,13 +135,13 @@ class WarpGaussianStep:
         """A structure of type `kind` over tensors of n rows with `widths` numbers each, for which it checks them."""
         for name, width in widths.items():
             if name not in optional or tensors[name] is not None:
-                self._required(name, tensors[name], width)
+                self._require(name, tensors[name], width)
         return struct(kind, tensors, **numbers)
 
-    def _required(self, name: str, tensor: Tensor | None, width: int) -> None:
+    def _require(self, name: str, tensor: Tensor | None, width: int) -> None:
         """Check that a tensor has a row of `width` numbers for each Gaussian."""
         device = self._like.device
-        if tensor is None or tensor.dtype != torch.float32 or tensor.device != device or not tensor.is_contiguous():
+        if tensor is None or tensor.dtype is not torch.float32 or tensor.device != device or not tensor.is_contiguous():
             where = "in the CPU's memory" if device.type == "cpu" else f"on {device}"
             raise TypeError(f"{name} must be a contiguous float32 tensor {where}.")
         if tensor.dim() == 0 or tensor.shape[0] != self._n or tensor.numel() != self._n * width:

@@ -29,7 +29,8 @@ SMALLEST: Final = wp.constant(wp.float64(2.2250738585072014e-308))
 
 Six: Final[Any] = wp.types.vector(length=6, dtype=wp.float64)
 Seven: Final[Any] = wp.types.vector(length=7, dtype=wp.float64)
-Counts: Final[Any] = wp.types.vector(length=27, dtype=wp.int32)
+COUNTS: Final = 27
+Counts: Final[Any] = wp.types.vector(length=COUNTS, dtype=wp.int32)
 """Comparable and opposed Gaussians, [7] each; rows corrected, and with ω at its lower bound, [6] each; still rows."""
 
 
