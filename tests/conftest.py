@@ -70,23 +70,23 @@ def blocks_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[str, int], int]
     return use
 
 
-@pytest.fixture
-def ptx_of(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., str]:
-    """Compiles the module of a kernel for CUDA, with `lanes` threads per block or Warp's own number, for a kind of GPU; returns
-    its assembly.
+@pytest.fixture(params=[80, 90, 120], ids="sm_{}".format)
+def ptx_of(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., str]:
+    """Compiles the module of a kernel for CUDA, with `lanes` threads per block or Warp's own number, for three kinds of GPU;
+    returns its assembly. Warp brings the compiler: it needs neither a GPU nor a driver.
     """
     if sys.platform == "darwin":
         pytest.skip("Warp for macOS brings no compiler for CUDA")
     import warp as wp
 
-    def compiled(module: Any, lanes: int | None = None, arch: int = 90) -> str:
+    def compiled(module: Any, lanes: int | None = None) -> str:
         if lanes is not None:
             monkeypatch.setitem(module.options, "block_dim", lanes)
         folder = tmp_path / str(len(list(tmp_path.iterdir())))
-        wp.compile_aot_module(module, arch=arch, module_dir=folder, use_ptx=True)
+        wp.compile_aot_module(module, arch=request.param, module_dir=folder, use_ptx=True)
         (file,) = folder.glob("*.ptx")
         assembly = file.read_text()
-        assert f".target sm_{arch}" in assembly
+        assert f".target sm_{request.param}" in assembly
         return assembly
 
     return compiled

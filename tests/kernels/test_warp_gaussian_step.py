@@ -87,6 +87,9 @@ def test_the_host_does_not_wait_for_the_device(warp_step):
 
 @pytest.mark.slow
 def test_the_kernels_compile_for_cuda_on_a_machine_without(warp_step, ptx_of):
-    assembly = ptx_of(warp_step.passes.step.module, warp_step.LANES["cuda"])  # the module of all three kernels
+    from clear_strategies.kernels.merge import warp as merge
+
+    assert "fma.rn.f32" not in ptx_of(merge.decide.module, merge._LANES["cuda"])
+    assembly = ptx_of(warp_step.passes.step.module, warp_step.LANES["cuda"])  # the module of both kernels
     assert ".local" not in assembly  # no spills: a thread's numbers are in registers
     assert "fma.rn.f32" not in assembly  # products and sums round as in torch
