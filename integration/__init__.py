@@ -2,7 +2,7 @@
 
 from clear_strategies.errors import HostError
 from integration.autograd_shot import AutogradShot
-from integration.host_score import ScoreScaler
+from integration.densification import ScoreScaler
 from integration.loss import extra_loss, joint_loss
 from integration.views import view
 

@@ -42,8 +42,8 @@ from clear_strategies.merging.in_place import InPlaceMerge, RoutedGradients
 from clear_strategies.merging.iteration import HrGradients
 from clear_strategies.strategies.base import overrides
 from integration.autograd_shot import AutogradShot, DrawnGradients, HostOutput, RenderAt, passes_to_parameters
+from integration.densification import ScoreScaler, write_score
 from integration.extra_steps import ExtraSteps
-from integration.host_score import ScoreScaler, write_score
 from integration.views import by_name, enlarged_mask
 from rasterizers.autograd import Drawing
 from rasterizers.interface import Color

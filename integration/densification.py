@@ -1,14 +1,23 @@
-"""The end of a host's densification, which a strategy may bring forward (SVS: anchor_start)."""
+"""What strategies change about a host's densification: its end (SVS: anchor_start), and the score that it reads.  Eq. 14"""
 
 from __future__ import annotations
 
 import logging
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, Final
 
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from clear_strategies.core.gradients import screen_norm, to_ndc
+from clear_strategies.density.threshold import count_passing, topk_threshold
 from clear_strategies.errors import SettingError
 from clear_strategies.merging.conductor import Conductor
+from integration.autograd_shot import AutogradShot, ScreenGradientSlot
 
 _log = logging.getLogger(__name__)
+_VIEWS_PER_FIT: Final = 10  # sorting N scores at every view would cost more than a fresher factor gains
 
 
 def end_with_strategies(conductor: Conductor, settings: Any, name: str, first: int = 1) -> None:
@@ -66,3 +75,117 @@ def _end_of_densification(conductor: Conductor, until: int, first: int) -> int:
 def _forbidding(conductor: Conductor, t: int) -> str:
     """The strategies that forbid densification at iteration t."""
     return ", ".join(type(s).__name__ for s in conductor.strategies if not s.may_densify(t))
+
+
+class ScoreScaler:
+    """Scales a score so that as many Gaussians pass the host's threshold as pass by the ordinary statistic.
+
+    S_i is 3 to 30 times smaller than the statistic that hosts compare with their threshold. The factor is computed from
+    means over the views of about one densification interval. It is the same for all Gaussians, so their order stays.
+
+    Args:
+        threshold: the host's densification threshold, on the mean over views of ‖∇_u‖ in NDC units.
+        half_life: number of views after which a view counts half in the means.
+
+    Attributes:
+        factor: what the score was last multiplied by.
+    """
+
+    def __init__(self, threshold: float, half_life: int = 100) -> None:
+        if not threshold > 0:
+            raise SettingError(f"threshold: the host's densification threshold must be > 0, got {threshold}.")
+        if half_life < 1:
+            raise SettingError(f"half_life: must be at least 1 view, got {half_life}.")
+        self.threshold, self.factor = threshold, 1.0
+        self._decay = 0.5 ** (1 / half_life)
+        self._sums: Float[Tensor, "3 N"] | None = None
+        self._views = 0
+
+    def __call__(
+        self, score: Float[Tensor, " N"], ordinary: Float[Tensor, " N"], visible: Bool[Tensor, " N"]
+    ) -> Float[Tensor, " N"]:
+        """The scaled score of one view; a changed number of Gaussians starts the means anew."""
+        if self._sums is None or self._sums.shape[1] != len(score):
+            self._sums, self._views = score.new_zeros(3, len(score)), 0
+        self._sums = self._sums.to(score)  # a checkpoint may have been loaded onto another device
+        self._sums *= self._decay
+        self._sums += torch.stack((score, ordinary, torch.ones_like(score))) * visible
+        if self._views % _VIEWS_PER_FIT == 0:
+            mean_score, mean_ordinary = self._sums[:2] / self._sums[2].clamp_min(1e-12)
+            self.factor = self._fit_factor(mean_score, mean_ordinary)
+        self._views += 1
+        return score * self.factor
+
+    def state_dict(self) -> dict[str, Any]:
+        """The means so far, to continue from."""
+        return {"factor": self.factor, "sums": None if self._sums is None else self._sums.clone(), "views": self._views}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self.factor, self._sums, self._views = float(state["factor"]), state["sums"], int(state["views"])
+
+    def _fit_factor(self, score: Float[Tensor, " N"], ordinary: Float[Tensor, " N"]) -> float:
+        passing = count_passing(ordinary, self.threshold)
+        # Without a passing Gaussian, the highest score becomes half the threshold.
+        equivalent = topk_threshold(score, passing) if passing else 2 * float(score.max())
+        return self.threshold / equivalent if equivalent > 0 else 1.0
+
+
+def score_for_host(
+    slot: ScreenGradientSlot,
+    score: Float[Tensor, " N"],
+    ordinary: Float[Tensor, " N"],
+    visible: Bool[Tensor, " N"],
+    scaler: ScoreScaler | None,
+    loss_scale: float = 1.0,
+) -> Float[Tensor, " N"] | None:
+    """The values in NDC units that the host's densifier should read; None: those that it has already.
+
+    Args:
+        score, ordinary: from `Conductor.scores`; the same tensor if no strategy has a score.
+        loss_scale: the factor that the slot's own gradients carry.
+    """
+    absgrad = slot.absgrad(len(score))
+    if absgrad is not None:
+        # The host's threshold applies to Σ|∂L/∂u|, so that statistic decides how many Gaussians the score lets pass.
+        if score is ordinary:
+            return None
+        ordinary = screen_norm(to_ndc(absgrad / loss_scale, slot.size))
+    return score if score is ordinary or scaler is None else scaler(score, ordinary, visible)
+
+
+def write_score(
+    shot: AutogradShot,
+    screen_gradient: Tensor,
+    scores: Callable[[Float[Tensor, "N 2"]], tuple[Float[Tensor, " N"], Float[Tensor, " N"]]],
+    scaler: ScoreScaler | None,
+    loss_scale: float = 1.0,
+) -> bool:
+    """Write the score where the host's densifier reads the screen gradient; False: it does not read it, or there is no score.
+
+    Args:
+        screen_gradient: of the LR loss, as the slot of `shot` has it, without `loss_scale`.
+        scores: `Conductor.scores` of this iteration.
+        loss_scale: the factor that the slot's own gradients carry.
+    """
+    slot = shot.gradient_slot
+    if not (slot.tensor.is_leaf or slot.tensor.retains_grad) or slot.tensor.grad is None:
+        return False
+    screen_lr = to_ndc(slot.per_gaussian(screen_gradient, len(shot.visible)), slot.size)
+    score, ordinary = scores(screen_lr)
+    if score is ordinary:  # without a strategy's score, the statistic that the host's threshold is meant for stays
+        return False
+    statistic = torch.linalg.vector_norm(screen_lr, dim=-1)  # the host's own
+    written = score_for_host(slot, score, statistic, shot.visible, scaler, loss_scale)
+    if written is not None:
+        slot.write(loss_scale * written)
+    return written is not None
+
+
+def warn_if_score_is_unused(conductor: Conductor, densifier: Any, threshold: float | None) -> None:
+    """Warn if a strategy has a score, but the host's densifier has no threshold on the screen gradient."""
+    scoring = conductor.owner("score")
+    if scoring is not None and densifier is not None and threshold is None:
+        _log.warning(
+            "%s does not read the screen gradient: the densification score of %s has no effect.",
+            type(densifier).__name__, type(scoring).__name__,
+        )  # fmt: skip

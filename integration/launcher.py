@@ -14,8 +14,7 @@ from typing import Any
 from clear_strategies.compose import conductor
 from clear_strategies.console import show_in_host
 from clear_strategies.errors import ClearError, DataError
-from integration.points import wants_stereo
-from integration.views import sr_source
+from integration.views import sr_source, wants_stereo
 
 _log = logging.getLogger(__name__)
 

@@ -19,7 +19,7 @@ from clear_strategies.core.view import ExtraView, View
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Update
 from integration.autograd_shot import AutogradShot
-from integration.host_score import ScoreScaler, score_for_host
+from integration.densification import ScoreScaler, score_for_host
 
 
 def joint_loss(

@@ -1,4 +1,4 @@
-"""A host's photos and cameras as the views that strategies use."""
+"""A host's photos and cameras: as the views that strategies use, and as initial points by dense stereo."""
 
 from __future__ import annotations
 
@@ -6,16 +6,19 @@ import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies.core.points import MAX_POINTS, PointCloud
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.priors.interface import super_resolved
 from clear_strategies.data.view_names import write_pngs
-from clear_strategies.errors import DataError, SettingError
+from clear_strategies.errors import DataError, HostError, SettingError
+from clear_strategies.geometry import stereo
+from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.merging.conductor import Conductor
 from rasterizers.interface import Camera
 
@@ -25,6 +28,8 @@ _OVERSHOOT: Final = 0.5  # of a network's images outside of [0, 1] at edges
 
 SuperResolve = Callable[[str, Float[Tensor, "h w 3"], int], Float[Tensor, "H W 3"]]
 """I_HR of a view from its name, its LR image and the factor: a prior of `clear_strategies.data.priors`, or your function."""
+Points = Literal["own", "stereo"]
+"""Whose points the Gaussians start from."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -185,3 +190,52 @@ def sr_source(
             "and leave P2G out."
         )
     return lambda name, image, factor: image, 1
+
+
+def no_stereo(problem: str) -> HostError:
+    """The error of a host whose points cannot be replaced, with the remedy."""
+    remedy = "Leave points at own, and write points3D.ply for the host to read: docs/how-to/stereo.md shows how."
+    return HostError(f"points=stereo: {problem}. {remedy}")
+
+
+def wants_stereo(points: str) -> bool:
+    """Whether the Gaussians start from stereo, and not from the host's own points.
+
+    Args:
+        points: "own" or "stereo".
+
+    Raises:
+        SettingError: it is neither.
+    """
+    if points not in ("own", "stereo"):
+        raise SettingError(
+            f"points: must be own (the host's) or stereo (dense stereo between its training photos), got {points!r}."
+        )
+    return points == "stereo"
+
+
+def stereo_points(photos: Sequence[HostPhoto]) -> PointCloud:
+    """Dense stereo between a host's training photos; one line of the log sums them up.
+
+    Args:
+        photos: in the host's world. Where the mask is below 0.5 the host hides the pixel, which gets no points. Stereo runs on
+            their device.
+
+    Returns:
+        At most `MAX_POINTS` points on the CPU: world units, RGB in [0, 1]. More are reduced at random, always to the same.
+
+    Raises:
+        DataError: there are fewer than two photos, or stereo confirms no depth.
+    """
+    posed = [photo.posed for photo in photos]
+    dense = stereo(
+        [photo.image for photo in posed],
+        torch.stack([photo.camera.world_to_camera for photo in posed]) if posed else torch.zeros(0, 4, 4),
+        torch.stack([intrinsics(photo.camera) for photo in posed]) if posed else torch.zeros(0, 3, 3),
+        masks=[None if photo.mask is None else photo.mask >= 0.5 for photo in photos],
+    )
+    cloud = PointCloud(dense.means.cpu(), dense.colors.cpu(), dense.summary)
+    kept = cloud.at_most(MAX_POINTS)
+    chosen = "" if len(kept) == len(cloud) else f"; {len(kept):,} of them, chosen at random, are used"
+    _log.info("points=stereo: %s%s.", dense.summary, chosen)
+    return kept

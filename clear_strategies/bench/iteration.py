@@ -17,9 +17,8 @@ from torch import Tensor
 import rasterizers
 from clear_strategies.bench import scenes
 from clear_strategies.bench.rasterizers import affordable, in_float64, relative, require_device, truth_backend, usable
-from clear_strategies.bench.results import Results
+from clear_strategies.bench.results import Results, interleaved, medians, milliseconds, queued
 from clear_strategies.bench.scenes import SETTINGS, Workload
-from clear_strategies.bench.timing import interleaved, medians, milliseconds, queued
 from clear_strategies.core import images
 from clear_strategies.core.view import Photo, View
 from clear_strategies.core.work_log import WorkLog

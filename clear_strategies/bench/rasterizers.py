@@ -19,9 +19,8 @@ from torch import Tensor
 
 import rasterizers
 from clear_strategies.bench import scenes
-from clear_strategies.bench.results import Results
+from clear_strategies.bench.results import Results, interleaved, medians, milliseconds, queued
 from clear_strategies.bench.scenes import SETTINGS, Workload
-from clear_strategies.bench.timing import interleaved, medians, milliseconds, queued
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import DataError
 from clear_strategies.outputs.figures import new_figure

@@ -23,8 +23,7 @@ import torch
 import rasterizers
 from clear_strategies.bench import scenes
 from clear_strategies.bench.iteration import TOTAL, Training, view_of
-from clear_strategies.bench.results import Results
-from clear_strategies.bench.timing import interleaved, medians
+from clear_strategies.bench.results import Results, interleaved, medians
 from clear_strategies.errors import DataError
 from clear_strategies.merging.objective import Objective
 from clear_strategies.training.loop import kernel_threads

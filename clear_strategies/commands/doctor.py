@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import shutil
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from typing import Final
 
 from clear_strategies import console
 from clear_strategies.commands.options import parser_of
-from clear_strategies.errors import SettingError
+from clear_strategies.errors import SettingError, one_line
 from clear_strategies.jobs.exit_codes import TRAIN
 from clear_strategies.outputs.provenance import origin
 
@@ -26,6 +27,8 @@ EXTRAS: Final = {
     "warp": (("warp",), "the rasterizer on CUDA without a CUDA toolkit"),
     "sweeps": (("hydra_plugins.hydra_joblib_launcher",), "many runs at once, on one machine or a cluster"),
 }
+_TOLERANCE: Final = 2e-3  # backends differ in rounding, a wrong one by far more
+_SLOW_TO_COMPILE: Final = ("warp",)  # on a CPU its first picture takes a minute, and its import half a second
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -48,17 +51,11 @@ def main(arguments: Sequence[str]) -> None:
 
 def _findings(broken: list[str], *, slow: bool) -> dict[str, Iterator[tuple[str, str]]]:
     """The rows by their title; they are found while they are printed, since torch's import takes most of the time."""
-
-    def backends() -> Iterator[tuple[str, str]]:
-        from clear_strategies.commands import self_test
-
-        yield from self_test.backends(broken, slow=slow)
-
     facts = origin()
     versions = {"python": f"{facts['python']} ({sys.executable})", **facts["versions"], "checkout": facts["git"]}
     return {
         "versions": iter(versions.items()), "missing extras": _missing(), "other programs": _programs(),
-        "machine": _machine(facts["platform"]), "cache": _cache(), "rasterizers, fastest first": backends(),
+        "machine": _machine(facts["platform"]), "cache": _cache(), "rasterizers, fastest first": _backends(broken, slow=slow),
     }  # fmt: skip
 
 
@@ -112,3 +109,53 @@ def _cache() -> Iterator[tuple[str, str]]:
     files = [path for path in folder.rglob("*") if path.is_file()] if folder.is_dir() else []
     size = sum(path.stat().st_size for path in files)
     yield "SR images", f"{folder}: {len(files)} files, {size / 1e6:.0f} MB (CLEAR_CACHE moves it; it may be deleted)"
+
+
+def _backends(broken: list[str], *, slow: bool) -> Iterator[tuple[str, str]]:
+    """Each backend: why it is not here, or how its picture of a few Gaussians compares with the reference's, and its time.
+
+    Args:
+        broken: takes the names of those that fail or differ.
+        slow: test also those that compile for long first.
+    """
+    import torch
+
+    import rasterizers
+    from rasterizers import native
+    from rasterizers.interface import BackendUnavailable, Camera, Splats
+
+    g, shapes = torch.Generator().manual_seed(0), ((3,), (4,), (3,), (), (1, 3), (3, 3))
+    means, quats, scales, opacities, sh0, shN = (torch.randn(300, *shape, generator=g) for shape in shapes)
+    tensors = means, quats, (scales * 0.3 - 2).exp(), opacities.sigmoid(), sh0, shN * 0.2
+    pose = torch.eye(4)
+    pose[2, 3] = 5
+    camera, on_cuda = Camera(pose, 76.0, 76.0, 32.0, 32.0, 64, 64), torch.cuda.is_available()
+    # For pictures this small, torch's own threads cost more than they bring.
+    with native.kernel_threads(native.threads()):
+        exact = rasterizers.load("torch", preset="accurate")(Splats(*tensors), camera).image
+        for name in rasterizers.names():
+            if name in _SLOW_TO_COMPILE and find_spec(name) is not None and not on_cuda and not slow:
+                yield name, "installed, not tested: it compiles for a minute first (--all tests it); slow without CUDA"
+                continue
+            try:
+                rasterizers.load(name)
+            except BackendUnavailable as reason:
+                yield name, f"not here: {reason}"
+                continue
+            try:
+                rasterizer = rasterizers.load(name, preset="accurate")
+                device = "cuda" if on_cuda and "cuda" in rasterizer.traits.devices else "cpu"
+                splats = Splats(*(x.to(device) for x in tensors))
+                rasterizer(splats, camera)
+                began = time.perf_counter()
+                image = rasterizer(splats, camera).image.cpu()
+                milliseconds = 1e3 * (time.perf_counter() - began)
+            except (BackendUnavailable, RuntimeError, ValueError) as error:
+                broken.append(name)
+                yield name, f"FAILS: {one_line(error)[:200]}"
+                continue
+            difference, module = float((image - exact).abs().max()), getattr(rasterizer, "module", None)
+            if not difference <= _TOLERANCE:
+                broken.append(name)
+            verdict = ("WRONG" if name in broken else "works") + (f" ({module})" if isinstance(module, str) else "")
+            yield name, f"{verdict}: differs from the reference by {difference:.1e}, {milliseconds:.1f} ms"

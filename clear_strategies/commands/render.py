@@ -22,6 +22,7 @@ _log = logging.getLogger(__name__)
 
 _LOOP: Final = "cameras"  # the --path that is a video
 _LONGEST: Final = 1280  # px, of a video where --width asks for nothing
+_SAMPLED: Final = 5  # cameras that the range of depths is taken from, about
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -34,9 +35,10 @@ def main(arguments: Sequence[str]) -> None:
     from clear_strategies.data.photo_files import write_png
     from clear_strategies.data.view_settings import resized
     from clear_strategies.jobs.saved import open_splat
-    from clear_strategies.viewing import FPS, video
+    from clear_strategies.outputs.figures import spaced
     from clear_strategies.viewing.cameras import at_most
-    from clear_strategies.viewing.look import DepthScale
+    from clear_strategies.viewing.look import colored, depth_range
+    from clear_strategies.viewing.video import write_video
 
     began = time.perf_counter()
     splat = open_splat(options.run, options.rasterizer)
@@ -49,13 +51,13 @@ def main(arguments: Sequence[str]) -> None:
         where = {name: at_most(c, None if width is not None else _LONGEST) for name, c in where.items()}
     kinds: dict[str, Callable[[Camera], Pixels]] = {"": lambda camera: to_bytes(painter.color(camera))}
     if options.depth:
-        scale = DepthScale.of(painter, list(where.values()))
-        _log.info("depth: %.3g (bright) to %.3g (dark) world units, grey where nothing is", scale.near, scale.far)
-        kinds["depth"] = lambda camera: scale.picture(painter.depth(camera))
+        near, far = depth_range(torch.cat([painter.depth(c).flatten() for c in spaced([*where.values()], _SAMPLED)]))
+        _log.info("depth: %.3g (bright) to %.3g (dark) world units, grey where nothing is", near, far)
+        kinds["depth"] = lambda camera: colored(painter.depth(camera), near, far)
     out = options.out or splat.folder / "rendered"
     for kind, draw in kinds.items():
         if options.path == _LOOP:
-            video.write_video(out / f"{_LOOP}{kind and f'_{kind}'}.mp4", map(draw, where.values()), fps=FPS)
+            write_video(out / f"{_LOOP}{kind and f'_{kind}'}.mp4", map(draw, where.values()))
             continue
         for name, camera in where.items():
             write_png(out / kind / f"{name}.png", torch.from_numpy(draw(camera)) / 255)
@@ -65,8 +67,7 @@ def main(arguments: Sequence[str]) -> None:
 def cameras_of(splat: SavedSplat, path: str, frames: int) -> dict[str, Camera]:
     """The cameras that `--path` names, by the names of their pictures."""
     from clear_strategies.data.view_names import file_stem
-    from clear_strategies.viewing.cameras import read_cameras
-    from clear_strategies.viewing.paths import through
+    from clear_strategies.viewing.cameras import read_cameras, through
 
     if path == _LOOP:
         if not splat.cameras:

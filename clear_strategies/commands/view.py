@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import logging
 import socket
+import threading
 import webbrowser
 from collections.abc import Sequence
+from contextlib import suppress
 
 from clear_strategies import console
 from clear_strategies.commands.options import parser_of
 from clear_strategies.errors import SettingError
+from clear_strategies.jobs.exit_codes import require_viewer
 
 _log = logging.getLogger(__name__)
 
@@ -27,7 +30,6 @@ def main(arguments: Sequence[str]) -> None:
     if not 0 <= options.port <= 65535:
         raise SettingError(f"--port: must be 0 to 65535, got {options.port}.")
     from clear_strategies.jobs.saved import open_splat
-    from clear_strategies.viewing import require_viewer
 
     require_viewer()
     splat = open_splat(options.run, options.rasterizer)
@@ -41,7 +43,9 @@ def main(arguments: Sequence[str]) -> None:
     _log.info("%s (Ctrl-C ends it)", viewer.address)
     if not options.no_browser:
         webbrowser.open(viewer.address)
-    viewer.serve_until_stopped()
+    with suppress(KeyboardInterrupt):
+        threading.Event().wait()
+    viewer.close()
 
 
 def _require_own(host: str) -> None:

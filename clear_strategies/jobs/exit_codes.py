@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import signal
+from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import Final, NamedTuple
 
@@ -68,7 +69,14 @@ def _library_errors() -> tuple[type[Exception], ...]:
 
 def require_train() -> None:
     """Raise a SettingError where one of the trainer's libraries is not installed; none is imported."""
-    if missing := [name for name in TRAIN if find_spec(name) is None]:
-        raise SettingError(
-            f"training needs {', '.join(missing)}, which the core does not install: pip install 'clear-strategies[train]'."
-        )
+    _require("training", "train", TRAIN)
+
+
+def require_viewer() -> None:
+    """Raise a SettingError where one of the viewer's libraries is not installed; none is imported."""
+    _require("the viewer", "view", ("viser", "nerfview", "splines"))
+
+
+def _require(what: str, extra: str, modules: Sequence[str]) -> None:
+    if missing := [name for name in modules if find_spec(name) is None]:
+        raise SettingError(f"{what} needs {', '.join(missing)}: pip install 'clear-strategies[{extra}]'.")

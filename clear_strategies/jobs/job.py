@@ -16,12 +16,13 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from clear_strategies import files, viewing
+from clear_strategies import files
 from clear_strategies.compose import tree
 from clear_strategies.data.prepare import save_lr
 from clear_strategies.data.scene import Scene
 from clear_strategies.jobs import device, resume
 from clear_strategies.jobs import scene as scenes
+from clear_strategies.jobs.exit_codes import require_viewer
 from clear_strategies.jobs.lock import hold
 from clear_strategies.jobs.settings import JobSettings, settings_of
 from clear_strategies.merging.conductor import Conductor
@@ -63,7 +64,7 @@ def run(
     values = tree(config)
     settings = settings_of(values)
     if settings.fit.viewer:
-        viewing.require_viewer()
+        require_viewer()
     conductor = settings.conductor(settings.fit.stretch)
     drawing = device.drawing(settings.rasterizer, settings.fit.device)
     with hold(folder), signals.interrupted("before training began"):

@@ -10,13 +10,12 @@ from typing import Any, Final, cast
 
 from clear_strategies.data.capture import MORE_PHOTOS, Capture
 from clear_strategies.data.cloud import CloudSettings
-from clear_strategies.data.hr_limit import within_limit
 from clear_strategies.data.photo_folders import require_text
 from clear_strategies.data.prepare import at_hr, prepare
 from clear_strategies.data.priors import Bicubic, Ncnn, Prior, cached, network_of
 from clear_strategies.data.priors.ncnn import factors, missing_packages
 from clear_strategies.data.scene import Scene
-from clear_strategies.data.view_settings import ViewSettings
+from clear_strategies.data.view_settings import ViewSettings, within_limit
 from clear_strategies.errors import SettingError
 from clear_strategies.settings import LISTED
 

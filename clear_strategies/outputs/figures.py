@@ -1,12 +1,22 @@
-"""What all figures share: colours, and matplotlib figures that need no display."""
+"""Pictures by matplotlib, which need no display: curves over the iterations, and sheets of images.
+
+On a sheet images are laid out in whole pixels: a render is shown pixel for pixel, a small one at a whole multiple, because a
+resized image does not show the detail that this library is about.
+"""
 
 from __future__ import annotations
 
 import io
 import math
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import numpy as np
+import torch
 
 from clear_strategies.data.photo_files import PNG_LEVEL
 from clear_strategies.files import write_bytes
@@ -24,6 +34,24 @@ AS_WRITTEN: Final[dict[str, Any]] = {"parse_math": False}
 """Style of a text with names of the user's: matplotlib would read what lies between two $ as mathematics."""
 
 Item = TypeVar("Item")
+
+# Title, column of history.csv, what it is drawn over, whether as a running mean.
+_CHARTS: Final = (
+    ("LR loss (running mean)", "loss_lr", "t", True),
+    ("PSNR of test views, dB", "psnr_test", "t", False),
+    ("PSNR of test views, dB", "psnr_test", "seconds", False),
+    ("share of Gaussians in conflict, before correction (running mean)", "conflict", "t", True),
+    ("share of the Gaussians that is corrected (running mean)", "corrected", "t", True),
+    ("number of Gaussians", "n_gaussians", "t", False),
+)
+_AXIS: Final = {"t": "iteration", "seconds": "training time, s"}
+_COLOURS: Final = (BLUE, RED, GREEN, YELLOW, CYAN, PURPLE)
+_STYLES: Final = [{"color": color, "linestyle": dash} for dash, color in product(("-", "--", ":"), _COLOURS)]
+
+ERROR_MAX: Final = 0.25  # the colours of an error map end here
+_GAP: Final = 8  # px
+_LINE: Final = 16  # height of a line of small print, px
+_NARROW, _WIDE = 240, 640  # the least and the greatest width at which an image is shown, px
 
 
 def spaced(items: Sequence[Item], count: int) -> Sequence[Item]:
@@ -47,3 +75,131 @@ def save_png(figure: Figure, path: Path) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=DPI, pil_kwargs={"compress_level": PNG_LEVEL})
     write_bytes(path, buffer.getvalue())
+
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def write_curves(path: Path, histories: Mapping[str, pd.DataFrame], title: str) -> None:
+    """Draw six charts with one line per run, and one legend below them."""
+    figure, axes = new_figure(2, 3, 15, 8)
+    known = {}
+    for axis, (name, column, over, smooth) in zip(axes.flatten(), _CHARTS, strict=True):
+        axis.set_title(name)
+        axis.set_xlabel(_AXIS[over], fontsize=8, color=FAINT)
+        for i, (run, history) in enumerate(histories.items()):
+            points = history.reindex(columns=[over, column]).dropna()
+            y = points[column]
+            if smooth:  # over a 50th of the rows
+                y = y.rolling(max(1, len(y) // 50)).mean()
+            if len(y):
+                marker = "o" if column == "psnr_test" else None
+                style = {"linewidth": 1.4, "marker": marker, "markersize": 3.5, **_STYLES[i % len(_STYLES)]}
+                (known[run],) = axis.plot(points[over], y, **style)
+        _finish(axis)
+    if known:
+        names = [textwrap.fill(run, width=60) for run in known]
+        legend = figure.legend(
+            known.values(), names, fontsize=9, frameon=False, loc="outside lower center", labelcolor=INK,
+            ncols=min(3, len(known)),
+        )  # fmt: skip
+        for text in legend.get_texts():
+            text.set(**AS_WRITTEN)
+    set_title(figure, title)
+    save_png(figure, path)
+
+
+def _finish(axis: Any) -> None:
+    """Style the axes so that the data stands out; axes without data say "not measured"."""
+    axis.title.set(fontsize=10, color=INK)
+    axis.tick_params(which="both", labelsize=8, colors=FAINT)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.spines[["left", "bottom"]].set_color(RULE)
+    if axis.lines:
+        axis.set_xlim(left=0)
+        axis.grid(alpha=0.25, linewidth=0.5)
+    else:
+        axis.text(0.5, 0.5, "not measured", fontsize=9, color=FAINT, ha="center", transform=axis.transAxes)
+        axis.set(xticks=[], yticks=[])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SheetRow:
+    """Images by their column, RGB [H, W, 3] or an error [H, W], and the line below each.
+
+    Args:
+        name: of the row. frame: the window [rows, columns] that is outlined in each image.
+    """
+
+    name: str
+    images: Mapping[str, np.ndarray]
+    captions: Mapping[str, str] = field(default_factory=dict)
+    frame: tuple[slice, slice] | None = None
+
+
+def magnification(width: int) -> float:
+    """How many times larger an image of this width is shown: a whole number, so that pixels stay squares, or less than 1
+    for an image that is too wide.
+    """
+    return math.ceil(_NARROW / width) if width <= _WIDE else _WIDE / width
+
+
+def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: str = "") -> None:
+    """Draw the rows below the names of their columns, and a bar of colours beside them where there are errors. `note` stands
+    below.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle
+
+    columns = list(dict.fromkeys(column for row in rows for column in row.images))
+    shapes = [image.shape for row in rows for image in row.images.values()]
+    times = magnification(max(shape[1] for shape in shapes))
+    cell_h, cell_w = (round(times * max(shape[axis] for shape in shapes)) for axis in (0, 1))
+    heads = [textwrap.wrap(column, cell_w // 7) or [""] for column in columns]
+    left, top, row_h = 2 * _LINE, (4 + max(map(len, heads))) * _LINE, cell_h + 2 * _LINE + _GAP
+    right, with_bar = left + len(columns) * (cell_w + _GAP), any(len(shape) == 2 for shape in shapes)
+    width, height = right + 5 * _LINE * with_bar, top + len(rows) * row_h + _LINE
+    figure, error = Figure(figsize=(width / DPI, height / DPI), dpi=DPI), None
+
+    def text(x: float, y: float, words: str, **style: Any) -> None:
+        style = {"fontsize": 8.5, "ha": "center", "va": "center", "color": INK, **AS_WRITTEN, **style}
+        figure.text(x / width, 1 - y / height, words, **style)
+
+    def box(x: float, y: float, w: float, h: float) -> tuple[float, float, float, float]:
+        return x / width, 1 - (y + h) / height, w / width, h / height
+
+    text(_GAP, 1.5 * _LINE, title, fontsize=12, ha="left")
+    for i, lines in enumerate(heads):
+        x = left + i * (cell_w + _GAP)
+        text(x + cell_w / 2, top - _LINE / 2, "\n".join(lines), fontsize=10, va="bottom")
+        for j, row in enumerate(rows):
+            y, pixels = top + j * row_h, row.images.get(columns[i])
+            if pixels is not None:
+                shown = _resized(pixels, times)
+                drawn = figure.figimage(shown, x, height - y - len(shown), cmap="magma", vmin=0, vmax=ERROR_MAX)
+                error = drawn if pixels.ndim == 2 else error
+                if row.frame is not None:
+                    down, across = (slice(times * s.start, times * s.stop) for s in row.frame)
+                    place = box(x + across.start, y + down.start, across.stop - across.start, down.stop - down.start)
+                    figure.add_artist(Rectangle(place[:2], *place[2:], fill=False, color="white", linewidth=1))
+            text(x + cell_w / 2, y + cell_h + _LINE, row.captions.get(columns[i], ""))
+    for j, row in enumerate(rows):
+        text(_LINE, top + j * row_h + cell_h / 2, row.name, rotation=90, color=FAINT)
+    text(left, height - _LINE, note, ha="left", color=FAINT)
+    if error is not None:
+        bar = figure.colorbar(error, cax=figure.add_axes(box(right, top, 12, cell_h)), extend="max", extendfrac=0.03)
+        bar.set_label("mean |difference| over RGB", fontsize=8, color=INK)
+        bar.ax.tick_params(labelsize=8, colors=INK)
+        bar.outline.set_visible(False)
+    save_png(figure, path)
+
+
+def _resized(pixels: np.ndarray, times: float) -> np.ndarray:
+    """Each pixel repeated where the image is shown larger, means where it is shown smaller."""
+    if times >= 1:
+        return pixels.repeat(int(times), 0).repeat(int(times), 1)
+    size = [round(times * edge) for edge in pixels.shape[:2]]
+    channels = torch.from_numpy(pixels.reshape(1, *pixels.shape[:2], -1)).permute(0, 3, 1, 2)
+    reduced = torch.nn.functional.interpolate(channels, size, mode="area")[0].permute(1, 2, 0)
+    return np.asarray(reduced.reshape(*size, *pixels.shape[2:]).numpy())

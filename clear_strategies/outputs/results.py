@@ -11,26 +11,23 @@ from typing import TYPE_CHECKING, Any, Final
 
 from torch import Tensor
 
-from clear_strategies import files, viewing
+from clear_strategies import files
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.view_names import file_stem
-from clear_strategies.errors import DataError
+from clear_strategies.errors import DataError, SettingError
 from clear_strategies.outputs import metrics
-from clear_strategies.outputs.contact_sheet import SheetRow, write_contact_sheet
-from clear_strategies.outputs.coverage import write_coverage
-from clear_strategies.outputs.curves import write_curves
 from clear_strategies.outputs.export import export_ply
-from clear_strategies.outputs.figures import spaced
-from clear_strategies.outputs.maps import MAPS, write_maps
+from clear_strategies.outputs.figures import SheetRow, spaced, write_contact_sheet, write_curves
+from clear_strategies.outputs.maps import MAPS, write_coverage, write_maps
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.plan import Chosen
 from clear_strategies.outputs.provenance import provenance
 from clear_strategies.training import memory
 from clear_strategies.training.state import TrainState
-from clear_strategies.viewing import cameras, paths, video
+from clear_strategies.viewing import cameras, video
 from clear_strategies.viewing.look import Painter
 from rasterizers.interface import Camera, Rasterizer
 
@@ -134,11 +131,11 @@ def _write_video(path: Path, train: Sequence[Camera], painter: Painter, frames: 
     """Write a loop through the training cameras. Without imageio-ffmpeg, log a message instead."""
     if not frames:
         return
-    if (missing := video.missing()) is not None:
-        _log.info("no video of the camera path is written: %s.", missing)
-        return
-    along = [cameras.at_most(camera, _LONGEST) for camera in paths.through(train, frames)]
-    video.write_video(path, (images.to_bytes(painter.color(camera)) for camera in along), fps=viewing.FPS)
+    along = [cameras.at_most(camera, _LONGEST) for camera in cameras.through(train, frames)]
+    try:
+        video.write_video(path, (images.to_bytes(painter.color(camera)) for camera in along))
+    except SettingError as missing:
+        _log.info("no video of the camera path is written: %s", missing)
 
 
 def _write_sheet(folder: Path, scene: Scene, evaluation: Evaluation, title: str) -> None:

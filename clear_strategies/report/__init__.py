@@ -24,8 +24,7 @@ import numpy as np
 from clear_strategies import console, files
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.errors import ClearError, DataError
-from clear_strategies.outputs.contact_sheet import SheetRow, write_contact_sheet
-from clear_strategies.outputs.curves import write_curves
+from clear_strategies.outputs.figures import SheetRow, write_contact_sheet, write_curves
 from clear_strategies.report.runs import Run, collect, history
 from clear_strategies.report.table import compare, layout, markdown, notes
 

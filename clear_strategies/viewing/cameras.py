@@ -1,4 +1,4 @@
-"""The cameras of a run as a file.
+"""The cameras of a run as a file, and a path through them.
 
 A run writes `cameras.json` in the layout of Inria's 3DGS, which SuperSplat and SIBR open: a list of {"id", "img_name",
 "width", "height", "position", "rotation" (camera to world, OpenCV axes), "fx", "fy"}. Ours adds "cx", "cy", "split" ("train",
@@ -7,13 +7,15 @@ A run writes `cameras.json` in the layout of Inria's 3DGS, which SuperSplat and 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import msgspec
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from clear_strategies import files
 from clear_strategies.data import strict_json
@@ -21,12 +23,13 @@ from clear_strategies.data.lenses import rigid_inverse
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.strict_json import Number, typed
 from clear_strategies.data.view_settings import resized
-from clear_strategies.errors import DataError
+from clear_strategies.errors import DataError, SettingError
 from rasterizers.interface import Camera, Color
 
 FILE: Final = "cameras.json"
-
-Split = Literal["train", "test"]
+_MOST_KEYS: Final = 24  # a path through more cameras passes every n-th
+_WRAP: Final = 3  # keys repeated at both ends, so that the rotation's spline has no seam
+_SWAY: Final = 0.1  # world units: how far a single camera moves to each side
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,13 +37,30 @@ class SavedCamera:
     """A camera of a run.
 
     Args:
-        camera: at HR.
+        camera: at HR. split: train or test.
         background: behind the Gaussians, RGB in [0, 1].
     """
 
     name: str
     camera: Camera
-    split: Split = "train"
+    split: str
+    background: Color
+
+
+_Vector = tuple[Number, Number, Number]
+
+
+class _Entry(msgspec.Struct):
+    width: Number
+    height: Number
+    fx: Number
+    fy: Number
+    rotation: tuple[_Vector, _Vector, _Vector]
+    position: _Vector
+    cx: Number | None = None
+    cy: Number | None = None
+    img_name: str | None = None
+    split: str = "train"
     background: Color = (0.0, 0.0, 0.0)
 
 
@@ -61,11 +81,19 @@ def write_cameras(folder: Path, scene: Scene) -> None:
 
 def read_cameras(path: Path) -> list[SavedCamera]:
     """The cameras of a run of ours or of Inria's 3DGS; a DataError if it is no such file."""
-    remedy = "give the cameras.json of a run"
-    entries = typed(path, strict_json.read(path), list[_Entry], remedy=remedy)
-    if not entries:
+    remedy, found = "give the cameras.json of a run", list[SavedCamera]()
+    for i, e in enumerate(typed(path, strict_json.read(path), list[_Entry], remedy=remedy)):
+        pose = rigid_inverse(path, f"[{i}].rotation", np.array(e.rotation), np.array(e.position))
+        width, height = round(e.width), round(e.height)
+        cx, cy = width / 2 if e.cx is None else e.cx, height / 2 if e.cy is None else e.cy
+        try:
+            camera = Camera(pose, e.fx, e.fy, cx, cy, width, height)
+        except ValueError as error:
+            raise DataError(path, f"[{i}]", str(error), "correct the camera") from error
+        found.append(SavedCamera(str(i) if e.img_name is None else e.img_name, camera, e.split, e.background))
+    if not found:
         raise DataError(path, "json", "is an empty list", remedy)
-    return [_saved_camera(path, i, entry) for i, entry in enumerate(entries)]
+    return found
 
 
 def at_most(camera: Camera, longest: int | None) -> Camera:
@@ -75,35 +103,45 @@ def at_most(camera: Camera, longest: int | None) -> Camera:
     return resized(camera, *(max(2, 2 * round(times * size / 2)) for size in (camera.width, camera.height)))
 
 
-_Vector = tuple[Number, Number, Number]
+def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """A closed, smooth path through the cameras: splines of position and rotation, at an even pace.
+
+    The path goes from each camera to the nearest that is left, and passes at most `_MOST_KEYS` of them. A single camera sways
+    to both sides. All frames have the first camera's lens and size.
+    """
+    if not cameras:
+        raise SettingError("a camera path needs at least one camera.")
+    if frames < 1:
+        raise SettingError(f"a camera path needs at least 1 frame, got {frames}.")
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    centers = np.stack([camera.center.double().cpu().numpy() for camera in cameras])
+    axes = np.stack([camera.world_to_camera[:3, :3].double().cpu().numpy().T for camera in cameras])  # camera to world
+    if len(cameras) == 1:
+        angles = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+        centers = centers + _SWAY * np.stack([np.cos(angles), np.sin(angles)], axis=1) @ axes[0, :, :2].T
+        axes = axes.repeat(len(centers), 0)
+    order = _tour(centers)
+    order = order[:: -(-len(order) // _MOST_KEYS)]
+    keys = np.array([order[i % len(order)] for i in range(-_WRAP, len(order) + _WRAP + 1)])
+    rotations = Rotation.from_matrix(axes[keys])
+    turned = (rotations[:-1].inv() * rotations[1:]).magnitude()
+    moved = np.linalg.norm(np.diff(centers[keys], axis=0), axis=1)
+    lengths = np.maximum(moved / max(moved.max(), 1e-9) + turned, 1e-3)  # the spline's parameter; never still
+    at = np.concatenate([[0.0], np.cumsum(lengths)])
+    times = np.linspace(at[_WRAP], at[_WRAP + len(order)], frames, endpoint=False)
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, :3, :3] = RotationSpline(at, rotations)(times).inv().as_matrix()
+    poses[:, :3, 3:] = -poses[:, :3, :3] @ CubicSpline(at, centers[keys])(times)[..., None]
+    return [replace(cameras[0], world_to_camera=torch.from_numpy(pose)) for pose in poses]
 
 
-class _Entry(msgspec.Struct):
-    width: Number
-    height: Number
-    fx: Number
-    fy: Number
-    rotation: tuple[_Vector, _Vector, _Vector]
-    position: _Vector
-    cx: Number | None = None
-    cy: Number | None = None
-    img_name: str | None = None
-    split: str = "train"
-    background: Color = (0.0, 0.0, 0.0)
-
-
-def _saved_camera(path: Path, i: int, entry: _Entry) -> SavedCamera:
-    width, height = round(entry.width), round(entry.height)
-    pose = rigid_inverse(path, f"[{i}].rotation", np.array(entry.rotation), np.array(entry.position))
-    cx = width / 2 if entry.cx is None else entry.cx
-    cy = height / 2 if entry.cy is None else entry.cy
-    try:
-        camera = Camera(pose.to(torch.float64), entry.fx, entry.fy, cx, cy, width, height)
-    except ValueError as error:
-        raise DataError(path, f"[{i}]", str(error), "correct the camera") from error
-    return SavedCamera(
-        name=str(i) if entry.img_name is None else entry.img_name,
-        camera=camera,
-        split="test" if entry.split == "test" else "train",
-        background=entry.background,
-    )
+def _tour(centers: Float[np.ndarray, "C 3"]) -> list[int]:
+    """All indices, each followed by the nearest of those that are left."""
+    tour, left = [0], np.arange(1, len(centers))
+    while len(left):
+        nearest = int(np.linalg.norm(centers[left] - centers[tour[-1]], axis=1).argmin())
+        tour.append(int(left[nearest]))
+        left = np.delete(left, nearest)
+    return tour

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -18,11 +16,10 @@ from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, Rasterizer
 
 _SOLID: Final = 0.5  # a pixel has a depth where the Gaussians cover at least this share of it
-_SAMPLED: Final = 5  # cameras that the range of depths is taken from, about
 _EXTREMES: Final = (0.02, 0.98)  # quantiles of depth at the ends of the range
 DEPTH_COLORS: Final = "viridis_r"
 """matplotlib's name of the colours of depth: near is bright."""
-_UNKNOWN: Final = 0.8  # grey
+_UNKNOWN: Final = "#cccccc"
 
 
 @dataclass(eq=False)
@@ -35,6 +32,11 @@ class Painter:
 
     field: GaussianField
     make: Callable[..., Rasterizer]
+    _as_measured: Rasterizer = field(init=False)
+    _over_black: Rasterizer = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._as_measured, self._over_black = self.make(), self.make(background=(0.0, 0.0, 0.0))
 
     @torch.no_grad()
     def color(self, camera: Camera) -> Float[Tensor, "H W 3"]:
@@ -59,45 +61,22 @@ class Painter:
     def _numbers(self, camera: Camera, rgb: Float[Tensor, "N 3"]) -> Float[Tensor, "H W 3"]:
         """Render the Gaussians with these colours over black."""
         splats = self.field.baked()
-        colored = replace(splats, sh0=((rgb - 0.5) / SH_C0)[:, None], shN=splats.shN[:, :0], rgb_offset=None)
-        return self._over_black(colored, camera).image
-
-    @cached_property
-    def _as_measured(self) -> Rasterizer:
-        return self.make()
-
-    @cached_property
-    def _over_black(self) -> Rasterizer:
-        return self.make(background=(0.0, 0.0, 0.0))
+        painted = replace(splats, sh0=((rgb - 0.5) / SH_C0)[:, None], shN=splats.shN[:, :0], rgb_offset=None)
+        return self._over_black(painted, camera).image
 
 
-@dataclass(frozen=True, slots=True)
-class DepthScale:
-    """The range of depths that the colours span, world units."""
+def depth_range(depth: Float[Tensor, "*shape"]) -> tuple[float, float]:
+    """The range that the colours span, of depths in world units; those that are not finite are left out. 0 to 1 where none is."""
+    known = depth[depth.isfinite()].cpu().numpy()  # torch's own quantile takes 16 million numbers at most
+    if not len(known):
+        return 0.0, 1.0
+    near, far = (float(np.quantile(known, q)) for q in _EXTREMES)
+    return near, max(far, near * (1 + 1e-6) + 1e-6)
 
-    near: float
-    far: float
 
-    @classmethod
-    def of(cls, painter: Painter, cameras: Sequence[Camera]) -> DepthScale:
-        """From the depths that a few of the cameras see."""
-        sampled = cameras[:: math.ceil(len(cameras) / _SAMPLED)]
-        return cls.spanning(torch.cat([painter.depth(camera).flatten() for camera in sampled]))
+def colored(depth: Float[Tensor, "H W"], near: float, far: float) -> UInt8[np.ndarray, "H W 3"]:
+    """Depth in colours, grey where there is none."""
+    from matplotlib import colormaps
 
-    @classmethod
-    def spanning(cls, depth: Float[Tensor, "*shape"]) -> DepthScale:
-        """From depths; those that are not finite are left out. 0 to 1 where none is finite."""
-        known = depth[depth.isfinite()].cpu().numpy()  # torch's own quantile takes 16 million numbers at most
-        if not len(known):
-            return cls(0.0, 1.0)
-        near, far = (float(np.quantile(known, q)) for q in _EXTREMES)
-        return cls(near, max(far, near * (1 + 1e-6) + 1e-6))
-
-    def picture(self, depth: Float[Tensor, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
-        """Depth in colours, grey where there is none."""
-        from matplotlib import colormaps
-
-        values = ((depth - self.near) / (self.far - self.near)).clamp(0, 1).numpy()
-        colored = colormaps[DEPTH_COLORS](np.nan_to_num(values))[..., :3]
-        colored[~np.isfinite(values)] = _UNKNOWN
-        return np.asarray((colored * 255).round().astype(np.uint8))
+    colors = colormaps[DEPTH_COLORS].with_extremes(bad=_UNKNOWN)
+    return np.asarray(colors(((depth - near) / (far - near)).numpy(), bytes=True)[..., :3])

@@ -6,7 +6,6 @@ Heavy: it imports viser and nerfview, and is itself imported only once a viewer 
 from __future__ import annotations
 
 import contextlib
-import functools
 import io
 import logging
 import math
@@ -23,15 +22,13 @@ import viser
 from jaxtyping import Float
 
 from clear_strategies.core.images import to_bytes
-from clear_strategies.viewing import paths
-from clear_strategies.viewing.cameras import at_most
-from clear_strategies.viewing.look import DepthScale, Painter
+from clear_strategies.geometry.cameras import looked_at
+from clear_strategies.viewing.look import Painter, colored, depth_range
 from clear_strategies.viewing.video import Pixels
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
-_SMALL: Final = 96  # px, longest edge of the pictures that the colours of depth are chosen by
 _SIZE: Final = 1024  # px, longest edge of a picture at first
 _PATIENCE: Final = 0.02  # seconds between looks at the button while the run is paused
 _TURN: Final = 0.002  # seconds that the lock is free after an iteration, so that a thread that waits for it gets it
@@ -49,7 +46,7 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         self, painter: Painter, cameras: Sequence[Camera], *, title: str, port: int = 8080, host: str = "127.0.0.1",
         out: Path | None = None, mode: Literal["rendering", "training"] = "rendering",
     ) -> None:  # fmt: skip
-        self._painter, self._cameras, self._failed = painter, cameras, ""
+        self._painter, self._failed = painter, ""
         # A browser that goes away while its picture is drawn.
         warnings.filterwarnings("ignore", message=".*it will never be delivered")
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its address; whoever opens it does
@@ -63,14 +60,6 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
     def address(self) -> str:
         """Where a browser finds it."""
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
-
-    def serve_until_stopped(self) -> None:
-        """Wait for Ctrl-C."""
-        try:
-            while True:
-                time.sleep(0.5)
-        except KeyboardInterrupt:
-            self.close()
 
     def close(self) -> None:
         """Stop serving."""
@@ -86,15 +75,10 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         width, height = size
         focal, world_to_camera = height / 2 / math.tan(fov / 2), np.linalg.inv(pose.astype(np.float64))
         camera = Camera(torch.from_numpy(world_to_camera), focal, focal, width / 2, height / 2, width, height)
-        if self._depth.value:
-            return self.depth_scale.picture(self._painter.depth(camera))
-        return to_bytes(self._painter.color(camera))
-
-    @functools.cached_property
-    def depth_scale(self) -> DepthScale:
-        """From the cameras of the run; 0 to 10 where none is known."""
-        cameras = [at_most(camera, _SMALL) for camera in self._cameras]
-        return DepthScale.of(self._painter, cameras) if cameras else DepthScale(0.0, 10.0)
+        if not self._depth.value:
+            return to_bytes(self._painter.color(camera))
+        depth = self._painter.depth(camera)
+        return colored(depth, *depth_range(depth))
 
     def _populate_rendering_tab(self) -> None:
         self._depth = self.server.gui.add_checkbox("Depth", False, order=0)
@@ -154,7 +138,7 @@ def _aim(server: viser.ViserServer, cameras: Sequence[Camera]) -> None:
     poses, first, start = [camera.world_to_camera.double() for camera in cameras], cameras[0], server.initial_camera
     up = -torch.stack(poses)[:, 1, :3].mean(0)
     server.scene.set_up_direction(tuple((up / up.norm().clamp_min(1e-9)).tolist()))
-    distance = float(np.linalg.norm(paths.look_at(cameras) - first.center.double().numpy()))
+    distance = float((looked_at(cameras) - first.center.double()).norm())
     start.position = tuple(first.center.tolist())
     start.look_at = tuple((first.center.double() + distance * poses[0][2, :3]).tolist())
     start.up = tuple((-poses[0][1, :3]).tolist())

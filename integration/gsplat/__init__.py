@@ -11,7 +11,6 @@ The names, shapes and order of calls that `attach` relies on are those of gsplat
 """
 
 from integration.gsplat.attached import Attached, attach
-from integration.gsplat.data import views_from_dataset
-from integration.gsplat.simple_trainer import install
+from integration.gsplat.simple_trainer import install, views_from_dataset
 
 __all__ = ["Attached", "attach", "install", "views_from_dataset"]

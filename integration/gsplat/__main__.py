@@ -16,8 +16,7 @@ from typing import Any
 
 from clear_strategies.errors import HostError
 from integration import launcher
-from integration.gsplat.data import photos_of
-from integration.gsplat.simple_trainer import install
+from integration.gsplat.simple_trainer import install, photos_of
 from integration.views import save_photos
 
 

@@ -20,9 +20,8 @@ from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment
 from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot, Target
-from integration.densification import require_end
+from integration.densification import require_end, warn_if_score_is_unused
 from integration.detail import detail_adam, sh0_offset
-from integration.host_score import warn_if_score_is_unused
 from integration.lineage import RowNumbers
 from integration.replacing import replace_everywhere
 from rasterizers.autograd import drawing_ahead, recorded, uncompiled

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import functools
+import inspect
 import logging
 import sys
 from collections.abc import Callable, Sequence
@@ -14,15 +16,13 @@ import torch
 from torch import Tensor
 
 from clear_strategies.console import show_in_host
+from clear_strategies.core.view import View
 from clear_strategies.errors import HostError, SettingError
 from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
 from integration.gsplat.attached import Attached, require_bands
-from integration.gsplat.data import photos_of
-from integration.gsplat.points import start_from_stereo
-from integration.points import Points, wants_stereo
 from integration.replacing import replace_everywhere
-from integration.views import SuperResolve, sr_source
+from integration.views import HostPhoto, Points, SuperResolve, no_stereo, sr_source, stereo_points, wants_stereo
 
 _log = logging.getLogger(__name__)
 
@@ -40,6 +40,7 @@ _NEEDED: Final = {
     "data_type": ("colmap", "other datasets have other cameras"),
 }
 """Fields of the trainer's Config: what CLEAR needs, and why."""
+_CREATE: Final = "create_splats_with_optimizers"
 
 
 def install(
@@ -160,3 +161,66 @@ class _Installed:
         """A checkpoint's sh0 is f_base + f_det, and it has the keys that the trainer's evaluation expects."""
         detail = stored.pop(f"{prefix}detail")
         stored[f"{prefix}sh0"] = stored[f"{prefix}sh0"] + sh0_offset(detail, stored[f"{prefix}sh0"])
+
+
+def photos_of(dataset: Any, device: torch.device | str = "cpu") -> list[HostPhoto]:
+    """The photos of a `Dataset`, in its order and in the world of its parser (photo i is `image_id` i).
+
+    gsplat sets its rendering to 0 outside of a mask.
+    """
+    photos = []
+    for i in range(len(dataset)):
+        item, name = dataset[i], str(dataset.parser.image_names[dataset.indices[i]])
+        image, mask = (item["image"] / 255).to(device), item.get("mask")
+        shown = None if mask is None or bool(mask.all()) else mask.to(image)
+        photos.append(HostPhoto(name, image, torch.linalg.inv(item["camtoworld"]).to(device), item["K"], shown))
+    return photos
+
+
+def views_from_dataset(
+    dataset: Any, sr: SuperResolve, factor: int = 4, device: torch.device | str = "cpu"
+) -> tuple[View, ...]:
+    """The views of a `Dataset`; view i is that of `image_id` i.
+
+    Args:
+        sr: gives the SR images. factor: HR pixels per LR pixel.
+
+    Raises:
+        DataError: an SR image is missing, or is not `factor` times as large as its photo.
+    """
+    return tuple(photo.view(sr, factor) for photo in photos_of(dataset, device))
+
+
+def start_from_stereo(runner_class: Any) -> None:
+    """Make every later `Runner` start from the stereo cloud of its training photos.
+
+    simple_trainer's `create_splats_with_optimizers` gets a parser whose `points` and `points_rgb` are that cloud; the
+    runner's own parser stays as it is. With an `init_type` other than "sfm", which reads no points, a warning says so.
+
+    Args:
+        runner_class: simple_trainer's `Runner`.
+
+    Raises:
+        HostError: the module of the class has no create_splats_with_optimizers or no Dataset.
+    """
+    module = getattr(inspect.unwrap(runner_class.__init__), "__globals__", {})
+    if missing := [name for name in (_CREATE, "Dataset") if name not in module]:
+        raise no_stereo(
+            f"the module of {runner_class.__name__} has no {missing[0]}, which gsplat's simple_trainer.py has"
+        )
+    create, dataset = module[_CREATE], module["Dataset"]
+
+    @functools.wraps(create)
+    def create_from_stereo(parser: Any, *args: Any, **kwargs: Any) -> Any:
+        call = inspect.signature(create).bind(parser, *args, **kwargs)
+        call.apply_defaults()
+        init_type = call.arguments.get("init_type", "sfm")
+        if init_type == "sfm":
+            cloud = stereo_points(photos_of(dataset(parser, split="train")))
+            parser = copy.copy(parser)  # what else its points are used for (depths) needs its own
+            parser.points, parser.points_rgb = cloud.means.numpy(), (cloud.colors * 255).numpy()
+        else:
+            _log.warning("points=stereo has no effect with init_type=%s. Set init_type=sfm.", init_type)
+        return create(parser, *args, **kwargs)
+
+    module[_CREATE] = create_from_stereo

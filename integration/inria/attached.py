@@ -18,8 +18,7 @@ from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment
 from integration.autograd_shot import HostOutput, Target
-from integration.densification import require_end
-from integration.host_score import warn_if_score_is_unused
+from integration.densification import require_end, warn_if_score_is_unused
 from integration.inria.cameras import HostViews, enlarged_camera, replaced_camera
 from integration.inria.detail import DetailFeature
 from integration.inria.model_proxy import Overrides, Role, host_output, proxy

@@ -18,8 +18,7 @@ from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import View
 from clear_strategies.data.priors import Bicubic, Images, Onnx, Prior, cached
 from clear_strategies.errors import DataError, SettingError
-from integration.points import stereo_points
-from integration.views import HostPhoto
+from integration.views import HostPhoto, stereo_points
 
 
 def prior(sr: Path | None) -> Prior:

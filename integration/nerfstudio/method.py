@@ -14,6 +14,7 @@ from typing import Any, Final, Literal
 import torch
 from jaxtyping import Float
 from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
@@ -31,13 +32,40 @@ from clear_strategies.errors import SettingError
 from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
 from integration.gsplat import Attached, attach
-from integration.nerfstudio.data import photos_of, prior, views_from_datamanager
-from integration.nerfstudio.datamanager import ClearDatamanagerConfig
+from integration.nerfstudio.data import photos_of, prior, seed_with_stereo, views_from_datamanager
 from integration.replacing import replaced_attribute
-from integration.views import save_photos
+from integration.views import save_photos, wants_stereo
 
 NAMES: Final = {"sh0": "features_dc", "shN": "features_rest"}
 """gsplat's parameter name -> splatfacto's, where they differ."""
+
+
+@dataclass
+class ClearDatamanagerConfig(FullImageDatamanagerConfig):  # type: ignore[misc]
+    """nerfstudio's settings, and whose points the Gaussians start from.
+
+    Raises:
+        SettingError: `points` is neither own nor stereo.
+    """
+
+    _target: type = field(default_factory=lambda: ClearDatamanager)
+    points: Literal["own", "stereo"] = "own"
+    """own: the data set's points; stereo: dense stereo between the training photos"""
+
+    def __post_init__(self) -> None:
+        wants_stereo(self.points)
+
+
+class ClearDatamanager(FullImageDatamanager):  # type: ignore[misc]
+    """nerfstudio's data manager; for training with points=stereo, the data set's points are replaced."""
+
+    config: ClearDatamanagerConfig
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        if wants_stereo(self.config.points) and self.test_mode == "val":  # otherwise a checkpoint has the Gaussians
+            show_in_host()
+            seed_with_stereo(self)
 
 
 @dataclass

@@ -12,8 +12,9 @@ import torch
 
 import rasterizers
 from clear_strategies import GCO, P2G, SVS, DataError, Objective
-from clear_strategies.bench import iteration, scale, scenes, timing
+from clear_strategies.bench import iteration, scale, scenes
 from clear_strategies.bench import rasterizers as drawing
+from clear_strategies.bench import results as timing
 from clear_strategies.bench.__main__ import main
 from clear_strategies.bench.rasterizers import ATTRIBUTES
 from clear_strategies.bench.results import Results

@@ -66,7 +66,7 @@ def test_sr_images_are_compared_of_few_photos_and_not_of_an_object_before_a_plai
         compared.append(photos[0].camera.width)
         return depth_maps(photos, *arguments)
 
-    monkeypatch.setattr("clear_strategies.data.cloud.compared.depth_maps", recorded)
+    monkeypatch.setattr("clear_strategies.data.cloud.depth_maps", recorded)
     settings = CloudSettings(init="stereo", densify=False)
     for n in (5, 6):
         initial_points(settings, lr[:n], hr=hr[:n])

@@ -10,11 +10,10 @@ import torch
 
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.cloud import CloudSettings
-from clear_strategies.data.hr_limit import within_limit
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.prepare import check_headers, prepare, save_lr
 from clear_strategies.data.priors import Bicubic
-from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split
+from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split, within_limit
 from clear_strategies.errors import DataError, SettingError
 from rasterizers import Camera
 from tests.helpers.captures import POINTS_AT_RANDOM as POINTS

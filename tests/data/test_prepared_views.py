@@ -86,7 +86,7 @@ def test_depth_is_that_of_the_hr_side_where_it_is_photos_and_else_of_lr(
         asked.append(stereo.window)
         return [DepthMap(torch.full(p.image.shape[:2], 4.0), torch.ones(p.image.shape[:2])) for p in photos]
 
-    monkeypatch.setattr("clear_strategies.data.cloud.compared.depth_maps", depth_maps)
+    monkeypatch.setattr("clear_strategies.data.cloud.depth_maps", depth_maps)
     cloud = CloudSettings(init="stereo", stereo=StereoSettings(max_pixels=max_pixels))
     scene = prepare(ROOM, ViewSettings(photos_are=photos_are, train=2), Bicubic(), cloud)
     assert asked == windows

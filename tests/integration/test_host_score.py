@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from clear_strategies import GCO, P2G, SVS, Conductor, Strategy
 from clear_strategies.errors import SettingError
 from integration.autograd_shot import ScreenGradientSlot
-from integration.densification import end_with_strategies, require_end
-from integration.host_score import ScoreScaler, score_for_host
+from integration.densification import ScoreScaler, end_with_strategies, require_end, score_for_host
 from integration.inria import attach
 from tests.helpers import gsplat_host
 from tests.helpers.host_parts import HR_FROM_START, WITHOUT_HR, N, options

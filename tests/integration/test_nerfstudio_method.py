@@ -34,8 +34,7 @@ from clear_strategies.errors import SettingError
 from clear_strategies.strategies import random_background
 from integration.nerfstudio import clear_splatfacto
 from integration.nerfstudio.data import stereo_cloud
-from integration.nerfstudio.datamanager import ClearDatamanager
-from integration.nerfstudio.method import ClearSplatfactoModel, ClearSplatfactoModelConfig
+from integration.nerfstudio.method import ClearDatamanager, ClearSplatfactoModel, ClearSplatfactoModelConfig
 from rasterizers import autograd
 from rasterizers.geometry import SH_C0
 

@@ -14,12 +14,10 @@ import torch
 
 from clear_strategies.geometry import stereo
 from clear_strategies.geometry.projection import intrinsics
-from integration import HostError
-from integration import points as initial
-from integration.gsplat import points as gsplat_points
+from integration import HostError, views
+from integration.gsplat import simple_trainer
 from integration.inria.from_options import install as install_in_inria
-from integration.points import stereo_points
-from integration.views import HostPhoto
+from integration.views import HostPhoto, stereo_points
 from rasterizers.geometry import SH_C0
 from tests.helpers import toy
 from tests.helpers.host_parts import FROM_START, N, options
@@ -56,10 +54,10 @@ def test_one_line_says_what_was_found_and_a_large_cloud_is_reduced(monkeypatch, 
     photos = host_photos()
     with caplog.at_level(logging.INFO):
         whole = stereo_points(photos)
-    assert [r.message for r in caplog.records if r.name == "integration.points"] == [
+    assert [r.message for r in caplog.records if r.name == "integration.views"] == [
         f"points=stereo: {expected().summary}."
     ]
-    monkeypatch.setattr(initial, "MAX_POINTS", 50)
+    monkeypatch.setattr(views, "MAX_POINTS", 50)
     with caplog.at_level(logging.INFO):
         few = stereo_points(photos)
     assert len(few) == 50
@@ -122,7 +120,7 @@ def test_a_script_without_the_hosts_functions_is_refused(trainer):
         rasterize_splats = train
 
     with pytest.raises(HostError, match=r"has no create_splats_with_optimizers.*points3D\.ply"):
-        gsplat_points.start_from_stereo(Runner)
+        simple_trainer.start_from_stereo(Runner)
     del trainer.Dataset
     with pytest.raises(HostError, match="has no Dataset"):
         install(trainer, points="stereo")

@@ -17,7 +17,7 @@ from clear_strategies.errors import DataError, SettingError
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.training.field import GaussianField
 from integration.examples.demo import load_demo, splats_with_optimizers
-from integration.gsplat.data import photos_of, views_from_dataset
+from integration.gsplat.simple_trainer import photos_of, views_from_dataset
 from integration.views import by_name, save_photos, view
 from tests.helpers import gsplat_host, toy
 from tests.helpers.host_parts import as_item

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from clear_strategies import GCO, P2G, Objective, View, files
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.data.scene import Scene
 from clear_strategies.outputs import results
-from clear_strategies.outputs.contact_sheet import magnification
+from clear_strategies.outputs.figures import magnification
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.plan import Chosen
 from clear_strategies.outputs.results import write_results
@@ -69,7 +70,7 @@ def test_conflict_csv_holds_columns_of_history_csv_and_the_ply_says_how_it_was_d
 def test_a_run_without_test_views_shows_training_views_and_what_is_not_wanted_or_cannot_be_written_is_missing(
     tmp_path, state, monkeypatch, caplog
 ):
-    monkeypatch.setattr("clear_strategies.viewing.video.find_spec", lambda _: None)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     scene = replace(SCENE, test=(), train=SCENE.train * 2)
     with caplog.at_level("DEBUG"):
         write(tmp_path, state, scene=scene, video=2)

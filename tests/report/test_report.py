@@ -16,8 +16,7 @@ import pandas as pd
 import pytest
 
 from clear_strategies import DataError, files, report
-from clear_strategies.outputs.contact_sheet import write_contact_sheet
-from clear_strategies.outputs.curves import write_curves
+from clear_strategies.outputs.figures import write_contact_sheet, write_curves
 from clear_strategies.settings import CHANGES_NO_RESULT
 from tests.helpers.finished_run import averages_of, cells, make_run, rows_of, scores, table_of
 from tests.helpers.image_files import array, holds, read

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from pathlib import Path
 
 import imageio_ffmpeg as ffmpeg
@@ -12,7 +13,8 @@ import pytest
 import torch
 
 from clear_strategies.errors import DataError, SettingError
-from clear_strategies.viewing import cameras, paths, video
+from clear_strategies.geometry.cameras import looked_at
+from clear_strategies.viewing import cameras, video
 from rasterizers.interface import Camera
 from tests.helpers import toy
 
@@ -92,7 +94,7 @@ def centers(cameras: list[Camera]) -> np.ndarray:
 
 
 def test_a_path_passes_its_cameras_and_is_even_and_closed_and_looks_where_they_look():
-    frames = paths.through(SHUFFLED, 120)
+    frames = cameras.through(SHUFFLED, 120)
     path = centers(frames)
     for camera in RING:
         assert np.linalg.norm(path - camera.center.numpy(), axis=1).min() < 0.1
@@ -107,27 +109,27 @@ def test_a_path_passes_its_cameras_and_is_even_and_closed_and_looks_where_they_l
 
 def test_many_cameras_are_thinned_and_the_point_that_they_look_at():
     dense = [at((3 * math.cos(a), 0.0, 3 * math.sin(a))) for a in np.arange(100) * math.tau / 100]
-    steps = np.linalg.norm(np.diff(centers(paths.through(dense, 60)), axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(centers(cameras.through(dense, 60)), axis=0), axis=1)
     assert steps.max() < 1.5 * steps.min()
-    np.testing.assert_allclose(paths.look_at(RING), 0, atol=1e-9)
+    np.testing.assert_allclose(looked_at(RING), 0, atol=1e-9)
     parallel = [toy.camera(0.0), toy.camera(0.0)]
-    assert np.isfinite(paths.look_at(parallel)).all()
+    assert np.isfinite(looked_at(parallel)).all()
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_few_cameras_and_cameras_at_one_place_give_a_path_too(count):
-    path = paths.through(RING[:count], 10)
+    path = cameras.through(RING[:count], 10)
     assert len(path) == 10
     assert len({tuple(center.round(6)) for center in centers(path)}) > 3
     assert np.isfinite(centers(path)).all()
-    still = paths.through([RING[0]] * (count + 1), 5)  # several cameras at one place
+    still = cameras.through([RING[0]] * (count + 1), 5)  # several cameras at one place
     np.testing.assert_allclose(centers(still), np.tile(RING[0].center.numpy(), (5, 1)), atol=1e-6)
 
 
-@pytest.mark.parametrize(("cameras", "frames"), [([], 5), (RING, 0)])
-def test_what_gives_no_path_is_refused(cameras, frames):
+@pytest.mark.parametrize(("along", "frames"), [([], 5), (RING, 0)])
+def test_what_gives_no_path_is_refused(along, frames):
     with pytest.raises(SettingError, match="needs at least"):
-        paths.through(cameras, frames)
+        cameras.through(along, frames)
 
 
 # ---- videos hold the frames that were written, and nothing is left of one that broke
@@ -176,6 +178,6 @@ def test_a_missing_program_and_a_missing_library_are_named(monkeypatch, tmp_path
     monkeypatch.setattr(ffmpeg, "get_ffmpeg_exe", nowhere)
     with pytest.raises(SettingError, match="does not run here: install ffmpeg"):
         video.write_video(tmp_path / "a.mp4", FRAMES, fps=10)
-    monkeypatch.setattr(video, "find_spec", lambda _: None)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(SettingError, match="pip install imageio-ffmpeg"):
         video.write_video(tmp_path / "a.mp4", FRAMES, fps=10)

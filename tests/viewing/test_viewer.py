@@ -14,13 +14,13 @@ import pytest
 import torch
 
 import rasterizers
-from clear_strategies import viewing
 from clear_strategies.commands import view
 from clear_strategies.core.images import to_bytes
 from clear_strategies.errors import SettingError
+from clear_strategies.jobs import exit_codes
 from clear_strategies.jobs.saved import open_splat
 from clear_strategies.training.field import GaussianField
-from clear_strategies.viewing.look import DepthScale, Painter
+from clear_strategies.viewing.look import Painter, colored, depth_range
 from tests.helpers import toy, wall
 from tests.helpers.command_line import TINY, run
 
@@ -54,7 +54,7 @@ def test_depth_is_unknown_where_nothing_is_and_numbers_are_blended_over_black(fi
     turned = replace(CAMERA, world_to_camera=torch.diag(torch.tensor([1.0, -1, -1, 1])) @ CAMERA.world_to_camera)
     depth = Painter(field, make).depth(turned)
     assert depth.isnan().all()
-    picture = DepthScale.of(Painter(field, make), [turned]).picture(depth)
+    picture = colored(depth, *depth_range(depth))
     assert (picture[0, 0] == 204).all()
     painter = Painter(field, make)
     ones = painter.numbers(CAMERA, torch.ones(len(field)))
@@ -77,8 +77,8 @@ def test_the_viewer_shows_what_is_measured_or_its_depth_and_closes(saved_run, tm
     try:
         assert viewer.address.startswith("http://127.0.0.1:")
         close(viewer.draw(POSE, FOV, (96, 64)), to_bytes(splat.painter.color(CAMERA)))
-        viewer._depth.value = True
-        close(viewer.draw(POSE, FOV, (96, 64)), viewer.depth_scale.picture(splat.painter.depth(CAMERA)))
+        viewer._depth.value, depth = True, splat.painter.depth(CAMERA)
+        close(viewer.draw(POSE, FOV, (96, 64)), colored(depth, *depth_range(depth)))
     finally:
         viewer.close()
 
@@ -96,9 +96,9 @@ def test_a_port_that_no_machine_has_and_an_address_of_another_machine_are_refuse
 
 
 def test_missing_libraries_are_named(monkeypatch):
-    monkeypatch.setattr(viewing, "find_spec", lambda name: None if name == "viser" else object())
+    monkeypatch.setattr(exit_codes, "find_spec", lambda name: None if name == "viser" else object())
     with pytest.raises(SettingError, match=r"the viewer needs viser: pip install 'clear-strategies\[view\]'"):
-        viewing.require_viewer()
+        exit_codes.require_viewer()
 
 
 def test_a_viewer_is_there_while_a_run_trains_and_draws_between_two_iterations_alone(saved_run, monkeypatch):

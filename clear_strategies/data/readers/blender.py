@@ -9,8 +9,8 @@ from typing import Final
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import Capture, lens_notes, require_names
 from clear_strategies.data.photo_folders import finder, named
+from clear_strategies.data.readers.nerfstudio import frames_of, points_of, transforms_of
 from clear_strategies.data.strict_json import read_object
-from clear_strategies.data.transforms import frames_of, points_of, transforms_of
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
 

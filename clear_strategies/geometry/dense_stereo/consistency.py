@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from clear_strategies.geometry.dense_stereo.image import Estimate
+from clear_strategies.geometry.dense_stereo.cost import Grey
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
-from clear_strategies.geometry.libraries import missing
+from clear_strategies.geometry.sift import missing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The depth of one photo, before it is compared with that of others."""
+
+    image: Grey
+    inverse_depth: Float[Tensor, "H W"]  # 1 / z, 1 / world units
+    correlation: Float[Tensor, "H W"]  # ZNCC of the windows at that depth, in [-1, 1]
 
 
 def confirm(

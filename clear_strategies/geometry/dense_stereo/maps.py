@@ -12,9 +12,8 @@ from torch import Tensor
 
 from clear_strategies.core.progress import Progress
 from clear_strategies.core.view import DepthMap, Photo
-from clear_strategies.geometry.dense_stereo.consistency import confirm, speckles
-from clear_strategies.geometry.dense_stereo.cost import cost_volume
-from clear_strategies.geometry.dense_stereo.image import Estimate, Grey, grey
+from clear_strategies.geometry.dense_stereo.consistency import Estimate, confirm, speckles
+from clear_strategies.geometry.dense_stereo.cost import Grey, cost_volume, grey
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.dense_stereo.smoothing import smooth
 from clear_strategies.geometry.dense_stereo.sources import Comparison, comparisons, plane_count

@@ -14,7 +14,7 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.readers import demo
-from clear_strategies.data.readers.demo.surfaces import Texture
+from clear_strategies.data.readers.demo import Texture
 from clear_strategies.errors import SettingError
 
 WIDTH, HEIGHT, FACTOR = 128, 96, 4

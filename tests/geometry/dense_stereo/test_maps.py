@@ -9,14 +9,13 @@ import torch
 from torch import Tensor
 
 from clear_strategies.core.view import Photo
-from clear_strategies.geometry.completion import completed
 from clear_strategies.geometry.dense_stereo import consistency, cost, sources
 from clear_strategies.geometry.dense_stereo.consistency import speckles
-from clear_strategies.geometry.dense_stereo.cost import cost_volume
-from clear_strategies.geometry.dense_stereo.image import Grey
+from clear_strategies.geometry.dense_stereo.cost import Grey, cost_volume
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.dense_stereo.smoothing import smooth
+from clear_strategies.geometry.filling import completed
 from tests.helpers.planes import plane_photos, same_maps
 from tests.helpers.textured import Surface, bump, camera, cast, slanted
 

@@ -12,20 +12,23 @@ from pathlib import Path
 from typing import Final, Literal, NamedTuple, get_args
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from clear_strategies.core.checks import refuse, require_choice, require_number, require_whole
 from clear_strategies.core.points import MAX_POINTS, PointCloud
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.capture import SfmPoints
-from clear_strategies.data.cloud.compared import stereo_depths
 from clear_strategies.data.ply import read_points
 from clear_strategies.errors import DataError
 from clear_strategies.geometry.cameras import common_box
 from clear_strategies.geometry.cleaning import OUTLIER_NEIGHBOURS, OUTLIER_RATIO, averaged_in_voxels, without_outliers
 from clear_strategies.geometry.dense_stereo.cloud import stereo_cloud
+from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.filling import STRIDE, densify, pixel_grid
 from clear_strategies.geometry.projection import blackened
+from clear_strategies.geometry.pseudo_views import cut_out
 from clear_strategies.geometry.sift import TriangulationSettings, triangulate
 from rasterizers.interface import Color
 
@@ -278,3 +281,45 @@ def random_cloud(photos: Sequence[Photo], count: int, seed: int, box: float | No
     # Equal colours would give all points equal colour gradients.
     colors = 0.5 + (torch.rand(count, 3, generator=g) - 0.5) * 0.1
     return PointCloud(means, colors, f"random: {count:,} points in {where}")
+
+
+class Depths(NamedTuple):
+    """Photos and their depth maps; the settings for a cloud of them, and their size as a multiple of LR."""
+
+    photos: Sequence[Photo]
+    maps: tuple[DepthMap, ...]
+    settings: StereoSettings
+    finer: float = 1.0
+
+
+def stereo_depths(
+    lr: Sequence[Photo],
+    hr: Sequence[Photo],
+    points: Float[Tensor, "N 3"],
+    settings: StereoSettings,
+    *,
+    hr_is_photo: bool,
+    background: Color | None = None,
+) -> Depths:
+    """Depth from HR, reduced to at most `settings.max_pixels`, where that is larger than LR; else from LR.
+
+    Args:
+        hr: the same views at HR; empty: LR is compared.
+        points, background: as in `clear_strategies.geometry.depth_maps`.
+        hr_is_photo: the HR images are photos, not SR images.
+    """
+    if hr and hr_is_photo:
+        photos = [photo.reduced(photo.factor_to(settings.max_pixels)) for photo in hr]
+        if (finer := photos[0].camera.width / lr[0].camera.width) > 1:
+            of_hr = settings.finer(finer)
+            return Depths(photos, tuple(depth_maps(photos, points, of_hr, background)), of_hr, finer)
+    maps = depth_maps(lr, points, settings, background)
+    if hr and not hr_is_photo and not cut_out(lr, background or (0.0, 0.0, 0.0)):
+        factor = hr[0].camera.width // lr[0].camera.width
+        least = max(photo.factor_to(settings.max_pixels) for photo in hr)
+        by = next((factor // k for k in range(least, factor) if factor % k == 0), 1)
+        if by > 1:
+            images = [photo.reduced(factor // by) for photo in hr]
+            finest = depth_maps(images, points, settings.finer(by), background)
+            maps = [map_lr.completed_by(map_sr.reduced(by)) for map_lr, map_sr in zip(maps, finest, strict=True)]
+    return Depths(lr, tuple(maps), settings)
