@@ -13,9 +13,8 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any, Final
+from functools import lru_cache, reduce
+from typing import Any, Final, NamedTuple
 
 import torch
 import warp as wp
@@ -62,8 +61,7 @@ class _View:
         self.capacity = -1  # pairs that the lists have space for; the nearest ones if there are more
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Lists:
+class _Lists(NamedTuple):
     """Pairs of Gaussian and tile. `splats` has the order of places, Gaussian by Gaussian; `tiles`, `gaussians` and `places` are
     sorted by tile, whose part is from `starts` to `ends`.
     """
@@ -148,10 +146,9 @@ class Frame:
     def basis(self) -> Float[Tensor, "N B1"]:
         """Y of this pose's directions, computed once for all grids."""
         if self._basis is None:
-            visible = torch.stack([view.visible for view in self.views]).any(0)
+            visible = reduce(torch.logical_or, [view.visible for view in self.views])
             self._basis = self.like.new_zeros(self.n, self.bands + 1)
-            arguments = (self.pose, self.means, visible, self._basis)
-            self.launch(basis, self.n, *arguments)
+            self.launch(basis, self.n, self.pose, self.means, visible, self._basis)
         return self._basis
 
     def project(self) -> tuple[Tensor, Tensor, Tensor]:
