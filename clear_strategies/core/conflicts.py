@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import deferred
@@ -100,7 +100,9 @@ def counted(p: Products) -> ConflictCounts:
     """Comparable and opposed Gaussians."""
     whole = p.whole()
     comparable = (whole.l2 > 0) & (whole.h2 > 0)
-    return ConflictCounts(numbers(comparable.sum(0)), numbers(((whole.dot < 0) & comparable).sum(0)))
+    return ConflictCounts(
+        deferred.elements(comparable.sum(0)), deferred.elements(((whole.dot < 0) & comparable).sum(0))
+    )
 
 
 def conflict_ratio(lr: Mapping[str, Tensor], hr: Mapping[str, Tensor]) -> dict[str, Number]:
@@ -109,11 +111,6 @@ def conflict_ratio(lr: Mapping[str, Tensor], hr: Mapping[str, Tensor]) -> dict[s
         return {}
     columns = GradientColumns.of(lr, hr)
     return counted(columns.products()).ratios(columns.names)
-
-
-def numbers(x: Int[Tensor, " K"] | Float[Tensor, " K"]) -> Sequence[Number]:
-    """The numbers of a tensor: read at once on the CPU, else one 0-dim tensor each."""
-    return x.tolist() if deferred.is_immediate(x) else x.unbind()
 
 
 def _side_by_side(grads: Mapping[str, Tensor], names: Sequence[str]) -> Float[Tensor, "N D"]:

@@ -14,11 +14,11 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import takewhile
+from itertools import islice, takewhile
 from typing import Final, NamedTuple, cast
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
@@ -29,12 +29,21 @@ class Deferred(NamedTuple):
     parts: tuple[Number, ...]
 
 
-_UNREAD: Final = (Tensor, Deferred)
+class Element(NamedTuple):
+    """The k-th number of a vector on a device that is never written to again. Many of a vector cost less than a tensor each, and
+    are fetched together.
+    """
+
+    vector: Float[Tensor, " K"] | Int[Tensor, " K"]
+    k: int
+
+
+_UNREAD: Final = (Tensor, Deferred, Element)
 
 Scalar = float | Tensor
 """For arithmetic: a float, or a 0-dim tensor on a device that is never written to again."""
 
-Number = Scalar | Deferred
+Number = Scalar | Deferred | Element
 """For logs and tables: a scalar, or a function of scalars."""
 
 
@@ -46,6 +55,11 @@ def is_immediate(x: Tensor) -> bool:
 def scalar(x: Tensor) -> Scalar:
     """A 0-dim tensor as a float where it is read at once, else itself."""
     return float(x.detach().numpy()) if is_immediate(x) else x
+
+
+def elements(x: Int[Tensor, " K"] | Float[Tensor, " K"]) -> Sequence[Number]:
+    """The numbers of a vector; read at once on the CPU."""
+    return x.tolist() if is_immediate(x) else [Element(x, k) for k in range(x.shape[0])]
 
 
 def defer(recipe: Callable[..., float], *numbers: Number) -> Number:
@@ -63,7 +77,9 @@ def read(numbers: Sequence[Number]) -> list[float]:
     def value(x: Number) -> float:
         if isinstance(x, Deferred):
             return x.recipe(*map(value, x.parts))
-        return values[id(x)] if isinstance(x, Tensor) else x
+        if isinstance(x, Element):
+            return values[id(x.vector)][x.k]
+        return values[id(x)][0] if isinstance(x, Tensor) else x
 
     return [value(x) for x in numbers]
 
@@ -98,19 +114,22 @@ def _tensors(x: Number) -> Iterator[Tensor]:
     if isinstance(x, Deferred):
         for part in x.parts:
             yield from _tensors(part)
+    elif isinstance(x, Element):
+        yield x.vector
     elif isinstance(x, Tensor):
         yield x
 
 
-def _transferred(tensors: Sequence[Tensor]) -> dict[int, float]:
-    """Each tensor's number by its id. Tensors of one type are stacked first, so that few kernels fetch many numbers."""
+def _transferred(tensors: Sequence[Tensor]) -> dict[int, Sequence[float]]:
+    """Each tensor's numbers by its id. Tensors of one type are joined first, so that few kernels fetch many numbers."""
     by_type: defaultdict[torch.dtype, list[Tensor]] = defaultdict(list)
     for x in {id(x): x for x in tensors}.values():
         by_type[x.dtype].append(x)
     if not by_type:
         return {}
-    values = torch.cat([torch.stack(alike).double() for alike in by_type.values()]).tolist()
-    return dict(zip((id(x) for alike in by_type.values() for x in alike), values, strict=True))
+    joined = torch.cat([torch.cat([x.view(-1) for x in alike]).double() for alike in by_type.values()])
+    values = iter(joined.tolist())
+    return {id(x): [*islice(values, x.numel())] for alike in by_type.values() for x in alike}
 
 
 def _is_unread(row: Mapping[str, Number]) -> bool:

@@ -17,7 +17,7 @@ from torch import Tensor
 from clear_strategies.core import deferred
 from clear_strategies.core.checks import refuse, require_choice, require_number
 from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule
-from clear_strategies.core.conflicts import ConflictCounts, GradientColumns, counted, numbers
+from clear_strategies.core.conflicts import ConflictCounts, GradientColumns, counted
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads
 from clear_strategies.core.step import Step
 from clear_strategies.kernels import merge
@@ -116,8 +116,8 @@ class GCO(Strategy):
         multiple = torch.where(conflict, ω * (p.dot + τ * n) / p.l2, 0.0)
         corrected = columns.minus(multiple, like=hr)  # Eq. 7
         counts = replace(
-            counted(p), corrected=numbers(conflict.sum(0)), omega=numbers((ω * conflict).sum(0)),
-            at_lower_bound=numbers((conflict & (ω <= self.weight_min)).sum(0)),
+            counted(p), corrected=deferred.elements(conflict.sum(0)), omega=deferred.elements((ω * conflict).sum(0)),
+            at_lower_bound=deferred.elements((conflict & (ω <= self.weight_min)).sum(0)),
         )  # fmt: skip
         self.report(counts, columns.names, isinstance(q, Tensor))
         return Grads({**hr, **corrected})

@@ -41,12 +41,13 @@ def test_elsewhere_nothing_is_read_until_it_is_asked_for(on_a_device):
 
 def test_numbers_cross_once_and_exactly_and_a_recipe_runs_once(on_a_device, monkeypatch):
     moved = []
-    monkeypatch.setattr(torch, "stack", lambda tensors, real=torch.stack: moved.append(len(tensors)) or real(tensors))
+    monkeypatch.setattr(torch, "cat", lambda tensors, real=torch.cat: moved.append(len(tensors)) or real(tensors))
     a, b = torch.tensor(1.0), torch.tensor(2.0)
-    assert deferred.read([deferred.defer(deferred.added, a, b), deferred.defer(deferred.ratio, a, b), a, 5.0]) == [
-        3.0, 0.5, 1.0, 5.0,
+    one, two, _ = deferred.elements(torch.tensor([7.0, 8.0, 9.0]))
+    assert deferred.read([deferred.defer(deferred.added, a, b), deferred.defer(deferred.ratio, a, two), a, 5.0, one]) == [
+        3.0, 0.125, 1.0, 5.0, 7.0,
     ]  # fmt: skip
-    assert moved == [2]
+    assert moved == [3, 1]  # two scalars and a vector, all of one type
     large = torch.tensor(2**24 + 1)
     assert deferred.read([deferred.scalar(large), torch.tensor(0.5)]) == [2**24 + 1, 0.5]
     calls = []

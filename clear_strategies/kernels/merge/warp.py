@@ -235,7 +235,7 @@ def merge(
     with on_stream(device):
         launch(decide, [blocks], decided, device, block=lanes, together=True)
         launch(combine, [n, sum(row.width for row in rows)], combined, device, block=lanes)
-    return interface.Merged(counts_of(counts.sum(0).unbind(), omegas.sum(0).unbind()), finite[0])
+    return interface.Merged(counts_of(counts.sum(0), omegas.sum(0)), finite[0])
 
 
 def _factors(colour: interface.Colour | None) -> Any:

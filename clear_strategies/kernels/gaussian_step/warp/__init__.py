@@ -98,8 +98,8 @@ class WarpGaussianStep:
         with on_stream(device):
             launch(passes.step, [blocks], step, device, block=lanes, together=True)
             launch(passes.step_bands, [self._n, settings.width], of_bands, device, block=lanes)
-        *numbers, still = counts.sum(0).unbind()
-        return StepCounts(conflict.counts_of(numbers, omegas.sum(0).unbind()), still if settings.skips else 0)
+        numbers = counts.sum(0)
+        return StepCounts(conflict.counts_of(numbers, omegas.sum(0)), numbers[-1] if settings.skips else 0)
 
     @property
     def _lanes(self) -> int:

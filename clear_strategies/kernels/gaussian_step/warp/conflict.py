@@ -6,15 +6,15 @@ core.gradients.CONFLICT_GROUPS, and the whole Gaussian is a seventh.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, Final
 
 import warp as wp
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from clear_strategies.core import deferred
 from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule
 from clear_strategies.core.conflicts import ConflictCounts
-from clear_strategies.core.deferred import Number
 from clear_strategies.kernels.gaussian_step.warp.raw_gradients import Gradient, RawGradient, View, basis_products
 from rasterizers.warp_runtime import struct
 
@@ -65,11 +65,11 @@ def rule_of(rule: CorrectionRule | None, q: Tensor | None) -> Any:
     )  # fmt: skip
 
 
-def counts_of(counts: Sequence[Number], omegas: Sequence[Number]) -> ConflictCounts:
+def counts_of(sums: Int[Tensor, " 27"], omegas: Float[Tensor, " 6"]) -> ConflictCounts:
     """The numbers of a sum of `Counts`, and those of ω, by what they count."""
-    seven, six = int(GROUPS) + 1, int(GROUPS)
+    counts, seven, six = deferred.elements(sums), int(GROUPS) + 1, int(GROUPS)
     comparable, opposed, rest = counts[:seven], counts[seven : 2 * seven], counts[2 * seven :]
-    return ConflictCounts(comparable, opposed, rest[:six], omegas, rest[six : 2 * six])
+    return ConflictCounts(comparable, opposed, rest[:six], deferred.elements(omegas), rest[six : 2 * six])
 
 
 @wp.struct
