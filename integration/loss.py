@@ -55,8 +55,8 @@ def joint_loss(
 
     loss: Tensor = _GivenGradients.apply(value, gradients, *trained.values())  # type: ignore[no-untyped-call]
     if scaler is not None and isinstance(lr, AutogradShot):
-        slot = lr.gradient_slot
-        score = score_for_host(slot, update.score, update.ordinary, lr.visible, scaler)
+        slot, (own, ordinary) = lr.gradient_slot, (update.score, update.ordinary)
+        score = None if own is None or ordinary is None else score_for_host(slot, own, ordinary, lr.visible, scaler)
         if score is not None:
             loss.register_hook(lambda loss_scale: slot.write(loss_scale * score))  # type: ignore[no-untyped-call]
     return loss, update

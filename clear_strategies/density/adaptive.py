@@ -115,9 +115,12 @@ class Density(Densifier):
         self.score, self.ordinary, self.count = (torch.zeros(n, device=device) for _ in range(3))
         self.cap, self._warned_of_cap = settings.max_gaussians, False
 
+    def collects(self, t: int) -> bool:
+        return self.settings.statistics_from < t < self.settings.stop
+
     def accumulate(self, update: Update, shot: Shot, t: int) -> None:
         """Add the scores of this view's visible Gaussians; dropped ones are not visible."""
-        if not self.settings.statistics_from < t < self.settings.stop:
+        if update.score is None or update.ordinary is None:
             return
         visible = shot.visible
         for total, value in ((self.score, update.score), (self.ordinary, update.ordinary)):

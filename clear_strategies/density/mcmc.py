@@ -23,6 +23,7 @@ from clear_strategies.core.seeds import hashed_generator_at
 from clear_strategies.core.view import View
 from clear_strategies.errors import DensityError
 from clear_strategies.geometry.pseudo_views import cut_out
+from clear_strategies.kernels import native
 from clear_strategies.schedules import LogLinear, milestone
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.densifier import Densifier
@@ -30,6 +31,7 @@ from clear_strategies.training.field import GaussianField
 from clear_strategies.training.optim import Adam
 from rasterizers.geometry import rotation_matrix
 from rasterizers.interface import Camera
+from rasterizers.native import threads
 
 _log = logging.getLogger(__name__)
 
@@ -113,6 +115,9 @@ class Sampler(Densifier):
         self.seed = seed
         self.cap: int = min(settings.max_gaussians, math.ceil(settings.per_point * n))
 
+    def collects(self, t: int) -> bool:
+        return False
+
     def due(self, t: int) -> bool:
         """Whether a round falls on t."""
         s = self.settings
@@ -161,16 +166,19 @@ class Sampler(Densifier):
 
     def _wander(self, field: GaussianField, t: int, generator: torch.Generator) -> None:
         """Add the noise."""
-        s = self.settings
+        s, means, quats, scales = self.settings, field.means.data, field.quats.data, field.scales.data
         gate = torch.sigmoid(_GATE * (s.dead_opacity - field.opacities.data.sigmoid()))
-        rows = torch.arange(len(field), device=gate.device)
-        if gate.device.type == "cpu":  # elsewhere the count would have to be waited for
-            rows = rows[gate > _STILL]
+        on_cpu = gate.device.type == "cpu"  # elsewhere the count would have to be waited for
+        rows = torch.nonzero(gate > _STILL)[:, 0] if on_cpu else torch.arange(len(field), device=gate.device)
         eta = torch.randn(len(rows), 3, generator=generator, device=gate.device)
-        R = rotation_matrix(field.quats.data[rows])
-        along = field.scales.data[rows].exp().square()[..., None] * (R.mT @ eta[..., None])  # S² Rᵀ η
-        strength = s.noise * s.cooling(t) / field.scales.data.amax(-1).median().exp()
-        field.means.data.index_add_(0, rows, (strength * gate[rows])[:, None] * (R @ along)[..., 0])
+        strength = s.noise * s.cooling(t)
+        if native.runs(gate):
+            native.module().wander(means, quats, scales, gate, rows, eta, strength, threads())
+            return
+        R = rotation_matrix(quats[rows])
+        along = scales[rows].exp().square()[..., None] * (R.mT @ eta[..., None])  # S² Rᵀ η
+        share = strength / scales.amax(-1).median().exp()
+        means.index_add_(0, rows, (share * gate[rows])[:, None] * (R @ along)[..., 0])
 
     def state_dict(self) -> dict[str, Tensor]:
         return {"cap": torch.tensor(self.cap)}

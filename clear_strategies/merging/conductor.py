@@ -150,6 +150,8 @@ class Conductor:
         view: View,
         t: int,
         stepper: Stepper[Any] | None = None,
+        *,
+        scored: bool = True,
     ) -> Update:
         """The merged gradient of one view, in place of `backward()`.
 
@@ -157,6 +159,7 @@ class Conductor:
             params: raw parameters by attribute. lr, hr: this view rendered at both scales. hr None skips HR; lr None
                 stands for the area mean of hr, where `wants_lr` is False or both scales have one size.
             stepper: merges and steps in one pass; None: the readable path below.
+            scored: False: no densification reads the scores of this iteration.
 
         Raises:
             ValueError: a scale that the objective needs was not rendered.
@@ -191,7 +194,9 @@ class Conductor:
             g_lr = g_mean if reduced else g_lr
         step = Step(t, view) if from_hr is None else from_hr.step
         with stage("strategies" if stepper is None else stepper.stage):
-            score, ordinary = self.scores(screen_in_ndc(g_lr, _size(rendered.image)), from_hr, t)  # S^dens   Eq. 14
+            score = ordinary = None
+            if scored:
+                score, ordinary = self.scores(screen_in_ndc(g_lr, _size(rendered.image)), from_hr, t)  # S^dens   Eq. 14
             if stepper is None:
                 merged = self.merge(params, g_lr, from_hr, t)
                 require_finite(f"{where}: the merged gradient", merged.grads)

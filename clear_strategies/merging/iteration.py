@@ -15,6 +15,7 @@ from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.step import Step
+from clear_strategies.kernels import native
 
 G = TypeVar("G")
 """The gradient of one loss in the form that a `Stepper` takes, with `screen` and `table()` of `Grads`, which it is in the
@@ -64,7 +65,8 @@ class Update:
     Args:
         step: the iteration, for `Conductor.after_step`.
         grads: the merged gradient by attribute, for the optimizer; None where a `Stepper` has made the step.
-        score: S_i, the statistic that densification uses; `ordinary` is that of 3DGS, without strategies.
+        score: S_i, the statistic that densification uses; `ordinary` is that of 3DGS, without strategies. None where nothing
+            collects them.
         conflict: share of Gaussians in conflict before correction, by group and as "gaussian"; empty without HR.
         losses: scalars by name. logs: the scalars that the strategies logged.
 
@@ -73,8 +75,8 @@ class Update:
 
     step: Step
     grads: Grads | None
-    score: Float[Tensor, " N"]
-    ordinary: Float[Tensor, " N"]
+    score: Float[Tensor, " N"] | None
+    ordinary: Float[Tensor, " N"] | None
     conflict: Mapping[str, Number] = field(default_factory=dict)
     losses: Mapping[str, Scalar] = field(default_factory=dict)
     logs: Mapping[str, Number] = field(default_factory=dict)
@@ -116,6 +118,8 @@ def require_finite_parts(where: str, g_lr: Any, hr: HrGradients[Any] | None) -> 
         parts |= {"∇L_base": hr.base.table()} | ({} if hr.hf is None else {"∇L_HF": hr.hf.table()})
         weights = {} if hr.step.evidence is None else {"reliability": hr.step.evidence.reliability}
         parts["the evidence"] = weights | ({"m": hr.m} if isinstance(hr.m, Tensor) else {})
-    for part, tensors in parts.items():
-        # The spherical harmonics of a direction are finite wherever the Gaussian is drawn, and are a third of the numbers.
-        require_finite(f"{where}: {part}", {name: x for name, x in tensors.items() if name != "basis"})
+    # The spherical harmonics of a direction are finite wherever the Gaussian is drawn, and are a third of the numbers.
+    looked_at = {p: {name: x for name, x in tensors.items() if name != "basis"} for p, tensors in parts.items()}
+    if not native.all_finite([x for tensors in looked_at.values() for x in tensors.values()]):
+        for part, tensors in looked_at.items():
+            require_finite(f"{where}: {part}", tensors)

@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core.view import SMALLEST
-from clear_strategies.kernels.losses import cpp
+from clear_strategies.kernels import native
 from rasterizers.native import threads
 
 PSNR_CAP: Final = 100.0  # dB, the PSNR of identical images
@@ -88,8 +88,8 @@ def mean_scores(scores: Sequence[ImageScores]) -> ImageScores | None:
 
 def _ssim(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None) -> float:
     """By the kernel of the loss, in a thirtieth of scikit-image's time; they differ by less than 1e-6. The kernel has no map."""
-    if shown is None and cpp.available():
-        return float(cpp.native().mean_ssim(x.float().contiguous(), y.float().contiguous(), threads()))
+    if shown is None and native.available():
+        return float(native.module().mean_ssim(x.float().contiguous(), y.float().contiguous(), threads()))
     from skimage.metrics import structural_similarity
 
     how = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0, "channel_axis": 2}

@@ -95,7 +95,8 @@ def check_answers_have_their_shapes(make: Make) -> None:
             f"background() must give three numbers in [0, 1], or None, got {color}",
         )
         update = conductor.update(params, lr, hr, view, t)
-        _require(update.score.shape == (_N,), f"score() gave {tuple(update.score.shape)} for {_N} Gaussians")
+        shape = None if update.score is None else tuple(update.score.shape)
+        _require(shape == (_N,), f"score() gave {shape} for {_N} Gaussians")
         for name, gradient in _grads(update).items():
             _require(gradient.shape == params[name].shape, f"the gradient of {name} has shape {tuple(gradient.shape)}")
             _require(bool(gradient.isfinite().all()), f"the gradient of {name} is not finite")

@@ -25,6 +25,7 @@ from clear_strategies.core.compiled_rules import Anchor, CorrectionRule
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads
 from clear_strategies.kernels import gaussian_step as kernel
+from clear_strategies.kernels import native
 from clear_strategies.kernels.gaussian_step import cpp
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrGradients
@@ -32,7 +33,6 @@ from clear_strategies.strategies.base import Strategy, not_stated_as_data, overr
 from clear_strategies.training.field import LOG_SCALE_LIMIT, LOGIT_LIMIT, Activation, FieldShot
 from clear_strategies.training.optim import BETA1, BETA2, Adam
 from rasterizers.interface import BackendUnavailable, SplatGradients
-from rasterizers.native import load_kernels
 from rasterizers.warp_runtime import require_warp
 
 _log = logging.getLogger(__name__)
@@ -75,7 +75,7 @@ def gaussian_pass(optimizer: Adam) -> GaussianPass:
     """The pass for the device of the optimizer's moments."""
     device = optimizer.first["means"].device.type
     if device == "cpu":
-        load_kernels("clear_strategies.kernels")
+        native.module()
         return cpp.CppGaussianStep
     require_warp("the compiled pass", device, "it runs in C++ for a field in the CPU's memory")
     from clear_strategies.kernels.gaussian_step import warp

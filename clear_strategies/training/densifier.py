@@ -32,6 +32,10 @@ class Densifier:
         """The iteration at which the second stage of a method of two begins."""
         return None
 
+    def collects(self, t: int) -> bool:
+        """Whether `accumulate` reads the scores of iteration t; else they are not computed."""
+        return True
+
     def accumulate(self, update: Update, shot: Shot, t: int) -> None:
         """Accumulate the scores of iteration t; `shot` is the rendering that they belong to."""
 

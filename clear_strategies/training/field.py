@@ -120,7 +120,7 @@ class GaussianField(nn.Module):
     def take(self, parents: Int[Tensor, " M"], fresh: Bool[Tensor, " M"]) -> None:
         """Change the structure by one gather: row i becomes a copy of row parents[i]."""
         for name in ATTRIBUTES:
-            getattr(self, name).data = getattr(self, name).data[parents]
+            getattr(self, name).data = getattr(self, name).data.index_select(0, parents)
         self.filter_3d = self.filter_3d[parents]
 
     def constrain(self) -> None:

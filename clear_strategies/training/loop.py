@@ -24,7 +24,7 @@ from clear_strategies.core.view import ExtraView, View
 from clear_strategies.data.priors import Bicubic, network_of
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DivergedError
-from clear_strategies.merging.iteration import Update
+from clear_strategies.merging.iteration import Update, require_finite_parts
 from clear_strategies.merging.skips import PLATEAU_LOSS
 from clear_strategies.strategies.base import Drawn
 from clear_strategies.training import checkpoint
@@ -53,7 +53,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     with stage(f"render {' + '.join(scale.upper() for scale, wanted in scales.items() if wanted)}"):
         lr, hr = θ.render_scales(over_color, view, gate=z, **scales)  # Î_LR, Î_HR     Eq. 2, 3
     params = θ.raw()
-    u = conductor.update(params, lr, hr, view, t, s.compiled_step)
+    u = conductor.update(params, lr, hr, view, t, s.compiled_step, scored=s.density.collects(t))
     if u.grads is not None:  # else the compiled step has made the step
         with stage("optimizer"):
             s.optimizer.step(params, u.grads)
@@ -116,18 +116,18 @@ def extra_steps(s: TrainState, rasterizer: Rasterizer, extra_views: Sequence[Ext
         DivergedError: a loss or a gradient is not finite; that step was not made.
     """
     row: dict[str, Number] = {}
-    θ, steps, where = s.field, s.optimizer.steps, f"t={s.t}, an extra view: the gradient"
+    θ, steps, where = s.field, s.optimizer.steps, f"t={s.t}, an extra view"
     for extra in extra_views:
         with s.conductor.work_log.stage("extra views"):
             shot = θ.shot(rasterizer, extra.photo.camera, None if extra.gate is None else extra.gate(len(θ)))
             losses = s.conductor.extra_loss(shot.image, extra, s.t)
             if s.compiled_step is not None:
                 (g,) = s.compiled_step.vjp(shot, losses.cotangents)
-                require_finite(where, g.table())
+                require_finite_parts(where, g, None)
                 s.compiled_step.step_extra(θ.raw(), g, s.t)
             else:
                 (grads,) = shot.vjp(losses.cotangents)
-                require_finite(where, grads)
+                require_finite(f"{where}: the gradient", grads)
                 s.optimizer.step(θ.raw(), grads)
                 θ.constrain()
             s.optimizer.steps = steps  # the learning rates follow the iteration

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.checks import require_choice, require_number, require_whole
-from clear_strategies.kernels.losses import cpp
+from clear_strategies.kernels import native
 from clear_strategies.schedules import milestone
 from rasterizers.interface import Camera, RasterSettings
 from rasterizers.native import threads
@@ -90,8 +90,8 @@ def _as_rows(cameras: Sequence[Camera]) -> Float[Tensor, "V 20"]:
 def _nearest_depths(means: Float[Tensor, "N 3"], cameras: Float[Tensor, "V 20"], near: float) -> Float[Tensor, " N"]:
     """The smallest depth beyond `near` among the cameras that see each centre; infinite where none does."""
     z_min = means.new_full((len(means),), torch.inf)
-    if means.device.type == "cpu" and means.dtype == torch.float32 and cpp.available():
-        cpp.native().nearest_depths(means.contiguous(), cameras, near, z_min, threads())
+    if native.runs(means):
+        native.module().nearest_depths(means.contiguous(), cameras, near, z_min, threads())
         return z_min
     for camera in cameras:
         pose, (fx, fy, cx, cy, u_low, u_high, v_low, v_high) = camera[:12].view(3, 4), camera[12:]

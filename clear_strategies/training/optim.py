@@ -130,11 +130,10 @@ class Adam:
 
     def take(self, parents: Int[Tensor, " M"], fresh: Bool[Tensor, " M"]) -> None:
         """Gather the moments after a change of structure; fresh rows start without momentum."""
+        new = fresh.nonzero()[:, 0]
         for moments in (self.first, self.second):
             for name, rows in moments.items():
-                gathered = rows[parents]
-                gathered[fresh] = 0
-                moments[name] = gathered
+                moments[name] = rows.index_select(0, parents).index_fill_(0, new, 0)
 
     def forget(self, name: str) -> None:
         """Zero an attribute's moments, e.g. after an opacity reset."""

@@ -10,14 +10,14 @@ import pytest
 import torch
 from torch._subclasses import FakeTensor, FakeTensorMode
 
-from clear_strategies.kernels import losses
-from clear_strategies.kernels.losses import cpp, reference, warp
+from clear_strategies.kernels import losses, native
+from clear_strategies.kernels.losses import reference, warp
 from clear_strategies.kernels.losses.images import image_pair
 from clear_strategies.merging.objective import Objective
 from rasterizers.interface import BackendUnavailable
 from rasterizers.native import load_kernels
 
-needs_cpp = pytest.mark.skipif(not cpp.available(), reason="the compiled kernels were not built")
+needs_cpp = pytest.mark.skipif(not native.available(), reason="the compiled kernels were not built")
 needs_warp = pytest.mark.skipif(not warp.available("cpu"), reason="NVIDIA Warp is not installed")
 
 
@@ -116,7 +116,7 @@ PAIRS = {
     "photo inverted": (photo(50, 60), 1 - photo(50, 60)),
     "beyond [0, 1]": (3 * photo(50, 60) - 1, photo(50, 60, 6)),
 }
-RUNNING = ["cpp"] * cpp.available() + ["warp"] * warp.available("cpu")
+RUNNING = ["cpp"] * native.available() + ["warp"] * warp.available("cpu")
 COMPILED = [pytest.param("cpp", marks=needs_cpp), pytest.param("warp", marks=needs_warp)]
 every_compiled = pytest.mark.parametrize("name", COMPILED)
 every_implementation = pytest.mark.parametrize("name", [*COMPILED, "torch"])
@@ -171,12 +171,12 @@ def test_the_bits_do_not_depend_on_threads(loss, threads):
 @needs_cpp
 @pytest.mark.parametrize("isa", ["baseline", "avx2"])
 def test_every_instruction_set_agrees(isa, monkeypatch):
-    if isa not in [*cpp.native().instruction_sets(), "baseline"]:
+    if isa not in [*native.module().instruction_sets(), "baseline"]:
         pytest.skip(f"this processor has no {isa}")
     x, y = rough(photo(141, 353), 0.1)
     fastest, module = [loss(x, y, "cpp") for loss in LOSSES.values()], load_kernels("clear_strategies.kernels", isa)
     assert module.isa == isa
-    monkeypatch.setattr(cpp, "native", lambda: module)
+    monkeypatch.setattr(native, "module", lambda: module)
     for loss, mine in zip(LOSSES.values(), fastest, strict=True):
         value, gradient = loss(x, y, "cpp")
         assert float(value) == pytest.approx(float(mine.value), rel=1e-6)
@@ -247,7 +247,7 @@ def test_without_compiled_kernels_torch_is_used(monkeypatch):
     def absent():
         raise BackendUnavailable("the compiled kernels are not installed")
 
-    monkeypatch.setattr(cpp, "native", absent)
+    monkeypatch.setattr(native, "module", absent)
     assert losses.running_on() == ["torch"]
     x, y = photo(20, 30), photo(20, 30, 6)
     assert torch.equal(Objective().lr(x, y).cotangents[0], reference.photometric(x, y, 0.2).gradient)
@@ -314,7 +314,7 @@ def test_auto_uses_warp_on_cuda_only(monkeypatch):
     assert losses._fastest(on_cuda(), on_cuda()) == "warp"
     assert losses._fastest(on_cuda(), x) == "torch"
     assert losses._fastest(on_cuda(torch.float64), on_cuda(torch.float64)) == "torch"
-    assert losses._fastest(x, x) == ("cpp" if cpp.available() else "torch")
+    assert losses._fastest(x, x) == ("cpp" if native.available() else "torch")
     assert losses.running_on("cuda") == ["warp", "torch"]
     assert "warp" not in losses.running_on("cpu")
 

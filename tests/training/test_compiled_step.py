@@ -381,10 +381,10 @@ def test_the_readable_path_is_taken_where_it_must_be_and_that_is_said_once(caplo
             assert compiled_step_for(*arguments) is None
         assert [reason in message for message in caplog.messages] == [True]
 
-    def missing(_):
+    def missing():
         raise BackendUnavailable("the compiled kernels are not installed.")
 
-    monkeypatch.setattr("clear_strategies.training.compiled_step.load_kernels", missing)
+    monkeypatch.setattr("clear_strategies.kernels.native.module", missing)
     caplog.clear()
     with caplog.at_level("DEBUG"):
         assert compiled_step_for(Conductor(), adam) is None

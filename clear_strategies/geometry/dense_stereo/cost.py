@@ -14,7 +14,7 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.core.view import Photo
 from clear_strategies.geometry.projection import intrinsics
-from clear_strategies.kernels.losses import cpp
+from clear_strategies.kernels import native
 from rasterizers.interface import Camera
 from rasterizers.native import threads
 
@@ -131,9 +131,9 @@ class _Swept:
 def _cost(reference: _Windows, other: _Swept, inverse_depths: Float[Tensor, " P"]) -> Float[Tensor, "P H W"]:
     """From the covariance with the windows of the other photo drawn through each plane, 0 where it does not see them."""
     image, window = reference.image, reference.window
-    if image.device.type == "cpu" and image.dtype == torch.float32 and cpp.available():
+    if native.runs(image):
         covariance, variance = image.new_empty(2, len(inverse_depths), *image.shape)
-        cpp.native().sweep(
+        native.module().sweep(
             image, reference.mean[0], other.rotated, other.shift, other.image, inverse_depths, window,
             covariance, variance, threads(),
         )  # fmt: skip

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.kernels.losses import cpp
+from clear_strategies.kernels import native
 
 _EDGE: Final = 20.0  # P2 is halved where neighbours differ by 1 / _EDGE in grey
 _FAR: Final = 1e9  # cost of planes before the first and after the last
@@ -23,8 +23,8 @@ def smooth(
 ) -> Float[Tensor, "H W D"]:
     """The mean over eight directions of L; `small_step` is P1, `large_step` the largest P2, and `image` grey in [0, 1]."""
     total = torch.zeros_like(cost)
-    if cost.device.type == "cpu" and cost.dtype == torch.float32 and cpp.available():
-        cpp.native().add_paths(cost.contiguous(), image.contiguous(), small_step, large_step, total)
+    if native.runs(cost):
+        native.module().add_paths(cost.contiguous(), image.contiguous(), small_step, large_step, total)
         return total.mul_(1 / 8)
     for turned, shifts in ((False, (-1, 0, 1)), (True, (0,))):
         C, grey, rows = (x.transpose(0, 1) if turned else x for x in (cost, image, total))

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from clear_strategies.core.compiled_rules import CorrectionRule
 from clear_strategies.core.conflicts import ConflictCounts
+from clear_strategies.kernels import native
 from clear_strategies.kernels.gaussian_step import Attribute, StepCounts, StepSettings
 from clear_strategies.kernels.merge.cpp import correction_table
-from rasterizers.native import load_kernels, threads
+from rasterizers.native import threads
 
 
 class CppGaussianStep:
@@ -36,7 +37,7 @@ class CppGaussianStep:
         hf: Mapping[str, Tensor] | None,
         lambda_hf: float,
     ) -> None:
-        kernels: Any = load_kernels("clear_strategies.kernels")
+        kernels: Any = native.module()
         self._step = kernels.GaussianStep(dict(activation), lr, base, hf, lr["basis"].shape[1], lambda_hf)
 
     def step(

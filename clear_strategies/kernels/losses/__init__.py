@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.errors import SettingError
+from clear_strategies.kernels import native
 from clear_strategies.kernels.losses import cpp, reference, warp
 from clear_strategies.kernels.losses.images import DEVICES, image_pair, supported
 from clear_strategies.kernels.losses.reference import LossAndGradient
@@ -35,7 +36,7 @@ def running_on(device: str = "cpu") -> list[Choice]:
     Warp's kernels on a CPU are for checks, and are not listed.
     """
     compiled: Choice = "warp" if device == "cuda" else "cpp"
-    available = warp.available() if device == "cuda" else cpp.available()
+    available = warp.available() if device == "cuda" else native.available()
     return [compiled, "torch"] if available else ["torch"]
 
 
@@ -49,7 +50,7 @@ def require(kernels: Choice) -> None:
     if kernels not in _CHOICES:
         raise SettingError(f"kernels must be one of {', '.join(_CHOICES)}, got {kernels!r}.")
     if kernels == "cpp":
-        cpp.native()
+        native.module()
     if kernels == "warp":
         warp.require("cpu")
 
@@ -95,7 +96,7 @@ def _chosen(kernels: Choice, x: Tensor, y: Tensor) -> Choice:
     require(kernels)
     if kernels == "auto":
         kernels = _fastest(x, y)
-    _log_once(f"cpp, for {cpp.native().isa}" if kernels == "cpp" else kernels)
+    _log_once(f"cpp, for {native.module().isa}" if kernels == "cpp" else kernels)
     return kernels
 
 

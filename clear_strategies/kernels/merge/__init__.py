@@ -14,6 +14,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
+from clear_strategies.kernels import native
 from clear_strategies.kernels.merge.interface import WIDEST, Colour, Merge, Merged, Rows
 from rasterizers.interface import BackendUnavailable
 from rasterizers.native import load_kernels
@@ -43,7 +44,7 @@ def empty_like(p: Tensor) -> Tensor:
 def _for_device(device: str) -> Merge | None:
     try:
         if device == "cpu":
-            load_kernels("clear_strategies.kernels")
+            native.module()
             from clear_strategies.kernels.merge import cpp
 
             return cpp.merge

@@ -12,8 +12,9 @@ from torch import Tensor
 from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule
 from clear_strategies.core.conflicts import ConflictCounts
 from clear_strategies.core.gradients import CONFLICT_GROUPS
+from clear_strategies.kernels import native
 from clear_strategies.kernels.merge.interface import FIRST_BANDS, Colour, Merged, Rows
-from rasterizers.native import load_kernels, threads
+from rasterizers.native import threads
 
 GROUPS: Final = {name: k for k, name in enumerate((*CONFLICT_GROUPS, "detail"))}
 
@@ -50,7 +51,7 @@ def merge(
             raise ValueError(f"the merged gradient of {name} must be contiguous, got strides {rows.out.stride()}.")
         tensors = (rows.out, rows.lr, rows.before, rows.hr, rows.p, rows.anchor)
         tuples.append((*(address(x, width) for x in tensors), rows.stiffness, width, GROUPS[name], first_band))
-    kernels: Any = load_kernels("clear_strategies.kernels")
+    kernels: Any = native.module()
     counts, finite = kernels.merge(
         n, tuples, factors(lr_colour), factors(colour), correction_table(rule, q), keeps_lr, lambda_hr, scale, threads()
     )

@@ -7,9 +7,11 @@
 #include "bind_merge.hpp"
 #include "bind_step.hpp"
 #include "filter.hpp"
+#include "finite.hpp"
 #include "isa.hpp"
 #include "smooth.hpp"
 #include "sweep.hpp"
+#include "wander.hpp"
 
 NB_MODULE(CLEAR_MODULE, m) {
   nanobind::set_leak_warnings(false);  // a script that ends while it holds a rendering has done nothing wrong
@@ -21,4 +23,6 @@ NB_MODULE(CLEAR_MODULE, m) {
   clear::bind_filter(m);
   clear::bind_sweep(m);
   clear::bind_smooth(m);
+  clear::bind_wander(m);
+  clear::bind_finite(m);
 }

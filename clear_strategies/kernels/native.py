@@ -1,0 +1,36 @@
+"""The compiled module of this package, which `src/` becomes, and whether there is one."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from types import ModuleType
+
+import torch
+from torch import Tensor
+
+from rasterizers.interface import BackendUnavailable
+from rasterizers.native import load_kernels
+
+
+def available() -> bool:
+    """Whether the kernels were compiled and run on this processor."""
+    try:
+        module()
+    except BackendUnavailable:
+        return False
+    return True
+
+
+def module() -> ModuleType:
+    """The compiled module for this processor's instruction set; a BackendUnavailable where there is none."""
+    return load_kernels("clear_strategies.kernels")
+
+
+def runs(x: Tensor) -> bool:
+    """Whether the kernels take this tensor: float32 in the CPU's memory."""
+    return x.device.type == "cpu" and x.dtype == torch.float32 and available()
+
+
+def all_finite(tensors: Collection[Tensor]) -> bool:
+    """Whether every number is known to be finite, in one call; False where the kernels do not take all of the tensors."""
+    return all(runs(x) and x.is_contiguous() for x in tensors) and bool(module().all_finite([*tensors]))
