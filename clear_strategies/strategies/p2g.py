@@ -13,17 +13,19 @@ from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core import deferred
 from clear_strategies.core.checks import refuse, require_choice, require_number, require_whole
-from clear_strategies.core.evidence import Evidence, PatchMaps, lift
+from clear_strategies.core.evidence import Evidence, PatchMaps
 from clear_strategies.core.gradients import Shot, screen_norm
 from clear_strategies.core.images import DownKernel, downsample, patch_means, quantize, upsample
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
+from clear_strategies.kernels import native
 from clear_strategies.strategies.base import ScreenGradients, Strategy
+from rasterizers.native import threads
 
 _log = logging.getLogger(__name__)
 
@@ -149,6 +151,27 @@ class P2G(Strategy):
             )  # fmt: skip
         maps_of_view: Tensor = self.cache[key]
         return maps_of_view
+
+
+def lift(
+    patch_maps: Float[Tensor, "C ph pw"], centers: Float[Tensor, "N 2"], visible: Bool[Tensor, " N"], patch: float
+) -> Float[Tensor, "C N"]:
+    """Look up the patch p(u_i) that contains each projected centre, in several maps at once.  Eq. 10
+
+    A centre outside the image has the border patch, an invisible Gaussian 0 (F24).
+
+    Args:
+        centers: u_i in pixels of the image that the patches tile; of invisible Gaussians anything, since gsplat leaves their
+            rows uninitialised. patch: edge of a patch in those pixels.
+    """
+    if all(native.runs(x) and x.is_contiguous() for x in (patch_maps, centers)) and visible.is_contiguous():
+        lifted = patch_maps.new_empty(len(patch_maps), len(centers))
+        native.module().lift(patch_maps, centers.detach(), visible, patch, lifted, threads())
+        return lifted
+    column, row = (centers / patch).long().unbind(-1)  # of NaN or infinity any number, which the clamps bring inside
+    height, width = patch_maps.shape[1:]
+    column, row = column.clamp(0, width - 1), row.clamp(0, height - 1)
+    return patch_maps.flatten(1).index_select(1, row * width + column) * visible
 
 
 # Rounding to 8 bits changes an image by a quarter of a grey level on average; a smaller scale would measure rounding.

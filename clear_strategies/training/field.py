@@ -145,7 +145,10 @@ class GaussianField(nn.Module):
         scales = raw["scales"].exp()
         # √(s² + f²), and s itself where the squares vanish; torch's hypot takes ten times as long.
         filtered = torch.maximum(scales, (scales.square() + self.filter_3d[:, None].square()).sqrt_())
-        coefficient = (scales / filtered).prod(-1)
+        shares = scales / filtered
+        coefficient = (
+            shares[:, 0] * shares[:, 1] * shares[:, 2]
+        )  # torch's product over rows of three takes twice as long
         sigmoid = raw["opacities"].sigmoid()
         z = coefficient if gate is None else coefficient * gate.to(coefficient)
         bands = (self.degree + 1) ** 2 - 1

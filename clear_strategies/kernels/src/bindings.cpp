@@ -9,6 +9,7 @@
 #include "filter.hpp"
 #include "finite.hpp"
 #include "isa.hpp"
+#include "lift.hpp"
 #include "smooth.hpp"
 #include "sweep.hpp"
 #include "wander.hpp"
@@ -25,4 +26,5 @@ NB_MODULE(CLEAR_MODULE, m) {
   clear::bind_smooth(m);
   clear::bind_wander(m);
   clear::bind_finite(m);
+  clear::bind_lift(m);
 }
