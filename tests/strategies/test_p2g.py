@@ -137,7 +137,8 @@ def test_without_a_high_frequency_loss_there_is_nothing_to_route():
 @pytest.mark.skipif(not native.available(), reason="the compiled kernels were not built")
 def test_compiled_lifting_has_the_bits_of_torch(monkeypatch):
     g = torch.Generator().manual_seed(0)
-    maps, u, visible = (
+    maps, u = torch.rand(2, 5, 7, generator=g), 300 * torch.randn(999, 2, generator=g)
+    visible = torch.rand(999, generator=g) > 0.3
         torch.rand(2, 5, 7, generator=g),
         300 * torch.randn(999, 2, generator=g),
         torch.rand(999, generator=g) > 0.3,
