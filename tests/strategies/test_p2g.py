@@ -139,10 +139,6 @@ def test_compiled_lifting_has_the_bits_of_torch(monkeypatch):
     g = torch.Generator().manual_seed(0)
     maps, u = torch.rand(2, 5, 7, generator=g), 300 * torch.randn(999, 2, generator=g)
     visible = torch.rand(999, generator=g) > 0.3
-        torch.rand(2, 5, 7, generator=g),
-        300 * torch.randn(999, 2, generator=g),
-        torch.rand(999, generator=g) > 0.3,
-    )
     compiled = lift(maps, u, visible, 64)
     monkeypatch.setattr(native, "available", lambda: False)
     assert torch.equal(compiled, lift(maps, u, visible, 64))
