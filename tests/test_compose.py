@@ -1,7 +1,5 @@
 """From conf/ to objects: names on the command line, the defaults' one owner, and what is refused."""
 
-from __future__ import annotations
-
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra

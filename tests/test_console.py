@@ -1,7 +1,5 @@
 """The console shows the plan, the bar, the result and warnings; run.log has everything."""
 
-from __future__ import annotations
-
 import io
 import logging
 import re

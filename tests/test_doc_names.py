@@ -1,7 +1,5 @@
 """What the documentation names exists: links, paths, symbols, settings, numbers of its tables."""
 
-from __future__ import annotations
-
 import ast
 import csv
 import importlib

@@ -1,7 +1,5 @@
 """What the documentation says runs: its commands, its Python, its tutorials. tests/test_doc_names.py checks what it names."""
 
-from __future__ import annotations
-
 import argparse
 import fnmatch
 import importlib

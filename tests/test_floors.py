@@ -1,7 +1,5 @@
 """Who may import whom: the table in docs/explanation/architecture.md, kept true."""
 
-from __future__ import annotations
-
 import ast
 import re
 from functools import cache

@@ -1,7 +1,5 @@
 """`.ci/gpu`, as far as a machine without a GPU can show it: its programs are stand-ins that only say how they were called."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 from pathlib import Path

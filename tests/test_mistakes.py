@@ -1,7 +1,5 @@
 """mistakes.csv: each command of it ends with the message and the exit code that stand there."""
 
-from __future__ import annotations
-
 import csv
 import re
 import shlex

@@ -1,7 +1,5 @@
 """`clear_strategies` from Python: its names, what `train` returns, a package with its own strategy, and what imports bring."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import subprocess

@@ -1,7 +1,5 @@
 """The doors, as a user goes through them: the command line, its outputs, what it says to bad input, and its exit codes."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """λ_HR and the learning rate over the iterations, and the milestones that stretch with a run."""
 
-from __future__ import annotations
-
 import pytest
 
 from clear_strategies.merging.objective import Objective

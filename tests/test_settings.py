@@ -1,7 +1,5 @@
 """Settings as plain values: defaults filled in from signatures, and everything checked before a class is called."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal

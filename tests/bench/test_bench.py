@@ -1,7 +1,5 @@
 """How the benchmark measures: scenes, turns, errors, and what each question times. No test asserts how long anything takes."""
 
-from __future__ import annotations
-
 import json
 import math
 from functools import partial

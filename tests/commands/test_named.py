@@ -1,7 +1,5 @@
 """What the first word of a command line does: a subcommand, help, Hydra, or an error that names what was meant; and `doctor`."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

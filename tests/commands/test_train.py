@@ -1,7 +1,5 @@
 """`clear-strategies train PHOTOS`: which reader, which settings, and what it says to a wrong argument."""
 
-from __future__ import annotations
-
 import pytest
 
 from clear_strategies import compose, hydra_app

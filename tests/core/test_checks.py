@@ -1,7 +1,5 @@
 """Settings are refused with name, rule, value and remedy: whole numbers, ranges, choices, colours, reader arguments."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Numbers that are read late: the same floats as at once, in one transfer, when they are asked for; and the history."""
 
-from __future__ import annotations
-
 import json
 import math
 

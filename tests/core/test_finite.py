@@ -1,7 +1,5 @@
 """What is not finite is found before a step, named, and never reaches a parameter or a checkpoint."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

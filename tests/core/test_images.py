@@ -1,7 +1,5 @@
 """Operators on images, photos before another background, and reduced depth maps."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Initial clouds: every choice of `init`, the order of the steps, and refused settings."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

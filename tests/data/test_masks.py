@@ -1,7 +1,5 @@
 """Masks as tools write them: their names, sizes and values, and masks that hide too much."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The image reader keeps every bit that it can read, turns colours to sRGB, and refuses what it cannot read."""
 
-from __future__ import annotations
-
 import struct
 import subprocess
 import zlib

@@ -1,7 +1,5 @@
 """PLY: bytes by hand, roundtrips as a property, and a table of malformed files that each get one line."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

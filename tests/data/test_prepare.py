@@ -1,7 +1,5 @@
 """Splits and sizes: the papers' view indices and pixel counts; what is refused before a photo is decoded."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

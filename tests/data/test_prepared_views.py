@@ -1,7 +1,5 @@
 """What views have beside their photos: SR detail, back-projection, depth, one exposure, transparency."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Density control by sampling: what moves, what is added, what the noise leaves alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """What cameras look at: their common box, which of them are compared, and which see a surface."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Photos whose exposure differs come back to the common one; photos that do not differ stay as they are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Points: densification, outliers and voxels, and those of depth maps."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Pseudo views of a plane are exact; what no photo shows stays unknown, and is continued smoothly."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

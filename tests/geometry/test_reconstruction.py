@@ -1,7 +1,5 @@
 """`stereo`: the trainer's cloud from plain tensors, in the light core too, and refusals that say what to give instead."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from typing import Any

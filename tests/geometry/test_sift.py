@@ -1,7 +1,5 @@
 """Triangulation: a textured plane at a known depth, single points by hand, and each filter on its own."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

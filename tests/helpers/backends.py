@@ -1,7 +1,5 @@
 """The backends that are compared with float64."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from copy import copy
 from dataclasses import dataclass, fields, replace

@@ -3,8 +3,6 @@
 The readers' tests compare with the cameras here. The malformed inputs are these scenes with one defect each.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import struct

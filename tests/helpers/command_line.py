@@ -1,7 +1,5 @@
 """Runs of the command line in processes of their own, tiny ones."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import tempfile

@@ -1,7 +1,5 @@
 """Random gradients of one view, for comparing the compiled per-Gaussian step with the readable path."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """The configuration of conf/ with some overrides, and the options that it offers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cache
 

@@ -3,8 +3,6 @@
 The commands come as JSON: [["python", "-m", "clear_strategies.run", "+strategy=gco"], …].
 """
 
-from __future__ import annotations
-
 import json
 import runpy
 import sys

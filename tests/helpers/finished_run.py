@@ -1,7 +1,5 @@
 """The folder of a finished run, as far as a report reads it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -3,8 +3,6 @@
 Each is a process as `python -m` makes one, with arguments, a folder, an environment, signals and an exit code of its own.
 """
 
-from __future__ import annotations
-
 import atexit
 import importlib
 import json

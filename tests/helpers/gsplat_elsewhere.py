@@ -1,7 +1,5 @@
 """`python -m tests.helpers.gsplat_elsewhere NAME …`: the example's loop with these strategies, on another device than the CPU."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from functools import partial

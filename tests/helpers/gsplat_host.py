@@ -1,7 +1,5 @@
 """A trainer like those in gsplat's documentation, on a CPU, with our rasterizer: `Host` contains nothing of CLEAR."""
 
-from __future__ import annotations
-
 import functools
 
 import torch

@@ -1,7 +1,5 @@
 """What the stand-ins for other trainers share."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

@@ -1,7 +1,5 @@
 """Random images that a PNG holds exactly, and finding one inside a larger image."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

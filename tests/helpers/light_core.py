@@ -4,8 +4,6 @@ Imports what a host imports, composes a conductor, takes three steps of a loop t
 of a plane by stereo.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Small photos, and hand-made ONNX files that enlarge them: a convolution, then DepthToSpace."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from pathlib import Path

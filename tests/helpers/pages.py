@@ -1,7 +1,5 @@
 """The pages of the documentation: their fenced blocks, and the commands in them."""
 
-from __future__ import annotations
-
 import importlib.util
 import itertools
 import re

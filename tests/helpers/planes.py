@@ -1,7 +1,5 @@
 """Cameras that look along z, and photos of simple surfaces, for tests of initial points."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

@@ -1,7 +1,5 @@
 """Checkouts of real trainers, run as programs on a CPU, and the toy scene in COLMAP's text files for them."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

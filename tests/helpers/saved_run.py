@@ -1,7 +1,5 @@
 """The folder of a small run as it was saved, without training: Gaussians with detail, view-dependent colour and a 3D filter."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

@@ -4,8 +4,6 @@ The schedule is compressed so that warm-up, densification, pruning, the opacity 
 happen: 3 warm-up starts, 2 to 12 densify and prune, 6 and 12 reset, 8 warm, 12 anchor, 14 decay.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace

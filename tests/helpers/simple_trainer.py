@@ -2,8 +2,6 @@
 and a PLY at the end. On a CPU; contains nothing of CLEAR.
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import dataclass, field
 from typing import Any

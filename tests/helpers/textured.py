@@ -1,7 +1,5 @@
 """Photos of a textured surface z = f(x, y), cast by fixed-point iteration, with their exact depth."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """A scene small enough for a test: a few random Gaussians, seen from an arc, at LR 24x16 and HR 96x64."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """A wall of opaque Gaussians, and cameras before it that look at it."""
 
-from __future__ import annotations
-
 import torch
 
 from clear_strategies.core.points import PointCloud

@@ -1,7 +1,5 @@
 """The scene that all real trainers get."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.helpers.real_hosts import write_scene

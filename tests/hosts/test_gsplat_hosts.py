@@ -7,8 +7,6 @@ CUDA modules are replaced by tests/hosts/cpu. tyro, torchmetrics, tensorboard, i
 must be installed, and COLMAP's pycolmap for 1.6.0.
 """
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -7,8 +7,6 @@ FOLDER holds checkouts named 3dgs, mip-splatting, dropgaussian, fsgs; nothing is
 skipped. Their CUDA modules are replaced by tests/hosts/cpu. plyfile, torchmetrics and matplotlib must be installed.
 """
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

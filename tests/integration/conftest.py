@@ -1,7 +1,5 @@
 """The 3DGS-style host of tests/helpers/inria_host."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 

@@ -1,7 +1,5 @@
 """A host whose tensors are on another device than the CPU, with the strategies: no operation finds tensors of both."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

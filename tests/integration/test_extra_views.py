@@ -1,7 +1,5 @@
 """Extra views in other trainers: drawn by the host's own renderer, and learned from in a step of the host's own optimizer."""
 
-from __future__ import annotations
-
 import copy
 import functools
 

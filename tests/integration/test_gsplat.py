@@ -1,7 +1,5 @@
 """CLEAR in an unmodified gsplat loop: it equals our own trainer, and each strategy changes only what it should."""
 
-from __future__ import annotations
-
 import functools
 import gc
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Calls of a wrapped `rasterization`: which one is the rendering of a photo, and what else a loop draws beside it."""
 
-from __future__ import annotations
-
 import functools
 from contextlib import nullcontext
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """gsplat's own densifiers with CLEAR attached: which Gaussian came from which, and what follows them."""
 
-from __future__ import annotations
-
 import copy
 
 import pytest

@@ -1,7 +1,5 @@
 """CLEAR in a trainer of the shape of gsplat's examples/simple_trainer.py: `python -m integration.gsplat simple_trainer.py`."""
 
-from __future__ import annotations
-
 import functools
 import logging
 import runpy

@@ -1,7 +1,5 @@
 """Densification in hosts: the tensor of the score, its scale, what a 3DGS-style densifier reads, and where it ends."""
 
-from __future__ import annotations
-
 import importlib
 from dataclasses import dataclass
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """CLEAR in a 3DGS-style loop: by two added lines, by one, or by `python -m integration.inria train.py …` without any."""
 
-from __future__ import annotations
-
 import copy
 import importlib
 import logging

@@ -1,7 +1,5 @@
 """Which Gaussian came from which in a GaussianModel, and the proxy of one that changes opacities and colours once."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

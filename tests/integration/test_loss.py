@@ -1,7 +1,5 @@
 """`joint_loss` in the smallest host: torch parameters, torch.optim, and a renderer with autograd."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

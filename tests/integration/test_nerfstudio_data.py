@@ -3,8 +3,6 @@
 test_nerfstudio_method.py tests the method itself, where nerfstudio is installed.
 """
 
-from __future__ import annotations
-
 import functools
 from dataclasses import replace
 from types import SimpleNamespace

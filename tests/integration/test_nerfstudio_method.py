@@ -6,8 +6,6 @@ Three things are not nerfstudio's own here: our rasterizer replaces gsplat's CUD
 `absgrad`), `Tensor.cuda()` returns the tensor itself, and the LPIPS network, which would be downloaded, is a constant.
 """
 
-from __future__ import annotations
-
 import copy
 import functools
 import importlib.metadata

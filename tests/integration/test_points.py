@@ -1,7 +1,5 @@
 """Initial points by stereo in gsplat's simple_trainer and in a 3DGS-style train.py: where they lie, and who trains them."""
 
-from __future__ import annotations
-
 import importlib.util
 import inspect
 import logging

@@ -1,7 +1,5 @@
 """A host's photos as views: masks, names with folders, what is refused; and the demo for a host's loop."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

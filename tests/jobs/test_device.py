@@ -1,7 +1,5 @@
 """Where a job computes: which rasterizer, which device, and what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The fair table and the papers' protocols: every file composes, every baseline trains, every sweep is what it says."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Resuming a job: what must agree with the run before, and what may differ."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

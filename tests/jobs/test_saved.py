@@ -1,7 +1,5 @@
 """A saved run is drawn as it was evaluated, from its checkpoint and from its PLY file; what `render` and `export` leave of it."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """The scene of a job: which photos, what is checked of them, what the log says of the prior, and other units."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import json

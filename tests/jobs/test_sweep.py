@@ -1,7 +1,5 @@
 """Jobs that can be started again, and sweeps of several processes: what is done stays, what failed is told, all stop."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

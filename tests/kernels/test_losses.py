@@ -1,7 +1,5 @@
 """Image losses: values, gradients and the hard inputs."""
 
-from __future__ import annotations
-
 import itertools
 import sys
 from concurrent.futures import ThreadPoolExecutor

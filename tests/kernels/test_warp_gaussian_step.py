@@ -1,7 +1,5 @@
 """The per-Gaussian step in Warp alone. tests/training/test_compiled_step.py compares it with the readable path."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode

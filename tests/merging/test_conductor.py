@@ -1,7 +1,5 @@
 """The conductor: Eq. 8 and 13, exclusivity, and the strategies' contract."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import pytest

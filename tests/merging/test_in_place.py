@@ -1,7 +1,5 @@
 """The merge in place against `Conductor.merge` in float64, by every pass that runs here."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Maps show what the strategies of a run decide, and making them does not change the run."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import replace

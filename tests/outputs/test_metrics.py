@@ -1,7 +1,5 @@
 """What is measured: the four numbers of an image, metrics.json, and the table at the end of a run."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import math

@@ -1,7 +1,5 @@
 """Figures, curves, maps of coverage and the contact sheet show what they are given and nothing else."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

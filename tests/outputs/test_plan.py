@@ -1,7 +1,5 @@
 """What a run says of itself: the plan, the progress bar, the provenance."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A finished run writes the files that docs/reference/files.md lists, metrics.json last; a file is whole or as it was before."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

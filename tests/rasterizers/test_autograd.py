@@ -1,7 +1,5 @@
 """Rasterizers as torch functions: gradients of the image, and depth to look at."""
 
-from __future__ import annotations
-
 import gc
 import inspect
 import weakref

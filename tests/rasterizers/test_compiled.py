@@ -1,7 +1,5 @@
 """The compiled backends: the public checks, agreement with float64, reproducible bits, hard inputs, expected depth."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

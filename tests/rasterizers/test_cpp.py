@@ -1,7 +1,5 @@
 """The backend "cpp" alone: its instruction sets, its threads and its memory budget."""
 
-from __future__ import annotations
-
 import functools
 from contextlib import suppress
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The reference rasterizer: the public checks, and values worked out by hand."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

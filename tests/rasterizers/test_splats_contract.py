@@ -1,7 +1,5 @@
 """The tensors of `Splats` have one dtype, one device and one row per Gaussian; every backend refuses others in a sentence."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

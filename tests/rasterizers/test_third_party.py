@@ -1,7 +1,5 @@
 """Rasterizers of others: a third party's class by its path, and the backend "gsplat" with our function in place of its own."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace

@@ -4,8 +4,6 @@ Clang, which macOS builds with, refuses some of what GCC accepts. For arm64 a cr
 runs them. Debian: apt install clang g++-aarch64-linux-gnu qemu-user-static.
 """
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The backend "warp" alone: where it runs, its blocks of many threads, and the deferred counts that CUDA uses."""
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 

@@ -1,7 +1,5 @@
 """The report: its command, its files, its table, its pictures, its rows, and the runs that it finds."""
 
-from __future__ import annotations
-
 import csv
 import os
 import re

@@ -1,7 +1,5 @@
 """FadingOpacity: which share of its opacity a Gaussian loses, when, and how many views slow it down."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """GCO: Eq. 6, 7 and 11 by property and by hand-computed values."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """P2G: Eq. 9, 10, 12 and 14."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """PseudoViews: which pictures it shows the field, when, and where it shows none."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 

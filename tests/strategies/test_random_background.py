@@ -1,7 +1,5 @@
 """RandomBackground: which colours, when, and for which photos none."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """SplatSuRe's weights, worked out by hand."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """SVS: Eq. 15 and 16."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given, settings

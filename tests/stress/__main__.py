@@ -3,8 +3,6 @@
 `--only NAME …` measures some of them; `--share 0.01` takes that part of the cases where their number is free.
 """
 
-from __future__ import annotations
-
 import argparse
 import logging
 import sys

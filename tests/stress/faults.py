@@ -3,8 +3,6 @@
 Afterwards a checkpoint is whole, every other file is as before or as it was to become, and the next start leaves no rest.
 """
 
-from __future__ import annotations
-
 import errno
 import io
 import os

@@ -1,7 +1,5 @@
 """Random damage to the files that are read: what comes back is sound or a DataError, at once and in little memory."""
 
-from __future__ import annotations
-
 import io
 import logging
 import math

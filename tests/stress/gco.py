@@ -1,7 +1,5 @@
 """GCO's correction against mpmath, over the range of float32."""
 
-from __future__ import annotations
-
 import mpmath
 import torch
 

@@ -3,8 +3,6 @@
 The job runs in a forked child of a process that has already imported everything, so that a kill costs a fraction of a second.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import random

@@ -3,8 +3,6 @@
 `Lifecycle` holds the rules and what must be true after each of them; `measure` runs it, and counts.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import shutil

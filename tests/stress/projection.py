@@ -1,7 +1,5 @@
 """Single Gaussians over the whole range of scales, depths, opacities and quaternion norms, against float64."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator, Mapping

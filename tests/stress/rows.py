@@ -1,7 +1,5 @@
 """The result of a stress measurement, and the table of all of them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A long run in one process, with every event: memory and open files stay flat, and no number becomes NaN."""
 
-from __future__ import annotations
-
 import gc
 import math
 import multiprocessing

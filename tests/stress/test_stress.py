@@ -1,7 +1,5 @@
 """A slice of `python -m tests.stress`, and proof that each of its measurements can fail."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

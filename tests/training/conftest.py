@@ -1,7 +1,5 @@
 """The passes of the compiled per-Gaussian step."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import pytest

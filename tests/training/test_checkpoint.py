@@ -1,7 +1,5 @@
 """Checkpoints: what is saved comes back, others may read the file, and the last few are kept."""
 
-from __future__ import annotations
-
 import errno
 import math
 import os

@@ -3,8 +3,6 @@
 In C++ and in Warp, whose kernels for CUDA run on a CPU, too.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ that nothing crosses over to the host while iterating; and with meta as the *def
 a tensor that forgets where it belongs cannot be reckoned with.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Extra views: each gets a step of the optimizer on the LR loss, weighted by pixel, besides that of the iteration's view."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import pytest

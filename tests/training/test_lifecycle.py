@@ -1,7 +1,5 @@
 """The field through clone, split, prune and reset: every per-Gaussian tensor stays with its Gaussian."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Masks: what a photo hides has no part in any loss, gradient or depth, whatever its pixels are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The memory of training is estimated before it begins, and what cannot fit is refused."""
 
-from __future__ import annotations
-
 import logging
 
 import pytest

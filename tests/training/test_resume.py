@@ -1,7 +1,5 @@
 """A resumed run has the same bits as one that never stopped, for every subset of strategies and around every event."""
 
-from __future__ import annotations
-
 import json
 import logging
 import math

@@ -1,7 +1,5 @@
 """What is left out: only what its setting says, said in the work_log, and harmless where nothing is settled."""
 
-from __future__ import annotations
-
 import weakref
 from dataclasses import replace
 

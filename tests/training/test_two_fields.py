@@ -1,7 +1,5 @@
 """Strategies that learn from what the field shows: two fields, methods of two stages, two subsets of a field."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 

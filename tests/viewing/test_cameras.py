@@ -1,7 +1,5 @@
 """Cameras as files, closed, even paths along them, and videos."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys

@@ -1,7 +1,5 @@
 """What a painter shows is what the metrics see; the viewer draws what its panel asks for, and changes nothing of a run."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time

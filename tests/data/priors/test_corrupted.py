@@ -1,7 +1,5 @@
 """Seeded errors: in exactly the given share of the patches, different in every view; on other priors and on the truth."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 

@@ -1,7 +1,5 @@
 """waifu2x and Real-ESRGAN: with a small stand-in for ncnn, and the real ones where the extra [sr] is installed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Priors: ONNX networks, SR images from a folder, the cache, tiles, and what holds for several."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 from pathlib import Path

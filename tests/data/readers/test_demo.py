@@ -1,7 +1,5 @@
 """The demo room: exact, anti-aliased, deterministic, with features at LR scale."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Photos without poses: structure from motion finds the true cameras, up to a similarity, and caches them."""
 
-from __future__ import annotations
-
 import errno
 import os
 import signal

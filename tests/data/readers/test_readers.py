@@ -1,7 +1,5 @@
 """What each format with poses has of its own: NeRF-synthetic, LLFF, transforms.json, COLMAP models."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

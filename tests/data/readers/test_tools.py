@@ -1,7 +1,5 @@
 """Captures as other tools write them, in small: what is read of each, and what the message is where it is not."""
 
-from __future__ import annotations
-
 import math
 import re
 import shutil

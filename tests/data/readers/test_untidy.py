@@ -1,7 +1,5 @@
 """Captures with poses and folders of photos as people have them: each ends well, or with a line that names file and remedy."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """Depth maps: right on known surfaces, unknown where nothing tells depth, the same bits every time; their completion."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

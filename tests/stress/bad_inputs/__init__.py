@@ -3,8 +3,6 @@
 `inputs()` lists them all, and a test runs each of them by its name.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import struct

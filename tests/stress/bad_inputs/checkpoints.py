@@ -1,7 +1,5 @@
 """Checkpoints: files that are gone, damaged or of another program, and sound ones that do not belong to the run."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from dataclasses import replace

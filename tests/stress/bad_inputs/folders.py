@@ -1,7 +1,5 @@
 """Folders where a data set, a run or its lock should be, and is not, or is something else."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

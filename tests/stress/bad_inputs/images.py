@@ -1,7 +1,5 @@
 """Image files: damaged, of a kind that is not read, too large, turned, or not of the size that is expected."""
 
-from __future__ import annotations
-
 import io
 import os
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Super-resolution: networks in ONNX that cannot be used, and SR images that do not belong to their photos."""
 
-from __future__ import annotations
-
 import math
 import pickle
 from collections.abc import Callable

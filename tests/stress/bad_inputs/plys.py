@@ -1,7 +1,5 @@
 """PLY files of Gaussians and of points."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """Captures with one defect: COLMAP, Blender and nerfstudio files, and the photos that belong to them."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Settings on the command line: outside their range, of another type, or of a name that nothing has."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from functools import cache
