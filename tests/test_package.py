@@ -42,8 +42,6 @@ def test_a_name_is_that_of_its_module(name):
 
 
 # ---- training from Python: what `train` returns
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> cs.Run:
     folder = tmp_path_factory.mktemp("notebook") / "run"
@@ -89,8 +87,6 @@ def test_a_folder_without_a_finished_run_and_a_wrong_setting_are_told(tmp_path: 
 
 
 # ---- docs/template, a package with a strategy of its own, works when it is installed
-
-
 TEMPLATE = ROOT / "docs" / "template"
 
 
@@ -136,8 +132,6 @@ def test_an_entry_point_without_a_package_is_named(tmp_path: Path, monkeypatch: 
 
 
 # ---- importing the library, an adapter or the geometry brings no heavy library into the host
-
-
 HEAVY = {
     *["cv2", "gsplat", "hydra", "kornia", "matplotlib", "msgspec", "nerfstudio", "open3d", "scipy", "skimage", "warp"]
 }

@@ -128,8 +128,6 @@ def test_growth_has_an_exponent_for_each_step_and_none_across_what_grows():
 
 
 # ---- what the benchmark draws
-
-
 def test_a_generated_scene_is_the_same_every_time_and_has_its_stated_statistics():
     scene, again = (scenes.surfaces("s", 20_000, 1008, 756, radius=5.5) for _ in range(2))
     for name in ATTRIBUTES:
@@ -159,8 +157,6 @@ def test_an_exported_field_is_drawn_as_the_field_draws_itself(tmp_path):
 
 
 # ---- the benchmark's command line: its files, its exit codes, and the data files of docs/explanation/benchmarks.md
-
-
 def test_rasterizers_writes_every_stage_both_errors_a_figure_and_the_machine(tmp_path, capsys):
     out = tmp_path / "new" / "folder"
     asked = ["rasterizers", "--scene", "tiny", "--repeats", "1", "--preset", "fast", "--backend", "torch"]

@@ -69,8 +69,6 @@ def test_the_mean_of_chosen_rows_is_the_same_without_counting_them(chosen, monke
 
 
 # ---- a long history: its rows come back as they were, small, and the newest may still change
-
-
 def rows(n: int) -> list[dict[str, float]]:
     return [{"t": float(t), "loss": 1 / (t + 1)} | ({"psnr": 20.0} if t % 7 == 0 else {}) for t in range(n)]
 

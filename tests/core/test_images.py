@@ -45,8 +45,6 @@ def test_back_projection_moves_an_image_until_it_shrinks_to_the_photo(down):
 
 
 # ---- photos before another background; the depth map of a photo at a smaller size
-
-
 def test_a_reduced_depth_map_holds_medians_of_what_is_known_and_a_completed_one_changes_nothing_known():
     depth = torch.full((4, 6), torch.nan)
     confidence = torch.zeros(4, 6)

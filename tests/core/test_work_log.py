@@ -123,8 +123,6 @@ def test_on_a_cpu_no_event_is_made_and_a_runs_log_is_on_its_device(monkeypatch):
 
 
 # ---- long work says how far it is, and short work nothing
-
-
 def test_a_line_now_and_then_and_only_where_something_has_happened(monkeypatch, caplog):
     clock = [100.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])

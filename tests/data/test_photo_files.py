@@ -101,8 +101,6 @@ def test_images_are_listed_by_name_and_ending_and_the_first_of_the_usual_folders
 
 
 # ---- photos with a colour profile of their own become sRGB; photos of sRGB keep their bits
-
-
 # ICC profiles of version 2 with three primaries and one curve, made by the formulas of the specification.
 DISPLAY_P3 = ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060))
 PRIMARIES = ((0.640, 0.330), (0.300, 0.600), (0.150, 0.060))

@@ -19,8 +19,6 @@ from tests.helpers.captures import alike as capture
 from tests.helpers.captures import in_a_row, papers
 
 # ---- splits and sizes: the papers' view indices and pixel counts; what is refused before a photo is decoded
-
-
 # Training indices among the n photos of each LLFF scene, and the number of test views: the 3-view protocol of RegNeRF,
 # FSGS, CoR-GS and DropGaussian.
 LLFF = {
@@ -203,8 +201,6 @@ def test_geographic_coordinates_give_a_warning(away, warns, caplog):
 
 
 # ---- the HR side is held to a number of megapixels: the factor, the photos and the words for each size of photo
-
-
 def held(size: tuple[int, int], *, super_resolve: bool = False, **settings) -> tuple[Capture, ViewSettings]:
     return within_limit(
         in_a_row(size, size), ViewSettings(**settings), reaches=lambda _: True, super_resolve=super_resolve

@@ -58,8 +58,6 @@ def test_few_cameras_are_all_compared_and_of_many_the_nearest_and_some_far_ones_
 
 
 # ---- colours between pixel centres, and which cameras see a surface
-
-
 def test_colours_are_sampled_between_pixel_centres() -> None:
     image = torch.tensor([[[0.0, 0, 0], [1.0, 1, 1]]])
     at = torch.tensor([[0.5, 0.5], [1.0, 0.5], [1.25, 0.5], [1.5, 0.5], [0.1, 0.2]])

@@ -74,8 +74,6 @@ def test_the_background_and_what_a_mask_hides_get_no_points() -> None:
 
 
 # ---- outliers and voxels: small cases by hand
-
-
 def test_outliers_are_removed() -> None:
     for line, ratio, kept in (
         # Mean distance to the 2 nearest, itself included: 1/2 four times and 96/2 once. Average 10, deviation 21.2.
@@ -104,8 +102,6 @@ def test_voxels_without_open3d_say_what_to_install(monkeypatch):
 
 
 # ---- points from depth maps: their spacing, what several photos see, and what fills the rest
-
-
 def flat(view: Photo, depth: float) -> DepthMap:
     shape = view.image.shape[:2]
     return DepthMap(torch.full(shape, depth), torch.ones(shape))

@@ -17,9 +17,8 @@ from integration.inria import attach
 from tests.helpers import gsplat_host
 from tests.helpers.host_parts import HR_FROM_START, WITHOUT_HR, N, options
 
+
 # ---- the tensor in which a host keeps the screen gradient
-
-
 @pytest.mark.parametrize("to_pixels", [(1.0, 1.0), (2 / 200, 2 / 100)], ids=["gsplat", "inria"])
 def test_written_norms_are_in_ndc(to_pixels):
     tensor = torch.zeros(1, 3, 2, requires_grad=True)
@@ -42,8 +41,6 @@ def test_packed_rows_are_those_of_their_gaussians_and_gsplats_absolute_gradient_
 
 
 # ---- the score at the scale of a host's threshold
-
-
 def everyone(n):
     return torch.ones(n, dtype=torch.bool)
 
@@ -95,8 +92,6 @@ def test_the_factor_follows_recent_views_restarts_with_another_number_of_gaussia
 
 
 # ---- a 3DGS-style loop
-
-
 def screen_gradient(host, render, camera, gaussians, **settings):
     """What the densifier reads after a step's backward pass."""
     package = render(camera, gaussians, None, None, **settings)

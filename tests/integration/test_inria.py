@@ -337,9 +337,7 @@ def test_views_need_unique_names_and_sr_images_of_the_right_size_and_intrinsics_
     assert torch.allclose(intrinsics(scene.cameras[0]), expected, atol=1e-4)
 
 
-# ---- cLEAR in a 3DGS-style train.py: by one line in it, or by `python -m integration.inria train.py …` without any change
-
-
+# ---- CLEAR in a 3DGS-style train.py: by one line in it, or by `python -m integration.inria train.py …` without any change
 SETUP = "    gaussians.training_setup(opt)\n"
 
 

@@ -149,8 +149,6 @@ def test_of_rows_with_one_parent_the_one_that_kept_its_place_is_the_old_gaussian
 
 
 # ---- a proxy of a host's model: opacities and colours are changed once, however the host's getters call each other
-
-
 ROLES = (
     ("get_opacity", "gate"), ("get_opacity_with_3D_filter", "gate"), ("get_scaling_n_opacity_with_3D_filter", "gate"),
     ("get_opacities", "gate"), ("_features_dc", "detail"),

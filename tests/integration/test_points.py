@@ -46,8 +46,6 @@ def assert_starts_there(means, sh0):
 
 
 # ---- what hosts share
-
-
 def test_one_line_says_what_was_found_and_a_large_cloud_is_reduced(monkeypatch, caplog):
     photos = host_photos()
     with caplog.at_level(logging.INFO):
@@ -65,8 +63,6 @@ def test_one_line_says_what_was_found_and_a_large_cloud_is_reduced(monkeypatch, 
 
 
 # ---- gsplat's simple_trainer
-
-
 @pytest.fixture
 def trainer(monkeypatch):
     """A fresh module of the stand-in."""
@@ -125,8 +121,6 @@ def test_a_script_without_the_hosts_functions_is_refused(trainer):
 
 
 # ---- 3DGS-style train.py
-
-
 def own_gaussians(host, folder, **settings):
     opt = options(host, folder, **settings)
     return *host.setup(opt), opt

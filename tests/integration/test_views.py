@@ -21,8 +21,6 @@ from tests.helpers import gsplat_host, toy
 from tests.helpers.host_parts import as_item
 
 # ---- A host's photos as views: what a mask hides, and what is refused
-
-
 PHOTO = toy.scene(20).train[0].lr
 
 
@@ -81,8 +79,6 @@ def test_two_views_of_one_name_are_refused():
 
 
 # ---- the demo as the loop of a host needs it
-
-
 def test_the_demo_has_photos_cameras_and_sr_images_that_fit():
     demo = load_demo(width=64, height=48)
     assert demo.images.shape == (3, 12, 16, 3)

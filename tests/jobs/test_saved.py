@@ -115,8 +115,6 @@ def test_a_rasterizer_that_is_not_here_gives_way(saved_run, tmp_path, caplog):
 
 
 # ---- `clear-strategies render RUN`: which files it leaves
-
-
 def files(folder):
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
 
@@ -166,8 +164,6 @@ def test_wrong_arguments_are_refused_in_one_line(saved_run, arguments, message):
 
 
 # ---- files for viewers hold the splat as it was measured; another program reads them
-
-
 def sorted_by_x(values, x):
     return values[np.argsort(x, kind="stable")]
 

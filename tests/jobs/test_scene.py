@@ -141,8 +141,6 @@ def test_a_prior_without_a_label_is_refused_before_data_is_read():
 
 
 # ---- what a capture is by default: all of its photos. What it is under a protocol: the same bits for ever
-
-
 def settings(*overrides: str) -> JobSettings:
     return settings_of(tree(composed(*overrides, "prior=bicubic", "data.cloud.init=random")))
 
@@ -208,8 +206,6 @@ def fingerprint(scene: Scene) -> str:
 
 
 # ---- a scene in other units trains to the same picture, and what was saved of it can be looked at
-
-
 SETTINGS = [
     *ALONE, "prior=bicubic", "data.views.photos_are=hr", "data.views.test_every=3", "+strategy=best", "fit.iterations=60",
     "skips=none", "fit.threads=1",

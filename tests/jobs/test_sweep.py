@@ -163,8 +163,6 @@ def test_failed_jobs_are_told_where_the_report_cannot_be_written(tmp_path, caplo
 
 
 # ---- one writer a folder: who holds it is respected while alive, and only then
-
-
 def test_a_held_folder_is_refused_released_when_the_job_fails_and_may_be_removed_by_hand(tmp_path):
     folder = tmp_path / "run"
     with (

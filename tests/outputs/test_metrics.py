@@ -25,9 +25,8 @@ from clear_strategies.outputs.score_table import describe
 from rasterizers.interface import Camera
 from tests.helpers.image_files import noise
 
+
 # ---- scores of a scene, and metrics.json
-
-
 def view(name: str, truth: Tensor, *, known: bool = True) -> View:
     height, width = truth.shape[:2]
     camera = Camera(torch.eye(4), fx=50.0, fy=50.0, cx=width / 2, cy=height / 2, width=width, height=height)
@@ -108,8 +107,6 @@ def test_a_render_that_is_not_finite_has_a_warning_and_null_in_the_file(tmp_path
 
 
 # ---- the table of scores at the end of a run
-
-
 OURS, BICUBIC = ImageScores(23.5, 0.7, 0.1, 0.01), ImageScores(22.0, 0.5, 0.16, 0.2)
 TABLE: Table = {"view": {"ours": OURS, "bicubic": BICUBIC, "prior": BICUBIC}}
 
@@ -148,8 +145,6 @@ def test_what_is_missing_has_no_row_and_no_note() -> None:
 
 
 # ---- the four numbers: by hand, against other implementations, and on photographs that everyone would rank alike
-
-
 def score(image: Tensor, truth: Tensor, shown: Tensor | None = None) -> ImageScores:
     return Truth(truth, shown).score(image)
 
@@ -167,9 +162,6 @@ def photograph() -> Tensor:
 
 def enlarged(truth: Tensor, factor: int) -> Tensor:
     return images.upsample(images.downsample(truth, factor), factor)
-
-
-# ── the numbers ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def test_an_image_is_perfect_to_itself_two_greys_by_hand_and_what_exceeds_the_range_is_clamped() -> None:
@@ -235,8 +227,6 @@ def test_images_of_different_or_tiny_size_are_refused() -> None:
 
 
 # ── what the measures notice ─────────────────────────────────────────────────────────────────────────────────────────
-
-
 def assert_ranked(*scores: ImageScores) -> None:
     """Best first, by each of the four."""
     for better, worse in pairwise(scores):
@@ -259,9 +249,6 @@ def test_all_four_rank_by_sharpness_and_blur_and_gmsd_tell_blur_texture_and_disp
     displaced = score(photograph.roll(2, dims=1), photograph)
     assert abs(displaced.blur) < 0.01
     assert displaced.gmsd > score(enlarged(photograph, 2), photograph).gmsd
-
-
-# ── masks ────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def test_hidden_pixels_do_not_count(photograph: Tensor) -> None:

@@ -12,9 +12,8 @@ from clear_strategies.outputs.figures import SheetRow, write_contact_sheet
 from tests.helpers import wall
 from tests.helpers.image_files import array, holds, read
 
+
 # ---- what the figures share
-
-
 @pytest.mark.parametrize(
     ("count", "expected"),
     [(0, []), (1, [0]), (3, [0, 4, 8]), (4, [0, 3, 6, 9]), (10, [*range(10)]), (99, [*range(10)])],
@@ -25,8 +24,6 @@ def test_spaced_items_are_at_most_as_many_as_asked_for(count: int, expected: lis
 
 
 # ---- maps/coverage.png: how many photos see each point, and photos without a pose
-
-
 SCENE = wall.scene(-1.0, 0.0, 1.0)
 
 
@@ -49,8 +46,6 @@ def test_the_map_has_the_colours_of_its_legend_and_dollars_are_no_mathematics(tm
 
 
 # ---- the contact sheet shows what it is given, pixel for pixel
-
-
 def row(name: str, seed: int, *, truth: bool = True, size: tuple[int, int] = (40, 60)) -> SheetRow:
     shown = {name: array(seed + k, *size) for k, name in enumerate(("LR, enlarged", "ours"))}
     if truth:

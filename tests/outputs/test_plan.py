@@ -19,8 +19,6 @@ from clear_strategies.training.state import TrainState
 from tests.helpers import toy
 
 # ---- the plan names what a run does and skips
-
-
 SCENE = toy.scene()
 
 
@@ -93,8 +91,6 @@ def test_of_progress_that_goes_to_a_file_a_twentieth_is_a_line_and_jumps_are_fol
 
 
 # ---- provenance holds what can be found out, and never fails
-
-
 def test_provenance_holds_versions_of_what_is_installed_machine_and_the_facts_of_the_run(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -134,8 +134,6 @@ def test_metrics_json_is_missing_where_another_file_could_not_be_written(tmp_pat
 
 
 # ---- a file is whole or as it was before; numbers that JSON does not have become null
-
-
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
     target = tmp_path / "results.json"
     files.write_text(target, "old")

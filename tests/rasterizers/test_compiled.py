@@ -55,8 +55,6 @@ def test_every_backend_passes_the_checks(backend, check):
 
 
 # ---- agreement ---------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("settings", [{}, CLEAN], ids=["default", "clean"])
 @pytest.mark.parametrize(("bands", "depth"), [(0, False), (15, False), (3, True)])
 @backends()
@@ -132,8 +130,6 @@ def test_needles_keep_their_shape(backend, aspect, pixels):
 
 
 # ---- the same bits -----------------------------------------------------------------------------------------------
-
-
 @WITH_DEPTH
 @backends()
 def test_bits_do_not_depend_on_the_run(backend, depth):
@@ -200,8 +196,6 @@ def test_equal_depths_are_ordered_by_index_and_long_lists_are_blended_to_the_end
 
 
 # ---- shapes and borders ------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("n", [0, 1, 2, 15, 16, 17, 255, 257])
 @backends()
 def test_any_number_of_gaussians(backend, n):
@@ -247,8 +241,6 @@ def test_a_black_gaussian_gets_the_gradient_of_its_colour(backend):
 
 
 # ---- values ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("opacity", "x"), [(0.9, 0.0), (0.01, 0.0), (0.6, 2.0)])
 def test_a_ball_has_its_depth_along_the_camera_s_axis_wherever_it_is_seen(opacity, x):
     ball = replace(balls(3.0, opacity=opacity), means=torch.tensor([[x, 0.0, 3.0]], dtype=torch.float64))
@@ -267,8 +259,6 @@ def test_depth_is_the_mean_by_blending_weight():
 
 
 # ---- agreement ---------------------------------------------------------------------------------------------------
-
-
 @backends(dtype=torch.float32)
 def test_the_faintest_pixel_has_a_depth(backend):
     # Where alpha is 1e-6, 1 - T has one digit left in float32.
@@ -279,8 +269,6 @@ def test_the_faintest_pixel_has_a_depth(backend):
 
 
 # ---- beside the image --------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("k", [1, 2, 3, 4])
 @backends()
 def test_depth_does_not_change_the_image_or_its_gradients(backend, k):

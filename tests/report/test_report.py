@@ -19,8 +19,6 @@ from clear_strategies.settings import CHANGES_NO_RESULT
 from tests.helpers.finished_run import averages_of, cells, make_run, rows_of, scores, table_of
 from tests.helpers.image_files import array, holds, read
 
-# ---- the command and its files
-
 
 def test_a_report_has_a_table_records_a_page_and_images(tmp_path: Path) -> None:
     for seed, psnr in enumerate((20.0, 21.5)):
@@ -83,9 +81,6 @@ def test_without_runs_the_command_logs_one_line_and_exits_with_2(tmp_path, caplo
     assert capsys.readouterr().out == ""
 
 
-# ---- the table leaves out what is empty and notes what a reader has to know
-
-
 def test_empty_columns_are_left_out_and_a_bar_in_a_name_does_not_break_the_table(tmp_path: Path) -> None:
     make_run(tmp_path, "+strategy=gco", conflict={}, scene="a|b")
     header, _, line = table_of(tmp_path).splitlines()[:3]
@@ -94,8 +89,6 @@ def test_empty_columns_are_left_out_and_a_bar_in_a_name_does_not_break_the_table
 
 
 # ---- A comparison enlarges the window where runs differ; charts draw what was measured
-
-
 def test_a_comparison_enlarges_the_part_where_runs_differ_most(tmp_path: Path) -> None:
     base = array(0, 64, 240)
     other = base.copy()
@@ -127,8 +120,6 @@ def test_runs_without_history_are_not_drawn_and_dollars_are_no_mathematics(tmp_p
 
 
 # ---- seeds are averaged, settings are distinguished, and differences are paired
-
-
 def test_runs_that_differ_in_their_seed_share_a_row(tmp_path: Path) -> None:
     for seed, psnr in enumerate((20.0, 21.0, 25.0)):
         make_run(tmp_path / str(seed), "+strategy=clear", seed=seed, psnr=psnr)
@@ -239,8 +230,6 @@ def test_scenes_with_different_data_settings_are_averaged(tmp_path: Path) -> Non
 
 
 # ---- finished runs are found, named and read; others are left out with a warning
-
-
 @pytest.mark.parametrize(
     ("overrides", "facts", "name"),
     [

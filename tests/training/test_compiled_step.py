@@ -317,8 +317,6 @@ def test_thirty_iterations_are_those_of_the_readable_path(passes, readable):
 
 
 # ---- which runs get the compiled per-Gaussian step, and that a run which does not says why
-
-
 @dataclass(frozen=True)
 class Tuned(GCO):
     """Other defaults, the same arithmetic."""

@@ -100,8 +100,6 @@ def test_both_paths_train_both(fused, caplog):
 
 
 # ---- methods of two stages: the Shuffle Split, and what the second stage trains on
-
-
 AT_10 = ShuffleSettings(start=20, stop=20, split_at=10, min_gaussians=1)
 
 
@@ -190,8 +188,6 @@ def test_timing_has_iterations_and_seconds_of_both_stages():
 
 
 # ---- two dropped subsets of a field, compared at a size that shows low frequencies alone
-
-
 def test_one_subset_learns_what_another_shows_of_a_training_view():
     state = start(("gco",), more=[PairDrop(share=0.5, start=4)])
     for _ in range(8):

@@ -17,8 +17,6 @@ from rasterizers.interface import Camera
 from tests.helpers import toy
 
 # ---- cameras as files: what a run writes is what is read
-
-
 SCENE = toy.scene(train=3, test=1)
 
 
@@ -70,8 +68,6 @@ def test_videos_have_even_sizes(longest, size):
 
 
 # ---- camera paths are closed, even, and pass what they must
-
-
 def at(center: tuple[float, float, float], focus: tuple[float, float, float] = (0, 0, 0)) -> Camera:
     """A camera that looks at the focus, with y pointing down in the world."""
     forward = np.subtract(focus, center) / np.linalg.norm(np.subtract(focus, center))
@@ -131,8 +127,6 @@ def test_what_gives_no_path_is_refused(along, frames):
 
 
 # ---- videos hold the frames that were written, and nothing is left of one that broke
-
-
 FRAMES = [np.full((32, 48, 3), 20 * i, np.uint8) for i in range(10)]
 
 

@@ -61,9 +61,6 @@ def test_depth_is_unknown_where_nothing_is_and_numbers_are_blended_over_black(fi
     torch.testing.assert_close(painter.numbers(CAMERA, torch.full((len(field),), 0.5)), ones / 2)
 
 
-# ---- the viewer
-
-
 def close(found, exact):
     assert found.shape == exact.shape
     assert np.abs(found.astype(int) - exact).max() <= 1

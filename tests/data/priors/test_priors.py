@@ -20,9 +20,8 @@ from clear_strategies.data.priors.tiling import tiled
 from clear_strategies.errors import DataError
 from tests.helpers.networks import Counting, onnx_bytes, photo, psnr, upscaling_weight
 
+
 # ---- what holds for several priors: paths, missing models, and the quality of real networks on a real photo
-
-
 def test_real_networks_do_on_fern_what_is_known_of_them_without_seams(
     shared_data: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -59,8 +58,6 @@ def test_what_is_no_sr_image_is_refused_by_the_name_of_its_view(made, told):
 
 
 # ---- SR images from a folder: found by name, refused if missing, ambiguous or of another size
-
-
 @pytest.mark.parametrize(
     ("suffix", "found"),
     [
@@ -89,8 +86,6 @@ def test_images_of_another_view_give_a_warning(tmp_path: Path, caplog: pytest.Lo
 
 
 # ---- ONNX networks: computed as torch computes them; files that cannot be used are refused
-
-
 @pytest.fixture
 def network(tmp_path: Path) -> Path:
     path = tmp_path / "tiny_x4.onnx"
@@ -119,9 +114,7 @@ def test_onnx_computes_what_torch_computes_without_a_warning_and_shares_no_array
     assert not np.shares_memory(first.numpy(), prior("a", lr, 4).numpy())
 
 
-# ---- sR images are computed once per content, and computed again if the entry is damaged
-
-
+# ---- SR images are computed once per content, and computed again if the entry is damaged
 @pytest.fixture
 def model(tmp_path: Path) -> Path:
     path = tmp_path / "model.bin"
@@ -190,8 +183,6 @@ def test_a_cache_that_cannot_be_written_costs_no_result_and_it_lies_where_the_en
 
 
 # ---- tiles join without seams, and equal the whole image where the overlap covers the receptive field
-
-
 @given(
     height=st.integers(1, 40), width=st.integers(1, 40), overlap=st.integers(0, 4), more=st.integers(1, 20),
     factor=st.sampled_from([1, 2, 4]), seed=st.integers(0, 9),

@@ -19,9 +19,7 @@ from clear_strategies.data.readers import blender, colmap, nerfstudio
 from clear_strategies.errors import DataError
 from tests.helpers import captures as tiny
 
-# ---- neRF-synthetic: OpenGL poses, RGBA over white, the order and the numbers of the protocol
-
-
+# ---- NeRF-synthetic: OpenGL poses, RGBA over white, the order and the numbers of the protocol
 PROTOCOL = {2, 16, 26, 55, 73, 76, 86, 93}
 
 
@@ -76,9 +74,6 @@ def test_the_protocols_frames_of_lego_are_found_by_number(shared_data: Path) -> 
     assert (train[2].load()[0, 0] == 1).all()
 
 
-# ---- LLFF's scenes are COLMAP's, with photos under other names
-
-
 def test_renamed_photos_of_llff_are_matched_by_order(tmp_path: Path) -> None:
     tiny.llff(tmp_path)
     for i, name in enumerate(tiny.NAMES):
@@ -95,8 +90,6 @@ def test_renamed_photos_of_llff_are_matched_by_order(tmp_path: Path) -> None:
 
 
 # ---- transforms.json: intrinsics wherever they stand, poses, splits, points
-
-
 def changed(root: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     """The tiny scene with another transforms.json."""
     tiny.edit(tiny.nerfstudio(root) / "transforms.json", change)
@@ -150,9 +143,7 @@ def test_points_of_a_ply_have_no_tracks(tmp_path: Path) -> None:
     assert points.source == "points.ply, 1 points without tracks"
 
 
-# ---- cOLMAP models: both layouts give the same scene, lenses are straightened, photos are found
-
-
+# ---- COLMAP models: both layouts give the same scene, lenses are straightened, photos are found
 LAYOUTS = {"bin": tiny.colmap_bin, "txt": tiny.colmap_txt}
 
 

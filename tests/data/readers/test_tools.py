@@ -27,7 +27,6 @@ from tests.helpers import captures as tiny
 from tests.helpers.captures import FOCAL, GOOD, HEIGHT, NAMES, READERS, WIDTH
 
 # ---- names: one rule for all readers
-
 NAMED: dict[str, tuple[Callable[[str], str], Callable[[Path], object]]] = {
     "backslashes": (lambda name: name.replace("/", "\\"), lambda _: None),
     "another ending": (lambda name: name.replace(".png", ".JPG"), lambda _: None),
@@ -114,7 +113,6 @@ def test_where_photos_have_an_ending_that_is_not_read_the_message_names_it(tmp_p
 
 
 # ---- poses that no reader reads beside photos
-
 BESIDE: dict[str, tuple[str, str, str]] = {
     "transform_train.json": ("transform_train.json", '{"frames": []}', "clear-strategies train .*transform_train.json"),
     "Metashape": ("cameras.xml", '<?xml version="1.0"?>\n<document><chunk>', "ns-process-data metashape"),
@@ -153,8 +151,6 @@ def test_transforms_under_any_name_are_read_when_the_file_is_named(tmp_path: Pat
 
 
 # ---- nothing is dropped in silence
-
-
 @pytest.mark.parametrize("names", [NAMES, ("a photo 1.png", "b photo 2.png", "c photo 3.png")])
 @pytest.mark.parametrize("points", ["", "\n", "8.0 6.0 -1 7 7 12\n"])
 def test_images_without_a_line_of_points_are_all_read(names: tuple[str, ...], points: str, tmp_path: Path) -> None:
@@ -189,8 +185,6 @@ def test_a_text_model_that_has_fewer_images_than_its_header_says_is_told(tmp_pat
 
 
 # ---- lenses: units, and COLMAP's camera models
-
-
 HALVES = {"cx": 0.5, "cy": 0.5}
 
 
@@ -269,8 +263,6 @@ def test_other_models_are_refused_by_name(model, parameters, command, layout, tm
 
 
 # ---- too little to train on
-
-
 @pytest.mark.parametrize(("others", "warned"), [(1, False), (3, True)])
 def test_where_few_photos_have_a_pose_a_note_says_so(others: int, warned: bool, tmp_path: Path) -> None:
     root = tiny.colmap_txt(tmp_path)
@@ -319,8 +311,6 @@ def test_photos_turned_on_the_spot_are_refused_before_poses_are_made_up(tmp_path
 
 
 # ---- docs/how-to/captures.md: each tool of its table, by small files as it writes them, is read as the table says
-
-
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "how-to" / "captures.md"
 ROW = re.compile(r"^\| (?P<tool>[^|]+) \| [^|]+ \| (?:`data=(?P<kind>\w+)`|–) \| [^|]+ \|$")
 ROWS = {found["tool"]: found["kind"] for line in PAGE.read_text().splitlines() if (found := ROW.match(line))}

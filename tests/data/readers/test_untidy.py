@@ -76,8 +76,6 @@ def test_reading_poses_decodes_no_photo(kind: str, tmp_path: Path) -> None:
 
 
 # ---- folders of photos as phones and people leave them: each ends well, or with one line that names the file and the remedy
-
-
 Read = Callable[..., Capture]
 
 

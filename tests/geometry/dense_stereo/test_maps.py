@@ -145,8 +145,6 @@ def test_what_is_alike_depends_on_the_ratio_of_depths_and_without_scipy_all_is_k
 
 
 # ---- completed depth: planes go on, surfaces end where colours change, outliers do not count
-
-
 H, W = 24, 32
 V, U = torch.meshgrid(torch.arange(H).double(), torch.arange(W).double(), indexing="ij")
 PLANE = 0.5 + 0.004 * U - 0.006 * V
@@ -193,8 +191,6 @@ def test_one_known_pixel_is_the_depth_of_all_of_a_photo_of_any_size() -> None:
 
 
 # ---- the cost volume and its smoothing
-
-
 def test_the_better_half_of_the_photos_decides_and_the_true_plane_costs_next_to_nothing() -> None:
     first, second, third = (Grey(p.camera, p.image.mean(2)) for p in plane_photos(3))
     planes = torch.tensor([1 / 8, 1 / 4, 1 / 3])
