@@ -111,9 +111,7 @@ def test_without_the_trainers_libraries_the_extra_is_named(monkeypatch):
 
 
 # ---- `clear-strategies doctor` says what is here, what is missing, and which backend draws something wrong
-def test_doctor_names_versions_memory_backends_and_missing_extras_of_the_project_with_what_they_add(
-    capsys, monkeypatch
-):
+def test_doctor_names_versions_memory_backends_and_missing_extras(capsys, monkeypatch) -> None:
     monkeypatch.setattr(doctor, "find_spec", lambda name: None if name == "pycolmap" else object())
     doctor.main([])
     said = capsys.readouterr().out

@@ -75,7 +75,7 @@ def test_photos_that_are_the_hr_side_are_not_moved_and_equalize_has_no_effect_wi
         ("hr", 250_000, [5, 7], (16, 12)),  # the LR photos, then the SR images that complete their depth
     ],
 )
-def test_depth_is_that_of_the_hr_side_where_it_is_photos_and_else_of_lr(
+def test_depth_is_of_the_hr_side_where_it_is_photos_and_else_of_lr(
     photos_are, max_pixels, windows, compared, monkeypatch
 ):
     asked = []

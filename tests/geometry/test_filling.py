@@ -35,9 +35,7 @@ def test_new_points_lie_on_the_plane_of_the_old_ones(a: float, b: float, stride:
     assert f"densified by {len(new):,}" in cloud.source
 
 
-def test_a_new_point_has_the_colour_of_its_pixel_and_without_points_in_view_there_is_none(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_new_point_has_the_colour_of_its_pixel_and_without_points_in_view_there_is_none(caplog):
     view = photo()
     cloud = densify(cloud_of(torch.randn(50, 3) * 0.2 + torch.tensor([0, 0, 5.0])), [view], 1)
     pixels, _ = project(view.camera, cloud.means[50:])

@@ -65,9 +65,7 @@ def test_means_lie_on_the_plane_and_the_summary_says_how_much_is_known(plane: St
     assert "without" not in plane.summary
 
 
-def test_one_tensor_is_a_list_of_photos_uint8_is_divided_by_255_and_depth_maps_alone_are_those_of_stereo(
-    plane: Stereo,
-) -> None:
+def test_one_tensor_is_a_list_of_photos_uint8_is_divided_by_255_and_depth_maps_are_stereos(plane: Stereo) -> None:
     photos = plane_photos(2, 64, 48)
     eight = [(photo.image * 255).round().to(torch.uint8) for photo in photos]
     listed = reconstruct(photos, images=[image.float() / 255 for image in eight])

@@ -209,9 +209,7 @@ def test_a_detail_feature_that_no_optimizer_steps_on_gives_a_warning(stepped, ca
 
 
 @pytest.mark.parametrize("own_background", [False, True])
-def test_both_scales_and_extra_views_are_over_the_background_of_a_strategy_unless_the_loop_has_its_own(
-    own_background, caplog
-):
+def test_all_renders_are_over_the_background_of_a_strategy_unless_the_loop_has_its_own(own_background, caplog) -> None:
     caplog.set_level("INFO")
     backgrounds, chosen = [], RandomBackground()
 

@@ -322,9 +322,7 @@ def test_unsupported_calls_are_refused(inria_host, inria_capture, inria_attached
         attach(gaussians, scene.cameras, Conductor(GCO()), sr=inria_capture / "sr")
 
 
-def test_views_need_unique_names_and_sr_images_of_the_right_size_and_intrinsics_are_of_the_projection(
-    inria_host, inria_capture
-):
+def test_views_need_unique_names_and_sr_images_of_the_right_size(inria_host, inria_capture) -> None:
     gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
     with pytest.raises(SettingError, match="at least one training camera"):
         attach(gaussians, [], Conductor(), sr=inria_capture / "sr")
@@ -376,9 +374,7 @@ def test_schedules_are_those_of_the_hosts_own_options(inria_host, inria_capture)
 
 
 @pytest.mark.parametrize("points", ["own", "stereo"])
-def test_a_run_continues_from_the_hosts_checkpoint_as_if_it_had_not_stopped(
-    points, inria_capture, inria_launched, caplog
-):
+def test_a_run_continues_from_the_hosts_checkpoint(points, inria_capture, inria_launched, caplog) -> None:
     checkpoint, common = str(inria_capture / "5.pth"), ["--iterations", "8", "--sh_interval", "1"]
     with caplog.at_level(logging.INFO):
         whole = inria_launched(

@@ -95,9 +95,7 @@ def test_splats_start_at_the_stereo_cloud_and_their_optimizers_have_them(trainer
 
 
 @pytest.mark.parametrize(("init_type", "points"), [("sfm", "own"), ("random", "stereo")])
-def test_splats_start_at_the_hosts_own_points_by_default_and_where_they_are_random(
-    trainer, tmp_path, init_type, points, caplog
-):
+def test_splats_start_at_the_hosts_own_points_by_default_or_if_random(trainer, tmp_path, init_type, points, caplog):
     own = runner_of(trainer, tmp_path, init_type=init_type).splats
     install(trainer, **({"points": points} if points == "stereo" else {}))
     for name, p in runner_of(trainer, tmp_path, init_type=init_type).splats.items():

@@ -179,9 +179,7 @@ PROTOCOLS = {
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_under_a_protocol_photos_and_cameras_keep_their_bits(
-    protocol: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_under_a_protocol_photos_and_cameras_keep_their_bits(protocol, tmp_path, monkeypatch):
     monkeypatch.setattr("clear_strategies.data.prepare.SMALLEST", 1)  # px that scores need, more than these photos have
     write, changed, expected = PROTOCOLS[protocol]
     scene = write(tmp_path / "scene").name

@@ -77,9 +77,7 @@ def test_of_many_training_views_a_sample_is_scored(monkeypatch: pytest.MonkeyPat
     assert metrics.to_json(evaluation)["train"]["of"] == 7
 
 
-def test_where_hr_is_unknown_the_reduced_render_is_compared_with_lr_and_where_it_is_photos_nothing_else_is_scored() -> (
-    None
-):
+def test_without_hr_the_reduced_render_is_compared_with_lr_and_of_hr_photos_it_alone_is_scored() -> None:
     truth = noise(2, 48, 64)
     known, unknown = view("known", truth), view("unknown", truth, known=False)
     evaluation = metrics.evaluate(scene((known, unknown), (unknown,)), lambda camera: truth)
@@ -236,9 +234,7 @@ def assert_ranked(*scores: ImageScores) -> None:
         assert abs(better.blur) < abs(worse.blur)
 
 
-def test_all_four_rank_by_sharpness_and_blur_and_gmsd_tell_blur_texture_and_displacement_apart(
-    photograph: Tensor,
-) -> None:
+def test_all_four_rank_by_sharpness_and_two_tell_blur_texture_and_displacement_apart(photograph: Tensor) -> None:
     assert_ranked(*(score(enlarged(photograph, factor), photograph) for factor in (1, 2, 4, 8)))
     blurred, texture = enlarged(photograph, 4), noise(0, 256, 256) - 0.5
     of_blurred, of_both = score(blurred, photograph), score(blurred + 0.15 * texture, photograph)

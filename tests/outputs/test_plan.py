@@ -76,9 +76,7 @@ def test_the_progress_bar_counts_iterations(capsys: pytest.CaptureFixture[str]) 
     assert [line.split("|")[2].split()[0] for line in lines] == [f"{i}/10" for i in range(1, 11)]
 
 
-def test_of_progress_that_goes_to_a_file_a_twentieth_is_a_line_and_jumps_are_followed(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_of_progress_that_goes_to_a_file_a_twentieth_is_a_line_and_jumps_are_followed(capsys):
     state = started()
     state.settings = replace(state.settings, iterations=200)
     state.history.append({"t": 1.0, "lambda_hr": 0.0, "loss_lr": 0.5, "n_gaussians": 9.0})
@@ -91,9 +89,7 @@ def test_of_progress_that_goes_to_a_file_a_twentieth_is_a_line_and_jumps_are_fol
 
 
 # ---- provenance holds what can be found out, and never fails
-def test_provenance_holds_versions_of_what_is_installed_machine_and_the_facts_of_the_run(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_provenance_holds_versions_of_what_is_installed_machine_and_the_facts_of_the_run(monkeypatch):
     found = provenance(seed=3, backend="torch")
     assert torch.__version__.startswith(found["versions"]["torch"])  # which leaves out +cu130 in PyPI's wheel
     assert found["threads"] == torch.get_num_threads()

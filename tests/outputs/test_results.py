@@ -65,7 +65,7 @@ def test_conflict_csv_holds_columns_of_history_csv_and_the_ply_says_how_it_was_d
     assert not read_gaussians(tmp_path / "point_cloud.ply").antialiased
 
 
-def test_a_run_without_test_views_shows_training_views_and_what_is_not_wanted_or_cannot_be_written_is_missing(
+def test_without_test_views_training_views_are_shown_and_what_cannot_be_written_is_missing(
     tmp_path, state, monkeypatch, caplog
 ):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
@@ -148,9 +148,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monke
     assert list(tmp_path.iterdir()) == [target]
 
 
-def test_processes_of_one_number_do_not_write_into_one_file_and_folders_and_long_names_are_no_error(
-    tmp_path: Path,
-) -> None:
+def test_processes_of_one_number_folders_and_long_names_are_no_error(tmp_path: Path) -> None:
     with files.replacing(tmp_path / "sr.png") as first, files.replacing(tmp_path / "sr.png") as second:
         first.write_text("first")
         second.write_text("second")

@@ -259,9 +259,7 @@ def test_runs_of_a_sweep_are_in_the_order_of_their_jobs_and_linked_ones_count_on
     assert [run.name for run in report.collect([runs, ours, runs / ".." / "runs" / "ours"])] == ["gco", "clear"]
 
 
-def test_damaged_and_unfinished_runs_are_left_out_with_a_warning(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_damaged_and_unfinished_runs_are_left_out_with_a_warning(tmp_path, caplog):
     make_run(tmp_path / "good", "+strategy=gco")
     (make_run(tmp_path / "truncated") / "metrics.json").write_text('{"scene": "de')
     (make_run(tmp_path / "list") / "metrics.json").write_text("[]")

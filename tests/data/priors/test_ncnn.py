@@ -97,9 +97,7 @@ def truth_and_lr() -> tuple[Tensor, Tensor]:
 
 
 @real
-def test_waifu2x_is_nearer_to_the_truth_than_bicubic_and_realesrgan_is_another(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_waifu2x_is_nearer_to_the_truth_than_bicubic_and_realesrgan_is_another(caplog):
     truth, lr = truth_and_lr()
     assert psnr(Ncnn()("view", lr, 4), truth) > psnr(Bicubic()("view", lr, 4), truth) + 0.5
     half = images.downsample(truth, 2)

@@ -22,9 +22,7 @@ from tests.helpers.networks import Counting, onnx_bytes, photo, psnr, upscaling_
 
 
 # ---- what holds for several priors: paths, missing models, and the quality of real networks on a real photo
-def test_real_networks_do_on_fern_what_is_known_of_them_without_seams(
-    shared_data: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_real_networks_do_on_fern_what_is_known_of_them_without_seams(shared_data, caplog):
     """504x376 from 126x94, a training view."""
     weights, photos = shared_data / "sr_weights", sorted((shared_data / "fern" / "images_4").iterdir())
     hr = images.downsample(images.crop_to_multiple(read_image(photos[10]), 8), 2)[:376, :504]
@@ -168,7 +166,7 @@ def test_a_damaged_entry_is_logged_and_computed_again(model, tmp_path, damage, c
     assert torch.equal(read_image(entry), first)
 
 
-def test_a_cache_that_cannot_be_written_costs_no_result_and_it_lies_where_the_environment_says(
+def test_a_cache_that_cannot_be_written_costs_no_result_and_the_environment_moves_it(
     model, tmp_path, caplog, monkeypatch
 ):
     (tmp_path / "file").write_bytes(b"in the way of a folder")
@@ -188,9 +186,7 @@ def test_a_cache_that_cannot_be_written_costs_no_result_and_it_lies_where_the_en
     factor=st.sampled_from([1, 2, 4]), seed=st.integers(0, 9),
 )  # fmt: skip
 @settings(max_examples=40, deadline=None)
-def test_tiles_join_to_the_whole_where_the_overlap_reaches_as_far_as_the_network_sees(
-    height: int, width: int, overlap: int, more: int, factor: int, seed: int
-) -> None:
+def test_tiles_join_to_the_whole_where_the_overlap_is_the_receptive_field(height, width, overlap, more, factor, seed):
     kernel = torch.randn(3, 1, 2 * overlap + 1, 2 * overlap + 1, generator=torch.Generator().manual_seed(seed))
     tile = 4 * overlap + more
 

@@ -402,9 +402,7 @@ def test_a_tools_files_are_read_as_the_table_says(tool: str, tmp_path: Path) -> 
     assert (capture.points is not None and len(capture.points.means) == 2) == (tool in POINTS)
 
 
-def test_plain_photos_have_their_poses_estimated_and_a_video_is_answered_with_the_line_that_takes_frames(
-    tmp_path: Path,
-) -> None:
+def test_plain_photos_are_read_and_a_video_is_answered_with_the_line_that_takes_frames(tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
     Image.new("RGB", (16, 12)).save(tmp_path / "photos/a.jpg")
     assert detect(tmp_path / "photos") == ROWS["plain photos"] == "photos"

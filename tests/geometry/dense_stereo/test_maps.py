@@ -134,9 +134,7 @@ def test_islands_of_fewer_pixels_are_found(fewest: int, count: int) -> None:
     assert int(result.sum()) == count
 
 
-def test_what_is_alike_depends_on_the_ratio_of_depths_and_without_scipy_all_is_kept(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_is_alike_depends_on_the_ratio_of_depths_and_without_scipy_all_is_kept(monkeypatch):
     depth = map_with_islands()
     assert torch.equal(speckles(depth, 5, 0.05), speckles(1e-6 * depth, 5, 0.05))
     assert int(speckles(depth, 13, 0.02).sum()) == 97  # each column is an island of twelve
@@ -219,9 +217,7 @@ def test_the_compiled_sweep_is_the_readable_one(window: int, monkeypatch: pytest
 
 
 @pytest.mark.parametrize("shape", [(5, 7, 16), (9, 4, 21), (1, 6, 3)])
-def test_the_compiled_smoothing_is_the_readable_one(
-    shape: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_compiled_smoothing_is_the_readable_one(shape, monkeypatch):
     volume, image = torch.rand(shape), torch.rand(shape[:2])
     compiled = smooth(volume, image, 0.08, 0.6)
     monkeypatch.setattr(cost.cpp, "available", lambda: False)
