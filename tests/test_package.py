@@ -51,16 +51,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> cs.Run:
     return made
 
 
-def test_a_run_has_its_numbers_and_its_gaussians_by_gsplats_names(run: cs.Run) -> None:
+def test_a_run_has_its_numbers_and_its_gaussians_by_gsplats_names_and_renders_from_anywhere(run: cs.Run) -> None:
     n = run.metrics["gaussians"]
     widths = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (3, 3)}
     assert {name: tuple(rows.shape) for name, rows in run.splats.items()} == {k: (n, *w) for k, w in widths.items()}
     assert {"pseudo_views", "fading_opacity"} <= set(run.metrics["strategies"])  # best, unless another is chosen
     assert {"+strategy=best", "prior=bicubic"} <= set(run.metrics["overrides"])
     assert "threads" in (run.folder / "run.log").read_text()  # a line that the console shows with -v alone
-
-
-def test_it_renders_what_the_run_rendered_and_from_anywhere_else(run: cs.Run) -> None:
     camera = run.cameras[0]
     picture = run.render()
     assert picture.shape == (camera.height, camera.width, 3)
@@ -106,7 +103,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(TEMPLATE)
 
 
-def test_its_own_tests_pass(installed: None) -> None:
+def test_its_own_tests_pass_it_trains_by_its_name_and_composes_with_others(installed: None, tmp_path: Path) -> None:
     spec = importlib.util.spec_from_file_location("test_veto", TEMPLATE / "tests" / "test_veto.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -114,9 +111,6 @@ def test_its_own_tests_pass(installed: None) -> None:
     assert len(tests) == 2
     for test in tests:
         test()
-
-
-def test_it_trains_by_its_name_and_composes_with_others(installed: None, tmp_path: Path) -> None:
     of_veto = ("+strategy=[veto,svs]", "strategies.veto.start=5", "prior=bicubic")
     run = cs.train(None, *TINY, *of_veto, folder=tmp_path / "run")
     assert run.metrics["strategies"] == ["veto", "svs"]

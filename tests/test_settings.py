@@ -53,22 +53,16 @@ def test_defaults_come_from_the_signature_and_the_node_wins():
     inner = {TARGET: f"{Inner.__module__}.Inner", "size": 3, "mode": "b"}
     assert node == target(Outer, inner=inner, names=None, color=[0.0, 1.0], weights={"x": 1.0, "y": 2.0}, on="auto")
     assert with_defaults([target(call, depth=7)]) == [target(call, depth=7, strict=False)]
-
-
-def test_another_target_takes_the_place_of_a_nested_default():
     node = with_defaults(target(Outer, inner=target(call, root="r")))
     assert node["inner"] == target(call, root="r", depth=2, strict=False)
+    node = target(call, root="r", _recursive_=False, inner=target(Inner))
+    assert with_defaults(node)["inner"] == target(Inner)
+    assert build(node) == ("r", 2, False, {"inner": target(Inner)})
 
 
 @pytest.mark.parametrize("kept", [{TARGET: None}, {TARGET: "nowhere.Mine", "x": 1}, {"a": {"b": 1}}, "text"])
 def test_what_cannot_be_looked_up_stays_as_it_is(kept):
     assert with_defaults(kept) == kept
-
-
-def test_nodes_below_recursive_false_stay_plain():
-    node = target(call, root="r", _recursive_=False, inner=target(Inner))
-    assert with_defaults(node)["inner"] == target(Inner)
-    assert build(node) == ("r", 2, False, {"inner": target(Inner)})
 
 
 def test_a_node_is_built_from_the_inside_out_and_a_partial_waits_for_what_is_missing():

@@ -22,19 +22,24 @@ def on_a_device(monkeypatch):
     monkeypatch.setattr(deferred, "is_immediate", lambda x: False)
 
 
-def test_on_the_cpu_numbers_are_floats():
+def test_on_the_cpu_numbers_are_floats_and_elsewhere_nothing_is_read_until_asked_for(monkeypatch):
     assert deferred.scalar(torch.tensor(1.5)) == 1.5
     assert deferred.defer(deferred.ratio, 1.0, 4.0) == 0.25
     assert math.isnan(deferred.defer(deferred.ratio, 0.0, 0.0))
-
-
-def test_elsewhere_nothing_is_read_until_it_is_asked_for(on_a_device):
+    monkeypatch.setattr(deferred, "is_immediate", lambda x: False)
     with toy.Operations() as done:
         part, whole = deferred.scalar(torch.tensor(3)), deferred.scalar(torch.tensor(4.0, dtype=torch.float64))
         share = deferred.defer(deferred.ratio, part, deferred.defer(deferred.added, whole, 8.0))
         rows = [{"t": 1.0, "share": share, "part": part}, {"t": 2.0, "share": share}]
     assert reads(done) == 0
     assert deferred.resolve(rows) == [{"t": 1.0, "share": 0.25, "part": 3.0}, {"t": 2.0, "share": 0.25}]
+    history = History()
+    for t in range(300):
+        history.append({"t": float(t), "loss": torch.tensor(t / 2)})
+    assert all(isinstance(row["loss"], torch.Tensor) for row in history)
+    assert [row["loss"] for row in deferred.resolve(history)] == [t / 2 for t in range(300)]
+    history.append({"t": 300.0, "loss": 150.0})
+    assert [row["loss"] for row in history] == [t / 2 for t in range(301)]
 
 
 def test_numbers_cross_once_and_exactly_and_a_recipe_runs_once(on_a_device, monkeypatch):
@@ -85,13 +90,3 @@ def test_rows_come_back_as_they_were_by_any_index_and_the_newest_may_change():
             history[beyond]
     history[-1]["seconds"], history[-60]["loss"] = 3.0, 9.0
     assert (history[499]["seconds"], history[440]["loss"]) == (3.0, 9.0)
-
-
-def test_numbers_on_a_device_are_kept_until_they_are_read():
-    history = History()
-    for t in range(300):
-        history.append({"t": float(t), "loss": torch.tensor(t / 2)})
-    assert all(isinstance(row["loss"], torch.Tensor) for row in history)
-    assert [row["loss"] for row in deferred.resolve(history)] == [t / 2 for t in range(300)]
-    history.append({"t": 300.0, "loss": 150.0})
-    assert [row["loss"] for row in history] == [t / 2 for t in range(301)]

@@ -25,22 +25,23 @@ def flat_photos() -> list[Photo]:
     return [replace(p, image=torch.full_like(p.image, 0.5)) for p in (photo(0.0), photo(0.5))]
 
 
-def test_auto_triangulates_where_it_can(caplog: pytest.LogCaptureFixture) -> None:
+def test_auto_triangulates_where_it_can_then_takes_stereo_then_random_points(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("DEBUG")
     cloud = initial_points(CloudSettings(densify=False), plane_photos(3), sfm=sfm(), train_ids=[1, 2, 3]).cloud
     assert len(cloud) > 50
     assert cloud.uses_test_views == "no"
     assert "init: auto chose" in caplog.text
     assert "does not use the scene's own points" in caplog.text
-
-
-def test_auto_takes_stereo_keeps_its_depth_and_says_how_much_is_known(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("DEBUG")
     found = initial_points(CloudSettings(stereo=StereoSettings(max_planes=64)), plane_photos(3, 64, 48))
     assert len(found.depths) == 3
     assert "dense stereo between the 3 photos (depth known at" in found.cloud.source
-    assert "init: auto chose" in caplog.text
+    assert caplog.text.count("init: auto chose") == 2
     assert ((found.cloud.means[:, 2] / 4 - 1).abs() < 0.03).float().mean() > 0.95
+    cloud = initial_points(CloudSettings(random_points=99), flat_photos(), sfm=sfm()).cloud
+    assert len(cloud) == 99
+    assert cloud.source.startswith("random")
+    assert cloud.uses_test_views == "no"
+    assert "auto chose random points: the training LR images give only 0 (data.cloud.enough: 50)" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -85,14 +86,6 @@ def test_sr_images_are_compared_of_few_photos_and_not_of_an_object_before_a_plai
 def test_what_is_asked_for_does_not_fall_back(init, photos, problem) -> None:
     with pytest.raises(DataError, match=problem):
         initial_points(CloudSettings(init=init), photos)
-
-
-def test_auto_falls_back_to_random_and_logs_it(caplog: pytest.LogCaptureFixture) -> None:
-    cloud = initial_points(CloudSettings(random_points=99), flat_photos(), sfm=sfm()).cloud
-    assert len(cloud) == 99
-    assert cloud.source.startswith("random")
-    assert cloud.uses_test_views == "no"
-    assert "auto chose random points: the training LR images give only 0 (data.cloud.enough: 50)" in caplog.text
 
 
 def test_a_given_file_is_read_and_refused_without_points(tmp_path: Path) -> None:

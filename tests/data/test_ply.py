@@ -33,7 +33,7 @@ def header(*lines: str, form: str = "binary_little_endian") -> bytes:
 XYZ = ("property float x", "property float y", "property float z")
 
 
-def test_gaussians_are_written_byte_for_byte_in_the_standard_layout(tmp_path: Path) -> None:
+def test_gaussians_and_points_are_written_byte_for_byte_as_3dgs_reads_them(tmp_path: Path) -> None:
     shN = torch.arange(9.0).view(1, 3, 3) + 10  # band b, channel c: 10 + 3b + c
     one = GaussianPly(
         means=torch.tensor([[1.0, 2, 3]]), sh0=torch.tensor([[[4.0, 5, 6]]]), shN=shN, opacities=torch.tensor([7.0]),
@@ -48,9 +48,6 @@ def test_gaussians_are_written_byte_for_byte_in_the_standard_layout(tmp_path: Pa
     channel_major = (10, 13, 16, 11, 14, 17, 12, 15, 18)
     values = (1, 2, 3, 0, 0, 0, 4, 5, 6, *channel_major, 7, -1, -2, -3, 0.5, 0.25, 0.125, 0)
     assert (tmp_path / "g.ply").read_bytes() == text.encode() + struct.pack("<26f", *values)
-
-
-def test_points_are_written_byte_for_byte_as_3dgs_reads_them(tmp_path: Path) -> None:
     write_points(tmp_path / "p.ply", torch.tensor([[1.0, 2, 3]]), torch.tensor([[0.0, 0.5, 1]]))
     text = "ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
     text += "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
@@ -111,7 +108,7 @@ def test_a_point_is_read_from_every_layout(tmp_path, form, lines, body):
         assert len(read_points(tmp_path / "p.ply")) == 0
 
 
-def test_a_gaussian_files_colours_are_its_constant_band_and_points_without_any_are_grey(tmp_path, caplog):
+def test_colours_of_a_gaussian_file_and_of_none_and_properties_outside_the_layout(tmp_path, caplog):
     g = gaussians(1, 3)
     g.sh0[:] = torch.tensor([0.0, 1.0, -9.0])
     write_gaussians(tmp_path / "g.ply", g)
@@ -120,9 +117,6 @@ def test_a_gaussian_files_colours_are_its_constant_band_and_points_without_any_a
     (tmp_path / "p.ply").write_bytes(header("element vertex 1", *XYZ) + struct.pack("<3f", 1, 2, 3))
     assert read_points(tmp_path / "p.ply").colors.tolist() == [[0.5, 0.5, 0.5]]
     assert "no colours, so its points are grey" in caplog.text
-
-
-def test_properties_outside_the_gaussian_layout_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_gaussians(tmp_path / "g.ply", gaussians(1, 0))
     content = (tmp_path / "g.ply").read_bytes()
     extra = content.replace(b"end_header", b"property float filter_3D\nend_header") + struct.pack("<f", 1)

@@ -133,6 +133,8 @@ def test_a_ready_made_lr_image_that_is_not_like_its_photo_gives_a_warning(tmp_pa
         message = r"0000.png: the photo, reduced again, differs .* check that .*0000.png shows this view, undistorted"
         assert bool(re.search(message, caplog.text)) is warned
     assert made.notes["LR"] == f"4x4, read from {tmp_path} (D is taken to be bicubic)"
+    with pytest.raises(SettingError, match=r"data\.views\.lr_folder: must be null"):
+        ViewSettings(photos_are="lr", lr_folder="here")
 
 
 RIG = ("cam1/0001.png", "cam1/0002.png", "cam2/0001.png", "cam2/rgb.0003.png")
@@ -181,11 +183,6 @@ def test_saved_lr_images_are_those_of_their_views_and_no_two_are_saved_as_one(tm
 def test_points_that_do_not_exist_are_refused_before_a_photo_is_decoded(init):
     with pytest.raises(DataError, match=r"there are none|is not there"):
         prepare(undecodable(), papers(train=1), Bicubic(), CloudSettings(init=init, path="nowhere.ply"))
-
-
-def test_lr_photos_and_an_lr_folder_contradict_each_other():
-    with pytest.raises(SettingError, match=r"data\.views\.lr_folder: must be null"):
-        ViewSettings(photos_are="lr", lr_folder="here")
 
 
 @pytest.mark.parametrize(("away", "warns"), [(0.0, False), (4.5e6, True)])

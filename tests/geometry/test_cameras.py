@@ -58,18 +58,10 @@ def test_few_cameras_are_all_compared_and_of_many_the_nearest_and_some_far_ones_
 
 
 # ---- colours between pixel centres, and which cameras see a surface
-def test_colours_are_sampled_between_pixel_centres() -> None:
+def test_colours_lie_between_pixel_centres_and_a_point_is_seen_inside_a_camera_if_not_hidden():
     image = torch.tensor([[[0.0, 0, 0], [1.0, 1, 1]]])
     at = torch.tensor([[0.5, 0.5], [1.0, 0.5], [1.25, 0.5], [1.5, 0.5], [0.1, 0.2]])
     assert torch.allclose(sample_colors(image, at)[:, 0], torch.tensor([0, 0.5, 0.75, 1, 0]))
-
-
-def small_camera(x: float) -> Camera:
-    """A pixel is 0.1 wide at a depth of 1."""
-    return planes.camera(x, 10, 10, 10.0)
-
-
-def test_a_point_is_seen_where_it_is_inside_a_camera_and_not_hidden():
     wall = torch.full((10, 10), 1.0)
     across = torch.arange(10) / 10 - 0.45  # the centres of a row of pixels at a depth of 1
     points = torch.stack((across, torch.zeros(10) + 0.05, torch.ones(10)), dim=1)
@@ -77,3 +69,8 @@ def test_a_point_is_seen_where_it_is_inside_a_camera_and_not_hidden():
     assert beside.tolist() == [1] * 5 + [2] * 5
     for depth, seen in ((wall * 0.5, 0), (wall * 2, 1), (wall * torch.nan, 0)):  # before, behind, unknown
         assert times_seen(points, [(small_camera(0.0), depth)]).unique().tolist() == [seen]
+
+
+def small_camera(x: float) -> Camera:
+    """A pixel is 0.1 wide at a depth of 1."""
+    return planes.camera(x, 10, 10, 10.0)

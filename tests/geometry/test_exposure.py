@@ -26,21 +26,15 @@ def depths(count: int = 3) -> list[DepthMap]:
     return [DepthMap(whole, torch.ones_like(whole))] * count
 
 
-def test_casts_are_found_up_to_their_geometric_mean():
+def test_casts_are_found_up_to_their_geometric_mean_and_photos_without_keep_their_colours():
     gains = exposure_gains(photos(CASTS), depths())
     assert torch.allclose(gains * CASTS, CASTS.log().mean(0).exp().expand(3, 3), atol=1e-3)
     assert torch.allclose(gains.log().mean(0), torch.zeros(3), atol=1e-5)
-
-
-def test_photos_that_do_not_differ_keep_their_colours_and_clipped_pixels_tell_nothing():
     assert torch.allclose(exposure_gains(photos(torch.ones(3, 3)), depths()), torch.ones(3, 3), atol=1e-5)
     casts = torch.tensor([[1.9, 1.9, 1.9], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
     assert float((photos(casts)[0].image == 1).float().mean()) > 0.1
     gains = exposure_gains(photos(casts), depths())
     assert torch.allclose(gains[1] / gains[0], torch.full((3,), 1.9), atol=2e-3)
-
-
-def test_a_photo_that_shares_no_surface_or_hides_it_keeps_its_colours_and_does_not_change_the_others():
     unknown = DepthMap(torch.full((90, 120), torch.nan), torch.zeros(90, 120))
     gains = exposure_gains(photos(CASTS), [*depths(2), unknown])
     assert gains[2].tolist() == pytest.approx([1, 1, 1])

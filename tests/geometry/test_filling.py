@@ -84,19 +84,17 @@ def test_outliers_are_removed() -> None:
         assert without_outliers(PointCloud(means, means * 0, "given"), 2, ratio).means[:, 0].tolist() == kept
 
 
-def test_voxels_hold_the_averages_of_their_points_in_the_order_of_the_cubes():
+def test_voxels_hold_the_averages_of_their_points_or_say_what_to_install(monkeypatch):
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "open3d", None)  # makes its import fail
+        with pytest.raises(BackendUnavailable, match=r"data\.cloud\.voxel needs Open3D.*pip install .*\[open3d\]"):
+            averaged_in_voxels(PointCloud(torch.rand(4, 3), torch.rand(4, 3), "given"), 0.1)
     pytest.importorskip("open3d")
     means = torch.tensor([[0.0, 0, 0], [5.0, 0, 0], [0.2, 0.1, 0], [0.0, 5, 0]])
     cloud = averaged_in_voxels(PointCloud(means, means / 5, "given"), 1.0)
     assert torch.allclose(cloud.means, torch.tensor([[0.1, 0.05, 0], [0.0, 5, 0], [5.0, 0, 0]]))
     assert torch.allclose(cloud.colors, cloud.means / 5)
     assert cloud.source == "given, in voxels of 1"
-
-
-def test_voxels_without_open3d_say_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "open3d", None)  # makes its import fail
-    with pytest.raises(BackendUnavailable, match=r"data\.cloud\.voxel needs Open3D.*pip install .*\[open3d\]"):
-        averaged_in_voxels(PointCloud(torch.rand(4, 3), torch.rand(4, 3), "given"), 0.1)
 
 
 # ---- points from depth maps: their spacing, what several photos see, and what fills the rest

@@ -73,6 +73,8 @@ def test_one_tensor_is_a_list_of_photos_uint8_is_divided_by_255_and_depth_maps_a
     assert same(reconstruct(photos, images=eight), listed)
     maps = depth_maps(plane_photos(3, 64, 48), settings=QUICK)
     assert same(plane, Stereo(tuple(maps), plane.means, plane.colors, ""))
+    with pytest.raises(SettingError, match="background: must be three numbers"):
+        reconstruct(plane_photos(2, 64, 48), background=(255, 255, 255))
 
 
 def test_given_features_take_the_place_of_triangulated_ones_and_the_background_gets_no_points() -> None:
@@ -157,8 +159,3 @@ def test_what_cannot_be_used_is_refused_with_a_remedy(case: str) -> None:
     changed, message = REFUSED[case]
     with pytest.raises(DataError, match=message):
         reconstruct(plane_photos(2, 64, 48), **changed)
-
-
-def test_a_background_must_be_a_colour() -> None:
-    with pytest.raises(SettingError, match="background: must be three numbers"):
-        reconstruct(plane_photos(2, 64, 48), background=(255, 255, 255))

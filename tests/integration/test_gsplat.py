@@ -169,7 +169,7 @@ def with_info(change):
     return changed
 
 
-def test_a_renderer_without_projected_centres_trains_without_a_score():
+def test_a_renderer_without_projected_centres_and_radii_of_gsplat_1_4_are_supported():
     """The renderer of gsplat's 3DGUT (with_ut, with_eval3d) has no gradient of the projected centres."""
     scene = toy.scene(20)
     host = Host(scene, rasterization=with_info(lambda info: {"means2d": info["means2d"].detach()}))
@@ -177,9 +177,6 @@ def test_a_renderer_without_projected_centres_trains_without_a_score():
     clear = trained(host, scene, conductor, [v.name for v in scene.train])
     assert clear.attachment.counts["merges"] == 3
     assert float(host.splats["detail"].abs().max()) > 0
-
-
-def test_radii_of_gsplat_1_4_are_supported():
     scene = toy.scene(30)
     new, _ = first_gradient(scene, subset("clear"))
     old, _ = first_gradient(scene, subset("clear"), with_info(lambda info: {"radii": info["radii"][..., 0]}))

@@ -118,16 +118,13 @@ def gaussians(*x, colours=None, rotation=0.0):
     return {"means": means, "quats": torch.tensor([[1.0, rotation, 0.0, 0.0]]).repeat(len(x), 1), "sh0": sh0}
 
 
-def test_clones_splits_and_pruned_gaussians_are_found():
+def test_clones_splits_and_pruned_gaussians_are_found_by_colour_and_place():
     before = gaussians(1.0, 2.0, 3.0, 4.0)
     assert find_change(before, gaussians(1.0, 2.0, 3.0, 4.0)) is None
     # 2 is pruned, 3 is cloned, 4 is split in two that keep its colour.
     change = find_change(before, gaussians(1.0, 3.0, 3.0, 3.9, 4.2, colours=(1.0, 3.0, 3.0, 4.0, 4.0)))
     assert change.parents.tolist() == [0, 2, 2, 3, 3]
     assert change.fresh.tolist() == [False, False, True, True, True]
-
-
-def test_the_nearest_of_equal_colours_is_the_parent_and_a_new_colour_or_rotation_has_none():
     before = gaussians(1.0, 2.0, 3.0, colours=(7.0, 7.0, 7.0))
     change = find_change(before, gaussians(1.0, 2.0, 2.9, 1.2, colours=(7.0, 7.0, 7.0, 7.0)))
     assert change.parents.tolist() == [0, 1, 2, 0]
@@ -137,9 +134,6 @@ def test_the_nearest_of_equal_colours_is_the_parent_and_a_new_colour_or_rotation
     empty = {name: tensor[:0] for name, tensor in gaussians(1.0).items()}
     assert find_change(empty, gaussians(1.0)).parents.tolist() == [-1]
     assert find_change(gaussians(1.0), empty).parents.tolist() == []
-
-
-def test_of_rows_with_one_parent_the_one_that_kept_its_place_is_the_old_gaussian():
     relocated = change_of(torch.tensor([2, 1, 2, 3]), 4)  # row 0 was moved onto 2
     assert relocated.fresh.tolist() == [True, False, False, False]
     pruned_and_split = change_of(torch.tensor([1, 3, 3]), 4)

@@ -49,13 +49,15 @@ def test_a_hosts_masks_that_hide_everything_are_refused(level):
         gsplat_host.started(host=gsplat_host.Host(scene), scene=replace(scene, train=tuple(hidden)))
 
 
-def test_sr_images_and_reduced_photos_may_overshoot_but_not_have_other_values():
+def test_sr_images_may_overshoot_but_not_have_other_values_and_names_are_unique():
     assert float(of_host(sr=lambda *a: torch.full((64, 96, 3), 1.03)).hr.image.max()) == 1
     with pytest.raises(DataError, match=r"SR image: must lie in \[0, 1\], has values from 200 to 200"):
         of_host(sr=lambda *a: torch.full((64, 96, 3), 200.0))
     sharp = of_host(image=1.1 * PHOTO.image - 0.03)
     assert float(sharp.lr.image.min()) >= 0
     P2G(patch=4).patch_maps(sharp)
+    with pytest.raises(SettingError, match=r"'0001\.png' is the name of several"):
+        by_name([of_host("0001.png"), of_host("0002.png"), of_host("0001.png")])
 
 
 @pytest.mark.parametrize(
@@ -71,11 +73,6 @@ def test_sr_images_and_reduced_photos_may_overshoot_but_not_have_other_values():
 def test_a_photo_mask_or_K_of_another_shape_or_range_is_refused(wrong, message):
     with pytest.raises(DataError, match=message):
         of_host(**wrong)
-
-
-def test_two_views_of_one_name_are_refused():
-    with pytest.raises(SettingError, match=r"'0001\.png' is the name of several"):
-        by_name([of_host("0001.png"), of_host("0002.png"), of_host("0001.png")])
 
 
 # ---- the demo as the loop of a host needs it
@@ -144,14 +141,11 @@ def test_photos_of_one_name_in_two_folders_have_their_own_sr_images(dataset, tmp
         views_from_dataset(dataset, Images(str(tmp_path / "flat")))
 
 
-def test_photos_are_written_into_their_folders_with_their_masks(dataset, tmp_path):
+def test_photos_are_written_with_their_masks_which_hide_at_both_scales(dataset, tmp_path):
     save_photos(photos_of(dataset), tmp_path / "lr")
     written = [read_image(tmp_path / "lr" / name) for name in NAMES]
     assert float(written[0][:, HIDDEN].max()) == 0
     assert torch.allclose(written[1], dataset.train[1].lr.image, atol=1 / 255)
-
-
-def test_a_masked_pixel_is_hidden_at_both_scales(dataset, tmp_path):
     views = views_from_dataset(dataset, Images(str(tmp_path / "sr")))
     masks = {photo.name: photo.mask for photo in photos_of(dataset)}
     assert [mask is None for mask in masks.values()] == [False, True, True]

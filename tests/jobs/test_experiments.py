@@ -169,11 +169,7 @@ def test_the_evidence_differs_in_what_it_sweeps_alone(experiment):
         pieces(c)
 
 
-def test_every_experiment_has_a_test():
-    assert {*SCENES, *ROWS, *EVIDENCE, "smoke"} == set(options("experiment"))
-
-
-def test_the_protocols_are_the_papers():
+def test_the_protocols_are_the_papers_and_every_experiment_has_a_test():
     firsts = []
     for experiment in SCENES:
         (job, *_), composed_job = jobs(f"experiment={experiment}", "data.root=here")
@@ -186,6 +182,7 @@ def test_the_protocols_are_the_papers():
     assert (blender.cloud.init, blender.cloud.random_points, blender.cloud.box) == ("random", 10_000, 1)
     assert (mip360.views.train, mip360.views.shrink, mip360.views.sizes) == (24, 2, "round")
     assert {llff.cloud.init, mip360.cloud.init} == {"auto"}
+    assert {*SCENES, *ROWS, *EVIDENCE, "smoke"} == set(options("experiment"))
 
 
 HORNS = ("experiment=llff_x4", "data.root=here", "data.scene=horns")

@@ -134,13 +134,10 @@ def test_test_views_are_what_was_evaluated(saved_run, tmp_path):
     torch.testing.assert_close(read_image(tmp_path / f"{view.name}.png"), exact, atol=0.5 / 255 + 1e-5, rtol=0)
 
 
-def test_the_default_folder_lies_in_the_run_and_width_sets_the_size(saved_run):
+def test_width_sets_the_size_and_a_file_of_cameras_gives_a_picture_of_each_and_of_its_depth(saved_run, tmp_path):
     folder, _ = saved_run
     render.main([str(folder), "--path", "train", "--width", "48"])
     assert image_size(folder / "rendered" / "view0.png") == (48, 32)
-
-
-def test_a_file_of_cameras_gives_a_picture_of_each_and_of_its_depth(saved_run, tmp_path):
     folder, _ = saved_run
     (entry, *_) = json.loads((folder / "cameras.json").read_text())
     (tmp_path / "path.json").write_text(json.dumps([{**entry, "img_name": name} for name in "ab"]))

@@ -101,7 +101,7 @@ def test_no_photos_of_a_folder_called_demo_are_taken_for_their_own_sr_images(kin
     assert not scene.synthetic_prior
 
 
-def test_auto_without_the_extra_names_it_in_one_line(monkeypatch, caplog):
+def test_auto_names_the_extra_in_one_line_and_says_why_a_factor_is_left_to_bicubic(monkeypatch, caplog, tmp_path):
     monkeypatch.setattr(ncnn, "find_spec", lambda name: None)
     with caplog.at_level("DEBUG"):
         scene = of_photos()
@@ -111,15 +111,12 @@ def test_auto_without_the_extra_names_it_in_one_line(monkeypatch, caplog):
         "pip install 'clear-strategies[sr]'."
     ]
     assert "SR network" not in scene.notes
-
-
-def test_auto_says_why_a_factor_is_left_to_bicubic(tmp_path, monkeypatch, caplog):
     fake_ncnn.install(tmp_path, monkeypatch)
     of_photos(factor=3)
     assert "auto chose bicubic (no detail beyond LR). waifu2x enlarges by 2 or 4, not by 3; for SR" in caplog.text
 
 
-def test_a_factor_that_the_network_has_not_is_refused_before_data_is_read(tmp_path: Path, monkeypatch):
+def test_a_factor_that_the_network_has_not_and_a_prior_without_a_label_are_refused(tmp_path, monkeypatch):
     fake_ncnn.install(tmp_path, monkeypatch)
     for prior in ("realesrgan", "waifu2x"):
         values = tree(composed(f"prior={prior}", "data.views.sr_scale=3"))
@@ -128,16 +125,13 @@ def test_a_factor_that_the_network_has_not_is_refused_before_data_is_read(tmp_pa
     require_factor(Corrupted(Ncnn()), 2)
     with pytest.raises(SettingError, match="must be 4 with realesrgan, got 2"):
         require_factor(Corrupted(Ncnn("realesrgan")), 2)
+    with pytest.raises(SettingError, match="prior: Unlabelled is no Prior: it needs the property label"):
+        settings_of(tree(composed(f"prior._target_={__name__}.Unlabelled")))
 
 
 class Unlabelled:
     def __call__(self, name, lr, factor):
         raise NotImplementedError
-
-
-def test_a_prior_without_a_label_is_refused_before_data_is_read():
-    with pytest.raises(SettingError, match="prior: Unlabelled is no Prior: it needs the property label"):
-        settings_of(tree(composed(f"prior._target_={__name__}.Unlabelled")))
 
 
 # ---- what a capture is by default: all of its photos. What it is under a protocol: the same bits for ever

@@ -187,7 +187,7 @@ def test_cotangents_take_the_memory_of_earlier_ones_of_their_shape_alone(drawn):
         assert (again.data_ptr() == held.data_ptr()) == reused
 
 
-def test_a_scale_that_the_objective_needs_is_asked_for(drawn):
+def test_a_scale_that_the_objective_needs_is_asked_for_and_hr_only_while_it_has_a_use(drawn):
     field, view, lr, hr = drawn
     with pytest.raises(ValueError, match="needs the HR scale"):
         Conductor(objective=Objective(lr_from="hr")).update(field.raw(), lr, None, view, 5)
@@ -195,6 +195,13 @@ def test_a_scale_that_the_objective_needs_is_asked_for(drawn):
         Conductor().update(field.raw(), None, hr, view, 5)
     with pytest.raises(ValueError, match="L_base must act from the first iteration"):
         Objective(lambda_lr=0.0)
+    objective = Objective(lambda_hr=WarmupDecay(start=10, full=20, decay_from=30, end=40))
+    plain = Conductor(objective=objective, statistics_from=5)
+    assert [plain.wants_hr(t) for t in (5, 6, 10, 11)] == [False, False, False, True]
+    scoring = Conductor(P2G(), objective=objective, statistics_from=5)
+    assert [scoring.wants_hr(t) for t in (5, 6, 10, 11)] == [False, True, True, True]
+    never = Conductor(objective=Objective(lambda_hr=WarmupDecay(peak=0, final=0)))
+    assert not any(never.wants_hr(t) for t in range(0, 10_000, 100))
 
 
 def test_routing_weighs_the_high_frequency_gradient_only(drawn):
@@ -218,16 +225,6 @@ def test_two_owners_of_one_question_are_refused_and_the_order_does_not_matter(dr
         Conductor(GCO(), Halve())
     one, other = (updated(drawn, *s).grads for s in ((GCO(), P2G(), SVS()), (SVS(), P2G(), GCO())))
     assert all(torch.equal(one[name], other[name]) for name in one)
-
-
-def test_hr_is_wanted_only_while_it_has_a_use():
-    objective = Objective(lambda_hr=WarmupDecay(start=10, full=20, decay_from=30, end=40))
-    plain = Conductor(objective=objective, statistics_from=5)
-    assert [plain.wants_hr(t) for t in (5, 6, 10, 11)] == [False, False, False, True]
-    scoring = Conductor(P2G(), objective=objective, statistics_from=5)
-    assert [scoring.wants_hr(t) for t in (5, 6, 10, 11)] == [False, True, True, True]
-    never = Conductor(objective=Objective(lambda_hr=WarmupDecay(peak=0, final=0)))
-    assert not any(never.wants_hr(t) for t in range(0, 10_000, 100))
 
 
 def test_conflict_is_measured_before_correction_and_what_was_logged_belongs_to_its_iteration(drawn):

@@ -184,15 +184,12 @@ def test_ssim_is_scikit_images(size: tuple[int, int]) -> None:
         assert score(image, truth).ssim == pytest.approx(theirs, abs=1e-6)
 
 
-def test_gmsd_of_one_edge_by_hand() -> None:
+def test_gmsd_of_one_edge_by_hand_and_as_opencv_has_it(photograph: Tensor) -> None:
     edge = torch.cat([grey(0.4, 16, 8), grey(0.5, 16, 8)], dim=1).double()
     # At half size 2 of 8 columns feel the step of 0.1, with gradient 0.1; elsewhere both images are flat.
     similarity = (170 / 255**2) / (0.1**2 + 170 / 255**2)
     expected = math.sqrt(0.25 * 0.75) * (1 - similarity)
     assert score(edge, grey(0.4).double()).gmsd == pytest.approx(expected)
-
-
-def test_gmsd_agrees_with_opencv(photograph: Tensor) -> None:
     cv2 = pytest.importorskip("cv2")
     blurred = enlarged(photograph, 4)
     x, y = ((image.mean(dim=2, keepdim=True) * 255).numpy() for image in (blurred, photograph))

@@ -32,12 +32,15 @@ def lines(state: TrainState, *names: str, method: str | None = None) -> dict[str
     return {label: words for label, _, words in split}
 
 
-def test_the_plan_names_strategies_and_their_milestones() -> None:
+def test_the_plan_names_strategies_and_milestones_and_a_run_as_the_command_line_does() -> None:
     found = lines(started(GCO(), SVS(anchor_start=7)), "gco", "svs")
     assert found["strategies"].strip() == "gco (GCO), svs (SVS)"
     assert "SVS anchor_start 7" in found["milestones"]
     assert "(the paper's baseline)" in lines(started())["strategies"]
     assert "(the paper's baseline)" not in lines(started(), method="srgs")["strategies"]
+    chosen = (["+strategy=best", "fit.seed=3"], ["+strategy=[gco,svs]"], ["+method=srgs"], None)
+    titles = [plan.Chosen(None, ["gco", "p2g"], words).title for words in chosen]
+    assert titles == ["best", "gco + svs", "srgs", "gco + p2g"]
 
 
 class Quiet(Strategy):
@@ -111,9 +114,3 @@ def test_without_git_the_commit_is_unknown(monkeypatch: pytest.MonkeyPatch, fail
 
     monkeypatch.setattr(subprocess, "run", fails)
     assert provenance()["git"] in {"unknown", "no checkout"}
-
-
-def test_a_run_is_called_as_on_the_command_line() -> None:
-    chosen = (["+strategy=best", "fit.seed=3"], ["+strategy=[gco,svs]"], ["+method=srgs"], None)
-    titles = [plan.Chosen(None, ["gco", "p2g"], words).title for words in chosen]
-    assert titles == ["best", "gco + svs", "srgs", "gco + p2g"]

@@ -128,12 +128,18 @@ def test_rgb_may_have_any_range_as_in_gsplat():
     assert torch.allclose(signed.grad, above.grad, rtol=1e-4, atol=1e-4)
 
 
-def test_backgrounds_have_a_gradient():
+def test_backgrounds_have_a_gradient_and_gsplats_own_defaults_are_drawn():
     background = torch.rand(1, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
     image, alpha, _ = stand_in(backgrounds=background)
     assert torch.equal(image, stand_in(backgrounds=background.detach())[0])
     image.sum().backward()
     assert torch.allclose(background.grad, (1 - alpha).sum().expand(1, 3))
+    # The eleventh is far_plane in gsplat; it was taken for eps2d.
+    with pytest.raises(TypeError, match="positional arguments"):
+        autograd.rasterization(*[None] * 9, 0.01, 1e10)
+    given = inspect.signature(pytest.importorskip("gsplat").rasterization).parameters
+    defaults = {name: p.default for name, p in given.items() if p.default is not p.empty and name != "sh_degree"}
+    assert stand_in(**defaults)[0].shape == (1, 30, 40, 3)
 
 
 @pytest.mark.parametrize("name", ["viewmats", "Ks", "backgrounds"])
@@ -142,12 +148,6 @@ def test_tensors_of_cameras_need_one_row_for_each(name):
     right = {"viewmats": torch.zeros(2, 4, 4), "Ks": torch.zeros(2, 3, 3), "backgrounds": torch.zeros(2, 3)}
     with pytest.raises(ValueError, match=rf"^{name} must have the shape \[C, .* for C cameras, got"):
         autograd._require_shapes(5, torch.zeros(5, 3), **{**right, name: right[name][0]}, sh_degree=None)
-
-
-def test_arguments_by_position_after_the_size_are_refused():
-    """The eleventh is far_plane in gsplat; it was taken for eps2d."""
-    with pytest.raises(TypeError, match="positional arguments"):
-        autograd.rasterization(*[None] * 9, 0.01, 1e10)
 
 
 def test_poses_that_should_learn_are_refused():
@@ -162,12 +162,6 @@ def test_poses_that_should_learn_are_refused():
             draw()
         with torch.no_grad():  # an evaluation of a loop that gsplat trained
             assert torch.isfinite(draw()).all()
-
-
-def test_gsplats_own_defaults_are_drawn():
-    given = inspect.signature(pytest.importorskip("gsplat").rasterization).parameters
-    defaults = {name: p.default for name, p in given.items() if p.default is not p.empty and name != "sh_degree"}
-    assert stand_in(**defaults)[0].shape == (1, 30, 40, 3)
 
 
 def test_gsplats_strategy_reads_the_packed_info():

@@ -64,10 +64,18 @@ def test_batches_do_not_change_the_picture(lanes):
     assert torch.allclose(found.vjp(v).means, expected.vjp(v).means, rtol=1e-9, atol=1e-12)
 
 
-def test_the_reference_is_available_and_where_no_rasterizer_draws_the_error_says_so():
+def test_a_preset_sets_the_cut_offs_and_where_no_rasterizer_draws_the_error_says_so():
     assert rasterizers.available()["torch"] is None
     with pytest.raises(rasterizers.BackendUnavailable, match="no rasterizer draws tensors on 'mps'; move the splats"):
         rasterizers.fastest("mps")
+    assert rasterizers.load("torch", preset="fast") == rasterizers.load("torch")
+    cuts = []
+    for name, preset in PRESETS.items():
+        rasterizer = rasterizers.load("torch", preset=name)
+        cuts.append((rasterizer.alpha_min, rasterizer.transmittance_min))
+        assert cuts[-1] == (preset["alpha_min"], preset["transmittance_min"])
+        assert rasterizers.load("torch", preset=name, alpha_min=1 / 64) == replace(rasterizer, alpha_min=1 / 64)
+    assert cuts == sorted(cuts, reverse=True)  # coarsest first
 
 
 def test_a_scaled_camera_has_the_same_field_of_view():
@@ -108,17 +116,6 @@ def test_quaternions_of_any_norm_give_the_same_rotation_and_spherical_harmonics_
     Y = spherical_harmonics(directions, 15)
     gram = 4 * math.pi * Y.T @ Y / len(Y)
     assert torch.allclose(gram, torch.eye(16, dtype=torch.float64), atol=0.03)
-
-
-def test_a_preset_sets_the_cut_offs_and_settings_override_it():
-    assert rasterizers.load("torch", preset="fast") == rasterizers.load("torch")
-    cuts = []
-    for name, preset in PRESETS.items():
-        rasterizer = rasterizers.load("torch", preset=name)
-        cuts.append((rasterizer.alpha_min, rasterizer.transmittance_min))
-        assert cuts[-1] == (preset["alpha_min"], preset["transmittance_min"])
-        assert rasterizers.load("torch", preset=name, alpha_min=1 / 64) == replace(rasterizer, alpha_min=1 / 64)
-    assert cuts == sorted(cuts, reverse=True)  # coarsest first
 
 
 @pytest.mark.parametrize("pixels", [1e3, 1e5, 1e7, 1e9])

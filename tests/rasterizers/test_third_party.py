@@ -58,15 +58,12 @@ class Flat:
         return self.inner.render_scales(jobs)
 
 
-def test_a_third_partys_rasterizer_passes_the_checks_and_is_built_by_its_path():
+def test_third_parties_rasterizers_pass_the_checks_and_are_refused_where_depth_is_asked_of_one_without(caplog):
     check_rasterizer(ThirdParty)
     target = f"{__name__}.ThirdParty"
     found = instantiate({"_target_": target, "near": 0.01, "background": [1, 1, 1], "lanes_per_pass": 4096})
     assert isinstance(found, Rasterizer)
     assert found == ThirdParty(near=0.01, background=(1.0, 1.0, 1.0), lanes_per_pass=4096)
-
-
-def test_a_rasterizer_without_depth_passes_the_checks_and_is_refused_by_name_where_depth_is_asked(caplog):
     with caplog.at_level("INFO", "rasterizers"):
         check_rasterizer(Flat)
     assert "check_nothing_to_draw_of_depth: not checked, the rasterizer's traits.depth is False" in caplog.text

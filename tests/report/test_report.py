@@ -79,6 +79,8 @@ def test_without_runs_the_command_logs_one_line_and_exits_with_2(tmp_path, caplo
     assert report.main([str(tmp_path)]) == 2
     assert len(caplog.records) == 1
     assert capsys.readouterr().out == ""
+    with pytest.raises(DataError, match="there is no finished run here: give the folder of a run or of a sweep"):
+        report.collect([tmp_path, tmp_path / "absent"])
 
 
 def test_empty_columns_are_left_out_and_a_bar_in_a_name_does_not_break_the_table(tmp_path: Path) -> None:
@@ -271,8 +273,3 @@ def test_damaged_and_unfinished_runs_are_left_out_with_a_warning(tmp_path, caplo
         (message,) = (r.getMessage() for r in caplog.records if str(tmp_path / name) in r.getMessage())
         assert "left out" in message
         assert "\n" not in message
-
-
-def test_a_folder_without_a_finished_run_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="there is no finished run here: give the folder of a run or of a sweep"):
-        report.collect([tmp_path, tmp_path / "absent"])

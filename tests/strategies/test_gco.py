@@ -36,10 +36,17 @@ def test_values_worked_out_by_hand_which_reliability_softens_down_to_the_lower_b
     assert result.tolist() == pytest.approx([-3 + omega * 2.75, 4, 0], rel=1e-6)
 
 
-def test_opposite_gradients_are_corrected_up_to_the_upper_bound():
+def test_opposite_gradients_are_corrected_up_to_the_upper_bound_and_agreeing_ones_to_the_lower():
     result = GCO().correct(Grads({"opacities": torch.tensor([2.0])}), Grads({"opacities": torch.tensor([-1.0])}), None)
     # c = -1, s = 1 -> ω = 0.75; d = -2 + 0.05·2 = -1.9; -1 + 0.75·1.9/4·2
     assert float(result["opacities"]) == pytest.approx(-1 + 0.75 * 1.9 / 2, rel=1e-6)
+    lr, hr = random_pair(8)
+    gco = GCO()
+    gco.correct(lr, hr, toy.step(evidence=Evidence(torch.full((200,), 0.99), torch.ones(200))))
+    assert gco.logs["mean_omega"] == pytest.approx(0.05, abs=1e-3)
+    assert gco.logs["omega_at_lower_bound"] == 1
+    gco.correct(lr, hr, toy.step(evidence=Evidence(torch.zeros(200), torch.ones(200))))
+    assert gco.logs["omega_at_lower_bound"] < 0.9
 
 
 @given(seed=st.integers(0, 10_000), tolerance=st.floats(0, 0.9))
@@ -100,16 +107,6 @@ def test_rotation_noise_of_isotropic_gaussians_is_gated():
     assert torch.equal(result["quats"], hr["quats"])
     assert gco.logs["corrected_quats"] == 0
     assert gco.logs["corrected_scales"] > 0
-
-
-def test_a_prior_that_agrees_with_lr_leaves_omega_at_its_lower_bound():
-    lr, hr = random_pair(8)
-    gco = GCO()
-    gco.correct(lr, hr, toy.step(evidence=Evidence(torch.full((200,), 0.99), torch.ones(200))))
-    assert gco.logs["mean_omega"] == pytest.approx(0.05, abs=1e-3)
-    assert gco.logs["omega_at_lower_bound"] == 1
-    gco.correct(lr, hr, toy.step(evidence=Evidence(torch.zeros(200), torch.ones(200))))
-    assert gco.logs["omega_at_lower_bound"] < 0.9
 
 
 def test_gradients_of_any_layout_and_of_two_types_are_corrected():

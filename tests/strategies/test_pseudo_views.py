@@ -65,16 +65,13 @@ def test_the_weight_is_that_of_the_settings_where_photos_tell_the_colour_and_sma
     assert not extra.photo.image[extra.weight == 0].any()
 
 
-def test_without_stereo_only_the_borders_are_shown(caplog):
+def test_views_without_depth_get_it_from_stereo_and_without_it_only_the_borders_are_shown(caplog):
     made = prepared(SCENE.train[:1])
     assert "only shows the borders of the photos" in caplog.text
     extra = made.extra_views(2)[0]
     assert extra.photo.camera.width > SCENE.train[0].lr.camera.width
     assert (made.summary() or "").startswith("1 with a field 1.3 times as wide")
     assert prepared(SCENE.train[:1], replace(FEW, border=1.0)).summary() is None
-
-
-def test_views_without_depth_get_it_from_stereo():
     capture = demo.read(width=128, height=96, views=6, train=3)
     scene = prepare(
         capture, ViewSettings(train=3, photos_are="hr"), Bicubic(), CloudSettings(init="random", random_points=10)

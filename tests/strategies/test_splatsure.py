@@ -52,13 +52,20 @@ def test_equal_sampling_keeps_nearly_everything_and_a_wide_range_leaves_nearly_n
     assert float(s.weight("c")) < 1e-6
 
 
-def test_a_gaussian_that_few_views_show_keeps_its_gradient():
+def test_a_gaussian_that_few_views_show_keeps_its_gradient_and_half_the_size_changes_no_rate():
     s = started()
     for name, distance, shown in (("a", 1.0, [True, True]), ("b", 2.0, [True, False]), ("c", 4.0, [True, True])):
         visit(s, name, distance, shown)
     w = visit(s, "c", 4.0, [True, True])
     assert float(w[0]) < 1e-6
     assert float(w[1]) == 1.0
+    rates = []
+    for factor in (2, 4):
+        strategy, lr, hr = started(), camera(4.0), camera(4.0, 10.0 * factor)
+        view = View("a", Photo(lr, torch.zeros(8, 8, 3)), Photo(hr, torch.zeros(8, 8, 3)))
+        strategy.after_step({"means": torch.zeros(1, 3)}, Step(1, view, torch.tensor([True])))
+        rates.append(strategy.state["a"])
+    assert torch.equal(*rates)
 
 
 def test_a_rate_is_that_of_the_last_iteration_that_showed_the_gaussian_before_the_camera():
@@ -85,13 +92,3 @@ def test_two_views_are_warned_of_and_without_hr_there_is_nothing_to_withhold(cap
     assert "SplatSuRe has no effect: 2 training views are fewer than min_views=3" in caplog.text
     reasons = [SplatSuRe().without_effect(lambda_lr=lr, lambda_hr=1 - lr, lambda_hf=0.2) for lr in (1, 0)]
     assert reasons == ["lambda_HR is 0 throughout", None]
-
-
-def test_an_hr_side_of_half_the_size_changes_no_rate():
-    rates = []
-    for factor in (2, 4):
-        strategy, lr, hr = started(), camera(4.0), camera(4.0, 10.0 * factor)
-        view = View("a", Photo(lr, torch.zeros(8, 8, 3)), Photo(hr, torch.zeros(8, 8, 3)))
-        strategy.after_step({"means": torch.zeros(1, 3)}, Step(1, view, torch.tensor([True])))
-        rates.append(strategy.state["a"])
-    assert torch.equal(*rates)

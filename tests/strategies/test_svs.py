@@ -25,10 +25,15 @@ def test_mask_is_zero_or_the_inverse_keep_rate(p, seed, t):
     assert torch.equal(z, dropout_mask(500, p, seed, t))
 
 
-def test_mask_has_its_rate_and_changes_with_seed_and_iteration():
+def test_the_mask_has_its_rate_which_ramps_linearly_and_changes_with_seed_and_iteration():
     assert float((dropout_mask(100_000, 0.2, 0, 1) == 0).float().mean()) == pytest.approx(0.2, abs=0.005)
     assert not torch.equal(dropout_mask(1000, 0.2, 0, 1), dropout_mask(1000, 0.2, 0, 2))
     assert not torch.equal(dropout_mask(1000, 0.2, 0, 1), dropout_mask(1000, 0.2, 1, 1))
+    ramp = Ramp(maximum=0.2, full=100)
+    assert [ramp(0), ramp(50), ramp(100), ramp(200)] == pytest.approx([0, 0.1, 0.2, 0.2])
+    assert SVS(dropout=Ramp(maximum=0.0)).gate(5, 10) is None
+    svs = started(0, dropout=Ramp(0.2, "constant", full=400), looks=1_000)
+    assert kept_share(svs, 400) == pytest.approx(1 - 0.08, abs=4e-3)
 
 
 def test_both_scales_lose_the_same_gaussians():
@@ -39,12 +44,6 @@ def test_both_scales_lose_the_same_gaussians():
     assert not lr.visible[z == 0].any()
     assert not hr.visible[z == 0].any()
     assert hr.visible[z > 0].any()
-
-
-def test_dropout_ramps_linearly_and_costs_nothing_at_rate_zero():
-    ramp = Ramp(maximum=0.2, full=100)
-    assert [ramp(0), ramp(50), ramp(100), ramp(200)] == pytest.approx([0, 0.1, 0.2, 0.2])
-    assert SVS(dropout=Ramp(maximum=0.0)).gate(5, 10) is None
 
 
 def started(n_views=3, **settings):
@@ -63,11 +62,6 @@ def params(n=20, seed=0):
         "means": torch.randn(n, 3, generator=g), "scales": torch.randn(n, 3, generator=g),
         "opacities": torch.randn(n, generator=g), "detail": torch.randn(n, 3, generator=g),
     }  # fmt: skip
-
-
-def test_a_short_run_that_does_not_know_its_views_counts_one():
-    svs = started(0, dropout=Ramp(0.2, "constant", full=400), looks=1_000)
-    assert kept_share(svs, 400) == pytest.approx(1 - 0.08, abs=4e-3)
 
 
 @pytest.mark.parametrize(("n_views", "rate"), [(2, 0.2), (4, 0.2), (8, 0.1), (80, 0.01)])

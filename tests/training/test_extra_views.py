@@ -39,7 +39,7 @@ def parameters(state: TrainState) -> dict[str, torch.Tensor]:
     return {name: value.clone() for name, value in state.field.raw().items()}
 
 
-def test_they_come_when_a_strategy_says_so_and_their_loss_is_in_the_history():
+def test_they_come_when_a_strategy_says_so_and_are_compared_before_the_background():
     state = start((), more=[Dark()])
     for _ in range(ITERATIONS):
         iterate(state, toy.RASTERIZER)
@@ -47,6 +47,12 @@ def test_they_come_when_a_strategy_says_so_and_their_loss_is_in_the_history():
     assert [int(row["t"]) for row in rows if EXTRA_LOSS in row] == list(range(2, ITERATIONS + 1, 2))
     assert all(row[EXTRA_LOSS] > 0 for row in rows if EXTRA_LOSS in row)
     assert state.conductor.work_log.entries["extra views"].runs == ITERATIONS // 2
+    white = (1.0, 1.0, 1.0)
+    photo = Photo(toy.camera(0.0, 24, 16), torch.ones(16, 24, 3), transparency=torch.ones(16, 24))
+    conductor = Conductor(Red(), objective=Objective(kernels="torch"))
+    render = torch.tensor([1.0, 0.0, 0.0]).expand(16, 24, 3)
+    loss = conductor.extra_loss(render, ExtraView(photo, torch.ones(16, 24), white), 1)
+    assert float(loss.cotangents.abs().max()) < 1e-12
 
 
 def test_every_strategy_is_asked_unless_there_is_no_lr_loss_and_the_weight_scales_the_gradient():
@@ -97,12 +103,3 @@ def test_a_number_that_is_not_finite_is_found_before_the_step(fused):
     with pytest.raises(DivergedError, match="t=1, an extra view"):
         extra_steps(state, toy.RASTERIZER, [extra])
     assert all(torch.equal(value, before[name]) for name, value in state.field.raw().items())
-
-
-def test_a_transparent_picture_is_compared_before_the_background_of_the_iteration():
-    white = (1.0, 1.0, 1.0)
-    photo = Photo(toy.camera(0.0, 24, 16), torch.ones(16, 24, 3), transparency=torch.ones(16, 24))
-    conductor = Conductor(Red(), objective=Objective(kernels="torch"))
-    render = torch.tensor([1.0, 0.0, 0.0]).expand(16, 24, 3)
-    loss = conductor.extra_loss(render, ExtraView(photo, torch.ones(16, 24), white), 1)
-    assert float(loss.cotangents.abs().max()) < 1e-12

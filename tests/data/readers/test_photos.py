@@ -146,10 +146,16 @@ def estimate(tmp_path, monkeypatch):
     return run
 
 
-def test_of_several_models_the_largest_is_kept_and_the_others_are_told(tmp_path, estimate, caplog):
+def test_the_largest_of_several_models_is_kept_and_a_full_disk_is_told(tmp_path, estimate, caplog):
     estimate(lambda *_: [FakeModel("0", "1", "2"), FakeModel("3", "4", "5", "6", "7"), FakeModel("8", "9")])
     assert (tmp_path / "poses/images.bin").read_text() == "3,4,5,6,7"
     assert "groups that nothing connects (5, 3, 2 photos); the largest is used" in caplog.text
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "00000.jpg")
+
+    with pytest.raises(OSError, match="No space left"):
+        estimate(full)
 
 
 def test_poses_that_another_run_has_estimated_meanwhile_are_kept(tmp_path, estimate):
@@ -160,14 +166,6 @@ def test_poses_that_another_run_has_estimated_meanwhile_are_kept(tmp_path, estim
 
     estimate(slower)
     assert [(p.name, p.read_text()) for p in tmp_path.glob("poses*/*")] == [("cameras.bin", "of the other run")]
-
-
-def test_a_full_disk_is_not_taken_for_photos_without_overlap(estimate):
-    def full(*_):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "00000.jpg")
-
-    with pytest.raises(OSError, match="No space left"):
-        estimate(full)
 
 
 def test_no_photo_has_more_features_than_asked_for(tmp_path: Path) -> None:

@@ -23,10 +23,13 @@ from tests.helpers import captures as tiny
 PROTOCOL = {2, 16, 26, 55, 73, 76, 86, 93}
 
 
-def test_splits_are_those_of_the_files(tmp_path: Path) -> None:
+def test_splits_are_those_of_the_files_and_missing_test_views_are_told(tmp_path: Path, caplog) -> None:
     capture = blender.read(tiny.blender(tmp_path))
     assert [(f.name, f.split) for f in capture.frames] == [("a", "train"), ("b", "train"), ("test/c", "test")]
     assert capture.background == (1.0, 1.0, 1.0)
+    (tiny.blender(tmp_path) / "transforms_test.json").unlink()
+    assert [frame.split for frame in blender.read(tmp_path).frames] == ["train", "train"]
+    assert "no test views" in caplog.text
 
 
 def test_the_order_is_that_of_the_file_and_endings_may_be_given(tmp_path: Path) -> None:
@@ -51,12 +54,6 @@ def test_the_lens_and_the_masks_that_a_file_names_are_used(tmp_path: Path) -> No
     assert not train.shown().any()
     assert "1 of 2 photos undistorted" in capture.notes["lens"]
     assert not torch.equal(test.load(), train.load())
-
-
-def test_a_scene_without_test_views_is_read_and_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    (tiny.blender(tmp_path) / "transforms_test.json").unlink()
-    assert [frame.split for frame in blender.read(tmp_path).frames] == ["train", "train"]
-    assert "no test views" in caplog.text
 
 
 def test_the_protocols_frames_of_lego_are_found_by_number(shared_data: Path) -> None:

@@ -388,8 +388,14 @@ WRITE: dict[str, Callable[[Path], object]] = {
 POINTS = ("COLMAP 3", "COLMAP 4", "RealityCapture", "nerfstudio", "BlenderNeRF", "LLFF")
 
 
-def test_the_table_has_every_tool() -> None:
+def test_the_table_has_every_tool_and_a_video_is_answered_with_the_line_that_takes_frames(tmp_path: Path) -> None:
     assert set(ROWS) == {*WRITE, "plain photos", "videos"}
+    (tmp_path / "photos").mkdir()
+    Image.new("RGB", (16, 12)).save(tmp_path / "photos/a.jpg")
+    assert detect(tmp_path / "photos") == ROWS["plain photos"] == "photos"
+    (tmp_path / "clip.mp4").write_bytes(b"")
+    with pytest.raises(DataError, match="ffmpeg -i VIDEO -vf thumbnail=15 -fps_mode passthrough"):
+        photos.read(tmp_path / "clip.mp4")
 
 
 @pytest.mark.parametrize("tool", WRITE)
@@ -400,12 +406,3 @@ def test_a_tools_files_are_read_as_the_table_says(tool: str, tmp_path: Path) -> 
     capture = tiny.READERS[ROWS[tool]](root)
     tiny.require_poses(capture)
     assert (capture.points is not None and len(capture.points.means) == 2) == (tool in POINTS)
-
-
-def test_plain_photos_are_read_and_a_video_is_answered_with_the_line_that_takes_frames(tmp_path: Path) -> None:
-    (tmp_path / "photos").mkdir()
-    Image.new("RGB", (16, 12)).save(tmp_path / "photos/a.jpg")
-    assert detect(tmp_path / "photos") == ROWS["plain photos"] == "photos"
-    (tmp_path / "clip.mp4").write_bytes(b"")
-    with pytest.raises(DataError, match="ffmpeg -i VIDEO -vf thumbnail=15 -fps_mode passthrough"):
-        photos.read(tmp_path / "clip.mp4")
