@@ -57,8 +57,3 @@ def partners(cameras: Sequence[Camera]) -> list[list[int]]:
     ordered = torch.cdist(centers, centers).argsort(dim=1, stable=True).tolist()
     rows = ([b for b in row if b != a] for a, row in enumerate(ordered))
     return [sorted(row[rank] for rank in ranks) for row in rows]
-
-
-def distance_to(camera: Camera, means: Float[Tensor, "N 3"]) -> float:
-    """From the camera to the middle of the points, the median of each coordinate; 1 for a camera that is there."""
-    return float(torch.linalg.vector_norm(camera.center.double() - means.median(dim=0).values.cpu().double())) or 1.0

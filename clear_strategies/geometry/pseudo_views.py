@@ -125,6 +125,12 @@ def moved_aside(camera: Camera, distance: float, reach: float, generator: torch.
     return replace(camera, world_to_camera=turned.to(camera.world_to_camera))
 
 
+def beside(camera: Camera, means: Float[Tensor, "N 3"], reach: float, generator: torch.Generator) -> Camera:
+    """The camera moved aside at its distance to the middle of the points, the median of each coordinate; 1 if it is there."""
+    distance = torch.linalg.vector_norm(camera.center.double() - means.median(dim=0).values.cpu().double())
+    return moved_aside(camera, float(distance) or 1.0, reach, generator)
+
+
 def _source(photo: Photo, depth_map: DepthMap, background: Color) -> _Source:
     """Pixels at the border of the background are mixed with it: they give points but no colour."""
     known, depth = depth_map.known, torch.nan_to_num(depth_map.depth)

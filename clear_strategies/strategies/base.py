@@ -24,7 +24,7 @@ from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, View
 from rasterizers.interface import Color
 
-_DEVICE: Final = "device"
+_DEVICE, _SEED = "device", "seed"  # in the cache
 
 # A hook that compiled passes compute, and the fact that states it as data.
 _STATED_BY: Final = {"correct": "correction_rule", "regularize": "anchor"}
@@ -83,6 +83,7 @@ class Strategy:
         self.state.clear()
         self.cache.clear()
         self.logs.clear()
+        self.cache[_SEED] = seed
 
     def on_views(self, views: Sequence[View]) -> None:
         """Look at all training views once, after `on_fit_start`.
@@ -216,6 +217,11 @@ class Strategy:
         """The device of the field."""
         device: torch.device = self.cache.get(_DEVICE, torch.device("cpu"))
         return device
+
+    @property
+    def seed(self) -> int:
+        """The seed of the run; 0 before it starts."""
+        return int(self.cache.get(_SEED, 0))
 
 
 def overrides(strategy: Strategy, hook: str) -> bool:

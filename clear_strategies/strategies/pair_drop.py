@@ -45,16 +45,12 @@ class PairDrop(Strategy):
         for name in ("reduced", "every"):
             require_whole(name, getattr(self, name), least=1)
 
-    def on_fit_start(self, n_views: int, seed: int) -> None:
-        super().on_fit_start(n_views, seed)
-        self.cache.update(seed=seed, cameras=())
-
     def on_views(self, views: Sequence[View]) -> None:
         self.cache["cameras"] = [view.lr.reduced(self.reduced).camera for view in views]
 
     def drawn_views(self, t: int, drawn: Drawn) -> Sequence[ExtraView]:
         """What one subset shows of a training view, for another to match: functions of (seed, t)."""
-        seed, cameras = self.cache["seed"], self.cache["cameras"]
+        seed, cameras = self.seed, self.cache.get("cameras")
         if t < self.start or t % self.every or not cameras:
             return ()
         camera = one_of(cameras, generator_at(seed, t))

@@ -72,10 +72,6 @@ class PseudoViews(Strategy):
         require_number("continued", self.continued, most=1)
         require_number("border", self.border, least=1)
 
-    def on_fit_start(self, n_views: int, seed: int) -> None:
-        super().on_fit_start(n_views, seed)
-        self.cache.update(seed=seed, views=(), borders=())
-
     def on_views(self, views: Sequence[View]) -> None:
         """Make the pseudo views: a function of the views and the seed. None are made, and a message says why, where they
         would be of no use.
@@ -116,7 +112,7 @@ class PseudoViews(Strategy):
             tolerance=self.tolerance,
             max_pixels=self.max_pixels,
             background=views[0].background,
-            seed=self.cache["seed"],
+            seed=self.seed,
         )
 
     def _pixels(self, photos: dict[str, Photo]) -> int:
@@ -134,7 +130,7 @@ class PseudoViews(Strategy):
         borders: Sequence[ExtraView] = self.cache.get("borders", ())
         if not (aside or borders) or t % self.every:
             return ()
-        generator = generator_at(self.cache["seed"], t)
+        generator = generator_at(self.seed, t)
 
         def drawn(n: int) -> int:
             return int(torch.randint(n, (), generator=generator))

@@ -45,7 +45,7 @@ class RandomBackground(Strategy):
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
         super().on_fit_start(n_views, seed)
-        self.cache["seed"], self.cache["reason"] = seed, self._reason_to_keep(n_views)
+        self.cache["reason"] = self._reason_to_keep(n_views)
 
     def summary(self) -> str | None:
         reason: str = self.cache.get("reason", "")
@@ -70,7 +70,7 @@ class RandomBackground(Strategy):
         """RGB, uniform in [0, 1]: a function of (seed, t)."""
         if t > self.until or self.cache.get("reason"):
             return None
-        r, g, b = torch.rand(3, generator=generator_at(self.cache.get("seed", 0), t)).tolist()
+        r, g, b = torch.rand(3, generator=generator_at(self.seed, t)).tolist()
         return r, g, b
 
 

@@ -16,8 +16,7 @@ import torch
 from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.seeds import hashed_generator_at, one_of
 from clear_strategies.core.view import ExtraView, Photo, View
-from clear_strategies.geometry.cameras import distance_to
-from clear_strategies.geometry.pseudo_views import moved_aside
+from clear_strategies.geometry.pseudo_views import beside
 from clear_strategies.schedules import milestone
 from clear_strategies.strategies.base import Drawn, Strategy
 
@@ -50,39 +49,33 @@ class SRStage(Strategy):
         for name in ("reach", "weight"):
             require_number(name, getattr(self, name), above=0)
 
-    def on_fit_start(self, n_views: int, seed: int) -> None:
-        super().on_fit_start(n_views, seed)
-        self.cache.update(seed=seed, views=(), pictures=None)
-
     def on_views(self, views: Sequence[View]) -> None:
         self.cache["views"] = views
 
     def drawn_views(self, t: int, drawn: Drawn) -> Sequence[ExtraView]:
         """From `start` on one picture at HR: a function of (seed, t) and of the field at the end of the first stage."""
-        views: Sequence[View] = self.cache["views"]
+        views: Sequence[View] = self.cache.get("views", ())
         if t <= self.start or not views:
             return ()
-        if self.cache["pictures"] is None:
+        if "pictures" not in self.cache:
             if t > self.start + 1:
                 _log.warning("SRStage draws its pictures at t=%d, not at t=%d: the bits are not those of an uninterrupted run.",
                              t, self.start + 1)  # fmt: skip
             self.cache["pictures"] = [self._picture(views[i % len(views)], i, drawn) for i in range(self.count)]
         photos = [view.hr for view in views] if t % 2 or not self.count else self.cache["pictures"]
-        generator = hashed_generator_at(self.cache["seed"], t)
-        photo: Photo = one_of(photos, generator)
+        photo: Photo = one_of(photos, hashed_generator_at(self.seed, t))
         weight = torch.full_like(photo.image[..., 0], self.weight)
         weight = weight if photo.shown is None else weight * photo.shown
         return (ExtraView(photo, weight, views[0].background, robust=True),)
 
     def _picture(self, view: View, i: int, drawn: Drawn) -> Photo:
         """What the field shows by an LR camera beside that of `view`, enlarged."""
-        generator = hashed_generator_at(self.cache["seed"], -1 - i)
-        camera = view.lr.camera
-        camera = moved_aside(camera, distance_to(camera, drawn.means), self.reach, generator)
+        camera = beside(view.lr.camera, drawn.means, self.reach, hashed_generator_at(self.seed, -1 - i))
         return Photo(camera.scaled(view.factor), drawn.enlarge(drawn.draw(camera), view.factor))
 
     def on_fit_end(self) -> None:
-        self.cache.update(views=(), pictures=None)
+        for name in ("views", "pictures"):
+            self.cache.pop(name, None)
 
     def summary(self) -> str | None:
         if not self.cache.get("views"):

@@ -69,7 +69,6 @@ class SVS(Strategy):
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
         super().on_fit_start(n_views, seed)
-        self.cache["seed"] = seed
         n_views = max(1, n_views)
         # How far a run that sees each view `dropout.full` / n_views times needs the rate.
         self.cache["share"] = min(1.0, self.dropout.full / (self.looks * n_views)) if self.looks else 1.0
@@ -85,7 +84,7 @@ class SVS(Strategy):
         p = self.dropout(t) * self.cache.get("share", 1.0)
         if p == 0:
             return None
-        return dropout_mask(n, p, self.cache.get("seed", 0), t, self.device)
+        return dropout_mask(n, p, self.seed, t, self.device)
 
     def regularize(self, params: Mapping[str, Tensor], t: int) -> Grads | None:
         """∇ λ_stab Σ_i ‖θ_i - θ_i^a‖²_W, for every Gaussian, seen or not; None before the anchor."""

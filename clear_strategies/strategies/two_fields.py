@@ -21,8 +21,7 @@ from clear_strategies.core.points import spread
 from clear_strategies.core.seeds import hashed_generator_at, one_of
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, Photo, View
-from clear_strategies.geometry.cameras import distance_to
-from clear_strategies.geometry.pseudo_views import moved_aside
+from clear_strategies.geometry.pseudo_views import beside
 from clear_strategies.schedules import milestone
 from clear_strategies.strategies.base import Drawn, Strategy
 from rasterizers.interface import Camera
@@ -67,10 +66,6 @@ class TwoFields(Strategy):
             require_number(name, getattr(self, name), above=0)
         require_number("alone", self.alone)
 
-    def on_fit_start(self, n_views: int, seed: int) -> None:
-        super().on_fit_start(n_views, seed)
-        self.cache.update(seed=seed, cameras=())
-
     def on_views(self, views: Sequence[View]) -> None:
         self.cache["cameras"] = [view.lr.camera.scaled(min(self.size, view.factor)) for view in views]
 
@@ -81,11 +76,11 @@ class TwoFields(Strategy):
         """What the other field shows by a camera that is a function of (seed, t) and of where its Gaussians are."""
         if self.alone > 0 and t % self.compare_every == 0 and self.start <= t <= self.compare_until:
             self.cache["others"] = drawn.means
-        if t < self.start or t % self.every or not self.cache["cameras"]:
+        cameras: Sequence[Camera] = self.cache.get("cameras", ())
+        if t < self.start or t % self.every or not cameras:
             return ()
-        generator = hashed_generator_at(self.cache["seed"], t)
-        camera: Camera = one_of(self.cache["cameras"], generator)
-        camera = moved_aside(camera, distance_to(camera, drawn.means), self.reach, generator)
+        generator = hashed_generator_at(self.seed, t)
+        camera = beside(one_of(cameras, generator), drawn.means, self.reach, generator)
         image = drawn.draw(camera)
         return (ExtraView(Photo(camera, image), torch.full_like(image[..., 0], self.weight)),)
 
