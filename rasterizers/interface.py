@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import chain
 from typing import Final, Protocol, cast, runtime_checkable
 
@@ -147,6 +147,11 @@ class Splats:
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+    def to(self, *where: torch.device | str | torch.dtype) -> Splats:
+        """The same on another device or in another type, as of `Tensor.to`."""
+        tensors = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{name: x.to(*where) for name, x in tensors.items() if x is not None})
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,7 +14,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 import torch
 from torch import Tensor
@@ -71,7 +71,7 @@ def check_gradients_are_finite_differences(make: Make) -> None:
             numeric = float(((ends[0] - ends[1]) * v[0]).sum()) / (2 * step)
             analytic = float((gradient * direction).sum())
             scale = max(abs(numeric), float(gradient.abs().max()) * 1e-2, 1e-9)
-            _require(
+            require(
                 abs(numeric - analytic) <= tolerance * scale, f"∂/∂{name}: {analytic:.8g}, by differences {numeric:.8g}"
             )
 
@@ -99,12 +99,12 @@ def check_dropped_equals_absent(make: Make, *, depth: bool = False) -> None:
     draw = _drawing(rasterizer, depth)
     rendering, without = draw(gated, camera), draw(select(splats, kept), camera)
     _close(pixels_of(rendering), pixels_of(without), 1e-6, "the image")
-    _require(not bool(rendering.visible[~kept].any()), "a dropped Gaussian counts as visible")
+    require(not bool(rendering.visible[~kept].any()), "a dropped Gaussian counts as visible")
     v = torch.ones_like(rendering.image)[None]
     gradients, expected = rendering.vjp(v), without.vjp(v)
     for name in _ATTRIBUTES:
         rows = gradient_of(gradients, name)[0]
-        _require(float(rows[~kept].abs().max()) == 0, f"a dropped Gaussian has a gradient of {name}")
+        require(float(rows[~kept].abs().max()) == 0, f"a dropped Gaussian has a gradient of {name}")
         _close(rows[kept], gradient_of(expected, name)[0], 1e-5, f"the others' {name}")
 
 
@@ -118,13 +118,13 @@ def check_nothing_to_draw(make: Make, *, depth: bool = False) -> None:
     for splats in (select(behind, torch.zeros(5, dtype=torch.bool)), behind):
         rendering = _drawing(rasterizer, depth)(splats, camera)
         _close(rendering.image, torch.tensor(background, dtype=dtype).expand(11, 19, 3), 1e-7, "the background")
-        _require(float(rendering.alpha.abs().max()) == 0, "alpha is not 0 where nothing is")
-        _require(rendering.depth is None or not bool(rendering.depth.any()), "depth is not 0 where nothing is")
+        require(float(rendering.alpha.abs().max()) == 0, "alpha is not 0 where nothing is")
+        require(rendering.depth is None or not bool(rendering.depth.any()), "depth is not 0 where nothing is")
         gradients = rendering.vjp(torch.ones_like(rendering.image).expand(2, -1, -1, -1))
         for name in _ATTRIBUTES:
             found = gradient_of(gradients, name)
-            _require(found.shape[:2] == (2, len(splats)), f"the gradient of {name} has shape {tuple(found.shape)}")
-            _require(found.numel() == 0 or float(found.abs().max()) == 0, f"the gradient of {name} is not 0")
+            require(found.shape[:2] == (2, len(splats)), f"the gradient of {name} has shape {tuple(found.shape)}")
+            require(found.numel() == 0 or float(found.abs().max()) == 0, f"the gradient of {name} is not 0")
 
 
 def check_scales_together_equal_one_by_one(make: Make, *, depth: bool = False) -> None:
@@ -133,7 +133,7 @@ def check_scales_together_equal_one_by_one(make: Make, *, depth: bool = False) -
     splats, camera = scene(60, dtype=_widest(rasterizer)), _camera(48, 33)
     jobs = [(splats, camera.scaled(1 / 3)), (splats, camera)]
     low, high = rasterizer.render_scales(jobs, depth=[False, True]) if depth else rasterizer.render_scales(jobs)
-    _require(low.depth is None, "an image has a depth without depth=True")
+    require(low.depth is None, "an image has a depth without depth=True")
     _close(low.image, rasterizer(*jobs[0]).image, 1e-6, "an image drawn together with a larger one")
     _close(
         pixels_of(high),
@@ -150,7 +150,7 @@ def check_equal_depths_have_an_order(make: Make) -> None:
     splats = scene(40, dtype=dtype)
     splats = replace(splats, means=torch.cat((splats.means[:, :2], torch.full((40, 1), 5.0, dtype=dtype)), 1))
     first, second = (rasterizer(splats, _camera(32, 32)).image for _ in range(2))
-    _require(bool((first == second).all()), "two renderings of one scene differ")
+    require(bool((first == second).all()), "two renderings of one scene differ")
 
 
 def check_agrees_with_the_reference(make: Make, *, depth: bool = False) -> None:
@@ -158,12 +158,12 @@ def check_agrees_with_the_reference(make: Make, *, depth: bool = False) -> None:
     rasterizer = make()
     for bands in (0, 3, 8, 15):
         splats, camera = scene(300, bands=bands), _camera(65, 47)
-        exact = ReferenceRasterizer()(to(splats, torch.float64), camera, depth=depth)
+        exact = ReferenceRasterizer()(splats.to(torch.float64), camera, depth=depth)
         dtype = torch.float32 if torch.float32 in rasterizer.traits.dtypes else torch.float64
-        found = _drawing(rasterizer, depth)(to(splats, dtype), camera)
+        found = _drawing(rasterizer, depth)(splats.to(dtype), camera)
         error = (pixels_of(found).double() - pixels_of(exact)).abs() / magnitude(exact)
-        _require(float((error <= 5e-6).double().mean()) >= 0.999, f"{bands} bands: more than 0.1 % of values are off")
-        _require(float(error.max()) <= 8e-3, f"{bands} bands: a value is off by {float(error.max()):.2g}")
+        require(float((error <= 5e-6).double().mean()) >= 0.999, f"{bands} bands: more than 0.1 % of values are off")
+        require(float(error.max()) <= 8e-3, f"{bands} bands: a value is off by {float(error.max()):.2g}")
         v = _cotangents(exact, 1, torch.Generator().manual_seed(6))
         gradients, expected = found.vjp(v.to(dtype)), exact.vjp(v)
         for name in (*_ATTRIBUTES, "screen"):
@@ -205,7 +205,7 @@ def scene(n: int, *, seed: int = 0, bands: int = 3, dtype: torch.dtype = torch.f
     g = torch.Generator().manual_seed(seed)
     z = 2 + 4 * torch.rand(n, 1, generator=g)
     means = torch.cat(((torch.rand(n, 2, generator=g) - 0.5) * 1.6 * z, z), dim=1)
-    splats = Splats(
+    return Splats(
         means=means,
         quats=torch.randn(n, 4, generator=g),
         scales=torch.exp(torch.randn(n, 3, generator=g) * 0.6 - 2.2) * z / 3,
@@ -213,18 +213,13 @@ def scene(n: int, *, seed: int = 0, bands: int = 3, dtype: torch.dtype = torch.f
         sh0=torch.randn(n, 1, 3, generator=g),
         shN=torch.randn(n, bands, 3, generator=g) * 0.2,
         rgb_offset=torch.randn(n, 3, generator=g) * 0.1,
-    )
-    return to(splats, dtype)
-
-
-def to(splats: Splats, dtype: torch.dtype) -> Splats:
-    """The splats in another precision."""
-    return _map(splats, lambda x: x.to(dtype))
+    ).to(dtype)
 
 
 def select(splats: Splats, rows: Tensor) -> Splats:
     """Some of the splats."""
-    return _map(splats, lambda x: x[rows])
+    tensors = {name: getattr(splats, name) for name in _ATTRIBUTES}
+    return Splats(**{name: x[rows] for name, x in tensors.items() if x is not None})
 
 
 def gradient_of(gradients: SplatGradients, name: str) -> Tensor:
@@ -258,13 +253,6 @@ def _cotangents(like: Rendering, k: int, generator: torch.Generator) -> Tensor:
     return torch.randn(k, *like.image.shape, generator=generator).to(like.image)
 
 
-def _map(splats: Splats, f: Callable[[Tensor], Tensor]) -> Splats:
-    changed: dict[str, Any] = {
-        name: f(getattr(splats, name)) for name in _ATTRIBUTES if getattr(splats, name) is not None
-    }
-    return replace(splats, **changed)
-
-
 def _camera(width: int, height: int) -> Camera:
     return Camera(torch.eye(4), 0.9 * width, 0.9 * width, 0.52 * width, 0.47 * height, width, height)
 
@@ -277,9 +265,10 @@ def _close(found: Tensor, expected: Tensor, tolerance: float, what: str) -> None
     """Compare relative to the L2 norm, so that the rounding of tiny entries does not count."""
     scale = float(torch.linalg.vector_norm(expected)) or 1.0
     error = float(torch.linalg.vector_norm(found - expected)) / scale
-    _require(math.isfinite(error) and error <= tolerance, f"{what}: relative error {error:.3g}, allowed {tolerance:g}")
+    require(math.isfinite(error) and error <= tolerance, f"{what}: relative error {error:.3g}, allowed {tolerance:g}")
 
 
-def _require(holds: bool, otherwise: str) -> None:
+def require(holds: bool, otherwise: str) -> None:
+    """Raise a ContractError unless it holds."""
     if not holds:
         raise ContractError(otherwise)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -14,6 +14,7 @@ from scipy.special import expit
 
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.errors import DataError
+from clear_strategies.jobs.saved import overview
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, Splats
 
@@ -41,9 +42,7 @@ class Workload:
 
     def to(self, device: str, dtype: torch.dtype = torch.float32) -> Workload:
         """The Gaussians on another device; cameras stay on the CPU."""
-        tensors = {f.name: getattr(self.splats, f.name) for f in fields(self.splats)}
-        moved = {name: t.to(device, dtype) for name, t in tensors.items() if t is not None}
-        return replace(self, splats=Splats(**moved))
+        return replace(self, splats=self.splats.to(device, dtype))
 
 
 def surfaces(name: str, n: int, width: int, height: int, *, radius: float, seed: int = 0) -> Workload:
@@ -131,18 +130,7 @@ def from_ply(path: Path) -> Workload:
     """Gaussians as a run exports them; a DataError where the file is no such export."""
     g = read_gaussians(path)
     splats = Splats(g.means, g.quats, g.scales.exp(), g.opacities.sigmoid(), g.sh0, g.shN)
-    return Workload(path.stem, splats, facing_all(splats))
-
-
-def facing_all(splats: Splats, width: int = 1008, height: int = 756) -> Camera:
-    """A camera along +z that sees the middle nine tenths of the Gaussians; a .ply file holds no camera."""
-    low, high = (np.quantile(splats.means.numpy(), q, axis=0) for q in (0.05, 0.95))
-    center, half = (low + high) / 2, (high - low) / 2
-    focal = _FOCAL * width
-    back = max(half[0] * focal / (width / 2), half[1] * focal / (height / 2), 1e-3) + half[2]
-    pose = torch.eye(4)
-    pose[:3, 3] = torch.tensor([-center[0], -center[1], back - center[2]])
-    return Camera(pose, focal, focal, width / 2, height / 2, width, height)
+    return Workload(path.stem, splats, overview(splats.means, splats.opacities))
 
 
 _TAILS: Final = "tails"

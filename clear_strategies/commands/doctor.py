@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from typing import Final
 
 from clear_strategies import console
-from clear_strategies.commands.options import parser_of
+from clear_strategies.commands import parser_of
 from clear_strategies.errors import SettingError, one_line
 from clear_strategies.jobs.exit_codes import TRAIN
 from clear_strategies.outputs.provenance import origin
@@ -22,7 +22,6 @@ EXTRAS: Final = {
     "colmap": (("pycolmap",), "poses for photos without any (data=photos)"),
     "heic": (("pillow_heif",), "photos as iPhones save them (HEIC)"),
     "view": (("viser", "nerfview"), "clear-strategies view, and fit.viewer"),
-    "open3d": (("open3d",), "points averaged in voxels (data.cloud.voxel)"),
     "gsplat": (("gsplat",), "gsplat's rasterizer on CUDA"),
     "warp": (("warp",), "the rasterizer on CUDA without a CUDA toolkit"),
     "sweeps": (("hydra_plugins.hydra_joblib_launcher",), "many runs at once, on one machine or a cluster"),
@@ -122,17 +121,14 @@ def _backends(broken: list[str], *, slow: bool) -> Iterator[tuple[str, str]]:
 
     import rasterizers
     from rasterizers import native
-    from rasterizers.interface import BackendUnavailable, Camera, Splats
+    from rasterizers.interface import BackendUnavailable, Camera
+    from rasterizers.testing import scene
 
-    g, shapes = torch.Generator().manual_seed(0), ((3,), (4,), (3,), (), (1, 3), (3, 3))
-    means, quats, scales, opacities, sh0, shN = (torch.randn(300, *shape, generator=g) for shape in shapes)
-    tensors = means, quats, (scales * 0.3 - 2).exp(), opacities.sigmoid(), sh0, shN * 0.2
-    pose = torch.eye(4)
-    pose[2, 3] = 5
-    camera, on_cuda = Camera(pose, 76.0, 76.0, 32.0, 32.0, 64, 64), torch.cuda.is_available()
+    splats, camera = scene(300), Camera(torch.eye(4), 58.0, 58.0, 32.0, 32.0, 64, 64)
+    on_cuda = torch.cuda.is_available()
     # For pictures this small, torch's own threads cost more than they bring.
     with native.kernel_threads(native.threads()):
-        exact = rasterizers.load("torch", preset="accurate")(Splats(*tensors), camera).image
+        exact = rasterizers.load("torch", preset="accurate")(splats, camera).image
         for name in rasterizers.names():
             if name in _SLOW_TO_COMPILE and find_spec(name) is not None and not on_cuda and not slow:
                 yield name, "installed, not tested: it compiles for a minute first (--all tests it); slow without CUDA"
@@ -145,10 +141,10 @@ def _backends(broken: list[str], *, slow: bool) -> Iterator[tuple[str, str]]:
             try:
                 rasterizer = rasterizers.load(name, preset="accurate")
                 device = "cuda" if on_cuda and "cuda" in rasterizer.traits.devices else "cpu"
-                splats = Splats(*(x.to(device) for x in tensors))
-                rasterizer(splats, camera)
+                there = splats.to(device)
+                rasterizer(there, camera)
                 began = time.perf_counter()
-                image = rasterizer(splats, camera).image.cpu()
+                image = rasterizer(there, camera).image.cpu()
                 milliseconds = 1e3 * (time.perf_counter() - began)
             except (BackendUnavailable, RuntimeError, ValueError) as error:
                 broken.append(name)

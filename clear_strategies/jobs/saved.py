@@ -10,6 +10,8 @@ from typing import Any, Final
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.data.ply import read_gaussians
@@ -55,8 +57,12 @@ class SavedSplat:
 
     def poses(self) -> list[Camera]:
         """The training cameras, or, where none are known, one that sees the whole splat."""
-        train = [saved.camera for saved in self.cameras if saved.split == "train"]
-        return train or [saved.camera for saved in self.cameras] or [overview(self.painter.field)]
+        train, field = [saved.camera for saved in self.cameras if saved.split == "train"], self.painter.field
+        return (
+            train
+            or [saved.camera for saved in self.cameras]
+            or [overview(field.means.data, field.opacities.data.sigmoid())]
+        )
 
 
 def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
@@ -94,9 +100,9 @@ def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
     return SavedSplat(folder, name or "splat", source, painter, cameras, bool(settings.get("antialiased", True)))
 
 
-def overview(field: GaussianField) -> Camera:
+def overview(means: Float[Tensor, "N 3"], opacities: Float[Tensor, " N"]) -> Camera:
     """A camera, upright by OpenCV's axes, that sees most of the opacity."""
-    means, weights = field.means.data.cpu().double(), field.opacities.data.sigmoid().cpu().double()
+    means, weights = means.cpu().double(), opacities.cpu().double()
     order = means.argsort(dim=0)
     total = weights[order].cumsum(0) / weights.sum()
     low, middle, high = (

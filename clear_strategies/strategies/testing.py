@@ -27,7 +27,7 @@ from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import WarmupDecay, scaled
 from clear_strategies.strategies.base import Drawn, Strategy
 from rasterizers.interface import Camera
-from rasterizers.testing import ContractError
+from rasterizers.testing import ContractError, require
 
 Make = Callable[[], Strategy]
 
@@ -52,8 +52,8 @@ def check_strategy(make: Make) -> None:
 def check_is_frozen_settings(make: Make) -> None:
     """A frozen dataclass with a repr that names its settings, and milestones that can be stretched."""
     strategy = make()
-    _require(isinstance(strategy, Strategy), f"{type(strategy).__name__} is no Strategy")
-    _require(is_dataclass(strategy), "a strategy is a dataclass of settings")
+    require(isinstance(strategy, Strategy), f"{type(strategy).__name__} is no Strategy")
+    require(is_dataclass(strategy), "a strategy is a dataclass of settings")
     settings = [f.name for f in fields(strategy) if f.init]
     if settings:
         try:
@@ -62,9 +62,9 @@ def check_is_frozen_settings(make: Make) -> None:
             pass
         else:
             raise ContractError("settings can be assigned; declare the dataclass frozen")
-    _require(all(name in repr(strategy) for name in settings), f"repr does not show every setting: {strategy!r}")
-    _require(strategy == make(), "two strategies with the same settings are not equal")
-    _require(scaled(strategy, 1.0) == strategy, "stretching milestones by 1 changes the strategy")
+    require(all(name in repr(strategy) for name in settings), f"repr does not show every setting: {strategy!r}")
+    require(strategy == make(), "two strategies with the same settings are not equal")
+    require(scaled(strategy, 1.0) == strategy, "stretching milestones by 1 changes the strategy")
 
 
 def check_gradients_are_left_alone(make: Make) -> None:
@@ -78,8 +78,8 @@ def check_gradients_are_left_alone(make: Make) -> None:
         conductor.update(params, lr, hr, view, t)
     after = [dict(g) for shot in (lr, hr) for g in shot.gradients]
     for old, new in zip(before, after, strict=True):
-        _require(all(torch.equal(old[k], new[k]) for k in old), "a gradient was changed in place")
-    _require(all(torch.equal(values[k], params[k]) for k in values), "a parameter was changed in place by update()")
+        require(all(torch.equal(old[k], new[k]) for k in old), "a gradient was changed in place")
+    require(all(torch.equal(values[k], params[k]) for k in values), "a parameter was changed in place by update()")
 
 
 def check_answers_have_their_shapes(make: Make) -> None:
@@ -88,21 +88,21 @@ def check_answers_have_their_shapes(make: Make) -> None:
     lr, hr, view, params = _situation(1)
     for t in range(1, _STEPS):
         z = conductor.gate(t, _N)
-        _require(z is None or (z.shape == (_N,) and bool((z >= 0).all())), "gate() must give [N] numbers >= 0, or None")
+        require(z is None or (z.shape == (_N,) and bool((z >= 0).all())), "gate() must give [N] numbers >= 0, or None")
         color = conductor.background(t)
-        _require(
+        require(
             color is None or (len(color) == 3 and all(0 <= c <= 1 for c in color)),
             f"background() must give three numbers in [0, 1], or None, got {color}",
         )
         update = conductor.update(params, lr, hr, view, t)
         shape = None if update.score is None else tuple(update.score.shape)
-        _require(shape == (_N,), f"score() gave {shape} for {_N} Gaussians")
+        require(shape == (_N,), f"score() gave {shape} for {_N} Gaussians")
         for name, gradient in _grads(update).items():
-            _require(gradient.shape == params[name].shape, f"the gradient of {name} has shape {tuple(gradient.shape)}")
-            _require(bool(gradient.isfinite().all()), f"the gradient of {name} is not finite")
+            require(gradient.shape == params[name].shape, f"the gradient of {name} has shape {tuple(gradient.shape)}")
+            require(bool(gradient.isfinite().all()), f"the gradient of {name} is not finite")
         if update.evidence is not None:
             for q in (update.evidence.reliability, update.evidence.demand):
-                _require(bool(((q >= 0) & (q <= 1)).all()), "evidence must lie in [0, 1]")
+                require(bool(((q >= 0) & (q <= 1)).all()), "evidence must lie in [0, 1]")
         conductor.after_step(params, update.step)
 
 
@@ -112,7 +112,7 @@ def check_works_without_hr(make: Make) -> None:
     lr, _, view, params = _situation(2)
     update = conductor.update(params, lr, None, view, 1)
     for name in ("means", "opacities"):
-        _require(bool(_grads(update)[name].isfinite().all()), f"the gradient of {name} is not finite without HR")
+        require(bool(_grads(update)[name].isfinite().all()), f"the gradient of {name} is not finite without HR")
 
 
 def check_is_reproducible(make: Make) -> None:
@@ -122,7 +122,7 @@ def check_is_reproducible(make: Make) -> None:
         torch.manual_seed(noise)
         results.append([*_trace(_conductor(make), 1, _STEPS)])
     for first, second in zip(*results, strict=True):
-        _require(torch.equal(first, second), "two runs with one seed differ; derive randomness from (seed, t)")
+        require(torch.equal(first, second), "two runs with one seed differ; derive randomness from (seed, t)")
 
 
 def check_state_is_all_there_is(make: Make) -> None:
@@ -134,7 +134,7 @@ def check_state_is_all_there_is(make: Make) -> None:
         second.load_state_dict(first.state_dict())
         rest = [*_trace(second, cut, _STEPS)]
         for a, b in zip(trace, [*beginning, *rest], strict=True):
-            _require(torch.equal(a, b), f"cut before t={cut}: resuming from `state` does not continue the run")
+            require(torch.equal(a, b), f"cut before t={cut}: resuming from `state` does not continue the run")
 
 
 def check_state_follows_its_gaussians(make: Make) -> None:
@@ -144,16 +144,16 @@ def check_state_follows_its_gaussians(make: Make) -> None:
         pass
     before = {name: rows.clone() for name, rows in conductor.state_dict().items()}
     for name, rows in before.items():
-        _require(rows.shape[:1] == (_N,), f"state {name!r} has shape {tuple(rows.shape)}; keep per-Gaussian rows only")
+        require(rows.shape[:1] == (_N,), f"state {name!r} has shape {tuple(rows.shape)}; keep per-Gaussian rows only")
     order = torch.randperm(_N, generator=torch.Generator().manual_seed(0))
     conductor.on_resize(order)
     for name, rows in conductor.state_dict().items():
-        _require(torch.equal(rows, before[name][order]), f"state {name!r} did not follow its Gaussians")
+        require(torch.equal(rows, before[name][order]), f"state {name!r} did not follow its Gaussians")
 
 
 def check_can_be_copied(make: Make) -> None:
     """Sweeps send strategies to other processes."""
-    _require(pickle.loads(pickle.dumps(make())) == make(), "a strategy does not survive pickling")  # noqa: S301 - our own
+    require(pickle.loads(pickle.dumps(make())) == make(), "a strategy does not survive pickling")  # noqa: S301 - our own
 
 
 CHECKS: Final[Sequence[Callable[[Make], None]]] = (
@@ -247,8 +247,3 @@ def _trace(conductor: Conductor, start: int, stop: int) -> Any:
 def _grads(update: Update) -> Grads:
     """The merged gradient, which is there as no `Stepper` is used."""
     return update.grads or Grads()
-
-
-def _require(holds: bool, otherwise: str) -> None:
-    if not holds:
-        raise ContractError(otherwise)

@@ -14,7 +14,7 @@ import rasterizers
 from rasterizers import BackendUnavailable, Camera, Rasterizer, Rendering, SplatGradients, Splats
 from rasterizers.geometry import SH_C0
 from rasterizers.reference import ReferenceRasterizer
-from rasterizers.testing import gradient_of, pixels_of, scene, to
+from rasterizers.testing import gradient_of, pixels_of, scene
 
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN", "rgb_offset", "screen")
 CLEAN = {"alpha_min": 1e-7, "transmittance_min": 1e-9}  # cut-offs far below what float32 resolves: no flips
@@ -125,7 +125,7 @@ def backends(*, dtype: torch.dtype | None = None) -> pytest.MarkDecorator:
 def exact(splats: Splats, camera: Camera, *, depth: bool = False, **settings: Any) -> Rendering:
     """The rendering in float64, by "cpp" where it was compiled."""
     rasterizer = rasterizers.load("torch" if why_not("cpp") else "cpp", **settings)
-    return rasterizer(to(splats, torch.float64), camera, depth=depth)
+    return rasterizer(splats.to(torch.float64), camera, depth=depth)
 
 
 def balls(*depths: float, opacity=0.6, scale=0.4, color=0.5, dtype=torch.float64) -> Splats:

@@ -11,7 +11,7 @@ import rasterizers
 from rasterizers import Camera, Splats
 from rasterizers.geometry import SH_C0
 from rasterizers.reference import ReferenceRasterizer
-from rasterizers.testing import CHECKS, gradient_of, magnitude, pixels_of, scene, select, to
+from rasterizers.testing import CHECKS, gradient_of, magnitude, pixels_of, scene, select
 from tests.helpers.backends import (
     ATTRIBUTES,
     CLEAN,
@@ -35,8 +35,8 @@ def require_reference(backend, splats, view, v, *, depth=False, **settings):
     narrow = backend.widest == torch.float32
     settings = {**settings, **(CLEAN if narrow else {})}
     of_image, of_gradient = (5e-6, 5e-5) if narrow else (1e-12, 1e-10)
-    found = backend(**settings)(to(splats, backend.widest), view, depth=depth)
-    expected = ReferenceRasterizer(**settings)(to(splats, torch.float64), view, depth=depth)
+    found = backend(**settings)(splats.to(backend.widest), view, depth=depth)
+    expected = ReferenceRasterizer(**settings)(splats.to(torch.float64), view, depth=depth)
     error = (pixels_of(found).double() - pixels_of(expected)).abs() / magnitude(expected)
     assert float(error.max()) < of_image
     assert float((found.alpha.double() - expected.alpha).abs().max()) < of_image
@@ -110,7 +110,7 @@ def needle(aspect, pixels, turned):
         quats=torch.tensor([[math.cos(turned / 2), 0, 0, math.sin(turned / 2)]]),
         scales=torch.tensor([[size, size / aspect, size / aspect]]),
     )
-    right = ReferenceRasterizer(**CLEAN)(to(splats, torch.float64), view)
+    right = ReferenceRasterizer(**CLEAN)(splats.to(torch.float64), view)
     return splats, right.image, right.vjp(cotangents(1, 64, 64).double())
 
 
@@ -186,7 +186,7 @@ def test_equal_depths_are_ordered_by_index_and_long_lists_are_blended_to_the_end
     # With all Gaussians at one depth, the image follows the order of their indices.
     splats, view = scene(64), camera(32, 32)
     flat = replace(splats, means=torch.cat((splats.means[:, :2], torch.full((64, 1), 5.0)), dim=1))
-    require_image(backend()(flat, view).image, ReferenceRasterizer()(to(flat, torch.float64), view).image)
+    require_image(backend()(flat, view).image, ReferenceRasterizer()(flat.to(torch.float64), view).image)
     reverse = torch.arange(63, -1, -1)
     assert not torch.equal(backend()(select(flat, reverse), view).image, backend()(flat, view).image)
     # More Gaussians over a tile than a buffer holds (cpp: 2048), most of them faint, so that no pixel ends early.
@@ -262,7 +262,7 @@ def test_depth_is_the_mean_by_blending_weight():
 @backends(dtype=torch.float32)
 def test_the_faintest_pixel_has_a_depth(backend):
     # Where alpha is 1e-6, 1 - T has one digit left in float32.
-    splats = to(balls(2.0, 6.0, opacity=1e-6, scale=10.0), torch.float32)
+    splats = balls(2.0, 6.0, opacity=1e-6, scale=10.0).to(torch.float32)
     found = backend(**CLEAN)(splats, camera(8, 8), depth=True)
     expected = exact(splats, camera(8, 8), depth=True, **CLEAN)
     assert torch.allclose(found.depth.double(), expected.depth, rtol=1e-5)

@@ -9,7 +9,7 @@ import torch
 import rasterizers
 from rasterizers import BackendUnavailable
 from rasterizers.interface import over
-from rasterizers.testing import gradient_of, to
+from rasterizers.testing import gradient_of
 from tests.helpers.backends import CLEAN, camera, cotangents, dense_scene, everything, needs, require_same_bits
 
 installed = needs("warp")
@@ -171,7 +171,7 @@ def test_long_lists_and_large_gaussians_are_summed_in_short_chains():
     v = cotangents(1, tails.camera.height, tails.camera.width)
     found = frame.Frame(rasterizers.load("warp", device="cpu", **CLEAN), [(tails.splats, tails.camera)], [False])
     (drawn,) = found.draw()
-    exact = rasterizers.load("cpp", **CLEAN)(to(tails.splats, torch.float64), tails.camera)
+    exact = rasterizers.load("cpp", **CLEAN)(tails.splats.to(torch.float64), tails.camera)
     g, expected = drawn.vjp(v), exact.vjp(v.double())
     for name in ("means", "quats", "scales", "opacities", "sh0"):
         error = gradient_of(g, name).double() - gradient_of(expected, name)

@@ -8,7 +8,7 @@ import torch
 
 from rasterizers import Camera, Rasterizer, Splats
 from rasterizers.reference import ReferenceRasterizer
-from rasterizers.testing import gradient_of, to
+from rasterizers.testing import gradient_of
 from tests.helpers.backends import CLEAN
 from tests.stress.rows import Row, Worst
 
@@ -48,7 +48,7 @@ def measure(backends: Mapping[str, Rasterizer], *, every: int = 1) -> Iterator[R
     v = torch.randn(1, 9, 9, 3, generator=torch.Generator().manual_seed(0))
     images, gradients = ({name: Worst() for name in backends} for _ in range(2))
     for where, splats in cases(every):
-        reference = exact(to(splats, torch.float64), _CAMERA)
+        reference = exact(splats.to(torch.float64), _CAMERA)
         expected = reference.vjp(v.double()) if bool(reference.visible.any()) else None
         for name, draw in backends.items():
             rendering = draw(splats, _CAMERA)
