@@ -34,7 +34,7 @@ from clear_strategies.core import deferred
 from clear_strategies.core.gradients import conflict_columns
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
-from clear_strategies.data.shown import require_shown
+from clear_strategies.data.scene import require_shown
 from clear_strategies.errors import HostError, SettingError
 from clear_strategies.kernels.merge import Colour
 from clear_strategies.merging.conductor import Conductor
@@ -44,7 +44,7 @@ from clear_strategies.strategies.base import overrides
 from integration.autograd_shot import AutogradShot, DrawnGradients, HostOutput, RenderAt, passes_to_parameters
 from integration.densification import ScoreScaler, write_score
 from integration.extra_steps import ExtraSteps
-from integration.views import by_name, enlarged_mask
+from integration.views import enlarged_mask, require_unique
 from rasterizers.autograd import Drawing
 from rasterizers.interface import Color
 
@@ -93,8 +93,9 @@ class Attachment:
         reads_score: bool = True,
     ) -> None:
         _require_supported(conductor, accumulation)
-        self._views = by_name(views)
+        require_unique(view.name for view in views)
         require_shown(views)
+        self._views = {view.name: view for view in views}
         self.conductor, self.params, self.accumulation = conductor, params, accumulation
         self._masks, self._own_background, self._reads_score = dict(masks or {}), own_background, reads_score
         self.t = 1

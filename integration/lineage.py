@@ -7,11 +7,10 @@ rows that it keeps, see inria/rows.py.
 from __future__ import annotations
 
 from collections.abc import Callable, MutableMapping
-from dataclasses import dataclass
 from typing import Any, Final
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from clear_strategies.errors import HostError
@@ -20,35 +19,9 @@ ROWS: Final = "clear_rows"
 """Key of the row numbers."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Change:
-    """One change of structure.
-
-    Args:
-        parents: row i now comes from row parents[i]; -1: from no row that can be found.
-        fresh: rows that the change added: second copies of a parent, and moved rows.
-    """
-
-    parents: Int[Tensor, " M"]
-    fresh: Bool[Tensor, " M"]
-
-
 def is_same(parents: Int[Tensor, " M"], n: int) -> bool:
     """Whether the M rows are the N rows that they come from, in the same order."""
     return len(parents) == n and bool((parents == torch.arange(n, device=parents.device)).all())
-
-
-def change_of(parents: Int[Tensor, " M"], n: int) -> Change | None:
-    """The change of N Gaussians that made row i from row parents[i]; None: the rows are the same.
-
-    Of the rows with one parent, that at its parent's place is the old Gaussian, else the first.
-    """
-    if is_same(parents, n):
-        return None
-    rows = torch.arange(len(parents), device=parents.device)
-    place = torch.where(parents == rows, rows - len(parents), rows)  # < 0: it has kept its place
-    first = torch.full((n,), len(parents), device=parents.device).scatter_reduce(0, parents, place, "amin")
-    return Change(parents, first[parents] != place)
 
 
 class RowNumbers:
@@ -85,8 +58,8 @@ class RowNumbers:
         self._put(rows)
         self._unchanged = self._entries[ROWS], self._entries[ROWS]._version
 
-    def poll(self) -> Change | None:
-        """The change since the last call; None: there was none.
+    def poll(self) -> Int[Tensor, " M"] | None:
+        """parents[M] of the change since the last call: row i comes from row parents[i]; None: the rows are the same.
 
         Raises:
             HostError: a densifier changed the parameters but not this one, or the origin of a row is unknown.
@@ -103,9 +76,9 @@ class RowNumbers:
             return None
         if bool((rows == 0).any()):
             raise HostError("gsplat 1.4 does not say where relocated Gaussians come from. Update it to 1.5 or later.")
-        change = change_of(rows.detach() - 1, self._numbered)
+        parents, numbered = rows.detach() - 1, self._numbered
         self.restart()
-        return change
+        return None if is_same(parents, numbered) else parents
 
     def remove(self) -> None:
         """Take the row numbers out of the host."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from torch import Tensor
 from clear_strategies.core.points import MAX_POINTS, PointCloud
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.priors.interface import super_resolved
-from clear_strategies.data.view_names import write_pngs
+from clear_strategies.data.view_names import bare, write_pngs
 from clear_strategies.errors import DataError, HostError, SettingError
 from clear_strategies.geometry import stereo
 from clear_strategies.geometry.projection import intrinsics
@@ -129,20 +130,15 @@ def _require_range(name: str, what: str, values: Tensor) -> None:
         raise DataError(name, what, problem, "divide 8-bit values by 255")
 
 
-def by_name(views: Sequence[View]) -> dict[str, View]:
-    """The views by their names.
+def require_unique(names: Iterable[str]) -> None:
+    """Refuse two photos of one name, with or without its ending: SR images are found by it, and strategies know a view by it.
 
     Raises:
-        SettingError: two have the same.
+        DataError: there are two.
     """
-    named = {view.name: view for view in views}
-    if len(named) < len(views):
-        duplicate = next(view.name for view in views if named[view.name] is not view)
-        raise SettingError(
-            f"views: strategies know each by its name, but {duplicate!r} is the name of several. Where folders have equal file "
-            "names, name the views with their folders."
-        )
-    return named
+    if twice := [name for name, count in Counter(map(bare, names)).items() if count > 1]:
+        remedy = "give each its own; where folders have equal file names, name the views with their folders"
+        raise DataError(twice[0], "name", "is that of two photos", remedy)
 
 
 def save_photos(photos: Iterable[HostPhoto], folder: Path | str) -> None:

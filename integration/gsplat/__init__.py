@@ -11,6 +11,6 @@ The names, shapes and order of calls that `attach` relies on are those of gsplat
 """
 
 from integration.gsplat.attached import Attached, attach
-from integration.gsplat.simple_trainer import install, views_from_dataset
+from integration.gsplat.simple_trainer import install
 
-__all__ = ["Attached", "attach", "install", "views_from_dataset"]
+__all__ = ["Attached", "attach", "install"]

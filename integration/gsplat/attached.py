@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core.gradients import PARAMETERS
@@ -80,7 +80,7 @@ class Attached:
                 "at least one view is needed; integration.views.view(...) makes one from an image and a camera."
             )
         self._names = {name: name for name in PARAMETERS} | dict(names or {})
-        self._params, self._optimizers, self._views = params, optimizers, tuple(views)
+        self._params, self._views = params, tuple(views)
         require_bands(params)
         if missing := [name for name in self._names.values() if name not in params]:
             raise ValueError(f"params must hold {', '.join(self._names.values())}; {missing[0]} is missing.")
@@ -104,10 +104,11 @@ class Attached:
         warn_if_score_is_unused(conductor, strategy, threshold)
         self.attachment = Attachment(
             conductor, self.params, views=self._views, seed=seed, loss_scale=loss_scale, accumulation=accumulation,
-            poll_parents=self._poll_parents, restart_parents=self._rows.restart, threshold=threshold, masks=masks,
+            poll_parents=self._rows.poll, restart_parents=self._rows.restart, threshold=threshold, masks=masks,
             own_background=own_background, reads_score=threshold is not None,
         )  # fmt: skip
-        self.attachment.hook(self._optimizers_of_gaussians())
+        # Those of the Gaussians; others, e.g. of poses, do not count.
+        self.attachment.hook([optimizers[name] for name in (*self._names.values(), "detail") if name in optimizers])
 
     def params(self) -> dict[str, Tensor]:
         """The current leaves, by gsplat's names."""
@@ -181,14 +182,6 @@ class Attached:
         self.attachment.remove()
         self._undo.close()
         self._rows.remove()
-
-    def _optimizers_of_gaussians(self) -> list[torch.optim.Optimizer]:
-        """The optimizers of the Gaussians; others, e.g. of poses, do not count."""
-        return [self._optimizers[name] for name in (*self._names.values(), "detail") if name in self._optimizers]
-
-    def _poll_parents(self) -> Int[Tensor, " M"] | None:
-        change = self._rows.poll()
-        return None if change is None else change.parents
 
     def _draws_colors(self, call: Mapping[str, Any]) -> bool:
         """Whether a call draws the colours of the scene, and not its depth alone, its normals or other features."""

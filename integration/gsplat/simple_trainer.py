@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from clear_strategies.console import show_in_host
-from clear_strategies.core.view import View
 from clear_strategies.errors import HostError, SettingError
 from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
@@ -175,20 +174,6 @@ def photos_of(dataset: Any, device: torch.device | str = "cpu") -> list[HostPhot
         shown = None if mask is None or bool(mask.all()) else mask.to(image)
         photos.append(HostPhoto(name, image, torch.linalg.inv(item["camtoworld"]).to(device), item["K"], shown))
     return photos
-
-
-def views_from_dataset(
-    dataset: Any, sr: SuperResolve, factor: int = 4, device: torch.device | str = "cpu"
-) -> tuple[View, ...]:
-    """The views of a `Dataset`; view i is that of `image_id` i.
-
-    Args:
-        sr: gives the SR images. factor: HR pixels per LR pixel.
-
-    Raises:
-        DataError: an SR image is missing, or is not `factor` times as large as its photo.
-    """
-    return tuple(photo.view(sr, factor) for photo in photos_of(dataset, device))
 
 
 def start_from_stereo(runner_class: Any) -> None:

@@ -18,8 +18,8 @@ from torch import Tensor
 
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import SUFFIXES
-from clear_strategies.errors import DataError, SettingError
-from integration.views import HostPhoto, SuperResolve
+from clear_strategies.errors import SettingError
+from integration.views import HostPhoto, SuperResolve, require_unique
 from rasterizers.interface import Camera
 
 _SAME_POSE: Final = 1e-6  # largest difference between the entries of the poses of one camera and its copy
@@ -51,11 +51,7 @@ class HostViews:
                 "cameras: at least one training camera is needed, got none. Pass scene.getTrainCameras()."
             )
         names = [camera.image_name for camera in cameras]
-        if twice := next((name for name in names if names.count(name) > 1), None):
-            raise DataError(
-                twice, "training cameras", "two have this name, so their SR images cannot be told apart",
-                "give every photo its own name; this trainer ignores folders",
-            )  # fmt: skip
+        require_unique(names)
         self.factor = factor
         photos = [photo_of(camera, device) for camera in cameras]
         self.all = tuple(photo.view(sr, factor) for photo in photos)

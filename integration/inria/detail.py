@@ -12,8 +12,7 @@ from torch import Tensor
 from clear_strategies.errors import HostError
 from clear_strategies.merging.detail import DetailRates
 from integration.detail import detail_adam, sh0_offset
-from integration.inria.rows import CarriedRows
-from integration.lineage import Change
+from integration.inria.rows import CarriedRows, Change
 
 
 class DetailFeature:

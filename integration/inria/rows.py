@@ -10,13 +10,14 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, Final
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from integration.lineage import Change, is_same
+from integration.lineage import is_same
 from integration.replacing import replace_methods
 
 _log = logging.getLogger(__name__)
@@ -26,6 +27,19 @@ _COMPARED: Final = ("means", *_COPIED)
 _GROUPS: Final = {"means": "xyz", "quats": "rotation", "sh0": "f_dc"}
 """The parameter groups of 3DGS that hold the parameters `_COMPARED`."""
 _HASH_FACTOR: Final = 0x2545F4914F6CDD1D
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Change:
+    """One change of structure.
+
+    Args:
+        parents: row i now comes from row parents[i]; -1: from no row that can be found.
+        fresh: rows that the change added: second copies of a parent, and moved rows.
+    """
+
+    parents: Int[Tensor, " M"]
+    fresh: Bool[Tensor, " M"]
 
 
 class CarriedRows:

@@ -18,7 +18,7 @@ from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import View
 from clear_strategies.data.priors import Bicubic, Images, Onnx, Prior, cached
 from clear_strategies.errors import DataError, SettingError
-from integration.views import HostPhoto, stereo_points
+from integration.views import HostPhoto, require_unique, stereo_points
 
 
 def prior(sr: Path | None) -> Prior:
@@ -41,7 +41,7 @@ def views_from_datamanager(
         SettingError: the photos are not kept in memory.
     """
     files = datamanager.train_dataset.image_filenames
-    _require_unique_stems(files)
+    require_unique(Path(file).name for file in files)
     if masked := [Path(file).name for file, item in zip(files, _cached(datamanager), strict=True) if "mask" in item]:
         raise DataError(
             masked[0], "mask", "hides pixels from splatfacto's loss but not from the losses of the SR image",
@@ -50,32 +50,21 @@ def views_from_datamanager(
     return tuple(photo.view(sr, factor) for photo in photos_of(datamanager, device))
 
 
-def seed_with_stereo(datamanager: Any) -> None:
-    """Replace the data set's points, which the pipeline gives to its model, by the stereo cloud of the training photos.
-
-    Raises:
-        DataError: there are fewer than two photos, or stereo confirms no depth.
-        SettingError: the photos are not kept in memory.
-    """
-    cloud = stereo_cloud(datamanager)
-    points = {"points3D_xyz": cloud.means, "points3D_rgb": (cloud.colors * 255).round().to(torch.uint8)}
-    metadata = datamanager.train_dataparser_outputs.metadata
-    for name in [name for name in metadata if name.startswith("points3D_")]:  # also errors and tracks of the old points
-        del metadata[name]
-    metadata.update(points)
-
-
-def stereo_cloud(datamanager: Any) -> PointCloud:
-    """The stereo cloud of a `FullImageDatamanager`'s undistorted training photos, in the world of its cameras.
-
-    Pixels that a mask hides, or alpha, get no points.
+def seed_with_stereo(datamanager: Any) -> PointCloud:
+    """Replace the data set's points, which the pipeline gives to its model, by the stereo cloud of a `FullImageDatamanager`'s
+    undistorted training photos, in the world of its cameras. Pixels that a mask hides, or alpha, get no points.
 
     Raises:
         DataError: there are fewer than two photos, or stereo confirms no depth.
         SettingError: the photos are not kept in memory.
     """
     photos, items = photos_of(datamanager), _cached(datamanager)
-    return stereo_points([replace(photo, mask=_mask(item)) for photo, item in zip(photos, items, strict=True)])
+    cloud = stereo_points([replace(photo, mask=_mask(item)) for photo, item in zip(photos, items, strict=True)])
+    metadata = datamanager.train_dataparser_outputs.metadata
+    for name in [name for name in metadata if name.startswith("points3D_")]:  # also errors and tracks of the old points
+        del metadata[name]
+    metadata |= {"points3D_xyz": cloud.means, "points3D_rgb": (cloud.colors * 255).round().to(torch.uint8)}
+    return cloud
 
 
 def photos_of(datamanager: Any, device: torch.device | str = "cpu") -> list[HostPhoto]:
@@ -126,15 +115,3 @@ def _cached(datamanager: Any) -> Any:
             "cache_images: clear-splatfacto needs cpu or gpu, got disk: every photo is read once, before training begins."
         )
     return datamanager.cached_train
-
-
-def _require_unique_stems(files: Any) -> None:
-    """SR images are found by the stem of their photo."""
-    first: dict[str, Path] = {}
-    for file in map(Path, files):
-        other = first.setdefault(file.stem, file)
-        if other is not file:
-            raise DataError(
-                file, "file name", f"has the stem of {other}, and SR images are found by the stem",
-                "give each photo its own name",
-            )  # fmt: skip

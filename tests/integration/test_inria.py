@@ -326,7 +326,7 @@ def test_views_need_unique_names_and_sr_images_of_the_right_size(inria_host, inr
     gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
     with pytest.raises(SettingError, match="at least one training camera"):
         attach(gaussians, [], Conductor(), sr=inria_capture / "sr")
-    with pytest.raises(DataError, match="view0: training cameras: two have this name"):
+    with pytest.raises(DataError, match="view0: name: is that of two photos"):
         attach(gaussians, [scene.cameras[0]] * 2, Conductor(), sr=inria_capture / "sr")
     with pytest.raises(DataError, match="is 96x64 where 48x32 is expected"):
         attach(gaussians, scene.cameras, Conductor(), sr=inria_capture / "sr", factor=2)

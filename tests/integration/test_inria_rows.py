@@ -8,7 +8,6 @@ import torch
 from integration.inria.cameras import enlarged_camera
 from integration.inria.model_proxy import Overrides, proxy
 from integration.inria.rows import CarriedRows, find_change
-from integration.lineage import change_of
 from rasterizers.geometry import SH_C0
 from tests.helpers import toy
 from tests.helpers.host_parts import N, loop, options
@@ -134,12 +133,6 @@ def test_clones_splits_and_pruned_gaussians_are_found_by_colour_and_place():
     empty = {name: tensor[:0] for name, tensor in gaussians(1.0).items()}
     assert find_change(empty, gaussians(1.0)).parents.tolist() == [-1]
     assert find_change(gaussians(1.0), empty).parents.tolist() == []
-    relocated = change_of(torch.tensor([2, 1, 2, 3]), 4)  # row 0 was moved onto 2
-    assert relocated.fresh.tolist() == [True, False, False, False]
-    pruned_and_split = change_of(torch.tensor([1, 3, 3]), 4)
-    assert pruned_and_split.fresh.tolist() == [False, False, True]
-    assert change_of(torch.arange(4), 4) is None
-    assert change_of(torch.arange(3), 4).fresh.tolist() == [False, False, False]
 
 
 # ---- a proxy of a host's model: opacities and colours are changed once, however the host's getters call each other

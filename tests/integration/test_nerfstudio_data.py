@@ -21,7 +21,6 @@ from integration.nerfstudio.data import (
     photos_of,
     prior,
     seed_with_stereo,
-    stereo_cloud,
     views_from_datamanager,
 )
 from integration.views import save_photos
@@ -85,7 +84,7 @@ def test_masks_equal_stems_and_photos_that_stay_on_disk_are_refused(tmp_path):
     with pytest.raises(DataError, match="mask"):
         views_from_datamanager(DataManager(mask=torch.ones(16, 24, 1)), Bicubic(), 4)
     twins = DataManager(files=("a/0.jpg", "b/0.png", "a/1.jpg"))
-    with pytest.raises(DataError, match="stem"):
+    with pytest.raises(DataError, match="is that of two photos"):
         views_from_datamanager(twins, Bicubic(), 4)
     with pytest.raises(DataError, match="is that of two photos"):
         save_photos(photos_of(twins), tmp_path)
@@ -122,7 +121,7 @@ def test_hidden_pixels_give_no_seed_points(by):
 
     kind = (lambda image: image) if by == "mask" else with_alpha
     mask = {} if by == "alpha" else {"mask": half[..., None].bool()}
-    assert 0 < len(stereo_cloud(DataManager(kind, **mask))) < 0.8 * len(stereo_cloud(DataManager()))
+    assert 0 < len(seed_with_stereo(DataManager(kind, **mask))) < 0.8 * len(seed_with_stereo(DataManager()))
 
 
 def test_alpha_is_composited_over_black():

@@ -31,7 +31,7 @@ from clear_strategies.data.photo_files import write_png
 from clear_strategies.errors import SettingError
 from clear_strategies.strategies import random_background
 from integration.nerfstudio import clear_splatfacto
-from integration.nerfstudio.data import stereo_cloud
+from integration.nerfstudio.data import seed_with_stereo
 from integration.nerfstudio.method import ClearDatamanager, ClearSplatfactoModel, ClearSplatfactoModelConfig
 from rasterizers import autograd
 from rasterizers.geometry import SH_C0
@@ -183,7 +183,7 @@ def test_it_starts_from_the_stereo_cloud_of_its_photos(capture, tmp_path):
     host = trainer(config)
     model, manager = host.pipeline.model, host.pipeline.datamanager
     assert isinstance(manager, ClearDatamanager)
-    cloud = stereo_cloud(manager)
+    cloud = seed_with_stereo(manager)
     assert torch.equal(model.gauss_params["means"], cloud.means)
     colors = model.gauss_params["features_dc"].detach() * SH_C0 + 0.5
     assert torch.allclose(colors, cloud.colors, atol=1 / 255)

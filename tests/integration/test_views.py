@@ -11,12 +11,12 @@ from clear_strategies.core import images
 from clear_strategies.core.points import PointCloud
 from clear_strategies.data.photo_files import read_image, write_png
 from clear_strategies.data.priors import Images
-from clear_strategies.errors import DataError, SettingError
+from clear_strategies.errors import DataError
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.training.field import GaussianField
 from integration.examples.demo import load_demo, splats_with_optimizers
-from integration.gsplat.simple_trainer import photos_of, views_from_dataset
-from integration.views import by_name, save_photos, view
+from integration.gsplat.simple_trainer import photos_of
+from integration.views import require_unique, save_photos, view
 from tests.helpers import gsplat_host, toy
 from tests.helpers.host_parts import as_item
 
@@ -56,8 +56,8 @@ def test_sr_images_may_overshoot_but_not_have_other_values_and_names_are_unique(
     sharp = of_host(image=1.1 * PHOTO.image - 0.03)
     assert float(sharp.lr.image.min()) >= 0
     P2G(patch=4).patch_maps(sharp)
-    with pytest.raises(SettingError, match=r"'0001\.png' is the name of several"):
-        by_name([of_host("0001.png"), of_host("0002.png"), of_host("0001.png")])
+    with pytest.raises(DataError, match=r"0001: name: is that of two photos"):
+        require_unique(["0002.png", "0001.png", "0001.jpg"])
 
 
 @pytest.mark.parametrize(
@@ -130,15 +130,20 @@ def dataset(tmp_path):
     return made
 
 
+def views_of(dataset, folder):
+    sr = Images(str(folder))
+    return tuple(photo.view(sr, 4) for photo in photos_of(dataset))
+
+
 def test_photos_of_one_name_in_two_folders_have_their_own_sr_images(dataset, tmp_path):
-    views = views_from_dataset(dataset, Images(str(tmp_path / "sr")))
+    views = views_of(dataset, tmp_path / "sr")
     assert [one.name for one in views] == list(NAMES)
     for one, expected in zip(views[1:], dataset.train[1:], strict=True):
         assert torch.allclose(one.hr.image, expected.hr.image, atol=1 / 255)
     for name, one in zip(NAMES, dataset.train, strict=True):
         write_png(tmp_path / "flat" / name.split("/")[1], images.quantize(one.hr.image))
     with pytest.raises(DataError, match="would be that of two views, cam1/0001 and cam2/0001"):
-        views_from_dataset(dataset, Images(str(tmp_path / "flat")))
+        views_of(dataset, tmp_path / "flat")
 
 
 def test_photos_are_written_with_their_masks_which_hide_at_both_scales(dataset, tmp_path):
@@ -146,7 +151,7 @@ def test_photos_are_written_with_their_masks_which_hide_at_both_scales(dataset, 
     written = [read_image(tmp_path / "lr" / name) for name in NAMES]
     assert float(written[0][:, HIDDEN].max()) == 0
     assert torch.allclose(written[1], dataset.train[1].lr.image, atol=1 / 255)
-    views = views_from_dataset(dataset, Images(str(tmp_path / "sr")))
+    views = views_of(dataset, tmp_path / "sr")
     masks = {photo.name: photo.mask for photo in photos_of(dataset)}
     assert [mask is None for mask in masks.values()] == [False, True, True]
     assert float(views[0].hr.image[:, 4 * 12 :].abs().max()) == 0
