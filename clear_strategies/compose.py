@@ -257,11 +257,6 @@ def _folder_of(point: EntryPoint) -> str:
     return str(next(iter(spec.submodule_search_locations)))
 
 
-def _unnamed(*more: str) -> list[str]:
-    """`${settings_without_result:more, …}` in conf/: the keys of overrides that do not name a sweep's folders."""
-    return [*sorted(CHANGES_NO_RESULT), *more]
-
-
 def _one_folder(name: str) -> str:
     """`${one_folder:name}` in conf/: the name of a job's folder, one word that every file system takes. A path among the
     overrides would otherwise lead elsewhere: behind `../..` all jobs share a folder.
@@ -273,7 +268,10 @@ def _one_folder(name: str) -> str:
     return f"{word.encode()[: _LONGEST_NAME - len(digest) - 1].decode(errors='ignore')}_{digest}"
 
 
-OmegaConf.register_new_resolver("settings_without_result", _unnamed, replace=True)
+# `${settings_without_result:more, …}` in conf/: the keys of overrides that do not name a sweep's folders.
+OmegaConf.register_new_resolver(
+    "settings_without_result", lambda *more: [*sorted(CHANGES_NO_RESULT), *more], replace=True
+)
 OmegaConf.register_new_resolver("one_folder", _one_folder, replace=True)
 Plugins.instance().register(_ConfSource)
 Plugins.instance().register(_ReadConf)

@@ -1,10 +1,8 @@
-"""Atomic writes: a file is either whole or as it was before."""
+"""Atomic writes: a file is either whole or as it was before; and the lock of a folder, which has one writer at a time."""
 
 from __future__ import annotations
 
-import json
 import logging
-import math
 import os
 import secrets
 import shutil
@@ -18,6 +16,7 @@ from clear_strategies.errors import DataError
 
 _log = logging.getLogger(__name__)
 
+LOCK: Final = "run.lock"
 _PARTIAL: Final = ".partial"
 _KEPT: Final = 40  # characters of a file's name in that of its part, so that a name may be as long as the disk allows
 _LARGEST: Final = 64 << 30
@@ -114,12 +113,35 @@ def write_text(path: Path, text: str) -> None:
 
 def write_json(path: Path, value: Any) -> None:
     """JSON, atomically. NaN and infinities, which JSON does not have, become null."""
-    write_text(path, json.dumps(_without_nan(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    import msgspec
+
+    def plain(value: Any) -> Any:  # numbers of numpy and strings of torch are no float and no str to msgspec
+        return dict(value) if isinstance(value, Mapping) else str(value) if isinstance(value, str) else float(value)
+
+    write_bytes(path, msgspec.json.format(msgspec.json.encode(value, enc_hook=plain), indent=1) + b"\n")
 
 
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+class HeldError(DataError):
+    """Another running process holds the folder."""
+
+
+@contextmanager
+def hold(folder: Path) -> Iterator[None]:
+    """Hold the lock of `folder`, which is created if it does not exist, so that it has one writer.
+
+    The system frees the lock of a process that has died, so a killed run does not block the next; the empty file stays.
+    """
+    from filelock import FileLock, Timeout
+
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise HeldError(
+            folder / LOCK, "lock", "another run is at work in this folder", "wait for it, or take another folder"
+        ) from error
+    try:
+        yield
+    finally:
+        lock.release()

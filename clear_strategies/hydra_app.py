@@ -127,12 +127,10 @@ def job(config: DictConfig) -> float | None:
 
 def _end(error: BaseException, ending: exit_codes.Ending, folder: Path, *, resumes: bool) -> None:
     """Log why a job ended, and exit; a job that fails in a sweep leaves a note instead, and the other jobs continue."""
-    from clear_strategies.jobs.lock import HeldError
-
     code, message = ending
     hydra_config = HydraConfig.get()
     in_sweep = hydra_config.mode == RunMode.MULTIRUN
-    if in_sweep and resumes and isinstance(error, HeldError):
+    if in_sweep and resumes and isinstance(error, files.HeldError):
         _log.warning("left to the other process: %s", message)
         return
     _log.log(logging.INFO if code > exit_codes.SIGNALS else logging.ERROR, "%s", message)  # a stop is no error

@@ -18,7 +18,7 @@ import torch
 from clear_strategies import console
 from clear_strategies.bench.results import Results
 from clear_strategies.bench.scenes import NAMES
-from clear_strategies.commands.options import positive
+from clear_strategies.commands import positive
 from clear_strategies.errors import ClearError
 from rasterizers.interface import PRESETS, BackendUnavailable
 
@@ -28,12 +28,12 @@ Options = Mapping[str, Mapping[str, Any]]
 """The arguments of argparse's `add_argument`, by the flag."""
 
 _COMMON: Final[Options] = {
-    "--threads": {"type": positive(int), "metavar": "N", "help": "threads of torch and the backends"},
+    "--threads": {"type": positive, "metavar": "N", "help": "threads of torch and the backends"},
     "--out": {"type": Path, "metavar": "FOLDER", "help": "write tables (CSV), figures (PNG) and the machine here"},
 }
 _SCENES: Final = f"{', '.join(NAMES)}, or a .ply"
 _TURNS: Final[Options] = {
-    "--repeats": {"type": positive(int), "default": 9, "metavar": "N", "help": "turns of each contender (default 9)"},
+    "--repeats": {"type": positive, "default": 9, "metavar": "N", "help": "turns of each contender (default 9)"},
     "--device": {"default": "cpu", "choices": ["cpu", "cuda"], "help": "default: cpu"},
 }
 _MANY: Final = {"nargs": "+", "default": []}
@@ -53,15 +53,15 @@ QUESTIONS: Final[Mapping[str, tuple[str, Options]]] = {
     "host": ("what the strategies cost in another trainer's loop", {
         "--strategies": {"nargs": "+", "default": ["gco", "p2g", "svs", "clear", "clear skips=none", "best"],
                          "metavar": "NAME", "help": "as in `conductor`, with overrides after a space"},
-        "--gaussians": {"type": positive(int), "default": 46_000, "metavar": "N", "help": "default 46000"},
-        "--width": {"type": positive(int), "default": 128, "metavar": "PX", "help": "of the LR photos (default 128)"},
+        "--gaussians": {"type": positive, "default": 46_000, "metavar": "N", "help": "default 46000"},
+        "--width": {"type": positive, "default": 128, "metavar": "PX", "help": "of the LR photos (default 128)"},
         **_TURNS, "--repeats": {**_TURNS["--repeats"], "default": 20},
     }),
     "scale": ("how time and memory grow with Gaussians, pixels and photos", {
-        "--gaussians": {"nargs": "*", "type": positive(int), "default": [1_000, 10_000, 100_000, 1_000_000], "metavar": "N"},
-        "--widths": {"nargs": "*", "type": positive(int), "default": [252, 504, 1008, 2016], "metavar": "PX"},
-        "--photos": {"nargs": "*", "type": positive(int), "default": [10, 50, 200], "metavar": "N"},
-        "--iterations": {"type": positive(int), "default": 200, "metavar": "N", "help": "of a run (default 200)"},
+        "--gaussians": {"nargs": "*", "type": positive, "default": [1_000, 10_000, 100_000, 1_000_000], "metavar": "N"},
+        "--widths": {"nargs": "*", "type": positive, "default": [252, 504, 1008, 2016], "metavar": "PX"},
+        "--photos": {"nargs": "*", "type": positive, "default": [10, 50, 200], "metavar": "N"},
+        "--iterations": {"type": positive, "default": 200, "metavar": "N", "help": "of a run (default 200)"},
         "--repeats": _TURNS["--repeats"],
     }),
 }  # fmt: skip

@@ -11,13 +11,14 @@ What begins with an override or a flag is Hydra's: `+strategy=clear`, `fit.itera
 
 from __future__ import annotations
 
+import argparse
 import difflib
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Final
+from typing import Final, NoReturn
 
 from clear_strategies.errors import SettingError
 
@@ -76,3 +77,29 @@ def _help() -> None:
 def _rows(table: Mapping[str, str]) -> str:
     width = max(map(len, table))
     return "".join(f"  {left:<{width}}  {right}\n" for left, right in table.items())
+
+
+class _Parser(argparse.ArgumentParser):
+    """Raises a SettingError for wrong arguments, in place of argparse's usage and exit."""
+
+    def error(self, message: str) -> NoReturn:
+        raise SettingError(f"{message}. {self.prog} --help lists the arguments.")
+
+
+def parser_of(command: str, description: str, *, run: bool = True) -> argparse.ArgumentParser:
+    """A parser with `--verbose`, and with RUN and `--rasterizer` for commands that open one."""
+    parser = _Parser(prog=f"clear-strategies {command}", description=description)
+    if run:
+        parser.add_argument(
+            "run", type=Path, metavar="RUN", help="a run's folder, one of its checkpoints, or a PLY file"
+        )
+        parser.add_argument("--rasterizer", metavar="NAME", help="cpp, torch, warp or gsplat (default: the run's own)")
+    parser.add_argument("-v", "--verbose", action="store_true", help="say more")
+    return parser
+
+
+def positive(text: str) -> int:
+    """The type of an argument that must be a whole number above 0."""
+    if not (text.isdecimal() and int(text) > 0):
+        raise argparse.ArgumentTypeError(f"must be a whole number above 0, got {text}")
+    return int(text)

@@ -121,11 +121,14 @@ def _backends(broken: list[str], *, slow: bool) -> Iterator[tuple[str, str]]:
 
     import rasterizers
     from rasterizers import native
-    from rasterizers.interface import BackendUnavailable, Camera
-    from rasterizers.testing import scene
+    from rasterizers.interface import BackendUnavailable, Camera, Splats
 
-    splats, camera = scene(300), Camera(torch.eye(4), 58.0, 58.0, 32.0, 32.0, 64, 64)
-    on_cuda = torch.cuda.is_available()
+    g, shapes = torch.Generator().manual_seed(0), ((3,), (4,), (3,), (), (1, 3), (3, 3))
+    means, quats, scales, opacities, sh0, shN = (torch.randn(300, *shape, generator=g) for shape in shapes)
+    splats = Splats(means, quats, (scales * 0.3 - 2).exp(), opacities.sigmoid(), sh0, shN * 0.2)
+    pose = torch.eye(4)
+    pose[2, 3] = 5
+    camera, on_cuda = Camera(pose, 76.0, 76.0, 32.0, 32.0, 64, 64), torch.cuda.is_available()
     # For pictures this small, torch's own threads cost more than they bring.
     with native.kernel_threads(native.threads()):
         exact = rasterizers.load("torch", preset="accurate")(splats, camera).image

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from clear_strategies import console
-from clear_strategies.commands.options import parser_of
+from clear_strategies.commands import parser_of
 from clear_strategies.errors import SettingError
 
 _log = logging.getLogger(__name__)
@@ -22,7 +22,7 @@ def main(arguments: Sequence[str]) -> None:
     options = parser.parse_args(arguments)
     console.show(verbose=options.verbose)
     from clear_strategies.jobs.saved import open_splat
-    from clear_strategies.outputs.export import export_ply
+    from clear_strategies.outputs.results import export_ply
 
     splat = open_splat(options.run, options.rasterizer)
     out = options.out or splat.folder / f"{splat.name}.ply"

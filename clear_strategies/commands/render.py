@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from clear_strategies import console
-from clear_strategies.commands.options import parser_of, positive
+from clear_strategies.commands import parser_of, positive
 from clear_strategies.errors import SettingError
 
 if TYPE_CHECKING:
     from clear_strategies.jobs.saved import SavedSplat
-    from clear_strategies.viewing.video import Pixels
+    from clear_strategies.viewing.look import Pixels
     from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
@@ -37,8 +37,7 @@ def main(arguments: Sequence[str]) -> None:
     from clear_strategies.jobs.saved import open_splat
     from clear_strategies.outputs.figures import spaced
     from clear_strategies.viewing.cameras import at_most
-    from clear_strategies.viewing.look import colored, depth_range
-    from clear_strategies.viewing.video import write_video
+    from clear_strategies.viewing.look import colored, depth_range, write_video
 
     began = time.perf_counter()
     splat = open_splat(options.run, options.rasterizer)
@@ -90,8 +89,8 @@ def _parser() -> argparse.ArgumentParser:
     which += " cameras; or the cameras.json of a run or of Inria's 3DGS: pictures from its cameras"
     parser.add_argument("--path", default=_LOOP, metavar="WHICH", help=which)
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="where the files go (default: RUN/rendered)")
-    parser.add_argument("--frames", type=positive(int), default=120, help="of the video (%(default)s)")
+    parser.add_argument("--frames", type=positive, default=120, help="of the video (%(default)s)")
     width = f"width of the pictures (default: that of the HR camera, of a video at most {_LONGEST})"
-    parser.add_argument("--width", type=positive(int), metavar="PX", help=width)
+    parser.add_argument("--width", type=positive, metavar="PX", help=width)
     parser.add_argument("--depth", action="store_true", help="depth as well, in colours")
     return parser

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from clear_strategies import console
-from clear_strategies.commands.options import parser_of
+from clear_strategies.commands import parser_of
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs.exit_codes import require_viewer
 

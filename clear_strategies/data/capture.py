@@ -103,7 +103,6 @@ class Capture:
         background: the colour behind the scene (white for Blender's RGBA).
         notes: label -> fact for the printed plan (the source of the poses, what was undistorted …).
         own_prior: makes the prior of `prior=auto` of what loads the photos, by the frames' names; real photos have none.
-        depth: the exact depth (z) through each pixel's centre of a camera, infinite without a surface; None: unknown.
         unplaced: why the pose is unknown, by the names of such photos.
     """
 
@@ -113,7 +112,6 @@ class Capture:
     background: Color = BLACK
     notes: dict[str, str] = field(default_factory=dict)
     own_prior: Callable[[Mapping[str, Callable[[], Float[Tensor, "H W 3"]]]], Prior] | None = None
-    depth: Callable[[Camera], Float[Tensor, "H W"]] | None = None
     unplaced: Mapping[str, str] = field(default_factory=dict)
 
 

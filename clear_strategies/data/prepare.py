@@ -30,8 +30,7 @@ from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.priors import Bicubic, Prior, fingerprint, network_of
 from clear_strategies.data.priors.cache import kept_network_of
 from clear_strategies.data.priors.interface import super_resolved, warn_if_far_from_lr
-from clear_strategies.data.scene import Scene
-from clear_strategies.data.shown import require_shown
+from clear_strategies.data.scene import Scene, require_shown
 from clear_strategies.data.view_names import ViewFiles, write_pngs
 from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split
 from clear_strategies.errors import DataError

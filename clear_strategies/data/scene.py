@@ -1,16 +1,29 @@
-"""The input of training: views at two scales, the initial points, and notes on where each came from."""
+"""The input of training: views at two scales, the initial points, and notes on where each came from. Whether masks and alpha
+leave anything to train on is checked here, for other trainers, too.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Final
 
 import torch
 
 from clear_strategies.core.points import PointCloud
-from clear_strategies.core.view import View
+from clear_strategies.core.view import Photo, View
 from clear_strategies.core.work_log import WorkLog
+from clear_strategies.data.photo_folders import some
+from clear_strategies.errors import DataError
 from rasterizers.interface import Color
+
+_log = logging.getLogger(__name__)
+
+_NOTHING: Final = 1e-3  # of a photo's pixels: one that shows fewer teaches nothing
+_NEARLY_ALL: Final = 0.9  # of the photos
+_FAINT: Final = 0.02  # alpha of a pixel that counts as transparent: 1 of 255 does, as in an alpha of 0 and 1
+_LITTLE: Final = 0.1  # of all pixels: less is more often a mask upside down than what was meant
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,3 +52,30 @@ class Scene:
     def to(self, device: torch.device | str) -> Scene:
         """The same scene with all views on `device`; the cloud, which is read once, stays on the CPU."""
         return replace(self, train=tuple(v.to(device) for v in self.train), test=tuple(v.to(device) for v in self.test))
+
+
+def require_shown(views: Sequence[View]) -> None:
+    """Warn of photos whose mask or alpha leaves nothing to train on, and of masks that leave little of all photos; a DataError
+    where nothing is left of nearly all photos.
+    """
+    shown = {view.name: _shown(view.lr) for view in views}
+    empty = [name for name, share in shown.items() if share < _NOTHING]
+    why = "their masks hide every pixel, or their alpha is 0"
+    if len(empty) > _NEARLY_ALL * len(views):
+        problem = f"show nothing of {len(empty)} of {len(views)} photos: {some(empty)}"
+        remedy = "a mask is 0 where it hides, and alpha where it is transparent: invert them, or train without them"
+        raise DataError(empty[0], "masks or alpha", problem, remedy)
+    if empty:
+        _log.warning("%d of %d photos teach nothing, since %s: %s.", len(empty), len(views), why, some(empty))
+    masked = [float(view.lr.shown.float().mean()) for view in views if view.lr.shown is not None]
+    if masked and sum(masked) < _LITTLE * len(masked):
+        message = "masks hide %.0f%% of their %d photos. A mask is 0 where it hides: are they upside down?"
+        _log.warning(message, 100 * (1 - sum(masked) / len(masked)), len(masked))
+
+
+def _shown(photo: Photo) -> float:
+    """The share of its pixels that a photo shows."""
+    shown = torch.ones(photo.image.shape[:2], dtype=torch.bool) if photo.shown is None else photo.shown.cpu()
+    if photo.transparency is not None:
+        shown = shown & (photo.transparency.cpu() < 1 - _FAINT)
+    return float(shown.float().mean())

@@ -23,12 +23,10 @@ from clear_strategies.data.scene import Scene
 from clear_strategies.jobs import device, resume
 from clear_strategies.jobs import scene as scenes
 from clear_strategies.jobs.exit_codes import require_viewer
-from clear_strategies.jobs.lock import hold
 from clear_strategies.jobs.settings import JobSettings, settings_of
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.outputs import plan, results, score_table
+from clear_strategies.outputs import metrics, plan, results
 from clear_strategies.outputs.metrics import Evaluation
-from clear_strategies.outputs.progress import progress_bar
 from clear_strategies.schedules import scaled
 from clear_strategies.training import memory, signals
 from clear_strategies.training.checkpoint import CHECKPOINTS
@@ -67,7 +65,7 @@ def run(
         require_viewer()
     conductor = settings.conductor(settings.fit.stretch)
     drawing = device.drawing(settings.rasterizer, settings.fit.device)
-    with hold(folder), signals.interrupted("before training began"):
+    with files.hold(folder), signals.interrupted("before training began"):
         if not resume.begun(folder):
             claim()
         return _Job(settings, conductor, drawing, resume.comparable(values), folder, overrides, claim).run()
@@ -120,9 +118,9 @@ class _Job:
         self._announce(scene, state, drawing, f"{threads} ({reason})", level)
         results.remove_earlier(folder, all_files=state.t == 1)
         evaluation, seconds = self._train(scene, there, state, drawing)
-        _log.log(level, "%s", score_table.describe(folder, evaluation, seconds))
+        _log.log(level, "%s", metrics.describe(folder, evaluation, seconds))
         if _in_sweep():
-            _log.info("%s", score_table.describe_job(HydraConfig.get().job.num, folder, evaluation, seconds))
+            _log.info("%s", metrics.describe_job(HydraConfig.get().job.num, folder, evaluation, seconds))
         if few:
             _log.warning("%s.", few)
         mean = evaluation.mean("test") or evaluation.mean("train")
@@ -179,7 +177,7 @@ class _Job:
         with signals.interrupted("before the run was finished", lambda: resume.newest(self.folder)):
             write_cameras(self.folder, scene)
             watched = self._watched(scene, state, painter)
-            with watched as after_step, progress_bar(state, after_step, title, shown=alone) as progress:
+            with watched as after_step, plan.progress_bar(state, after_step, title, shown=alone) as progress:
                 checkpoints = self.folder / CHECKPOINTS
                 fit(state, there, drawing.rasterizer, checkpoints=checkpoints, config=self.compared, progress=progress)
             seconds = time.perf_counter() - began

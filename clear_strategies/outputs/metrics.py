@@ -1,4 +1,4 @@
-"""Scores of a whole scene, and the content of metrics.json.
+"""Scores of a whole scene, the content of metrics.json, and what a run logs of them at its end.
 
 metrics.json: {"scene", "method", "strategies", "overrides", "seed", "iterations", "gaussians", "seconds", "conflict",
 "synthetic_prior", "config", "provenance", "note", "test": TABLE, "train": TABLE}, where TABLE is {"against", "views":
@@ -19,7 +19,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+import shlex
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -44,6 +45,11 @@ _log = logging.getLogger(__name__)
 NOTE: Final = (
     "bicubic and prior are made from the view's own LR photo, which a run never sees of a test view: they show what "
     "that photo allows, not what view synthesis can reach"
+)
+
+_LEGEND: Final = (
+    "  PSNR, SSIM: more is better; GMSD, the error of edges: less; blur, above 0 softer than the photo and below it harder: "
+    "closer to 0."
 )
 
 MOST_TRAIN: Final = 50  # training views that are scored; of more, those spaced evenly
@@ -192,3 +198,47 @@ def _scores_of(view: View, image: Float[Tensor, "H W 3"], down: DownKernel) -> d
     against = Truth(truth, mask)
     with ThreadPoolExecutor(torch.get_num_threads()) as threads:
         return dict(zip(scored, threads.map(against.score, scored.values()), strict=True))
+
+
+def describe(folder: Path, evaluation: Evaluation, seconds: float) -> str:
+    """The mean scores of the test and training views: of the run, and of the images that it is compared with."""
+    folder = _relative(folder)
+    rows = [(part, *row) for part in ("test", "train") for row in _rows(part, evaluation)]
+    width = max((len(image) for _, image, _ in rows), default=0)
+    lines = [f"done in {seconds:.0f} s: {folder}"]
+    lines += [f"  {part:<5}  {image:<{width}}  {numbers}" for part, image, numbers in rows]
+    if rows:
+        lines.append(_LEGEND)
+    if any(image in ("bicubic", "prior") for _, image, _ in rows):
+        lines.append(f"  {NOTE}.")
+    if unknown := " and ".join(part for part in ("test", "train") if evaluation.against_lr(part)):
+        lines.append(f"  {unknown}: the HR photos are unknown, so reduced images are compared with the LR photos.")
+    if evaluation.train and len(evaluation.train) < evaluation.train_views:
+        lines.append(
+            f"  train: {len(evaluation.train)} of the {evaluation.train_views} views, evenly spaced, are scored."
+        )
+    look = f"{folder / 'contact_sheet.png'}, or clear-strategies view {shlex.quote(str(folder))}"
+    return "\n".join([*lines, f"  look next: {look}"])
+
+
+def describe_job(number: int, folder: Path, evaluation: Evaluation, seconds: float) -> str:
+    """One line, of a job among many."""
+    means = ((part, mean) for part in ("test", "train") if (mean := evaluation.mean(part)) is not None)
+    score = next((f", {part} views {mean.psnr:.2f} dB" for part, mean in means), "")
+    return f"job {number}: done in {seconds:.0f} s{score}: {_relative(folder)}"
+
+
+def _relative(folder: Path) -> Path:
+    """Relative to the working directory, where the folder lies in it."""
+    return folder.relative_to(Path.cwd()) if Path.cwd() in folder.parents else folder
+
+
+def _rows(part: str, evaluation: Evaluation) -> Iterator[tuple[str, str]]:
+    # bicubic and prior are made from the LR photos, so they are not compared with these.
+    for image in ("ours",) if evaluation.against_lr(part) else ("ours", "bicubic", "prior"):
+        if (mean := evaluation.mean(part, image)) is not None:
+            yield image, _numbers(mean)
+
+
+def _numbers(m: ImageScores) -> str:
+    return f"PSNR {m.psnr:6.2f} dB   SSIM {m.ssim:7.4f}   GMSD {m.gmsd:7.4f}   blur {m.blur:+.4f}"

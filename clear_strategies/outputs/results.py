@@ -9,26 +9,29 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import torch
 from torch import Tensor
 
 from clear_strategies import files
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
 from clear_strategies.data.photo_files import write_png
+from clear_strategies.data.ply import GaussianPly, write_gaussians
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.view_names import file_stem
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.outputs import metrics
-from clear_strategies.outputs.export import export_ply
 from clear_strategies.outputs.figures import SheetRow, spaced, write_contact_sheet, write_curves
 from clear_strategies.outputs.maps import MAPS, write_coverage, write_maps
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.plan import Chosen
 from clear_strategies.outputs.provenance import provenance
 from clear_strategies.training import memory
+from clear_strategies.training.field import GaussianField
 from clear_strategies.training.state import TrainState
-from clear_strategies.viewing import cameras, video
-from clear_strategies.viewing.look import Painter
+from clear_strategies.viewing import cameras
+from clear_strategies.viewing.look import Painter, write_video
+from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, Rasterizer
 
 if TYPE_CHECKING:
@@ -102,6 +105,31 @@ def write_results(
     return evaluation
 
 
+def export_ply(path: Path, field: GaussianField, *, antialiased: bool = True, degree: int = 3) -> None:
+    """Write the field, atomically; f_det is folded into the colour, the 3D filter into scales and opacities.
+
+    Args:
+        antialiased: the field was trained with opacity compensation. The header then says `SplatRenderMode: mip`, and a viewer
+            that honours this draws the file in the same way.
+        degree: of view-dependent colour that is kept, at most that of the field.
+    """
+    splats = field.baked()
+    tiny = torch.finfo(torch.float32).eps
+    offset = splats.rgb_offset if splats.rgb_offset is not None else torch.zeros_like(splats.means)
+    higher = torch.zeros_like(field.shN.data)
+    higher[:, : splats.shN.shape[1]] = splats.shN  # bands above the active degree were never rendered
+    gaussians = GaussianPly(
+        means=splats.means,
+        sh0=splats.sh0 + offset[:, None] / SH_C0,
+        shN=higher[:, : (degree + 1) ** 2 - 1],
+        opacities=torch.logit(splats.opacities.clamp(tiny, 1 - tiny)),
+        scales=splats.scales.log(),
+        quats=torch.nn.functional.normalize(splats.quats, dim=-1),
+        antialiased=antialiased,
+    )
+    write_gaussians(path, gaussians)
+
+
 def remove_earlier(folder: Path, *, all_files: bool) -> None:
     """Remove metrics.json of an earlier run, because its presence says that a run is finished.
 
@@ -133,7 +161,7 @@ def _write_video(path: Path, train: Sequence[Camera], painter: Painter, frames: 
         return
     along = [cameras.at_most(camera, _LONGEST) for camera in cameras.through(train, frames)]
     try:
-        video.write_video(path, (images.to_bytes(painter.color(camera)) for camera in along))
+        write_video(path, (images.to_bytes(painter.color(camera)) for camera in along))
     except SettingError as missing:
         _log.info("no video of the camera path is written: %s", missing)
 

@@ -23,8 +23,7 @@ from jaxtyping import Float
 
 from clear_strategies.core.images import to_bytes
 from clear_strategies.geometry.cameras import looked_at
-from clear_strategies.viewing.look import Painter, colored, depth_range
-from clear_strategies.viewing.video import Pixels
+from clear_strategies.viewing.look import Painter, Pixels, colored, depth_range
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)

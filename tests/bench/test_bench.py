@@ -16,7 +16,7 @@ from clear_strategies.bench import results as timing
 from clear_strategies.bench.__main__ import main
 from clear_strategies.bench.rasterizers import ATTRIBUTES
 from clear_strategies.bench.results import Results
-from clear_strategies.outputs.export import export_ply
+from clear_strategies.outputs.results import export_ply
 from tests.helpers import toy
 from tests.helpers.backends import why_not
 

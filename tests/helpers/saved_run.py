@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 
 from clear_strategies import GCO
-from clear_strategies.outputs.export import export_ply
+from clear_strategies.outputs.results import export_ply
 from clear_strategies.training import checkpoint
 from clear_strategies.training.field import GaussianField
 from clear_strategies.viewing.cameras import write_cameras

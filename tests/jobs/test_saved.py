@@ -15,7 +15,7 @@ from clear_strategies.data.photo_files import image_size, read_image
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs.saved import open_splat
-from clear_strategies.outputs.export import export_ply
+from clear_strategies.outputs.results import export_ply
 from clear_strategies.training import checkpoint
 from tests.helpers import toy
 
@@ -150,8 +150,8 @@ def test_width_sets_the_size_and_a_file_of_cameras_gives_a_picture_of_each_and_o
     ("arguments", "message"),
     [
         (["--path", "nowhere"], "--path: must be cameras, train, test or a file"),
-        (["--frames", "0"], "must be above 0"),
-        (["--width", "0"], "must be above 0"),
+        (["--frames", "0"], "must be a whole number above 0"),
+        (["--width", "0"], "must be a whole number above 0"),
         (["--typo"], "unrecognized arguments: --typo"),
     ],
 )

@@ -12,9 +12,9 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from clear_strategies.files import LOCK, HeldError, hold
 from clear_strategies.hydra_app import FAILED, SweepCallback
 from clear_strategies.jobs import device
-from clear_strategies.jobs.lock import NAME, HeldError, hold
 from clear_strategies.training import checkpoint
 from tests.helpers.command_line import TINY, run, started, stopped_by, wait_for
 from tests.helpers.finished_run import make_run
@@ -92,7 +92,7 @@ def test_torch_and_kernels_divide_the_cores_among_the_jobs_whatever_an_earlier_j
 @pytest.mark.slow
 def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, monkeypatch):
     """So the same command, started several times, shares the work."""
-    from clear_strategies.jobs.lock import hold
+    from clear_strategies.files import hold
 
     with hold(tmp_path / "all" / "1"):
         result = run(*SWEEP, "+strategy=baseline,gco", "fit.iterations=3", cwd=tmp_path)
@@ -175,7 +175,7 @@ def test_a_held_folder_is_refused_released_when_the_job_fails_and_may_be_removed
         with pytest.raises(KeyError), hold(folder):
             raise KeyError
     with hold(tmp_path):
-        (tmp_path / NAME).unlink()
+        (tmp_path / LOCK).unlink()
     with hold(tmp_path / "run"):
         shutil.rmtree(tmp_path / "run")
 
@@ -183,7 +183,7 @@ def test_a_held_folder_is_refused_released_when_the_job_fails_and_may_be_removed
 HOLD = """
 import sys
 from pathlib import Path
-from clear_strategies.jobs.lock import hold
+from clear_strategies.files import hold
 with hold(Path(sys.argv[1])):
     print("got it", flush=True)
     sys.stdin.readline()

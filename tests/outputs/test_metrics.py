@@ -20,8 +20,7 @@ from clear_strategies.core.points import PointCloud
 from clear_strategies.data.scene import Scene
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.image_scores import PSNR_CAP, ImageScores, Truth
-from clear_strategies.outputs.metrics import NOTE, Evaluation, Table
-from clear_strategies.outputs.score_table import describe
+from clear_strategies.outputs.metrics import NOTE, Evaluation, Table, describe
 from rasterizers.interface import Camera
 from tests.helpers.image_files import noise
 

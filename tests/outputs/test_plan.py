@@ -11,7 +11,7 @@ import torch
 
 from clear_strategies import GCO, P2G, SVS, Grads, Objective, Strategy
 from clear_strategies.outputs import plan
-from clear_strategies.outputs.progress import progress_bar
+from clear_strategies.outputs.plan import progress_bar
 from clear_strategies.outputs.provenance import provenance
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.training.loop import iterate

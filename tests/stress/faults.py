@@ -18,7 +18,7 @@ import torch
 
 from clear_strategies import DataError, files
 from clear_strategies.data.photo_files import write_png
-from clear_strategies.outputs.export import export_ply
+from clear_strategies.outputs.results import export_ply
 from clear_strategies.training import checkpoint
 from clear_strategies.training.checkpoint import Checkpoint
 from clear_strategies.training.field import GaussianField

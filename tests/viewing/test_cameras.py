@@ -12,7 +12,7 @@ import torch
 
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.geometry.cameras import looked_at
-from clear_strategies.viewing import cameras, video
+from clear_strategies.viewing import cameras, look
 from rasterizers.interface import Camera
 from tests.helpers import toy
 
@@ -138,7 +138,7 @@ def frames_of(path):
 
 def test_an_mp4_holds_the_frames_in_a_folder_that_looks_like_a_protocol(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    video.write_video(Path("10:30/a.mp4"), iter(FRAMES), fps=10)
+    look.write_video(Path("10:30/a.mp4"), iter(FRAMES), fps=10)
     found = frames_of(tmp_path / "10:30" / "a.mp4")
     assert found.shape == (10, 32, 48, 3)
     assert np.abs(found.mean((1, 2, 3)) - np.arange(10) * 20).max() < 4
@@ -151,7 +151,7 @@ def test_a_video_that_breaks_leaves_nothing(tmp_path):
         raise RuntimeError
 
     with pytest.raises(RuntimeError):
-        video.write_video(tmp_path / "a.mp4", broken(), fps=10)
+        look.write_video(tmp_path / "a.mp4", broken(), fps=10)
     assert not list(tmp_path.iterdir())
 
 
@@ -160,7 +160,7 @@ def test_a_video_that_breaks_leaves_nothing(tmp_path):
 )
 def test_what_gives_no_video_is_refused(tmp_path, name, frames, message):
     with pytest.raises(SettingError, match=message):
-        video.write_video(tmp_path / name, frames, fps=10)
+        look.write_video(tmp_path / name, frames, fps=10)
 
 
 def test_a_missing_program_and_a_missing_library_are_named(monkeypatch, tmp_path):
@@ -169,7 +169,7 @@ def test_a_missing_program_and_a_missing_library_are_named(monkeypatch, tmp_path
 
     monkeypatch.setattr(ffmpeg, "get_ffmpeg_exe", nowhere)
     with pytest.raises(SettingError, match="does not run here: install ffmpeg"):
-        video.write_video(tmp_path / "a.mp4", FRAMES, fps=10)
+        look.write_video(tmp_path / "a.mp4", FRAMES, fps=10)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(SettingError, match="pip install imageio-ffmpeg"):
-        video.write_video(tmp_path / "a.mp4", FRAMES, fps=10)
+        look.write_video(tmp_path / "a.mp4", FRAMES, fps=10)

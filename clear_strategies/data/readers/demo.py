@@ -66,7 +66,7 @@ def read(*, width: int = 256, height: int = 192, views: int = 12, train: int = 3
         load = lru_cache(maxsize=1)(partial(render, camera))
         frames.append(Frame(f"demo_{i:02d}", camera, load, split="train" if i in chosen else "test"))
     notes = {"poses": "exact", "scene": "procedural room, photographs from scikit-image"}
-    return Capture("demo", tuple(frames), notes=notes, own_prior=DemoPrior, depth=depth)
+    return Capture("demo", tuple(frames), notes=notes, own_prior=DemoPrior)
 
 
 def render(camera: Camera) -> Float[Tensor, "H W 3"]:
@@ -77,12 +77,6 @@ def render(camera: Camera) -> Float[Tensor, "H W 3"]:
         colors = _cast(rays).reshape(-1, _RAYS, camera.width, _RAYS, 3)
         bands.append(colors.mean(axis=(1, 3)))
     return images.quantize(torch.from_numpy(np.concatenate(bands)).clamp(0, 1))
-
-
-def depth(camera: Camera) -> Float[Tensor, "H W"]:
-    """Depth (z) through each pixel's centre, infinite where there is no surface: the ground truth."""
-    rays = Rays.through(camera, 0, camera.height, 1)
-    return torch.from_numpy(np.min([surface.depth(rays) for surface in room()], axis=0))
 
 
 def _camera(position: float, width: int, height: int) -> Camera:

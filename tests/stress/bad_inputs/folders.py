@@ -6,8 +6,8 @@ from pathlib import Path
 
 from clear_strategies.data.photo_folders import image_folder, list_images
 from clear_strategies.data.readers import colmap
+from clear_strategies.files import hold
 from clear_strategies.jobs import resume
-from clear_strategies.jobs.lock import hold
 from clear_strategies.jobs.saved import open_splat
 from tests.helpers.captures import GOOD, READERS
 from tests.helpers.short_run import SCENE
