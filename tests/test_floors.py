@@ -33,7 +33,7 @@ DOORS = {
     door: named(own) for door, own in re.findall(r"`(\w+)`(?: \((.*?)\))?", PAGE.split("The doors")[1].split("\n\n")[0])
 }
 
-HEAVY = {"cv2", "kornia", "PIL", "warp", "gsplat", "hydra", "omegaconf"}
+HEAVY = {"cv2", "kornia", "open3d", "PIL", "warp", "gsplat", "hydra", "omegaconf"}
 PACKAGES = ("clear_strategies", "rasterizers", "integration")
 
 

@@ -126,7 +126,9 @@ def test_an_entry_point_without_a_package_is_named(tmp_path: Path, monkeypatch: 
 
 
 # ---- importing the library, an adapter or the geometry brings no heavy library into the host
-HEAVY = {*["cv2", "gsplat", "hydra", "kornia", "matplotlib", "msgspec", "nerfstudio", "scipy", "skimage", "warp"]}
+HEAVY = {
+    *["cv2", "gsplat", "hydra", "kornia", "matplotlib", "msgspec", "nerfstudio", "open3d", "scipy", "skimage", "warp"]
+}
 HOSTS = [f"integration.{host}" for host in ("gsplat", "inria", "nerfstudio")]
 MODULES = ["clear_strategies", "rasterizers", "integration", *HOSTS, "clear_strategies.geometry"]
 
