@@ -204,7 +204,7 @@ def test_the_compiled_sweep_is_the_readable_one(window: int, monkeypatch: pytest
     first, second = (Grey(p.camera, p.image.mean(2)) for p in plane_photos(2, 77, 71))
     planes = torch.tensor([1 / 8, 1 / 4.1, 1 / 3, 3.0])
     compiled = cost_volume(first, [second], planes, window)
-    monkeypatch.setattr(cost.cpp, "available", lambda: False)
+    monkeypatch.setattr(cost.native, "available", lambda: False)
     difference = (cost_volume(first, [second], planes, window) - compiled).abs()
     assert difference.median() < 1e-6
     assert difference.max() < 0.01  # where there is next to no contrast
@@ -214,7 +214,7 @@ def test_the_compiled_sweep_is_the_readable_one(window: int, monkeypatch: pytest
 def test_the_compiled_smoothing_is_the_readable_one(shape, monkeypatch):
     volume, image = torch.rand(shape), torch.rand(shape[:2])
     compiled = smooth(volume, image, 0.08, 0.6)
-    monkeypatch.setattr(cost.cpp, "available", lambda: False)
+    monkeypatch.setattr(cost.native, "available", lambda: False)
     assert torch.equal(compiled, smooth(volume, image, 0.08, 0.6))
 
 
