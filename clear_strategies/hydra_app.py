@@ -148,9 +148,8 @@ class SweepCallback(Callback):
     """Runs at the beginning and end of a sweep, in the process that was started; jobs may run in other processes."""
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        signal.signal(
-            signal.SIGTERM, signal.default_int_handler
-        )  # as Ctrl-C; else joblib's workers would go on without us
+        # As Ctrl-C; else joblib's workers would go on without us.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         for note in Path(config.hydra.sweep.dir).rglob(FAILED):  # of an earlier sweep
             note.unlink()
 

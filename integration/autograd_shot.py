@@ -160,9 +160,8 @@ class AutogradShot:
             weight = hr.m * lambda_hf  # of each Gaussian
             detail = self._detail(hr.hf.values)
             detail = None if detail is None else scale_rows(detail, weight)  # m ∇L_HF        Eq. 12
-            g = {
-                name: _plus_rows(value, hr.hf.values[name], weight) for name, value in g.items()
-            }  # g^HR           Eq. 13
+            # g^HR           Eq. 13
+            g = {name: _plus_rows(value, hr.hf.values[name], weight) for name, value in g.items()}
         values, colour = self._raw(g, hr.base.basis)
         return RoutedGradients(values, hr.step, colour, detail)
 

@@ -64,15 +64,6 @@ class GaussianPly:
     quats: Float[Tensor, "N 4"]  # wxyz, any norm
     antialiased: bool = True  # drawn with opacity compensation, as they were trained: see `RasterSettings`
 
-    def __post_init__(self) -> None:
-        n, bands = len(self.means), self.shN.shape[1]
-        if bands not in _BANDS:
-            raise ValueError(f"shN must have 0, 3, 8 or 15 bands, got {bands}.")
-        shapes = {"means": (n, 3), "sh0": (n, 1, 3), "shN": (n, bands, 3), "opacities": (n,)}
-        for name, shape in {**shapes, "scales": (n, 3), "quats": (n, 4)}.items():
-            if (given := tuple(getattr(self, name).shape)) != shape:
-                raise ValueError(f"{name} must have shape {shape}, got {given}.")
-
     def __len__(self) -> int:
         return self.means.shape[0]
 

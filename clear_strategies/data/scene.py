@@ -28,21 +28,25 @@ _LITTLE: Final = 0.1  # of all pixels: less is more often a mask upside down tha
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """The input of a run."""
+    """The input of a run.
+
+    Args:
+        background: behind the Gaussians.
+        synthetic_prior: the SR images contain seeded errors, or the truth (the demo); reports mark such runs.
+        notes: label -> fact, as the plan prints and the provenance keeps them.
+        unplaced: see `Capture.unplaced`; such photos are not used.
+        work_log: how long the views and the initial points took.
+    """
 
     name: str
     train: tuple[View, ...]
     test: tuple[View, ...]
     cloud: PointCloud
-    background: Color = (0.0, 0.0, 0.0)  # behind the Gaussians
-    synthetic_prior: bool = (
-        False  # the SR images contain seeded errors, or the truth (the demo); reports mark such runs
-    )
-    notes: dict[str, str] = field(
-        default_factory=dict
-    )  # label -> fact, as the plan prints and the provenance keeps them
-    unplaced: Mapping[str, str] = field(default_factory=dict)  # see `Capture.unplaced`; such photos are not used
-    work_log: WorkLog = field(default_factory=WorkLog)  # how long the views and the initial points took
+    background: Color = (0.0, 0.0, 0.0)
+    synthetic_prior: bool = False
+    notes: dict[str, str] = field(default_factory=dict)
+    unplaced: Mapping[str, str] = field(default_factory=dict)
+    work_log: WorkLog = field(default_factory=WorkLog)
 
     @property
     def device(self) -> torch.device:

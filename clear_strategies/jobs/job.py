@@ -5,8 +5,8 @@ from __future__ import annotations
 import functools
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -156,17 +156,13 @@ class _Job:
         if idle and not isinstance(state.density.settings, type(self.settings.density)):
             _log.warning("%s has no effect: %s densifies in place of it.", ", ".join(idle), state.density.name)
 
-    @contextmanager
-    def _watched(self, scene: Scene, state: TrainState, painter: Painter) -> Iterator[Callable[[], None] | None]:
-        """Open the viewer if `fit.viewer` asks for it, and yield a function to call after each iteration."""
+    def _watched(self, scene: Scene, painter: Painter) -> AbstractContextManager[Callable[[int], None] | None]:
+        """Opens the viewer if `fit.viewer` asks for it; its value is called after each iteration."""
         if not self.settings.fit.viewer:
-            yield None
-            return
+            return nullcontext()
         from clear_strategies.viewing.server import watched
 
-        cameras = [view.hr.camera for view in scene.train]
-        with watched(painter, cameras, f"{scene.name} · {self.chosen.title}") as turn:
-            yield lambda: turn(state.t - 1)
+        return watched(painter, [view.hr.camera for view in scene.train], f"{scene.name} · {self.chosen.title}")
 
     def _train(
         self, scene: Scene, there: Scene, state: TrainState, drawing: device.Drawing
@@ -176,8 +172,10 @@ class _Job:
         began = time.perf_counter() - state.seconds  # with what a resumed run took before
         with signals.interrupted("before the run was finished", lambda: resume.newest(self.folder)):
             write_cameras(self.folder, scene)
-            watched = self._watched(scene, state, painter)
-            with watched as after_step, plan.progress_bar(state, after_step, title, shown=alone) as progress:
+            with (
+                self._watched(scene, painter) as after_step,
+                plan.progress_bar(state, after_step, title, shown=alone) as progress,
+            ):
                 checkpoints = self.folder / CHECKPOINTS
                 fit(state, there, drawing.rasterizer, checkpoints=checkpoints, config=self.compared, progress=progress)
             seconds = time.perf_counter() - began

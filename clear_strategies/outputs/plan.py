@@ -133,13 +133,13 @@ def _listed(iterations: Mapping[str, int]) -> str:
 
 @contextmanager
 def progress_bar(
-    state: TrainState, after_step: Callable[[], None] | None = None, name: str | None = None, *, shown: bool = True
+    state: TrainState, after_step: Callable[[int], None] | None = None, name: str | None = None, *, shown: bool = True
 ) -> Iterator[Progress]:
     """A bar with loss, PSNR, number of Gaussians, conflict ratio and remaining time; where stderr is no terminal, 20 lines of it.
     Yields the function that advances it.
 
     Args:
-        after_step: called after each iteration.
+        after_step: called after each iteration, with its number.
         name: of the training, in front of the bar.
         shown: False where several jobs share the terminal.
     """
@@ -165,7 +165,7 @@ def progress_bar(
             if line:
                 sys.stderr.write(f"{bar}\n")
             if after_step is not None:
-                after_step()
+                after_step(state.t - 1)
 
         yield update
 

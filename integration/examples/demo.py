@@ -18,6 +18,7 @@ from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.training.field import GaussianField
 
 RATES: Final = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
+_FACTOR: Final = 4
 
 Render = Callable[[Tensor, Tensor, int, int], Tensor]
 
@@ -53,22 +54,20 @@ class Demo:
         return float(torch.stack(errors).log10().mean() * -10)
 
 
-def load_demo(
-    width: int = 256, height: int = 192, factor: int = 4, train: int = 3, device: torch.device | str = "cpu"
-) -> Demo:
-    """The demo's twelve views, of which `train` are for training.
+def load_demo(width: int = 256, height: int = 192, device: torch.device | str = "cpu") -> Demo:
+    """The demo's twelve views, three of them for training.
 
     Args:
-        width, height: of the HR images, px; multiples of `factor`, by which the training photos are reduced (bicubic).
+        width, height: of the HR images, px; multiples of 4, by which the training photos are reduced (bicubic).
         device: of the photos and the cameras.
     """
-    frames = demo.read(width=width, height=height, train=train).frames
+    frames = demo.read(width=width, height=height).frames
     trained = [frame for frame in frames if frame.split == "train"]
     return Demo(
         [frame.name for frame in trained],
-        torch.stack([images.downsample(frame.load(), factor) for frame in trained]).to(device),
+        torch.stack([images.downsample(frame.load(), _FACTOR) for frame in trained]).to(device),
         torch.stack([frame.camera.world_to_camera.float() for frame in trained]).to(device),
-        torch.stack([intrinsics(frame.camera.scaled(1 / factor)).float() for frame in trained]).to(device),
+        torch.stack([intrinsics(frame.camera.scaled(1 / _FACTOR)).float() for frame in trained]).to(device),
         DemoPrior(truth={frame.name: frame.load for frame in trained}),
         [
             (f.camera.world_to_camera.float().to(device), intrinsics(f.camera).float().to(device), f.load().to(device))
@@ -79,7 +78,7 @@ def load_demo(
 
 
 def splats_with_optimizers(
-    means: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"], sh_degree: int = 3
+    means: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"]
 ) -> tuple[dict[str, torch.nn.Parameter], dict[str, torch.optim.Adam]]:
     """The dictionaries of parameters and optimizers of a gsplat loop, as `create_splats_with_optimizers` of gsplat's
     simple_trainer.py makes them: round Gaussians as large as the distance to their neighbours, opacity 0.1.
@@ -87,6 +86,6 @@ def splats_with_optimizers(
     Args:
         means: world units. colors: RGB in [0, 1].
     """
-    start = GaussianField.from_cloud(PointCloud(means.cpu(), colors.cpu(), "given"), max_degree=sh_degree).raw()
+    start = GaussianField.from_cloud(PointCloud(means.cpu(), colors.cpu(), "given"), max_degree=3).raw()
     splats = {name: torch.nn.Parameter(start[name].to(means).clone()) for name in RATES}
     return splats, {name: torch.optim.Adam([p], lr=RATES[name], eps=1e-15) for name, p in splats.items()}

@@ -70,7 +70,7 @@ def test_a_strategy_without_effect_is_warned_of(caplog: pytest.LogCaptureFixture
 
 def test_the_progress_bar_counts_iterations(capsys: pytest.CaptureFixture[str]) -> None:
     state, steps = started(), []
-    with progress_bar(state, lambda: steps.append(state.t)) as update:
+    with progress_bar(state, lambda t: steps.append(t + 1)) as update:
         for _ in range(10):
             iterate(state, toy.RASTERIZER)
             update(state)

@@ -134,11 +134,7 @@ def find_model(root: Path) -> Path:
 
 
 def read_model(folder: Path) -> Model:
-    """Cameras, images and points of a model folder; a DataError where a file is missing or not what it should be.
-
-    Raises:
-        DataError: a file is missing or not what it should be.
-    """
+    """Cameras, images and points of a model folder; a DataError where a file is missing or not what it should be."""
     cameras, listing, points3d = _files(folder)
     lenses, images = read_cameras(cameras), read_images(listing)
     if not images:

@@ -169,10 +169,7 @@ class Finish:
 
     texture: str  # a photograph of scikit-image
     tint: Vector = (1.0, 1.0, 1.0)
-    repeat: tuple[float, float] = (
-        1.0,
-        1.0,
-    )  # on the surface's chart; every second one is mirrored, so that there is no seam
+    repeat: tuple[float, float] = (1.0, 1.0)  # on the surface's chart, every second one mirrored: there is no seam
     shift: tuple[float, float] = (0.0, 0.0)
     gloss: float = 0.0  # strength of the lamp's reflection
 

@@ -109,11 +109,7 @@ def copy_name(index: int) -> str:
 
 
 def require_placed(root: Path, placed: int, count: int, least: float = 0.0) -> None:
-    """Raise a DataError where fewer than `FEWEST` of `count` photos are placed, or a smaller share than `least`.
-
-    Raises:
-        DataError: fewer than `FEWEST` of `count` photos are placed, or a smaller share.
-    """
+    """Raise a DataError where fewer than `FEWEST` of `count` photos are placed, or a smaller share than `least`."""
     if placed >= FEWEST and placed / count >= least:
         return
     remedy = MORE_PHOTOS
