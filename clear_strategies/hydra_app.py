@@ -52,7 +52,7 @@ def main(overrides: Sequence[str] | None = None) -> None:
     arguments = sys.argv[1:] if overrides is None else overrides
     _require_known_flags(arguments)
     sys.argv[1:] = [_VERBOSE if a in ("-v", "--verbose") else readable(a) for a in arguments]  # Hydra reads them there
-    exit_codes.require_train()
+    exit_codes.require("train")
     try:
         hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(job)()
     except ConfigCompositionException as error:

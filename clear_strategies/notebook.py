@@ -88,7 +88,7 @@ def train(photos: str | Path | None = None, *settings: str, folder: str | Path |
         SettingError, StrategyConflict: a setting cannot be used; those of Hydra itself (hydra.run.dir) cannot.
         DataError: a photo or a file cannot be used.
     """
-    exit_codes.require_train()
+    exit_codes.require("train")
     console.show()
     overrides = list(settings) if photos is None else train_command.overrides([str(photos), *settings])
     if photos is None and not any(word.startswith(train_command.CHOOSE_STRATEGIES) for word in settings):

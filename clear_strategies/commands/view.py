@@ -12,7 +12,7 @@ from contextlib import suppress
 from clear_strategies import console
 from clear_strategies.commands import parser_of
 from clear_strategies.errors import SettingError
-from clear_strategies.jobs.exit_codes import require_viewer
+from clear_strategies.jobs import exit_codes
 
 _log = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ def main(arguments: Sequence[str]) -> None:
         raise SettingError(f"--port: must be 0 to 65535, got {options.port}.")
     from clear_strategies.jobs.saved import open_splat
 
-    require_viewer()
+    exit_codes.require("view")
     splat = open_splat(options.run, options.rasterizer)
     _log.info("%s", splat.source)
     from clear_strategies.viewing.server import SplatViewer

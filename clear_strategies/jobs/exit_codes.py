@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import errno
 import signal
-from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import Final, NamedTuple
 
@@ -25,10 +24,13 @@ UNUSABLE: Final = 2
 NO_DISK: Final = 3
 SIGNALS: Final = 128
 
-# What the extra [train] brings beside the core, by the names that are imported.
-TRAIN: Final = (
-    "cv2", "filelock", "jinja2", "kornia", "matplotlib", "msgspec", "pandas", "safetensors", "scipy", "skimage", "tqdm",
-)  # fmt: skip
+# What needs an extra, by its name, and the modules that it brings.
+NEEDED: Final = {
+    "train": ("training", (
+        "cv2", "filelock", "jinja2", "kornia", "matplotlib", "msgspec", "pandas", "safetensors", "scipy", "skimage", "tqdm",
+    )),
+    "view": ("the viewer", ("viser", "nerfview", "splines")),
+}  # fmt: skip
 
 
 class Ending(NamedTuple):
@@ -67,16 +69,8 @@ def _library_errors() -> tuple[type[Exception], ...]:
     return BackendUnavailable, HydraException, OmegaConfBaseException
 
 
-def require_train() -> None:
-    """Raise a SettingError where one of the trainer's libraries is not installed; none is imported."""
-    _require("training", "train", TRAIN)
-
-
-def require_viewer() -> None:
-    """Raise a SettingError where one of the viewer's libraries is not installed; none is imported."""
-    _require("the viewer", "view", ("viser", "nerfview", "splines"))
-
-
-def _require(what: str, extra: str, modules: Sequence[str]) -> None:
+def require(extra: str) -> None:
+    """Raise a SettingError where a library of this extra of `NEEDED` is not installed; none is imported."""
+    what, modules = NEEDED[extra]
     if missing := [name for name in modules if find_spec(name) is None]:
         raise SettingError(f"{what} needs {', '.join(missing)}: pip install 'clear-strategies[{extra}]'.")

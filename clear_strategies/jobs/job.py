@@ -20,9 +20,8 @@ from clear_strategies import files
 from clear_strategies.compose import tree
 from clear_strategies.data.prepare import save_lr
 from clear_strategies.data.scene import Scene
-from clear_strategies.jobs import device, resume
+from clear_strategies.jobs import device, exit_codes, resume
 from clear_strategies.jobs import scene as scenes
-from clear_strategies.jobs.exit_codes import require_viewer
 from clear_strategies.jobs.settings import JobSettings, settings_of
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.outputs import metrics, plan, results
@@ -62,7 +61,7 @@ def run(
     values = tree(config)
     settings = settings_of(values)
     if settings.fit.viewer:
-        require_viewer()
+        exit_codes.require("view")
     conductor = settings.conductor(settings.fit.stretch)
     drawing = device.drawing(settings.rasterizer, settings.fit.device)
     with files.hold(folder), signals.interrupted("before training began"):

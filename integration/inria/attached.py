@@ -21,7 +21,7 @@ from integration.autograd_shot import HostOutput, Target
 from integration.densification import require_end, warn_if_score_is_unused
 from integration.inria.cameras import HostViews, enlarged_camera, replaced_camera
 from integration.inria.detail import DetailFeature
-from integration.inria.model_proxy import Overrides, Role, host_output, proxy
+from integration.inria.model_proxy import Overrides, host_output, proxy
 from integration.inria.rows import CarriedRows
 from integration.replacing import replace_everywhere, replace_methods, replaced_attribute
 from integration.views import SuperResolve, sr_source
@@ -34,12 +34,6 @@ _ATTRIBUTES: Final = {
     "means": "_xyz", "quats": "_rotation", "scales": "_scaling", "opacities": "_opacity", "sh0": "_features_dc",
     "shN": "_features_rest",
 }  # fmt: skip
-_ROLES: Final[tuple[tuple[str, Role], ...]] = (
-    ("get_opacity", "gate"),
-    ("get_opacity_with_3D_filter", "gate"),
-    ("get_scaling_n_opacity_with_3D_filter", "gate"),
-    ("_features_dc", "detail"),
-)
 _SAVERS: Final = ("save_ply", "save_fused_ply")
 _STATE: Final = "clear"
 """Key of our state in the optimizer's state, which the host's checkpoints hold."""
@@ -130,7 +124,7 @@ class Attached:
             view = self.views.find(viewpoint_camera) if torch.is_grad_enabled() else None
             if view is None:  # evaluation, a viewer, a camera without a photo
                 shown = Overrides(detail=self.detail.value.detach() if self._trains_detail else None)
-                return render(viewpoint_camera, proxy(self._model, shown, _ROLES), *args, **kwargs)
+                return render(viewpoint_camera, proxy(self._model, shown), *args, **kwargs)
             if kwargs.get("subpixel_offset") is not None:
                 raise HostError(
                     "rays are jittered, and two scales of a view cannot share that. Train without ray_jitter."
@@ -142,7 +136,7 @@ class Attached:
                 camera, pinhole = self._camera_of(target, viewpoint_camera, sized)
                 params = self.params() if target == "hr" else self._host_params()
                 overrides = Overrides(gate, params.get("detail"))
-                call = signature.bind(camera, proxy(self._model, overrides, _ROLES), *args, **kwargs)
+                call = signature.bind(camera, proxy(self._model, overrides), *args, **kwargs)
                 call.arguments |= self._bg_color(call.arguments.get("bg_color"))
                 with recorded() as drawings:
                     result = render(*call.args, **call.kwargs)

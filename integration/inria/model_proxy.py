@@ -8,7 +8,7 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import torch
 from jaxtyping import Float
@@ -22,6 +22,15 @@ from rasterizers.interface import Camera
 
 Role = Literal["gate", "detail"]
 """What an override changes: opacities are multiplied by the gate, colours are offset by f_det."""
+_ROLES: Final[tuple[tuple[str, Role], ...]] = (
+    ("get_opacity", "gate"),
+    ("get_opacity_with_3D_filter", "gate"),
+    ("get_scaling_n_opacity_with_3D_filter", "gate"),
+    ("_features_dc", "detail"),
+)
+"""Names of a model's getters, methods and attributes, those that it has. Of role "gate" are opacities (or a tuple that ends with
+them), of role "detail" is the constant band of the colours.
+"""
 
 
 @dataclass(slots=True, eq=False)
@@ -41,24 +50,18 @@ class Overrides:
     active: set[Role] = field(default_factory=set)
 
 
-def proxy(model: Any, overrides: Overrides, roles: tuple[tuple[str, Role], ...]) -> Any:
-    """An object of the model's class that shares its attributes and applies the overrides.
-
-    Args:
-        roles: names of the model's getters, methods and attributes. Those of role "gate" give opacities (or a tuple that
-            ends with them), those of role "detail" the constant band of the colours. Names that the model does not have
-            are ignored.
-    """
-    result: Any = object.__new__(_proxy_class(type(model), roles))  # type: ignore[arg-type]
+def proxy(model: Any, overrides: Overrides) -> Any:
+    """An object of the model's class that shares its attributes and applies the overrides."""
+    result: Any = object.__new__(_proxy_class(type(model)))  # type: ignore[arg-type]
     object.__setattr__(result, "__dict__", vars(model))
     object.__setattr__(result, "_clear_overrides", overrides)
     return result
 
 
 @cache
-def _proxy_class(cls: type, roles: tuple[tuple[str, Role], ...]) -> type:
+def _proxy_class(cls: type) -> type:
     members: dict[str, Any] = {"__slots__": ("_clear_overrides",), "__module__": cls.__module__}
-    for name, role in roles:
+    for name, role in _ROLES:
         members |= {name: _member(inspect.getattr_static(cls, name, None), name, role)}
     return type(cls.__name__, (cls,), members)
 

@@ -93,7 +93,7 @@ def test_a_port_that_no_machine_has_and_an_address_of_another_machine_are_refuse
 def test_missing_libraries_are_named(monkeypatch):
     monkeypatch.setattr(exit_codes, "find_spec", lambda name: None if name == "viser" else object())
     with pytest.raises(SettingError, match=r"the viewer needs viser: pip install 'clear-strategies\[view\]'"):
-        exit_codes.require_viewer()
+        exit_codes.require("view")
 
 
 def test_a_viewer_is_there_while_a_run_trains_and_draws_between_two_iterations_alone(saved_run, monkeypatch):
