@@ -221,7 +221,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory):
 @pytest.mark.parametrize("scale", [1e-5, 0.003, 100.0, 1e5])
 def test_a_scene_in_other_units_gives_equal_results(scale: float, trained, caplog) -> None:
     score, folder = trained(scale)
-    assert score == pytest.approx(trained(1.0)[0], abs=0.2)
+    # Rounding alone moves 60 iterations by up to 0.3 dB (a scale of 100, with AVX2); a length in wrong units by several.
+    assert score == pytest.approx(trained(1.0)[0], abs=0.4)
     assert "near" not in caplog.text
     for saved in (folder, folder / "point_cloud.ply"):
         splat = open_splat(saved)
