@@ -146,9 +146,8 @@ class GaussianField(nn.Module):
         # √(s² + f²), and s itself where the squares vanish; torch's hypot takes ten times as long.
         filtered = torch.maximum(scales, (scales.square() + self.filter_3d[:, None].square()).sqrt_())
         shares = scales / filtered
-        coefficient = (
-            shares[:, 0] * shares[:, 1] * shares[:, 2]
-        )  # torch's product over rows of three takes twice as long
+        # torch's product over rows of three takes twice as long.
+        coefficient = shares[:, 0] * shares[:, 1] * shares[:, 2]
         sigmoid = raw["opacities"].sigmoid()
         z = coefficient if gate is None else coefficient * gate.to(coefficient)
         bands = (self.degree + 1) ** 2 - 1

@@ -1,4 +1,4 @@
-// How a patch map reaches a Gaussian (core/evidence.py), and its binding.
+// How a patch map reaches a Gaussian (strategies/p2g.py), and its binding.
 #pragma once
 
 #include <nanobind/nanobind.h>
