@@ -338,7 +338,7 @@ class Attachment:
         if "detail" in params and hr is not None and hr.hf is not None:
             self._decay_detail(params["detail"])
         if screen_gradient is not None and hr is not None:
-            scores = partial(self.conductor.scores, hr=hr, t=self.t)
+            scores = partial(self.conductor.scores, hr=hr, weights=self.conductor.objective.weights(self.t))
             if write_score(output.shot, screen_gradient / scale, scores, self._scaler, scale):
                 self.counts["scores written"] += 1
         self._grads_before = {}

@@ -231,12 +231,14 @@ class Traits:
         dtypes: the types that the splats' tensors may have.
         native_threads: it computes on the threads of `rasterizers.native`, not on torch's.
         depth: it draws expected depth. Without this trait nobody passes the argument `depth`, so its methods may lack it.
+        records: it is a `Recordable`.
     """
 
     devices: frozenset[str]
     dtypes: frozenset[torch.dtype]
     native_threads: bool = False
     depth: bool = False
+    records: bool = False
 
 
 @runtime_checkable
@@ -261,6 +263,23 @@ class Rasterizer(Protocol):
 
         Backends may share work between jobs whose splats hold the same tensor objects.
         """
+        ...
+
+
+@runtime_checkable
+class Recordable(Protocol):
+    """A rasterizer whose renderings can be part of a `recording.Recording`: what changes from one replay to the next, it reads
+    from tensors.
+    """
+
+    def numbers_of(self, camera: Camera, device: torch.device) -> Sequence[Tensor]:
+        """A camera's numbers, in tensors that belong to this camera object. Another camera's of the same size may be copied to
+        them.
+        """
+        ...
+
+    def over_changing(self, background: Float[Tensor, "1 3"]) -> Rasterizer:
+        """The rasterizer with a background on the device."""
         ...
 
 

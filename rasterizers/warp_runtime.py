@@ -11,7 +11,7 @@ import math
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from struct import Struct
 from typing import Any, Final
@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from rasterizers.interface import BackendUnavailable
+from rasterizers.recording import running
 
 
 def require_warp(what: str, device: str, otherwise: str) -> None:
@@ -71,7 +72,9 @@ def launch(
     recorded = _recorded.launches.get(key)
     if recorded is None:
         recorded = _recorded.launches[key] = _Launch(kernel, device, block)
-    recorded(size, arguments)
+    recorded.prepare(size, arguments).launch()
+    if (recording := running()) is not None:
+        recording.launched(_Launch(kernel, device, block).prepare(size, arguments).launch, arguments)
 
 
 class _Launch:
@@ -89,7 +92,7 @@ class _Launch:
         # For each argument that is an array: by shape and strides, its description, of which only the address changes.
         self.arrays: list[dict[Any, Any] | None] = [{} if wp.types.is_array(kind) else None for kind in self.kinds]
 
-    def __call__(self, size: tuple[int, ...], arguments: Sequence[Any]) -> None:
+    def prepare(self, size: tuple[int, ...], arguments: Sequence[Any]) -> Any:
         command = self.command
         params = command.params  # the bounds, and the arguments
         if size != self.size:
@@ -108,7 +111,7 @@ class _Launch:
                 described.data = argument.data_ptr()
             if self.on_cuda:
                 command.params_addr[index] = ctypes.addressof(params[index])
-        command.launch()
+        return command
 
     def _described(self, index: int, layout: Any, tensor: Tensor) -> Any:
         known = self.arrays[index - 1]
@@ -152,6 +155,9 @@ def sort_pairs(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
     """
     import warp as wp
 
+    if (recording := running()) is not None:
+        copies = [wp.from_torch(x) for x in (keys, values)]  # the kept ones lie elsewhere at the next sort
+        recording.launched(partial(wp.utils.radix_sort_pairs, *copies, count, end_bit=bits), (keys, values))
     key = len(keys), keys.device
     arrays = _recorded.sorts.get(key)
     if arrays is None:
@@ -168,12 +174,16 @@ def sort_pairs(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
 def array(tensor: Tensor | None, kind: Any) -> Any:
     """A tensor as a kernel's array of type `kind`, without a copy; the caller keeps it alive. None becomes an empty array.
 
-    The tensor may have more dimensions than the array: those of the array's vectors or matrices, and before them some that the
-    array's last dimension goes through.
+    The tensor may have more dimensions than the array: those of the array's vectors or matrices, or one with the numbers of a
+    structure, and before them some that the array's last dimension goes through.
     """
     if tensor is None:
         return _empty_array()
-    n, inner, shape, strides = kind.ndim, getattr(kind.dtype, "_shape_", ()), tensor.shape, tensor.stride()
+    n, shape, strides = kind.ndim, tensor.shape, tensor.stride()
+    is_struct = hasattr(kind.dtype, "ctype")
+    inner = (
+        (ctypes.sizeof(kind.dtype.ctype) // tensor.element_size(),) if is_struct else getattr(kind.dtype, "_shape_", ())
+    )
     outer, dense = len(shape) - len(inner), tuple(math.prod(inner[k + 1 :]) for k in range(len(inner)))
     last = [
         (length, step) for length, step in zip(shape[n - 1 : outer], strides[n - 1 : outer], strict=True) if length != 1
@@ -209,6 +219,16 @@ def struct(kind: Any, rows: Mapping[str, Tensor | None], **values: Any) -> Any:
     for name, tensor in given.items():
         _ADDRESS.pack_into(memory, offsets[name], tensor.data_ptr())
     return kind.ctype.from_buffer(memory)
+
+
+def on_device(structure: Any, device: torch.device) -> Tensor:
+    """A structure without arrays as an array of one, in a tensor of its bytes."""
+    return sent(torch.frombuffer(bytearray(structure), dtype=torch.uint8)[None], device)
+
+
+def sent(numbers: Tensor, device: torch.device) -> Tensor:
+    """A small tensor on the device; the host does not wait for it."""
+    return numbers.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else numbers
 
 
 _MOST_STRUCTURES: Final = 1024

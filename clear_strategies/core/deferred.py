@@ -14,12 +14,14 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import islice, takewhile
+from itertools import accumulate, islice, takewhile
 from typing import Final, NamedTuple, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+from rasterizers.recording import running
 
 
 class Deferred(NamedTuple):
@@ -48,8 +50,8 @@ Number = Scalar | Deferred | Element
 
 
 def is_immediate(x: Tensor) -> bool:
-    """Whether scalars computed from x are read at once: x is in the CPU's memory."""
-    return x.device.type == "cpu"
+    """Whether scalars computed from x are read at once: x is in the CPU's memory, and nothing is being recorded."""
+    return x.device.type == "cpu" and running() is None
 
 
 def scalar(x: Tensor) -> Scalar:
@@ -82,6 +84,22 @@ def read(numbers: Sequence[Number]) -> list[float]:
         return values[id(x)][0] if isinstance(x, Tensor) else x
 
     return [value(x) for x in numbers]
+
+
+def gathered(row: Mapping[str, Number]) -> tuple[Float[Tensor, " K"], Callable[[Tensor], dict[str, Number]]]:
+    """The numbers on the device that a row is made of, as one float64 vector, and the row of a copy of that vector."""
+    found = {id(x): x for number in row.values() for x in _tensors(number)}
+    firsts = dict(zip(found, accumulate((x.numel() for x in found.values()), initial=0), strict=False))
+    vector = torch.cat([x.reshape(-1).double() for x in found.values()])
+
+    def of(number: Number, copy: Tensor) -> Number:
+        if isinstance(number, Deferred):
+            return Deferred(number.recipe, tuple(of(part, copy) for part in number.parts))
+        if isinstance(number, Element):
+            return Element(copy, firsts[id(number.vector)] + number.k)
+        return Element(copy, firsts[id(number)]) if isinstance(number, Tensor) else number
+
+    return vector, lambda copy: {name: of(number, copy) for name, number in row.items()}
 
 
 def resolve(rows: Sequence[dict[str, Number]]) -> Sequence[dict[str, float]]:

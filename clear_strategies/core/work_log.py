@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
 import torch
 from jaxtyping import Shaped
 from torch import Tensor
+
+from rasterizers.recording import running
 
 _BATCH: Final = 1024  # pairs of events that are kept before those that the device has passed are read
 
@@ -42,6 +44,7 @@ class WorkLog:
         self._entries: dict[str, Entry] = {}
         self._stamped: deque[tuple[Entry, Any, Any]] = deque()
         self._counted: dict[tuple[str, str], Tensor] = {}
+        self._noted: list[tuple[str, str, int | Tensor]] | None = None
 
     @property
     def entries(self) -> dict[str, Entry]:
@@ -54,17 +57,32 @@ class WorkLog:
         return self._entries
 
     def stage(self, name: str) -> AbstractContextManager[None]:
-        """Count and time a block. Seconds are wall-clock on the CPU and device time on CUDA. Stages do not nest."""
+        """Count and time a block. Seconds are wall-clock on the CPU and device time on CUDA. Stages do not nest, and what is
+        recorded is not timed.
+        """
+        if running() is not None:
+            return nullcontext()
         return _Stage(self, name)
 
     def skip(self, name: str, reason: str, count: int | Shaped[Tensor, ""] = 1) -> None:
         """Count a skipped block, or `count` skipped rows of one; a count on the device is read later."""
-        if not isinstance(count, Tensor):
+        if self._noted is not None:
+            self._noted.append((name, reason, count))
+        elif not isinstance(count, Tensor):
             self._add(name, reason, count)
         elif (name, reason) in self._counted:
             self._counted[name, reason] += count
         else:
             self._counted[name, reason] = count.to(torch.int64, copy=True)  # the caller may overwrite its tensor
+
+    @contextmanager
+    def noted(self) -> Iterator[list[tuple[str, str, int | Tensor]]]:
+        """A scope in which skips are not counted but noted: the arguments of each `skip`."""
+        self._noted = []
+        try:
+            yield self._noted
+        finally:
+            self._noted = None
 
     def rows(self) -> list[dict[str, str | int | float]]:
         """One row per stage: runs, ms per run, seconds, skips, and the seconds that these saved at that rate."""

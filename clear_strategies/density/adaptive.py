@@ -190,7 +190,7 @@ class Density(Densifier):
         """Lower every rendered opacity to at most 0.01 (the form of Mip-Splatting)."""
         coefficient = field.opacity_coefficient().clamp_min(torch.finfo(torch.float32).tiny)
         target = field.filtered_opacities().clamp_max(_RESET_OPACITY) / coefficient
-        field.opacities.data = torch.minimum(field.opacities.data, torch.logit(target.clamp(1e-6, 1 - 1e-6)))
+        field.opacities.data.clamp_max_(torch.logit(target.clamp(1e-6, 1 - 1e-6)))
         optimizer.forget("opacities")
 
     def state_dict(self) -> dict[str, Tensor]:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.core.conflicts import conflict_ratio
-from clear_strategies.core.deferred import Number
+from clear_strategies.core.deferred import Number, Scalar
 from clear_strategies.core.finite import require_finite, require_finite_losses
 from clear_strategies.core.gradients import Grads, Shot, screen_in_ndc, screen_norm
 from clear_strategies.core.step import Step
@@ -196,7 +196,10 @@ class Conductor:
         with stage("strategies" if stepper is None else stepper.stage):
             score = ordinary = None
             if scored:
-                score, ordinary = self.scores(screen_in_ndc(g_lr, _size(rendered.image)), from_hr, t)  # S^dens   Eq. 14
+                weights = (o if stepper is None else stepper).weights(t)
+                score, ordinary = self.scores(
+                    screen_in_ndc(g_lr, _size(rendered.image)), from_hr, weights
+                )  # S^dens   Eq. 14
             if stepper is None:
                 merged = self.merge(params, g_lr, from_hr, t)
                 require_finite(f"{where}: the merged gradient", merged.grads)
@@ -301,20 +304,20 @@ class Conductor:
         return Merged(g + self._regularize(params, t), g_hr, corrected, conflict)  # Eq. 16
 
     def scores(
-        self, screen_lr: Float[Tensor, "N 2"], hr: HrGradients[Any] | None, t: int
+        self, screen_lr: Float[Tensor, "N 2"], hr: HrGradients[Any] | None, weights: tuple[Scalar, Scalar]
     ) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
         """The densification score of the strategies, and the ordinary ‖∇_u L‖ that holds without them.
 
         Args:
-            screen_lr: ∇_u(λ_LR L_LR) in NDC units.
+            screen_lr: ∇_u(λ_LR L_LR) in NDC units. weights: λ_HR and λ_HR λ_HF.
         """
-        λ, total, base, hf = self.objective.lambda_hr(t), screen_lr, None, None
+        (λ, λ_hf), total, base, hf = weights, screen_lr, None, None
         if hr is not None:
             base = screen_in_ndc(hr.base, hr.size)
             total = total + λ * base
             if hr.hf is not None:
                 hf = screen_in_ndc(hr.hf, hr.size)
-                total = total + λ * self.objective.lambda_hf * hf
+                total = total + λ_hf * hf
         screen = ScreenGradients(screen_lr, base, hf, screen_norm(total))
         score = None if hr is None else self._owner["score"].score(hr.step, screen)
         return screen.ordinary if score is None else score, screen.ordinary

@@ -104,6 +104,10 @@ class Stepper(Protocol[G]):
         """Merge, and step `params` and the optimizer's moments in place; returns the conflict ratios by group."""
         ...
 
+    def weights(self, t: int) -> tuple[Scalar, Scalar]:
+        """As `Objective.weights`."""
+        ...
+
     def step_extra(self, params: Mapping[str, Tensor], g_lr: G, t: int) -> None:
         """Step on the gradient of an extra view alone; nothing is regularized."""
         ...

@@ -77,6 +77,11 @@ class Objective:
         """Whether Î_LR is rendered; else it is the area mean of Î_HR, which is then needed at every iteration."""
         return self.lr_from == "lr" and self.lambda_lr > 0
 
+    def weights(self, t: int) -> tuple[float, float]:
+        """λ_HR(t) and λ_HR(t) λ_HF."""
+        λ = self.lambda_hr(t)
+        return λ, λ * self.lambda_hf
+
     def lr(
         self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None = None
     ) -> Losses:

@@ -195,6 +195,12 @@ class Strategy:
         """`correct` as data, for the compiled step; None: only the readable path computes it."""
         return None
 
+    def looked_up(self, view: View) -> Tensor | None:
+        """What `observe` and `route` read of a view, if they and `score` depend on view and iteration by it and by what they are
+        given alone, so that an iteration can be recorded: in a replay they read the tensor `View.looked_up`.
+        """
+        return None
+
     def anchor(self, n: int) -> Anchor | None:
         """`regularize` for n Gaussians as data, for the compiled step; None: nothing is added now."""
         return None
@@ -230,7 +236,7 @@ def overrides(strategy: Strategy, hook: str) -> bool:
 
 
 def describes(strategy: Strategy, fact: str) -> bool:
-    """Whether `fact` ("correction_rule", "anchor") describes what the strategy's class does.
+    """Whether `fact` ("correction_rule", "anchor", "looked_up") describes what the strategy's class does.
 
     A subclass that overrides any method of the class that states the fact no longer does the same:
     it must state the fact itself, or takes the readable path.

@@ -71,7 +71,7 @@ class P2G(Strategy):
     def observe(self, step: Step, hr: Shot) -> Evidence:
         """q_i and a_i of every Gaussian that is visible in this view."""
         view = step.view
-        q, a = lift(self._cached_patches(view), hr.means2d, hr.visible, self.patch * view.factor)
+        q, a = lift(self.looked_up(view), hr.means2d, hr.visible, self.patch * view.factor)
         evidence, seen = Evidence(q, a), hr.visible.sum()
         # Both are 0 where a Gaussian is invisible.
         self.log("mean_q", lambda: deferred.scalar(q.sum() / seen))
@@ -138,8 +138,10 @@ class P2G(Strategy):
         A = (patch_means(residual, self.patch * factor) / (2 * residual.mean() + self.detail_eps)).clamp(0, 1)
         return R, A
 
-    def _cached_patches(self, view: View) -> Float[Tensor, "2 ph pw"]:
+    def looked_up(self, view: View) -> Float[Tensor, "2 ph pw"]:
         """R and A."""
+        if view.looked_up is not None:
+            return view.looked_up
         key = (view.name, view.factor)
         if key not in self.cache:
             maps = self.patch_maps(view)

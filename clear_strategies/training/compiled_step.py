@@ -15,14 +15,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.compiled_rules import Anchor, CorrectionRule
-from clear_strategies.core.deferred import Number
+from clear_strategies.core.deferred import Number, Scalar
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads
 from clear_strategies.kernels import gaussian_step as kernel
 from clear_strategies.kernels import native
@@ -33,6 +33,7 @@ from clear_strategies.strategies.base import Strategy, not_stated_as_data, overr
 from clear_strategies.training.field import LOG_SCALE_LIMIT, LOGIT_LIMIT, Activation, FieldShot
 from clear_strategies.training.optim import BETA1, BETA2, Adam
 from rasterizers.interface import BackendUnavailable, SplatGradients
+from rasterizers.recording import running
 from rasterizers.warp_runtime import require_warp
 
 _log = logging.getLogger(__name__)
@@ -134,8 +135,14 @@ class CompiledStep:
         corrector = conductor.owner("correct")
         self._rule: CorrectionRule | None = None if corrector is None else corrector.correction_rule()
         self._regularizer: Strategy | None = next((s for s in conductor.strategies if overrides(s, "regularize")), None)
+        self._changing: Tensor | None = None  # the numbers of the step on the device, of a recording
         self._examined: tuple[int, Sequence[Tensor | None]] | None = None
         self._quiet = False
+
+    @property
+    def records(self) -> bool:
+        """Whether a step can be part of a recording."""
+        return getattr(self._passes, "records", False)
 
     def vjp(self, shot: FieldShot, cotangents: Float[Tensor, "K H W 3"]) -> list[Factors]:
         return Factors.of(shot.gradients(cotangents), shot.activation)
@@ -144,7 +151,25 @@ class CompiledStep:
         self, params: Mapping[str, Tensor], g_lr: Factors, hr: HrGradients[Factors] | None, t: int
     ) -> Mapping[str, Number]:
         """Step `params` and the optimizer's moments in place; returns the conflict ratios by group."""
-        return self._run(params, g_lr, hr, t, *self.optimizer.advance())
+        rates = (
+            ({}, 1.0) if running() is not None else self.optimizer.advance()
+        )  # of a recording, `count` has written them
+        return self._run(params, g_lr, hr, t, *rates)
+
+    def count(self, t: int) -> None:
+        """Count a step that is recorded or replayed, and write its numbers."""
+        from clear_strategies.kernels.gaussian_step.warp import written
+
+        rates, bias2 = self.optimizer.advance()
+        settings, device = self._settings(t, bias2), self.optimizer.first["means"].device
+        weight = settings.lambda_hr * self.conductor.objective.lambda_hf
+        self._changing = written(settings, rates, device, lambda_hf=weight, out=self._changing)
+
+    def weights(self, t: int) -> tuple[Scalar, Scalar]:
+        """λ_HR(t) and λ_HR(t) λ_HF; of a recording on the device."""
+        if running() is not None and self._changing is not None:
+            return self._changing[0, -2], self._changing[0, -1]
+        return self.conductor.objective.weights(t)
 
     def step_extra(self, params: Mapping[str, Tensor], g_lr: Factors, t: int) -> None:
         """Step on this gradient alone: no anchor pulls."""
@@ -180,7 +205,7 @@ class CompiledStep:
         keep = 1 - self.optimizer.rates.detail_decay if decays else 1.0
         attributes = {
             name: kernel.Attribute(
-                p, self.optimizer.first[name], self.optimizer.second[name], rates[name], anchor.targets.get(name),
+                p, self.optimizer.first[name], self.optimizer.second[name], rates.get(name, 0.0), anchor.targets.get(name),
                 anchor.stiffness.get(name, 0.0), keep if name == "detail" else 1.0, _LIMITS.get(name, float("inf")),
                 None if merged is None else merged[name],
             )
@@ -191,7 +216,7 @@ class CompiledStep:
         bands = active if skips and self._above_is_quiet(shN, active, anchor.targets.get("shN")) else shN.shape[1]
         evidence = None if hr is None else hr.step.evidence
         q = None if evidence is None else evidence.reliability.float().contiguous()
-        settings = kernel.StepSettings(BETA1, BETA2, bias2, self.optimizer.rates.eps, λ, skips, 3 * bands)
+        settings = self._settings(t, bias2, skips, 3 * bands, self._changing if running() is not None else None)
         stepped = gaussians.step(attributes, rule, q, settings)
         if rule is not None:
             rule.report(stepped.conflicts, CONFLICT_GROUPS, evidence is not None)
@@ -208,6 +233,10 @@ class CompiledStep:
         }  # fmt: skip
         base, hf = (None, None) if hr is None else (hr.base.rows, None if hr.hf is None else hr.hf.rows)
         return self._passes(activation, g_lr.rows, base, hf, self.conductor.objective.lambda_hf)
+
+    def _settings(self, t: int, bias2: float, *others: Any) -> kernel.StepSettings:
+        λ = self.conductor.objective.lambda_hr(t)
+        return kernel.StepSettings(BETA1, BETA2, bias2, self.optimizer.rates.eps, λ, *(others or (False, 0)))
 
     def _anchor(self, n: int) -> Anchor:
         if self._regularizer is None:

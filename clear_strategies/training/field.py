@@ -114,8 +114,12 @@ class GaussianField(nn.Module):
         return rasterizer(self._activate(gate).splats(detail=detail), camera).image
 
     def update_filter(self, cameras: Sequence[Camera], variance: float, near: float = NEAR) -> None:
-        """Recompute the 3D filter from the present means."""
-        self.filter_3d = filter_std(self.means.data, cameras, variance, near)
+        """Recompute the 3D filter from the present means, where it lies if it has a row for each."""
+        stds = filter_std(self.means.data, cameras, variance, near)
+        if len(stds) == len(self.filter_3d):
+            self.filter_3d.copy_(stds)
+        else:
+            self.filter_3d = stds
 
     def take(self, parents: Int[Tensor, " M"], fresh: Bool[Tensor, " M"]) -> None:
         """Change the structure by one gather: row i becomes a copy of row parents[i]."""

@@ -30,6 +30,7 @@ from clear_strategies.strategies.base import Drawn
 from clear_strategies.training import checkpoint
 from clear_strategies.training.clock import Clock
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
+from clear_strategies.training.replay import Given, Learned, replays_for
 from clear_strategies.training.signals import Interrupted, deferred_signals, foremost
 from clear_strategies.training.state import TrainState
 from rasterizers import native
@@ -48,27 +49,19 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     view = conductor.skips.view(view_at(s), t)
     hr_due = conductor.wants_hr(t)
     scales = {"lr": conductor.wants_lr and conductor.skips.lr_due(view, hr_due, conductor.work_log), "hr": hr_due}
-    over_color = over(rasterizer, conductor.background(t))
-    z = conductor.gate(t, len(θ))  # zᵗ             Eq. 15       SVS
-    with stage(f"render {' + '.join(scale.upper() for scale, wanted in scales.items() if wanted)}"):
-        lr, hr = θ.render_scales(over_color, view, gate=z, **scales)  # Î_LR, Î_HR     Eq. 2, 3
-    params = θ.raw()
-    u = conductor.update(params, lr, hr, view, t, s.compiled_step, scored=s.density.collects(t))
-    if u.grads is not None:  # else the compiled step has made the step
-        with stage("optimizer"):
-            s.optimizer.step(params, u.grads)
-            θ.constrain()
+    z, background = conductor.gate(t, len(θ)), conductor.background(t)  # zᵗ             Eq. 15       SVS
+    given = Given(t, view, scales, z, background)
+    learned = None if s.replays is None else s.replays.learn(given, learn)
+    u, row = learned or learn(s, rasterizer, given)
+    over_color = over(rasterizer, background)
     extra = extra_steps(s, over_color, conductor.extra_views(t, drawn_of(s, over_color)))
-    conductor.after_step(params, u.step)  # θᵃ at t = t_a  Eq. 16       SVS
-    *_, finest = (shot for shot in (lr, hr) if shot is not None)
-    s.density.accumulate(u, finest, t)  # S^dens         Eq. 14
+    conductor.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS
     with stage("density and filter"):
         # clone · split · prune = parents[M]
         restructured = conductor.may_densify(t) and s.density.step(θ, s.optimizer, t, s.resized)
         if s.filter_due() and not restructured:  # the means have not moved since
             s.refilter()
-    low = images.area_mean(finest.image, view.factor) if lr is None else lr.image
-    s.history.append(_row(s, u, low, view) | extra)
+    s.history.append(_row(s) | row | extra)
     if s.conductor.skips.measured(t) and not (restructured or s.reset_due(t)):
         with stage("training views drawn whole"):
             s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)
@@ -76,6 +69,31 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     if s.second is not None:
         s.second.follow(s)
     return u
+
+
+def learn(s: TrainState, rasterizer: Rasterizer, given: Given) -> Learned:
+    """What an iteration does with its view: render, compare, step on the merged gradient, and accumulate statistics.
+
+    It can be recorded where `Replays` say so: then nothing here reads a number from the device.
+    """
+    t, view, θ, conductor, stage = given.t, given.view, s.field, s.conductor, s.conductor.work_log.stage
+    with stage(f"render {' + '.join(scale.upper() for scale, wanted in given.scales.items() if wanted)}"):
+        lr, hr = θ.render_scales(  # Î_LR, Î_HR     Eq. 2, 3
+            over(rasterizer, given.background), view, gate=given.gate, **given.scales
+        )
+    params = θ.raw()
+    u = conductor.update(params, lr, hr, view, t, s.compiled_step, scored=s.density.collects(t))
+    if u.grads is not None:  # else the compiled step has made the step
+        with stage("optimizer"):
+            s.optimizer.step(params, u.grads)
+            θ.constrain()
+    *_, finest = (shot for shot in (lr, hr) if shot is not None)
+    s.density.accumulate(u, finest, t)  # S^dens         Eq. 14
+    low = images.area_mean(finest.image, view.factor) if lr is None else lr.image
+    photo = view.lr.over(given.background, view.background)
+    row: dict[str, Number] = {"psnr_train_lr": psnr_of(low, photo.image, photo.shown)}
+    row |= {f"loss_{name}": value for name, value in u.losses.items()}
+    return Learned(u, row | conflict_columns(u.conflict) | dict(u.logs))
 
 
 def view_at(s: TrainState) -> View:
@@ -135,17 +153,13 @@ def extra_steps(s: TrainState, rasterizer: Rasterizer, extra_views: Sequence[Ext
     return row
 
 
-def _row(s: TrainState, u: Update, lr_image: Tensor, view: View) -> dict[str, Number]:
-    photo = view.lr.over(s.conductor.background(s.t), view.background)
-    row: dict[str, Number] = {
+def _row(s: TrainState) -> dict[str, Number]:
+    return {
         "t": float(s.t),
         "lambda_hr": s.conductor.objective.lambda_hr(s.t),
-        "psnr_train_lr": psnr_of(lr_image, photo.image, photo.shown),
         "n_gaussians": float(len(s.field)),
         "detail_abs": deferred.scalar(s.field.detail.data.abs().mean()),
     }
-    row |= {f"loss_{name}": value for name, value in u.losses.items()}
-    return row | conflict_columns(u.conflict) | dict(u.logs)
 
 
 def kernel_threads(state: TrainState, rasterizer: Rasterizer) -> AbstractContextManager[None]:
@@ -184,6 +198,9 @@ def fit(
             return None
         return checkpoint.save(checkpoints, state.checkpoint(config or {}), keep=settings.keep)
 
+    for s in (state, state.second):
+        if settings.replay and s is not None:
+            s.replays = replays_for(s, rasterizer)
     clock = Clock(state.history_as_floats()[-1] if state.history else {})
     with deferred_signals() as pending, kernel_threads(state, rasterizer):
         while not state.ended:

@@ -25,6 +25,7 @@ from clear_strategies.training.field import GaussianField
 from clear_strategies.training.history import History
 from clear_strategies.training.mip import NEAR, MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
+from clear_strategies.training.replay import Replays
 from clear_strategies.training.settings import FitSettings
 
 _log = logging.getLogger(__name__)
@@ -41,6 +42,7 @@ class TrainState:
         near: the near plane of the rasterizer, world units.
         history: one row per iteration; read it by `history_as_floats`, since on a device its numbers are deferred.
         second: a second field that trains beside this one, if a strategy asks for it (`Strategy.second_seed`).
+        replays: where iterations are replayed (`fit.replay`); no checkpoint needs them.
         first: of a second field, the state that it trains beside.
     """
 
@@ -55,6 +57,7 @@ class TrainState:
     t: int = 1
     history: History = field(default_factory=History)
     compiled_step: CompiledStep | None = None
+    replays: Replays | None = None
     second: TrainState | None = None
     first: TrainState | None = None
 

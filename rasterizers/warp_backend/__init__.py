@@ -11,6 +11,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import torch
+from torch import Tensor
+
 from rasterizers.interface import Camera, Rendering, Splats
 from rasterizers.warp_backend.settings import WarpSettings
 
@@ -24,3 +27,9 @@ class WarpRasterizer(WarpSettings):
         from rasterizers.warp_backend.frame import Frame
 
         return [*Frame(self, jobs, depth).draw()]
+
+    def numbers_of(self, camera: Camera, device: torch.device) -> Sequence[Tensor]:
+        """See `rasterizers.interface.Recordable`."""
+        from rasterizers.warp_backend.frame import numbers_of
+
+        return numbers_of(camera, device)

@@ -116,7 +116,7 @@ def list_pairs(
     order: wp.array[wp.int32],
     ends: wp.array[wp.int64],
     rows: wp.array[Row],
-    grid: Grid,
+    grids: wp.array[Grid],
     firsts: wp.array[wp.int32],
     tiles: wp.array[wp.int32],
     places: wp.array[wp.int32],
@@ -128,7 +128,7 @@ def list_pairs(
     the compiler may round differently; if the tiles differ, the number of places holds. Places without a tile, and those beyond
     the last Gaussian's, get the tile that does not exist.
     """
-    place = wp.tid()
+    place, grid = wp.tid(), grids[0]
     tiles[place] = grid.tiles[0] * grid.tiles[1]
     places[place] = place
     if wp.int64(place) >= ends[ends.shape[0] - 1]:
@@ -147,8 +147,7 @@ def find_tiles(
     tiles: wp.array[wp.int32],
     places: wp.array[wp.int32],
     splats: wp.array[wp.int32],
-    totals: wp.array[wp.int64],
-    nth: wp.int32,
+    total: wp.array[wp.int64],
     capacity: wp.int32,
     listed: wp.array[wp.int32],
     starts: wp.array[wp.int32],
@@ -156,10 +155,10 @@ def find_tiles(
 ) -> None:
     """One thread per pair, sorted by tile: where each tile's list starts and ends, and its Gaussians.
 
-    `totals[nth]` is the number of pairs of this grid.
+    `total` is the number of pairs.
     """
     at = wp.tid()
-    count = wp.int32(wp.min(totals[nth], wp.int64(capacity)))
+    count = wp.int32(wp.min(total[0], wp.int64(capacity)))
     if at >= count:
         return
     tile = tiles[at]

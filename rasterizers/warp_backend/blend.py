@@ -73,8 +73,9 @@ def blend(depth: bool, lanes: int) -> Any:  # noqa: PLR0915 - a kernel
 
     @wp.kernel(module="unique", enable_backward=False)
     def blend(  # noqa: PLR0912, PLR0915
-        grid: Grid,
+        grids: wp.array[Grid],
         cuts: Cuts,
+        backgrounds: wp.array[wp.vec3],
         rows: wp.array[Row],
         depths: wp.array[wp.float32],
         listed: wp.array[wp.int32],
@@ -88,6 +89,7 @@ def blend(depth: bool, lanes: int) -> Any:  # noqa: PLR0915 - a kernel
     ) -> None:
         """`ended` receives the first pair that the pixel did not blend."""
         tile, lane = wp.tid()
+        grid, background = grids[0], backgrounds[0]
         begin, end = starts[tile], ends[tile]
         batch = wp.tile_empty(shape=(both,), dtype=Near, storage="shared")
         through, stop, light, weighted, weights = Numbers(), Ends(), Colours(), Numbers(), Numbers()
@@ -130,7 +132,7 @@ def blend(depth: bool, lanes: int) -> Any:  # noqa: PLR0915 - a kernel
             within = j * lanes + lane
             pixel = pixel_of(tile, within, grid)
             if inside(pixel, grid):
-                rgb = wp.vec3(light[j, 0], light[j, 1], light[j, 2]) + through[j] * cuts.background
+                rgb = wp.vec3(light[j, 0], light[j, 1], light[j, 2]) + through[j] * background
                 last = wp.min(stop[j], end - 1) / SEGMENT
                 for back in range(wp.max(last - begin / SEGMENT, 0)):
                     mark = last - back
@@ -197,8 +199,9 @@ def blend_vjp(K: int, lanes: int, shuffles: bool) -> Any:  # noqa: PLR0915 - a k
 
     @wp.kernel(module="unique", enable_backward=False)
     def blend_vjp(  # noqa: PLR0912, PLR0915
-        grid: Grid,
+        grids: wp.array[Grid],
         cuts: Cuts,
+        backgrounds: wp.array[wp.vec3],
         rows: wp.array[Row],
         tiles: wp.array[wp.int32],
         listed: wp.array[wp.int32],
@@ -208,10 +211,11 @@ def blend_vjp(K: int, lanes: int, shuffles: bool) -> Any:  # noqa: PLR0915 - a k
         ended: wp.array2d[wp.int32],
         marks: wp.array2d[wp.vec4],
         cotangents: wp.array3d[wp.vec3],
-        pairs: wp.int32,
+        total: wp.array[wp.int64],
         pair_sums: wp.array2d[wp.float32],
     ) -> None:
         segment, lane = wp.tid()
+        grid, background, pairs = grids[0], backgrounds[0], wp.int32(total[0])
         tile, n_tiles, after = wp.int32(-1), grid.tiles[0] * grid.tiles[1], (segment + 1) * SEGMENT
         batch = wp.tile_empty(shape=(both,), dtype=Near, storage="shared")
         where = wp.tile_empty(shape=(both,), dtype=wp.vec2i, storage="shared")
@@ -237,7 +241,7 @@ def blend_vjp(K: int, lanes: int, shuffles: bool) -> Any:  # noqa: PLR0915 - a k
                         if tile < n_tiles and inside(pixel, grid):
                             through[j] = transmittance[pixel[1], pixel[0]]
                             stop[j] = ended[pixel[1], pixel[0]]
-                            light = through[j] * cuts.background
+                            light = through[j] * background
                             if ends[tile] > after and stop[j] > after:
                                 mark = marks[segment + 1, within]
                                 through[j] = mark[3]
@@ -274,8 +278,8 @@ def blend_vjp(K: int, lanes: int, shuffles: bool) -> Any:  # noqa: PLR0915 - a k
                 if shuffles:
                     store(part, tile_and_place[1], pair_sums)
                 else:
-                    total = wp.tile_sum(wp.tile(part, preserve_type=True))
-                    sums = total[0]
+                    whole = wp.tile_sum(wp.tile(part, preserve_type=True))
+                    sums = whole[0]
                     for c in range(lane, W * K, lanes):
                         pair_sums[tile_and_place[1], c] = sums[c]
             half = lanes - half

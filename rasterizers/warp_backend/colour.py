@@ -74,10 +74,12 @@ def colour_of(
 
 
 @wp.kernel
-def basis(pose: Pose, means: wp.array[wp.vec3], visible: wp.array[wp.bool], Y: wp.array2d[wp.float32]) -> None:
+def basis(
+    poses: wp.array[Pose], means: wp.array[wp.vec3], visible: wp.array[wp.bool], Y: wp.array2d[wp.float32]
+) -> None:
     """Y of the visible Gaussians; the other rows are not written."""
     i = wp.tid()
     if visible[i]:
-        direction = wp.normalize(means[i] - pose.center)
+        direction = wp.normalize(means[i] - poses[0].center)
         for k in range(Y.shape[1]):
             Y[i, k] = band(k, direction)[0]

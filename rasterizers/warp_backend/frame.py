@@ -24,13 +24,14 @@ from torch import Tensor
 from rasterizers.checks import packed_rows, require_cotangents, require_finite, require_splats
 from rasterizers.geometry import tangent_limits
 from rasterizers.interface import Camera, SplatGradients, Splats
+from rasterizers.recording import running
 from rasterizers.warp_backend import types
 from rasterizers.warp_backend.bins import find_tiles, list_pairs
 from rasterizers.warp_backend.blend import blend, blend_vjp
 from rasterizers.warp_backend.colour import basis
 from rasterizers.warp_backend.project import fold, project, project_vjp
 from rasterizers.warp_backend.settings import PAIR_BYTES, SUMS_BYTES, TILE, WarpSettings, mebibytes, padded
-from rasterizers.warp_runtime import launch, on_stream, sort_pairs
+from rasterizers.warp_runtime import launch, on_device, on_stream, sort_pairs
 
 _ROW: Final = len(types.Row())
 DEFERRED_COUNTS: Final = {"cuda": True, "cpu": False}
@@ -50,13 +51,14 @@ class _View:
         self.columns, self.rows_of_tiles = -(-camera.width // TILE), -(-camera.height // TILE)
         self.opacities = splats.opacities.contiguous()
         self.offsets = None if splats.rgb_offset is None else splats.rgb_offset.contiguous()
-        self.grid = _grid_struct(camera, self.columns, self.rows_of_tiles)
+        self.grid = numbers_of(camera, like.device).grid
         self.ellipses, self.means2d = like.new_empty(n, _ROW), like.new_empty(n, 2)
         self.visible = like.new_empty(n, dtype=torch.bool)
         # Tiles of each Gaussian, and its first pair.
         self.counts, self.firsts = like.new_empty(2, n, dtype=torch.int32).unbind()
         self.ends = like.new_zeros(n + 1, dtype=torch.int64)  # pairs up to each Gaussian, front to back
-        self.pairs = 0  # set by `Frame.resolve_counts`
+        self.pairs = 0  # set by `Frame.resolve_counts`; of a recorded frame as many as it has space for
+        self.total: Tensor  # their number on the device, set by `Frame.draw`
         self.lists: _Lists  # set by `Frame._list`
         self.capacity = -1  # pairs that the lists have space for; the nearest ones if there are more
 
@@ -82,7 +84,8 @@ class Frame:
         for job, _ in jobs:
             require_splats(job, settings.traits)
         self.settings, self.jobs, self.n, self.like = settings, jobs, len(splats), splats.means
-        self.pose, self.cuts = _pose_struct(camera), _cuts_struct(settings)
+        self.pose, self.cuts = numbers_of(camera, self.like.device).pose, _cuts_struct(settings)
+        self.background = settings.background_on(self.like.device)
         self.means, self.quats, self.scales = (x.contiguous() for x in (splats.means, splats.quats, splats.scales))
         self.sh0, self.shN = packed_rows(splats.sh0), packed_rows(splats.shN)
         self.bands = self.shN.shape[1]
@@ -101,6 +104,13 @@ class Frame:
             for view in self.views:
                 torch.cumsum(view.counts.index_select(0, self._order), 0, out=view.ends[1:])
             self.totals = torch.cat([*(view.ends[-1:] for view in self.views), flags])
+            for view, total in zip(self.views, self.totals[:, None], strict=False):
+                view.total = total
+            if (recording := running()) is not None:
+                recording.pause(self._fits)
+                self._read = self.totals.tolist
+                self.resolve_counts(recorded=True)
+                return [WarpRendering(self, view) for view in self.views]
             self._read = _read_deferred(self.totals)
             capacities = [self.settings.capacity(view.camera) for view in self.views]
             if DEFERRED_COUNTS[self.settings.device] and min(capacities) >= 0:
@@ -110,8 +120,11 @@ class Frame:
                 self.resolve_counts()
             return [WarpRendering(self, view) for view in self.views]
 
-    def resolve_counts(self) -> None:
+    def resolve_counts(self, *, recorded: bool = False) -> None:
         """Read the numbers of pairs, and list the pairs again where the lists were too short.
+
+        Args:
+            recorded: replays may have other numbers of pairs, as far as there is space for them.
 
         Raises:
             ValueError: a number is not finite.
@@ -120,17 +133,26 @@ class Frame:
         if self.resolved:
             return
         *pairs, not_finite, is_long, is_longer = self._read()
-        self.folds = (1,) * is_long + (types.SEGMENT,) * is_longer
+        self.folds = (1,) * (recorded or is_long) + (types.SEGMENT,) * (recorded or is_longer)
         if not_finite:
             for splats, _ in self.jobs:
                 require_finite(splats)
         for nth, (view, count) in enumerate(zip(self.views, pairs, strict=True)):
             self._require_memory(view, count)
             self.settings.remember(view.camera, count)
-            view.pairs = count
-            if view.capacity < count:
-                self._list(nth, count)
+            view.pairs = self.settings.capacity(view.camera) if recorded else count
+            if view.capacity < view.pairs:
+                self._list(nth, view.pairs)
         self.resolved = True
+
+    def _fits(self) -> bool:
+        """Whether the lists of a recorded frame have space for its replay's pairs, and its numbers are finite."""
+        *pairs, not_finite, _, _ = self.totals.tolist()
+        for view, count in zip(self.views, pairs, strict=True):
+            if not self.settings.allows(count):
+                return False
+            self.settings.remember(view.camera, count)
+        return not not_finite and all(count <= view.pairs for view, count in zip(self.views, pairs, strict=True))
 
     def launch(self, kernel: Any, threads: int, *arguments: Any) -> None:
         """Launch a kernel with one thread per Gaussian, place or pair."""
@@ -186,7 +208,7 @@ class Frame:
             list_pairs, capacity, self._order, view.ends, view.ellipses, view.grid, view.firsts, tiles, places, splats
         )
         tiles, places = _sorted(tiles, places, capacity, n_tiles.bit_length())
-        self.launch(find_tiles, capacity, tiles, places, splats, self.totals, nth, capacity, gaussians, starts, ends)
+        self.launch(find_tiles, capacity, tiles, places, splats, view.total, capacity, gaussians, starts, ends)
         view.capacity, view.lists = capacity, _Lists(splats, tiles, gaussians, places, starts, ends)
 
 
@@ -233,9 +255,9 @@ class WarpRendering:
         self._marks = frame.empty(view.capacity // types.SEGMENT + 1, types.PIXELS, 4)
         lanes = TILE_LANES[frame.settings.device]
         frame.launch_blocks(
-            blend(view.has_depth, lanes), view.columns * view.rows_of_tiles, lanes, view.grid, frame.cuts, view.ellipses,
-            frame.depths, lists.gaussians, lists.starts, lists.ends, self._image, self._transmittance, self._ended, self._marks,
-            self._depth,
+            blend(view.has_depth, lanes), view.columns * view.rows_of_tiles, lanes, view.grid, frame.cuts, frame.background,
+            view.ellipses, frame.depths, lists.gaussians, lists.starts, lists.ends, self._image, self._transmittance,
+            self._ended, self._marks, self._depth,
         )  # fmt: skip
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
@@ -264,11 +286,11 @@ class WarpRendering:
         lanes = LANES[frame.settings.device]
         frame.launch_blocks(
             blend_vjp(k, lanes, frame.settings.device == "cuda"), -(-view.pairs // types.SEGMENT), lanes, view.grid, frame.cuts,
-            view.ellipses, lists.tiles, lists.gaussians, lists.places, lists.ends, self._transmittance, self._ended, self._marks,
-            v, view.pairs, pair_sums,
+            frame.background, view.ellipses, lists.tiles, lists.gaussians, lists.places, lists.ends, self._transmittance,
+            self._ended, self._marks, v, view.total, pair_sums,
         )  # fmt: skip
         for stride in frame.folds:
-            frame.launch(fold(k), view.pairs, view.counts, view.firsts, lists.splats, stride, pair_sums)
+            frame.launch(fold(k), view.pairs, view.counts, view.firsts, lists.splats, view.total, stride, pair_sums)
         frame.launch(
             project_vjp(k), frame.n, frame.pose, view.grid, frame.cuts, frame.means, frame.quats, frame.scales, view.opacities,
             frame.slopes, frame.bands > 0, view.ellipses, view.counts, view.firsts, pair_sums, *out,
@@ -298,25 +320,30 @@ def _read_deferred(numbers: Tensor) -> Any:
     return wait
 
 
+class CameraNumbers(NamedTuple):
+    """A camera's numbers on the device: `types.Pose` and `types.Grid`, as bytes."""
+
+    pose: Tensor
+    grid: Tensor
+
+
 @lru_cache(maxsize=1024)
-def _pose_struct(camera: Camera) -> Any:
+def numbers_of(camera: Camera, device: torch.device) -> CameraNumbers:
+    """Those of this camera object."""
     pose, world = types.Pose(), camera.world_to_camera.double()
     rotation = world[:3, :3].flatten().tolist()
     pose.rotation, pose.exact_rotation = wp.mat33(*rotation), wp.mat33d(*rotation)
     pose.exact_translation = wp.vec3d(*world[:3, 3].tolist())
     pose.center = wp.vec3(*camera.center.double().tolist())
-    return pose.__ctype__()  # type: ignore[attr-defined]
-
-
-@lru_cache(maxsize=1024)
-def _grid_struct(camera: Camera, columns: int, rows: int) -> Any:
     grid = types.Grid()
     grid.exact_focal, grid.exact_principal = wp.vec2d(camera.fx, camera.fy), wp.vec2d(camera.cx, camera.cy)
     grid.focal = wp.vec2(camera.fx, camera.fy)
-    grid.size, grid.tiles = wp.vec2i(camera.width, camera.height), wp.vec2i(columns, rows)
+    grid.size = wp.vec2i(camera.width, camera.height)
+    grid.tiles = wp.vec2i(-(-camera.width // TILE), -(-camera.height // TILE))
     (left, right), (top, bottom) = tangent_limits(camera)
     grid.low, grid.high = wp.vec2(left, top), wp.vec2(right, bottom)
-    return grid.__ctype__()  # type: ignore[attr-defined]
+    structures: tuple[Any, Any] = pose, grid
+    return CameraNumbers(*(on_device(x.__ctype__(), device) for x in structures))
 
 
 @lru_cache(maxsize=1024)
@@ -325,5 +352,5 @@ def _cuts_struct(settings: WarpSettings) -> Any:
     cuts.kernel, cuts.near, cuts.antialiased = settings.kernel, settings.near, settings.antialiased
     cuts.near_bits = int.from_bytes(struct.pack("<d", settings.near), "little")
     cuts.alpha_min, cuts.alpha_max = settings.alpha_min, settings.alpha_max
-    cuts.transmittance_min, cuts.background = settings.transmittance_min, wp.vec3(*settings.background)
+    cuts.transmittance_min = settings.transmittance_min
     return cuts.__ctype__()  # type: ignore[attr-defined]

@@ -53,8 +53,8 @@ def finite(v: wp.vec3) -> wp.bool:
 
 @wp.kernel
 def project(
-    pose: Pose,
-    grid: Grid,
+    poses: wp.array[Pose],
+    grids: wp.array[Grid],
     cuts: Cuts,
     means: wp.array[wp.vec3],
     quats: wp.array[wp.vec4],
@@ -94,6 +94,7 @@ def project(
     visible[i] = False
     counts[i] = 0
 
+    pose, grid = poses[0], grids[0]
     centre = centre_of(pose, means[i])
     if centre.z > cuts.near:
         u = grid.exact_focal[0] * centre.tan[0] + grid.exact_principal[0]
@@ -147,19 +148,22 @@ def fold(K: int) -> Any:
         counts: wp.array[wp.int32],
         firsts: wp.array[wp.int32],
         splats: wp.array[wp.int32],
+        total: wp.array[wp.int64],
         stride: wp.int32,
         pair_sums: wp.array[PairSums],
     ) -> None:
         """One thread per place; at every `SEGMENT`-th multiple of `stride` it adds the sums of the multiples up to the next."""
         place = wp.tid()
+        if wp.int64(place) >= total[0]:
+            return
         i = splats[place]
         nth, count = place - firsts[i], counts[i]
         if count <= stride * SEGMENT or nth % (stride * SEGMENT) != 0:
             return
-        total = PairSums()
+        share = PairSums()
         for other in range(nth, wp.min(nth + stride * SEGMENT, count), stride):
-            total += pair_sums[firsts[i] + other]
-        pair_sums[place] = total
+            share += pair_sums[firsts[i] + other]
+        pair_sums[place] = share
 
     return fold
 
@@ -172,8 +176,8 @@ def project_vjp(K: int) -> Any:
 
     @wp.kernel(module="unique", enable_backward=False)
     def project_vjp(
-        pose: Pose,
-        grid: Grid,
+        poses: wp.array[Pose],
+        grids: wp.array[Grid],
         cuts: Cuts,
         means: wp.array[wp.vec3],
         quats: wp.array[wp.vec4],
@@ -206,6 +210,7 @@ def project_vjp(K: int) -> Any:
         total = PairSums()
         for nth in range(0, counts[i], stride_of(counts[i])):
             total += pair_sums[firsts[i] + nth]
+        pose, grid = poses[0], grids[0]
         g = geometry_of(pose, grid, centre_of(pose, means[i]), quats[i], scales[i])
         f = footprint_of(g, grid, cuts)
         ellipse = ellipse_of(rows[i])

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Final
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from rasterizers.checks import Backend, require_device
 from rasterizers.interface import Camera, Color, Traits
-from rasterizers.warp_runtime import require_warp
+from rasterizers.warp_runtime import require_warp, sent
 
 TILE: Final = 8
 """Edge of the tiles that Gaussians are listed for, px."""
@@ -23,7 +26,7 @@ SUMS_BYTES: Final = 36  # a pair's nine sums for one cotangent
 
 
 _TRAITS: Final = {
-    device: Traits(devices=frozenset({device}), dtypes=frozenset({torch.float32}), depth=True)
+    device: Traits(devices=frozenset({device}), dtypes=frozenset({torch.float32}), depth=True, records=True)
     for device in ("cpu", "cuda")
 }
 
@@ -40,6 +43,7 @@ class WarpSettings(Backend):
         memory: MiB that one image's lists may take, together with the sums that their pairs send back.
         device: "cuda" or "cpu", where the splats' tensors are; by default "cuda" where there is one.
         capacities: the number of pairs to allocate for the next image of each size, from the images before it.
+        changing: see `over_changing`.
 
     Raises:
         BackendUnavailable: Warp is not installed, or there is no CUDA device.
@@ -49,6 +53,7 @@ class WarpSettings(Backend):
     memory: int = 4096
     device: str = field(default_factory=_default_device)
     capacities: dict[tuple[int, int], int] = field(default_factory=dict, init=False, repr=False, compare=False)
+    changing: Tensor | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         Backend.__post_init__(self)
@@ -67,6 +72,15 @@ class WarpSettings(Backend):
         object.__setattr__(copied, "capacities", self.capacities)
         return copied
 
+    def over_changing(self, background: Float[Tensor, "1 3"]) -> WarpSettings:
+        """As `with_background`, for a background on the device that is another one in each replay of a recording."""
+        copied = self.with_background(self.background)
+        object.__setattr__(copied, "changing", background)
+        return copied
+
+    def background_on(self, device: torch.device) -> Float[Tensor, "1 3"]:
+        return _color_on(self.background, device) if self.changing is None else self.changing
+
     def capacity(self, camera: Camera) -> int:
         """The number of pairs to allocate for an image of this size before they are counted; -1: it is the first one."""
         return self.capacities.get((camera.width, camera.height), -1)
@@ -79,6 +93,11 @@ class WarpSettings(Backend):
     def allows(self, pairs: int) -> bool:
         """Whether the lists of this many pairs, which are counted in 32 bits, fit the budget."""
         return mebibytes(pairs) <= self.memory and pairs < 2**31
+
+
+@lru_cache(maxsize=64)
+def _color_on(color: Color, device: torch.device) -> Float[Tensor, "1 3"]:
+    return sent(torch.tensor([color], dtype=torch.float32), device)
 
 
 def padded(count: int) -> int:

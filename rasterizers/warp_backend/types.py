@@ -53,7 +53,6 @@ class Cuts:
     alpha_min: wp.float32
     alpha_max: wp.float32
     transmittance_min: wp.float32
-    background: wp.vec3
     antialiased: wp.bool
 
 

@@ -51,6 +51,7 @@ class StepSettings:
         bias2: bias of Adam's second moment.
         skips: skip rows that would not change.
         width: numbers of an shN row that are stepped, at least those of the active bands.
+        changing: on a device, the rates, `bias2` and `lambda_hr`, in place of the others: `warp.written` makes it.
     """
 
     beta1: float
@@ -60,6 +61,7 @@ class StepSettings:
     lambda_hr: float
     skips: bool
     width: int
+    changing: Tensor | None = None
 
 
 class StepCounts(NamedTuple):

@@ -44,6 +44,6 @@ class CppGaussianStep:
         self, attributes: Mapping[str, Attribute], rule: CorrectionRule | None, q: Tensor | None, settings: StepSettings
     ) -> StepCounts:
         tables = {name: a._asdict() | {"width": math.prod(a.p.shape[1:])} for name, a in attributes.items()}
-        numbers = {slot: getattr(settings, slot) for slot in StepSettings.__slots__}
+        numbers = {slot: getattr(settings, slot) for slot in StepSettings.__slots__ if slot != "changing"}
         conflicts, still = self._step.step(tables, correction_table(rule, q), numbers, threads())
         return StepCounts(ConflictCounts(*conflicts), still)

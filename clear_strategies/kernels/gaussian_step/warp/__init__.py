@@ -36,6 +36,8 @@ class WarpGaussianStep:
         TypeError, ValueError: a tensor is not float32, contiguous and on that device, or has a wrong shape.
     """
 
+    records: Final = True
+
     def __init__(
         self,
         activation: Mapping[str, Tensor | None],
@@ -88,8 +90,9 @@ class WarpGaussianStep:
         blocks = -(-self._n // self._lanes)
         counts = self._like.new_empty(blocks, conflict.COUNTS, dtype=torch.int32)
         omegas = self._like.new_empty(blocks, conflict.GROUPS, dtype=torch.float64)
-        adam_step = _adam(settings, attributes)
-        device, lanes = self._like.device, self._lanes
+        device, lanes, adam_step = self._like.device, self._lanes, settings.changing
+        if adam_step is None:
+            adam_step = written(settings, {name: a.rate for name, a in attributes.items()}, device)
         step = (
             *self._gradients, conflict.rule_of(rule, q), q, _options(self._has_base, rule is not None, settings), adam_step,
             *parameters, bands, colours, moving, counts, omegas,
@@ -150,14 +153,25 @@ class WarpGaussianStep:
 
 def _options(has_hr: bool, corrects: bool, settings: StepSettings) -> Any:
     return struct(
-        passes.StepOptions, {}, lambda_hr=settings.lambda_hr, skips=settings.skips, width=settings.width,
+        passes.StepOptions, {}, skips=settings.skips, width=settings.width,
         compares=has_hr and settings.lambda_hr > 0, corrects=corrects,
     )  # fmt: skip
 
 
-def _adam(s: StepSettings, attributes: Mapping[str, Attribute]) -> Any:
-    rates = struct(adam.Rates, {}, **{name: -a.rate for name, a in attributes.items()})
-    return struct(
-        adam.AdamStep, {}, rates=rates, beta1=s.beta1, beta2=s.beta2, gain1=1 - s.beta1, gain2=1 - s.beta2,
-        per_bias2=1 / s.bias2, eps=s.eps,
+def written(
+    s: StepSettings, rates: Mapping[str, float], device: torch.device, *, lambda_hf: float = 0.0, out: Tensor | None = None
+) -> Tensor:  # fmt: skip
+    """The numbers of a step on the device, as a row of `adam.AdamStep`; written into `out` where it is given.
+
+    Args:
+        rates: each attribute's, see `Attribute`. lambda_hf: λ_HR λ_HF, the last number.
+    """
+    out = torch.empty(1, adam.NUMBERS, device=device) if out is None else out
+    numbers = struct(
+        adam.AdamStep, {}, rates=struct(adam.Rates, {}, **{name: -rate for name, rate in rates.items()}), beta1=s.beta1,
+        beta2=s.beta2, gain1=1 - s.beta1, gain2=1 - s.beta2, per_bias2=1 / s.bias2, eps=s.eps, lambda_hr=s.lambda_hr,
+        lambda_hf=lambda_hf,
     )  # fmt: skip
+    with on_stream(device):
+        launch(adam.write, [1], (numbers, out), device)
+    return out

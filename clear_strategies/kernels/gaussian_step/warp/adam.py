@@ -4,7 +4,12 @@ multiplication here.
 
 from __future__ import annotations
 
+from typing import Final
+
 import warp as wp
+
+NUMBERS: Final = 15
+"""Of an `AdamStep`."""
 
 
 @wp.struct
@@ -32,6 +37,8 @@ class AdamStep:
     gain2: wp.float32
     per_bias2: wp.float32  # 1 / bias of the second moment
     eps: wp.float32
+    lambda_hr: wp.float32
+    lambda_hf: wp.float32  # λ_HR λ_HF, which no kernel reads
 
 
 @wp.struct
@@ -50,6 +57,11 @@ class Attribute:
     stiffness: wp.float32  # 2 λ_stab W
     keep: wp.float32  # factor of the decay per step (f_det), 1: none
     limit: wp.float32
+
+
+@wp.kernel
+def write(values: AdamStep, out: wp.array[AdamStep]) -> None:
+    out[0] = values
 
 
 @wp.func

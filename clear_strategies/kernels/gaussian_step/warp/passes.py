@@ -40,9 +40,8 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 @wp.struct
 class StepOptions:
-    """The settings of a step other than Adam's."""
+    """The settings of a step that are the same in many."""
 
-    lambda_hr: wp.float32
     compares: wp.bool
     corrects: wp.bool
     skips: wp.bool  # skip rows that would not change
@@ -59,7 +58,7 @@ def step(
     rule: Rule,
     reliability: wp.array[wp.float32],
     options: StepOptions,
-    adam: AdamStep,
+    adams: wp.array[AdamStep],
     means: Attribute,
     quats: Attribute,
     scales: Attribute,
@@ -77,6 +76,7 @@ def step(
     If LR and HR have different bases, there are two colours, one for each.
     """
     block, lane = wp.tid()
+    adam = adams[0]
     at = block * wp.block_dim() + lane
     i = wp.min(at, view.n - 1)  # lanes beyond the last Gaussian neither count nor write
     g_lr, g_hr, g_hf = load(activation, lr, base, hf, view, i)
@@ -91,7 +91,7 @@ def step(
             change = correct(products, rule, reliability, i)
         tally = counted(products, change)
 
-    moves, λ = not still, options.lambda_hr
+    moves, λ = not still, adam.lambda_hr
     d_means = merged3(g_lr.means, g_hr.means, change.multiple[MEANS], λ)
     d_quats = merged4(g_lr.quats, g_hr.quats, change.multiple[QUATS], λ)
     d_scales = merged3(g_lr.scales, g_hr.scales, change.multiple[SCALES], λ)
@@ -135,14 +135,14 @@ def step_bands(
     hr_basis: wp.array2d[wp.float32],
     colours: wp.array3d[wp.float32],
     moving: wp.array[wp.bool],
-    adam: AdamStep,
+    adams: wp.array[AdamStep],
     shN: Attribute,
 ) -> None:
     """One thread per number of shN's stepped bands."""
     i, j = wp.tid()
     if not moving[i]:
         return
-    band, channel = 1 + j / 3, j % 3
+    adam, band, channel = adams[0], 1 + j / 3, j % 3
     gradient = wp.float32(0.0)
     if band < view.bases:
         gradient = lr_basis[i, band] * colours[0, i, channel]

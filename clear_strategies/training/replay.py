@@ -1,0 +1,221 @@
+"""Iterations that are recorded and replayed: on a GPU, an iteration takes the host longer than the kernels.
+
+What an iteration does with its view (render, losses, gradients, merge and step, statistics) is recorded once for each kind of
+iteration (`_Kind`), see `rasterizers.recording`, and done again while the tensors of the field lie where they lay. Before a
+replay, what the iteration is given is copied to where the recorded one read it: photo, SR image, what P2G looks up, cameras,
+dropout mask, background, and the numbers of the optimizer's step. All else is live: extra views, what strategies and densifier do
+after the step, and every iteration that cannot be replayed. A replay has the bits of the live iteration.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+import torch
+from torch import Tensor
+
+from clear_strategies.core import deferred
+from clear_strategies.core.deferred import Number
+from clear_strategies.core.view import Photo, View
+from clear_strategies.kernels import losses
+from clear_strategies.merging.iteration import Update
+from clear_strategies.strategies.base import describes, overrides
+from rasterizers.interface import Color, Rasterizer, Recordable
+from rasterizers.recording import Recording
+from rasterizers.warp_runtime import sent
+
+if TYPE_CHECKING:
+    from clear_strategies.training.compiled_step import CompiledStep
+    from clear_strategies.training.state import TrainState
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Given:
+    """What an iteration is given.
+
+    Args:
+        t: the iteration. view: as the skips leave it. scales: whether "lr" and "hr" are drawn.
+        gate: zᵗ. background: behind everything that is drawn; None: the scene's own.
+    """
+
+    t: int
+    view: View
+    scales: Mapping[str, bool]
+    gate: Tensor | None
+    background: Color | None
+
+
+class Learned(NamedTuple):
+    """What an iteration made of its view: the update, and columns of the history."""
+
+    update: Update
+    row: dict[str, Number]
+
+
+Learn = Callable[["TrainState", Rasterizer, Given], Learned]
+
+
+def replays_for(s: TrainState, rasterizer: Rasterizer) -> Replays | None:
+    """The replays of this training; None, and a log line with the reason, where its iterations cannot be recorded."""
+    reason = next(_why_not(s, rasterizer), None)
+    if reason is None and s.compiled_step is not None:
+        return Replays(s, rasterizer, s.compiled_step)
+    _log.warning("fit.replay has no effect: %s.", reason)
+    return None
+
+
+def _why_not(s: TrainState, rasterizer: Rasterizer) -> Iterator[str]:
+    if not rasterizer.traits.records:
+        yield f"{type(rasterizer).__name__} cannot be recorded; rasterizer=warp can"
+    if s.compiled_step is None or not s.compiled_step.records:
+        yield "the per-Gaussian step is not that of Warp"
+    chosen = s.conductor.objective.kernels
+    if (losses.running_on(s.device.type)[0] if chosen == "auto" else chosen) != "warp":
+        yield "the losses are not those of Warp (objective.kernels)"
+    for strategy in s.conductor.strategies:
+        if any(overrides(strategy, hook) for hook in ("observe", "route", "score")) and not describes(
+            strategy, "looked_up"
+        ):
+            yield f"{type(strategy).__name__} does not state what it looks up of a view"
+
+
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """What Python decides by in an iteration: iterations of one kind launch the same kernels.
+
+    Args:
+        addresses: where the tensors lie that it reads and steps.
+    """
+
+    addresses: tuple[int, ...]
+    shapes: tuple[Any, ...]
+    facts: tuple[Any, ...]
+
+
+class Replays:
+    """The recordings of one training."""
+
+    def __init__(self, s: TrainState, rasterizer: Rasterizer, compiled_step: CompiledStep) -> None:
+        self._state, self._rasterizer, self._count = s, rasterizer, compiled_step.count
+        self._recorded: dict[_Kind, _Recorded | None] = {}  # None: seen once
+        self._addresses: tuple[int, ...] = ()
+
+    def learn(self, given: Given, learn: Learn) -> Learned | None:
+        """What the iteration learns, by a replay; None where it has to be live.
+
+        An iteration of a new kind is live first, so that kernels are compiled and caches filled, and is recorded the next time.
+        """
+        kind = self._kind(given)
+        if kind.addresses != self._addresses:  # the structure has changed, and with it everything that was recorded
+            self._recorded.clear()
+            self._addresses = kind.addresses
+        if kind not in self._recorded:
+            self._recorded[kind] = None
+            return None
+        recorded = self._recorded[kind]
+        if recorded is None:
+            recorded = self._recorded[kind] = _Recorded(self._state, self._rasterizer, given, self._count)
+            return recorded.record(given, learn)
+        learned = recorded.replay(given)
+        if learned is None:
+            self._recorded[kind] = None  # recorded anew, with space for more pairs
+        return learned
+
+    def _kind(self, given: Given) -> _Kind:
+        s, o, view = self._state, self._state.conductor.objective, given.view
+        tables = s.field.raw(), s.optimizer.first, s.optimizer.second, s.density.state_dict(), s.conductor.state_dict()
+        addresses = s.field.filter_3d.data_ptr(), *(x.data_ptr() for table in tables for x in table.values())
+        photos = [(p.image.shape, p.shown is None) for p in (view.lr, view.hr)]
+        facts = (
+            s.field.degree, *given.scales.values(), given.gate is None, given.background is None, o.lambda_hr(given.t) > 0,
+            s.density.collects(given.t),
+        )  # fmt: skip
+        return _Kind((len(s.field), *addresses), (*photos, view.background), facts)
+
+
+class _Recorded:
+    """The recording of one kind of iteration, and the tensors from which it reads what it is given."""
+
+    def __init__(self, s: TrainState, rasterizer: Rasterizer, given: Given, count: Callable[[int], None]) -> None:
+        self._count = count
+        self._state, self._device, owner = s, s.device, s.conductor.owner("observe")
+        self._looked_up = (lambda view: None) if owner is None else owner.looked_up
+        self._view, self._gate = _copied(given.view, self._looked_up(given.view)), _clone(given.gate)
+        self._background = s.field.means.new_empty(1, 3)
+        recordable = cast(Recordable, rasterizer)
+        self._rasterizer = rasterizer if given.background is None else recordable.over_changing(self._background)
+        self._numbers_of = recordable.numbers_of
+        self._numbers = [self._numbers_of(photo.camera, s.device) for photo in (self._view.lr, self._view.hr)]
+
+    def record(self, given: Given, learn: Learn) -> Learned:
+        own = replace(given, view=self._view, gate=self._gate, background=None)
+
+        def work() -> tuple[Learned, Tensor, Callable[[Tensor], dict[str, Number]]]:
+            learned = learn(self._state, self._rasterizer, own)
+            counts = {f"skip {k}": count for k, (*_, count) in enumerate(skips) if isinstance(count, Tensor)}
+            return learned, *deferred.gathered(learned.row | counts)
+
+        self._fill(given)
+        with self._state.conductor.work_log.noted() as skips:
+            self._recording = Recording(self._device, work)
+        self._skips = skips
+        return self._learned(given)
+
+    def replay(self, given: Given) -> Learned | None:
+        optimizer = self._state.optimizer
+        steps = optimizer.steps
+        self._fill(given)
+        with self._state.conductor.work_log.stage("replayed"):
+            done = self._recording.replay()
+        if done:
+            return self._learned(given)
+        optimizer.steps = steps
+        return None
+
+    def _fill(self, given: Given) -> None:
+        """Write what the iteration is given to where the recorded one reads it."""
+        view, own = given.view, self._view
+        for photo, copy, numbers in zip((view.lr, view.hr), (own.lr, own.hr), self._numbers, strict=True):
+            copy.image.copy_(photo.over(given.background, view.background).image)
+            _copy(photo.shown, copy.shown)
+            for x, y in zip(self._numbers_of(photo.camera, self._device), numbers, strict=True):
+                y.copy_(x)
+        _copy(self._looked_up(view), own.looked_up)
+        _copy(given.gate, self._gate)
+        if given.background is not None:
+            self._background.copy_(sent(torch.tensor([given.background], dtype=torch.float32), self._device))
+        self._count(given.t)
+
+    def _learned(self, given: Given) -> Learned:
+        """What the last replay made, with the numbers of its history copied: the next one overwrites them."""
+        learned, numbers, row_of = self._recording.result
+        row, skip = row_of(numbers.clone()), self._state.conductor.work_log.skip
+        for k, (name, reason, count) in enumerate(self._skips):
+            counted = row.pop(f"skip {k}", None)
+            skip(name, reason, counted.vector[counted.k].long() if isinstance(counted, deferred.Element) else count)
+        if deferred.is_immediate(numbers):
+            deferred.resolve([row])
+        step = replace(learned.update.step, t=given.t, view=given.view)
+        return Learned(replace(learned.update, step=step), row)
+
+
+def _copied(view: View, looked_up: Tensor | None) -> View:
+    """A view of the same sizes with tensors and cameras of its own, of which only what training reads is copied."""
+    lr, hr = (
+        Photo(replace(photo.camera), photo.image.clone(), _clone(photo.shown)) for photo in (view.lr, view.hr)
+    )  # fmt: skip
+    return View(view.name, lr, hr, background=view.background, looked_up=_clone(looked_up))
+
+
+def _clone(x: Tensor | None) -> Tensor | None:
+    return None if x is None else x.clone()
+
+
+def _copy(x: Tensor | None, to: Tensor | None) -> None:
+    if x is not None and to is not None:
+        to.copy_(x)

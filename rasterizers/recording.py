@@ -1,0 +1,188 @@
+"""Work on a device that is recorded once and then done again without the Python that launched it.
+
+On CUDA a recording is a row of CUDA graphs; on the CPU, where Warp's kernels run to be checked, it is a row of lists of the same
+calls. Either way a replay runs the same kernels on the same memory. What changes from one replay to the next must therefore lie
+in tensors that are written before it: a number that Python passed to a kernel or to torch is the same in every replay.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
+from typing import Any, Final, Generic, TypeVar
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+T = TypeVar("T")
+
+
+class Recording(Generic[T]):
+    """What `work` did on the device, to be done again. It is done once while it is recorded.
+
+    Args:
+        device: where it works; all of it on torch's current stream.
+        work: launches by torch and by `rasterizers.warp_runtime`. It must not read a number from the device, but right after a
+            `pause`. What it does once, such as to compile kernels or to fill caches, must have been done.
+
+    Attributes:
+        result: what `work` returned. Its tensors receive new values in every replay.
+
+    Raises:
+        RuntimeError: `work` does what cannot be recorded.
+    """
+
+    def __init__(self, device: torch.device, work: Callable[[], T]) -> None:
+        self._parts: list[tuple[Callable[[], None], Callable[[], bool]]] = []
+        self._recorder: _Recorder = _Graphs(device) if device.type == "cuda" else _Calls()
+        _running.recording = self
+        try:
+            with self._recorder.scope(), self._recorder:
+                self._recorder.begin()
+                self.result = work()
+                self._parts.append((self._recorder.end(), lambda: True))
+        finally:
+            _running.recording = None
+
+    def pause(self, holds: Callable[[], bool]) -> None:
+        """End a part of the work: the host may read what it computed.
+
+        Args:
+            holds: asked at this place of every replay, whether what was recorded after it holds for what was computed before it.
+        """
+        self._parts.append((self._recorder.end(), holds))
+        self._recorder.begin()
+
+    def launched(self, again: Callable[[], Any], tensors: Iterable[Any]) -> None:
+        """Add a launch that torch does not see. It has been made, and reads and writes these tensors."""
+        self._recorder.launched(again, tensors)
+
+    def replay(self) -> bool:
+        """Do the work again; False: it ended at a `pause` where what was recorded does not hold."""
+        for work, holds in self._parts:
+            work()
+            if not holds():
+                return False
+        return True
+
+
+class _Running(threading.local):
+    recording: Recording[Any] | None = None
+
+
+_running: Final = _Running()
+
+
+def running() -> Recording[Any] | None:
+    """The recording that this thread is making."""
+    return _running.recording
+
+
+class _Recorder(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Sees the calls of torch's operations while it is entered, and keeps the tensors that they read from elsewhere."""
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self._own: set[int] = set()  # addresses of the memory that the work has allocated
+        self._kept: list[Any] = []
+
+    def scope(self) -> AbstractContextManager[Any]:
+        return nullcontext()
+
+    def begin(self) -> None:
+        raise NotImplementedError
+
+    def end(self) -> Callable[[], None]:
+        """End a part; returns what does it again."""
+        raise NotImplementedError
+
+    def launched(self, again: Callable[[], Any], tensors: Iterable[Any]) -> None:
+        self._keep(tensors)
+
+    def _keep(self, tensors: Iterable[Any]) -> None:
+        self._kept += [x for x in tensors if isinstance(x, Tensor) and x.untyped_storage().data_ptr() not in self._own]
+
+    def __torch_dispatch__(self, op: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        call = partial(op, *args, **(kwargs or {}))
+        result = call()
+        if op.overloadpacket is torch.ops.aten._local_scalar_dense:
+            raise RuntimeError("recorded work must not read a number from the device.")
+        made = [x for x in tree_leaves(result) if isinstance(x, Tensor)]
+        if not (op.is_view or op._schema.is_mutable):
+            self._own |= {x.untyped_storage().data_ptr() for x in made}
+        self.called(op, call, made)
+        self._keep(tree_leaves((args, kwargs)))
+        return result
+
+    def called(self, op: Any, call: Callable[[], Any], made: list[Tensor]) -> None:
+        """An operation of torch that has returned these tensors."""
+
+
+class _Graphs(_Recorder):  # type: ignore[no-untyped-call]
+    """Records CUDA graphs. All of them take their memory from one pool, since they run in order."""
+
+    def __init__(self, device: torch.device) -> None:
+        super().__init__()
+        self._stream: Any = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        self._pool: Any = None
+        self._graph: Any = None
+
+    @contextmanager
+    def scope(self) -> Iterator[None]:
+        outer = torch.cuda.current_stream(self._stream.device)
+        self._stream.wait_stream(outer)
+        try:
+            with torch.cuda.stream(self._stream):
+                yield
+        finally:
+            if self._graph is not None:  # the work failed
+                self._graph.capture_end()
+            outer.wait_stream(self._stream)
+
+    def begin(self) -> None:
+        graph: Any = torch.cuda.CUDAGraph()
+        graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
+        self._graph, self._pool = graph, graph.pool()
+
+    def end(self) -> Callable[[], None]:
+        graph, self._graph = self._graph, None
+        graph.capture_end()
+        graph.replay()  # to record is not to run
+        replay: Callable[[], None] = graph.replay
+        return replay
+
+
+class _Calls(_Recorder):  # type: ignore[no-untyped-call]
+    """Records the calls, and makes them."""
+
+    def begin(self) -> None:
+        self._again: list[Callable[[], Any]] = []
+
+    def end(self) -> Callable[[], None]:
+        calls = self._again
+
+        def replay() -> None:
+            for call in calls:
+                call()
+
+        return replay
+
+    def launched(self, again: Callable[[], Any], tensors: Iterable[Any]) -> None:
+        self._keep(tensors)
+        self._again.append(again)
+
+    def called(self, op: Any, call: Callable[[], Any], made: list[Tensor]) -> None:
+        self._kept.append(made)
+        if op._schema.is_mutable:
+            self._again.append(call)
+        elif made and not op.is_view and not op.overloadpacket.__name__.startswith(("empty", "new_empty")):
+            self._again.append(partial(_written_anew, made, call))
+
+
+def _written_anew(made: list[Tensor], call: Callable[[], Any]) -> None:
+    for tensor, value in zip(made, tree_leaves(call()), strict=True):
+        tensor.copy_(value)
