@@ -10,8 +10,8 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from functools import partial
-from typing import Any, Final, Generic, TypeVar
+from functools import cache, partial
+from typing import Any, Final, Generic, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -57,8 +57,12 @@ class Recording(Generic[T]):
         self._parts.append((self._recorder.end(), holds))
         self._recorder.begin()
 
-    def launched(self, again: Callable[[], Any], tensors: Iterable[Any]) -> None:
-        """Add a launch that torch does not see. It has been made, and reads and writes these tensors."""
+    def launched(self, again: Callable[[], Callable[[], Any]], tensors: Iterable[Any]) -> None:
+        """Add a launch that torch does not see. It has been made, and reads and writes these tensors.
+
+        Args:
+            again: makes what launches again, where a graph does not do that.
+        """
         self._recorder.launched(again, tensors)
 
     def replay(self) -> bool:
@@ -100,7 +104,7 @@ class _Recorder(TorchDispatchMode):  # type: ignore[no-untyped-call]
         """End a part; returns what does it again."""
         raise NotImplementedError
 
-    def launched(self, again: Callable[[], Any], tensors: Iterable[Any]) -> None:
+    def launched(self, again: Callable[[], Callable[[], Any]], tensors: Iterable[Any]) -> None:
         self._keep(tensors)
 
     def _keep(self, tensors: Iterable[Any]) -> None:
@@ -127,9 +131,9 @@ class _Graphs(_Recorder):  # type: ignore[no-untyped-call]
 
     def __init__(self, device: torch.device) -> None:
         super().__init__()
-        self._stream: Any = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        self._stream = _side_stream(device)
         self._pool: Any = None
-        self._graph: Any = None
+        self._capturing: tuple[Any, Any] | None = None  # torch's graph, and Warp's stream, which knows of the capture
 
     @contextmanager
     def scope(self) -> Iterator[None]:
@@ -139,21 +143,41 @@ class _Graphs(_Recorder):  # type: ignore[no-untyped-call]
             with torch.cuda.stream(self._stream):
                 yield
         finally:
-            if self._graph is not None:  # the work failed
-                self._graph.capture_end()
+            if self._capturing is not None:  # the work failed
+                self._end_capture()
             outer.wait_stream(self._stream)
 
     def begin(self) -> None:
-        graph: Any = torch.cuda.CUDAGraph()
+        import warp as wp
+
+        from rasterizers.warp_runtime import warp_stream
+
+        stream, graph = warp_stream(self._stream), cast(Any, torch.cuda.CUDAGraph())
         graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
-        self._graph, self._pool = graph, graph.pool()
+        self._capturing, self._pool = (graph, stream), graph.pool()
+        wp.capture_begin(stream=stream, external=True)  # else the memory of Warp's sort would leak
 
     def end(self) -> Callable[[], None]:
-        graph, self._graph = self._graph, None
-        graph.capture_end()
+        graph = self._end_capture()
         graph.replay()  # to record is not to run
         replay: Callable[[], None] = graph.replay
         return replay
+
+    def _end_capture(self) -> Any:
+        import warp as wp
+
+        (graph, stream), self._capturing = cast(tuple[Any, Any], self._capturing), None
+        try:
+            self._kept.append(wp.capture_end(stream=stream))
+        finally:
+            graph.capture_end()
+        return graph
+
+
+@cache
+def _side_stream(device: torch.device) -> Any:
+    """The stream that graphs are captured on, which torch's default stream cannot be."""
+    return torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
 
 
 class _Calls(_Recorder):  # type: ignore[no-untyped-call]
@@ -171,9 +195,9 @@ class _Calls(_Recorder):  # type: ignore[no-untyped-call]
 
         return replay
 
-    def launched(self, again: Callable[[], Any], tensors: Iterable[Any]) -> None:
+    def launched(self, again: Callable[[], Callable[[], Any]], tensors: Iterable[Any]) -> None:
         self._keep(tensors)
-        self._again.append(again)
+        self._again.append(again())
 
     def called(self, op: Any, call: Callable[[], Any], made: list[Tensor]) -> None:
         self._kept.append(made)

@@ -74,7 +74,7 @@ def launch(
         recorded = _recorded.launches[key] = _Launch(kernel, device, block)
     recorded.prepare(size, arguments).launch()
     if (recording := running()) is not None:
-        recording.launched(_Launch(kernel, device, block).prepare(size, arguments).launch, arguments)
+        recording.launched(lambda: _Launch(kernel, device, block).prepare(size, arguments).launch, arguments)
 
 
 class _Launch:
@@ -155,9 +155,6 @@ def sort_pairs(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
     """
     import warp as wp
 
-    if (recording := running()) is not None:
-        copies = [wp.from_torch(x) for x in (keys, values)]  # the kept ones lie elsewhere at the next sort
-        recording.launched(partial(wp.utils.radix_sort_pairs, *copies, count, end_bit=bits), (keys, values))
     key = len(keys), keys.device
     arrays = _recorded.sorts.get(key)
     if arrays is None:
@@ -169,6 +166,9 @@ def sort_pairs(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
         )
     arrays[0].ptr, arrays[1].ptr = keys.data_ptr(), values.data_ptr()
     wp.utils.radix_sort_pairs(*arrays, count, end_bit=bits)
+    if (recording := running()) is not None:  # `arrays` will lie elsewhere at the next sort
+        again = partial(wp.utils.radix_sort_pairs, *map(wp.from_torch, (keys, values)), count, end_bit=bits)
+        recording.launched(lambda: again, (keys, values))
 
 
 def array(tensor: Tensor | None, kind: Any) -> Any:
@@ -257,12 +257,14 @@ def on_stream(device: torch.device) -> AbstractContextManager[Any]:
     import warp as wp
 
     wp.init()
-    scope: AbstractContextManager[Any] = wp.ScopedStream(_stream(torch.cuda.current_stream(device)), sync_enter=False)
+    scope: AbstractContextManager[Any] = wp.ScopedStream(
+        warp_stream(torch.cuda.current_stream(device)), sync_enter=False
+    )
     return scope
 
 
 @cache
-def _stream(stream: torch.cuda.Stream) -> Any:
+def warp_stream(stream: torch.cuda.Stream) -> Any:
     """Torch's stream as a Warp stream. Cached, because Warp keeps the scratch memory of its sort with the stream."""
     import warp as wp
 

@@ -19,12 +19,13 @@ def test_every_command_is_understood_and_a_failed_step_stops_no_other(tmp_path):
     environment = {**os.environ, "PATH": f"{programs}:{os.environ['PATH']}"}
     done = subprocess.run([SCRIPT, out, scenes], env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 1
-    assert [line for line in done.stdout.splitlines() if ": passed" not in line] == ["same-bits: failed, 0 s"]
+    failed = [f"{step}: failed, 0 s" for step in ("same-bits", "same-bits-replayed")]
+    assert [line for line in done.stdout.splitlines() if ": passed" not in line] == failed
     assert "point_cloud.ply" in (out / "logs" / "same-bits.log").read_text()
     calls = [line.split() for line in (tmp_path / "calls").read_text().splitlines()]
     modules = [words[words.index("-m") + 1] for words in calls]
     assert modules.count("clear_strategies.bench") == 5
-    assert modules.count("clear_strategies.run") == 8
+    assert modules.count("clear_strategies.run") == 9
     assert [words[:3] for words in calls[-2:]] == [
         ["compute-sanitizer", "--tool", tool] for tool in ("memcheck", "racecheck")
     ]
