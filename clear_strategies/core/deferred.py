@@ -90,7 +90,8 @@ def gathered(row: Mapping[str, Number]) -> tuple[Float[Tensor, " K"], Callable[[
     """The numbers on the device that a row is made of, as one float64 vector, and the row of a copy of that vector."""
     found = {id(x): x for number in row.values() for x in _tensors(number)}
     firsts = dict(zip(found, accumulate((x.numel() for x in found.values()), initial=0), strict=False))
-    vector = torch.cat([x.reshape(-1).double() for x in found.values()])
+    parts = [x.reshape(-1) for x in found.values()]
+    vector = torch.cat([*parts, parts[0].new_empty(0, dtype=torch.float64)])
 
     def of(number: Number, copy: Tensor) -> Number:
         if isinstance(number, Deferred):

@@ -124,7 +124,7 @@ def list_pairs(
 ) -> None:
     """One thread per place: its Gaussian, front to back, and which of the Gaussian's tiles it holds.
 
-    The Gaussian at `order[rank]` has the places from `ends[rank]` to `ends[rank + 1]`, as many as another kernel counted, where
+    The Gaussian at `order[rank]` has the places from `ends[rank - 1]` to `ends[rank]`, as many as another kernel counted, where
     the compiler may round differently; if the tiles differ, the number of places holds. Places without a tile, and those beyond
     the last Gaussian's, get the tile that does not exist.
     """
@@ -133,9 +133,10 @@ def list_pairs(
     places[place] = place
     if wp.int64(place) >= ends[ends.shape[0] - 1]:
         return
-    after = wp.lower_bound(ends, wp.int64(place) + wp.int64(1))
-    i = order[after - 1]
-    nth = place - wp.int32(ends[after - 1])
+    rank = wp.lower_bound(ends, wp.int64(place) + wp.int64(1))
+    i, nth = order[rank], place
+    if rank > 0:
+        nth -= wp.int32(ends[rank - 1])
     if nth == 0:
         firsts[i] = place
     tiles[place] = nth_tile(ellipse_of(rows[i]), nth, grid)

@@ -75,11 +75,12 @@ def colour_of(
 
 @wp.kernel
 def basis(
-    poses: wp.array[Pose], means: wp.array[wp.vec3], visible: wp.array[wp.bool], Y: wp.array2d[wp.float32]
+    poses: wp.array[Pose], means: wp.array[wp.vec3], visible: wp.array2d[wp.bool], Y: wp.array2d[wp.float32]
 ) -> None:
-    """Y of the visible Gaussians; the other rows are not written."""
+    """Y of the Gaussians that are visible on a grid, 0 of the others."""
     i = wp.tid()
-    if visible[i]:
-        direction = wp.normalize(means[i] - poses[0].center)
-        for k in range(Y.shape[1]):
-            Y[i, k] = band(k, direction)[0]
+    direction, seen = wp.normalize(means[i] - poses[0].center), wp.bool(False)
+    for grid in range(visible.shape[0]):
+        seen = seen or visible[grid, i]
+    for k in range(Y.shape[1]):
+        Y[i, k] = wp.where(seen, band(k, direction)[0], 0.0)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from functools import lru_cache, reduce
+from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 import torch
@@ -45,7 +45,9 @@ TILE_LANES: Final = {"cuda": TILE**2, "cpu": 1}
 class _View:
     """One pixel grid of a frame: its inputs, and its results on the device."""
 
-    def __init__(self, splats: Splats, camera: Camera, *, has_depth: bool) -> None:
+    def __init__(
+        self, splats: Splats, camera: Camera, has_depth: bool, counts: Tensor, firsts: Tensor, visible: Tensor, total: Tensor
+    ) -> None:  # fmt: skip
         n, like = len(splats), splats.means
         self.camera, self.has_depth = camera, has_depth
         self.columns, self.rows_of_tiles = -(-camera.width // TILE), -(-camera.height // TILE)
@@ -53,12 +55,11 @@ class _View:
         self.offsets = None if splats.rgb_offset is None else splats.rgb_offset.contiguous()
         self.grid = numbers_of(camera, like.device).grid
         self.ellipses, self.means2d = like.new_empty(n, _ROW), like.new_empty(n, 2)
-        self.visible = like.new_empty(n, dtype=torch.bool)
-        # Tiles of each Gaussian, and its first pair.
-        self.counts, self.firsts = like.new_empty(2, n, dtype=torch.int32).unbind()
-        self.ends = like.new_zeros(n + 1, dtype=torch.int64)  # pairs up to each Gaussian, front to back
+        self.visible = visible
+        self.counts, self.firsts = counts, firsts  # tiles of each Gaussian, and its first pair
+        self.ends: Tensor  # pairs up to each Gaussian, front to back, and included; set by `Frame.draw`
+        self.total = total  # number of pairs
         self.pairs = 0  # set by `Frame.resolve_counts`; of a recorded frame as many as it has space for
-        self.total: Tensor  # their number on the device, set by `Frame.draw`
         self.lists: _Lists  # set by `Frame._list`
         self.capacity = -1  # pairs that the lists have space for; the nearest ones if there are more
 
@@ -92,20 +93,26 @@ class Frame:
         self.colours = self.empty(self.n, 3)
         self.slopes = self.empty(self.n if self.bands else 0, 3, 3)
         self.depths = self.empty(self.n if any(depth) else 0)
-        self.views = [_View(*job, has_depth=z) for job, z in zip(jobs, depth, strict=True)]
+        k = len(jobs)
+        self._counts, firsts = self.empty(2, k, self.n, dtype=torch.int32).unbind()
+        self._visible = self.empty(k, self.n, dtype=torch.bool)
+        # The number of pairs on each grid, and the flags of `project.project`.
+        self.totals = self.like.new_zeros(k + 3, dtype=torch.int64)
+        each = zip(jobs, depth, self._counts, firsts, self._visible, self.totals[:k, None], strict=True)
+        self.views = [_View(*job, *others) for job, *others in each]
         self._basis: Tensor | None = None
         self.resolved = False
 
     def draw(self) -> list[WarpRendering]:
         """An image on each grid. Errors in the input may be raised only when an image is first accessed."""
         with on_stream(self.like.device):
-            keys, places, flags = self.project()
+            keys, places = self.project()
             self._order = _sorted(keys, places, self.n, 31)[1]
-            for view in self.views:
-                torch.cumsum(view.counts.index_select(0, self._order), 0, out=view.ends[1:])
-            self.totals = torch.cat([*(view.ends[-1:] for view in self.views), flags])
-            for view, total in zip(self.views, self.totals[:, None], strict=False):
-                view.total = total
+            ends = torch.cumsum(self._counts.index_select(1, self._order), 1)  # in 64 bits
+            for view, ends_of_view in zip(self.views, ends, strict=True):
+                view.ends = ends_of_view
+            if self.n:
+                self.totals[: len(ends)] = ends[:, -1]
             if (recording := running()) is not None:
                 recording.pause(self._fits)
                 self._read = self.totals.tolist
@@ -168,22 +175,21 @@ class Frame:
     def basis(self) -> Float[Tensor, "N B1"]:
         """Y of this pose's directions, computed once for all grids."""
         if self._basis is None:
-            visible = reduce(torch.logical_or, [view.visible for view in self.views])
-            self._basis = self.like.new_zeros(self.n, self.bands + 1)
-            self.launch(basis, self.n, self.pose, self.means, visible, self._basis)
+            self._basis = self.empty(self.n, self.bands + 1)
+            self.launch(basis, self.n, self.pose, self.means, self._visible, self._basis)
         return self._basis
 
-    def project(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Project onto each grid. Returns depth keys and their Gaussians, with space for sorting, and the kernel's flags."""
+    def project(self) -> tuple[Tensor, Tensor]:
+        """Project onto each grid. Returns depth keys and their Gaussians, with space for sorting."""
         keys, places = (self.empty(2 * self.n, dtype=torch.int32) for _ in range(2))
-        flags = self.like.new_zeros(3, dtype=torch.int64)
         for nth, view in enumerate(self.views):
             self.launch(
                 project, self.n, self.pose, view.grid, self.cuts, self.means, self.quats, self.scales, view.opacities, self.sh0,
                 self.shN, view.offsets is not None, view.offsets, nth == 0, keys, places, self.colours, self.slopes, self.depths,
-                view.ellipses, view.means2d, view.visible, view.counts, flags,
+                view.ellipses, view.means2d, view.visible, view.counts,
+                self.totals[len(self.views) :],
             )  # fmt: skip
-        return keys, places, flags
+        return keys, places
 
     def _require_memory(self, view: _View, count: int) -> None:
         """Refuse counts beyond the budget. Counts are 64-bit up to here, and fit 32 bits after it."""
