@@ -7,11 +7,12 @@ Expected depth, where it is drawn, is E = Σ T_i α_i z_i / Σ T_i α_i.
 A Gaussian with α_i < α_min is skipped; a pixel ends before the Gaussian that would take its T below transmittance_min.
 The final T is stored, because 1 - alpha would lose its digits.
 
-The VJP has a block of threads for every `SEGMENT` pairs, however long a tile's list is. Where a list goes on beyond a segment,
-the forward pass leaves a mark for each pixel: T at the segment's end, and the light from behind it.
+Both directions have a block of threads for every `SEGMENT` pairs, however long a tile's list is. A tile's part of a segment is a
+piece. Forward, each piece is blended alone, as if T were 1 before it, and then the pieces of a tile one after the other; at the
+start of each a mark is left for each pixel: T there, and the light from behind it.
 
-Both read the Gaussians in batches: each thread of a block loads one, and all threads use them from shared memory. Batches
-alternate between two halves of it, so that a thread may load the next batch while others use this one.
+Pairs are read in batches: each thread of a block loads one, and all threads use them from shared memory. Batches alternate
+between two halves of it, so that a thread may load the next batch while others use this one.
 """
 
 from __future__ import annotations
@@ -63,16 +64,95 @@ def alpha_of(g: Near, d: wp.vec2) -> wp.float32:
     return g[5] * wp.exp(-exponent(g[2], g[3], g[4], d[0], d[1]))
 
 
+@wp.func
+def piece_of(segment: wp.int32, tile: wp.int32) -> wp.int32:
+    """The number of the piece that a tile has in a segment: pairs are sorted by tile, so that each has another."""
+    return segment + tile
+
+
 @cache
-def blend(depth: bool, lanes: int) -> Any:  # noqa: PLR0915 - a kernel
-    """The kernel that draws the image, with `lanes` threads per tile; with `depth` also E, which is 0 where nothing is drawn."""
+def blend_pieces(depth: bool, lanes: int) -> Any:
+    """The kernel that blends each segment as if nothing lay before it, with `lanes` threads per segment."""
     per_lane, both = PIXELS // lanes, 2 * lanes
-    Numbers = wp.types.vector(length=per_lane, dtype=wp.float32)
-    Ends = wp.types.vector(length=per_lane, dtype=wp.int32)
-    Colours = wp.types.matrix(shape=(per_lane, 3), dtype=wp.float32)
+    Lights = wp.types.matrix(shape=(per_lane, 4), dtype=wp.float32)
+    Depths = wp.types.matrix(shape=(per_lane, 2), dtype=wp.float32)
+
+    @wp.func
+    def keep(
+        piece: wp.int32,
+        lane: wp.int32,
+        light: Any,
+        sums: Any,
+        pieces: wp.array2d[wp.vec4],
+        expected: wp.array2d[wp.vec2],
+    ) -> None:
+        for j in range(per_lane):
+            pieces[piece, j * lanes + lane] = wp.vec4(light[j, 0], light[j, 1], light[j, 2], light[j, 3])
+            if depth:
+                expected[piece, j * lanes + lane] = wp.vec2(sums[j, 0], sums[j, 1])
 
     @wp.kernel(module="unique", enable_backward=False)
-    def blend(  # noqa: PLR0912, PLR0915
+    def blend_pieces(
+        grids: wp.array[Grid],
+        cuts: Cuts,
+        rows: wp.array[Row],
+        depths: wp.array[wp.float32],
+        tiles: wp.array[wp.int32],
+        listed: wp.array[wp.int32],
+        total: wp.array[wp.int64],
+        capacity: wp.int32,
+        pieces: wp.array2d[wp.vec4],
+        expected: wp.array2d[wp.vec2],
+    ) -> None:
+        """`pieces` receives light and transmittance, and `expected` the sums of E, see `piece_of`."""
+        segment, lane = wp.tid()
+        grid, first = grids[0], segment * SEGMENT
+        n_tiles, pairs = grid.tiles[0] * grid.tiles[1], wp.int32(wp.min(total[0], wp.int64(capacity)))
+        last = wp.min(first + SEGMENT, pairs)
+        batch = wp.tile_empty(shape=(both,), dtype=Near, storage="shared")
+        tile_of = wp.tile_empty(shape=(both,), dtype=wp.int32, storage="shared")
+        light, sums, tile, half = Lights(), Depths(), wp.int32(n_tiles), wp.int32(0)
+        for start in range(first, last, lanes):
+            loaded, found, mine = Near(), wp.int32(n_tiles), start + lane
+            if mine < last:
+                found = tiles[mine]
+                if found < n_tiles:
+                    loaded = near(rows[listed[mine]], found, grid)
+            wp.tile_assign(batch, wp.tile(loaded, preserve_type=True), offset=(half,))
+            wp.tile_assign(tile_of, wp.tile(found), offset=(half,))
+            for nth in range(wp.min(lanes, last - start)):
+                g = batch[half + nth]
+                if tile_of[half + nth] != tile:
+                    if tile < n_tiles:
+                        keep(piece_of(segment, tile), lane, light, sums, pieces, expected)
+                    tile = tile_of[half + nth]
+                    light, sums = Lights(), Depths()
+                    for j in range(per_lane):
+                        light[j, 3] = 1.0
+                for j in range(per_lane):
+                    free = alpha_of(g, offset_of(j * lanes + lane, g))
+                    if free >= cuts.alpha_min:
+                        share = wp.min(free, cuts.alpha_max)
+                        weight = light[j, 3] * share
+                        for c in range(3):
+                            light[j, c] += weight * g[6 + c]
+                        if depth:
+                            sums[j, 0] += weight * depths[listed[start + nth]]
+                            sums[j, 1] += weight
+                        light[j, 3] *= 1.0 - share
+            half = lanes - half
+        if tile < n_tiles:
+            keep(piece_of(segment, tile), lane, light, sums, pieces, expected)
+
+    return blend_pieces
+
+
+@cache
+def blend(depth: bool) -> Any:  # noqa: PLR0915 - a kernel
+    """The kernel that draws the image of pieces; with `depth` also E, which is 0 where nothing is drawn."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def blend(  # noqa: PLR0912
         grids: wp.array[Grid],
         cuts: Cuts,
         backgrounds: wp.array[wp.vec3],
@@ -81,72 +161,72 @@ def blend(depth: bool, lanes: int) -> Any:  # noqa: PLR0915 - a kernel
         listed: wp.array[wp.int32],
         starts: wp.array[wp.int32],
         ends: wp.array[wp.int32],
+        pieces: wp.array2d[wp.vec4],
+        sums_of_pieces: wp.array2d[wp.vec2],
         image: wp.array2d[wp.vec3],
         transmittance: wp.array2d[wp.float32],
         ended: wp.array2d[wp.int32],
-        marks: wp.array2d[wp.vec4],
         expected: wp.array2d[wp.float32],
     ) -> None:
-        """`ended` receives the first pair that the pixel did not blend."""
-        tile, lane = wp.tid()
-        grid, background = grids[0], backgrounds[0]
+        """One thread per pixel of a tile. `ended` receives the first pair that the pixel did not blend, and a piece the mark of
+        its start: the light from behind, and T.
+
+        A pixel that ends within a piece blends it once more, pair by pair.
+        """
+        tile, within = wp.tid()
+        grid = grids[0]
+        pixel = pixel_of(tile, within, grid)
+        if not inside(pixel, grid):
+            return
         begin, end = starts[tile], ends[tile]
-        batch = wp.tile_empty(shape=(both,), dtype=Near, storage="shared")
-        through, stop, light, weighted, weights = Numbers(), Ends(), Colours(), Numbers(), Numbers()
-        for j in range(per_lane):
-            through[j] = 1.0
-            stop[j] = end
-            if not inside(pixel_of(tile, j * lanes + lane, grid), grid):
-                stop[j] = begin
-        half = wp.int32(0)
-        for first in range(begin, end, lanes):
-            loaded = Near()
-            if first + lane < end:
-                loaded = near(rows[listed[first + lane]], tile, grid)
-            wp.tile_assign(batch, wp.tile(loaded, preserve_type=True), offset=(half,))
-            for nth in range(wp.min(lanes, end - first)):
-                at, g = first + nth, batch[half + nth]
-                for j in range(per_lane):
-                    within = j * lanes + lane
-                    if at < stop[j]:
-                        if at % SEGMENT == 0 and at > begin:  # light is that of one segment
-                            marks[at / SEGMENT, within] = wp.vec4(light[j, 0], light[j, 1], light[j, 2], through[j])
-                            for c in range(3):
-                                light[j, c] = 0.0
-                        free = alpha_of(g, offset_of(within, g))
-                        if free >= cuts.alpha_min:
-                            share = wp.min(free, cuts.alpha_max)
-                            after = through[j] * (1.0 - share)
-                            if after < cuts.transmittance_min:
-                                stop[j] = at
-                            else:
-                                weight = through[j] * share
-                                for c in range(3):
-                                    light[j, c] += weight * g[6 + c]
-                                if depth:
-                                    weighted[j] += weight * depths[listed[at]]
-                                    weights[j] += weight
-                                through[j] = after
-            half = lanes - half
-        for j in range(per_lane):
-            within = j * lanes + lane
-            pixel = pixel_of(tile, within, grid)
-            if inside(pixel, grid):
-                rgb = wp.vec3(light[j, 0], light[j, 1], light[j, 2]) + through[j] * background
-                last = wp.min(stop[j], end - 1) / SEGMENT
-                for back in range(wp.max(last - begin / SEGMENT, 0)):
-                    mark = last - back
-                    segment = marks[mark, within]
-                    marks[mark, within] = wp.vec4(rgb[0], rgb[1], rgb[2], segment[3])
-                    rgb += wp.vec3(segment[0], segment[1], segment[2])
-                image[pixel[1], pixel[0]] = rgb
-                transmittance[pixel[1], pixel[0]] = through[j]
-                ended[pixel[1], pixel[0]] = stop[j]
-                if depth:
-                    over = wp.float32(0.0)
-                    if weights[j] > 0.0:
-                        over = 1.0 / weights[j]
-                    expected[pixel[1], pixel[0]] = weighted[j] * over
+        first, stop, last = begin / SEGMENT, wp.int32(end), begin / SEGMENT
+        through, light, weighted, weights = wp.float32(1.0), wp.vec3(), wp.float32(0.0), wp.float32(0.0)
+        for segment in range(first, (end + SEGMENT - 1) / SEGMENT):
+            if stop == end:
+                at, last = piece_of(segment, tile), segment
+                piece = pieces[at, within]
+                pieces[at, within] = wp.vec4(
+                    light[0], light[1], light[2], through
+                )  # light is that of the segment before
+                light = through * wp.vec3(piece[0], piece[1], piece[2])
+                after = through * piece[3]
+                if after >= cuts.transmittance_min:
+                    if depth:
+                        weighted += through * sums_of_pieces[at, within][0]
+                        weights += through * sums_of_pieces[at, within][1]
+                    through = after
+                else:
+                    light = wp.vec3()
+                    for pair in range(wp.max(segment * SEGMENT, begin), wp.min((segment + 1) * SEGMENT, end)):
+                        if stop == end:
+                            g = near(rows[listed[pair]], tile, grid)
+                            free = alpha_of(g, offset_of(within, g))
+                            if free >= cuts.alpha_min:
+                                share = wp.min(free, cuts.alpha_max)
+                                after = through * (1.0 - share)
+                                if after < cuts.transmittance_min:
+                                    stop = pair
+                                else:
+                                    weight = through * share
+                                    light += weight * wp.vec3(g[6], g[7], g[8])
+                                    if depth:
+                                        weighted += weight * depths[listed[pair]]
+                                        weights += weight
+                                    through = after
+        rgb = light + through * backgrounds[0]
+        for back in range(last - first):
+            at = piece_of(last - back, tile)
+            before = pieces[at, within]
+            pieces[at, within] = wp.vec4(rgb[0], rgb[1], rgb[2], before[3])
+            rgb += wp.vec3(before[0], before[1], before[2])
+        image[pixel[1], pixel[0]] = rgb
+        transmittance[pixel[1], pixel[0]] = through
+        ended[pixel[1], pixel[0]] = stop
+        if depth:
+            over = wp.float32(0.0)
+            if weights > 0.0:
+                over = 1.0 / weights
+            expected[pixel[1], pixel[0]] = weighted * over
 
     return blend
 
@@ -243,7 +323,7 @@ def blend_vjp(K: int, lanes: int, shuffles: bool) -> Any:  # noqa: PLR0915 - a k
                             stop[j] = ended[pixel[1], pixel[0]]
                             light = through[j] * background
                             if ends[tile] > after and stop[j] > after:
-                                mark = marks[segment + 1, within]
+                                mark = marks[piece_of(segment + 1, tile), within]
                                 through[j] = mark[3]
                                 light = wp.vec3(mark[0], mark[1], mark[2])
                             for k in range(K):

@@ -1,6 +1,6 @@
 """A frame: one set of Gaussians seen from one pose on one or more pixel grids. Launches the kernels, and keeps shared data.
 
-    forward:   project (each grid) -> order by depth -> (each grid: list pairs -> blend)
+    forward:   project (each grid) -> order by depth -> (each grid: list pairs -> blend pieces -> blend)
     backward:  blend_vjp -> fold -> project_vjp
 
 Torch allocates all memory except the sort's scratch, and all work runs on torch's current stream. The number of pairs of
@@ -27,7 +27,7 @@ from rasterizers.interface import Camera, SplatGradients, Splats
 from rasterizers.recording import running
 from rasterizers.warp_backend import types
 from rasterizers.warp_backend.bins import find_tiles, list_pairs
-from rasterizers.warp_backend.blend import blend, blend_vjp
+from rasterizers.warp_backend.blend import blend, blend_pieces, blend_vjp
 from rasterizers.warp_backend.colour import basis
 from rasterizers.warp_backend.project import fold, project, project_vjp
 from rasterizers.warp_backend.settings import PAIR_BYTES, SUMS_BYTES, TILE, WarpSettings, mebibytes, padded
@@ -258,13 +258,19 @@ class WarpRendering:
     def _blend(self) -> None:
         frame, view, lists = self._frame, self._view, self._view.lists
         self._drawn_from = lists
-        self._marks = frame.empty(view.capacity // types.SEGMENT + 1, types.PIXELS, 4)
+        n_tiles, segments = view.columns * view.rows_of_tiles, -(-view.capacity // types.SEGMENT)
+        pieces = self._marks = frame.empty(segments + n_tiles, types.PIXELS, 4)
+        sums = frame.empty(segments + n_tiles, types.PIXELS, 2) if view.has_depth else None
         lanes = TILE_LANES[frame.settings.device]
         frame.launch_blocks(
-            blend(view.has_depth, lanes), view.columns * view.rows_of_tiles, lanes, view.grid, frame.cuts, frame.background,
-            view.ellipses, frame.depths, lists.gaussians, lists.starts, lists.ends, self._image, self._transmittance,
-            self._ended, self._marks, self._depth,
+            blend_pieces(view.has_depth, lanes), segments, lanes, view.grid, frame.cuts, view.ellipses, frame.depths, lists.tiles,
+            lists.gaussians, view.total, view.capacity, pieces, sums,
         )  # fmt: skip
+        drawn = (
+            view.grid, frame.cuts, frame.background, view.ellipses, frame.depths, lists.gaussians, lists.starts, lists.ends,
+            pieces, sums, self._image, self._transmittance, self._ended, self._depth,
+        )  # fmt: skip
+        launch(blend(view.has_depth), [n_tiles, types.PIXELS], drawn, frame.like.device, block=types.PIXELS)
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
         """One pass for up to three cotangents; see `Rendering.vjp`."""

@@ -162,7 +162,9 @@ def test_an_image_does_not_depend_on_the_capacity_of_its_lists(capacity, deferre
 @installed
 @needs("cpp")
 def test_long_lists_and_large_gaussians_are_summed_in_short_chains():
-    """A tile's list of 2,600, and a Gaussian on each of 12,000 tiles, whose sums are folded twice."""
+    """A tile's list of 2,600, and a Gaussian on each of 12,000 tiles, whose sums are folded twice. Each kernel that goes through
+    pairs has a block for each segment of them, and the others go through what is left of a tile or a Gaussian.
+    """
     from clear_strategies.bench import scenes
     from rasterizers.warp_backend import frame, project
     from rasterizers.warp_backend.settings import SEGMENT
@@ -172,12 +174,14 @@ def test_long_lists_and_large_gaussians_are_summed_in_short_chains():
     found = frame.Frame(rasterizers.load("warp", device="cpu", **CLEAN), [(tails.splats, tails.camera)], [False])
     (drawn,) = found.draw()
     exact = rasterizers.load("cpp", **CLEAN)(tails.splats.to(torch.float64), tails.camera)
+    assert float((drawn.image - exact.image).abs().max()) < 2e-5
     g, expected = drawn.vjp(v), exact.vjp(v.double())
     for name in ("means", "quats", "scales", "opacities", "sh0"):
         error = gradient_of(g, name).double() - gradient_of(expected, name)
         assert float(error.norm()) <= 2e-5 * float(gradient_of(expected, name).norm()), name
     counts, lists = found.views[0].counts, found.views[0].lists
     assert int((lists.ends - lists.starts).max()) > 30 * SEGMENT
+    assert int((lists.ends // SEGMENT - lists.starts // SEGMENT).max()) < SEGMENT  # pieces of a tile
     assert int(counts.max()) > SEGMENT**2
     assert found.folds == (1, SEGMENT)
     assert all(count <= SEGMENT * project.stride_of(count) for count in counts.unique().tolist())
@@ -223,7 +227,8 @@ def test_the_kernels_compile_for_cuda_on_a_machine_without(ptx_of):
     for kernel in (bins.list_pairs, colour.basis, project.project):
         ptx_of(kernel.module)
     for depth in (False, True):
-        ptx_of(blend.blend(depth, 64).module, 64)
+        ptx_of(blend.blend_pieces(depth, 64).module, 64)
+        ptx_of(blend.blend(depth).module, 64)
     for k in (1, 2, 3):
         ptx_of(project.fold(k).module)
         ptx_of(project.project_vjp(k).module)
