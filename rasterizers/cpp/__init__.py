@@ -17,6 +17,7 @@ from typing import Final
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.utils.dlpack import from_dlpack
 
 from rasterizers.checks import Backend, packed_rows, require_cotangents, require_finite, require_splats
 from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradients, Splats, Traits
@@ -108,8 +109,7 @@ class _Frame:
 
     def empty(self, *shape: int) -> Tensor:
         """An uninitialised tensor in recycled memory, because fresh pages cost more than filling them."""
-        uninitialised: Tensor = self.native.empty(shape)
-        return uninitialised
+        return from_dlpack(self.native.empty(shape))
 
     def basis(self) -> Float[Tensor, "N B1"]:
         """Y of this pose's directions, computed once for all grids."""

@@ -1,8 +1,6 @@
 // Python bindings of the image losses. Images are contiguous float32 [H, W, 3] on the CPU, as is the gradient's output.
 #pragma once
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/pair.h>
 
 #include <algorithm>
@@ -11,11 +9,12 @@
 
 #include "haar.hpp"
 #include "photometric.hpp"
+#include "tensor.hpp"
 
 namespace clear {
 
 template <class T>
-using Image = nanobind::ndarray<T, nanobind::shape<-1, -1, kChannels>, nanobind::c_contig, nanobind::device::cpu>;
+using Image = Tensor<T, nanobind::shape<-1, -1, kChannels>, nanobind::c_contig, nanobind::device::cpu>;
 using ImageIn = Image<const float>;
 using ImageOut = Image<float>;
 

@@ -2,14 +2,13 @@
 // correction, and counts.
 #pragma once
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/vector.h>
 
 #include <string>
 #include <vector>
 
 #include "conflict.hpp"
+#include "tensor.hpp"
 
 namespace clear {
 
@@ -24,7 +23,7 @@ class Tensors {
     if (!table.contains(name)) throw nb::key_error(name);
     nb::handle value = table[name];
     if (value.is_none() && optional) return nullptr;
-    nb::ndarray<T, nb::c_contig, nb::device::cpu> array;
+    Tensor<T, nb::c_contig, nb::device::cpu> array;
     if (!nb::try_cast(value, array, false))
       throw nb::type_error((std::string(name) + " must be a contiguous float32 tensor in the CPU's memory").c_str());
     bool fits = array.ndim() >= 1 && std::int64_t(array.shape(0)) == n && std::int64_t(array.size()) == n * width;
@@ -35,12 +34,12 @@ class Tensors {
                              " numbers, got shape (" + found + ")").c_str());
     }
     T* data = array.data();
-    kept_.push_back(nb::cast(array));
+    kept_.emplace_back(array.handle());
     return data;
   }
 
  private:
-  std::vector<nb::object> kept_;
+  std::vector<nb::ndarray<>> kept_;
 };
 
 inline Correction correction_of(Tensors& tensors, std::int64_t n, const nb::dict& t) {

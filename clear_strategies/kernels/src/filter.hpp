@@ -1,10 +1,9 @@
 // The 3D filter's loop over Gaussians and cameras, and its binding.
 #pragma once
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-
 #include <cstdint>
+
+#include "tensor.hpp"
 
 namespace clear {
 
@@ -16,8 +15,8 @@ void nearest_depths(const float* means, std::int64_t n, const float* cameras, st
 
 inline void bind_filter(nanobind::module_& m) {
   namespace nb = nanobind;
-  using Rows = nb::ndarray<const float, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
-  using Depths = nb::ndarray<float, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+  using Rows = Tensor<const float, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
+  using Depths = Tensor<float, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
   m.def(
       "nearest_depths",
       [](const Rows& means, const Rows& cameras, float near, const Depths& depths, int threads) {

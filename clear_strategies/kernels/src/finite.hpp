@@ -1,13 +1,13 @@
 // Whether all numbers of some tensors are finite, in one call.
 #pragma once
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/vector.h>
 
 #include <cstdint>
 #include <cstring>
 #include <vector>
+
+#include "tensor.hpp"
 
 namespace clear {
 
@@ -26,10 +26,10 @@ inline bool all_finite(const float* numbers, std::size_t count) {
 }
 
 inline void bind_finite(nanobind::module_& m) {
-  using Tensor = nanobind::ndarray<const float, nanobind::c_contig, nanobind::device::cpu>;
-  m.def("all_finite", [](const std::vector<Tensor>& tensors) {
+  using Numbers = Tensor<const float, nanobind::c_contig, nanobind::device::cpu>;
+  m.def("all_finite", [](const std::vector<Numbers>& tensors) {
     nanobind::gil_scoped_release free;
-    for (const Tensor& x : tensors)
+    for (const Numbers& x : tensors)
       if (!all_finite(x.data(), x.size())) return false;
     return true;
   });

@@ -1,13 +1,11 @@
 // How a patch map reaches a Gaussian (strategies/p2g.py), and its binding.
 #pragma once
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-
 #include <algorithm>
 #include <cstdint>
 
 #include "pool.hpp"
+#include "tensor.hpp"
 
 namespace clear {
 
@@ -34,10 +32,10 @@ inline void lift(const Patches& p, const float* centers, const bool* visible, st
 
 inline void bind_lift(nanobind::module_& m) {
   namespace nb = nanobind;
-  using Maps = nb::ndarray<const float, nb::shape<-1, -1, -1>, nb::c_contig, nb::device::cpu>;
-  using Centers = nb::ndarray<const float, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
-  using Visible = nb::ndarray<const bool, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
-  using Out = nb::ndarray<float, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
+  using Maps = Tensor<const float, nb::shape<-1, -1, -1>, nb::c_contig, nb::device::cpu>;
+  using Centers = Tensor<const float, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
+  using Visible = Tensor<const bool, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+  using Out = Tensor<float, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
   m.def(
       "lift",
       [](const Maps& maps, const Centers& centers, const Visible& visible, float edge, const Out& out, int threads) {

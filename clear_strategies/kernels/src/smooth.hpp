@@ -1,8 +1,7 @@
 // Semi-global smoothing of a cost volume (geometry/dense_stereo/smoothing.py), and its binding.
 #pragma once
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
+#include "tensor.hpp"
 
 namespace clear {
 
@@ -17,9 +16,9 @@ void add_paths(const CostVolume& volume, float small_step, float large_step, flo
 
 inline void bind_smooth(nanobind::module_& m) {
   namespace nb = nanobind;
-  using Volume = nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
-  using Map = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-  using Out = nb::ndarray<float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+  using Volume = Tensor<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+  using Map = Tensor<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+  using Out = Tensor<float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
   m.def("add_paths", [](const Volume& cost, const Map& grey, float small_step, float large_step, const Out& total) {
     for (int axis = 0; axis < 3; ++axis)
       if (total.shape(axis) != cost.shape(axis) || (axis < 2 && grey.shape(axis) != cost.shape(axis)))

@@ -1,8 +1,7 @@
 // The windows of a plane sweep (geometry/dense_stereo/cost.py), and its binding.
 #pragma once
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
+#include "tensor.hpp"
 
 namespace clear {
 
@@ -21,10 +20,10 @@ void sweep(const Sweep& s, const float* inverse_depths, int planes, float* covar
 
 inline void bind_sweep(nanobind::module_& m) {
   namespace nb = nanobind;
-  using Line = nb::ndarray<const float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-  using Map = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-  using Maps = nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
-  using Out = nb::ndarray<float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+  using Line = Tensor<const float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+  using Map = Tensor<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+  using Maps = Tensor<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+  using Out = Tensor<float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
   m.def("sweep", [](const Map& image, const Map& mean, const Maps& rotated, const Line& shift, const Map& other, const Line& depths,
                     int window, const Out& covariances, const Out& variances, int threads) {
     const auto fits = [&](const auto& maps, std::size_t n) {

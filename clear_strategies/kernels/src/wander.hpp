@@ -1,10 +1,9 @@
 // MCMC's noise (density/mcmc.py), and its binding.
 #pragma once
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-
 #include <cstdint>
+
+#include "tensor.hpp"
 
 namespace clear {
 
@@ -19,10 +18,10 @@ void wander(const Field& field, const std::int64_t* rows, const float* eta, std:
 
 inline void bind_wander(nanobind::module_& m) {
   namespace nb = nanobind;
-  using Rows = nb::ndarray<const float, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
-  using Means = nb::ndarray<float, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
-  using Gate = nb::ndarray<const float, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
-  using Indices = nb::ndarray<const std::int64_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+  using Rows = Tensor<const float, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
+  using Means = Tensor<float, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+  using Gate = Tensor<const float, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+  using Indices = Tensor<const std::int64_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
   m.def(
       "wander",
       [](const Means& means, const Rows& quats, const Rows& scales, const Gate& gate, const Indices& rows, const Rows& eta,

@@ -2,8 +2,6 @@
 //
 // Tensors are taken with `noconvert`: nanobind would pass a converted copy, which is freed when the call returns, while the
 // frame keeps pointers into it.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
@@ -12,17 +10,18 @@
 
 #include "frame.hpp"
 #include "isa.hpp"
+#include "tensor.hpp"
 
 namespace nb = nanobind;
 
 namespace clear {
 
 template <class T, std::int64_t... shape>
-using Read = nb::ndarray<const T, nb::shape<shape...>, nb::c_contig, nb::device::cpu>;
+using Read = Tensor<const T, nb::shape<shape...>, nb::c_contig, nb::device::cpu>;
 template <class T, std::int64_t... shape>
-using Write = nb::ndarray<T, nb::shape<shape...>, nb::c_contig, nb::device::cpu>;
+using Write = Tensor<T, nb::shape<shape...>, nb::c_contig, nb::device::cpu>;
 template <class T>
-using Rows = nb::ndarray<const T, nb::shape<-1, -1, 3>, nb::device::cpu>;  // shN: rows need not be contiguous to each other
+using Rows = Tensor<const T, nb::shape<-1, -1, 3>, nb::device::cpu>;  // shN: rows need not be contiguous to each other
 
 inline auto tensor(const char* name) { return nb::arg(name).noconvert(); }
 
@@ -43,9 +42,9 @@ Splats<T> splats_of(const Read<T, -1, 3>& means, const Read<T, -1, 4>& quats, co
   return {n, means.data(), quats.data(), scales.data(), sh0.data(), shN.data(), n ? shN.stride(0) : 0, int(bands)};
 }
 
-// A torch tensor whose memory returns to the recycler when it is freed, for the gradients of the next iteration.
+// The DLPack capsule of a tensor whose memory returns to the recycler when it is freed, for the gradients of the next iteration.
 template <class T>
-nb::ndarray<nb::pytorch, T> empty(const std::vector<std::size_t>& shape) {
+nb::ndarray<T> empty(const std::vector<std::size_t>& shape) {
   std::size_t size = 1;
   for (std::size_t edge : shape) size *= edge;
   auto buffer = std::make_unique<Buffer<T>>();
@@ -53,7 +52,7 @@ nb::ndarray<nb::pytorch, T> empty(const std::vector<std::size_t>& shape) {
   T* data = buffer->data();
   nb::capsule owner(buffer.get(), [](void* p) noexcept { delete static_cast<Buffer<T>*>(p); });
   buffer.release();
-  return nb::ndarray<nb::pytorch, T>(data, shape.size(), shape.data(), owner);
+  return nb::ndarray<T>(data, shape.size(), shape.data(), owner);
 }
 
 template <class T>
