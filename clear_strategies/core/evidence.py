@@ -25,10 +25,15 @@ class PatchMaps:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """q_i and a_i of one view, in [0, 1]; both are 0 for a Gaussian that is not visible in the view (F24)."""
+    """q_i and a_i of one view, in [0, 1]; both are 0 for a Gaussian that is not visible in the view (F24).
+
+    Args:
+        sums: on a device, the number of visible Gaussians, and Σ q_i and Σ w_i; None where they have not been added up.
+    """
 
     reliability: Float[Tensor, " N"]
     demand: Float[Tensor, " N"]
+    sums: Float[Tensor, " 3"] | None = None
 
     @cached_property
     def weight(self) -> Float[Tensor, " N"]:

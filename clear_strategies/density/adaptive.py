@@ -18,6 +18,7 @@ from clear_strategies.core.gradients import Shot
 from clear_strategies.core.seeds import generator_at
 from clear_strategies.density.threshold import count_passing, topk_mask
 from clear_strategies.errors import DensityError
+from clear_strategies.kernels import per_gaussian
 from clear_strategies.merging.iteration import Update
 from clear_strategies.schedules import milestone
 from clear_strategies.training.densifier import Densifier
@@ -123,6 +124,10 @@ class Density(Densifier):
         if update.score is None or update.ordinary is None:
             return
         visible = shot.visible
+        if (kernels := per_gaussian.for_tensors(self.score, update.score)) is not None:
+            totals, largest = (self.score, self.ordinary, self.count), self.settings.reduce == "max"
+            kernels.accumulate(visible, update.score, update.ordinary, totals, largest=largest)
+            return
         for total, value in ((self.score, update.score), (self.ordinary, update.ordinary)):
             if self.settings.reduce == "max":
                 torch.maximum(total, torch.where(visible, value, total), out=total)

@@ -13,15 +13,16 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.core.conflicts import conflict_ratio
-from clear_strategies.core.deferred import Number, Scalar
+from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import require_finite, require_finite_losses
 from clear_strategies.core.gradients import Grads, Shot, screen_in_ndc, screen_norm
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, View
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import StrategyConflict
+from clear_strategies.kernels import per_gaussian
 from clear_strategies.merging.detail import DetailRates
-from clear_strategies.merging.iteration import HrGradients, Merged, Stepper, Update, require_finite_parts
+from clear_strategies.merging.iteration import HrGradients, Merged, Stepper, Update, Weights, require_finite_parts
 from clear_strategies.merging.objective import Losses, Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
 from clear_strategies.strategies.base import Drawn, ScreenGradients, Strategy, by_class, overrides
@@ -304,22 +305,18 @@ class Conductor:
         return Merged(g + self._regularize(params, t), g_hr, corrected, conflict)  # Eq. 16
 
     def scores(
-        self, screen_lr: Float[Tensor, "N 2"], hr: HrGradients[Any] | None, weights: tuple[Scalar, Scalar]
+        self, screen_lr: Float[Tensor, "N 2"], hr: HrGradients[Any] | None, weights: Weights
     ) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
         """The densification score of the strategies, and the ordinary ‖∇_u L‖ that holds without them.
 
         Args:
             screen_lr: ∇_u(λ_LR L_LR) in NDC units. weights: λ_HR and λ_HR λ_HF.
         """
-        (λ, λ_hf), total, base, hf = weights, screen_lr, None, None
-        if hr is not None:
-            base = screen_in_ndc(hr.base, hr.size)
-            total = total + λ * base
-            if hr.hf is not None:
-                hf = screen_in_ndc(hr.hf, hr.size)
-                total = total + λ_hf * hf
-        screen = ScreenGradients(screen_lr, base, hf, screen_norm(total))
-        score = None if hr is None else self._owner["score"].score(hr.step, screen)
+        if hr is None:
+            ordinary = screen_norm(screen_lr)
+            return ordinary, ordinary
+        screen = _screen_gradients(screen_lr, hr, weights)
+        score = self._owner["score"].score(hr.step, screen)
         return screen.ordinary if score is None else score, screen.ordinary
 
     def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
@@ -410,6 +407,23 @@ class Conductor:
             else:
                 total = total + g
         return total
+
+
+def _screen_gradients(
+    lr: Float[Tensor, "N 2"], hr: HrGradients[Any], weights: Weights
+) -> ScreenGradients:  # fmt: skip
+    if (kernels := per_gaussian.for_tensors(lr, hr.base.screen)) is not None:
+        screens, ordinary = kernels.screens(
+            lr, hr.base.screen, None if hr.hf is None else hr.hf.screen, hr.size, weights
+        )
+        return ScreenGradients(lr, screens[0], None if hr.hf is None else screens[1], ordinary)
+    λ, λ_hf = weights
+    base = screen_in_ndc(hr.base, hr.size)
+    total, hf = lr + λ * base, None
+    if hr.hf is not None:
+        hf = screen_in_ndc(hr.hf, hr.size)
+        total = total + λ_hf * hf
+    return ScreenGradients(lr, base, hf, screen_norm(total))
 
 
 def _vjp(shot: Shot, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[Grads]:

@@ -23,6 +23,10 @@ readable path.
 """
 
 
+Weights = tuple[float, float] | Tensor
+"""λ_HR(t) and λ_HR(t) λ_HF: two numbers, or a tensor of them on the device, [2]."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class HrGradients(Generic[G]):
     """What the HR render of one view gives: its gradients, the evidence, and the routing weights.
@@ -104,7 +108,7 @@ class Stepper(Protocol[G]):
         """Merge, and step `params` and the optimizer's moments in place; returns the conflict ratios by group."""
         ...
 
-    def weights(self, t: int) -> tuple[Scalar, Scalar]:
+    def weights(self, t: int) -> Weights:
         """As `Objective.weights`."""
         ...
 

@@ -23,7 +23,7 @@ from clear_strategies.core.gradients import Shot, screen_norm
 from clear_strategies.core.images import DownKernel, downsample, patch_means, quantize, upsample
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
-from clear_strategies.kernels import native
+from clear_strategies.kernels import native, per_gaussian
 from clear_strategies.strategies.base import ScreenGradients, Strategy
 from rasterizers.native import threads
 
@@ -70,8 +70,14 @@ class P2G(Strategy):
 
     def observe(self, step: Step, hr: Shot) -> Evidence:
         """q_i and a_i of every Gaussian that is visible in this view."""
-        view = step.view
-        q, a = lift(self.looked_up(view), hr.means2d, hr.visible, self.patch * view.factor)
+        maps, patch = self.looked_up(step.view), self.patch * step.view.factor
+        if (kernels := per_gaussian.for_tensors(maps, hr.means2d)) is not None:
+            q, a, sums = kernels.look_up(maps, hr.means2d.detach(), hr.visible, patch)
+            seen, sum_q, sum_w = deferred.elements(sums)
+            self.log("mean_q", deferred.defer(deferred.ratio, sum_q, seen))
+            self.log("mean_w", deferred.defer(deferred.ratio, sum_w, seen))
+            return Evidence(q, a, sums)
+        q, a = lift(maps, hr.means2d, hr.visible, patch)
         evidence, seen = Evidence(q, a), hr.visible.sum()
         # Both are 0 where a Gaussian is invisible.
         self.log("mean_q", lambda: deferred.scalar(q.sum() / seen))
@@ -82,7 +88,11 @@ class P2G(Strategy):
         """m_i = q_min + (1 - q_min) w_i, over its mean where `normalize`; undefined for invisible Gaussians."""
         if step.evidence is None or step.visible is None:
             raise ValueError("P2G routes by evidence, but there is none for this view; call P2G.observe first.")
-        m = self.floor + (1 - self.floor) * step.evidence.weight  # Eq. 12
+        e = step.evidence
+        if e.sums is not None and (kernels := per_gaussian.for_tensors(e.reliability)) is not None:
+            m: Tensor = kernels.route(e.reliability, e.demand, e.sums, self.floor, self.normalize)
+            return m
+        m = self.floor + (1 - self.floor) * e.weight  # Eq. 12
         if not self.normalize:
             return m
         mean = (m * step.visible).sum() / step.visible.sum().clamp_min(1)
@@ -90,9 +100,14 @@ class P2G(Strategy):
 
     def score(self, step: Step, screen: ScreenGradients) -> Float[Tensor, " N"] | None:
         """S_i = w_i ‖∇_u L_HF‖, alone or joined with the ordinary statistic; None (ordinary) where λ_HF = 0."""
-        if self.score_by == "gradient" or step.evidence is None or screen.hf is None:
+        e = step.evidence
+        if self.score_by == "gradient" or e is None or screen.hf is None:
             return None
-        S: Tensor = step.evidence.weight * screen_norm(screen.hf)  # Eq. 14
+        if (kernels := per_gaussian.for_tensors(e.reliability, screen.hf)) is not None:
+            joined = self.score_by == "sum"
+            S: Tensor = kernels.evidence_score(e.reliability, e.demand, screen.hf, screen.ordinary, joined=joined)
+            return S
+        S = e.weight * screen_norm(screen.hf)  # Eq. 14
         if self.score_by == "evidence":
             return S
         return screen.ordinary + S * (screen.ordinary.mean() / S.mean().clamp_min(torch.finfo(S.dtype).tiny))

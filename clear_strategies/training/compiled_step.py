@@ -22,13 +22,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.compiled_rules import Anchor, CorrectionRule
-from clear_strategies.core.deferred import Number, Scalar
+from clear_strategies.core.deferred import Number
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads
 from clear_strategies.kernels import gaussian_step as kernel
 from clear_strategies.kernels import native
 from clear_strategies.kernels.gaussian_step import cpp
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.merging.iteration import HrGradients
+from clear_strategies.merging.iteration import HrGradients, Weights
 from clear_strategies.strategies.base import Strategy, not_stated_as_data, overrides
 from clear_strategies.training.field import LOG_SCALE_LIMIT, LOGIT_LIMIT, Activation, FieldShot
 from clear_strategies.training.optim import BETA1, BETA2, Adam
@@ -165,10 +165,10 @@ class CompiledStep:
         weight = settings.lambda_hr * self.conductor.objective.lambda_hf
         self._changing = written(settings, rates, device, lambda_hf=weight, out=self._changing)
 
-    def weights(self, t: int) -> tuple[Scalar, Scalar]:
+    def weights(self, t: int) -> Weights:
         """λ_HR(t) and λ_HR(t) λ_HF; of a recording on the device."""
         if running() is not None and self._changing is not None:
-            return self._changing[0, -2], self._changing[0, -1]
+            return self._changing[0, -2:]
         return self.conductor.objective.weights(t)
 
     def step_extra(self, params: Mapping[str, Tensor], g_lr: Factors, t: int) -> None:

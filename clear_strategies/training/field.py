@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from clear_strategies.core.gradients import ATTRIBUTES, Grads
 from clear_strategies.core.points import PointCloud, spread
 from clear_strategies.core.view import View
+from clear_strategies.kernels import per_gaussian
 from clear_strategies.training.mip import NEAR, filter_std
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats
@@ -145,7 +146,14 @@ class GaussianField(nn.Module):
         return self._activate(None).splats(detail=True)
 
     def _activate(self, gate: Tensor | None) -> Activation:
-        raw = self.raw()
+        raw, bands = self.raw(), (self.degree + 1) ** 2 - 1
+        kernels = per_gaussian.for_tensors(raw["scales"], gate)
+        if kernels is not None:
+            scales, filtered, sigmoid, coefficient, factor, opacities = kernels.activate(
+                raw["scales"], raw["opacities"], self.filter_3d, gate
+            )
+            shN = raw["shN"][:, :bands]
+            return Activation(raw, scales, filtered, self.filter_3d, sigmoid, coefficient, factor, opacities, shN)
         scales = raw["scales"].exp()
         # √(s² + f²), and s itself where the squares vanish; torch's hypot takes ten times as long.
         filtered = torch.maximum(scales, (scales.square() + self.filter_3d[:, None].square()).sqrt_())
@@ -154,8 +162,8 @@ class GaussianField(nn.Module):
         coefficient = shares[:, 0] * shares[:, 1] * shares[:, 2]
         sigmoid = raw["opacities"].sigmoid()
         z = coefficient if gate is None else coefficient * gate.to(coefficient)
-        bands = (self.degree + 1) ** 2 - 1
-        return Activation(raw, scales, filtered, self.filter_3d, sigmoid, coefficient, z, raw["shN"][:, :bands])
+        shN = raw["shN"][:, :bands]
+        return Activation(raw, scales, filtered, self.filter_3d, sigmoid, coefficient, z, z * sigmoid, shN)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,7 +171,7 @@ class Activation:
     """The activated field, with what the chain rule to the raw parameters needs.
 
     Args:
-        scales: s = exp(raw). filtered: √(s² + f²). sigmoid: σ(raw). factor: coefficient · z, so opacity = factor · σ.
+        scales: s = exp(raw). filtered: √(s² + f²). sigmoid: σ(raw). factor: coefficient · z. opacities: factor · σ.
     """
 
     raw: Mapping[str, Tensor]
@@ -173,11 +181,8 @@ class Activation:
     sigmoid: Float[Tensor, " N"]
     coefficient: Float[Tensor, " N"]
     factor: Float[Tensor, " N"]
+    opacities: Float[Tensor, " N"]
     shN: Float[Tensor, "N B 3"]  # noqa: N815 - gsplat's name
-
-    @property
-    def opacities(self) -> Float[Tensor, " N"]:
-        return self.factor * self.sigmoid
 
     def splats(self, *, detail: bool) -> Splats:
         return Splats(

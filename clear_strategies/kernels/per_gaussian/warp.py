@@ -1,0 +1,308 @@
+"""The kernels, and their launches. Importing this module imports Warp."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, Final
+
+import torch
+import warp as wp
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from rasterizers.warp_runtime import launch, on_stream
+
+wp.set_module_options({"enable_backward": False})
+
+LANES: Final = {"cuda": 256, "cpu": 1}
+"""Threads per block; on a CPU, Warp's blocks have one."""
+_UNIT: Final = wp.constant(wp.float32(2.0**20))  # see `core.gradients.screen_norm`
+_TINY: Final = wp.constant(wp.float32(torch.finfo(torch.float32).tiny))
+
+
+@wp.kernel
+def _activate(
+    log_scales: wp.array[wp.vec3],
+    logits: wp.array[wp.float32],
+    filters: wp.array[wp.float32],
+    gate: wp.array[wp.float32],
+    scales: wp.array[wp.vec3],
+    filtered: wp.array[wp.vec3],
+    sigmoid: wp.array[wp.float32],
+    coefficient: wp.array[wp.float32],
+    factor: wp.array[wp.float32],
+    opacities: wp.array[wp.float32],
+) -> None:
+    i = wp.tid()
+    raw, s, larger, c = log_scales[i], wp.vec3(), wp.vec3(), wp.float32(1.0)
+    for d in range(3):
+        s[d] = wp.exp(raw[d])
+        larger[d] = wp.max(s[d], wp.sqrt(s[d] * s[d] + filters[i] * filters[i]))  # s where the squares vanish
+        c *= s[d] / larger[d]
+    scales[i] = s
+    filtered[i] = larger
+    coefficient[i] = c
+    o = 1.0 / (1.0 + wp.exp(-logits[i]))
+    if gate.shape[0] > 0:
+        c *= gate[i]
+    sigmoid[i] = o
+    factor[i] = c
+    opacities[i] = c * o
+
+
+def activate(
+    log_scales: Float[Tensor, "N 3"], logits: Float[Tensor, " N"], filters: Float[Tensor, " N"], gate: Tensor | None
+) -> tuple[Tensor, ...]:
+    """Scales, filtered scales, σ, coefficient, factor and opacities, see `training.field.Activation`."""
+    n = len(logits)
+    scales, filtered = log_scales.new_empty(2, n, 3).unbind()
+    rest = logits.new_empty(4, n).unbind()
+    _per_gaussian(_activate, n, log_scales, logits, filters, gate, scales, filtered, *rest)
+    return scales, filtered, *rest
+
+
+@cache
+def _look_up(lanes: int) -> Any:
+    @wp.kernel(module="unique", enable_backward=False)
+    def look_up(
+        maps: wp.array3d[wp.float32],
+        centers: wp.array[wp.vec2],
+        visible: wp.array[wp.bool],
+        patch: wp.float32,
+        reliability: wp.array[wp.float32],
+        demand: wp.array[wp.float32],
+        parts: wp.array[wp.vec3d],
+    ) -> None:
+        block, lane = wp.tid()
+        i = block * lanes + lane
+        share = wp.vec3d()
+        if i < visible.shape[0]:
+            q, a = wp.float32(0.0), wp.float32(0.0)
+            if visible[i]:
+                column = wp.clamp(wp.int32(centers[i][0] / patch), 0, maps.shape[2] - 1)
+                row = wp.clamp(wp.int32(centers[i][1] / patch), 0, maps.shape[1] - 1)
+                q, a = wp.float32(maps[0, row, column]), wp.float32(maps[1, row, column])
+                share = wp.vec3d(wp.float64(1.0), wp.float64(q), wp.float64(q * a))
+            reliability[i] = q
+            demand[i] = a
+        wp.tile_store(parts, wp.tile_sum(wp.tile(share, preserve_type=True)), offset=(block,))
+
+    return look_up
+
+
+def look_up(
+    maps: Float[Tensor, "2 ph pw"], centers: Float[Tensor, "N 2"], visible: Bool[Tensor, " N"], patch: float
+) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"], Float[Tensor, " 3"]]:
+    """Q and a of each Gaussian (Eq. 10), as of `strategies.p2g.lift`; the number of visible ones, and Σ q and Σ w over them."""
+    q, a = maps.new_empty(2, len(centers)).unbind()
+    parts = _parts(q, 3)
+    _blocks(_look_up, len(parts), maps, centers, visible, patch, q, a, parts)
+    return q, a, _total(parts)
+
+
+@wp.kernel
+def _route(
+    reliability: wp.array[wp.float32],
+    demand: wp.array[wp.float32],
+    sums: wp.array[wp.vec3d],
+    floor: wp.float32,
+    normalized: wp.bool,
+    m: wp.array[wp.float32],
+) -> None:
+    i = wp.tid()
+    m_i = floor + (1.0 - floor) * (reliability[i] * demand[i])  # Eq. 12
+    if normalized:
+        seen = wp.max(sums[0][0], wp.float64(1.0))
+        mean = wp.float32((wp.float64(floor) * sums[0][0] + wp.float64(1.0 - floor) * sums[0][2]) / seen)
+        m_i /= wp.max(mean, _TINY)
+    m[i] = m_i
+
+
+def route(
+    q: Float[Tensor, " N"], a: Float[Tensor, " N"], sums: Float[Tensor, " 3"], floor: float, normalize: bool
+) -> Float[Tensor, " N"]:
+    """m, as of `P2G.route`, of what `look_up` returned."""
+    m = torch.empty_like(q)
+    _per_gaussian(_route, len(m), q, a, sums[None], floor, normalize, m)
+    return m
+
+
+@wp.func
+def norm(screen: wp.vec2) -> wp.float32:
+    x, y = _UNIT * screen[0], _UNIT * screen[1]
+    return wp.sqrt(x * x + y * y) / _UNIT
+
+
+@wp.kernel
+def _screens(
+    lr: wp.array[wp.vec2],
+    base: wp.array[wp.vec2],
+    hf: wp.array[wp.vec2],
+    half_width: wp.float32,
+    half_height: wp.float32,
+    lambda_hr: wp.float32,
+    lambda_hf: wp.float32,
+    changing: wp.array[wp.float32],
+    screens: wp.array2d[wp.vec2],
+    ordinary: wp.array[wp.float32],
+) -> None:
+    i = wp.tid()
+    half, weights, total = wp.vec2(half_width, half_height), wp.vec2(lambda_hr, lambda_hf), wp.vec2(lr[i])
+    if changing.shape[0] > 0:
+        weights = wp.vec2(changing[0], changing[1])
+    screen = wp.cw_mul(base[i], half)
+    screens[0, i] = screen
+    total += weights[0] * screen
+    if hf.shape[0] > 0:
+        screen = wp.cw_mul(hf[i], half)
+        screens[1, i] = screen
+        total += weights[1] * screen
+    ordinary[i] = norm(total)
+
+
+def screens(
+    lr: Float[Tensor, "N 2"],
+    base: Float[Tensor, "N 2"],
+    hf: Float[Tensor, "N 2"] | None,
+    size: tuple[int, int],
+    weights: tuple[float, float] | Float[Tensor, " 2"],
+) -> tuple[Float[Tensor, "K N 2"], Float[Tensor, " N"]]:
+    """∇_u of the HR losses in NDC, and the ordinary statistic, see `strategies.base.ScreenGradients`.
+
+    Args:
+        lr: in NDC. base, hf: 1/pixel of an image of `size`. weights: λ_HR and λ_HR λ_HF, as numbers or on the device.
+    """
+    found, ordinary = base.new_empty(1 if hf is None else 2, len(base), 2), base.new_empty(len(base))
+    numbers, changing = ((0.0, 0.0), weights) if isinstance(weights, Tensor) else (weights, None)
+    halves = [pixels / 2 for pixels in size]
+    _per_gaussian(_screens, len(base), lr, base, hf, *halves, *numbers, changing, found, ordinary)
+    return found, ordinary
+
+
+@cache
+def _evidence_score(lanes: int) -> Any:
+    @wp.kernel(module="unique", enable_backward=False)
+    def evidence_score(
+        reliability: wp.array[wp.float32],
+        demand: wp.array[wp.float32],
+        hf: wp.array[wp.vec2],
+        ordinary: wp.array[wp.float32],
+        score: wp.array[wp.float32],
+        parts: wp.array[wp.vec2d],
+    ) -> None:
+        block, lane = wp.tid()
+        i = block * lanes + lane
+        share = wp.vec2d()
+        if i < score.shape[0]:
+            S = reliability[i] * demand[i] * norm(hf[i])  # Eq. 14
+            score[i] = S
+            share = wp.vec2d(wp.float64(ordinary[i]), wp.float64(S))
+        wp.tile_store(parts, wp.tile_sum(wp.tile(share, preserve_type=True)), offset=(block,))
+
+    return evidence_score
+
+
+@wp.kernel
+def _joined(ordinary: wp.array[wp.float32], sums: wp.array[wp.vec2d], score: wp.array[wp.float32]) -> None:
+    i = wp.tid()
+    n = wp.float64(ordinary.shape[0])
+    share = wp.float32(sums[0][0] / n) / wp.max(wp.float32(sums[0][1] / n), _TINY)
+    score[i] = ordinary[i] + score[i] * share
+
+
+def evidence_score(
+    q: Float[Tensor, " N"],
+    a: Float[Tensor, " N"],
+    hf: Float[Tensor, "N 2"],
+    ordinary: Float[Tensor, " N"],
+    *,
+    joined: bool,
+) -> Float[Tensor, " N"]:
+    """S, as of `P2G.score`: alone, or joined with the ordinary statistic at equal mean."""
+    n = len(ordinary)
+    score, parts = ordinary.new_empty(n), _parts(ordinary, 2)
+    _blocks(_evidence_score, len(parts), q, a, hf, ordinary, score, parts)
+    if joined:
+        _per_gaussian(_joined, n, ordinary, _total(parts)[None], score)
+    return score
+
+
+@wp.kernel
+def _accumulate(
+    visible: wp.array[wp.bool],
+    score: wp.array[wp.float32],
+    ordinary: wp.array[wp.float32],
+    largest: wp.bool,
+    total_score: wp.array[wp.float32],
+    total_ordinary: wp.array[wp.float32],
+    count: wp.array[wp.float32],
+) -> None:
+    i = wp.tid()
+    if not visible[i]:
+        return
+    count[i] += 1.0
+    if largest:
+        total_score[i] = wp.max(total_score[i], score[i])
+        total_ordinary[i] = wp.max(total_ordinary[i], ordinary[i])
+    else:
+        total_score[i] += score[i]
+        total_ordinary[i] += ordinary[i]
+
+
+def accumulate(
+    visible: Bool[Tensor, " N"],
+    score: Tensor,
+    ordinary: Tensor,
+    totals: tuple[Tensor, Tensor, Tensor],
+    *,
+    largest: bool,
+) -> None:
+    """Add the statistics of the visible Gaussians to `totals`, of score, ordinary and their number, as `Density.accumulate`."""
+    _per_gaussian(_accumulate, len(visible), visible, score, ordinary, largest, *totals)
+
+
+@cache
+def _sum(width: int) -> Any:
+    """The kernel that adds up rows of `width` numbers, with one block of `lanes` threads."""
+
+    @cache
+    def kernel(lanes: int) -> Any:
+        Row = wp.types.vector(length=width, dtype=wp.float64)
+
+        @wp.kernel(module="unique", enable_backward=False)
+        def total(parts: wp.array[Row], out: wp.array[Row]) -> None:
+            _, lane = wp.tid()
+            share = Row()
+            for part in range(lane, parts.shape[0], lanes):
+                share += parts[part]
+            wp.tile_store(out, wp.tile_sum(wp.tile(share, preserve_type=True)))
+
+        return total
+
+    return kernel
+
+
+def _parts(like: Tensor, width: int) -> Float[Tensor, "blocks width"]:
+    """Memory for the sums of each block over the Gaussians of `like`."""
+    return like.new_empty(-(-len(like) // LANES[like.device.type]), width, dtype=torch.float64)
+
+
+def _total(parts: Float[Tensor, "blocks width"]) -> Float[Tensor, " width"]:
+    """Their sum, in a fixed order."""
+    out = parts.new_empty(parts.shape[1])
+    _blocks(_sum(parts.shape[1]), 1, parts, out[None])
+    return out
+
+
+def _per_gaussian(kernel: Any, n: int, *arguments: Any) -> None:
+    device = next(x.device for x in arguments if isinstance(x, Tensor))
+    with on_stream(device):
+        launch(kernel, [n], arguments, device)
+
+
+def _blocks(kernel: Any, blocks: int, *arguments: Any) -> None:
+    """Launch a kernel of blocks that sum; `kernel` makes it for a number of threads per block."""
+    device = next(x.device for x in arguments if isinstance(x, Tensor))
+    lanes = LANES[device.type]
+    with on_stream(device):
+        launch(kernel(lanes), [blocks], arguments, device, block=lanes, together=True)
