@@ -181,12 +181,14 @@ def _side_stream(device: torch.device) -> Any:
 
 
 class _Calls(_Recorder):  # type: ignore[no-untyped-call]
-    """Records the calls, and makes them."""
+    """Records the calls, and makes them. Launches between two operations of torch become one graph of Warp's."""
 
     def begin(self) -> None:
         self._again: list[Callable[[], Any]] = []
+        self._launches: list[Callable[[], Any]] = []
 
     def end(self) -> Callable[[], None]:
+        self._join()
         calls = self._again
 
         def replay() -> None:
@@ -197,13 +199,26 @@ class _Calls(_Recorder):  # type: ignore[no-untyped-call]
 
     def launched(self, again: Callable[[], Callable[[], Any]], tensors: Iterable[Any]) -> None:
         self._keep(tensors)
-        self._again.append(again())
+        self._launches.append(again())
+
+    def _join(self) -> None:
+        if not self._launches:
+            return
+        import warp as wp
+
+        wp.capture_begin(device="cpu")  # on a CPU to capture is not to run, either
+        for launch in self._launches:
+            launch()
+        self._again.append(partial(wp.capture_launch, wp.capture_end(device="cpu")))
+        self._launches = []
 
     def called(self, op: Any, call: Callable[[], Any], made: list[Tensor]) -> None:
         self._kept.append(made)
         if op._schema.is_mutable:
+            self._join()
             self._again.append(call)
         elif made and not op.is_view and not op.overloadpacket.__name__.startswith(("empty", "new_empty")):
+            self._join()
             self._again.append(partial(_written_anew, made, call))
 
 
