@@ -1,4 +1,4 @@
-"""Time and error of one training iteration of CLEAR, stage by stage, and the time without L_HF and without HR.
+"""Time and error of one training iteration of CLEAR, stage by stage, and the time without L_HF, without HR and replayed.
 
 The truth is the same iteration in float64 by the readable path, at the same cut-offs; each of its stages gets the inputs of the
 measured stage. The outputs of the stages are compared: images, their cotangents, the gradients of the Gaussians, and the merged
@@ -34,6 +34,7 @@ from clear_strategies.training.field import GaussianField
 from clear_strategies.training.loop import iterate, kernel_threads
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
+from clear_strategies.training.replay import replays_for
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import PRESETS, Camera, Rasterizer, Rendering, SplatGradients, Splats
@@ -99,7 +100,7 @@ class Training:
 
 
 def measure(results: Results, *, scene: str, backend: str | None, repeats: int, device: str) -> None:
-    """Measure a full iteration, one without L_HF and one without HR, in turns.
+    """Measure a full iteration, one without L_HF, one without HR and, where there are recordings, a replayed one, in turns.
 
     Args:
         backend: None: the fastest that runs here.
@@ -113,6 +114,9 @@ def measure(results: Results, *, scene: str, backend: str | None, repeats: int, 
     rasterizer = rasterizers.load(backend, preset=_PRESET, **SETTINGS)
     view = view_of(workload, rasterizer)
     trainings = {name: Training(workload, view, rasterizer, objective) for name, objective in OBJECTIVES.items()}
+    if device == "cuda" and rasterizer.traits.records:
+        replayed = trainings["replayed"] = Training(workload, view, rasterizer, Objective())
+        replayed.state.replays = replays_for(replayed.state, rasterizer)
     with kernel_threads(trainings["lr_and_hr"].state, rasterizer):
         turns = interleaved(trainings, repeats, device=device, label=workload.name)
     table = medians(turns).T.add_suffix("_ms")
