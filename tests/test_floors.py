@@ -128,7 +128,7 @@ def test_heavy_libraries_stay_in_their_rooms():
 
 def test_packages_import_what_lies_below_them():
     """No concrete rasterizer in clear_strategies, nothing of clear_strategies in rasterizers, and hosts at the top."""
-    shared = ("rasterizers.interface", "rasterizers.geometry", "rasterizers.native", "rasterizers.warp_runtime")
+    shared = tuple(f"rasterizers.{name}" for name in ("interface", "geometry", "native", "recording", "warp_runtime"))
     for path in modules("clear_strategies"):
         found = {name for name in imports(path) if name.startswith(("rasterizers.", "integration"))}
         wrong = {name for name in found if not name.startswith(shared) and path.name != "testing.py"}

@@ -30,7 +30,8 @@ from clear_strategies.strategies.base import Drawn
 from clear_strategies.training import checkpoint
 from clear_strategies.training.clock import Clock
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
-from clear_strategies.training.replay import Given, Learned, replays_for
+from clear_strategies.training.given import Given, Learned
+from clear_strategies.training.replay import replays_for
 from clear_strategies.training.signals import Interrupted, deferred_signals, foremost
 from clear_strategies.training.state import TrainState
 from rasterizers import native

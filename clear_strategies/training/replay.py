@@ -10,9 +10,9 @@ after the step, and every iteration that cannot be replayed. A replay has the bi
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -21,43 +21,15 @@ from clear_strategies.core import deferred
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.view import Photo, View
 from clear_strategies.kernels import losses
-from clear_strategies.merging.iteration import Update
 from clear_strategies.strategies.base import describes, overrides
-from rasterizers.interface import Color, Rasterizer, Recordable
+from clear_strategies.training.compiled_step import CompiledStep
+from clear_strategies.training.given import Given, Learned
+from clear_strategies.training.state import TrainState
+from rasterizers.interface import Rasterizer, Recordable
 from rasterizers.recording import Recording
 from rasterizers.warp_runtime import sent
 
-if TYPE_CHECKING:
-    from clear_strategies.training.compiled_step import CompiledStep
-    from clear_strategies.training.state import TrainState
-
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Given:
-    """What an iteration is given.
-
-    Args:
-        t: the iteration. view: as the skips leave it. scales: whether "lr" and "hr" are drawn.
-        gate: zᵗ. background: behind everything that is drawn; None: the scene's own.
-    """
-
-    t: int
-    view: View
-    scales: Mapping[str, bool]
-    gate: Tensor | None
-    background: Color | None
-
-
-class Learned(NamedTuple):
-    """What an iteration made of its view: the update, and columns of the history."""
-
-    update: Update
-    row: dict[str, Number]
-
-
-Learn = Callable[["TrainState", Rasterizer, Given], Learned]
 
 
 def replays_for(s: TrainState, rasterizer: Rasterizer) -> Replays | None:
@@ -105,7 +77,7 @@ class Replays:
         self._recorded: dict[_Kind, _Recorded | None] = {}  # None: seen once
         self._addresses: tuple[int, ...] = ()
 
-    def learn(self, given: Given, learn: Learn) -> Learned | None:
+    def learn(self, given: Given, learn: Callable[..., Learned]) -> Learned | None:
         """What the iteration learns, by a replay; None where it has to be live.
 
         An iteration of a new kind is live first, so that kernels are compiled and caches filled, and is recorded the next time.
@@ -152,7 +124,7 @@ class _Recorded:
         self._numbers_of = recordable.numbers_of
         self._numbers = [self._numbers_of(photo.camera, s.device) for photo in (self._view.lr, self._view.hr)]
 
-    def record(self, given: Given, learn: Learn) -> Learned:
+    def record(self, given: Given, learn: Callable[..., Learned]) -> Learned:
         own = replace(given, view=self._view, gate=self._gate, background=None)
 
         def work() -> tuple[Learned, Tensor, Callable[[Tensor], dict[str, Number]]]:

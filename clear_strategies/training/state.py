@@ -22,10 +22,10 @@ from clear_strategies.training.checkpoint import Checkpoint
 from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for
 from clear_strategies.training.densifier import Densifier, DensifierSettings, cameras_extent
 from clear_strategies.training.field import GaussianField
+from clear_strategies.training.given import Replayer
 from clear_strategies.training.history import History
 from clear_strategies.training.mip import NEAR, MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
-from clear_strategies.training.replay import Replays
 from clear_strategies.training.settings import FitSettings
 
 _log = logging.getLogger(__name__)
@@ -57,7 +57,7 @@ class TrainState:
     t: int = 1
     history: History = field(default_factory=History)
     compiled_step: CompiledStep | None = None
-    replays: Replays | None = None
+    replays: Replayer | None = None
     second: TrainState | None = None
     first: TrainState | None = None
 
