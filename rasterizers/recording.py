@@ -150,8 +150,6 @@ class _Graphs(_Recorder):  # type: ignore[no-untyped-call]
     def begin(self) -> None:
         import warp as wp
 
-        from rasterizers.warp_runtime import warp_stream
-
         stream, graph = warp_stream(self._stream), cast(Any, torch.cuda.CUDAGraph())
         graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
         self._capturing, self._pool = (graph, stream), graph.pool()
@@ -178,6 +176,14 @@ class _Graphs(_Recorder):  # type: ignore[no-untyped-call]
 def _side_stream(device: torch.device) -> Any:
     """The stream that graphs are captured on, which torch's default stream cannot be."""
     return torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+
+
+@cache
+def warp_stream(stream: torch.cuda.Stream) -> Any:
+    """Torch's stream as a Warp stream. Cached, because Warp keeps the scratch memory of its sort with the stream."""
+    import warp as wp
+
+    return wp.stream_from_torch(stream)
 
 
 class _Calls(_Recorder):  # type: ignore[no-untyped-call]

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from rasterizers.interface import BackendUnavailable
-from rasterizers.recording import running
+from rasterizers.recording import running, warp_stream
 
 
 def require_warp(what: str, device: str, otherwise: str) -> None:
@@ -288,11 +288,3 @@ def on_stream(device: torch.device) -> AbstractContextManager[Any]:
         warp_stream(torch.cuda.current_stream(device)), sync_enter=False
     )
     return scope
-
-
-@cache
-def warp_stream(stream: torch.cuda.Stream) -> Any:
-    """Torch's stream as a Warp stream. Cached, because Warp keeps the scratch memory of its sort with the stream."""
-    import warp as wp
-
-    return wp.stream_from_torch(stream)

@@ -87,7 +87,7 @@ def test_on_cuda_each_part_is_captured_and_replayed_and_warp_knows(fails, monkey
         return SimpleNamespace(**names, pool=lambda: "pool")
 
     monkeypatch.setattr(recording, "_side_stream", lambda device: stream)
-    monkeypatch.setattr("rasterizers.warp_runtime.warp_stream", lambda stream: stream)
+    monkeypatch.setattr(recording, "warp_stream", lambda stream: stream)
     for name, fake in {
         "CUDAGraph": graph,
         "current_stream": lambda device: stream,
