@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from functools import cache, partial
 from typing import Any, Final, Generic, TypeVar, cast
 
@@ -143,8 +143,9 @@ class _Graphs(_Recorder):  # type: ignore[no-untyped-call]
             with torch.cuda.stream(self._stream):
                 yield
         finally:
-            if self._capturing is not None:  # the work failed
-                self._end_capture()
+            if self._capturing is not None:  # the work failed, and so may this
+                with suppress(RuntimeError):
+                    self._end_capture()
             outer.wait_stream(self._stream)
 
     def begin(self) -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any, Final, cast
 
 import torch
 from torch import Tensor
@@ -30,6 +30,8 @@ from rasterizers.recording import Recording
 from rasterizers.warp_runtime import sent
 
 _log = logging.getLogger(__name__)
+
+_MOST_KINDS: Final = 8  # a recording keeps the memory of an iteration
 
 
 def replays_for(s: TrainState, rasterizer: Rasterizer) -> Replays | None:
@@ -76,6 +78,7 @@ class Replays:
         self._state, self._rasterizer, self._count = s, rasterizer, compiled_step.count
         self._recorded: dict[_Kind, _Recorded | None] = {}  # None: seen once
         self._addresses: tuple[int, ...] = ()
+        self._device, self._failed = s.device, False
 
     def learn(self, given: Given, learn: Callable[..., Learned]) -> Learned | None:
         """What the iteration learns, by a replay; None where it has to be live.
@@ -87,21 +90,37 @@ class Replays:
             self._recorded.clear()
             self._addresses = kind.addresses
         if kind not in self._recorded:
-            self._recorded[kind] = None
+            if len(self._recorded) < _MOST_KINDS:
+                self._recorded[kind] = None
             return None
-        recorded = self._recorded[kind]
-        if recorded is None:
-            recorded = self._recorded[kind] = _Recorded(self._state, self._rasterizer, given, self._count)
-            return recorded.record(given, learn)
-        learned = recorded.replay(given)
+        optimizer, recorded = self._state.optimizer, self._recorded[kind]
+        steps, learned = optimizer.steps, None
+        if recorded is not None:
+            learned = recorded.replay(given)
+        elif not self._failed:
+            recorded = _Recorded(self._state, self._rasterizer, given, self._count)
+            learned = self._record(recorded, given, learn)
+        # Lists that were too short are recorded anew, with space for more pairs.
+        self._recorded[kind] = None if learned is None else recorded
         if learned is None:
-            self._recorded[kind] = None  # recorded anew, with space for more pairs
+            optimizer.steps = steps
         return learned
+
+    def _record(self, recorded: _Recorded, given: Given, learn: Callable[..., Learned]) -> Learned | None:
+        try:
+            return recorded.record(given, learn)
+        except RuntimeError as error:
+            if self._device.type == "cpu":  # what is recorded there has been done
+                raise
+            self._failed = True
+            _log.warning("fit.replay: an iteration could not be recorded, so that all are live from now on: %s", error)
+            return None
 
     def _kind(self, given: Given) -> _Kind:
         s, o, view = self._state, self._state.conductor.objective, given.view
         tables = s.field.raw(), s.optimizer.first, s.optimizer.second, s.density.state_dict(), s.conductor.state_dict()
-        addresses = s.field.filter_3d.data_ptr(), *(x.data_ptr() for table in tables for x in table.values())
+        rows = [x for table in tables for x in table.values() if x.dim() > 0]  # others are no memory of the field's
+        addresses = [x.data_ptr() for x in (s.field.filter_3d, *rows)]
         photos = [(p.image.shape, p.shown is None) for p in (view.lr, view.hr)]
         facts = (
             s.field.degree, *given.scales.values(), given.gate is None, given.background is None, o.lambda_hr(given.t) > 0,
@@ -139,15 +158,11 @@ class _Recorded:
         return self._learned(given)
 
     def replay(self, given: Given) -> Learned | None:
-        optimizer = self._state.optimizer
-        steps = optimizer.steps
+        """What the iteration learns; None where the recording does not hold for it, before anything has changed."""
         self._fill(given)
         with self._state.conductor.work_log.stage("replayed"):
             done = self._recording.replay()
-        if done:
-            return self._learned(given)
-        optimizer.steps = steps
-        return None
+        return self._learned(given) if done else None
 
     def _fill(self, given: Given) -> None:
         """Write what the iteration is given to where the recorded one reads it."""

@@ -110,6 +110,18 @@ def test_where_lists_are_too_short_the_iteration_is_live_and_recorded_anew():
     assert replays_of(replayed) == 5 + 1 + 2  # t=9 ends at the count, and t=10 is recorded
 
 
+def test_where_a_graph_cannot_be_recorded_all_iterations_are_live(monkeypatch, caplog):
+    live, other = (trained(start(density=False), replayed=r, until=2) for r in (False, True))
+
+    def fails(*_):
+        raise RuntimeError("operation not permitted when stream is capturing")
+
+    monkeypatch.setattr("clear_strategies.training.replay.Recording", fails)
+    other.replays._device = torch.device("cuda")  # where what is recorded has not been done yet
+    require_same(trained(other, replayed=True, until=6), trained(live, replayed=False, until=6))
+    assert caplog.text.count("could not be recorded, so that all are live from now on: operation not permitted") == 1
+
+
 def replays_of(state: TrainState) -> int:
     return state.conductor.work_log.entries["replayed"].runs
 
