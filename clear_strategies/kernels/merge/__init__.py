@@ -13,6 +13,7 @@ from functools import cache
 
 import torch
 from torch import Tensor
+from torch.utils.dlpack import from_dlpack
 
 from clear_strategies.kernels import native
 from clear_strategies.kernels.merge.interface import WIDEST, Colour, Merge, Merged, Rows
@@ -35,8 +36,7 @@ def compiled(tensors: Iterable[Tensor]) -> Merge | None:
 def empty_like(p: Tensor) -> Tensor:
     """Contiguous float32 of this shape, not initialized; on a CPU in memory that the last gradient has left."""
     if p.device.type == "cpu":
-        recycled: Tensor = load_kernels("rasterizers.cpp").Frame.empty(p.shape)
-        return recycled
+        return from_dlpack(load_kernels("rasterizers.cpp").Frame.empty(p.shape))
     return torch.empty_like(p, dtype=torch.float32, memory_format=torch.contiguous_format)
 
 
