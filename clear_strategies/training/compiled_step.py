@@ -151,10 +151,7 @@ class CompiledStep:
         self, params: Mapping[str, Tensor], g_lr: Factors, hr: HrGradients[Factors] | None, t: int
     ) -> Mapping[str, Number]:
         """Step `params` and the optimizer's moments in place; returns the conflict ratios by group."""
-        rates = (
-            ({}, 1.0) if running() is not None else self.optimizer.advance()
-        )  # of a recording, `count` has written them
-        return self._run(params, g_lr, hr, t, *rates)
+        return self._run(params, g_lr, hr, t, *self._advance())
 
     def count(self, t: int) -> None:
         """Count a step that is recorded or replayed, and write its numbers."""
@@ -173,7 +170,7 @@ class CompiledStep:
 
     def step_extra(self, params: Mapping[str, Tensor], g_lr: Factors, t: int) -> None:
         """Step on this gradient alone: no anchor pulls."""
-        self._run(params, g_lr, None, t, *self.optimizer.advance(), anchor=Anchor({}, {}))
+        self._run(params, g_lr, None, t, *self._advance(), anchor=Anchor({}, {}))
 
     def gradient(
         self, params: Mapping[str, Tensor], g_lr: Factors, hr: HrGradients[Factors] | None, t: int
@@ -233,6 +230,10 @@ class CompiledStep:
         }  # fmt: skip
         base, hf = (None, None) if hr is None else (hr.base.rows, None if hr.hf is None else hr.hf.rows)
         return self._passes(activation, g_lr.rows, base, hf, self.conductor.objective.lambda_hf)
+
+    def _advance(self) -> tuple[Mapping[str, float], float]:
+        """As of `Adam.advance`. Of a recording, `count` has written the numbers."""
+        return ({}, 1.0) if running() is not None else self.optimizer.advance()
 
     def _settings(self, t: int, bias2: float, *others: Any) -> kernel.StepSettings:
         λ = self.conductor.objective.lambda_hr(t)

@@ -30,12 +30,12 @@ from clear_strategies.strategies.base import Drawn
 from clear_strategies.training import checkpoint
 from clear_strategies.training.clock import Clock
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
-from clear_strategies.training.given import Given, Learned
+from clear_strategies.training.given import Given, GivenExtra, GivenView, L, Learned, LearnedView
 from clear_strategies.training.replay import replays_for
 from clear_strategies.training.signals import Interrupted, deferred_signals, foremost
 from clear_strategies.training.state import TrainState
 from rasterizers import native
-from rasterizers.interface import Camera, Rasterizer, over
+from rasterizers.interface import Camera, Color, Rasterizer, over
 
 EXTRA_LOSS: Final = "loss_extra"
 """The column of the history: the LR loss of the iteration's last extra view."""
@@ -51,18 +51,17 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     hr_due = conductor.wants_hr(t)
     scales = {"lr": conductor.wants_lr and conductor.skips.lr_due(view, hr_due, conductor.work_log), "hr": hr_due}
     z, background = conductor.gate(t, len(θ)), conductor.background(t)  # zᵗ             Eq. 15       SVS
-    given = Given(t, view, scales, z, background)
-    learned = None if s.replays is None else s.replays.learn(given, learn)
-    u, row = learned or learn(s, rasterizer, given)
-    over_color = over(rasterizer, background)
-    extra = extra_steps(s, over_color, conductor.extra_views(t, drawn_of(s, over_color)))
+    learned = _learned(s, rasterizer, GivenView(t, view, scales, z, background), learn)
+    u = learned.update
+    extras = conductor.extra_views(t, drawn_of(s, over(rasterizer, background)))
+    extra = extra_steps(s, rasterizer, extras, background)
     conductor.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS
     with stage("density and filter"):
         # clone · split · prune = parents[M]
         restructured = conductor.may_densify(t) and s.density.step(θ, s.optimizer, t, s.resized)
         if s.filter_due() and not restructured:  # the means have not moved since
             s.refilter()
-    s.history.append(_row(s) | row | extra)
+    s.history.append(_row(s) | learned.row | extra)
     if s.conductor.skips.measured(t) and not (restructured or s.reset_due(t)):
         with stage("training views drawn whole"):
             s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)
@@ -72,7 +71,13 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     return u
 
 
-def learn(s: TrainState, rasterizer: Rasterizer, given: Given) -> Learned:
+def _learned(s: TrainState, rasterizer: Rasterizer, given: Given, learn: Callable[..., L]) -> L:
+    """What `learn` returns for the iteration, or a replay of it."""
+    replayed = None if s.replays is None else s.replays.learn(given, learn)
+    return learn(s, rasterizer, given) if replayed is None else replayed
+
+
+def learn(s: TrainState, rasterizer: Rasterizer, given: GivenView) -> LearnedView:
     """What an iteration does with its view: render, compare, step on the merged gradient, and accumulate statistics.
 
     It can be recorded where `Replays` say so: then nothing here reads a number from the device.
@@ -94,7 +99,7 @@ def learn(s: TrainState, rasterizer: Rasterizer, given: Given) -> Learned:
     photo = view.lr.over(given.background, view.background)
     row: dict[str, Number] = {"psnr_train_lr": psnr_of(low, photo.image, photo.shown)}
     row |= {f"loss_{name}": value for name, value in u.losses.items()}
-    return Learned(u, row | conflict_columns(u.conflict) | dict(u.logs))
+    return LearnedView(row | conflict_columns(u.conflict) | dict(u.logs), u)
 
 
 def view_at(s: TrainState) -> View:
@@ -124,9 +129,14 @@ def drawn_of(s: TrainState, rasterizer: Rasterizer) -> Drawn:
     return Drawn(field.means.data, draw, enlarged)
 
 
-def extra_steps(s: TrainState, rasterizer: Rasterizer, extra_views: Sequence[ExtraView]) -> dict[str, Number]:
+def extra_steps(
+    s: TrainState, rasterizer: Rasterizer, extra_views: Sequence[ExtraView], background: Color | None = None
+) -> dict[str, Number]:  # fmt: skip
     """One step of the optimizer on the LR loss of each extra view: a picture that a strategy wants the field to match besides
     the iteration's own view.
+
+    Args:
+        background: behind everything that is drawn; None: the rasterizer's.
 
     Returns:
         The column `EXTRA_LOSS` of the history; nothing without extra views.
@@ -135,23 +145,29 @@ def extra_steps(s: TrainState, rasterizer: Rasterizer, extra_views: Sequence[Ext
         DivergedError: a loss or a gradient is not finite; that step was not made.
     """
     row: dict[str, Number] = {}
-    θ, steps, where = s.field, s.optimizer.steps, f"t={s.t}, an extra view"
     for extra in extra_views:
-        with s.conductor.work_log.stage("extra views"):
-            shot = θ.shot(rasterizer, extra.photo.camera, None if extra.gate is None else extra.gate(len(θ)))
-            losses = s.conductor.extra_loss(shot.image, extra, s.t)
-            if s.compiled_step is not None:
-                (g,) = s.compiled_step.vjp(shot, losses.cotangents)
-                require_finite_parts(where, g, None)
-                s.compiled_step.step_extra(θ.raw(), g, s.t)
-            else:
-                (grads,) = shot.vjp(losses.cotangents)
-                require_finite(f"{where}: the gradient", grads)
-                s.optimizer.step(θ.raw(), grads)
-                θ.constrain()
-            s.optimizer.steps = steps  # the learning rates follow the iteration
-            row[EXTRA_LOSS] = losses.values["lr"]
+        gate, steps = None if extra.gate is None else extra.gate(len(s.field)), s.optimizer.steps
+        row |= _learned(s, rasterizer, GivenExtra(s.t, extra, gate, background), learn_extra).row
+        s.optimizer.steps = steps  # the learning rates follow the iteration
     return row
+
+
+def learn_extra(s: TrainState, rasterizer: Rasterizer, given: GivenExtra) -> Learned:
+    """What an iteration does with an extra view. It can be recorded as `learn`."""
+    θ, extra, where = s.field, given.extra, f"t={given.t}, an extra view"
+    with s.conductor.work_log.stage("extra views"):
+        shot = θ.shot(over(rasterizer, given.background), extra.photo.camera, given.gate)
+        losses = s.conductor.extra_loss(shot.image, extra, given.t)
+        if s.compiled_step is not None:
+            (g,) = s.compiled_step.vjp(shot, losses.cotangents)
+            require_finite_parts(where, g, None)
+            s.compiled_step.step_extra(θ.raw(), g, given.t)
+        else:
+            (grads,) = shot.vjp(losses.cotangents)
+            require_finite(f"{where}: the gradient", grads)
+            s.optimizer.step(θ.raw(), grads)
+            θ.constrain()
+    return Learned({EXTRA_LOSS: losses.values["lr"]})
 
 
 def _row(s: TrainState) -> dict[str, Number]:

@@ -1,9 +1,9 @@
 """Iterations that are recorded and replayed: on a GPU, an iteration takes the host longer than the kernels.
 
-What an iteration does with its view (render, losses, gradients, merge and step, statistics) is recorded once for each kind of
-iteration (`_Kind`), see `rasterizers.recording`, and done again while the tensors of the field lie where they lay. Before a
-replay, what the iteration is given is copied to where the recorded one read it: photo, SR image, what P2G looks up, cameras,
-dropout mask, background, and the numbers of the optimizer's step. All else is live: extra views, what strategies and densifier do
+What an iteration does with its view (render, losses, gradients, merge and step, statistics), and with an extra view, is recorded
+once for each kind of iteration (`_Kind`), see `rasterizers.recording`, and done again while the tensors of the field lie where
+they lay. Before a replay, what the iteration is given is copied to where the recorded one read it: photo, SR image, what P2G looks
+up, cameras, dropout mask, background, and the numbers of the optimizer's step. All else is live: what strategies and densifier do
 after the step, and every iteration that cannot be replayed. A replay has the bits of the live iteration.
 """
 
@@ -23,7 +23,7 @@ from clear_strategies.core.view import Photo, View
 from clear_strategies.kernels import losses
 from clear_strategies.strategies.base import describes, overrides
 from clear_strategies.training.compiled_step import CompiledStep
-from clear_strategies.training.given import Given, Learned
+from clear_strategies.training.given import Given, GivenExtra, GivenView, L, Learned, LearnedView
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Rasterizer, Recordable
 from rasterizers.recording import Recording
@@ -80,8 +80,8 @@ class Replays:
         self._addresses: tuple[int, ...] = ()
         self._device, self._failed = s.device, False
 
-    def learn(self, given: Given, learn: Callable[..., Learned]) -> Learned | None:
-        """What the iteration learns, by a replay; None where it has to be live.
+    def learn(self, given: Given, learn: Callable[..., L]) -> L | None:
+        """See `given.Replayer`.
 
         An iteration of a new kind is live first, so that kernels are compiled and caches filled, and is recorded the next time.
         """
@@ -94,7 +94,8 @@ class Replays:
                 self._recorded[kind] = None
             return None
         optimizer, recorded = self._state.optimizer, self._recorded[kind]
-        steps, learned = optimizer.steps, None
+        steps = optimizer.steps
+        learned: L | None = None
         if recorded is not None:
             learned = recorded.replay(given)
         elif not self._failed:
@@ -106,7 +107,7 @@ class Replays:
             optimizer.steps = steps
         return learned
 
-    def _record(self, recorded: _Recorded, given: Given, learn: Callable[..., Learned]) -> Learned | None:
+    def _record(self, recorded: _Recorded, given: Given, learn: Callable[..., L]) -> L | None:
         try:
             return recorded.record(given, learn)
         except RuntimeError as error:
@@ -117,63 +118,75 @@ class Replays:
             return None
 
     def _kind(self, given: Given) -> _Kind:
-        s, o, view = self._state, self._state.conductor.objective, given.view
+        s, λ = self._state, self._state.conductor.objective.lambda_hr(given.t)
         tables = s.field.raw(), s.optimizer.first, s.optimizer.second, s.density.state_dict(), s.conductor.state_dict()
         rows = [x for table in tables for x in table.values() if x.dim() > 0]  # others are no memory of the field's
         addresses = [x.data_ptr() for x in (s.field.filter_3d, *rows)]
-        photos = [(p.image.shape, p.shown is None) for p in (view.lr, view.hr)]
-        facts = (
-            s.field.degree, *given.scales.values(), given.gate is None, given.background is None, o.lambda_hr(given.t) > 0,
-            s.density.collects(given.t),
-        )  # fmt: skip
-        return _Kind((len(s.field), *addresses), (*photos, view.background), facts)
+        facts: list[Any] = [s.field.degree, given.gate is None, given.background is None, λ > 0]
+        if isinstance(given, GivenView):
+            facts += [given.view.background, *given.scales.values(), s.density.collects(given.t)]
+        else:
+            facts += [given.extra.background, given.extra.robust]
+        shapes = [(photo.image.shape, photo.shown is None) for photo in given.photos]
+        return _Kind((len(s.field), *addresses), tuple(shapes), tuple(facts))
 
 
 class _Recorded:
     """The recording of one kind of iteration, and the tensors from which it reads what it is given."""
 
     def __init__(self, s: TrainState, rasterizer: Rasterizer, given: Given, count: Callable[[int], None]) -> None:
-        self._count = count
-        self._state, self._device, owner = s, s.device, s.conductor.owner("observe")
-        self._looked_up = (lambda view: None) if owner is None else owner.looked_up
-        self._view, self._gate = _copied(given.view, self._looked_up(given.view)), _clone(given.gate)
-        self._background = s.field.means.new_empty(1, 3)
+        self._count, self._state, self._device, owner = count, s, s.device, s.conductor.owner("observe")
+        self._look_up = None if owner is None else owner.looked_up
         recordable = cast(Recordable, rasterizer)
-        self._rasterizer = rasterizer if given.background is None else recordable.over_changing(self._background)
         self._numbers_of = recordable.numbers_of
-        self._numbers = [self._numbers_of(photo.camera, s.device) for photo in (self._view.lr, self._view.hr)]
+        self._own, self._background = self._copied(given), s.field.means.new_empty(1, 3)
+        self._rasterizer = rasterizer if given.background is None else recordable.over_changing(self._background)
+        self._written = self._read_of(self._own)
 
-    def record(self, given: Given, learn: Callable[..., Learned]) -> Learned:
-        own = replace(given, view=self._view, gate=self._gate, background=None)
-
-        def work() -> tuple[Learned, Tensor, Callable[[Tensor], dict[str, Number]]]:
-            learned = learn(self._state, self._rasterizer, own)
+    def record(self, given: Given, learn: Callable[..., L]) -> L:
+        def work() -> tuple[L, Tensor, Callable[[Tensor], dict[str, Number]]]:
+            learned = learn(self._state, self._rasterizer, self._own)
             counts = {f"skip {k}": count for k, (*_, count) in enumerate(skips) if isinstance(count, Tensor)}
             return learned, *deferred.gathered(learned.row | counts)
 
-        self._fill(given)
+        self._write(given)
         with self._state.conductor.work_log.noted() as skips:
-            self._recording = Recording(self._device, work)
+            self._recording: Recording[Any] = Recording(self._device, work)
         self._skips = skips
-        return self._learned(given)
+        return cast(L, self._learned(given))
 
-    def replay(self, given: Given) -> Learned | None:
+    def replay(self, given: Given) -> Any | None:
         """What the iteration learns; None where the recording does not hold for it, before anything has changed."""
-        self._fill(given)
+        self._write(given)
         with self._state.conductor.work_log.stage("replayed"):
             done = self._recording.replay()
         return self._learned(given) if done else None
 
-    def _fill(self, given: Given) -> None:
+    def _copied(self, given: Given) -> Given:
+        """The same with tensors and cameras of its own, and photos that no background shows through."""
+        photos = [Photo(replace(p.camera), p.image.clone(), _clone(p.shown)) for p in given.photos]
+        gate = _clone(given.gate)
+        if isinstance(given, GivenExtra):
+            extra = replace(given.extra, photo=photos[0], weight=given.extra.weight.clone())
+            return replace(given, extra=extra, gate=gate, background=None)
+        looked_up = None if self._look_up is None else _clone(self._look_up(given.view))
+        view = View(given.view.name, photos[0], photos[1], background=given.view.background, looked_up=looked_up)
+        return replace(given, view=view, gate=gate, background=None)
+
+    def _read_of(self, given: Given) -> list[Tensor | None]:
+        """All tensors that an iteration reads of what it is given."""
+        read = [given.gate]
+        for photo in given.photos:
+            read += [photo.image, photo.shown, *self._numbers_of(photo.camera, self._device)]
+        if isinstance(given, GivenExtra):
+            return [*read, given.extra.weight]
+        return [*read, None if self._look_up is None else self._look_up(given.view)]
+
+    def _write(self, given: Given) -> None:
         """Write what the iteration is given to where the recorded one reads it."""
-        view, own = given.view, self._view
-        for photo, copy, numbers in zip((view.lr, view.hr), (own.lr, own.hr), self._numbers, strict=True):
-            copy.image.copy_(photo.over(given.background, view.background).image)
-            _copy(photo.shown, copy.shown)
-            for x, y in zip(self._numbers_of(photo.camera, self._device), numbers, strict=True):
-                y.copy_(x)
-        _copy(self._looked_up(view), own.looked_up)
-        _copy(given.gate, self._gate)
+        for x, own in zip(self._read_of(given), self._written, strict=True):
+            if x is not None and own is not None:
+                own.copy_(x)
         if given.background is not None:
             self._background.copy_(sent(torch.tensor([given.background], dtype=torch.float32), self._device))
         self._count(given.t)
@@ -187,22 +200,11 @@ class _Recorded:
             skip(name, reason, counted.vector[counted.k].long() if isinstance(counted, deferred.Element) else count)
         if deferred.is_immediate(numbers):
             deferred.resolve([row])
+        if isinstance(given, GivenExtra):
+            return Learned(row)
         step = replace(learned.update.step, t=given.t, view=given.view)
-        return Learned(replace(learned.update, step=step), row)
-
-
-def _copied(view: View, looked_up: Tensor | None) -> View:
-    """A view of the same sizes with tensors and cameras of its own, of which only what training reads is copied."""
-    lr, hr = (
-        Photo(replace(photo.camera), photo.image.clone(), _clone(photo.shown)) for photo in (view.lr, view.hr)
-    )  # fmt: skip
-    return View(view.name, lr, hr, background=view.background, looked_up=_clone(looked_up))
+        return LearnedView(row, replace(learned.update, step=step))
 
 
 def _clone(x: Tensor | None) -> Tensor | None:
     return None if x is None else x.clone()
-
-
-def _copy(x: Tensor | None, to: Tensor | None) -> None:
-    if x is not None and to is not None:
-        to.copy_(x)

@@ -85,7 +85,7 @@ def test_five_hundred_replayed_iterations_have_the_bits_of_live_ones(moves):
     live, replayed = (trained(best(), replayed=r, until=500) for r in (False, True))
     require_same(replayed, live)
     assert live.conductor.work_log.state_dict().keys().isdisjoint({"replayed"})
-    assert replays_of(replayed) > 400
+    assert replays_of(replayed) > 600  # of 500 views and 250 extra views
     assert len(live.field) > 12
 
 
