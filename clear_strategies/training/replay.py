@@ -1,10 +1,10 @@
 """Iterations that are recorded and replayed: on a GPU, an iteration takes the host longer than the kernels.
 
-What an iteration does with its view (render, losses, gradients, merge and step, statistics), and with an extra view, is recorded
-once for each kind of iteration (`_Kind`), see `rasterizers.recording`, and done again while the tensors of the field lie where
-they lay. Before a replay, what the iteration is given is copied to where the recorded one read it: photo, SR image, what P2G looks
-up, cameras, dropout mask, background, and the numbers of the optimizer's step. All else is live: what strategies and densifier do
-after the step, and every iteration that cannot be replayed. A replay has the bits of the live iteration.
+What an iteration does with its view (render, losses, gradients, merge and step, statistics), and with an extra view, is
+recorded once for each kind of iteration (`_Kind`), see `rasterizers.recording`, and done again while the tensors of the field
+lie where they lay. Before a replay, what the iteration is given is copied to where the recorded one read it: photo, SR image,
+what P2G looks up, cameras, dropout mask, background, and the numbers of the optimizer's step. All else is live: what strategies
+and densifier do after the step, and every iteration that cannot be replayed. A replay has the bits of the live iteration.
 """
 
 from __future__ import annotations
