@@ -412,7 +412,8 @@ class Conductor:
 def _screen_gradients(
     lr: Float[Tensor, "N 2"], hr: HrGradients[Any], weights: Weights
 ) -> ScreenGradients:  # fmt: skip
-    if (kernels := per_gaussian.for_tensors(lr, hr.base.screen)) is not None:
+    kernels = None if hr.base.screen is None else per_gaussian.for_tensors(lr, hr.base.screen)
+    if kernels is not None:
         screens, ordinary = kernels.screens(
             lr, hr.base.screen, None if hr.hf is None else hr.hf.screen, hr.size, weights
         )

@@ -87,6 +87,7 @@ def test_the_host_does_not_wait_for_the_device(warp_step):
 def test_the_kernels_compile_for_cuda_on_a_machine_without(warp_step, ptx_of):
     from clear_strategies.kernels.merge import warp as merge
 
+    ptx_of(warp_step.adam.write.module)
     assert "fma.rn.f32" not in ptx_of(merge.decide.module, merge._LANES["cuda"])
     assembly = ptx_of(warp_step.passes.step.module, warp_step.LANES["cuda"])  # the module of both kernels
     assert ".local" not in assembly  # no spills: a thread's numbers are in registers
