@@ -123,16 +123,16 @@ class Density(Densifier):
         """Add the scores of this view's visible Gaussians; dropped ones are not visible."""
         if update.score is None or update.ordinary is None:
             return
-        visible = shot.visible
         if (kernels := per_gaussian.for_tensors(self.score, update.score)) is not None:
             totals, largest = (self.score, self.ordinary, self.count), self.settings.reduce == "max"
-            kernels.accumulate(visible, update.score, update.ordinary, totals, largest=largest)
+            kernels.accumulate(shot.visible, update.score, update.ordinary, totals, largest=largest)
             return
+        visible = shot.visible.to(self.count)
         for total, value in ((self.score, update.score), (self.ordinary, update.ordinary)):
             if self.settings.reduce == "max":
-                torch.maximum(total, torch.where(visible, value, total), out=total)
+                torch.maximum(total, torch.where(shot.visible, value, total), out=total)
             else:
-                total.add_(torch.where(visible, value, 0.0))
+                total.addcmul_(value, visible)
         self.count += visible
 
     def due(self, t: int) -> bool:

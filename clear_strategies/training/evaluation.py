@@ -50,7 +50,7 @@ def loss_of_views(state: TrainState, rasterizer: Rasterizer) -> Number:
 
 def psnr_of(image: Tensor, target: Tensor, shown: Tensor | None) -> Number:
     """dB, of the shown pixels."""
-    squared = (image.clamp(0, 1) - target).square()
+    squared = image.clamp(0, 1).sub_(target).square_()
     mse = squared.mean() if shown is None else (squared.mean(2) * shown).sum() / shown.sum().clamp_min(1)
     return deferred.defer(_decibels, deferred.scalar(mse))
 
