@@ -34,6 +34,8 @@ class Skips:
     Args:
         coarse_until: until this iteration HR is rendered and compared at half its size, and LR is not rendered where that is
             LR's size; 0: never.
+        hr_every: until then, HR is rendered and compared in one of so many iterations, where no densification reads its scores;
+            1: in each.
         plateau_gain: once the loss of the training views, drawn whole, has not fallen by at least this share within
             `plateau_window` iterations, training continues at iteration `plateau_to`; 0: never.
         plateau_window: iterations between two measurements.
@@ -42,6 +44,7 @@ class Skips:
     """
 
     coarse_until: int = milestone(0)
+    hr_every: int = 1
     plateau_gain: float = 0.0
     plateau_window: int = milestone(500)
     plateau_from: int = milestone(5_000)
@@ -50,6 +53,7 @@ class Skips:
     def __post_init__(self) -> None:
         require_number("plateau_gain", self.plateau_gain, below=1)
         require_whole("coarse_until", self.coarse_until, least=0)
+        require_whole("hr_every", self.hr_every, least=1)
 
 
 class SkipPolicy:
@@ -70,7 +74,11 @@ class SkipPolicy:
             _log.warning("skips.coarse_until has no effect: SR images are halved where data.views.sr_scale is even.")
         elif s.coarse_until > 0:
             phrases.append(f"HR at half its size until iteration {s.coarse_until}")
-        if in_host or s.plateau_gain == 0:
+        if in_host:
+            return phrases
+        if s.hr_every > 1 and s.coarse_until > 0:
+            phrases.append(f"HR but in one of {s.hr_every} iterations until {s.coarse_until}")
+        if s.plateau_gain == 0:
             return phrases
         if s.plateau_window == 0:
             _log.warning(
@@ -92,6 +100,13 @@ class SkipPolicy:
         if view.name not in self._coarse:
             self._coarse[view.name] = replace(view, hr=view.hr.reduced(_REDUCED), truth=None)
         return self._coarse[view.name]
+
+    def hr_rests(self, t: int, work_log: WorkLog) -> bool:
+        """Whether HR is left out of iteration t. Of two iterations that is the second; pseudo views come then, too."""
+        if t > self.skips.coarse_until or (t - 1) % self.skips.hr_every == 0:
+            return False
+        work_log.skip("render LR + HR", f"HR in one of {self.skips.hr_every} iterations (skips.hr_every)")
+        return True
 
     def lr_due(self, view: View, hr_due: bool, work_log: WorkLog) -> bool:
         """Whether LR is rendered: not where HR at half its size is as large as the photo, for one render then serves both."""

@@ -172,8 +172,9 @@ def progress_bar(
 
 def _numbers(row: Mapping[str, float], lambda_lr: float) -> dict[str, str]:
     """What the bar shows of a row of the history."""
-    loss = lambda_lr * row["loss_lr"] + row["lambda_hr"] * row.get("loss_base", 0.0)
-    numbers = {"loss": f"{loss:.4f}", "N": f"{int(row['n_gaussians']):,}"}
+    loss, numbers = lambda_lr * row["loss_lr"], {"N": f"{int(row['n_gaussians']):,}"}
+    if row["lambda_hr"] == 0 or "loss_base" in row:  # else HR was left out, and the loss would jump
+        numbers["loss"] = f"{loss + row['lambda_hr'] * row.get('loss_base', 0.0):.4f}"
     if not math.isnan(row.get("conflict", math.nan)):
         numbers["conflict"] = f"{row['conflict']:.2f}"
     return numbers | ({"psnr": f"{row['psnr_test']:.2f} dB"} if "psnr_test" in row else {})

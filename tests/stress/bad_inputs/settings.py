@@ -34,7 +34,7 @@ _REFUSED: dict[str, str] = {
     "at least 0": """
         fit.max_degree=-1 fit.probe_every=-1 fit.probe_views=-1 fit.checkpoint_every=-1 fit.degree_every=-1
         fit.map_views=-1 fit.video=-1 density.reset_every=-1 optim.detail_steps=-1
-        optim.geometry_steps=-1 skips.coarse_until=-1 strategies.svs.looks=-1""",
+        optim.geometry_steps=-1 skips.coarse_until=-1 skips.hr_every=0 strategies.svs.looks=-1""",
     "auto": "fit.fused=sometimes data.cloud.densify=maybe",
     "cpu": "fit.device=tpu",
     "true or false": "fit.scale_schedule=7",
