@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+R = TypeVar("R")
 T = TypeVar("T")
 
 
@@ -26,8 +27,8 @@ class Recording(Generic[T]):
 
     Args:
         device: where it works; all of it on torch's current stream.
-        work: launches by torch and by `rasterizers.warp_runtime`. It must not read a number from the device, but right after a
-            `pause`. What it does once, such as to compile kernels or to fill caches, must have been done.
+        work: launches by torch and by `rasterizers.warp_runtime`. It must not read a number from the device, but in a `pause`.
+            What it does once, such as to compile kernels or to fill caches, must have been done.
 
     Attributes:
         result: what `work` returned. Its tensors receive new values in every replay.
@@ -42,20 +43,31 @@ class Recording(Generic[T]):
         _running.recording = self
         try:
             with self._recorder.scope(), self._recorder:
-                self._recorder.begin()
+                self._begin()
                 self.result = work()
-                self._parts.append((self._recorder.end(), lambda: True))
+                self._end(lambda: True)
         finally:
             _running.recording = None
 
-    def pause(self, holds: Callable[[], bool]) -> None:
-        """End a part of the work: the host may read what it computed.
+    def pause(self, read: Callable[[], R], holds: Callable[[], bool]) -> R:
+        """End a part of the work, and return what the host reads of it.
 
         Args:
+            read: called once, while nothing is recorded.
             holds: asked at this place of every replay, whether what was recorded after it holds for what was computed before it.
         """
-        self._parts.append((self._recorder.end(), holds))
+        self._end(holds)
+        found = read()
+        self._begin()
+        return found
+
+    def _begin(self) -> None:
         self._recorder.begin()
+        self._recorder.active = True
+
+    def _end(self, holds: Callable[[], bool]) -> None:
+        self._recorder.active = False
+        self._parts.append((self._recorder.end(), holds))
 
     def launched(self, again: Callable[[], Callable[[], Any]], tensors: Iterable[Any]) -> None:
         """Add a launch that torch does not see. It has been made, and reads and writes these tensors.
@@ -93,6 +105,7 @@ class _Recorder(TorchDispatchMode):  # type: ignore[no-untyped-call]
         super().__init__()  # type: ignore[no-untyped-call]
         self._own: set[int] = set()  # addresses of the memory that the work has allocated
         self._kept: list[Any] = []
+        self.active = False
 
     def scope(self) -> AbstractContextManager[Any]:
         return nullcontext()
@@ -113,6 +126,8 @@ class _Recorder(TorchDispatchMode):  # type: ignore[no-untyped-call]
     def __torch_dispatch__(self, op: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         call = partial(op, *args, **(kwargs or {}))
         result = call()
+        if not self.active:
+            return result
         if op.overloadpacket is torch.ops.aten._local_scalar_dense:
             raise RuntimeError("recorded work must not read a number from the device.")
         made = [x for x in tree_leaves(result) if isinstance(x, Tensor)]

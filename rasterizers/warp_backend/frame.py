@@ -12,7 +12,7 @@ and if the lists were too short, the image is drawn again before it is returned.
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
@@ -101,6 +101,7 @@ class Frame:
         each = zip(jobs, depth, self._counts, firsts, self._visible, self.totals[:k, None], strict=True)
         self.views = [_View(*job, *others) for job, *others in each]
         self._basis: Tensor | None = None
+        self._read: Callable[[], list[int]]  # the numbers of `totals`; set by `draw`
         self.resolved = False
 
     def draw(self) -> list[WarpRendering]:
@@ -114,8 +115,8 @@ class Frame:
             if self.n:
                 self.totals[: len(ends)] = ends[:, -1]
             if (recording := running()) is not None:
-                recording.pause(self._fits)
-                self._read = self.totals.tolist
+                numbers = recording.pause(self.totals.tolist, self._fits)
+                self._read = lambda: numbers
                 self.resolve_counts(recorded=True)
                 return [WarpRendering(self, view) for view in self.views]
             self._read = _read_deferred(self.totals)
@@ -186,8 +187,7 @@ class Frame:
             self.launch(
                 project, self.n, self.pose, view.grid, self.cuts, self.means, self.quats, self.scales, view.opacities, self.sh0,
                 self.shN, view.offsets is not None, view.offsets, nth == 0, keys, places, self.colours, self.slopes, self.depths,
-                view.ellipses, view.means2d, view.visible, view.counts,
-                self.totals[len(self.views) :],
+                view.ellipses, view.means2d, view.visible, view.counts, self.totals[len(self.views) :],
             )  # fmt: skip
         return keys, places
 

@@ -33,17 +33,17 @@ def test_a_replay_reads_what_has_been_written_since():
 
 
 def test_a_replay_ends_where_what_follows_does_not_hold():
-    x, found = torch.zeros(()), torch.zeros(())
+    x, found, read = torch.zeros(()), torch.zeros(()), []
 
     def work():
         found.copy_(x)
         current = running()
         assert current is not None
-        current.pause(lambda: float(x) < 2)
+        read.append(current.pause(lambda: float(found), lambda: float(x) < 2))
         found.add_(10)
 
     recorded = Recording(CPU, work)
-    assert [recorded.replay(), float(found)] == [True, 10]
+    assert [recorded.replay(), float(found), read] == [True, 10, [0]]
     x.fill_(2)
     assert [recorded.replay(), float(found)] == [False, 2]
 
@@ -100,14 +100,14 @@ def test_on_cuda_each_part_is_captured_and_replayed_and_warp_knows(fails, monkey
     def work():
         current = running()
         assert current is not None
-        current.pause(lambda: True)
+        current.pause(lambda: order.append("read"), lambda: True)
         if fails:
             raise ValueError("no")
 
     part = ["capture_begin", "wp.capture_begin", "wp.capture_end", "capture_end"]
     with pytest.raises(ValueError, match="no") if fails else nullcontext():
         recorded = Recording(torch.device("cuda"), work)
-    assert order == [*part, "replay", *part] + ["replay"] * (not fails)
+    assert order == [*part, "replay", "read", *part] + ["replay"] * (not fails)
     if not fails:
         order.clear()
         assert [recorded.replay(), order] == [True, ["replay", "replay"]]
