@@ -231,14 +231,12 @@ class Traits:
         dtypes: the types that the splats' tensors may have.
         native_threads: it computes on the threads of `rasterizers.native`, not on torch's.
         depth: it draws expected depth. Without this trait nobody passes the argument `depth`, so its methods may lack it.
-        records: it is a `Recordable`.
     """
 
     devices: frozenset[str]
     dtypes: frozenset[torch.dtype]
     native_threads: bool = False
     depth: bool = False
-    records: bool = False
 
 
 @runtime_checkable

@@ -37,7 +37,7 @@ from clear_strategies.training.optim import Adam, LearningRates
 from clear_strategies.training.replay import replays_for
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
-from rasterizers.interface import PRESETS, Camera, Rasterizer, Rendering, SplatGradients, Splats
+from rasterizers.interface import PRESETS, Camera, Rasterizer, Recordable, Rendering, SplatGradients, Splats
 
 FROZEN: Final = LearningRates(LogLinear(1e-30, 1e-30), *(0.0,) * 6, detail_decay=0.002)
 """Adam does all its work, and the scene stays the same from turn to turn."""
@@ -114,7 +114,7 @@ def measure(results: Results, *, scene: str, backend: str | None, repeats: int, 
     rasterizer = rasterizers.load(backend, preset=_PRESET, **SETTINGS)
     view = view_of(workload, rasterizer)
     trainings = {name: Training(workload, view, rasterizer, objective) for name, objective in OBJECTIVES.items()}
-    if device == "cuda" and rasterizer.traits.records:
+    if device == "cuda" and isinstance(rasterizer, Recordable):
         replayed = trainings["replayed"] = Training(workload, view, rasterizer, Objective())
         replayed.state.replays = replays_for(replayed.state, rasterizer)
     with kernel_threads(trainings["lr_and_hr"].state, rasterizer):

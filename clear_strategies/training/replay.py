@@ -37,14 +37,14 @@ _MOST_KINDS: Final = 8  # a recording keeps the memory of an iteration
 def replays_for(s: TrainState, rasterizer: Rasterizer) -> Replays | None:
     """The replays of this training; None, and a log line with the reason, where its iterations cannot be recorded."""
     reason = next(_why_not(s, rasterizer), None)
-    if reason is None and s.compiled_step is not None:
+    if reason is None and s.compiled_step is not None and isinstance(rasterizer, Recordable):
         return Replays(s, rasterizer, s.compiled_step)
     _log.warning("fit.replay has no effect: %s.", reason)
     return None
 
 
 def _why_not(s: TrainState, rasterizer: Rasterizer) -> Iterator[str]:
-    if not rasterizer.traits.records:
+    if not isinstance(rasterizer, Recordable):
         yield f"{type(rasterizer).__name__} cannot be recorded; rasterizer=warp can"
     if s.compiled_step is None or not s.compiled_step.records:
         yield "the per-Gaussian step is not that of Warp"
@@ -74,7 +74,7 @@ class _Kind:
 class Replays:
     """The recordings of one training."""
 
-    def __init__(self, s: TrainState, rasterizer: Rasterizer, compiled_step: CompiledStep) -> None:
+    def __init__(self, s: TrainState, rasterizer: Recordable, compiled_step: CompiledStep) -> None:
         self._state, self._rasterizer, self._count = s, rasterizer, compiled_step.count
         self._recorded: dict[_Kind, _Recorded | None] = {}  # None: seen once
         self._addresses: tuple[int, ...] = ()
@@ -134,13 +134,12 @@ class Replays:
 class _Recorded:
     """The recording of one kind of iteration, and the tensors from which it reads what it is given."""
 
-    def __init__(self, s: TrainState, rasterizer: Rasterizer, given: Given, count: Callable[[int], None]) -> None:
+    def __init__(self, s: TrainState, rasterizer: Recordable, given: Given, count: Callable[[int], None]) -> None:
         self._count, self._state, self._device, owner = count, s, s.device, s.conductor.owner("observe")
         self._look_up = None if owner is None else owner.looked_up
-        recordable = cast(Recordable, rasterizer)
-        self._numbers_of = recordable.numbers_of
+        self._numbers_of = rasterizer.numbers_of
         self._own, self._background = self._copied(given), s.field.means.new_empty(1, 3)
-        self._rasterizer = rasterizer if given.background is None else recordable.over_changing(self._background)
+        self._rasterizer = rasterizer if given.background is None else rasterizer.over_changing(self._background)
         self._written = self._read_of(self._own)
 
     def record(self, given: Given, learn: Callable[..., L]) -> L:
