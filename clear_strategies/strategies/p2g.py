@@ -181,7 +181,7 @@ def lift(
         centers: u_i in pixels of the image that the patches tile; of invisible Gaussians anything, since gsplat leaves their
             rows uninitialised. patch: edge of a patch in those pixels.
     """
-    if all(native.runs(x) and x.is_contiguous() for x in (patch_maps, centers)) and visible.is_contiguous():
+    if native.takes(patch_maps, centers) and visible.is_contiguous():
         lifted = patch_maps.new_empty(len(patch_maps), len(centers))
         native.module().lift(patch_maps, centers.detach(), visible, patch, lifted, threads())
         return lifted
