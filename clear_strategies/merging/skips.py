@@ -77,7 +77,7 @@ class SkipPolicy:
         if in_host:
             return phrases
         if s.hr_every > 1 and s.coarse_until > 0:
-            phrases.append(f"HR but in one of {s.hr_every} iterations until {s.coarse_until}")
+            phrases.append(f"HR in one of {s.hr_every} iterations until iteration {s.coarse_until}")
         if s.plateau_gain == 0:
             return phrases
         if s.plateau_window == 0:
@@ -101,7 +101,7 @@ class SkipPolicy:
             self._coarse[view.name] = replace(view, hr=view.hr.reduced(_REDUCED), truth=None)
         return self._coarse[view.name]
 
-    def hr_rests(self, t: int, work_log: WorkLog) -> bool:
+    def leaves_out_hr(self, t: int, work_log: WorkLog) -> bool:
         """Whether HR is left out of iteration t. Of two iterations that is the second; pseudo views come then, too."""
         if t > self.skips.coarse_until or (t - 1) % self.skips.hr_every == 0:
             return False

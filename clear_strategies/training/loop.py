@@ -48,8 +48,8 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     t, θ, conductor, stage = s.t, s.field, s.conductor, s.conductor.work_log.stage
     θ.degree = min(s.settings.max_degree, (t - 1) // max(1, s.settings.degree_every))
     view = conductor.skips.view(view_at(s), t)
-    may_rest = conductor.wants_lr and not s.density.collects(t)  # a score needs HR
-    hr_due = conductor.wants_hr(t) and not (may_rest and conductor.skips.hr_rests(t, conductor.work_log))
+    needs_hr = not conductor.wants_lr or s.density.collects(t)  # for Î_LR, or for a score
+    hr_due = conductor.wants_hr(t) and (needs_hr or not conductor.skips.leaves_out_hr(t, conductor.work_log))
     scales = {"lr": conductor.wants_lr and conductor.skips.lr_due(view, hr_due, conductor.work_log), "hr": hr_due}
     z, background = conductor.gate(t, len(θ)), conductor.background(t)  # zᵗ             Eq. 15       SVS
     learned = _learned(s, rasterizer, GivenView(t, view, scales, z, background), learn)

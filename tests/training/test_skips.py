@@ -35,11 +35,11 @@ def test_by_default_and_of_photos_that_sr_does_not_enlarge_nothing_is_left_out_a
     assert (short.coarse_until, short.plateau_from, short.plateau_window, short.plateau_to) == (300, 500, 50, 800)
 
 
-def test_hr_rests_in_all_but_one_of_so_many_iterations_until_coarse_until():
+def test_hr_is_left_out_in_all_but_one_of_so_many_iterations_until_coarse_until():
     work_log, policy = WorkLog(), SkipPolicy(Skips(coarse_until=8, hr_every=3))
-    assert [t for t in range(1, 13) if policy.hr_rests(t, work_log)] == [2, 3, 5, 6, 8]
+    assert [t for t in range(1, 13) if policy.leaves_out_hr(t, work_log)] == [2, 3, 5, 6, 8]
     assert work_log.entries["render LR + HR"].skipped == {"HR in one of 3 iterations (skips.hr_every)": 5}
-    assert not any(SkipPolicy().hr_rests(t, work_log) for t in range(1, 5))
+    assert not any(SkipPolicy().leaves_out_hr(t, work_log) for t in range(1, 5))
     state = start(("gco",))
     state.conductor.skips = SkipPolicy(Skips(coarse_until=ITERATIONS, hr_every=2))
     for _ in range(ITERATIONS):
@@ -68,7 +68,7 @@ def test_a_skip_that_cannot_act_is_a_warning_and_not_in_the_plan(caplog):
     view, skips = toy.scene().train[0], Skips(coarse_until=10, plateau_gain=0.01)
     half, rest, window = SkipPolicy(replace(skips, hr_every=2)).descriptions([view])
     assert half == "HR at half its size until iteration 10"
-    assert rest == "HR but in one of 2 iterations until 10"
+    assert rest == "HR in one of 2 iterations until iteration 10"
     assert "500 iterations gain less than 1.0%" in window
     assert not caplog.records
     odd = replace(view, hr=view.hr.reduced(4))  # by a factor of 1
