@@ -33,8 +33,8 @@ class Recycler {
   // A block of at least `bytes`, at most about twice that. The address sanitizer gets exact blocks, and none is kept.
   __attribute__((noinline)) Block take(std::size_t bytes) {
 #if defined(__SANITIZE_ADDRESS__)
-    const std::size_t exact = (bytes + 63) / 64 * 64;
-    Block block{std::aligned_alloc(64, exact), exact};
+    const std::size_t exact = (bytes + 127) / 128 * 128;  // a register of float64 has 128 bytes
+    Block block{std::aligned_alloc(128, exact), exact};
     if (!block.data) throw std::bad_alloc();
     return block;
 #endif
