@@ -1,8 +1,8 @@
 """Work on a device that is recorded once and then done again without the Python that launched it.
 
-On CUDA a recording is a row of CUDA graphs; on the CPU, where Warp's kernels run to be checked, it is a row of lists of the same
-calls. Either way a replay runs the same kernels on the same memory. What changes from one replay to the next must therefore lie
-in tensors that are written before it: a number that Python passed to a kernel or to torch is the same in every replay.
+On CUDA a recording consists of CUDA graphs. On the CPU, where Warp's kernels run for tests, it consists of torch's operations
+and of Warp's graphs between them. A replay runs the same kernels on the same memory. What changes from one replay to the next
+must lie in tensors that are written before it: a number that Python passed to a kernel or to torch is the same in every replay.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ T = TypeVar("T")
 
 
 class Recording(Generic[T]):
-    """What `work` did on the device, to be done again. It is done once while it is recorded.
+    """What `work` did on the device. It is done once while it is recorded, and again by each `replay`.
 
     Args:
-        device: where it works; all of it on torch's current stream.
+        device: the device of all tensors of `work`, which runs on torch's current stream.
         work: launches by torch and by `rasterizers.warp_runtime`. It must not read a number from the device, but in a `pause`.
             What it does once, such as to compile kernels or to fill caches, must have been done.
 
@@ -99,7 +99,7 @@ def running() -> Recording[Any] | None:
 
 
 class _Recorder(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Sees the calls of torch's operations while it is entered, and keeps the tensors that they read from elsewhere."""
+    """Records while it is entered. Each operation of torch calls it, and it keeps the tensors that were allocated before."""
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
@@ -148,7 +148,7 @@ class _Graphs(_Recorder):  # type: ignore[no-untyped-call]
         super().__init__()
         self._stream = _side_stream(device)
         self._pool: Any = None
-        self._capturing: tuple[Any, Any] | None = None  # torch's graph, and Warp's stream, which knows of the capture
+        self._capturing: tuple[Any, Any] | None = None  # torch's graph, and Warp's stream
 
     @contextmanager
     def scope(self) -> Iterator[None]:

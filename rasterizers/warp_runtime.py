@@ -115,7 +115,7 @@ class _Launch:
         return command
 
     def recordable(self, size: tuple[int, ...], arguments: Sequence[Any]) -> Callable[[], None]:
-        """What launches it with these arguments, and can be captured on a CPU, where Warp wants to know the arrays."""
+        """A function that launches the kernel with these arguments. To capture it on a CPU, Warp needs the arrays."""
         command = self.prepare(size, arguments)
         if not self.on_cuda:
             command.fwd_args = [_original(kind, x) for kind, x in zip(self.kinds, command.params[1:], strict=True)]

@@ -93,7 +93,9 @@ def _look_up(lanes: int) -> Any:
 def look_up(
     maps: Float[Tensor, "2 ph pw"], centers: Float[Tensor, "N 2"], visible: Bool[Tensor, " N"], patch: float
 ) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"], Float[Tensor, " 3"]]:
-    """Q and a of each Gaussian (Eq. 10), as of `strategies.p2g.lift`; the number of visible ones, and Σ q and Σ w over them."""
+    """Reliability q and demand a of each Gaussian (Eq. 10), as of `strategies.p2g.lift`; and the number of visible ones, with
+    Σ q and Σ w over them.
+    """
     q, a = maps.new_empty(2, len(centers)).unbind()
     parts = _parts(q, 3)
     _blocks(_look_up, len(parts), maps, centers, visible, patch, q, a, parts)
