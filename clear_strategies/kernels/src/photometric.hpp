@@ -43,7 +43,8 @@ inline double l1_with_gradient(const ImagePair& im, float weight, int threads) {
 template <class Task>
 PhotometricMeans sum_tiles(const ImagePair& im, int inset, int threads, Task&& task) {
   const int height = im.height - 2 * inset, row = im.row - 2 * inset * kChannels;
-  const int down = (height + ssim::kTileHeight - 1) / ssim::kTileHeight, across = ssim::tiles_across(row);
+  const int most = std::clamp(height / 4, ssim::kLowTileHeight, ssim::kTileHeight);
+  const int down = (height + most - 1) / most, across = ssim::tiles_across(row);
   auto border = [](int inset, int size, int tiles, int i) { return inset + int(std::int64_t(size) * i / tiles); };
   std::vector<PhotometricMeans> sums(std::size_t(across) * down);
   Pool::instance().run(threads, std::int64_t(sums.size()), [&](std::int64_t i) {

@@ -30,8 +30,9 @@ namespace ssim {
 // Windows that are computed together, down and along.
 inline constexpr int kDown = 4, kAlong = 4;
 
-// The largest tile, in rows, and in numbers of a row with those that its windows reach beside it.
-inline constexpr int kTileHeight = 96, kTileWidth = 3072;
+// The largest tile, in rows, and in numbers of a row with those that its windows reach beside it: larger buffers miss the L2
+// cache more often. Where such tiles would be few, threads share lower ones.
+inline constexpr int kTileHeight = 192, kLowTileHeight = 96, kTileWidth = 1536;
 inline constexpr int kMargin = 2 * kReach * kChannels;  // the gradient reaches the maps, and these the images
 
 // Rows, by what they hold of each number.
