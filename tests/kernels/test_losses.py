@@ -100,7 +100,7 @@ PAIRS = {
         f"{x:.3g} against a far {y:.3g}": (flat(x), flat(y))
         for x, y in itertools.permutations((0.0, 3e-4, 1 / 255, 0.5, 1.0), 2)
     },
-    **{f"noise of {h} x {w}": noise(h, w) for h, w in ((1, 1), (3, 30), (11, 11), (40, 1), (141, 1101))},
+    **{f"noise of {h} x {w}": noise(h, w) for h, w in ((1, 1), (3, 30), (11, 11), (40, 1), (30, 48), (141, 1101))},
     "noise against black": (NOISE, DARK),
     "black against noise": (DARK, NOISE),
     "noise against grey": (NOISE, DARK + 0.4),

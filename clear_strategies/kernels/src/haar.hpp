@@ -8,6 +8,7 @@
 // pixel). Both compute the same details: half of the work is done twice, but no lanes are shuffled.
 #pragma once
 
+#include <array>
 #include <cstring>
 #include <vector>
 
@@ -48,17 +49,22 @@ class Workspace {
   float* above() { return rows_[4]; }  // the low part's gradient, repeated for each pixel of a block
   float* side() { return rows_[5]; }   // 1 for a block's left pixel, -1 for its right
 
+  // The two rows of x and of y that a row of blocks is made of.
+  std::array<const float*, 4> sources(int block_row) const {
+    auto row = [&](const float* image, int r) {
+      return image + std::ptrdiff_t(std::min(r, in_.height - 1)) * in_.width * kChannels;
+    };
+    const float *x = in_.x, *y = in_.y ? in_.y : x;
+    return {row(x, 2 * block_row), row(x, 2 * block_row + 1), row(y, 2 * block_row), row(y, 2 * block_row + 1)};
+  }
+
   void read(int block_row) {
+    const auto rows = sources(block_row);
+    const int n = in_.width * kChannels;
     for (int k : {0, 1}) {
-      int r = std::min(2 * block_row + k, in_.height - 1), n = in_.width * kChannels;
-      const float* x = in_.x + std::ptrdiff_t(r) * n;
+      const float *x = rows[k], *y = rows[2 + k];
       float* to = input(k);
-      if (in_.y) {
-        const float* y = in_.y + std::ptrdiff_t(r) * n;
-        for (int i = 0; i < n; ++i) to[i] = x[i] - y[i];
-      } else {
-        std::memcpy(to, x, sizeof(float) * std::size_t(n));
-      }
+      for (int i = 0; i < n; ++i) to[i] = in_.y ? x[i] - y[i] : x[i];
       for (int i = n; i < in_.even_row(); ++i) to[i] = to[i - kChannels];
     }
   }
@@ -92,12 +98,15 @@ inline void low_part(const Level& level, float* low, int threads) {
   });
 }
 
-// Gradient of one row of blocks, into work.output; returns the sum of |detail| over it.
-inline double blocks_of_row(Workspace& work, float scale, bool has_above) {
+// Gradient of one row of blocks, into work.output, or past the caches into the two rows from `stream_to` on; returns the sum of
+// |detail| over it. Waiting for memory takes longer than the arithmetic, so the next row of blocks is fetched meanwhile.
+inline double blocks_of_row(Workspace& work, int j, float scale, bool has_above, float* stream_to) {
   const float *upper = work.input(0), *lower = work.input(1);
+  const auto next = work.sources(j + 1);
   Floats zero(0.0f), half(0.5f), plus(scale), sum(0.0f);
   auto signed_scale = [&](const Floats& v) { return where(v > zero, plus) - where(v < zero, plus); };
   for (int i = 0; i < work.width(); i += kLanes) {
+    for (const float* row : next) __builtin_prefetch(row + i, 0, 2);
     Floats side = Floats::load(work.side() + i), up = Floats::load(upper + i), down = Floats::load(lower + i);
     auto left = side > zero;
     Floats a = select(left, up, Floats::load(upper + i - kChannels));
@@ -108,8 +117,9 @@ inline double blocks_of_row(Workspace& work, float scale, bool has_above) {
     sum += absolute(horizontal) + absolute(vertical) + absolute(diagonal);
     Floats h = side * signed_scale(horizontal), v = signed_scale(vertical), hv = side * signed_scale(diagonal);
     Floats low = has_above ? Floats::load(work.above() + i) : zero;
-    ((low + h + v + hv) * half).store(work.output(0) + i);
-    ((low + h - v - hv) * half).store(work.output(1) + i);
+    Floats first = (low + h + v + hv) * half, second = (low + h - v - hv) * half;
+    if (stream_to) first.stream(stream_to + i), second.stream(stream_to + work.width() + i);
+    else first.store(work.output(0) + i), second.store(work.output(1) + i);
   }
   float lanes[kLanes];
   sum.store(lanes);
@@ -131,13 +141,16 @@ inline double details(const Level& level, const float* above, float scale, float
         for (int c = 0; c < kChannels; ++c)
           to[2 * i * kChannels + c] = to[(2 * i + 1) * kChannels + c] = from[i * kChannels + c];
     }
-    sums[j] = blocks_of_row(work, scale, above != nullptr);
+    float* to = gradient + std::ptrdiff_t(2 * j) * n;
+    const bool aligned = n % kLanes == 0 && reinterpret_cast<std::uintptr_t>(gradient) % (kLanes * sizeof(float)) == 0;
+    const bool stream = aligned && n == level.even_row() && 2 * j + 1 < level.height;
+    sums[j] = blocks_of_row(work, j, scale, above != nullptr, stream ? to : nullptr);
+    if (stream) return end_of_stream();
     float *upper = work.output(0), *lower = work.output(1);
     if (2 * j + 1 == level.height)
       for (int i = 0; i < work.width(); ++i) upper[i] += lower[i];
     for (float* row : {upper, lower})
       for (int i = n; i < level.even_row(); ++i) row[i - kChannels] += row[i];
-    float* to = gradient + std::ptrdiff_t(2 * j) * n;
     std::memcpy(to, upper, sizeof(float) * std::size_t(n));
     if (2 * j + 1 < level.height) std::memcpy(to + n, lower, sizeof(float) * std::size_t(n));
   });
