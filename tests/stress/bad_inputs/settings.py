@@ -28,13 +28,14 @@ _REFUSED: dict[str, str] = {
         fit.iterations=0 fit.iterations=-5 fit.keep=0 fit.threads=0 density.every=0 density.max_gaussians=0
         density.min_gaussians=0 decorators.back_projected.rounds=0 strategies.pseudo_views.every=0
         strategies.pseudo_views.count=0 strategies.pseudo_views.max_pixels=0 strategies.mcmc.every=0
-        strategies.p2g.patch=0 objective.haar_levels=0 data.cloud.stride=0 data.cloud.max_points=-1""",
+        strategies.p2g.patch=0 objective.haar_levels=0 data.cloud.stride=0 data.cloud.max_points=-1
+        skips.hr_every=0""",
     "whole number": "fit.iterations=1.5 fit.iterations=many fit.iterations=null fit.seed=x data.views.sr_scale=4.0",
     "at most 3": "fit.max_degree=4",
     "at least 0": """
         fit.max_degree=-1 fit.probe_every=-1 fit.probe_views=-1 fit.checkpoint_every=-1 fit.degree_every=-1
         fit.map_views=-1 fit.video=-1 density.reset_every=-1 optim.detail_steps=-1
-        optim.geometry_steps=-1 skips.coarse_until=-1 skips.hr_every=0 strategies.svs.looks=-1""",
+        optim.geometry_steps=-1 skips.coarse_until=-1 strategies.svs.looks=-1""",
     "auto": "fit.fused=sometimes data.cloud.densify=maybe",
     "cpu": "fit.device=tpu",
     "true or false": "fit.scale_schedule=7",
