@@ -31,8 +31,13 @@ class GivenView:
 
     @property
     def photos(self) -> Sequence[Photo]:
-        """The photos, before the background of the iteration."""
-        return [photo.over(self.background, self.view.background) for photo in (self.view.lr, self.view.hr)]
+        """The photos that the iteration compares renderings with: LR, and HR where it is drawn."""
+        return [self.view.lr, self.view.hr] if self.scales["hr"] else [self.view.lr]
+
+    @property
+    def behind(self) -> Color:
+        """The background of the photos."""
+        return self.view.background
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +56,12 @@ class GivenExtra:
     @property
     def photos(self) -> Sequence[Photo]:
         """As of `GivenView`."""
-        return [self.extra.photo.over(self.background, self.extra.background)]
+        return [self.extra.photo]
+
+    @property
+    def behind(self) -> Color:
+        """As of `GivenView`."""
+        return self.extra.background
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -122,11 +122,11 @@ class Replays:
         tables = s.field.raw(), s.optimizer.first, s.optimizer.second, s.density.state_dict(), s.conductor.state_dict()
         rows = [x for table in tables for x in table.values() if x.dim() > 0]  # others are no memory of the field's
         addresses = [x.data_ptr() for x in (s.field.filter_3d, *rows)]
-        facts: list[Any] = [s.field.degree, given.gate is None, given.background is None, λ > 0]
+        facts: list[Any] = [s.field.degree, given.gate is None, given.background is None, given.behind, λ > 0]
         if isinstance(given, GivenView):
-            facts += [given.view.background, *given.scales.values(), s.density.collects(given.t)]
+            facts += [*given.scales.values(), s.density.collects(given.t)]
         else:
-            facts += [given.extra.background, given.extra.robust]
+            facts.append(given.extra.robust)
         shapes = [(photo.image.shape, photo.shown is None) for photo in given.photos]
         return _Kind((len(s.field), *addresses), tuple(shapes), tuple(facts))
 
@@ -163,20 +163,23 @@ class _Recorded:
 
     def _copied(self, given: Given) -> Given:
         """The same with tensors and cameras of its own, and photos that no background shows through."""
-        photos = [Photo(replace(p.camera), p.image.clone(), _clone(p.shown)) for p in given.photos]
+        copies = (p.over(given.background, given.behind) for p in given.photos)
+        photos = [Photo(replace(p.camera), p.image.clone(), _clone(p.shown)) for p in copies]
         gate = _clone(given.gate)
         if isinstance(given, GivenExtra):
             extra = replace(given.extra, photo=photos[0], weight=given.extra.weight.clone())
             return replace(given, extra=extra, gate=gate, background=None)
         looked_up = None if self._look_up is None else _clone(self._look_up(given.view))
-        view = View(given.view.name, photos[0], photos[1], background=given.view.background, looked_up=looked_up)
+        lr, hr, *_ = [*photos, given.view.hr]  # where HR is not drawn, its size alone is read
+        view = View(given.view.name, lr, hr, background=given.behind, looked_up=looked_up)
         return replace(given, view=view, gate=gate, background=None)
 
     def _read_of(self, given: Given) -> list[Tensor | None]:
         """All tensors that an iteration reads of what it is given."""
         read = [given.gate]
         for photo in given.photos:
-            read += [photo.image, photo.shown, *self._numbers_of(photo.camera, self._device)]
+            image = photo.over(given.background, given.behind).image
+            read += [image, photo.shown, *self._numbers_of(photo.camera, self._device)]
         if isinstance(given, GivenExtra):
             return [*read, given.extra.weight]
         return [*read, None if self._look_up is None else self._look_up(given.view)]
