@@ -99,7 +99,7 @@ def look_up(
     q, a = maps.new_empty(2, len(centers)).unbind()
     parts = _parts(q, 3)
     _blocks(_look_up, len(parts), maps, centers, visible, patch, q, a, parts)
-    return q, a, _total(parts)
+    return q, a, parts.sum(0)
 
 
 @wp.kernel
@@ -225,7 +225,7 @@ def evidence_score(
     score, parts = ordinary.new_empty(n), _parts(ordinary, 2)
     _blocks(_evidence_score, len(parts), q, a, hf, ordinary, score, parts)
     if joined:
-        _per_gaussian(_joined, n, ordinary, _total(parts)[None], score)
+        _per_gaussian(_joined, n, ordinary, parts.sum(0)[None], score)
     return score
 
 
@@ -263,37 +263,9 @@ def accumulate(
     _per_gaussian(_accumulate, len(visible), visible, score, ordinary, largest, *totals)
 
 
-@cache
-def _sum(width: int) -> Any:
-    """The kernel that adds up rows of `width` numbers, with one block of `lanes` threads."""
-
-    @cache
-    def kernel(lanes: int) -> Any:
-        Row = wp.types.vector(length=width, dtype=wp.float64)
-
-        @wp.kernel(module="unique", enable_backward=False)
-        def total(parts: wp.array[Row], out: wp.array[Row]) -> None:
-            _, lane = wp.tid()
-            share = Row()
-            for part in range(lane, parts.shape[0], lanes):
-                share += parts[part]
-            wp.tile_store(out, wp.tile_sum(wp.tile(share, preserve_type=True)))
-
-        return total
-
-    return kernel
-
-
 def _parts(like: Tensor, width: int) -> Float[Tensor, "blocks width"]:
     """Memory for the sums of each block over the Gaussians of `like`."""
     return like.new_empty(-(-len(like) // LANES[like.device.type]), width, dtype=torch.float64)
-
-
-def _total(parts: Float[Tensor, "blocks width"]) -> Float[Tensor, " width"]:
-    """Their sum, in a fixed order."""
-    out = parts.new_empty(parts.shape[1])
-    _blocks(_sum(parts.shape[1]), 1, parts, out[None])
-    return out
 
 
 def _per_gaussian(kernel: Any, n: int, *arguments: Any) -> None:
