@@ -198,9 +198,8 @@ class Conductor:
             score = ordinary = None
             if scored:
                 weights = (o if stepper is None else stepper).weights(t)
-                score, ordinary = self.scores(
-                    screen_in_ndc(g_lr, _size(rendered.image)), from_hr, weights
-                )  # S^dens   Eq. 14
+                screen_lr = screen_in_ndc(g_lr, _size(rendered.image))
+                score, ordinary = self.scores(screen_lr, from_hr, weights)  # S^dens   Eq. 14
             if stepper is None:
                 merged = self.merge(params, g_lr, from_hr, t)
                 require_finite(f"{where}: the merged gradient", merged.grads)

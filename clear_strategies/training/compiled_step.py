@@ -15,7 +15,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import torch
 from jaxtyping import Float
@@ -158,9 +158,8 @@ class CompiledStep:
         from clear_strategies.kernels.gaussian_step.warp import written
 
         rates, bias2 = self.optimizer.advance()
-        settings, device = self._settings(t, bias2), self.optimizer.first["means"].device
-        weight = settings.lambda_hr * self.conductor.objective.lambda_hf
-        self._changing = written(settings, rates, device, lambda_hf=weight, out=self._changing)
+        device, (_, λ_hf) = self.optimizer.first["means"].device, self.conductor.objective.weights(t)
+        self._changing = written(self._settings(t, bias2), rates, device, lambda_hf=λ_hf, out=self._changing)
 
     def weights(self, t: int) -> Weights:
         """λ_HR(t) and λ_HR(t) λ_HF; of a recording on the device."""
@@ -235,9 +234,11 @@ class CompiledStep:
         """As of `Adam.advance`. Of a recording, `count` has written the numbers."""
         return ({}, 1.0) if running() is not None else self.optimizer.advance()
 
-    def _settings(self, t: int, bias2: float, *others: Any) -> kernel.StepSettings:
+    def _settings(
+        self, t: int, bias2: float, skips: bool = False, width: int = 0, changing: Tensor | None = None
+    ) -> kernel.StepSettings:
         λ = self.conductor.objective.lambda_hr(t)
-        return kernel.StepSettings(BETA1, BETA2, bias2, self.optimizer.rates.eps, λ, *(others or (False, 0)))
+        return kernel.StepSettings(BETA1, BETA2, bias2, self.optimizer.rates.eps, λ, skips, width, changing)
 
     def _anchor(self, n: int) -> Anchor:
         if self._regularizer is None:

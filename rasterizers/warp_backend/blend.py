@@ -185,9 +185,8 @@ def blend(depth: bool) -> Any:  # noqa: PLR0915 - a kernel
             if stop == end:
                 at, last = piece_of(segment, tile), segment
                 piece = pieces[at, within]
-                pieces[at, within] = wp.vec4(
-                    light[0], light[1], light[2], through
-                )  # light is that of the segment before
+                # The light is that of the segment before.
+                pieces[at, within] = wp.vec4(light[0], light[1], light[2], through)
                 light = through * wp.vec3(piece[0], piece[1], piece[2])
                 after = through * piece[3]
                 if after >= cuts.transmittance_min:

@@ -50,7 +50,7 @@ class _View:
     ) -> None:  # fmt: skip
         n, like = len(splats), splats.means
         self.camera, self.has_depth = camera, has_depth
-        self.columns, self.rows_of_tiles = -(-camera.width // TILE), -(-camera.height // TILE)
+        self.columns, self.rows_of_tiles = _tiles_of(camera)
         self.opacities = splats.opacities.contiguous()
         self.offsets = None if splats.rgb_offset is None else splats.rgb_offset.contiguous()
         self.grid = numbers_of(camera, like.device).grid
@@ -332,6 +332,11 @@ def _read_deferred(numbers: Tensor) -> Any:
     return wait
 
 
+def _tiles_of(camera: Camera) -> tuple[int, int]:
+    """Columns and rows of tiles."""
+    return -(-camera.width // TILE), -(-camera.height // TILE)
+
+
 class CameraNumbers(NamedTuple):
     """A camera's numbers on the device: `types.Pose` and `types.Grid`, as bytes."""
 
@@ -351,7 +356,7 @@ def numbers_of(camera: Camera, device: torch.device) -> CameraNumbers:
     grid.exact_focal, grid.exact_principal = wp.vec2d(camera.fx, camera.fy), wp.vec2d(camera.cx, camera.cy)
     grid.focal = wp.vec2(camera.fx, camera.fy)
     grid.size = wp.vec2i(camera.width, camera.height)
-    grid.tiles = wp.vec2i(-(-camera.width // TILE), -(-camera.height // TILE))
+    grid.tiles = wp.vec2i(*_tiles_of(camera))
     (left, right), (top, bottom) = tangent_limits(camera)
     grid.low, grid.high = wp.vec2(left, top), wp.vec2(right, bottom)
     structures: tuple[Any, Any] = pose, grid
