@@ -25,19 +25,17 @@ if TYPE_CHECKING:
     from clear_strategies.strategies.fading_opacity import FadingOpacity
     from clear_strategies.strategies.gco import GCO
     from clear_strategies.strategies.p2g import P2G
-    from clear_strategies.strategies.pair_drop import PairDrop
     from clear_strategies.strategies.pseudo_views import PseudoViews
     from clear_strategies.strategies.random_background import RandomBackground
     from clear_strategies.strategies.splatsure import SplatSuRe
     from clear_strategies.strategies.sr_stage import SRStage
     from clear_strategies.strategies.svs import SVS
-    from clear_strategies.strategies.two_fields import TwoFields
 
 __all__ = [
     "ATTRIBUTES", "CONFLICT_GROUPS", "GCO", "MCMC", "P2G", "SVS", "AnchorError", "ClearError", "Conductor", "DataError",
-    "DepthMap", "Evidence", "ExtraView", "FadingOpacity", "Grads", "Objective", "PairDrop", "Photo", "PseudoViews",
+    "DepthMap", "Evidence", "ExtraView", "FadingOpacity", "Grads", "Objective", "Photo", "PseudoViews",
     "RandomBackground", "Run", "SRStage", "ScreenGradients", "Shot", "SplatSuRe", "Step", "Strategy", "StrategyConflict",
-    "TwoFields", "Update", "View", "train",
+    "Update", "View", "train",
 ]  # fmt: skip
 
 _NAMES: Final = {  # by the module of this package that they are defined in
@@ -55,13 +53,11 @@ _NAMES: Final = {  # by the module of this package that they are defined in
     "strategies.fading_opacity": ("FadingOpacity",),
     "strategies.gco": ("GCO",),
     "strategies.p2g": ("P2G",),
-    "strategies.pair_drop": ("PairDrop",),
     "strategies.pseudo_views": ("PseudoViews",),
     "strategies.random_background": ("RandomBackground",),
     "strategies.splatsure": ("SplatSuRe",),
     "strategies.sr_stage": ("SRStage",),
     "strategies.svs": ("SVS",),
-    "strategies.two_fields": ("TwoFields",),
 }
 _HOMES: Final = {name: f"{__name__}.{module}" for module, names in _NAMES.items() for name in names}
 

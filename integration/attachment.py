@@ -41,6 +41,7 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.in_place import InPlaceMerge, RoutedGradients
 from clear_strategies.merging.iteration import HrGradients
 from clear_strategies.strategies.base import overrides
+from clear_strategies.strategies.sr_stage import SRStage
 from integration.autograd_shot import AutogradShot, DrawnGradients, HostOutput, RenderAt, passes_to_parameters
 from integration.densification import ScoreScaler, write_score
 from integration.extra_steps import ExtraSteps
@@ -403,11 +404,12 @@ def _announce(conductor: Conductor, views: Sequence[View], *, own_background: bo
         _log.info("Skipped: %s.", phrase)
     for hook, reason in {
         "densifier": "keeps its own density control",
-        "drawn_views": "draws no picture for it",
         **({"background": "chooses its background itself"} if own_background else {}),
     }.items():
         for owner in (s for s in conductor.strategies if overrides(s, hook)):
             _log.info("%s has no effect here: the host %s.", type(owner).__name__, reason)
+    for stage in (s for s in conductor.strategies if isinstance(s, SRStage)):
+        _log.info("%s has no effect here: the host draws no picture for it.", type(stage).__name__)
     if not conductor.strategies:
         _log.info("no strategy is attached: both losses are summed, as in the paper's baseline.")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -207,14 +206,12 @@ class ExtraView:
         background: see `View.background`; what a transparent photo lies over.
         robust: the photo was invented in part: where the render differs from it much more than elsewhere, the weight is lower,
             see `clear_strategies.core.images.agreement`.
-        gate: maps the number of Gaussians to what multiplies their opacities in the render, >= 0; None: every one takes part.
     """
 
     photo: Photo
     weight: Float[Tensor, "h w"]
     background: Color = (0.0, 0.0, 0.0)
     robust: bool = False
-    gate: Callable[[int], Float[Tensor, " N"]] | None = None
 
     def to(self, device: torch.device | str) -> ExtraView:
         return replace(self, photo=self.photo.to(device), weight=self.weight.to(device))

@@ -179,7 +179,6 @@ class _Job:
                 fit(state, there, drawing.rasterizer, checkpoints=checkpoints, config=self.compared, progress=progress)
             seconds = time.perf_counter() - began
             self.conductor.on_fit_end()  # its memory is for the results
-            state.second = None
             memory.release()
             evaluation = results.write_results(
                 self.folder, scene, state, drawing.rasterizer, painter, self.chosen, backend=drawing.name, seconds=seconds,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, Final, TypeVar
 
 import torch
@@ -25,14 +24,14 @@ from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.iteration import HrGradients, Merged, Stepper, Update, Weights, require_finite_parts
 from clear_strategies.merging.objective import Losses, Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
-from clear_strategies.strategies.base import Drawn, ScreenGradients, Strategy, by_class, overrides
+from clear_strategies.strategies.base import ScreenGradients, Strategy, by_class, overrides
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
 P = TypeVar("P")
 
-_ONE_ANSWER: Final = ("densifier", "background", "gate", "observe", "route", "correct", "score", "second_seed")
+_ONE_ANSWER: Final = ("densifier", "background", "gate", "observe", "route", "correct", "score")
 
 
 class Conductor:
@@ -82,8 +81,7 @@ class Conductor:
             if owners:
                 self._owner[hook] = owners[0]
         self.regularizers = [s for s in strategies if overrides(s, "regularize")]
-        self._that_look = [s for s in strategies if overrides(s, "drawn_views")]
-        others = ("regularize", "extra_views", "drawn_views", "may_densify", "after_step")
+        others = ("regularize", "extra_views", "may_densify", "after_step")
         for s in strategies:
             if not any(overrides(s, hook) for hook in (*_ONE_ANSWER, *others)):
                 _log.warning("%s implements no hook; it has no effect.", type(s).__name__)
@@ -228,31 +226,11 @@ class Conductor:
         apart = apart or self.owner("route") is not None or self.owner("score") is not None
         return self._backward_hr(hr, Step(t, view, hr.visible), vjp or _vjp, apart=apart)[1]
 
-    def copy(self) -> Conductor:
-        """A conductor of the same settings for a second field, which shares the work log. No plateau ends the second field's
-        training: it follows the first.
-        """
-        copy = Conductor(
-            *(replace(s) for s in self.strategies), objective=self.objective, statistics_from=self.statistics_from,
-            decorators=self.decorators, detail=self.detail, skips=replace(self.skips.skips, plateau_gain=0.0),
-        )  # fmt: skip
-        copy.decorated, copy.sr, copy.work_log = self.decorated, self.sr, self.work_log
-        return copy
-
-    def extra_views(self, t: int, drawn: Drawn | None = None) -> list[ExtraView]:
-        """The pictures that the field should match at t besides the view; each gets a step on `extra_loss`.
-
-        Args:
-            drawn: what `Strategy.drawn_views` may look at; None: it is not called.
-        """
+    def extra_views(self, t: int) -> list[ExtraView]:
+        """The pictures that the field should match at t besides the view; each gets a step on `extra_loss`."""
         if self.objective.lambda_lr == 0:
             return []
-        views = [extra for s in self.strategies for extra in s.extra_views(t)]
-        if drawn is not None:
-            for s in self._that_look:
-                with self.work_log.stage("pictures drawn"):
-                    views += s.drawn_views(t, drawn)
-        return views
+        return [extra for s in self.strategies for extra in s.extra_views(t)]
 
     def extra_loss(self, image: Float[Tensor, "h w 3"], extra: ExtraView, t: int) -> Losses:
         """The LR loss of a render of `extra`, weighted by pixel: its value and its cotangent [1, h, w, 3].  Eq. 4

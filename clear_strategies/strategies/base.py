@@ -2,7 +2,7 @@
 
 The hooks are phases of an iteration, so their order needs no configuration. `Strategy` answers each as if there were no
 strategy. At most one strategy may override each of the hooks with a single answer: densifier, background, gate, observe, route,
-correct, score, second_seed.
+correct, score.
 """
 
 from __future__ import annotations
@@ -43,21 +43,6 @@ class ScreenGradients:
     base: Float[Tensor, "N 2"] | None
     hf: Float[Tensor, "N 2"] | None
     ordinary: Float[Tensor, " N"]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Drawn:
-    """A field that a strategy may look at.
-
-    Args:
-        means: of its Gaussians, not to be changed.
-        draw: what a camera sees of it, over the colour of the iteration, without f_det and gradient; `gate` as of `ExtraView`.
-        enlarge: a picture as SR image, `factor` times as large, by the network of the run's prior; by bicubic without one.
-    """
-
-    means: Float[Tensor, "N 3"]
-    draw: Callable[..., Float[Tensor, "h w 3"]]  # (camera, gate=None)
-    enlarge: Callable[[Float[Tensor, "h w 3"], int], Float[Tensor, "H W 3"]]
 
 
 @dataclass(frozen=True)
@@ -140,20 +125,6 @@ class Strategy:
 
         Each of them is rendered once, without dropout and f_det, and gets an optimizer step of its own on the LR loss, after
         the step of the iteration's view. It takes no part in evidence, conflicts, densification or regularization.
-        """
-        return ()
-
-    def second_seed(self, seed: int) -> int | None:
-        """The seed of a second field that the trainer is to train beside the first, with the same settings; None: there is none.
-        Evaluation draws the first. Other trainers never call this hook, since they hold one field.
-        """
-        return None
-
-    def drawn_views(self, t: int, drawn: Drawn) -> Sequence[ExtraView]:
-        """As `extra_views`, for pictures that are made of what a field shows. Other trainers never call this hook.
-
-        Args:
-            drawn: the other field where there are two, else the field itself.
         """
         return ()
 

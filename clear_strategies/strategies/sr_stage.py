@@ -8,24 +8,27 @@ each view is invented differently, so pixels that the field contradicts count le
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.seeds import hashed_generator_at, one_of
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.geometry.pseudo_views import beside
 from clear_strategies.schedules import milestone
-from clear_strategies.strategies.base import Drawn, Strategy
+from clear_strategies.strategies.base import Strategy
+from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class SRStage(Strategy):
-    """HR pictures in a second stage. For this package's trainer: another one draws no picture for a strategy.
+    """HR pictures in a second stage. It has an effect in this package's trainer alone, which calls `begin`.
 
     A run that is resumed in its second stage draws its pictures anew, and says so: its bits differ from an uninterrupted run's.
 
@@ -52,26 +55,34 @@ class SRStage(Strategy):
     def on_views(self, views: Sequence[View]) -> None:
         self.cache["views"] = views
 
-    def drawn_views(self, t: int, drawn: Drawn) -> Sequence[ExtraView]:
-        """From `start` on one picture at HR: a function of (seed, t) and of the field at the end of the first stage."""
+    def begin(self, t: int, means: Float[Tensor, "N 3"], enlarged: Callable[[Camera, int], Photo]) -> None:
+        """Draw the pictures beside the training cameras, where t is the first iteration of the second stage.
+
+        Args:
+            means: of the field. enlarged: what the field shows by an LR camera, a given number of times as large.
+        """
         views: Sequence[View] = self.cache.get("views", ())
-        if t <= self.start or not views:
-            return ()
+        if t <= self.start or not views or "pictures" in self.cache:
+            return
+        if t > self.start + 1:
+            _log.warning("SRStage draws its pictures at t=%d, not at t=%d: the bits are not those of an uninterrupted run.",
+                         t, self.start + 1)  # fmt: skip
+        self.cache["pictures"] = pictures = []
+        for i in range(self.count):
+            view = views[i % len(views)]
+            camera = beside(view.lr.camera, means, self.reach, hashed_generator_at(self.seed, -1 - i))
+            pictures.append(enlarged(camera, view.factor))
+
+    def extra_views(self, t: int) -> Sequence[ExtraView]:
+        """After `begin` one picture at HR: a function of (seed, t) and of the field at the end of the first stage."""
         if "pictures" not in self.cache:
-            if t > self.start + 1:
-                _log.warning("SRStage draws its pictures at t=%d, not at t=%d: the bits are not those of an uninterrupted run.",
-                             t, self.start + 1)  # fmt: skip
-            self.cache["pictures"] = [self._picture(views[i % len(views)], i, drawn) for i in range(self.count)]
+            return ()
+        views: Sequence[View] = self.cache["views"]
         photos = [view.hr for view in views] if t % 2 or not self.count else self.cache["pictures"]
         photo: Photo = one_of(photos, hashed_generator_at(self.seed, t))
         weight = torch.full_like(photo.image[..., 0], self.weight)
         weight = weight if photo.shown is None else weight * photo.shown
         return (ExtraView(photo, weight, views[0].background, robust=True),)
-
-    def _picture(self, view: View, i: int, drawn: Drawn) -> Photo:
-        """What the field shows by an LR camera beside that of `view`, enlarged."""
-        camera = beside(view.lr.camera, drawn.means, self.reach, hashed_generator_at(self.seed, -1 - i))
-        return Photo(camera.scaled(view.factor), drawn.enlarge(drawn.draw(camera), view.factor))
 
     def on_fit_end(self) -> None:
         for name in ("views", "pictures"):

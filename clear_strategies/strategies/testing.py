@@ -25,7 +25,7 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Update
 from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import WarmupDecay, scaled
-from clear_strategies.strategies.base import Drawn, Strategy
+from clear_strategies.strategies.base import Strategy
 from rasterizers.interface import Camera
 from rasterizers.testing import ContractError, require
 
@@ -211,15 +211,6 @@ def _situation(seed: int) -> tuple[StubShot, StubShot, View, dict[str, Tensor]]:
     return lr, hr, view, random_params(_N, g)
 
 
-def _drawn() -> Drawn:
-    """A field that shows by each camera the same grey, so that a strategy that draws late sees what it would have seen."""
-
-    def grey(camera: Camera, gate: Any = None) -> Tensor:
-        return torch.full((camera.height, camera.width, 3), 0.5)
-
-    return Drawn(torch.zeros(_N, 3), grey, lambda image, factor: images.upsample(image, factor, "nearest"))
-
-
 def _conductor(make: Make, *, lambda_hf: float = 0.2) -> Conductor:
     """Milestones are compressed, so that every phase falls inside the few steps of a check."""
     objective = Objective(WarmupDecay(start=0, full=1, decay_from=_STEPS, end=_STEPS), lambda_hf)
@@ -239,7 +230,7 @@ def _trace(conductor: Conductor, start: int, stop: int) -> Any:
         yield update.score
         grads = _grads(update)
         yield from (grads[name] for name in sorted(grads))
-        for extra in conductor.extra_views(t, _drawn()):
+        for extra in conductor.extra_views(t):
             yield from (extra.photo.image, extra.weight)
         conductor.after_step(params, update.step)
 

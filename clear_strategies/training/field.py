@@ -103,16 +103,14 @@ class GaussianField(nn.Module):
         shots = {d: FieldShot(r, active, detail=d) for (d, _), r in zip(wanted, renderings, strict=True)}
         return shots.get(False), shots.get(True)
 
-    def shot(self, rasterizer: Rasterizer, camera: Camera, gate: Float[Tensor, " N"] | None = None) -> FieldShot:
-        """A rendering to learn from, of all Gaussians unless `gate` drops some, without f_det."""
-        active = self._activate(gate)
+    def shot(self, rasterizer: Rasterizer, camera: Camera) -> FieldShot:
+        """A rendering to learn from, of all Gaussians, without f_det."""
+        active = self._activate()
         return FieldShot(rasterizer(active.splats(detail=False), camera), active, detail=False)
 
-    def render(
-        self, rasterizer: Rasterizer, camera: Camera, *, detail: bool = True, gate: Float[Tensor, " N"] | None = None
-    ) -> Float[Tensor, "H W 3"]:
-        """An image for evaluation: no dropout but `gate`, f = base + det, not clamped."""
-        return rasterizer(self._activate(gate).splats(detail=detail), camera).image
+    def render(self, rasterizer: Rasterizer, camera: Camera, *, detail: bool = True) -> Float[Tensor, "H W 3"]:
+        """An image for evaluation: no dropout, f = base + det, not clamped."""
+        return rasterizer(self._activate().splats(detail=detail), camera).image
 
     def update_filter(self, cameras: Sequence[Camera], variance: float, near: float = NEAR) -> None:
         """Recompute the 3D filter from the present means, where it lies if it has a row for each."""
@@ -135,17 +133,17 @@ class GaussianField(nn.Module):
 
     def filtered_opacities(self) -> Float[Tensor, " N"]:
         """σ(opacity) times the 3D filter's coefficient, the opacity that is rendered; pruning uses it."""
-        return self._activate(None).opacities
+        return self._activate().opacities
 
     def opacity_coefficient(self) -> Float[Tensor, " N"]:
         """Π_k s_k / √(s_k² + f²): a filtered Gaussian is larger, and its opacity lower by this factor."""
-        return self._activate(None).coefficient
+        return self._activate().coefficient
 
     def baked(self) -> Splats:
         """Splats for exports and viewers: the filter in scales and opacities, f_det in the colour."""
-        return self._activate(None).splats(detail=True)
+        return self._activate().splats(detail=True)
 
-    def _activate(self, gate: Tensor | None) -> Activation:
+    def _activate(self, gate: Tensor | None = None) -> Activation:
         raw, bands = self.raw(), (self.degree + 1) ** 2 - 1
         kernels = per_gaussian.for_tensors(raw["scales"], gate)
         if kernels is not None:

@@ -45,12 +45,11 @@ class GivenExtra:
     """What an iteration is given besides: an extra view.
 
     Args:
-        gate: what `ExtraView.gate` answers. t, background: as of `GivenView`.
+        t, background: as of `GivenView`.
     """
 
     t: int
     extra: ExtraView
-    gate: Tensor | None
     background: Color | None
 
     @property

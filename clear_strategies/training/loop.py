@@ -13,20 +13,19 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
-from torch import Tensor
 
 from clear_strategies.core import deferred, images
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import conflict_columns
 from clear_strategies.core.seeds import generator_at
-from clear_strategies.core.view import ExtraView, View
+from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.data.priors import Bicubic, network_of
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DivergedError
 from clear_strategies.merging.iteration import Update, require_finite_parts
 from clear_strategies.merging.skips import PLATEAU_LOSS
-from clear_strategies.strategies.base import Drawn
+from clear_strategies.strategies.sr_stage import SRStage
 from clear_strategies.training import checkpoint
 from clear_strategies.training.clock import Clock
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
@@ -43,8 +42,6 @@ EXTRA_LOSS: Final = "loss_extra"
 
 def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     """One iteration, in the paper's order."""
-    if s.second is not None:  # a field of its own, of the same t
-        iterate(s.second, rasterizer)
     t, θ, conductor, stage = s.t, s.field, s.conductor, s.conductor.work_log.stage
     θ.degree = min(s.settings.max_degree, (t - 1) // max(1, s.settings.degree_every))
     view = conductor.skips.view(view_at(s), t)
@@ -54,8 +51,8 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     z, background = conductor.gate(t, len(θ)), conductor.background(t)  # zᵗ             Eq. 15       SVS
     learned = _learned(s, rasterizer, GivenView(t, view, scales, z, background), learn)
     u = learned.update
-    extras = conductor.extra_views(t, drawn_of(s, over(rasterizer, background)))
-    extra = extra_steps(s, rasterizer, extras, background)
+    begin_sr_stage(s, over(rasterizer, background))
+    extra = extra_steps(s, rasterizer, conductor.extra_views(t), background)
     conductor.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS
     with stage("density and filter"):
         # clone · split · prune = parents[M]
@@ -67,8 +64,6 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
         with stage("training views drawn whole"):
             s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)
     s.advance()
-    if s.second is not None:
-        s.second.follow(s)
     return u
 
 
@@ -109,25 +104,25 @@ def view_at(s: TrainState) -> View:
     return s.views[_order_of_views(s.settings.seed, epoch, len(s.views))[position]]
 
 
-@lru_cache(maxsize=8)  # an epoch's iterations ask for the same order, those of two fields in turns
+@lru_cache(maxsize=1)  # an epoch's iterations ask for the same order
 def _order_of_views(seed: int, epoch: int, n: int) -> list[int]:
     order: list[int] = torch.randperm(n, generator=generator_at(seed, epoch)).tolist()
     return order
 
 
-def drawn_of(s: TrainState, rasterizer: Rasterizer) -> Drawn:
-    """What the strategies of `s` may look at: the other field where there are two."""
-    field = (s if s.other is None else s.other).field
+def begin_sr_stage(s: TrainState, rasterizer: Rasterizer) -> None:
+    """Let `SRStage` draw what the field shows, enlarged by the network of the run's prior; by bicubic without one."""
 
-    def enlarged(image: Tensor, factor: int) -> Tensor:
-        network = network_of(s.conductor.sr) or Bicubic()
-        return network("a drawn picture", images.quantize(image.cpu()), factor).to(image.device)
+    def enlarged(camera: Camera, factor: int) -> Photo:
+        with s.conductor.work_log.stage("pictures drawn"):
+            image = s.field.render(rasterizer, camera, detail=False)
+            network = network_of(s.conductor.sr) or Bicubic()
+            large = network("a drawn picture", images.quantize(image.cpu()), factor)
+        return Photo(camera.scaled(factor), large.to(image.device))
 
-    def draw(camera: Camera, gate: Callable[[int], Tensor] | None = None) -> Tensor:
-        z = None if gate is None else gate(len(field))
-        return field.render(rasterizer, camera, detail=False, gate=z)
-
-    return Drawn(field.means.data, draw, enlarged)
+    for strategy in s.conductor.strategies:
+        if isinstance(strategy, SRStage):
+            strategy.begin(s.t, s.field.means.data, enlarged)
 
 
 def extra_steps(
@@ -147,8 +142,8 @@ def extra_steps(
     """
     row: dict[str, Number] = {}
     for extra in extra_views:
-        gate, steps = None if extra.gate is None else extra.gate(len(s.field)), s.optimizer.steps
-        row |= _learned(s, rasterizer, GivenExtra(s.t, extra, gate, background), learn_extra).row
+        steps = s.optimizer.steps
+        row |= _learned(s, rasterizer, GivenExtra(s.t, extra, background), learn_extra).row
         s.optimizer.steps = steps  # the learning rates follow the iteration
     return row
 
@@ -157,7 +152,7 @@ def learn_extra(s: TrainState, rasterizer: Rasterizer, given: GivenExtra) -> Lea
     """What an iteration does with an extra view. It can be recorded as `learn`."""
     θ, extra, where = s.field, given.extra, f"t={given.t}, an extra view"
     with s.conductor.work_log.stage("extra views"):
-        shot = θ.shot(over(rasterizer, given.background), extra.photo.camera, given.gate)
+        shot = θ.shot(over(rasterizer, given.background), extra.photo.camera)
         losses = s.conductor.extra_loss(shot.image, extra, given.t)
         if s.compiled_step is not None:
             (g,) = s.compiled_step.vjp(shot, losses.cotangents)
@@ -216,9 +211,8 @@ def fit(
             return None
         return checkpoint.save(checkpoints, state.checkpoint(config or {}), keep=settings.keep)
 
-    for s in (state, state.second):
-        if settings.replay and s is not None:
-            s.replays = replays_for(s, rasterizer)
+    if settings.replay:
+        state.replays = replays_for(state, rasterizer)
     clock = Clock(state.history_as_floats()[-1] if state.history else {})
     with deferred_signals() as pending, kernel_threads(state, rasterizer):
         while not state.ended:

@@ -27,8 +27,7 @@ def require(state: TrainState, limit: int | None) -> str:
     """
     cuda, n, most = state.device.type == "cuda", len(state.field), state.density.cap
     now = torch.cuda.memory_allocated(state.device) if cuda else system_bytes("/proc/self/status", "VmRSS") or 0
-    fields = 1 if state.second is None else 2
-    each = fields * (_COPIES * sum(x.nbytes for x in state.field.raw().values()) // n + _GAUSSIAN)
+    each = _COPIES * sum(x.nbytes for x in state.field.raw().values()) // n + _GAUSSIAN
     fixed = now + _PIXEL * max(view.hr.image[..., 0].numel() for view in state.views)
     start, grown = ((fixed + each * count) >> 20 for count in (n, most or n))
     free = torch.cuda.mem_get_info()[0] if cuda else system_bytes("/proc/meminfo", "MemAvailable")

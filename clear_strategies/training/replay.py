@@ -122,9 +122,9 @@ class Replays:
         tables = s.field.raw(), s.optimizer.first, s.optimizer.second, s.density.state_dict(), s.conductor.state_dict()
         rows = [x for table in tables for x in table.values() if x.dim() > 0]  # others are no memory of the field's
         addresses = [x.data_ptr() for x in (s.field.filter_3d, *rows)]
-        facts: list[Any] = [s.field.degree, given.gate is None, given.background is None, given.behind, λ > 0]
+        facts: list[Any] = [s.field.degree, given.background is None, given.behind, λ > 0]
         if isinstance(given, GivenView):
-            facts += [*given.scales.values(), s.density.collects(given.t)]
+            facts += [given.gate is None, *given.scales.values(), s.density.collects(given.t)]
         else:
             facts.append(given.extra.robust)
         shapes = [(photo.image.shape, photo.shown is None) for photo in given.photos]
@@ -165,24 +165,23 @@ class _Recorded:
         """The same with tensors and cameras of its own, and photos that no background shows through."""
         copies = (p.over(given.background, given.behind) for p in given.photos)
         photos = [Photo(replace(p.camera), p.image.clone(), _clone(p.shown)) for p in copies]
-        gate = _clone(given.gate)
         if isinstance(given, GivenExtra):
             extra = replace(given.extra, photo=photos[0], weight=given.extra.weight.clone())
-            return replace(given, extra=extra, gate=gate, background=None)
+            return replace(given, extra=extra, background=None)
         looked_up = None if self._look_up is None else _clone(self._look_up(given.view))
         lr, hr, *_ = [*photos, given.view.hr]  # where HR is not drawn, its size alone is read
         view = View(given.view.name, lr, hr, background=given.behind, looked_up=looked_up)
-        return replace(given, view=view, gate=gate, background=None)
+        return replace(given, view=view, gate=_clone(given.gate), background=None)
 
     def _read_of(self, given: Given) -> list[Tensor | None]:
         """All tensors that an iteration reads of what it is given."""
-        read = [given.gate]
+        read: list[Tensor | None] = []
         for photo in given.photos:
             image = photo.over(given.background, given.behind).image
             read += [image, photo.shown, *self._numbers_of(photo.camera, self._device)]
         if isinstance(given, GivenExtra):
             return [*read, given.extra.weight]
-        return [*read, None if self._look_up is None else self._look_up(given.view)]
+        return [*read, given.gate, None if self._look_up is None else self._look_up(given.view)]
 
     def _write(self, given: Given) -> None:
         """Write what the iteration is given to where the recorded one reads it."""

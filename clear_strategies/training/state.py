@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import torch
 from jaxtyping import Int
@@ -30,8 +30,6 @@ from clear_strategies.training.settings import FitSettings
 
 _log = logging.getLogger(__name__)
 
-_SECOND: Final = "second"  # before the names of the second field's tensors in a checkpoint
-
 
 @dataclass(slots=True)
 class TrainState:
@@ -41,9 +39,7 @@ class TrainState:
         t: the iteration to come, from 1.
         near: the near plane of the rasterizer, world units.
         history: one row per iteration; read it by `history_as_floats`, since on a device its numbers are deferred.
-        second: a second field that trains beside this one, if a strategy asks for it (`Strategy.second_seed`).
         replays: where iterations are replayed (`fit.replay`); no checkpoint needs them.
-        first: of a second field, the state that it trains beside.
     """
 
     field: GaussianField
@@ -58,8 +54,6 @@ class TrainState:
     history: History = field(default_factory=History)
     compiled_step: CompiledStep | None = None
     replays: Replayer | None = None
-    second: TrainState | None = None
-    first: TrainState | None = None
 
     @classmethod
     def start(
@@ -72,7 +66,6 @@ class TrainState:
         rates: LearningRates,
         mip: MipFilter,
         near: float = NEAR,
-        first: TrainState | None = None,
     ) -> TrainState:
         """The state before the first iteration, on the device of the scene's views.
 
@@ -80,7 +73,6 @@ class TrainState:
             settings, density, rates, mip: with milestones already scaled to this run.
             density: replaced where a strategy brings a densifier.
             near: of the rasterizer that draws.
-            first: the state beside which this one trains, as its second field.
         """
         device = scene.device
         theta = GaussianField.from_cloud(scene.cloud, max_degree=settings.max_degree).to(device)
@@ -94,21 +86,10 @@ class TrainState:
             )
         optimizer = Adam(theta.raw(), rates, extent)
         conductor.on_fit_start(len(scene.train), settings.seed, device, scene.train)
-        state = cls(theta, conductor, optimizer, densifier, settings, mip, scene.train, near, first=first)
+        state = cls(theta, conductor, optimizer, densifier, settings, mip, scene.train, near)
         state.compiled_step = compiled_step_for(conductor, optimizer, settings.fused)
         state.refilter()
-        owner = conductor.owner("second_seed") if first is None else None
-        if owner is not None and (seed := owner.second_seed(settings.seed)) is not None:
-            state.second = cls.start(
-                scene, conductor.copy(), settings=replace(settings, seed=seed), density=density, rates=rates, mip=mip, near=near,
-                first=state,
-            )  # fmt: skip
         return state
-
-    @property
-    def other(self) -> TrainState | None:
-        """The other one of two; strategies look at its field."""
-        return self.second or self.first
 
     @property
     def device(self) -> torch.device:
@@ -141,10 +122,6 @@ class TrainState:
         self.conductor.work_log.skip("iterations", reason, left_out)
         _log.info("t=%d: %s; training goes on at t=%d.", done, reason, self.t)
 
-    def follow(self, first: TrainState) -> None:
-        """Go to the iteration of the first field, whose history is the run's."""
-        self.t, self.optimizer.steps, self.history = first.t, first.optimizer.steps, History()
-
     def refilter(self) -> None:
         cameras = [(v.hr if self.mip.cameras == "hr" else v.lr).camera for v in self.views]
         self.field.update_filter(cameras, self.mip.variance, self.near)
@@ -175,9 +152,6 @@ class TrainState:
             ("strategies", self.conductor.state_dict()),
         ):
             tensors |= {f"{prefix}/{name}": value for name, value in table.items()}
-        if self.second is not None:
-            of_second = self.second.checkpoint(config).tensors
-            tensors |= {f"{_SECOND}/{name}": value for name, value in of_second.items()}
         facts = {"optimizer_steps": float(self.optimizer.steps), "degree": float(self.field.degree)}
         history, work_log = self.history_as_floats(), self.conductor.work_log.state_dict()
         return Checkpoint(self.t, tensors, config, facts, history, work_log, self.device.type)
@@ -197,16 +171,12 @@ class TrainState:
             self.density.load_state_dict(tables.get("density", {}))
             self.conductor.load_state_dict(tables.get("strategies", {}))
             self.conductor.work_log.load_state_dict(saved.work_log)
-            if self.second is not None:
-                self.second.restore(replace(saved, tensors=tables[_SECOND]), source)
         except (KeyError, ValueError, TypeError) as error:
             raise DataError(
                 source, "tensors", f"do not fit this run ({error})", "resume with the run's own config"
             ) from error
         self.t = saved.t
         self.history = History(dict(row) for row in saved.history)
-        if self.second is not None:
-            self.second.follow(self)
 
     def _require_rows(self, tables: Mapping[str, Mapping[str, Tensor]], saved: Checkpoint) -> None:
         """Check that all restored tensors have a row for each Gaussian, and the width and type that this run has."""

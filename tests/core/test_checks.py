@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from clear_strategies import PairDrop, SplatSuRe, SRStage
+from clear_strategies import SplatSuRe, SRStage
 from clear_strategies.core.checks import as_color, require_choice, require_number, require_whole
 from clear_strategies.data.readers import blender, colmap, demo, nerfstudio, photos
 from clear_strategies.errors import SettingError
@@ -75,7 +75,6 @@ REFUSED: dict[Callable[..., object], dict[str, object]] = {
     },
     SplatSuRe: {"ratio": 0.9, "softness": 0.0, "min_views": 0},
     SRStage: {"count": -1, "reach": 0.0, "weight": 0.0},
-    PairDrop: {"share": 1.0, "weight": 0.0, "reduced": 0, "every": 0},
     WarmupDecay: {"peak": -1.0},
     LogLinear: {"final": 101.0},
 }  # fmt: skip

@@ -57,7 +57,6 @@ def start(
         "pseudo_views": lambda: cs.PseudoViews(count=8, reach=0.1),
         "fading_opacity": lambda: cs.FadingOpacity(rate=0.02, until=1_350),
         "random_background": lambda: cs.RandomBackground(until=1_350),
-        "two_fields": lambda: cs.TwoFields(start=4, alone=0.2, compare_every=5, compare_until=12),
     }  # fmt: skip
     objective = cs.Objective(lambda_hr=WarmupDecay(final=0.1, start=3, full=8, decay_from=14, end=ITERATIONS))
     return TrainState.start(

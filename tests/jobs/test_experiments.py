@@ -96,7 +96,7 @@ def test_what_the_methods_are():
         "srgs": (1.0, 0.0, "lr", *on_hr), "dropgaussian_srgs": (1.0, 0.0, "lr", *on_hr),
         "srgs_lr": (0.4, 0.6, "hr", *on_hr), "binocular3dgs_srgs": (0.4, 0.6, "hr", *on_hr),
         "splatsure": (0.4, 0.6, "hr", *on_hr), "dropgaussian_splatsure": (0.4, 0.6, "hr", *on_hr),
-        "cor_gs_srgs": (0.4, 0.6, "hr", *on_hr), "s2gaussian": (*on_lr, *on_hr),
+        "s2gaussian": (*on_lr, *on_hr),
     }  # fmt: skip
     assert composed("+method=3dgs_lr").rasterizer.antialiased is False
     assert list(composed("+method=binocular3dgs_srgs").strategies) == ["fading_opacity", "pseudo_views"]

@@ -1,0 +1,117 @@
+"""Methods of two stages: the Shuffle Split, and what the second stage trains on."""
+
+import logging
+from dataclasses import replace
+
+import pandas as pd
+import torch
+
+from clear_strategies import Conductor, ExtraView, Objective, Photo, SRStage
+from clear_strategies.core import images
+from clear_strategies.density.shuffle import ShuffleSettings
+from clear_strategies.outputs import results
+from clear_strategies.training.field import GaussianField
+from clear_strategies.training.loop import EXTRA_LOSS, iterate
+from clear_strategies.training.optim import Adam, LearningRates
+from rasterizers import Camera
+from tests.helpers import toy
+from tests.helpers.short_run import SCENE, start
+
+AT_10 = ShuffleSettings(start=20, stop=20, split_at=10, min_gaussians=1)
+
+
+def field_of(opacities: list[float]) -> tuple[GaussianField, Adam]:
+    theta = GaussianField.from_cloud(toy.cloud(len(opacities)))
+    theta.opacities.data[:] = torch.logit(torch.tensor(opacities))
+    theta.scales.data[:] = torch.log(torch.tensor([0.4, 0.2, 0.1]))
+    theta.quats.data[:] = torch.tensor([2**-0.5, 0, 0, 2**-0.5])  # x turns to y
+    return theta, Adam(theta.raw(), LearningRates(), extent=1.0)
+
+
+def test_an_opaque_gaussian_becomes_six_thinner_ones_once_and_the_cap_leaves_the_most_opaque():
+    theta, optimizer = field_of([0.3, 0.84, 0.4])
+    density, parents = AT_10.densifier(3, extent=1.0, seed=0, white_background=False), []
+    before = theta.means.data.clone()
+    assert [density.step(theta, optimizer, t, parents.append) for t in (9, 10, 11)] == [False, True, False]
+    assert parents[0].tolist() == [0, 2, *[1] * 6]
+    aside = theta.means.data[2:] - before[1]
+    expected = torch.tensor([[0, -0.2, 0], [0, 0.2, 0], [0.1, 0, 0], [-0.1, 0, 0], [0, 0, -0.05], [0, 0, 0.05]])
+    assert torch.allclose(aside, expected, atol=1e-6)
+    assert torch.allclose(theta.scales.data[2].exp(), torch.tensor([0.4 / 4, 0.2 / 1.9, 0.1 / 1.9]))
+    assert torch.allclose(theta.opacities.data[2:].sigmoid(), torch.tensor(0.6))  # two of them are as opaque as one was
+    assert len(density.score) == len(theta) == 8
+    assert density.second_stage == 11
+    theta, optimizer = field_of([0.6, 0.7, 0.9, 0.8])
+    settings = ShuffleSettings(start=20, stop=20, split_at=10, min_gaussians=1, max_gaussians=14)
+    density, parents = settings.densifier(4, extent=1.0, seed=0, white_background=False), []
+    density.step(theta, optimizer, 12, parents.append)  # skips may jump over t=10
+    assert parents[0].tolist() == [0, 1, *[2, 3] * 6]
+    resumed = settings.densifier(14, extent=1.0, seed=0, white_background=False)
+    resumed.load_state_dict(density.state_dict())
+    assert not resumed.step(theta, optimizer, 13, parents.append)
+
+
+def staged(settings: SRStage) -> SRStage:
+    Conductor(settings).on_fit_start(3, 3, views=SCENE.train)
+    return settings
+
+
+def test_sr_images_and_enlarged_pictures_of_the_first_stage_come_in_turn(caplog):
+    stage, seen = staged(SRStage(start=4, count=5)), []
+
+    def enlarged(camera: Camera, factor: int) -> Photo:
+        seen.append(camera)
+        large = camera.scaled(factor)
+        return Photo(large, torch.full((large.height, large.width, 3), 0.25))
+
+    shown = []
+    for t in range(1, 15):
+        stage.begin(t, SCENE.cloud.means, enlarged)
+        shown.append(stage.extra_views(t))
+    assert [len(views) for views in shown] == [0] * 4 + [1] * 10
+    assert len(seen) == 5  # drawn once, at LR
+    assert {camera.width for camera in seen} == {SCENE.train[0].lr.camera.width}
+    of_photos = {id(view.hr) for view in SCENE.train}
+    for t, (extra,) in enumerate(shown[4:], 5):
+        assert extra.robust
+        assert (id(extra.photo) in of_photos) == bool(t % 2)
+        assert extra.photo.camera.width == SCENE.train[0].hr.camera.width
+    assert not caplog.records
+    with caplog.at_level(logging.WARNING):
+        staged(SRStage(start=4, count=5)).begin(9, SCENE.cloud.means, enlarged)
+    assert "draws its pictures at t=9, not at t=5" in caplog.text
+
+
+def test_the_trainer_draws_what_the_field_shows_and_steps_on_it():
+    state, before = start((), more=[SRStage(start=3, count=2)]), []
+    for _ in range(6):
+        before.append(state.field.baked())
+        iterate(state, toy.RASTERIZER)
+    assert [EXTRA_LOSS in row for row in state.history] == [False] * 3 + [True] * 3
+    for photo in state.conductor.strategies[-1].cache["pictures"]:
+        image = images.area_mean(photo.image, SCENE.train[0].factor)
+        exact = toy.RASTERIZER(before[3], photo.camera.scaled(1 / SCENE.train[0].factor)).image
+        assert float((image - exact).abs().mean()) < 0.05
+
+
+def test_a_robust_picture_counts_less_where_the_field_contradicts_it():
+    grey = torch.full((32, 32, 3), 0.5)
+    noisy = grey + 0.02 * torch.randn(32, 32, 3, generator=torch.Generator().manual_seed(0))
+    noisy[:8, :8] = 1.0
+    weight = images.agreement(noisy, grey)
+    assert weight.shape == (32, 32, 1)
+    assert float(weight[:6, :6].max()) < 0.05
+    assert float(weight[12:, 12:].min()) > 0.5
+    assert float(images.agreement(grey, grey).min()) == 1
+    photo = SCENE.train[0].lr
+    conductor, one = Conductor(objective=Objective(kernels="torch")), torch.ones(photo.image.shape[:2])
+    render = torch.rand(photo.image.shape, generator=torch.Generator().manual_seed(1))
+    plain, robust = (conductor.extra_loss(render, ExtraView(photo, one, robust=r), 1).cotangents for r in (False, True))
+    assert torch.allclose(robust, plain * images.agreement(render, photo.image))
+
+
+def test_timing_has_iterations_and_seconds_of_both_stages():
+    state, history = start(()), pd.DataFrame({"t": range(1, 6), "seconds": [2.0, 4.0, 6.0, 8.0, 10.0]})
+    assert results._two_stages(state, history) == []
+    state.t, state.density = 6, replace(AT_10, split_at=2).densifier(3, extent=1.0, seed=0, white_background=False)
+    assert [(row["runs"], row["seconds"]) for row in results._two_stages(state, history)] == [(2, 4.0), (3, 6.0)]
