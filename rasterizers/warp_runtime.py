@@ -55,6 +55,16 @@ def require_warp(what: str, device: str, otherwise: str) -> None:
         )
 
 
+@cache
+def runs_warp(device: str) -> bool:
+    """Whether Warp runs on "cuda", or on "cpu"."""
+    try:
+        require_warp("a kernel", device, "torch computes the same")
+    except BackendUnavailable:
+        return False
+    return True
+
+
 def launch(
     kernel: Any, dim: Sequence[int], arguments: Sequence[Any], device: torch.device, *, block: int = 256, together: bool = False
 ) -> None:  # fmt: skip

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
+
+from clear_strategies.core import deferred
+from clear_strategies.core.deferred import Number
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,3 +43,10 @@ class Evidence:
     def weight(self) -> Float[Tensor, " N"]:
         """w_i = q_i a_i."""
         return self.reliability * self.demand  # Eq. 10
+
+    def means(self, visible: Bool[Tensor, " N"]) -> Sequence[Number]:
+        """The means of q_i and w_i over the Gaussians that are visible; NaN where none is."""
+        if self.sums is not None:
+            seen, *totals = deferred.elements(self.sums)
+            return [deferred.defer(deferred.ratio, total, seen) for total in totals]
+        return [deferred.scalar(x.sum() / visible.sum()) for x in (self.reliability, self.weight)]

@@ -123,17 +123,8 @@ class Density(Densifier):
         """Add the scores of this view's visible Gaussians; dropped ones are not visible."""
         if update.score is None or update.ordinary is None:
             return
-        if (kernels := per_gaussian.for_tensors(self.score, update.score)) is not None:
-            totals, largest = (self.score, self.ordinary, self.count), self.settings.reduce == "max"
-            kernels.accumulate(shot.visible, update.score, update.ordinary, totals, largest=largest)
-            return
-        visible = shot.visible.to(self.count)
-        for total, value in ((self.score, update.score), (self.ordinary, update.ordinary)):
-            if self.settings.reduce == "max":
-                torch.maximum(total, torch.where(shot.visible, value, total), out=total)
-            else:
-                total.addcmul_(value, visible)
-        self.count += visible
+        totals, largest = (self.score, self.ordinary, self.count), self.settings.reduce == "max"
+        per_gaussian.accumulate(shot.visible, update.score, update.ordinary, totals, largest)
 
     def due(self, t: int) -> bool:
         """Whether a round of densification and pruning falls on t."""

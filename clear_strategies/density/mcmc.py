@@ -23,15 +23,13 @@ from clear_strategies.core.seeds import hashed_generator_at
 from clear_strategies.core.view import View
 from clear_strategies.errors import DensityError
 from clear_strategies.geometry.pseudo_views import cut_out
-from clear_strategies.kernels import native
+from clear_strategies.kernels import per_gaussian
 from clear_strategies.schedules import LogLinear, milestone
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.densifier import Densifier
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.optim import Adam
-from rasterizers.geometry import rotation_matrix
 from rasterizers.interface import Camera
-from rasterizers.native import threads
 
 _log = logging.getLogger(__name__)
 
@@ -171,14 +169,7 @@ class Sampler(Densifier):
         on_cpu = gate.device.type == "cpu"  # elsewhere the count would have to be waited for
         rows = torch.nonzero(gate > _STILL)[:, 0] if on_cpu else torch.arange(len(field), device=gate.device)
         eta = torch.randn(len(rows), 3, generator=generator, device=gate.device)
-        strength = s.noise * s.cooling(t)
-        if native.runs(gate):
-            native.module().wander(means, quats, scales, gate, rows, eta, strength, threads())
-            return
-        R = rotation_matrix(quats[rows])
-        along = scales[rows].exp().square()[..., None] * (R.mT @ eta[..., None])  # S² Rᵀ η
-        share = strength / scales.amax(-1).median().exp()
-        means.index_add_(0, rows, (share * gate[rows])[:, None] * (R @ along)[..., 0])
+        per_gaussian.wander(means, quats, scales, gate, rows, eta, s.noise * s.cooling(t))
 
     def state_dict(self) -> dict[str, Tensor]:
         return {"cap": torch.tensor(self.cap)}

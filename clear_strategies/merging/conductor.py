@@ -14,7 +14,7 @@ from clear_strategies.core import images
 from clear_strategies.core.conflicts import conflict_ratio
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import require_finite, require_finite_losses
-from clear_strategies.core.gradients import Grads, Shot, screen_in_ndc, screen_norm
+from clear_strategies.core.gradients import Grads, Shot, screen_in_ndc, screen_norm, screen_of
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, View
 from clear_strategies.core.work_log import WorkLog
@@ -386,22 +386,9 @@ class Conductor:
         return total
 
 
-def _screen_gradients(
-    lr: Float[Tensor, "N 2"], hr: HrGradients[Any], weights: Weights
-) -> ScreenGradients:  # fmt: skip
-    kernels = None if hr.base.screen is None else per_gaussian.for_tensors(lr, hr.base.screen)
-    if kernels is not None:
-        screens, ordinary = kernels.screens(
-            lr, hr.base.screen, None if hr.hf is None else hr.hf.screen, hr.size, weights
-        )
-        return ScreenGradients(lr, screens[0], None if hr.hf is None else screens[1], ordinary)
-    λ, λ_hf = weights
-    base = screen_in_ndc(hr.base, hr.size)
-    total, hf = lr + λ * base, None
-    if hr.hf is not None:
-        hf = screen_in_ndc(hr.hf, hr.size)
-        total = total + λ_hf * hf
-    return ScreenGradients(lr, base, hf, screen_norm(total))
+def _screen_gradients(lr: Float[Tensor, "N 2"], hr: HrGradients[Any], weights: Weights) -> ScreenGradients:
+    hf = None if hr.hf is None else screen_of(hr.hf)
+    return ScreenGradients(lr, *per_gaussian.screens(lr, screen_of(hr.base), hf, hr.size, weights))
 
 
 def _vjp(shot: Shot, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[Grads]:

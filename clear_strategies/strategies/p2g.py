@@ -13,19 +13,17 @@ from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core import deferred
 from clear_strategies.core.checks import refuse, require_choice, require_number, require_whole
 from clear_strategies.core.evidence import Evidence, PatchMaps
-from clear_strategies.core.gradients import Shot, screen_norm
+from clear_strategies.core.gradients import Shot
 from clear_strategies.core.images import DownKernel, downsample, patch_means, quantize, upsample
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
-from clear_strategies.kernels import native, per_gaussian
+from clear_strategies.kernels import per_gaussian
 from clear_strategies.strategies.base import ScreenGradients, Strategy
-from rasterizers.native import threads
 
 _log = logging.getLogger(__name__)
 
@@ -70,47 +68,24 @@ class P2G(Strategy):
 
     def observe(self, step: Step, hr: Shot) -> Evidence:
         """q_i and a_i of every Gaussian that is visible in this view."""
-        maps, patch = self.looked_up(step.view), self.patch * step.view.factor
-        if (kernels := per_gaussian.for_tensors(maps, hr.means2d)) is not None:
-            q, a, sums = kernels.look_up(maps, hr.means2d.detach(), hr.visible, patch)
-            seen, sum_q, sum_w = deferred.elements(sums)
-            self.log("mean_q", deferred.defer(deferred.ratio, sum_q, seen))
-            self.log("mean_w", deferred.defer(deferred.ratio, sum_w, seen))
-            return Evidence(q, a, sums)
-        q, a = lift(maps, hr.means2d, hr.visible, patch)
-        evidence, seen = Evidence(q, a), hr.visible.sum()
-        # Both are 0 where a Gaussian is invisible.
-        self.log("mean_q", lambda: deferred.scalar(q.sum() / seen))
-        self.log("mean_w", lambda: deferred.scalar(evidence.weight.sum() / seen))
-        return evidence
+        maps, visible = self.looked_up(step.view), hr.visible
+        e = per_gaussian.evidence(maps, hr.means2d, visible, self.patch * step.view.factor)  # R and A at p(u_i)  Eq. 10
+        self.log("mean_q", lambda: e.means(visible)[0])
+        self.log("mean_w", lambda: e.means(visible)[1])
+        return e
 
     def route(self, step: Step) -> Float[Tensor, " N"]:
         """m_i = q_min + (1 - q_min) w_i, over its mean where `normalize`; undefined for invisible Gaussians."""
         if step.evidence is None or step.visible is None:
             raise ValueError("P2G routes by evidence, but there is none for this view; call P2G.observe first.")
-        e = step.evidence
-        if e.sums is not None and (kernels := per_gaussian.for_tensors(e.reliability)) is not None:
-            m: Tensor = kernels.route(e.reliability, e.demand, e.sums, self.floor, self.normalize)
-            return m
-        m = self.floor + (1 - self.floor) * e.weight  # Eq. 12
-        if not self.normalize:
-            return m
-        mean = (m * step.visible).sum() / step.visible.sum().clamp_min(1)
-        return m / mean.clamp_min(torch.finfo(m.dtype).tiny)
+        return per_gaussian.route(step.evidence, step.visible, self.floor, self.normalize)  # Eq. 12
 
     def score(self, step: Step, screen: ScreenGradients) -> Float[Tensor, " N"] | None:
         """S_i = w_i ‖∇_u L_HF‖, alone or joined with the ordinary statistic; None (ordinary) where λ_HF = 0."""
         e = step.evidence
         if self.score_by == "gradient" or e is None or screen.hf is None:
             return None
-        if (kernels := per_gaussian.for_tensors(e.reliability, screen.hf)) is not None:
-            joined = self.score_by == "sum"
-            S: Tensor = kernels.evidence_score(e.reliability, e.demand, screen.hf, screen.ordinary, joined=joined)
-            return S
-        S = e.weight * screen_norm(screen.hf)  # Eq. 14
-        if self.score_by == "evidence":
-            return S
-        return screen.ordinary + S * (screen.ordinary.mean() / S.mean().clamp_min(torch.finfo(S.dtype).tiny))
+        return per_gaussian.evidence_score(e, screen.hf, screen.ordinary, self.score_by == "sum")  # Eq. 14
 
     def without_effect(self, *, lambda_lr: float, lambda_hr: float, lambda_hf: float) -> str | None:
         if lambda_hr == 0:
@@ -168,27 +143,6 @@ class P2G(Strategy):
             )  # fmt: skip
         maps_of_view: Tensor = self.cache[key]
         return maps_of_view
-
-
-def lift(
-    patch_maps: Float[Tensor, "C ph pw"], centers: Float[Tensor, "N 2"], visible: Bool[Tensor, " N"], patch: float
-) -> Float[Tensor, "C N"]:
-    """Look up the patch p(u_i) that contains each projected centre, in several maps at once.  Eq. 10
-
-    A centre outside the image has the border patch, an invisible Gaussian 0 (F24).
-
-    Args:
-        centers: u_i in pixels of the image that the patches tile; of invisible Gaussians anything, since gsplat leaves their
-            rows uninitialised. patch: edge of a patch in those pixels.
-    """
-    if native.takes(patch_maps, centers) and visible.is_contiguous():
-        lifted = patch_maps.new_empty(len(patch_maps), len(centers))
-        native.module().lift(patch_maps, centers.detach(), visible, patch, lifted, threads())
-        return lifted
-    column, row = (centers / patch).long().unbind(-1)  # of NaN or infinity any number, which the clamps bring inside
-    height, width = patch_maps.shape[1:]
-    column, row = column.clamp(0, width - 1), row.clamp(0, height - 1)
-    return patch_maps.flatten(1).index_select(1, row * width + column) * visible
 
 
 # Rounding to 8 bits changes an image by a quarter of a grey level on average; a smaller scale would measure rounding.

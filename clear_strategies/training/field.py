@@ -145,23 +145,8 @@ class GaussianField(nn.Module):
 
     def _activate(self, gate: Tensor | None = None) -> Activation:
         raw, bands = self.raw(), (self.degree + 1) ** 2 - 1
-        kernels = per_gaussian.for_tensors(raw["scales"], gate)
-        if kernels is not None:
-            scales, filtered, sigmoid, coefficient, factor, opacities = kernels.activate(
-                raw["scales"], raw["opacities"], self.filter_3d, gate
-            )
-            shN = raw["shN"][:, :bands]
-            return Activation(raw, scales, filtered, self.filter_3d, sigmoid, coefficient, factor, opacities, shN)
-        scales = raw["scales"].exp()
-        # √(s² + f²), and s itself where the squares vanish; torch's hypot takes ten times as long.
-        filtered = torch.maximum(scales, (scales.square() + self.filter_3d[:, None].square()).sqrt_())
-        shares = scales / filtered
-        # torch's product over rows of three takes twice as long.
-        coefficient = shares[:, 0] * shares[:, 1] * shares[:, 2]
-        sigmoid = raw["opacities"].sigmoid()
-        z = coefficient if gate is None else coefficient * gate.to(coefficient)
-        shN = raw["shN"][:, :bands]
-        return Activation(raw, scales, filtered, self.filter_3d, sigmoid, coefficient, z, z * sigmoid, shN)
+        activated = per_gaussian.activate(raw["scales"], raw["opacities"], self.filter_3d, gate)
+        return Activation(raw, self.filter_3d, raw["shN"][:, :bands], *activated)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,14 +158,14 @@ class Activation:
     """
 
     raw: Mapping[str, Tensor]
+    filter_3d: Float[Tensor, " N"]
+    shN: Float[Tensor, "N B 3"]  # noqa: N815 - gsplat's name
     scales: Float[Tensor, "N 3"]
     filtered: Float[Tensor, "N 3"]
-    filter_3d: Float[Tensor, " N"]
     sigmoid: Float[Tensor, " N"]
     coefficient: Float[Tensor, " N"]
     factor: Float[Tensor, " N"]
     opacities: Float[Tensor, " N"]
-    shN: Float[Tensor, "N B 3"]  # noqa: N815 - gsplat's name
 
     def splats(self, *, detail: bool) -> Splats:
         return Splats(

@@ -13,10 +13,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.checks import require_choice, require_number, require_whole
-from clear_strategies.kernels import native
+from clear_strategies.kernels import per_gaussian
 from clear_strategies.schedules import milestone
 from rasterizers.interface import Camera, RasterSettings
-from rasterizers.native import threads
 
 _log = logging.getLogger(__name__)
 
@@ -64,7 +63,7 @@ def filter_std(
     """
     if variance == 0 or not len(means):
         return means.new_zeros(len(means))
-    z_min = _nearest_depths(means, _as_rows(cameras).to(means), near)
+    z_min = per_gaussian.nearest_depths(means.contiguous(), _as_rows(cameras).to(means), near)
     seen = z_min.isfinite()
     if not bool(seen.any()):
         _log.warning(
@@ -85,18 +84,3 @@ def _as_rows(cameras: Sequence[Camera]) -> Float[Tensor, "V 20"]:
     ]
     poses = torch.stack([camera.world_to_camera for camera in cameras])[:, :3].flatten(1)
     return torch.cat((poses, poses.new_tensor(numbers)), dim=1)
-
-
-def _nearest_depths(means: Float[Tensor, "N 3"], cameras: Float[Tensor, "V 20"], near: float) -> Float[Tensor, " N"]:
-    """The smallest depth beyond `near` among the cameras that see each centre; infinite where none does."""
-    z_min = means.new_full((len(means),), torch.inf)
-    if native.runs(means):
-        native.module().nearest_depths(means.contiguous(), cameras, near, z_min, threads())
-        return z_min
-    for camera in cameras:
-        pose, (fx, fy, cx, cy, u_low, u_high, v_low, v_high) = camera[:12].view(3, 4), camera[12:]
-        x, y, z = (means @ pose[:, :3].T + pose[:, 3]).unbind(-1)
-        u, v = fx * x / z + cx, fy * y / z + cy
-        inside = (z > near) & (u >= u_low) & (u <= u_high) & (v >= v_low) & (v <= v_high)
-        z_min = torch.where(inside, torch.minimum(z_min, z), z_min)
-    return z_min

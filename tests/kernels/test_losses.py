@@ -14,9 +14,10 @@ from clear_strategies.kernels.losses.images import image_pair
 from clear_strategies.merging.objective import Objective
 from rasterizers.interface import BackendUnavailable
 from rasterizers.native import load_kernels
+from rasterizers.warp_runtime import runs_warp
 
 needs_cpp = pytest.mark.skipif(not native.available(), reason="the compiled kernels were not built")
-needs_warp = pytest.mark.skipif(not warp.available("cpu"), reason="NVIDIA Warp is not installed")
+needs_warp = pytest.mark.skipif(not runs_warp("cpu"), reason="NVIDIA Warp is not installed")
 
 
 def image(height, width, seed=0, dtype=torch.float64):
@@ -114,7 +115,7 @@ PAIRS = {
     "photo inverted": (photo(50, 60), 1 - photo(50, 60)),
     "beyond [0, 1]": (3 * photo(50, 60) - 1, photo(50, 60, 6)),
 }
-RUNNING = ["cpp"] * native.available() + ["warp"] * warp.available("cpu")
+RUNNING = ["cpp"] * native.available() + ["warp"] * runs_warp("cpu")
 COMPILED = [pytest.param("cpp", marks=needs_cpp), pytest.param("warp", marks=needs_warp)]
 every_compiled = pytest.mark.parametrize("name", COMPILED)
 every_implementation = pytest.mark.parametrize("name", [*COMPILED, "torch"])
@@ -293,10 +294,10 @@ def test_the_objective_gives_its_losses_in_order():
 def missing(monkeypatch):
     """No Warp here."""
     monkeypatch.setitem(sys.modules, "warp", None)  # makes its import fail
-    for cached in (warp.available, warp.require):
+    for cached in (runs_warp, warp.require):
         cached.cache_clear()
     yield
-    for cached in (warp.available, warp.require):
+    for cached in (runs_warp, warp.require):
         cached.cache_clear()
 
 
@@ -308,7 +309,7 @@ def on_cuda(dtype=torch.float32):
 
 def test_auto_uses_warp_on_cuda_only(monkeypatch):
     x = torch.rand(4, 5, 3)
-    monkeypatch.setattr(warp, "available", lambda device="cuda": True)
+    monkeypatch.setattr(losses, "runs_warp", lambda device: True)
     assert losses._fastest(on_cuda(), on_cuda()) == "warp"
     assert losses._fastest(on_cuda(), x) == "torch"
     assert losses._fastest(on_cuda(torch.float64), on_cuda(torch.float64)) == "torch"

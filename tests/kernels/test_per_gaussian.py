@@ -11,7 +11,7 @@ from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import Grads, to_ndc
 from clear_strategies.core.step import Step
 from clear_strategies.density.adaptive import DensitySettings
-from clear_strategies.kernels import per_gaussian
+from clear_strategies.kernels.per_gaussian import activate, dispatch
 from clear_strategies.merging.iteration import HrGradients, Update
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
@@ -28,7 +28,7 @@ def by_warp(request, monkeypatch, blocks_of):
 
     def both(function):
         expected = function()
-        monkeypatch.setattr(per_gaussian, "DEVICES", {"cpu"})
+        monkeypatch.setattr(dispatch, "DEVICES", {"cpu"})
         if request.param > 1:
             blocks_of(warp.LANES, request.param)
         return function(), expected
@@ -80,7 +80,8 @@ def test_the_evidence_and_its_routing(by_warp, normalize, share):
     def answers():
         e = p2g.observe(Step(1, view, visible), shot)
         logged = [deferred.read([x() if callable(x) else x])[0] for x in p2g.logs.values()]
-        return e.reliability, e.demand, p2g.route(Step(1, view, visible, e))[visible], torch.tensor(logged)
+        routed = [p2g.route(Step(1, view, visible, one))[visible] for one in (e, Evidence(e.reliability, e.demand))]
+        return e.reliability, e.demand, *routed, torch.tensor(logged)
 
     for found, expected in zip(*by_warp(answers), strict=True):
         torch.testing.assert_close(found, expected, rtol=2e-6, atol=0, equal_nan=True)
@@ -122,7 +123,11 @@ def test_the_kernels_compile_for_cuda_on_a_machine_without(ptx_of):
 
 
 def test_other_tensors_take_torch(monkeypatch):
-    assert per_gaussian.for_tensors(torch.zeros(3)) is None
-    monkeypatch.setattr(per_gaussian, "DEVICES", {"cpu"})
-    assert per_gaussian.for_tensors(torch.zeros(3), None) is not None
-    assert per_gaussian.for_tensors(torch.zeros(3), torch.zeros(3, dtype=torch.float64)) is None
+    from clear_strategies.kernels.per_gaussian import warp
+
+    monkeypatch.setattr(warp, "activate", lambda *_: "Warp's")
+    x = [torch.zeros(1, 3), torch.zeros(1), torch.zeros(1)]
+    assert activate(*x, None) != "Warp's"
+    monkeypatch.setattr(dispatch, "DEVICES", {"cpu"})
+    assert activate(*x, None) == "Warp's"
+    assert activate(*x, torch.zeros(1, dtype=torch.float64)) != "Warp's"

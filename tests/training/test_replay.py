@@ -9,7 +9,7 @@ import clear_strategies as cs
 import rasterizers
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.density.mcmc import MCMC
-from clear_strategies.kernels import per_gaussian
+from clear_strategies.kernels.per_gaussian import dispatch
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
 from clear_strategies.training import checkpoint
 from clear_strategies.training.compiled_step import CompiledStep
@@ -29,7 +29,7 @@ ROUND = 50  # iterations between changes of the structure
 
 @pytest.fixture(autouse=True)
 def _kernels_of_warp(monkeypatch):
-    monkeypatch.setattr(per_gaussian, "DEVICES", {"cpu"})
+    monkeypatch.setattr(dispatch, "DEVICES", {"cpu"})
 
 
 def start(*more, iterations=500, density=True) -> TrainState:

@@ -21,6 +21,7 @@ from clear_strategies.kernels import native
 from clear_strategies.kernels.losses import cpp, reference, warp
 from clear_strategies.kernels.losses.images import DEVICES, image_pair, supported
 from clear_strategies.kernels.losses.reference import LossAndGradient
+from rasterizers.warp_runtime import runs_warp
 
 __all__ = ["Choice", "LossAndGradient", "haar_l1", "photometric", "require", "running_on"]
 
@@ -36,7 +37,7 @@ def running_on(device: str = "cpu") -> list[Choice]:
     Warp's kernels on a CPU are for checks, and are not listed.
     """
     compiled: Choice = "warp" if device == "cuda" else "cpp"
-    available = warp.available() if device == "cuda" else native.available()
+    available = runs_warp("cuda") if device == "cuda" else native.available()
     return [compiled, "torch"] if available else ["torch"]
 
 

@@ -1,32 +1,21 @@
-"""What an iteration computes for each Gaussian between its renderings and its step, on CUDA: a few kernels of Warp, where torch
-launches one for each operation.
+"""What an iteration computes for each Gaussian beside its renderings and its step.
 
-`GaussianField`, `P2G`, `Conductor.scores` and `Density` say in torch what they compute; tests/kernels/test_per_gaussian.py
-compares. On a CPU they compute it themselves.
+`reference` specifies it in torch. `warp` computes the same on CUDA, in a few kernels where torch launches one for each operation,
+and `cpp` on a CPU what torch takes long for; `dispatch` chooses. tests/kernels/test_per_gaussian.py compares.
 """
 
-from __future__ import annotations
+from clear_strategies.kernels.per_gaussian.reference import (
+    accumulate,
+    activate,
+    evidence,
+    evidence_score,
+    lift,
+    nearest_depths,
+    route,
+    screens,
+    wander,
+)  # fmt: skip
 
-from types import ModuleType
-from typing import Final
-
-import torch
-from torch import Tensor
-
-from clear_strategies.kernels import losses
-
-DEVICES: Final = {"cuda"}
-"""Where the kernels are used; tests add the CPU."""
-
-
-def for_tensors(*tensors: Tensor | None) -> ModuleType | None:
-    """The kernels, where they take these tensors: float32 on CUDA, with Warp installed."""
-    for x in tensors:
-        if x is not None and (x.device.type not in DEVICES or x.dtype != torch.float32):
-            return None
-    device = next(x.device.type for x in tensors if x is not None)
-    if not losses.warp.available(device):
-        return None
-    from clear_strategies.kernels.per_gaussian import warp
-
-    return warp
+__all__ = [
+    "accumulate", "activate", "evidence", "evidence_score", "lift", "nearest_depths", "route", "screens", "wander",
+]  # fmt: skip

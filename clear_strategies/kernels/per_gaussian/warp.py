@@ -1,4 +1,4 @@
-"""The kernels, and their launches. Importing this module imports Warp."""
+"""Functions of `reference` by kernels of Warp, for float32 tensors on CUDA. Importing this module imports Warp."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import warp as wp
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from clear_strategies.core.evidence import Evidence
 from rasterizers.warp_runtime import launch, on_stream
 
 wp.set_module_options({"enable_backward": False})
@@ -53,7 +54,6 @@ def _activate(
 def activate(
     log_scales: Float[Tensor, "N 3"], logits: Float[Tensor, " N"], filters: Float[Tensor, " N"], gate: Tensor | None
 ) -> tuple[Tensor, ...]:
-    """Scales, filtered scales, σ, coefficient, factor and opacities, see `training.field.Activation`."""
     n = len(logits)
     scales, filtered = log_scales.new_empty(2, n, 3).unbind()
     rest = logits.new_empty(4, n).unbind()
@@ -90,16 +90,13 @@ def _look_up(lanes: int) -> Any:
     return look_up
 
 
-def look_up(
+def evidence(
     maps: Float[Tensor, "2 ph pw"], centers: Float[Tensor, "N 2"], visible: Bool[Tensor, " N"], patch: float
-) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"], Float[Tensor, " 3"]]:
-    """Reliability q and demand a of each Gaussian (Eq. 10), as of `strategies.p2g.lift`; and the number of visible ones, with
-    Σ q and Σ w over them.
-    """
+) -> Evidence:
     q, a = maps.new_empty(2, len(centers)).unbind()
     parts = _parts(q, 3)
-    _blocks(_look_up, len(parts), maps, centers, visible, patch, q, a, parts)
-    return q, a, parts.sum(0)
+    _blocks(_look_up, len(parts), maps, centers.detach(), visible, patch, q, a, parts)
+    return Evidence(q, a, parts.sum(0))
 
 
 @wp.kernel
@@ -120,12 +117,11 @@ def _route(
     m[i] = m_i
 
 
-def route(
-    q: Float[Tensor, " N"], a: Float[Tensor, " N"], sums: Float[Tensor, " 3"], floor: float, normalize: bool
-) -> Float[Tensor, " N"]:
-    """m, as of `P2G.route`, of what `look_up` returned."""
-    m = torch.empty_like(q)
-    _per_gaussian(_route, len(m), q, a, sums[None], floor, normalize, m)
+def route(e: Evidence, visible: Bool[Tensor, " N"], floor: float, normalize: bool) -> Float[Tensor, " N"]:
+    m, sums = torch.empty_like(e.reliability), e.sums
+    if sums is None:  # the evidence is not that of `evidence` above
+        sums = torch.stack([x.sum(dtype=torch.float64) for x in (visible, e.reliability, e.weight)])
+    _per_gaussian(_route, len(m), e.reliability, e.demand, sums[None], floor, normalize, m)
     return m
 
 
@@ -168,17 +164,12 @@ def screens(
     hf: Float[Tensor, "N 2"] | None,
     size: tuple[int, int],
     weights: tuple[float, float] | Float[Tensor, " 2"],
-) -> tuple[Float[Tensor, "K N 2"], Float[Tensor, " N"]]:
-    """∇_u of the HR losses in NDC, and the ordinary statistic, see `strategies.base.ScreenGradients`.
-
-    Args:
-        lr: in NDC. base, hf: 1/pixel of an image of `size`. weights: λ_HR and λ_HR λ_HF, as numbers or on the device.
-    """
+) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N 2"] | None, Float[Tensor, " N"]]:
     found, ordinary = base.new_empty(1 if hf is None else 2, len(base), 2), base.new_empty(len(base))
     numbers, changing = ((0.0, 0.0), weights) if isinstance(weights, Tensor) else (weights, None)
     halves = [pixels / 2 for pixels in size]
     _per_gaussian(_screens, len(base), lr, base, hf, *halves, *numbers, changing, found, ordinary)
-    return found, ordinary
+    return found[0], None if hf is None else found[1], ordinary
 
 
 @cache
@@ -213,17 +204,11 @@ def _joined(ordinary: wp.array[wp.float32], sums: wp.array[wp.vec2d], score: wp.
 
 
 def evidence_score(
-    q: Float[Tensor, " N"],
-    a: Float[Tensor, " N"],
-    hf: Float[Tensor, "N 2"],
-    ordinary: Float[Tensor, " N"],
-    *,
-    joined: bool,
+    e: Evidence, hf: Float[Tensor, "N 2"], ordinary: Float[Tensor, " N"], joined: bool
 ) -> Float[Tensor, " N"]:
-    """S, as of `P2G.score`: alone, or joined with the ordinary statistic at equal mean."""
     n = len(ordinary)
     score, parts = ordinary.new_empty(n), _parts(ordinary, 2)
-    _blocks(_evidence_score, len(parts), q, a, hf, ordinary, score, parts)
+    _blocks(_evidence_score, len(parts), e.reliability, e.demand, hf, ordinary, score, parts)
     if joined:
         _per_gaussian(_joined, n, ordinary, parts.sum(0)[None], score)
     return score
@@ -252,14 +237,8 @@ def _accumulate(
 
 
 def accumulate(
-    visible: Bool[Tensor, " N"],
-    score: Tensor,
-    ordinary: Tensor,
-    totals: tuple[Tensor, Tensor, Tensor],
-    *,
-    largest: bool,
+    visible: Bool[Tensor, " N"], score: Tensor, ordinary: Tensor, totals: tuple[Tensor, Tensor, Tensor], largest: bool
 ) -> None:
-    """Add the statistics of the visible Gaussians to `totals`, of score, ordinary and their number, as `Density.accumulate`."""
     _per_gaussian(_accumulate, len(visible), visible, score, ordinary, largest, *totals)
 
 

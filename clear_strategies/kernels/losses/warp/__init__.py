@@ -9,18 +9,7 @@ from __future__ import annotations
 from functools import cache
 from types import ModuleType
 
-from rasterizers.interface import BackendUnavailable
 from rasterizers.warp_runtime import require_warp
-
-
-@cache
-def available(device: str = "cuda") -> bool:
-    """Whether the kernels run on "cuda", or on "cpu"."""
-    try:
-        require(device)
-    except BackendUnavailable:
-        return False
-    return True
 
 
 @cache
