@@ -10,7 +10,7 @@ import clear_strategies
 from clear_strategies import GCO, P2G, SVS, Conductor, Grads, Objective, Photo, Strategy, StrategyConflict
 from clear_strategies.kernels.losses import reference
 from clear_strategies.schedules import WarmupDecay
-from clear_strategies.strategies.testing import CHECKS, ContractError, check_strategy
+from clear_strategies.testing import CHECKS, ContractError, check_strategy
 from clear_strategies.training.field import GaussianField
 from rasterizers import Splats, autograd
 from tests.helpers import toy

@@ -13,7 +13,7 @@ from clear_strategies.core.points import PointCloud
 from clear_strategies.density.adaptive import Density, DensitySettings
 from clear_strategies.errors import DensityError
 from clear_strategies.schedules import scaled
-from clear_strategies.strategies.testing import StubShot
+from clear_strategies.testing import StubShot
 from clear_strategies.training.densifier import cameras_extent
 from clear_strategies.training.evaluation import evaluate
 from clear_strategies.training.field import GaussianField

@@ -6,7 +6,7 @@ import torch
 from clear_veto import Veto
 
 from clear_strategies import Conductor, Grads, Photo, Step, View
-from clear_strategies.strategies.testing import check_strategy
+from clear_strategies.testing import check_strategy
 from rasterizers.interface import Camera
 
 
