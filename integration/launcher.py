@@ -8,13 +8,13 @@ import runpy
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from clear_strategies.compose import conductor
 from clear_strategies.console import show_in_host
 from clear_strategies.errors import ClearError, DataError
-from integration.views import sr_source, wants_stereo
+from integration.settings import Settings
 
 _log = logging.getLogger(__name__)
 
@@ -23,21 +23,21 @@ def main(
     module: str,
     script: str,
     arguments: Sequence[str] | None,
-    hook: Callable[[Path | None, dict[str, Any]], AbstractContextManager[list[Any]]],
+    hook: Callable[[Path | None, Settings], AbstractContextManager[list[Any]]],
     otherwise: str,
 ) -> int:
     """The program `python -m <module> [options] script [its arguments]`; returns its exit status.
 
     Args:
         script: a description of the host's script.
-        hook: takes `--save-lr` and the arguments of `install`; a context in which the script runs with CLEAR. Its value is
+        hook: takes `--save-lr` and the settings of `install`; a context in which the script runs with CLEAR. Its value is
             the list of what was attached (`Attached` of this host), which the script fills.
         otherwise: why that list may be empty at the end.
     """
     show_in_host()
     options = _parser(module, f"Run {script} with CLEAR.").parse_args(arguments)
     try:
-        settings = _install_settings(options)
+        settings = _settings(options)
         with _as_script(options.script, options.rest), hook(options.save_lr, settings) as attached:
             runpy.run_path(str(options.script), run_name="__main__")
     except ClearError as error:
@@ -52,30 +52,31 @@ def main(
 def _parser(module: str, description: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=f"python -m {module}", description=description)
     add = parser.add_argument
-    add("--strategies", default="clear", metavar="NAMES", help="of conf/strategy: clear, gco, gco,svs … (%(default)s)")
+    add("--strategies", metavar="NAMES", help="of conf/strategy: clear, gco, gco,svs … (%(default)s)")
     add(
-        "--overrides", action="append", default=[], metavar="KEY=VALUE",
+        "--overrides", action="append", metavar="KEY=VALUE",
         help="e.g. strategies.gco.tolerance=0.1; repeatable",
     )  # fmt: skip
     add(
-        "--points", default="own", metavar="own|stereo",
+        "--points", metavar="own|stereo",
         help="what the Gaussians start from: the trainer's own points, or dense stereo between its training photos "
         "(%(default)s)",
     )  # fmt: skip
     add("--sr", metavar="FOLDER", help="SR images, named like the photos")
-    add("--suffix", default="", help="what the SR tool appended to the names, e.g. _x4")
-    add("--factor", type=int, default=4, help="HR pixels per LR pixel (%(default)s)")
+    add("--suffix", help="what the SR tool appended to the names, e.g. _x4")
+    add("--factor", type=int, help="HR pixels per LR pixel (%(default)s)")
     add(
         "--save-lr", type=Path, metavar="FOLDER",
         help="write the photos as they are trained on (reduced, masked) for an SR tool to enlarge; then stop",
     )  # fmt: skip
     add("script", type=Path, help="the host's script")
     add("rest", nargs=argparse.REMAINDER, help="the arguments of the script")
+    parser.set_defaults(**asdict(Settings()) | {"overrides": []})
     return parser
 
 
-def _install_settings(options: argparse.Namespace) -> dict[str, Any]:
-    """The arguments of `install`; what it would refuse is refused here, before the host loads its scene.
+def _settings(options: argparse.Namespace) -> Settings:
+    """The settings of `install`; what it would refuse is refused here, before the host loads its scene.
 
     Raises:
         DataError: the script is missing.
@@ -83,11 +84,11 @@ def _install_settings(options: argparse.Namespace) -> dict[str, Any]:
     """
     if not options.script.is_file():
         raise DataError(options.script, "script", "is not there", "give the training script of your trainer")
-    wants_stereo(options.points)
+    chosen = vars(options)
+    settings = Settings(**{f.name: chosen[f.name] for f in fields(Settings) if f.name in chosen})
     if options.save_lr is None:
-        sr_source(options.sr, conductor(options.strategies, *options.overrides), options.factor, options.suffix)
-    names = ("strategies", "overrides", "points", "sr", "suffix", "factor")
-    return {name: getattr(options, name) for name in names}
+        settings.sr_source(settings.conductor())
+    return settings
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from typing import Any
 from clear_strategies.errors import HostError
 from integration import launcher
 from integration.gsplat.simple_trainer import install, photos_of
+from integration.settings import Settings
 from integration.views import save_photos
 
 
@@ -28,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 @contextmanager
-def _installed_by_cli(save_lr: Path | None, settings: dict[str, Any]) -> Iterator[list[Any]]:
+def _installed_by_cli(save_lr: Path | None, settings: Settings) -> Iterator[list[Any]]:
     """CLEAR is installed when the script calls `cli`, which is when its `Runner` exists."""
     distributed: Any = importlib.import_module("gsplat.distributed")
     cli, attached = distributed.cli, list[Any]()
@@ -41,7 +42,7 @@ def _installed_by_cli(save_lr: Path | None, settings: dict[str, Any]) -> Iterato
         if save_lr is not None:
             runner.train = lambda self: _save_lr(self, save_lr)
         else:
-            install(runner, **settings, installed=attached.append)
+            install(runner, settings, installed=attached.append)
         return cli(train, *args, **kwargs)
 
     distributed.cli = cli_with_clear

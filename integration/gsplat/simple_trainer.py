@@ -7,9 +7,9 @@ import functools
 import inspect
 import logging
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
-from pathlib import Path
+from dataclasses import replace
 from typing import Any, Final
 
 import torch
@@ -21,7 +21,8 @@ from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
 from integration.gsplat.attached import Attached, require_bands
 from integration.replacing import replace_everywhere
-from integration.views import HostPhoto, Points, SuperResolve, no_stereo, sr_source, stereo_points, wants_stereo
+from integration.settings import Settings
+from integration.views import HostPhoto, no_stereo, stereo_points
 
 _log = logging.getLogger(__name__)
 
@@ -44,15 +45,10 @@ _CREATE: Final = "create_splats_with_optimizers"
 
 def install(
     runner_class: Any,
+    settings: Settings | None = None,
     *,
-    strategies: str = "clear",
-    overrides: Sequence[str] = (),
-    sr: SuperResolve | str | Path | None = None,
-    suffix: str = "",
-    factor: int = 4,
-    points: Points = "own",
-    seed: int = 0,
     installed: Callable[[Attached], None] = lambda attached: None,
+    **changes: Any,
 ) -> None:
     """Train every later `Runner` of simple_trainer.py with CLEAR.
 
@@ -63,21 +59,16 @@ def install(
         runner_class: simple_trainer's `Runner`. Its Config stretches the schedules (`max_steps`), and
             `strategy.refine_stop_iter` is lowered to the step at which a strategy ends densification. With 0, a strategy may
             densify in place of `DefaultStrategy`.
-        strategies: names of conf/strategy, e.g. "gco,svs". overrides: settings, e.g. "strategies.gco.tolerance=0.1".
-        sr: the folder of the SR images, or a function that makes them. suffix: what the SR tool appended to the names.
-        factor: HR pixels per LR pixel.
-        points: "own": the splats start as the host's `init_type` says; "stereo": from dense stereo between its training
-            photos, in place of its SfM points.
+        settings: None: the defaults. changes: fields of `Settings` in place of those, e.g. sr="sr_x4".
         installed: called with every attachment.
 
     Raises:
-        SettingError: `points` is neither of these.
+        SettingError: see `Settings`.
         HostError: points=stereo, and the module of the class has no `create_splats_with_optimizers` or no `Dataset`.
     """
-    from clear_strategies.compose import conductor  # brings Hydra
-
     show_in_host()
-    if wants_stereo(points):
+    wanted = replace(settings or Settings(), **changes)
+    if wanted.from_stereo:
         start_from_stereo(runner_class)
     train, rasterize_splats = runner_class.train, runner_class.rasterize_splats
     last: _Installed | None = None  # of the last Runner, whose evaluation may come after its training
@@ -87,14 +78,15 @@ def install(
         nonlocal last
         require_supported(runner.cfg, runner.world_size)
         require_bands(runner.splats)
-        chosen = conductor(strategies, *overrides, iterations=runner.cfg.max_steps)
+        chosen = wanted.conductor(runner.cfg.max_steps)
         end_with_strategies(chosen, runner.cfg.strategy, "refine_stop_iter", first=0)
-        source, scale = sr_source(sr, chosen, factor, suffix)
+        source, scale = wanted.sr_source(chosen)
         photos = photos_of(runner.trainset, runner.device)
         masks = {photo.name: photo.mask for photo in photos if photo.mask is not None}
         if last is not None:
             last.finish()
-        runner.clear = last = _Installed(runner, [photo.view(source, scale) for photo in photos], masks, chosen, seed)
+        views = [photo.view(source, scale) for photo in photos]
+        runner.clear = last = _Installed(runner, views, masks, chosen, wanted.seed)
         installed(last.attached)
         result = train(runner)
         _log.info("%s.", last.attached.attachment.summary())

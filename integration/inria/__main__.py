@@ -18,6 +18,7 @@ from clear_strategies.errors import HostError
 from integration import launcher
 from integration.inria.cameras import photo_of
 from integration.inria.from_options import install
+from integration.settings import Settings
 from integration.views import save_photos
 
 _log = logging.getLogger("integration.inria")  # __name__ is "__main__" here
@@ -32,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 @contextmanager
-def _installed_by_training_setup(save_lr: Path | None, settings: dict[str, Any]) -> Iterator[list[Any]]:
+def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> Iterator[list[Any]]:
     """CLEAR is installed after the script's first call of `training_setup`, for the cameras of the last `Scene`."""
     importlib.import_module("gaussian_renderer")  # whose `render` install replaces
     scene: Any = importlib.import_module("scene")
@@ -56,7 +57,7 @@ def _installed_by_training_setup(save_lr: Path | None, settings: dict[str, Any])
         if save_lr is not None:
             save_photos(map(photo_of, scenes[-1].getTrainCameras()), save_lr)
             raise SystemExit(0)
-        attached.append(install(gaussians, scenes[-1], opt, **settings))
+        attached.append(install(gaussians, scenes[-1], opt, settings))
         return result
 
     scene.GaussianModel.training_setup, scene.Scene.__init__ = setup_and_install, init_and_remember

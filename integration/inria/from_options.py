@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Sequence
-from pathlib import Path
+from dataclasses import replace
 from typing import Any, Final
 
 import torch
@@ -15,24 +14,13 @@ from clear_strategies.errors import HostError
 from integration.densification import end_with_strategies
 from integration.inria.attached import Attached
 from integration.inria.cameras import photo_of
-from integration.views import Points, SuperResolve, no_stereo, stereo_points, wants_stereo
+from integration.settings import Settings
+from integration.views import no_stereo, stereo_points
 
 _OPEN: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 
-def install(
-    gaussians: Any,
-    scene: Any,
-    opt: Any,
-    *,
-    strategies: str = "clear",
-    overrides: Sequence[str] = (),
-    sr: SuperResolve | str | Path | None = None,
-    suffix: str = "",
-    factor: int = 4,
-    points: Points = "own",
-    seed: int = 0,
-) -> Attached:
+def install(gaussians: Any, scene: Any, opt: Any, settings: Settings | None = None, **changes: Any) -> Attached:
     """Train the host's Gaussians with CLEAR; `gaussian_renderer.render` is replaced wherever it was imported.
 
     Args:
@@ -41,31 +29,26 @@ def install(
         opt: the options that the host passed to `training_setup`. `iterations` stretches the schedules,
             `densify_grad_threshold` scales P2G's score, and `densify_until_iter` is lowered to the iteration at which a
             strategy ends densification. With 0, a strategy may densify in place of the host.
-        strategies: names of conf/strategy: "clear", "gco", "gco,svs" …
-        overrides: settings, e.g. "strategies.gco.tolerance=0.1", "objective=lr_only".
-        sr: the folder of the SR images, or a function that makes them. suffix: what the SR tool appended to the names.
-        factor: HR pixels per LR pixel.
-        points: "own": the Gaussians stay as the host made them; "stereo": they are made again from dense stereo between
-            the training photos, by the host's `create_from_pcd` and `training_setup`. A checkpoint that is restored later
-            replaces them.
+        settings: None: the defaults. With points="stereo" the Gaussians are made again by the host's `create_from_pcd` and
+            `training_setup`; a checkpoint that is restored later replaces them.
+        changes: fields of `Settings` in place of those, e.g. sr="sr_x4".
 
     Raises:
         HostError: the host has another shape than 3DGS.
-        SettingError: `points` is neither of these, or see `Attached`.
+        SettingError: see `Settings` and `Attached`.
         DataError: see `Attached`; stereo confirms no depth.
     """
-    from clear_strategies.compose import conductor  # brings Hydra
-
     show_in_host()
+    wanted = replace(settings or Settings(), **changes)
     iterations = getattr(opt, "iterations", None)
     if iterations is None:
         raise HostError(f"{type(opt).__name__} has no iterations, which the options of training_setup have in 3DGS.")
-    chosen = conductor(strategies, *overrides, iterations=int(iterations))
-    if wants_stereo(points):
+    chosen = wanted.conductor(int(iterations))
+    if wanted.from_stereo:
         start_from_stereo(gaussians, scene, opt)
     end_with_strategies(chosen, opt, "densify_until_iter")
     attached = Attached(
-        gaussians, scene.getTrainCameras(), chosen, sr=sr, suffix=suffix, factor=factor, seed=seed,
+        gaussians, scene.getTrainCameras(), chosen, sr=wanted.sr, suffix=wanted.suffix, factor=wanted.factor, seed=wanted.seed,
         threshold=getattr(opt, "densify_grad_threshold", None), densify_until=getattr(opt, "densify_until_iter", None),
         own_background=bool(getattr(opt, "random_background", False)),
     )  # fmt: skip

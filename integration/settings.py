@@ -1,0 +1,58 @@
+"""What `install` takes, in every host."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from clear_strategies.merging.conductor import Conductor
+from clear_strategies.schedules import REFERENCE_ITERATIONS
+from integration.views import Points, SuperResolve, sr_source, wants_stereo
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Which strategies train, from which SR images and points.
+
+    Args:
+        strategies: names of conf/strategy: "clear", "gco", "gco,svs" …
+        overrides: settings, e.g. "strategies.gco.tolerance=0.1", "objective=lr_only".
+        sr: the folder of the SR images, or a function that makes them; None: there are none, for strategies and objectives that
+            do not use HR. suffix: what the SR tool appended to the names.
+        factor: HR pixels per LR pixel.
+        points: "own": the Gaussians start as the host makes them; "stereo": from dense stereo between its training photos.
+        seed: of the strategies.
+
+    Raises:
+        SettingError: `points` is neither of these.
+    """
+
+    strategies: str = "clear"
+    overrides: Sequence[str] = ()
+    sr: SuperResolve | str | Path | None = None
+    suffix: str = ""
+    factor: int = 4
+    points: Points = "own"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        wants_stereo(self.points)
+
+    @property
+    def from_stereo(self) -> bool:
+        return wants_stereo(self.points)
+
+    def conductor(self, iterations: int = REFERENCE_ITERATIONS) -> Conductor:
+        """The strategies, with milestones for a training of so many iterations.
+
+        Raises:
+            SettingError: a name or a setting is refused.
+        """
+        from clear_strategies.compose import conductor  # brings Hydra
+
+        return conductor(self.strategies, *self.overrides, iterations=iterations)
+
+    def sr_source(self, conductor: Conductor) -> tuple[SuperResolve, int]:
+        """See `views.sr_source`."""
+        return sr_source(self.sr, conductor, self.factor, self.suffix)
