@@ -36,7 +36,7 @@ ATTRIBUTES: Final = ("means", "scales", "quats", "opacities", "sh0", "shN")
 NO_CUT_OFFS: Final = {"alpha_min": 1e-9, "transmittance_min": 0.0}
 REFERENCE_LIMIT: Final = 10_000  # Gaussians; with more, the pure-torch reference takes minutes per turn
 
-Drawn = Mapping[str, Tensor]
+ImageAndGradients = Mapping[str, Tensor]
 """An image, and the gradients of one cotangent by attribute, in main memory."""
 
 
@@ -196,7 +196,7 @@ def _time_rows(contestants: Sequence[Contestant], median: pd.DataFrame) -> Itera
 def _error_rows(workload: Workload, contestants: Sequence[Contestant], backend: str) -> Iterator[dict[str, Any]]:
     """Two rows per contestant: against float64 at its own cut-offs, and without any."""
     cotangent = random_cotangents(workload)[0]
-    truths: dict[tuple[Any, ...], Drawn] = {}
+    truths: dict[tuple[Any, ...], ImageAndGradients] = {}
     for c in contestants:
         drawn = draw(c.render, cotangent)
         for against, cut_offs in ((SAME, PRESETS[c.names["preset"]]), (NONE, NO_CUT_OFFS)):
@@ -206,14 +206,14 @@ def _error_rows(workload: Workload, contestants: Sequence[Contestant], backend: 
             yield {**c.names, "truth": against, **errors_of(drawn, truths[key])}
 
 
-def draw(render: Callable[[], Any], cotangent: Float[Tensor, "H W 3"]) -> Drawn:
+def draw(render: Callable[[], Any], cotangent: Float[Tensor, "H W 3"]) -> ImageAndGradients:
     """`render` returns an object with `image`, and `vjp` of K cotangents."""
     rendering = render()
     g = rendering.vjp(cotangent[None])
     return {"image": rendering.image.detach().cpu(), **{name: getattr(g, name)[0].cpu() for name in ATTRIBUTES}}
 
 
-def errors_of(measured: Drawn, truth: Drawn) -> dict[str, float]:
+def errors_of(measured: ImageAndGradients, truth: ImageAndGradients) -> dict[str, float]:
     """Table columns: absolute errors of the image, and relative L2 errors of each attribute's gradient.
 
     `<attribute>_relative` is over all Gaussians, `<attribute>_median` the median of the Gaussians' relative errors.
@@ -265,7 +265,9 @@ def in_float64(backend: str, workload: Workload, rules: Mapping[str, Any]) -> tu
     return rasterizer, workload.to(device if device in rasterizer.traits.devices else "cpu", torch.float64)
 
 
-def truth_of(backend: str, workload: Workload, cotangent: Float[Tensor, "H W 3"], rules: Mapping[str, Any]) -> Drawn:
+def truth_of(
+    backend: str, workload: Workload, cotangent: Float[Tensor, "H W 3"], rules: Mapping[str, Any]
+) -> ImageAndGradients:
     """Draw in float64."""
     rasterizer, wide = in_float64(backend, workload, rules)
     return draw(lambda: rasterizer(wide.splats, wide.camera), cotangent.to(wide.splats.means))

@@ -79,7 +79,7 @@ def rasterizer_node(node: Mapping[str, Any]) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class Drawing:
+class ReadyRasterizer:
     """A rasterizer that is ready to draw.
 
     Args:
@@ -98,23 +98,23 @@ class Drawing:
         given = self.make.keywords
         return RasterSettings(**{f.name: given[f.name] for f in fields(RasterSettings) if f.name in given})
 
-    def having(self, **settings: Any) -> Drawing:
+    def having(self, **settings: Any) -> ReadyRasterizer:
         """The same with other settings."""
         make = functools.partial(self.make, **settings)
         return replace(self, rasterizer=make(), make=make)
 
-    def over(self, background: Color) -> Drawing:
+    def over(self, background: Color) -> ReadyRasterizer:
         """The same over the data set's background, unless the settings name one."""
         return self if "background" in self.make.keywords else self.having(background=background)
 
-    def among(self, means: Float[Tensor, "N 3"]) -> Drawing:
+    def among(self, means: Float[Tensor, "N 3"]) -> ReadyRasterizer:
         """The same for a scene of these points: where they spread less than 1, the default near plane is as much nearer."""
         if self.make.keywords.get("near") != _SHARED.near or not len(means) or not 0 < (size := spread(means)) < 1:
             return self
         return self.having(near=_SHARED.near * size)
 
 
-def drawing(settings: RasterizerSettings | functools.partial[Rasterizer], asked: Device | None) -> Drawing:
+def drawing(settings: RasterizerSettings | functools.partial[Rasterizer], asked: Device | None) -> ReadyRasterizer:
     """The rasterizer of the settings on the device that was asked for."""
     if asked == "cuda" and not torch.cuda.is_available():
         raise SettingError(
@@ -134,10 +134,10 @@ def drawing(settings: RasterizerSettings | functools.partial[Rasterizer], asked:
             f"rasterizer: {name} is no Rasterizer. rasterizers.testing.check_rasterizer says what is missing."
         )
     device = drawn_on(rasterizer.traits.devices, name, asked)
-    return Drawing(rasterizer, name if device == "cpu" else f"{name} on {device}", device, make)
+    return ReadyRasterizer(rasterizer, name if device == "cpu" else f"{name} on {device}", device, make)
 
 
-def log_choice(settings: RasterizerSettings | functools.partial[Rasterizer], chosen: Drawing) -> None:
+def log_choice(settings: RasterizerSettings | functools.partial[Rasterizer], chosen: ReadyRasterizer) -> None:
     """Log why the other backends were not chosen, where `auto` found neither CUDA nor compiled kernels."""
     auto = isinstance(settings, RasterizerSettings) and settings.name == "auto"
     if auto and chosen.device == "cpu" and not chosen.rasterizer.traits.native_threads:

@@ -80,7 +80,7 @@ class _Job:
 
     settings: JobSettings
     conductor: Conductor
-    drawing: device.Drawing
+    drawing: device.ReadyRasterizer
     compared: Mapping[str, Any]
     folder: Path
     overrides: Sequence[str] | None
@@ -125,7 +125,7 @@ class _Job:
         mean = evaluation.mean("test") or evaluation.mean("train")
         return None if mean is None else mean.psnr
 
-    def _start(self, scene: Scene, there: Scene, drawing: device.Drawing) -> TrainState:
+    def _start(self, scene: Scene, there: Scene, drawing: device.ReadyRasterizer) -> TrainState:
         """The state that training starts from: the initial one, or the checkpoint that `fit.resume` names.
 
         Args:
@@ -140,7 +140,9 @@ class _Job:
         resume.resume(state, scene, settings.fit.resume, self.folder, self.compared)
         return state
 
-    def _announce(self, scene: Scene, state: TrainState, drawing: device.Drawing, threads: str, level: int) -> None:
+    def _announce(
+        self, scene: Scene, state: TrainState, drawing: device.ReadyRasterizer, threads: str, level: int
+    ) -> None:
         """Log the plan, and what was set in vain. A SettingError if the run does not fit into memory."""
         memory.release()
         machine = {
@@ -164,7 +166,7 @@ class _Job:
         return watched(painter, [view.hr.camera for view in scene.train], f"{scene.name} · {self.chosen.title}")
 
     def _train(
-        self, scene: Scene, there: Scene, state: TrainState, drawing: device.Drawing
+        self, scene: Scene, there: Scene, state: TrainState, drawing: device.ReadyRasterizer
     ) -> tuple[Evaluation, float]:
         """Train to the end and write the files; return the scores and the seconds of training."""
         title, alone, painter = self.chosen.title, device.jobs_at_once() == 1, Painter(state.field, drawing.make)

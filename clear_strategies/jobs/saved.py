@@ -17,7 +17,7 @@ from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.jobs import device
-from clear_strategies.jobs.device import Drawing
+from clear_strategies.jobs.device import ReadyRasterizer
 from clear_strategies.jobs.resume import folder_of
 from clear_strategies.settings import TARGET, build, with_defaults
 from clear_strategies.training import checkpoint
@@ -136,7 +136,7 @@ def _ply_in(folder: Path, path: Path) -> Path:
     return ply
 
 
-def _drawing(settings: Mapping[str, Any], name: str | None) -> Drawing:
+def _drawing(settings: Mapping[str, Any], name: str | None) -> ReadyRasterizer:
     """The rasterizer with the settings of a run, or of the name that was asked for."""
     defaults = with_defaults({TARGET: device.BY_NAME})
     if name is not None:

@@ -25,10 +25,10 @@ from clear_strategies import console, files
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.errors import ClearError, DataError
 from clear_strategies.outputs.figures import SheetRow, write_contact_sheet, write_curves
-from clear_strategies.report.runs import Run, collect, history
+from clear_strategies.report.runs import FinishedRun, collect, history
 from clear_strategies.report.table import compare, layout, markdown, notes
 
-__all__ = ["Run", "collect", "compare", "layout", "main", "markdown", "notes", "write"]
+__all__ = ["FinishedRun", "collect", "compare", "layout", "main", "markdown", "notes", "write"]
 
 _log = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def write(runs: Sequence[Run], out: Path) -> str:
+def write(runs: Sequence[FinishedRun], out: Path) -> str:
     """Write the files of a report into `out`; returns the text of report.md."""
     table = compare(runs)
     text = markdown(layout(table), notes(table, runs))
@@ -102,7 +102,7 @@ def _file_names(scenes: Iterable[str]) -> dict[str, str]:
     return words
 
 
-def _compare_renders(path: Path, scene: str, runs: Mapping[str, Run]) -> bool:
+def _compare_renders(path: Path, scene: str, runs: Mapping[str, FinishedRun]) -> bool:
     """Draw a test view that all runs rendered, and the truth where it is known; returns whether there is one."""
     names = [{file.name for file in (run.folder / "renders").glob("*.png")} for run in runs.values()]
     shared = sorted(set.intersection(*names))

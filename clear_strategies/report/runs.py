@@ -28,7 +28,7 @@ _PATH: Final = re.compile(r"scene|data\.root|data\.(reader\.)?path")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
+class FinishedRun:
     """A finished run.
 
     Args:
@@ -49,7 +49,7 @@ class Run:
     numbers: Mapping[str, float]
 
     @classmethod
-    def read(cls, folder: Path) -> Run:
+    def read(cls, folder: Path) -> FinishedRun:
         """Read a run's folder."""
         path = folder / "metrics.json"
         content = metrics.read(path, "train the run again")
@@ -77,7 +77,7 @@ class Run:
         )
 
 
-def collect(folders: Iterable[Path]) -> list[Run]:
+def collect(folders: Iterable[Path]) -> list[FinishedRun]:
     """Every finished run at or below the folders and the links in them: the jobs of a sweep by number, other runs by path.
     Unfinished and damaged runs are logged and left out.
     """
@@ -95,7 +95,7 @@ def collect(folders: Iterable[Path]) -> list[Run]:
     runs = []
     for folder in finished:
         try:
-            runs.append(Run.read(folder))
+            runs.append(FinishedRun.read(folder))
         except DataError as error:
             _log.warning("%s; left out.", error)
     if not runs:

@@ -15,7 +15,7 @@ from typing import Any, Final
 import pandas as pd
 
 from clear_strategies.outputs.metrics import NOTE
-from clear_strategies.report.runs import Run
+from clear_strategies.report.runs import FinishedRun
 
 _log = logging.getLogger(__name__)
 
@@ -27,7 +27,7 @@ _QUANTITIES: Final = {
 }  # fmt: skip
 
 
-def compare(runs: Sequence[Run]) -> pd.DataFrame:
+def compare(runs: Sequence[FinishedRun]) -> pd.DataFrame:
     """For each scene, in the order of the runs, one row per method; then the averages over scenes.
 
     Returns:
@@ -60,7 +60,7 @@ def layout(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame({name: column for name, column in cells.items() if any(column)})
 
 
-def notes(table: pd.DataFrame, runs: Sequence[Run]) -> list[str]:
+def notes(table: pd.DataFrame, runs: Sequence[FinishedRun]) -> list[str]:
     """What a reader of the table has to know about it."""
     lines = [f"bicubic, prior: PSNR of the enlarged LR photos and of the SR images; {NOTE}."]
     if (table["psnr_delta"].abs() > 0).any():
@@ -102,11 +102,11 @@ def _numbers(means: pd.Series[float], deviations: pd.Series[float] | None, form:
     ]
 
 
-def _by_scene(runs: Sequence[Run]) -> dict[str, list[Run]]:
+def _by_scene(runs: Sequence[FinishedRun]) -> dict[str, list[FinishedRun]]:
     return {scene: [run for run in runs if run.scene == scene] for scene in dict.fromkeys(run.scene for run in runs)}
 
 
-def _single(runs: Sequence[Run]) -> list[dict[str, Any]]:
+def _single(runs: Sequence[FinishedRun]) -> list[dict[str, Any]]:
     """Of one scene: a row for each run.
 
     `key` is name and settings, a line each; `identity`, the key of an average, leaves out the `data` settings that all runs of

@@ -24,9 +24,9 @@ class WarpRasterizer(WarpSettings):
 
     def draw(self, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> list[Rendering]:
         """Jobs of one pose share colour and depth order."""
-        from rasterizers.warp_backend.frame import Frame
+        from rasterizers.warp_backend.frame import WarpFrame
 
-        return [*Frame(self, jobs, depth).draw()]
+        return [*WarpFrame(self, jobs, depth).draw()]
 
     def numbers_of(self, camera: Camera, device: torch.device) -> Sequence[Tensor]:
         """See `rasterizers.interface.Recordable`."""

@@ -57,10 +57,10 @@ class _View:
         self.ellipses, self.means2d = like.new_empty(n, _ROW), like.new_empty(n, 2)
         self.visible = visible
         self.counts, self.firsts = counts, firsts  # tiles of each Gaussian, and its first pair
-        self.ends: Tensor  # pairs up to each Gaussian, front to back, and included; set by `Frame.draw`
+        self.ends: Tensor  # pairs up to each Gaussian, front to back, and included; set by `WarpFrame.draw`
         self.total = total  # number of pairs
-        self.pairs = 0  # set by `Frame.resolve_counts`; of a recorded frame as many as it has space for
-        self.lists: _Lists  # set by `Frame._list`
+        self.pairs = 0  # set by `WarpFrame.resolve_counts`; of a recorded frame as many as it has space for
+        self.lists: _Lists  # set by `WarpFrame._list`
         self.capacity = -1  # pairs that the lists have space for; the nearest ones if there are more
 
 
@@ -77,7 +77,7 @@ class _Lists(NamedTuple):
     ends: Tensor
 
 
-class Frame:
+class WarpFrame:
     """One depth order for several pixel grids, and the tensors that the VJP reads again."""
 
     def __init__(self, settings: WarpSettings, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> None:
@@ -221,7 +221,7 @@ class Frame:
 class WarpRendering:
     """An image on one pixel grid of a frame. Accessing it resolves the frame's counts."""
 
-    def __init__(self, frame: Frame, view: _View) -> None:
+    def __init__(self, frame: WarpFrame, view: _View) -> None:
         self._frame, self._view = frame, view
         height, width = view.camera.height, view.camera.width
         self.means2d: Float[Tensor, "N 2"] = view.means2d

@@ -74,7 +74,7 @@ def test_the_reference_takes_no_part_in_large_scenes_and_unavailable_backends_ar
 
 
 def test_errors_are_those_of_their_definitions():
-    def drawn(image: list[float], gradient: list[list[float]]) -> drawing.Drawn:
+    def drawn(image: list[float], gradient: list[list[float]]) -> drawing.ImageAndGradients:
         return {"image": torch.tensor(image), **dict.fromkeys(drawing.ATTRIBUTES, torch.tensor(gradient))}
 
     truth = drawn([0.0, 0, 0], [[3.0, 4], [0, 0], [1, 0]])

@@ -110,8 +110,8 @@ def sevens(monkeypatch):
     """Uninitialised memory holds sevens."""
     from rasterizers.warp_backend import frame
 
-    empty = frame.Frame.empty
-    monkeypatch.setattr(frame.Frame, "empty", lambda self, *s, dtype=None: empty(self, *s, dtype=dtype).fill_(7))
+    empty = frame.WarpFrame.empty
+    monkeypatch.setattr(frame.WarpFrame, "empty", lambda self, *s, dtype=None: empty(self, *s, dtype=dtype).fill_(7))
 
 
 @installed
@@ -122,7 +122,7 @@ def test_unused_places_do_not_change_the_image(monkeypatch, sevens):
     splats, view = dense_scene(200)
     v = cotangents(2, view.height, view.width)
     expected = everything(rasterizers.load("warp", device="cpu")(splats, view), v)
-    project = frame.Frame.project
+    project = frame.WarpFrame.project
     unused = torch.arange(200) % 3
 
     def counting_too_many(self):
@@ -131,7 +131,7 @@ def test_unused_places_do_not_change_the_image(monkeypatch, sevens):
         counts += unused * (counts > 0)
         return found
 
-    monkeypatch.setattr(frame.Frame, "project", counting_too_many)
+    monkeypatch.setattr(frame.WarpFrame, "project", counting_too_many)
     require_same_bits(everything(rasterizers.load("warp", device="cpu")(splats, view), v), expected)
 
 
@@ -171,7 +171,7 @@ def test_long_lists_and_large_gaussians_are_summed_in_short_chains():
 
     tails = scenes.load("tails")
     v = cotangents(1, tails.camera.height, tails.camera.width)
-    found = frame.Frame(rasterizers.load("warp", device="cpu", **CLEAN), [(tails.splats, tails.camera)], [False])
+    found = frame.WarpFrame(rasterizers.load("warp", device="cpu", **CLEAN), [(tails.splats, tails.camera)], [False])
     (drawn,) = found.draw()
     exact = rasterizers.load("cpp", **CLEAN)(tails.splats.to(torch.float64), tails.camera)
     assert float((drawn.image - exact.image).abs().max()) < 2e-5
@@ -196,7 +196,7 @@ def test_errors_are_raised_when_an_image_is_accessed(deferred):
     rasterizer(splats, view)
 
     def launched(splats):  # not by `rasterizer(…)`: the tests' type checks would access the image that it returns
-        return frame.Frame(rasterizer, [(splats, view)], [False]).draw()[0]
+        return frame.WarpFrame(rasterizer, [(splats, view)], [False]).draw()[0]
 
     huge = launched(dataclasses.replace(splats, scales=splats.scales * 100))
     with pytest.raises(MemoryError, match="Raise `memory`"):

@@ -245,7 +245,7 @@ def test_scenes_with_different_data_settings_are_averaged(tmp_path: Path) -> Non
 )
 def test_a_run_is_named_by_its_strategies_as_given_on_the_command_line(tmp_path, overrides, facts, name):
     folder = make_run(tmp_path, *overrides, **facts, **({} if overrides else {"overrides": None}))
-    run = report.Run.read(folder)
+    run = report.FinishedRun.read(folder)
     assert (run.name, run.settings) == (name, ())
 
 
