@@ -1,8 +1,10 @@
-"""Functions of `reference` in C++, for contiguous float32 tensors on a CPU."""
+"""Functions of `reference` in C++, with its arguments, for contiguous float32 tensors on a CPU."""
 
 from __future__ import annotations
 
-from jaxtyping import Bool, Float, Int
+from typing import Any
+
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.kernels import native
@@ -23,13 +25,5 @@ def lift(
     return lifted
 
 
-def wander(
-    means: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
-    log_scales: Float[Tensor, "N 3"],
-    gate: Float[Tensor, " N"],
-    rows: Int[Tensor, " K"],
-    eta: Float[Tensor, "K 3"],
-    strength: float,
-) -> None:
-    native.module().wander(means, quats, log_scales, gate, rows, eta, strength, threads())
+def wander(*arguments: Any) -> None:
+    native.module().wander(*arguments, threads())
