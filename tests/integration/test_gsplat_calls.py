@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clear_strategies import P2G, Conductor, RandomBackground, View
+from clear_strategies import P2G, Conductor, RandomBackground, SRStage, View
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.merging.in_place import InPlaceMerge
 from integration import HostError
@@ -219,8 +219,9 @@ def test_all_renders_are_over_the_background_of_a_strategy_unless_the_loop_has_i
         return gsplat_host.rasterization(**call)
 
     host = Host(toy.scene(20), rasterization=recorded)
-    _, _, render = started(chosen, toy.ShowsDark(), host=host, own_background=own_background)
+    _, _, render = started(chosen, toy.ShowsDark(), SRStage(), host=host, own_background=own_background)
     render().mean().backward()
+    assert "SRStage has no effect here: the host draws no picture" in caplog.text
     assert ("RandomBackground has no effect here" in caplog.text) == own_background
     color = None if own_background else torch.tensor(chosen.background(1)).tolist()
     assert [b if b is None else b[0].tolist() for b in backgrounds] == [color] * 3
