@@ -140,11 +140,13 @@ def tree(config: DictConfig, without: Iterable[str] = ()) -> dict[str, Any]:
     return {key: value for key, value in values.items() if key not in without}
 
 
-def flat(node: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """The leaves of a tree by their dotted keys."""
+def flat(node: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
+    """The leaves of a tree by their dotted keys. The entries of a list that holds tables or lists have their number as key."""
     leaves: dict[str, Any] = {}
     for name, value in node.items():
-        leaves |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+        nested = isinstance(value, list) and any(isinstance(entry, dict | list) for entry in value)
+        below = dict(enumerate(value)) if nested else value
+        leaves |= flat(below, f"{prefix}{name}.") if isinstance(below, dict) else {f"{prefix}{name}": value}
     return leaves
 
 

@@ -38,7 +38,7 @@ FAILED: Final = "failed.txt"
 _VERBOSE: Final = "fit.verbose=true"
 _FLAGS: Final = (
     "--help", "--hydra-help", "--version", "--cfg", "--resolve", "--package", "--run", "--multirun", "--shell-completion",
-    "--config-path", "--config-name", "--config-dir", "--experimental-rerun", "--info",
+    "--config-path", "--config-name", "--config-dir", "--info",
 )  # fmt: skip
 
 

@@ -26,7 +26,9 @@ from clear_strategies.data.ply import read_gaussians
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
 from clear_strategies.jobs import exit_codes, job
+from clear_strategies.jobs.device import BY_NAME
 from clear_strategies.jobs.saved import SavedSplat, open_splat
+from clear_strategies.settings import TARGET
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
@@ -38,9 +40,12 @@ class Run:
 
     Args:
         folder: of its files, which `docs/reference/files.md` lists.
+        rasterizer: that draws it, as `clear-strategies render --rasterizer` takes it; None: the one that the run trained with. A
+            class that `rasterizer._target_` named has to be named again, unless `train` returned the run: no file does it.
     """
 
     folder: Path
+    rasterizer: str | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "folder", Path(self.folder))
@@ -64,7 +69,7 @@ class Run:
         return self._splat.poses()
 
     def render(self, camera: Camera | None = None) -> Float[Tensor, "H W 3"]:
-        """The picture from a camera, RGB in [0, 1], on the CPU, by the rasterizer that the run trained with.
+        """The picture from a camera, RGB in [0, 1], on the CPU, by `rasterizer`.
 
         Args:
             camera: None: the first training camera. `dataclasses.replace` makes others of it.
@@ -73,7 +78,7 @@ class Run:
 
     @cached_property
     def _splat(self) -> SavedSplat:
-        return open_splat(self.folder)
+        return open_splat(self.folder, self.rasterizer)
 
 
 def train(photos: str | Path | None = None, *settings: str, folder: str | Path | None = None) -> Run:
@@ -113,4 +118,5 @@ def train(photos: str | Path | None = None, *settings: str, folder: str | Path |
     finally:
         torch.set_num_threads(threads)
     _log.info("%s", into)
-    return Run(into)
+    theirs = config.rasterizer[TARGET]
+    return Run(into, None if theirs == BY_NAME else theirs)

@@ -93,7 +93,8 @@ def parser_of(command: str, description: str, *, run: bool = True) -> argparse.A
         parser.add_argument(
             "run", type=Path, metavar="RUN", help="a run's folder, one of its checkpoints, or a PLY file"
         )
-        parser.add_argument("--rasterizer", metavar="NAME", help="cpp, torch, warp or gsplat (default: the run's own)")
+        which = "cpp, torch, warp, gsplat, or another package's class by its dotted name (default: the run's own)"
+        parser.add_argument("--rasterizer", metavar="NAME", help=which)
     parser.add_argument("-v", "--verbose", action="store_true", help="say more")
     return parser
 

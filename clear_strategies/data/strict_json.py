@@ -1,9 +1,12 @@
-"""JSON files, checked against msgspec types, which ignore keys that they do not have: `typed(path, read_object(path), Run)`."""
+"""JSON files, checked against msgspec types, which ignore keys that they do not have: `typed(path, read_object(path), Run)`.
+
+A file is data: a configuration that is read from one passes `plain_settings`, and nothing that it names is imported or called.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
@@ -54,3 +57,23 @@ def typed(
         parts = (where, place.strip("`."), missing[1] if missing else "")
         rule = "is missing" if missing else problem.replace("Expected", "must be")
         raise DataError(path, ".".join(filter(None, parts)).replace(".[", "[") or "json", rule, remedy) from error
+
+
+def plain_settings(path: Path, config: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration of a run as its files hold it: numbers, text, true, false, null and lists of these, by dotted keys.
+
+    A table is refused, since `clear_strategies.settings.build` would call what its `_target_` names. Who builds an object of
+    these values chooses the class from what is installed here, or from the user's own command, and never from the file.
+
+    Raises:
+        DataError: a value is or holds a table.
+    """
+    for key, value in config.items():
+        if not _is_plain(value):
+            problem = "must be a number, text, true, false, null or a list of these, and holds a table, which could name a call"
+            raise DataError(path, f"config.{key}", problem, "this program writes no such file: do not use it")
+    return dict(config)
+
+
+def _is_plain(value: Any) -> bool:
+    return all(map(_is_plain, value)) if isinstance(value, list) else not isinstance(value, dict)

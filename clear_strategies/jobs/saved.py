@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies.compose import options
 from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.errors import DataError, SettingError
@@ -33,6 +34,8 @@ _log = logging.getLogger(__name__)
 PLY: Final = "point_cloud.ply"
 _FAR: Final = 2.5  # radii of the scene, distance of the camera for a PLY file without cameras
 _SIZE: Final = (1280, 720)  # px, of that camera
+_OF_RASTERIZER: Final = "rasterizer."
+_SHARED: Final = ("kernel", "antialiased", "background")  # settings that mean the same for every rasterizer
 _DEPTH: Final = 3  # cameras.json lies at most so many folders above a PLY file
 
 
@@ -69,7 +72,8 @@ def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
     """Open a run's folder, one of its checkpoints, or a PLY file.
 
     Args:
-        rasterizer: by name; None: the one that the run trained with, or else the fastest here.
+        rasterizer: by name, or by the dotted name of another package's class; None: the one that the run trained with, if it is
+            known here (see `_drawing`), or else the fastest.
     """
     folder, above = folder_of(path), 0
     is_ply = path.is_file() and path.suffix != checkpoint.SUFFIX
@@ -77,9 +81,10 @@ def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
         saved = checkpoint.load(path)
         field, source, name = _field_of(saved, path), f"{folder}, {saved.t - 1} iterations", folder.name
         settings = {
-            key.removeprefix("rasterizer."): value
+            key.removeprefix(_OF_RASTERIZER): value
             for key, value in saved.config.items()
-            if key.startswith("rasterizer.") and value is not None  # the default, also of a field of an earlier version
+            if key.startswith(_OF_RASTERIZER)
+            and value is not None  # the default, also of a field of an earlier version
         }
     else:
         ply = path if is_ply else _ply_in(folder, path)
@@ -136,17 +141,34 @@ def _ply_in(folder: Path, path: Path) -> Path:
     return ply
 
 
-def _drawing(settings: Mapping[str, Any], name: str | None) -> ReadyRasterizer:
-    """The rasterizer with the settings of a run, or of the name that was asked for."""
-    defaults = with_defaults({TARGET: device.BY_NAME})
+def _drawing(settings: Mapping[str, Any], name: str | None) -> Drawing:
+    """The rasterizer with the settings of a run, or the one that was asked for.
+
+    The class is one of this repository, one that the configuration of an installed package names, or the one that was asked for:
+    a file gives arguments, and never what is called with them.
+
+    Args:
+        settings: what a checkpoint holds, so plain values.
+    """
+    target, shared = settings.get(TARGET, device.BY_NAME), {key: settings[key] for key in _SHARED if key in settings}
+    own = {key: value for key, value in settings.items() if not key.startswith("_")}
     if name is not None:
-        shared = {key: settings[key] for key in ("kernel", "antialiased", "background") if key in settings}
-        return device.drawing(build({**defaults, **shared, "name": name}, "rasterizer"), None)
+        named = {TARGET: name} if "." in name else {TARGET: device.BY_NAME, "name": name}
+        return _made({**(own if named[TARGET] == target != device.BY_NAME else shared), **named})
     try:
-        return device.drawing(build(device.rasterizer_node({**defaults, **settings}), "rasterizer"), None)
+        if target != device.BY_NAME and target not in [node.get(TARGET) for node in options("rasterizer").values()]:
+            rule = f"{target} is a class that only the file names, and a file never says what is imported"
+            raise SettingError(
+                f"{_OF_RASTERIZER}{TARGET}: {rule}. If you trust it, --rasterizer {target} draws with it."
+            )
+        return _made({**own, TARGET: target})
     except SettingError as error:
         _log.warning("%s The fastest rasterizer of this machine draws instead.", error)
-        return device.drawing(build(defaults, "rasterizer"), None)
+        return _made({**shared, TARGET: device.BY_NAME})
+
+
+def _made(node: Mapping[str, Any]) -> Drawing:
+    return device.drawing(build(device.rasterizer_node(with_defaults(node)), "rasterizer"), None)
 
 
 def _cameras_near(folder: Path, above: int) -> list[SavedCamera]:

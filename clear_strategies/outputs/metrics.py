@@ -35,7 +35,7 @@ from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
 from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
-from clear_strategies.data.strict_json import Count, Positive, read_object, typed
+from clear_strategies.data.strict_json import Count, Positive, plain_settings, read_object, typed
 from clear_strategies.outputs.figures import spaced
 from clear_strategies.outputs.image_scores import ImageScores, Truth, mean_scores
 from rasterizers.interface import Camera
@@ -102,7 +102,9 @@ class Metrics(msgspec.Struct):
 
 def read(path: Path, remedy: str) -> Metrics:
     """The content of metrics.json."""
-    return typed(path, read_object(path), Metrics, remedy=remedy)
+    content = typed(path, read_object(path), Metrics, remedy=remedy)
+    content.config = plain_settings(path, content.config)
+    return content
 
 
 def as_float(value: float | None) -> float:

@@ -22,6 +22,7 @@ from safetensors.torch import load as tensors_of
 from safetensors.torch import save as serialized
 from torch import Tensor
 
+from clear_strategies.data.strict_json import plain_settings
 from clear_strategies.errors import DataError
 from clear_strategies.files import flush, read_bytes, write_bytes
 
@@ -52,7 +53,7 @@ class Checkpoint:
     """What a run needs to continue.
 
     Args:
-        t: the next iteration. config: the run's composed configuration, to refuse another one on resume.
+        t: the next iteration. config: the run's composed configuration, to refuse another one on resume; see `plain_settings`.
         facts: small numbers (Adam's step count, the active SH degree …). history: one row per iteration.
         work_log: `WorkLog.state_dict` until then.
         device: "cpu" or "cuda", where the run was; tensors are saved from and loaded to the CPU.
@@ -116,13 +117,14 @@ def load(path: Path) -> Checkpoint:
         if metadata.get("sha256") != _seal(metadata["stated"], tensors):
             raise DataError(file, "sha256", "is not that of the content: the file was altered", _USE_ANOTHER)
         stated = msgspec.json.decode(metadata["stated"], type=_Stated)
+        config = plain_settings(file, stated.config)
         rows = [zip(stated.columns, row, strict=True) for row in tensors.pop(_HISTORY).tolist()]
         history = [{name: x for name, x in row if not math.isnan(x)} for row in rows]
     except (SafetensorError, msgspec.MsgspecError, KeyError, TypeError, ValueError, RecursionError) as error:
         if isinstance(error, DataError):
             raise
         raise DataError(file, "file", f"is no whole checkpoint ({error})", _USE_ANOTHER) from error
-    return Checkpoint(stated.t, tensors, stated.config, stated.facts, history, stated.work_log, stated.device)
+    return Checkpoint(stated.t, tensors, config, stated.facts, history, stated.work_log, stated.device)
 
 
 def _seal(text: str, tensors: Mapping[str, Tensor]) -> str:

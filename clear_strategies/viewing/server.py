@@ -1,5 +1,9 @@
 """The viewer in the browser: viser's page and nerfview's controls, and pictures drawn by the rasterizer of the run.
 
+nerfview ends the process on an error in a thread that draws, and part of it runs in the thread that trains; viser checks nothing
+of what a browser sends. So its camera (`get_camera_state`), its sizes (`_Sizes`), and errors of drawing and updates are dealt
+with here: the browser gets the picture from its last camera, or a black one, and the log gets one line.
+
 Heavy: it imports viser and nerfview, and is itself imported only once a viewer opens.
 """
 
@@ -9,19 +13,24 @@ import contextlib
 import io
 import logging
 import math
+import threading
 import time
+import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
+from weakref import WeakKeyDictionary
 
 import nerfview
 import numpy as np
 import torch
 import viser
 from jaxtyping import Float
+from nerfview._renderer import InterruptRenderException, Renderer
 
 from clear_strategies.core.images import to_bytes
+from clear_strategies.errors import one_line
 from clear_strategies.geometry.cameras import looked_at
 from clear_strategies.viewing.look import Painter, Pixels, colored, depth_range
 from rasterizers.interface import Camera
@@ -29,8 +38,22 @@ from rasterizers.interface import Camera
 _log = logging.getLogger(__name__)
 
 _SIZE: Final = 1024  # px, longest edge of a picture at first
+_SIZES: Final = {"viewer_res": (64, 2048), "render_width": (1, 4096), "render_height": (1, 4096)}  # px, least and most
+_BLACK: Final = np.zeros((2, 2, 3), np.uint8)  # a page stretches any picture over itself
+_FOV: Final = (1e-3, 3.1)  # radians
+_ASPECT: Final = (1 / 25, 25.0)  # width by height: beyond, nerfview asks for pictures without pixels
+_FARTHEST: Final = 1e9  # world units, of a camera from the origin
 _PATIENCE: Final = 0.02  # seconds between looks at the button while the run is paused
+_PICTURE: Final = 30.0  # seconds that the last picture may take once the viewer closes
 _TURN: Final = 0.002  # seconds that the lock is free after an iteration, so that a thread that waits for it gets it
+
+
+class _Sizes(nerfview.RenderTabState):  # type: ignore[misc]
+    """nerfview's state of the panel, with sizes that can be drawn: a slider's range binds the page alone."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        least, most = _SIZES.get(name, (None, None))
+        super().__setattr__(name, value if least is None or most is None else min(max(value, least), most))
 
 
 class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no types
@@ -45,7 +68,8 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         self, painter: Painter, cameras: Sequence[Camera], *, title: str, port: int = 8080, host: str = "127.0.0.1",
         out: Path | None = None, mode: Literal["rendering", "training"] = "rendering",
     ) -> None:  # fmt: skip
-        self._painter, self._failed = painter, ""
+        self._painter, self._told = painter, set[tuple[str, int]]()
+        self._drawable = WeakKeyDictionary[Any, Any]()  # the last camera of each browser
         # A browser that goes away while its picture is drawn.
         warnings.filterwarnings("ignore", message=".*it will never be delivered")
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its address; whoever opens it does
@@ -60,10 +84,33 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         """Where a browser finds it."""
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
+    def get_camera_state(self, client: Any) -> Any:
+        """The camera of a browser; where it sends what cannot be drawn, the last one that could, or else any."""
+        try:
+            state = super().get_camera_state(client)
+            _require_drawable(state)
+        except Exception as error:  # whatever viser and numpy make of it
+            self._tell(error)
+            return self._drawable.get(client, nerfview.CameraState(fov=1.0, aspect=1.0, c2w=np.eye(4)))
+        self._drawable[client] = state
+        return state
+
+    def update(self, step: int, num_train_rays_per_step: int) -> None:
+        """nerfview's, in the thread that trains: an error of a browser, such as one that leaves meanwhile, is logged."""
+        try:
+            super().update(step, num_train_rays_per_step)
+        except Exception as error:
+            self._tell(error)
+
     def close(self) -> None:
-        """Stop serving."""
+        """Stop serving and drawing: a thread that still drew when the process ends would abort it."""
+        drawing = [thread for thread in threading.enumerate() if isinstance(thread, Renderer) and thread.viewer is self]
+        for thread in drawing:
+            thread.running = False
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
+        for thread in drawing:
+            thread.join(_PICTURE)
 
     def draw(self, pose: Float[np.ndarray, "4 4"], fov: float, size: tuple[int, int]) -> Pixels:
         """The picture of `size` (width, height) pixels.
@@ -79,6 +126,10 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         depth = self._painter.depth(camera)
         return colored(depth, *depth_range(depth))
 
+    def _init_rendering_tab(self) -> None:
+        super()._init_rendering_tab()
+        self.render_tab_state = _Sizes()
+
     def _populate_rendering_tab(self) -> None:
         self._depth = self.server.gui.add_checkbox("Depth", False, order=0)
         self._depth.on_update(self.rerender)
@@ -91,11 +142,18 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         size = (tab.render_width, tab.render_height) if tab.preview_render else (tab.viewer_width, tab.viewer_height)
         try:
             return self.draw(state.c2w, state.fov, size)
-        except (RuntimeError, ValueError) as error:
-            if str(error) != self._failed:  # once, not in every frame
-                self._failed = str(error)
-                _log.warning("the viewer could not draw: %s", error)
-            return np.zeros((size[1], size[0], 3), np.uint8)
+        except InterruptRenderException:  # by which nerfview itself stops a picture that nobody waits for any more
+            raise
+        except Exception as error:  # of memory, of anyone's rasterizer
+            self._tell(error)
+            return _BLACK
+
+    def _tell(self, error: Exception) -> None:
+        """Log an error, once for each line of code that raises it: it would come again in every frame."""
+        *_, (frame, line) = traceback.walk_tb(error.__traceback__)
+        if (place := (frame.f_code.co_filename, line)) not in self._told:
+            self._told.add(place)
+            _log.warning("the viewer could not draw: %s: %s", type(error).__name__, one_line(error))
 
 
 @contextlib.contextmanager
@@ -107,13 +165,13 @@ def watched(painter: Painter, cameras: Sequence[Camera], title: str) -> Iterator
     """
     viewer = SplatViewer(painter, cameras, title=title, mode="training")
     _log.info("look while it trains: %s", viewer.address)
-    viewer.lock.acquire()
-    began = time.monotonic()
+    held, began = viewer.lock.acquire(), time.monotonic()
 
     def after_step(iteration: int) -> None:
-        nonlocal began
+        nonlocal held, began
         # nerfview shares the time between both by the pixels of each a second: an iteration counts as one.
         viewer.render_tab_state.num_train_rays_per_sec = 1 / max(time.monotonic() - began, 1e-9)
+        held = False
         viewer.lock.release()
         try:
             viewer.update(iteration, 1)
@@ -122,14 +180,24 @@ def watched(painter: Painter, cameras: Sequence[Camera], title: str) -> Iterator
             while viewer.state == "paused":
                 time.sleep(_PATIENCE)
         finally:
-            viewer.lock.acquire()
+            held = viewer.lock.acquire()
         began = time.monotonic()
 
     try:
         yield after_step
     finally:
-        viewer.lock.release()
+        if held:  # else Ctrl-C came while it waited for a picture
+            viewer.lock.release()
         viewer.close()
+
+
+def _require_drawable(state: Any) -> None:
+    """Raise a ValueError for a camera that no rasterizer should be asked to draw; NaN fails every comparison."""
+    turned = abs(float(np.linalg.det(state.c2w[:3, :3])) - 1) < 1e-3 and float(np.abs(state.c2w).max()) < _FARTHEST
+    if not (turned and _FOV[0] <= state.fov <= _FOV[1] and _ASPECT[0] <= state.aspect <= _ASPECT[1]):
+        rule = f"a fov in {_FOV} rad, a width by height in {_ASPECT}, a rotation, and a position within {_FARTHEST:g}"
+        got = f"{state.fov}, {state.aspect} and {state.c2w[:3].tolist()}"
+        raise ValueError(f"a browser's camera must have {rule}, got {got}. Its last camera stays.")
 
 
 def _aim(server: viser.ViserServer, cameras: Sequence[Camera]) -> None:

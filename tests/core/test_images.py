@@ -44,6 +44,17 @@ def test_back_projection_moves_an_image_until_it_shrinks_to_the_photo(down):
     assert torch.equal(images.back_projected(sr, lr, 4, 3, down, where=left)[:, 40:], sr[:, 40:])
 
 
+def test_agreement_is_four_fifths_at_the_median_difference_and_a_half_at_twice_the_median():
+    target = torch.full((24, 24, 3), 0.4)
+    image = target + 0.1
+    image[:8, :8] += 0.1
+    weight = images.agreement(image, target)
+    torch.testing.assert_close(weight[12:, 12:], torch.full((12, 12, 1), 1 / (1 + 0.5**2)))
+    torch.testing.assert_close(
+        weight[:6, :6], torch.full((6, 6, 1), 1 / (1 + 1**2))
+    )  # of which all 5 x 5 pixels differ so
+
+
 # ---- photos before another background; the depth map of a photo at a smaller size
 def test_a_reduced_depth_map_holds_medians_of_what_is_known_and_a_completed_one_changes_nothing_known():
     depth = torch.full((4, 6), torch.nan)

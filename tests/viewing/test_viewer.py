@@ -1,12 +1,15 @@
 """What a painter shows is what the metrics see; the viewer draws what its panel asks for, and changes nothing of a run."""
 
+import itertools
 import math
 import threading
 import time
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from urllib.request import urlopen
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -128,6 +131,180 @@ def test_a_viewer_is_there_while_a_run_trains_and_draws_between_two_iterations_a
         assert time.monotonic() - began > 0.25
     with pytest.raises(OSError, match="refused"):
         urlopen(viewers[0].address, timeout=20)  # noqa: S310
+
+
+class Browser:
+    """Speaks viser's protocol with the viewer of a run that trains, as its page does, and keeps the pictures that it is sent."""
+
+    def __init__(self, viewer, after_step) -> None:
+        self.viewer, self.after_step, self.pictures, self.steps = viewer, after_step, [], itertools.count(10)
+        viser, connect = import_module("viser"), import_module("websockets.sync.client").connect
+        self.socket = connect(
+            f"ws{viewer.address[4:]}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None, close_timeout=0.1
+        )
+        viewer.render_tab_state.viewer_res = 64
+        self.camera()
+        self.train_until(viewer.server.get_clients)
+        (client,) = viewer.server.get_clients().values()
+        client.scene.set_background_image = lambda image, **_: self.pictures.append(image)
+
+    def send(self, kind: str, **fields) -> None:
+        self.socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
+
+    def camera(self, **fields) -> None:
+        of_page = {"wxyz": (1, 0, 0, 0), "position": (0, 0, -3), "fov": 1.0, "near": 0.1, "far": 100.0, "image_height": 40,
+                   "image_width": 60, "look_at": (0, 0, 0), "up_direction": (0, -1, 0)}  # fmt: skip
+        self.send("ViewerCameraMessage", **{**of_page, **fields})
+
+    def slide(self, handle, value) -> None:
+        self.send("GuiUpdateMessage", uuid=handle._impl.uuid, updates={"value": value})
+
+    def train_until(self, condition, seconds: float = 20) -> None:
+        began = time.monotonic()
+        while not condition():
+            assert time.monotonic() < began + seconds, "the viewer has stopped"
+            self.after_step(next(self.steps))
+            time.sleep(0.005)
+
+    def sees(self, **camera) -> np.ndarray:
+        """The picture from a camera."""
+        for _ in range(2):  # the first may have been under way
+            self.pictures.clear()
+            self.camera(**camera)
+            self.train_until(lambda: self.pictures)
+        return self.pictures[-1]
+
+
+@pytest.fixture
+def browser(saved_run, monkeypatch):
+    server = pytest.importorskip(SERVER, exc_type=ImportError)
+    viewers, splat = [], open_splat(saved_run[0])
+
+    def refuse(code: int) -> None:  # in nerfview's thread, which then ends alone
+        viewers[0].ended = True
+        raise SystemExit(code)
+
+    monkeypatch.setattr("nerfview._renderer.os._exit", refuse)
+    opened = server.SplatViewer
+    monkeypatch.setattr(server, "SplatViewer", lambda *a, **k: viewers.append(opened(*a, **k)) or viewers[0])
+    with server.watched(splat.painter, splat.poses(), "toy") as after_step:
+        browser = Browser(viewers[0], after_step)
+        yield browser
+        browser.socket.close()
+    assert not hasattr(viewers[0], "ended"), "nerfview has ended the process"
+    assert not [t for t in threading.enumerate() if isinstance(t, server.Renderer)], "it still draws"
+
+
+NO_CAMERA = {
+    "fov": [0, -1.0, math.nan, math.inf, 1e-12, math.pi, 7],
+    "image_width": [0, -60, 10**12],
+    "image_height": [0, -40, 10**12],
+    "wxyz": [(0, 0, 0, 0), (math.nan,) * 4, (1e300, 0, 0, 1)],
+    "position": [(math.nan, 0, 0), (0, 0, math.inf), (0, 0, 1e300)],
+    "look_at": [(math.nan,) * 3], "up_direction": [(0, 0, 0)], "near": [math.nan], "far": [-1.0],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("field", NO_CAMERA)
+def test_a_training_and_its_viewer_go_on_whatever_camera_a_browser_sends(field, browser, caplog):
+    for value in NO_CAMERA[field]:
+        browser.sees(**{field: value})
+    assert caplog.text.count("a browser's camera must have") <= 1
+    assert browser.sees().std() > 0
+
+
+def test_a_message_that_is_none_loses_its_browser_the_connection_and_the_training_nothing(browser):
+    browser.camera(fov="wide")
+    browser.train_until(lambda: not browser.viewer.server.get_clients())
+    other = Browser(browser.viewer, browser.after_step)
+    assert other.sees().any()
+    other.socket.close()
+
+
+def test_a_browser_of_which_no_camera_is_known_sees_a_picture_too(browser):
+    browser.viewer._drawable.clear()
+    assert browser.sees(fov=0).any()
+
+
+@pytest.mark.parametrize(
+    ("handle", "values"),
+    [
+        ("viewer_res_slider", [0, -5, 10**9, "many"]),
+        ("render_res_vec2", [(0, 0), (-5, 10), (10**9, 10**9), (math.nan, 1)]),
+        ("fov_degrees_slider", [0, 360, math.nan]),
+        ("train_util_slider", [1.0, 2.0, -1.0, math.nan]),
+    ],
+)
+def test_a_training_and_its_viewer_go_on_whatever_a_slider_is_set_to(handle, values, browser, monkeypatch):
+    viewer = browser.viewer
+    for size in ("viewer_res", "render_width", "render_height"):
+        monkeypatch.setitem(import_module(SERVER)._SIZES, size, (64, 128))
+        setattr(viewer.render_tab_state, size, 128)
+    slider = (viewer._rendering_tab_handles | viewer._training_tab_handles)[handle]
+    viewer._painter.color = lambda camera: torch.rand(camera.height, camera.width, 3)
+    for preview in (False, True):
+        viewer.render_tab_state.preview_render = preview
+        for value in values:
+            browser.slide(slider, value)
+            assert max(browser.sees().shape[:2]) <= 128
+
+
+@pytest.mark.parametrize("error", [MemoryError, TypeError, KeyError, RuntimeError, ZeroDivisionError, AssertionError])
+def test_an_error_of_the_rasterizer_is_one_line_and_a_black_picture(error, browser, monkeypatch, caplog):
+    def fail(camera):
+        raise error("is\nbroken")
+
+    monkeypatch.setattr(browser.viewer._painter, "color", fail)
+    for _ in range(2):
+        assert not browser.sees().any()
+    (line,) = [record.getMessage() for record in caplog.records if "the viewer could not draw" in record.message]
+    assert line.startswith(f"the viewer could not draw: {error.__name__}: ")
+    assert "\n" not in line
+    monkeypatch.undo()
+    assert browser.sees().any()
+
+
+def test_a_picture_that_nerfview_stops_is_drawn_again_and_is_no_error(browser, monkeypatch, caplog):
+    stopped, color = [], browser.viewer._painter.color
+
+    def stop_once(camera):
+        if not stopped:
+            stopped.append(True)
+            raise import_module(SERVER).InterruptRenderException
+        return color(camera)
+
+    monkeypatch.setattr(browser.viewer._painter, "color", stop_once)
+    assert browser.sees().any()
+    assert stopped
+    assert "could not draw" not in caplog.text
+
+
+def test_a_training_goes_on_where_a_browser_leaves_while_it_is_updated(browser, monkeypatch, caplog):
+    viewer = browser.viewer
+    with monkeypatch.context() as patched:
+        patched.setattr(viewer, "_renderers", {"gone": None})  # viser still lists the browser
+        for step in (10**6, 2 * 10**6):
+            viewer.update(step, 1)
+    assert caplog.text.count("the viewer could not draw: KeyError") == 1
+    assert browser.sees().any()
+
+
+def test_ctrl_c_while_a_training_waits_for_a_picture_is_not_hidden_by_an_error_of_the_viewer(saved_run, monkeypatch):
+    server, splat = pytest.importorskip(SERVER, exc_type=ImportError), open_splat(saved_run[0])
+    lock = threading.Lock()
+
+    class Interrupted:
+        release = lock.release
+
+        def acquire(self) -> bool:
+            if hasattr(self, "drawing"):
+                raise KeyboardInterrupt
+            self.drawing = True
+            return lock.acquire()
+
+    monkeypatch.setattr("nerfview.viewer.VIEWER_LOCK", Interrupted())
+    with pytest.raises(KeyboardInterrupt), server.watched(splat.painter, splat.poses(), "toy") as after_step:
+        after_step(1)
 
 
 SMALL = [*TINY, "fit.probe_every=5000", "fit.threads=1", "prior=bicubic", "+strategy=gco"]

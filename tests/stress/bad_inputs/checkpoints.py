@@ -75,6 +75,11 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "altered t": (_rewritten(lambda data: data.replace(b'\\"t\\":100', b'\\"t\\":999')), "sha256: .* was altered"),
     "altered setting": (_rewritten(lambda data: data.replace(b'seed\\":1', b'seed\\":2')), "sha256: .* was altered"),
     "altered number": (_rewritten(lambda data: data.replace(struct.pack("<f", 1), struct.pack("<f", 2))), "was altered"),
+    "the same numbers in another shape": (_rewritten(lambda data: data.replace(b"[5,3]", b"[3,5]")), "sha256: .* was altered"),
+    "a table among the settings": (
+        _stated('{"t":1,"config":{"a.b":[{"_target_":"os.abort"}]},"facts":{},"work_log":{},"device":"cpu","columns":[]}'),
+        r"config\.a\.b: must be a number, text, true, false, null or a list of these",
+    ),
     "format of a later version": (_stated(format="99"), "format: is '99', this version reads '4'"),
     "no seal": (_stated(sealed=False, sha256=""), "sha256: .* was altered"),
     "stated is no JSON": (_stated("{"), "is no whole checkpoint"),
