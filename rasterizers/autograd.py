@@ -152,7 +152,8 @@ def _shown(rasterizer: Rasterizer, splats: Splats, camera: Camera) -> tuple[Any,
 def drawing_ahead(viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, height: int) -> Iterator[None]:
     """The first drawing inside from this pose brings along the one of the same splats by K and without `rgb_offset`.
 
-    A later drawing inside of just that takes it: the two share projection, colour and depth order. It is forgotten with the block.
+    A later drawing inside of just that takes it: the two share projection, colour and depth order. It is forgotten with the
+    block.
     """
     (fx, _, cx), (_, fy, cy), _ = K.tolist()
     _ahead.wanted, _ahead.kept = Camera(viewmat.detach(), fx, fy, cx, cy, width, height), None
@@ -312,10 +313,14 @@ class _Draw(torch.autograd.Function):
         if take_colours is not None:
             take_colours(rgb, basis)
         elif ctx.needs_input_grad[8]:
-            colors = basis[..., None] * rgb[:, None]
-            if inactive := inputs.colors.shape[1] - bands:
-                colors = torch.nn.functional.pad(colors, (0, 0, 0, inactive))
+            colors = outer(rgb, basis, inputs.colors.shape[1])
         return None, None, None, screen, *geometry, colors, None if inputs.rgb_offset is None else rgb
+
+
+def outer(rgb: Float[Tensor, "N 3"], basis: Float[Tensor, "N B1"], bands: int) -> Float[Tensor, "N K 3"]:
+    """The gradient of the colours from its factors, Y ⊗ ∇rgb, for as many bands; those that were not drawn have gradient 0."""
+    drawn = basis[..., None] * rgb[:, None]
+    return drawn if bands == basis.shape[1] else torch.nn.functional.pad(drawn, (0, 0, 0, bands - basis.shape[1]))
 
 
 @uncompiled

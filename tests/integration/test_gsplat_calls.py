@@ -132,7 +132,7 @@ def test_the_gradient_of_the_colours_comes_by_its_factors_but_where_a_hook_looks
             host.splats["shN"].register_hook(seen.append)
         for i in range(2):  # the second with gradients of the first, which are not zeroed
             (render(i).mean() + penalty * host.splats["shN"].square().sum()).backward()
-        assert len(seen) == (2 if hooked else 0)
+        assert len(seen) == (4 if hooked else 0)  # of LR and of HR
         merged.append({name: p.grad for name, p in host.splats.items() if p.grad is not None})
     assert by_factors == [True, True, False, False]
     assert all(torch.allclose(g, merged[1][name], rtol=1e-5, atol=1e-9) for name, g in merged[0].items())

@@ -93,13 +93,15 @@ def test_a_densifier_that_forgets_a_parameter_is_an_error():
 
 def test_the_state_of_gsplat_1_4_carries_the_rows_and_must_know_their_origin():
     state, recorder = {}, toy.Recorder()
-    host, _, render = gsplat_host.started(recorder, state=state)
+    host, _, render = gsplat_host.started(recorder, SplatSuRe(), state=state)
     assert ROWS not in host.splats
     for name, p in host.splats.items():
         host.splats[name] = torch.nn.Parameter(p.detach()[1:])
     state[ROWS] = state[ROWS][1:]
     render()
     assert torch.equal(recorder.changes[0], torch.arange(1, 20))
+    for i in range(3):  # until something is stored of each Gaussian
+        render(i).mean().backward()
     state[ROWS] = torch.zeros_like(state[ROWS])
     with pytest.raises(HostError, match="does not say where relocated Gaussians come from"):
         render()
