@@ -180,9 +180,9 @@ class AutogradShot:
         raw = {name: p for name, p in self.params.items() if p.requires_grad and name != "detail"}
         direct = {name: g[name] for name, p in raw.items() if drawn.get(name) is p and not is_hooked(p)}
         graph = {name: x for name, x in drawn.items() if name in g and name not in direct and x.requires_grad}
-        if not graph:
-            return direct, colour
         rest = {name: p for name, p in raw.items() if colour is None or name not in ("sh0", "shN")}
+        if not graph or not rest:
+            return direct, colour
         through = torch.autograd.grad(
             list(graph.values()), list(rest.values()), [g[name] for name in graph], retain_graph=True, allow_unused=True
         )

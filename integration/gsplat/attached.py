@@ -41,8 +41,8 @@ class Attached:
 
     Args:
         params: gsplat's dict of leaves.
-        optimizers: a dict with one for each of them, or of which some step the Gaussians, which may be made anew in it; or one for
-            all.
+        optimizers: a dict with one for each of them, or of which some step the Gaussians; they may be made anew in it. Or one
+            for all.
         views: all training views. A rendering is that of the view named by `rendering`, else of the one with its pose.
         strategy: gsplat's densification strategy, whose threshold scales P2G's score; None: a loop without one.
         state: where changes of structure are recorded, in place of `params`: the state of gsplat 1.4's strategy, or `signal` of
