@@ -273,7 +273,11 @@ class Attachment:
                 "Check that the training loop renders with the function that was replaced, and with the cameras that were "
                 "passed.",
             )
-        if not pending.output.shot.image.requires_grad:
+        shot = pending.output.shot
+        if (
+            not any(x.requires_grad for drawing in shot.drawings for x in drawing.inputs.values())
+            and not pending.output.marks
+        ):
             return (
                 f"the rendering of {pending.view} does not depend on {', '.join(trained)}",
                 "Pass the function tensors that are made of the parameters, with gradients enabled and not detached.",
@@ -331,9 +335,9 @@ class Attachment:
             self._pass = now = BackwardPass(current_pass(), self.params())
             torch.autograd.Variable._execution_engine.queue_callback(lambda: self._on_backward_end(now))
         self._pass.renderings.add(nth)
-        if nth != self._pending.nth or not self._merge_in_place.takes_factors(self._pass.params):
-            return None
-        return self._pass.take if self._pending.may_take_factors(self._pass.params) else None
+        params = self._pass.params
+        whole = not (self._merge_in_place.takes_factors(params) and self._pending.may_take_factors(params))
+        return None if whole else self._pass.take
 
     @torch.no_grad()
     def _on_backward_end(self, done: BackwardPass) -> None:

@@ -96,7 +96,8 @@ class AutogradShot:
         visible: Gaussians that contribute to the image.
         params: raw parameters by gsplat's names. A parameter that the image does not depend on has gradient 0.
         slot: where the host keeps the screen gradient; None: the image is a function of `means2d` itself.
-        drawn: means, quats, scales, opacities and colors that the rasterizer was given; None: the raw parameters.
+        drawn: means, quats, scales, opacities and colors that the rasterizer was given, none of them with a hook; None: the raw
+            parameters.
         drawings: by this package's rasterizers, for this image; a single one takes all cotangents in one pass.
     """
 
@@ -170,14 +171,16 @@ class AutogradShot:
         self, g: Mapping[str, Tensor], basis: Float[Tensor, "N B1"] | None
     ) -> tuple[dict[str, Tensor], Colour | None]:
         """The second part: from what was drawn to the raw parameters without f_det; sh0 and shN as factors where `are_joined`."""
-        drawn, colour = dict(self.drawn or self.params), None
+        raw = {name: p for name, p in self.params.items() if p.requires_grad and name != "detail"}
+        if self.drawing is None and self.drawn is None:  # g is theirs, with what their hooks have done to it
+            return {name: g[name] for name in raw}, None
+        drawn, colour = dict(self.drawn or {}), None
         if self.drawing is not None and basis is not None:
             drawn = dict(self.drawing.inputs)
             if are_joined(drawn["colors"], self.params):
                 colour = Colour(g["rgb"], basis)
             else:
                 g = {**g, "colors": outer(g["rgb"], basis, drawn["colors"].shape[1])}
-        raw = {name: p for name, p in self.params.items() if p.requires_grad and name != "detail"}
         direct = {name: g[name] for name, p in raw.items() if drawn.get(name) is p and not is_hooked(p)}
         graph = {name: x for name, x in drawn.items() if name in g and name not in direct and x.requires_grad}
         rest = {name: p for name, p in raw.items() if colour is None or name not in ("sh0", "shN")}

@@ -262,8 +262,8 @@ class Attached:
                     f"{view.lr.camera.width}x{view.lr.camera.height} pixels. Train at one resolution (nerfstudio: "
                     "num_downscales=0)."
                 )
-        marks = () if self._is_ours or target != "lr" else _aliased(call)
-        return self._drawn(rasterization, call, params, gate, marks)
+        aliases = () if self._is_ours else _aliased(call)
+        return self._drawn(rasterization, call, params, gate, aliases if target == "lr" else ())
 
     def _gated(self, opacities: Float[Tensor, " N"], gate: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
         """Their product, made once for both scales."""
@@ -348,8 +348,8 @@ def require_bands(params: Mapping[str, Any] | torch.nn.ParameterDict) -> None:
 
 
 def _aliased(call: dict[str, Any]) -> tuple[Tensor, ...]:
-    """Put other tensors over the same memory in place of those of the call that require gradients; returns them. What the loop
-    does to its renderings cannot reach their hooks.
+    """Put other tensors over the same memory in place of those of the call that require gradients; returns them. They have none
+    of the loop's hooks, and what the loop does to its renderings cannot reach theirs.
     """
     aliases = {name: x.view_as(x) for name, x in call.items() if isinstance(x, Tensor) and x.requires_grad}
     call |= aliases

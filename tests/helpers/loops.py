@@ -198,6 +198,7 @@ class Running:
             self.splats, self.optimizers, scene().train, self.conductor, accumulation=loop.accumulation,
             loss_scale=None if loop.scale == 1 else lambda: loop.scale,
         )  # fmt: skip
+        self.splats["detail"].data += 0.2 * torch.randn(20, 3, generator=chance)
         self.function = self.clear.wrap(FUNCTIONS[loop.function])
 
     def separate(self):

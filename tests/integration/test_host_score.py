@@ -56,6 +56,16 @@ def test_as_many_pass_as_by_the_ordinary_statistic_and_in_the_scores_order(seed,
     assert set((scaled >= 5e-4).nonzero()[:, 0].tolist()) == set(score.argsort(descending=True)[:passing].tolist())
 
 
+def test_a_gaussian_counts_in_the_views_that_see_it():
+    """Half of all is above the threshold where it is seen, every other time: its mean is that of these views."""
+    scaler, half = ScoreScaler(threshold=1.0, half_life=1_000), torch.arange(8) < 4
+    ordinary, score = torch.where(half, 1.5, 0.5), torch.where(half, 0.4, 0.2)
+    for i in range(11):
+        hidden = half & (i % 2 == 1)
+        scaled = scaler(torch.where(hidden, 0.1, score), torch.where(hidden, 0.1, ordinary), ~hidden)
+    assert ((scaled >= 1) == half).all()
+
+
 def test_none_passes_without_a_score_and_absolute_gradients_decide_how_many_pass_with_one():
     scaled = ScoreScaler(threshold=1.0)(torch.rand(20) * 100, torch.rand(20) * 0.5, everyone(20))
     assert float(scaled.max()) < 1
