@@ -107,6 +107,23 @@ def test_the_state_of_gsplat_1_4_carries_the_rows_and_must_know_their_origin():
         render()
 
 
+@pytest.mark.parametrize("strategies", [(), (SplatSuRe(),)], ids=["nothing is stored", "something of each"])
+def test_gaussians_that_come_from_no_other_are_added_where_nothing_is_stored_of_each(strategies):
+    recorder = toy.Recorder()
+    host, _, render = gsplat_host.started(recorder, *strategies)
+    for i in range(3):
+        render(i).mean().backward()
+    for name, p in host.splats.items():  # as a loop adds rows to whatever it finds among its parameters
+        rows = torch.cat((p.detach(), torch.zeros_like(p[:2])))
+        host.splats[name] = torch.nn.Parameter(rows, requires_grad=p.requires_grad)
+    if strategies:
+        with pytest.raises(HostError, match=rf"2 new Gaussians come from no other, but SplatSuRe.*parameter {ROWS}"):
+            render()
+    else:
+        render().mean().backward()
+        assert recorder.changes[0].tolist() == [*range(20), 0, 0]
+
+
 def test_the_signals_of_a_scene_carry_the_rows_and_may_change_in_place():
     """A scene of gsplat 1.6 replaces them where Gaussians are added or removed, and writes into them where one is moved."""
     signal, recorder = {}, toy.Recorder()
