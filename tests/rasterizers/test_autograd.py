@@ -94,21 +94,21 @@ def ahead(view):
 
 def test_an_image_that_is_drawn_ahead_is_taken_inside_and_forgotten_with_the_block(together):
     view, splats = camera(40, 30), scene(60)
-    shown = replace(splats, rgb_offset=None)
-    expected = autograd.draw(ReferenceRasterizer(), shown, view).image
+    shown, colors = replace(splats, rgb_offset=None), torch.cat((splats.sh0, splats.shN), 1)
+    expected = autograd.draw(ReferenceRasterizer(), shown, view, colors=colors).image
     with ahead(view):
-        autograd.draw(ReferenceRasterizer(), splats, view.scaled(2))
+        autograd.draw(ReferenceRasterizer(), splats, view.scaled(2), colors=colors)
         assert together[-1] == 2
         # While it is kept its tensors live, so that no others at their addresses are taken for them.
         assert autograd._ahead.kept[2].means.data_ptr() == splats.means.data_ptr()
         drawn = len(together)
-        assert torch.equal(autograd.draw(ReferenceRasterizer(), shown, view).image, expected)
+        assert torch.equal(autograd.draw(ReferenceRasterizer(), shown, view, colors=colors).image, expected)
         assert len(together) == drawn
         assert autograd._ahead.kept is None
     with ahead(view):
-        autograd.draw(ReferenceRasterizer(), splats, view.scaled(2))
+        autograd.draw(ReferenceRasterizer(), splats, view.scaled(2), colors=colors)
     shown.means.data.add_(0.1)  # which torch does not count
-    assert not torch.equal(autograd.draw(ReferenceRasterizer(), shown, view).image, expected)
+    assert not torch.equal(autograd.draw(ReferenceRasterizer(), shown, view, colors=colors).image, expected)
 
 
 def test_other_poses_and_the_image_itself_bring_no_other_along(together):
