@@ -187,3 +187,15 @@ def test_a_loop_goes_back_to_a_checkpoint_with_another_number_of_gaussians():
     render(1).mean().backward()
     assert len(recorder.changes) == 1
     assert {rows.shape for rows in clear.attachment.conductor.state_dict().values()} == {(20,)}
+
+
+@pytest.mark.parametrize("last", [4, 5])
+def test_gaussians_that_a_host_adds_in_the_step_of_the_anchor_are_there_before_it_is_taken(last):
+    """As with DefaultStrategy's refine_stop_iter at half of the steps, where SVS's anchor is."""
+    host, clear, render = gsplat_host.started(SVS(anchor_start=5, anchor_strength=0.01))
+    for t in range(1, 7):
+        render(t % 3).mean().backward()
+        if t == last:
+            for name, p in host.splats.items():
+                host.splats[name] = torch.nn.Parameter(p.detach()[1:], requires_grad=p.requires_grad)
+    assert clear.attachment.conductor.state_dict()["SVS.means"].shape == (19, 3)

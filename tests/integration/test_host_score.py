@@ -183,10 +183,10 @@ def test_it_is_the_first_iteration_after_the_last_that_is_allowed(first, caplog)
     settings = SimpleNamespace(until=100)
     with caplog.at_level("INFO"):
         end_with_strategies(Conductor(Late(20, 60)), settings, "until", first)
-    assert settings.until == 59 + first
-    assert f"densification ends at until={59 + first} instead of 100 (Late)" in caplog.text
+    assert settings.until == 60 + first
+    assert f"densification ends at until={60 + first} instead of 100 (Late)" in caplog.text
     assert (
-        f"Late forbids densification at 19 of the iterations before {59 + first}, the first is {first}" in caplog.text
+        f"Late forbids densification at 20 of the iterations before {60 + first}, the first is {first}" in caplog.text
     )
 
 
@@ -203,8 +203,8 @@ def test_a_host_that_would_densify_after_the_anchor_is_refused_before_the_first_
     early = SVS(anchor_start=5, anchor_strength=0.01)
     if host == "gsplat":
         strategy = SimpleNamespace(refine_stop_iter=24, grow_grad2d=2e-4)
-        with pytest.raises(SettingError, match=r"before the anchor is taken, got 24. Set refine_stop_iter=4"):
+        with pytest.raises(SettingError, match=r"before the anchor is taken, got 24. Set refine_stop_iter=5"):
             gsplat_host.started(early, strategy=strategy)
     else:
-        with pytest.raises(SettingError, match=r"before the anchor is taken, got 24. Set densify_until_iter=5"):
+        with pytest.raises(SettingError, match=r"before the anchor is taken, got 24. Set densify_until_iter=6"):
             request.getfixturevalue("inria_attached")(early, densify_until=24)
