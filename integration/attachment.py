@@ -422,8 +422,8 @@ class Attachment:
         self._detail_gradients += 1
         if self._detail_gradients == _PATIENCE * self.accumulation and rates.rate > 0 and not bool(detail.any()):
             _log.warning(
-                "f_det has no effect: none of its first %d gradients was stepped on. Step the optimizer of the parameter detail; "
-                "attach adds it to the dictionary of optimizers.", _PATIENCE,
+                "f_det has no effect: none of its first %d gradients was stepped on. Step the optimizer of the parameter detail: "
+                "attach adds it to the optimizers that it is given, and one that is made anew must hold it, too.", _PATIENCE,
             )  # fmt: skip
 
 
@@ -449,7 +449,7 @@ def first_hr(conductor: Conductor) -> int | None:
 
 def _warn_without_hr(counts: Counter[str], first: int | None) -> None:
     """At the end of a loop."""
-    if first is not None and counts["merges"] and not counts["HR renders"]:
+    if first is not None and 0 < counts["merges"] < first and not counts["HR renders"]:
         _log.warning(
             "HR took no part in the %d steps of this loop: it would from step %d on. %s",
             counts["merges"],
