@@ -129,8 +129,9 @@ class _Ahead(threading.local):
         plain = replace(splats, rgb_offset=None)
         if splats.rgb_offset is None and _grid(camera) == _grid(wanted):  # it is this one
             return rasterizer(splats, camera)
-        ahead, rendering = rasterizer.render_scales([(plain, wanted), (splats, camera)])
-        self.kept = _shown(rasterizer, plain, wanted), ahead, plain
+        other = replace(wanted, world_to_camera=camera.world_to_camera)  # by the same tensor, as a backend sees at once
+        ahead, rendering = rasterizer.render_scales([(plain, other), (splats, camera)])
+        self.kept = _shown(rasterizer, plain, other), ahead, plain
         return rendering
 
 
