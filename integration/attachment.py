@@ -120,7 +120,8 @@ class Attachment:
         self._logged: dict[str, deferred.Number] = {}
         self._hooks: list[Any] = []
         self._hooked: list[torch.optim.Optimizer] = []
-        self._stepped: set[int] = set()  # the optimizers that have stepped since the last merge
+        self._stepped: set[int] = set()  # the optimizers that have made this step of the host
+        self._has_merged = False  # since the last step
         self._has_warned = False
         conductor.on_fit_start(len(views), seed, params()["means"].device, views)
         _announce(conductor, views, own_background=own_background, iterations=iterations)
@@ -190,6 +191,7 @@ class Attachment:
         for hook in self._hooks:
             hook.remove()
         self._hooked = distinct
+        self._stepped.clear()
         self._hooks = [
             *(o.register_step_pre_hook(lambda o, *_: self._before_step(o)) for o in distinct),
             *(o.register_step_post_hook(lambda o, *_: self._step_on_extra_views(o)) for o in distinct),
@@ -242,8 +244,14 @@ class Attachment:
                 "the host steps inside of its backward pass, where the gradients of the views are not merged yet. Step after "
                 "loss.backward() has returned, not in a hook of a gradient."
             )
-        if self.counts["merges"] and id(optimizer) not in self._stepped:  # one step of the host: each optimizer once
-            self._stepped.add(id(optimizer))
+        if id(optimizer) in self._stepped:  # one step of the host is each optimizer once
+            self._stepped.clear()
+        begins = not self._stepped
+        self._stepped.add(id(optimizer))
+        if not begins:
+            return
+        has_merged, self._has_merged = self._has_merged, False
+        if has_merged:
             return
         trained = [name for name, p in self.params().items() if p.requires_grad and name != "detail"]
         cause = self._why_nothing_was_merged(trained)
@@ -385,6 +393,7 @@ class Attachment:
         )  # fmt: skip
         pending.merged.update(names or ("detail",))
         self._stepped.clear()
+        self._has_merged = True
         self.counts["merges"] += 1
         if not first:
             return

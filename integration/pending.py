@@ -121,10 +121,9 @@ class Pending:
         if routed is None or wanted.issuperset(routed.grads.keys() | ({"sh0", "shN"} if routed.colour else set())):
             return routed
         grads = dict(routed.grads)
-        colour = routed.colour if wanted.issuperset(("sh0", "shN")) else None
-        if routed.colour is not None and colour is None:
+        if routed.colour is not None:
             grads |= dense({}, routed.colour, {name: params[name] for name in ("sh0", "shN")})
-        return replace(routed, grads={name: g for name, g in grads.items() if name in wanted}, colour=colour)
+        return replace(routed, grads={name: g for name, g in grads.items() if name in wanted}, colour=None)
 
     def require_alone(self, of: BackwardPass) -> None:
         """Raise a HostError for a pass that adds to parameters by another rendering, too."""

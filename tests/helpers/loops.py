@@ -72,6 +72,7 @@ BESIDE = {
     "opacities": lambda p, colors, alphas: 0.01 * p["opacities"].sigmoid().mean(),
     "scales": lambda p, colors, alphas: 0.01 * p["scales"].exp().mean(),
     "colours": lambda p, colors, alphas: 0.01 * colors.square().mean(),
+    "f_det": lambda p, colors, alphas: 0.01 * p["detail"].mean(),
     "alphas": lambda p, colors, alphas: 0.01 * alphas.square().mean(),
 }
 
@@ -170,6 +171,20 @@ def loop_of(seed: int) -> Loop:
     """Half of its parts are the ordinary ones."""
     chance = random.Random(seed)  # noqa: S311
     return Loop(**{name: chance.choice([*values]) for name, values in CHOICES.items() if chance.random() < 0.5})
+
+
+def ordinary_but_for_one():
+    """Each part once in a loop that is ordinary else."""
+    loops = [
+        Loop(frozen=names, frozen_from=step)
+        for names in dict.fromkeys(FROZEN)
+        for step in CHOICES["frozen_from"]
+        if names
+    ]
+    loops += [
+        Loop(**{name: value}) for name, values in CHOICES.items() for value in values if not name.startswith("frozen")
+    ]
+    return dict.fromkeys(loops)
 
 
 @functools.cache
@@ -319,8 +334,7 @@ def reference(loop: Loop, conductor, p, view):
     if loop.corrects and lr:
         merged = conductor.strategies[0].correct(lr, hr, Step(1, view))
     found = {name: scale * (g + merged[name]) for name, g in lr.items()}
-    if lr:
-        found["detail"] = scale * hf[-1]
+    found["detail"] = total(p["detail"].grad, scale * hf[-1] if lr else None)
     found |= {name: p[name].grad for name in ("offset", "gain", "shift")}
     return {name: total(before[name], found.get(name)) for name in p}, bool(lr)
 
@@ -334,5 +348,6 @@ def compare(p, expected):
         g = expected[name]
         assert (x.grad is None) == (g is None), f"{name}: .grad is {x.grad}, not {g}"
         if g is not None:
+            assert name not in PARAMETERS or not x.grad.requires_grad, f"{name}: .grad has a graph, of LR alone"
             error, size = float((x.grad.double() - g).abs().max()), float(g.abs().max())
             assert error <= 2e-3 * size + 1e-12, f"{name}: {error:.3g} of {size:.3g}"

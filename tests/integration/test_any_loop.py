@@ -1,4 +1,4 @@
-"""Whatever the loop: the gradient is right, or the step is refused and says why. Loops are put together of parts by chance."""
+"""Whatever the loop: the gradient is right, or the step is refused and says why. Loops are put together of parts."""
 
 from contextlib import nullcontext
 
@@ -6,15 +6,14 @@ import pytest
 
 from integration import HostError
 from tests.helpers.backends import needs
-from tests.helpers.loops import Running, loop_of
+from tests.helpers.loops import Loop, Running, loop_of, ordinary_but_for_one
 
 pytestmark = needs("cpp")
 STEPS = 2
 
 
-def require_right(seed: int, caplog) -> None:
-    """Each step of a loop has the gradient of plain autograd and Eq. 8, or the refusal that its parts are meant to have."""
-    loop = loop_of(seed)
+def require_right(loop: Loop, caplog) -> None:
+    """Each step has the gradient of plain autograd and Eq. 8, or the refusal that the loop's parts are meant to have."""
     running = Running(loop)
     with pytest.raises(HostError, match=loop.refusal()) if loop.refusal() else nullcontext():
         for number in range(STEPS):
@@ -30,14 +29,18 @@ def require_right(seed: int, caplog) -> None:
     running.clear.remove()
 
 
-@pytest.mark.parametrize("seed", range(60))
-def test_a_step_of_any_loop_has_the_merged_gradient_or_is_refused(seed, caplog):
-    require_right(seed, caplog)
+def differences(loop: Loop) -> str:
+    return ", ".join(f"{name}: {x}" for name, x in vars(loop).items() if x != getattr(Loop(), name)) or "ordinary"
+
+
+@pytest.mark.parametrize("loop", ordinary_but_for_one(), ids=differences)
+def test_a_loop_that_is_ordinary_but_for_one_part_has_the_merged_gradient_or_is_refused(loop, caplog):
+    require_right(loop, caplog)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("hundred", range(10))
-def test_a_thousand_loops(hundred, caplog):
+def test_a_thousand_loops_of_any_parts(hundred, caplog):
     for seed in range(100 * hundred, 100 * hundred + 100):
         caplog.clear()
-        require_right(1_000 + seed, caplog)
+        require_right(loop_of(seed), caplog)
