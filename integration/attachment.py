@@ -24,7 +24,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import Any, Final
-from weakref import WeakMethod
+from weakref import WeakMethod, finalize
 
 import torch
 from jaxtyping import Int
@@ -36,21 +36,20 @@ from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
 from clear_strategies.data.scene import require_shown
 from clear_strategies.errors import HostError, SettingError
-from clear_strategies.kernels.merge import Colour
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.merging.in_place import InPlaceMerge, RoutedGradients
-from clear_strategies.merging.iteration import HrGradients
+from clear_strategies.merging.in_place import InPlaceMerge
 from clear_strategies.strategies.base import overrides
-from clear_strategies.strategies.sr_stage import SRStage
-from integration.autograd_shot import AutogradShot, DrawnGradients, HostOutput, RenderAt, passes_to_parameters
+from integration.autograd_shot import AutogradShot, RenderAt
 from integration.densification import ScoreScaler, write_score
 from integration.extra_steps import ExtraSteps
+from integration.pending import BackwardPass, Pending, current_pass
 from integration.views import enlarged_mask, require_unique
-from rasterizers.autograd import Drawing
+from rasterizers.autograd import TakeColours
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 _LOGGED_EVERY: Final = 100  # merges between two lines of the log
+_STRETCH: Final = "Make the conductor for the length of the loop: conductor(…, iterations=…)."
 _PATIENCE: Final = 10  # steps with a gradient of f_det, before a warning that none was made on it
 
 
@@ -62,7 +61,9 @@ class Attachment:
             iteration, since densifiers replace parameters.
         views: all training views. seed: of the strategies.
         poll_parents: called at every iteration. It returns parents[M] if the structure has changed since its last call (row i of
-            every parameter now comes from row parents[i]); None: it has not, or the host does not say how.
+            every parameter now comes from row parents[i], or from none where that is -1); None: it has not, or the host does
+            not say how.
+        remedy: what to do in this host about Gaussians that come from no other, where strategies store something of each.
         restart_parents: called where the host has loaded other parameters, which come from no earlier ones.
         threshold: the host's densification threshold on the mean ‖∇_u‖ in NDC units; None: the score is not scaled.
         loss_scale: returns the factor of the host's loss (`scaler.get_scale` of an AMP gradient scaler).
@@ -70,6 +71,7 @@ class Attachment:
         masks: [h, w] by the name of a view, what the host multiplies its LR image by; the HR image is multiplied here.
         own_background: the host chooses the colour behind its renderings; `background` then counts for nothing.
         reads_score: the host's densifier reads the screen gradient.
+        iterations: of the loop, where they are known.
 
     Attributes:
         t: the current iteration, from 1.
@@ -85,6 +87,7 @@ class Attachment:
         views: Sequence[View],
         poll_parents: Callable[[], Int[Tensor, " M"] | None],
         restart_parents: Callable[[], None] = lambda: None,
+        remedy: str = "End densification first.",
         seed: int = 0,
         threshold: float | None = None,
         loss_scale: Callable[[], float] | None = None,
@@ -92,6 +95,7 @@ class Attachment:
         masks: Mapping[str, Tensor] | None = None,
         own_background: bool = True,
         reads_score: bool = True,
+        iterations: int | None = None,
     ) -> None:
         _require_supported(conductor, accumulation)
         require_unique(view.name for view in views)
@@ -102,23 +106,26 @@ class Attachment:
         self.t = 1
         self.counts: Counter[str] = Counter()
         self.removed = False
-        self._poll_parents, self._restart_parents, self._loss_scale = poll_parents, restart_parents, loss_scale
+        self._poll_parents, self._restart_parents, self._remedy = poll_parents, restart_parents, remedy
+        self._loss_scale = loss_scale
         self._scaler = None if threshold is None else ScoreScaler(threshold)
         self._n = len(params()["means"])
         self._passes = 0  # backward passes of this iteration
-        self._merges_before_step = 0  # at the host's last step
         self._detail_gradients = 0
-        # What is rendered and not merged yet.
-        self._pending: tuple[int, HostOutput, HrGradients[DrawnGradients] | None, RoutedGradients | None] | None = None
+        self._pending: Pending | None = None  # the last rendering
+        self._pass: BackwardPass | None = None  # the last one that has reached a rendering
         self._merge_in_place = InPlaceMerge(conductor)
         self._step: Step | None = None  # of the rendering, until `after_step`
         self._extra = ExtraSteps(conductor, params)
-        self._grads_before: dict[str, Tensor] = {}  # .grad when the backward pass began
-        self._versions_before: list[tuple[int, int]] = []
         self._logged: dict[str, deferred.Number] = {}
         self._hooks: list[Any] = []
+        self._hooked: list[torch.optim.Optimizer] = []
+        self._stepped: set[int] = set()  # the optimizers that have made this step of the host
+        self._has_merged = False  # since the last step
+        self._has_warned = False
         conductor.on_fit_start(len(views), seed, params()["means"].device, views)
-        _announce(conductor, views, own_background=own_background)
+        _announce(conductor, views, own_background=own_background, iterations=iterations)
+        self._farewell = finalize(self, _warn_without_hr, self.counts, first_hr(conductor))
 
     def render_view(self, view: View, render_at: RenderAt) -> Any:
         """Render a training view at both scales; returns what the host's render function returns at LR."""
@@ -129,7 +136,7 @@ class Attachment:
         if z is not None:
             z = z.to(means)
         hr = routed = None
-        if conductor.wants_hr(t):
+        if self._wants_hr(t):
             self.counts["HR renders"] += 1
             view = conductor.skips.view(view, t)
             with _random_state_kept(means.device):
@@ -151,29 +158,16 @@ class Attachment:
                     self._extra.render(extra_views, t, lambda camera: render_at(camera, None, view).shot)
         output = render_at("lr", z, view)
         self.counts["LR renders"] += 1
-        if output.hooked.requires_grad:
-            self._pending = (nth := self.counts["LR renders"]), output, hr, routed
-            self._take_colours(output.shot.drawing, nth)
-            output.hooked.register_hook(_called_at(WeakMethod(self._on_backward), nth))  # type: ignore[no-untyped-call]
+        self._pending = Pending(self.counts["LR renders"], view.name, output, hr, routed)
+        scored = self._reads_score and hr is not None and conductor.owner("score") is not None
+        self._pending.listen(WeakMethod(self._reached), to_screen=scored)
         return output.returned
 
-    def _take_colours(self, drawing: Drawing | None, nth: int) -> None:
-        """Take the LR gradient of the colours by its factors, past the host's own copies of them, where the pass that is merged
-        would only pass it on to the parameters.
-        """
-        params = self.params()
-        if drawing is None or not (
-            self._merge_in_place.takes_factors(params) and passes_to_parameters(drawing, params)
-        ):
-            return
-        leaves = [torch.autograd.graph.get_gradient_edge(params[name]).node for name in ("sh0", "shN")]
-        is_pending = WeakMethod(self._is_pending)  # the drawing must not hold what holds it, see `_called_at`
-        drawing.colour.taken = lambda: (
-            (alive := is_pending()) is not None and alive(nth) and all(map(_is_accumulated, leaves))
-        )
-
-    def _is_pending(self, nth: int) -> bool:
-        return self._pending is not None and self._pending[0] == nth
+    def _wants_hr(self, t: int) -> bool:
+        """Whether HR takes part at t. Where the host's densifier reads its score, no iteration is skipped."""
+        conductor = self.conductor
+        scores = self._reads_score and conductor.owner("score") is not None and conductor.may_densify(t)
+        return conductor.wants_hr(t) and (scores or not conductor.skips.leaves_out_hr(t, conductor.work_log))
 
     def _count_parts(self, n: int) -> None:
         self.counts["HR renders in parts"] += 1
@@ -190,12 +184,16 @@ class Attachment:
         return None if self._own_background else self.conductor.background(self.t)
 
     def hook(self, optimizers: Sequence[torch.optim.Optimizer]) -> None:
-        """Hook the steps of the host's optimizers, and no longer those of earlier ones. The first steps once an iteration."""
+        """Hook the steps of the optimizers that the host now has, and no longer those of earlier ones."""
+        distinct = list({id(o): o for o in optimizers}.values())  # one optimizer may have several parameters
+        if list(map(id, distinct)) == list(map(id, self._hooked)):
+            return
         for hook in self._hooks:
             hook.remove()
-        distinct = list(dict.fromkeys(optimizers))  # one optimizer may have several parameters
+        self._hooked = distinct
+        self._stepped.clear()
         self._hooks = [
-            *(o.register_step_pre_hook(lambda *_: self._before_step()) for o in distinct[:1]),
+            *(o.register_step_pre_hook(lambda o, *_: self._before_step(o)) for o in distinct),
             *(o.register_step_post_hook(lambda o, *_: self._step_on_extra_views(o)) for o in distinct),
         ]
 
@@ -231,28 +229,71 @@ class Attachment:
 
     def remove(self) -> None:
         """Stop: the host's renderings pass through, and the gradients of one that is still pending stay unmerged."""
-        self.removed, self._pending = True, None
+        self.removed, self._pending, self._pass = True, None, None
         self.hook([])
         self._extra.forget()
         self.conductor.on_fit_end()
+        self._farewell()
 
-    def _before_step(self) -> None:
-        """Count the steps in which no strategy took part."""
+    def _before_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """Refuse a first step in which no strategy takes part, and tell of a later one."""
         if self._extra.stepping:
             return
-        merges = self.counts["merges"]
-        if not merges:
+        if current_pass() >= 0 and self._pending is not None and self._pending.output is not None:
             raise HostError(
-                "the host makes its first optimizer step, but none of its renderings was recognised as that of a training "
-                "view, so that no strategy would take part. Check that the training loop renders with the function that "
-                "was replaced, and with the cameras that were passed."
-                if self._pending is None
-                else "the host makes its first optimizer step, but no backward() has given the Gaussians a gradient, so that no "
-                "strategy would take part. Take the gradients by loss.backward(), not by torch.autograd.grad."
+                "the host steps inside of its backward pass, where the gradients of the views are not merged yet. Step after "
+                "loss.backward() has returned, not in a hook of a gradient."
             )
-        if merges == self._merges_before_step:
-            self.counts["steps of the host alone"] += 1
-        self._merges_before_step = merges
+        if id(optimizer) in self._stepped:  # one step of the host is each optimizer once
+            self._stepped.clear()
+        begins = not self._stepped
+        self._stepped.add(id(optimizer))
+        if not begins:
+            return
+        has_merged, self._has_merged = self._has_merged, False
+        if has_merged:
+            return
+        trained = [name for name, p in self.params().items() if p.requires_grad and name != "detail"]
+        cause = self._why_nothing_was_merged(trained)
+        if not self.counts["merges"]:
+            raise HostError(
+                f"the host makes its first optimizer step, but {cause[0]}, so that no strategy would take part. {cause[1]}"
+            )
+        self.counts["steps of the host alone"] += 1
+        if not self._has_warned:
+            self._has_warned = True
+            _log.warning(
+                "the host makes a step in which no strategy takes part: %s, and %s changed without CLEAR or not at all. %s",
+                cause[0], ", ".join(trained) or "nothing", cause[1],
+            )  # fmt: skip
+
+    def _why_nothing_was_merged(self, trained: Sequence[str]) -> tuple[str, str]:
+        """The cause, and what to do."""
+        pending = self._pending
+        if not trained:
+            return (
+                "all parameters of the Gaussians are frozen",
+                "Let those that should train require gradients, or remove() what was attached.",
+            )
+        if pending is None or pending.output is None:
+            return (
+                "none of its renderings was recognised as that of a training view",
+                "Check that the training loop renders with the function that was replaced, and with the cameras that were "
+                "passed.",
+            )
+        shot = pending.output.shot
+        if (
+            not any(x.requires_grad for drawing in shot.drawings for x in drawing.inputs.values())
+            and not pending.output.marks
+        ):
+            return (
+                f"the rendering of {pending.view} does not depend on {', '.join(trained)}",
+                "Pass the function tensors that are made of the parameters, with gradients enabled and not detached.",
+            )
+        return (
+            f"no backward() has given {', '.join(trained)} a gradient by the rendering of {pending.view}",
+            "Take the gradients by loss.backward(), not by torch.autograd.grad, of a loss of that rendering.",
+        )
 
     def _step_on_extra_views(self, optimizer: torch.optim.Optimizer) -> None:
         if not self._extra.stepping and (steps := self._extra.step(optimizer)):
@@ -274,6 +315,12 @@ class Attachment:
         if parents is None and n == self._n:
             return
         state = ", ".join(self.conductor.state_dict())
+        if parents is not None and (unknown := int((parents < 0).sum())):
+            if state:
+                raise HostError(
+                    f"{unknown:,} new Gaussians come from no other, but {state} is stored of each Gaussian. {self._remedy}"
+                )
+            parents = parents.clamp_min(0)
         if self._step is not None:  # without parents, what it holds per Gaussian cannot be gathered
             self._step = Step(self._step.t, self._step.view) if parents is None else self._step.resized(parents)
         if parents is not None:
@@ -288,63 +335,75 @@ class Attachment:
         self.counts["structure changes"] += 1
         self._n = n
 
-    def _on_backward(self, nth: int) -> None:
-        """The host's backward pass has reached Î_LR of the nth rendering, but no parameter yet."""
-        if self._pending is None:
-            return
-        if nth != self._pending[0]:
-            raise HostError(
-                "one backward pass reaches two renderings of training views, but each is merged by itself. With several views "
-                "for a step, call backward() after each rendering and set accumulation=, or use joint_loss. For a second pass "
-                "over the same view, call the function that was wrapped, its __wrapped__."
-            )
-        self._grads_before = {name: p.grad.clone() for name, p in self.params().items() if p.grad is not None}
-        self._versions_before = self._grad_versions()
-        centres = self._pending[1].shot.gradient_slot.tensor
-        screen_gradients: list[Tensor] = []
-        hook: Any = None
-        if self._reads_score and centres.requires_grad:
-            hook = centres.register_hook(screen_gradients.append)  # type: ignore[no-untyped-call]
-
-        def on_backward_end() -> None:
-            if hook is not None:
-                hook.remove()
-            self._merge(screen_gradients[0] if screen_gradients else None)
-
-        torch.autograd.Variable._execution_engine.queue_callback(on_backward_end)
+    def _reached(self, nth: int) -> TakeColours | None:
+        """A backward pass of the host has reached the nth rendering, but no parameter yet."""
+        if self.removed or self._pending is None:
+            return None
+        if self._pass is None or self._pass.task != current_pass():
+            self._pass = now = BackwardPass(current_pass(), self.params())
+            torch.autograd.Variable._execution_engine.queue_callback(lambda: self._on_backward_end(now))
+        self._pass.renderings.add(nth)
+        params = self._pass.params
+        whole = not (self._merge_in_place.takes_factors(params) and self._pending.may_take_factors(params))
+        return None if whole else self._pass.take
 
     @torch.no_grad()
-    def _merge(self, screen_gradient: Tensor | None) -> None:
-        """The host's backward pass has ended: replace its gradients by the merged ones.
+    def _on_backward_end(self, done: BackwardPass) -> None:
+        """A backward pass of the host has ended: replace the gradients that it has brought by the merged ones.
 
-        A pass that leaves every `.grad` as it was (`torch.autograd.grad`, `backward(inputs=…)`) asks for something else.
+        A pass that leaves every `.grad` as it was (`torch.autograd.grad`) asks for something else.
         """
-        if self._pending is None or ((versions := self._grad_versions()) and versions == self._versions_before):
+        pending, self._pass = self._pending, None
+        trained = {name for name, p in done.params.items() if p.requires_grad and name != "detail"}
+        accumulated = done.accumulated()
+        if pending is None or (trained and not accumulated):
             return
-        (_, output, hr, routed), self._pending = self._pending, None
-        params = self.params()
+        pending.require_alone(done)
+        using = [type(s).__name__ for s in map(self.conductor.owner, ("correct", "score")) if s is not None]
+        pending.require_first(accumulated, " and ".join(using))
+        if names := [name for name in accumulated if name not in pending.merged]:
+            self._merge(pending, done, names)
+        elif not trained and not pending.merged:
+            self._merge(pending, done, [])
+        if pending.merged >= trained:
+            pending.output = pending.hr = pending.routed = None
+
+    def _merge(self, pending: Pending, done: BackwardPass, names: Sequence[str]) -> None:
+        hr, first = pending.hr, not pending.merged
+        params = {name: done.params[name] for name in names}
         for name, p in params.items():
             if p.grad is not None and p.grad.is_sparse:
                 raise HostError(
                     f"{name}.grad is sparse, but the gradients of all Gaussians are merged. In gsplat: "
                     "rasterization(sparse_grad=False)."
                 )
+            if (
+                p.grad is not None and p.grad.requires_grad
+            ):  # of create_graph=True, of which the merged gradient is no part
+                p.grad = p.grad.detach()
         scale = (self._loss_scale() if self._loss_scale is not None else 1.0) / self.accumulation
-        drawing = output.shot.drawing
-        lr_colour = None if drawing is None or drawing.colour.factors is None else Colour(*drawing.colour.factors)
+        detail = done.params.get("detail") if first else None
+        if detail is not None:
+            params["detail"] = detail
+            if detail.grad is not None:  # what the host has given it stays
+                done.before["detail"] = detail.grad
         conflict = self._merge_in_place(
-            params, routed, self.t, before=self._grads_before, lr_colour=lr_colour, scale=scale,
+            params, pending.routed_of(names, done.params), self.t, before=done.before, lr_colour=done.colour, scale=scale,
             must_be_finite=self._loss_scale is None,
         )  # fmt: skip
-        if "detail" in params and hr is not None and hr.hf is not None:
-            self._decay_detail(params["detail"])
-        if screen_gradient is not None and hr is not None:
-            scores = partial(self.conductor.scores, hr=hr, weights=self.conductor.objective.weights(self.t))
-            if write_score(output.shot, screen_gradient / scale, scores, self._scaler, scale):
-                self.counts["scores written"] += 1
-        self._grads_before = {}
-        self._passes += 1
+        pending.merged.update(names or ("detail",))
+        self._stepped.clear()
+        self._has_merged = True
         self.counts["merges"] += 1
+        if not first:
+            return
+        self._passes += 1
+        if detail is not None:
+            self._finish_detail(detail, [done.params[name] for name in names], hr is not None and hr.hf is not None)
+        if (screen := pending.screen.get(done.task)) is not None and pending.output is not None and hr is not None:
+            scores = partial(self.conductor.scores, hr=hr, weights=self.conductor.objective.weights(self.t))
+            if write_score(pending.output.shot, screen / scale, scores, self._scaler, scale):
+                self.counts["scores written"] += 1
         λ = self.conductor.objective.lambda_hr(self.t)
         losses = {} if hr is None else hr.losses
         self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **conflict_columns(conflict)}
@@ -352,6 +411,16 @@ class Attachment:
             now = self.log
             losses_now = ", ".join(f"L_{name} {now[name]:.4f}" for name in losses) or "no HR"
             _log.info("t=%d: %s, lambda_HR %.3f, %s Gaussians.", self.t, losses_now, λ, f"{self._n:,}")
+
+    def _finish_detail(self, detail: Tensor, others: Sequence[Tensor], by_hf: bool) -> None:
+        """After the merge of f_det, which the host's optimizer steps as the others."""
+        if self._loss_scale is not None and detail.grad is not None:
+            # A gradient scaler asks each optimizer apart whether to step; 0 times a number that is not finite is not finite.
+            for p in others:
+                if p.grad is not None:
+                    detail.grad += 0 * p.grad.sum(dtype=torch.float32)
+        if by_hf:
+            self._decay_detail(detail)
 
     def _decay_detail(self, detail: Tensor) -> None:
         """L_HF does not change with a constant added to the colours, so that nothing else would hold the mean of f_det."""
@@ -362,14 +431,9 @@ class Attachment:
         self._detail_gradients += 1
         if self._detail_gradients == _PATIENCE * self.accumulation and rates.rate > 0 and not bool(detail.any()):
             _log.warning(
-                "f_det has no effect: none of its first %d gradients was stepped on. Step the optimizer of the parameter detail; "
-                "attach adds it to the dictionary of optimizers.", _PATIENCE,
+                "f_det has no effect: none of its first %d gradients was stepped on. Step the optimizer of the parameter detail: "
+                "attach adds it to the optimizers that it is given, and one that is made anew must hold it, too.", _PATIENCE,
             )  # fmt: skip
-
-    def _grad_versions(self) -> list[tuple[int, int]]:
-        """What changes with every gradient of the Gaussians; empty where all of them are frozen."""
-        trained = [p.grad for name, p in self.params().items() if p.requires_grad and name != "detail"]
-        return [(0, 0) if g is None else (id(g), g._version) for g in trained]
 
 
 def _require_supported(conductor: Conductor, accumulation: int) -> None:
@@ -386,12 +450,33 @@ def _require_supported(conductor: Conductor, accumulation: int) -> None:
         raise SettingError(f"CLEAR trains in one process, got {n}. Start the training without torchrun, on one device.")
 
 
-def _announce(conductor: Conductor, views: Sequence[View], *, own_background: bool) -> None:
+def first_hr(conductor: Conductor) -> int | None:
+    """The first iteration in which HR takes part in the gradient; None: in none."""
+    λ = conductor.objective.lambda_hr
+    return λ.start + 1 if λ.peak > 0 else λ.decay_from + 1 if λ.final > 0 else None
+
+
+def _warn_without_hr(counts: Counter[str], first: int | None) -> None:
+    """At the end of a loop."""
+    if first is not None and 0 < counts["merges"] < first and not counts["HR renders"]:
+        _log.warning(
+            "HR took no part in the %d steps of this loop: it would from step %d on. %s",
+            counts["merges"],
+            first,
+            _STRETCH,
+        )
+
+
+def _announce(conductor: Conductor, views: Sequence[View], *, own_background: bool, iterations: int | None) -> None:
     """Log what each strategy will do, and which have no effect. After `on_fit_start`.
 
     Args:
-        own_background: the host chooses its background by itself.
+        own_background: the host chooses its background by itself. iterations: of the loop, where they are known.
     """
+    if (first := first_hr(conductor)) is not None:
+        _log.info("HR takes part from step %d on (objective.lambda_hr.start).", first)
+        if iterations is not None and first > iterations:
+            _log.warning("HR takes part from step %d on, but the loop has %d steps. %s", first, iterations, _STRETCH)
     for s in conductor.strategies:
         if (prepared := s.summary()) is not None:
             _log.info("%s: %s.", type(s).__name__, prepared)
@@ -412,19 +497,6 @@ def _announce(conductor: Conductor, views: Sequence[View], *, own_background: bo
         _log.info("%s has no effect here: the host draws no picture for it.", type(stage).__name__)
     if not conductor.strategies:
         _log.info("no strategy is attached: both losses are summed, as in the paper's baseline.")
-
-
-def _called_at(on_backward: WeakMethod[Callable[[int], None]], nth: int) -> Callable[[Tensor], None]:
-    """A tensor hook that calls `on_backward(nth)`. Its reference is weak: with a strong one, its tensor would never be freed."""
-    return lambda _: None if (alive := on_backward()) is None else alive(nth)
-
-
-def _is_accumulated(leaf: Any) -> bool:
-    """Whether the backward pass under way adds to a leaf's `.grad`; `torch.autograd.grad` returns its gradient instead."""
-    try:
-        return bool(torch._C._will_engine_execute_node(leaf))
-    except RuntimeError:  # what torch does in a pass of `torch.autograd.grad` for this leaf
-        return False
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,7 +15,8 @@ from clear_strategies.core.view import View
 from clear_strategies.kernels.merge import Colour
 from clear_strategies.merging.in_place import RoutedGradients, dense
 from clear_strategies.merging.iteration import HrGradients
-from rasterizers.autograd import Drawing
+from integration.colours import are_joined, is_hooked
+from rasterizers.autograd import Drawing, outer
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera
 
@@ -95,7 +96,8 @@ class AutogradShot:
         visible: Gaussians that contribute to the image.
         params: raw parameters by gsplat's names. A parameter that the image does not depend on has gradient 0.
         slot: where the host keeps the screen gradient; None: the image is a function of `means2d` itself.
-        drawn: means, quats, scales, opacities and colors that the rasterizer was given; None: the raw parameters.
+        drawn: means, quats, scales, opacities and colors that the rasterizer was given, none of them with a hook; None: the raw
+            parameters.
         drawings: by this package's rasterizers, for this image; a single one takes all cotangents in one pass.
     """
 
@@ -168,25 +170,22 @@ class AutogradShot:
     def _raw(
         self, g: Mapping[str, Tensor], basis: Float[Tensor, "N B1"] | None
     ) -> tuple[dict[str, Tensor], Colour | None]:
-        """The second part: from what was drawn to the raw parameters without f_det; sh0 and shN as factors where the colours are
-        these two, side by side.
-        """
-        drawn, colour = dict(self.drawn or self.params), None
-        if self.drawing is not None and basis is not None:
-            splats, rgb = self.drawing.splats, g["rgb"]
-            drawn = {name: getattr(splats, name) for name in ("means", "quats", "scales", "opacities")}
-            if are_bands(splats.sh0, splats.shN, self.params):
-                colour = Colour(rgb, basis)
-            else:
-                bands = {"sh0": splats.sh0, "shN": splats.shN}
-                drawn |= bands
-                g = {**g, **dense({}, Colour(rgb, basis), bands)}
+        """The second part: from what was drawn to the raw parameters without f_det; sh0 and shN as factors where `are_joined`."""
         raw = {name: p for name, p in self.params.items() if p.requires_grad and name != "detail"}
-        direct = {name: g[name] for name, p in raw.items() if drawn.get(name) is p}
+        if self.drawing is None and self.drawn is None:  # g is theirs, with what their hooks have done to it
+            return {name: g[name] for name in raw}, None
+        drawn, colour = dict(self.drawn or {}), None
+        if self.drawing is not None and basis is not None:
+            drawn = dict(self.drawing.inputs)
+            if are_joined(drawn["colors"], self.params):
+                colour = Colour(g["rgb"], basis)
+            else:
+                g = {**g, "colors": outer(g["rgb"], basis, drawn["colors"].shape[1])}
+        direct = {name: g[name] for name, p in raw.items() if drawn.get(name) is p and not is_hooked(p)}
         graph = {name: x for name, x in drawn.items() if name in g and name not in direct and x.requires_grad}
-        if not graph:
-            return direct, colour
         rest = {name: p for name, p in raw.items() if colour is None or name not in ("sh0", "shN")}
+        if not graph or not rest:
+            return direct, colour
         through = torch.autograd.grad(
             list(graph.values()), list(rest.values()), [g[name] for name in graph], retain_graph=True, allow_unused=True
         )
@@ -221,54 +220,6 @@ def _plus_rows(
     return torch.addcmul(a, b, weight.to(b).view(-1, *[1] * (b.dim() - 1)))
 
 
-def passes_to_parameters(drawing: Drawing, params: Mapping[str, Tensor]) -> bool:
-    """Whether the gradient of the drawn colours becomes that of sh0 and shN and nothing else, without a hook on the way."""
-    leaves = [params[name] for name in ("sh0", "shN") if name in params]
-    hooked = any(p._backward_hooks or getattr(p, "_post_accumulate_grad_hooks", None) for p in leaves)
-    return len(leaves) == 2 and not hooked and are_bands(drawing.splats.sh0, drawing.splats.shN, params)
-
-
-_VIEWS: Final = frozenset(
-    {"UnsqueezeBackward0", "SqueezeBackward1", "ViewBackward0", "UnsafeViewBackward0", "ReshapeAliasBackward0"}
-)
-_CAST: Final = "ToCopyBackward0"  # to another type, e.g. spherical harmonics in float16
-_SECOND: Final = (1, 2**64 - 2)  # the dimension of bands, as autograd stores 1 and -2
-
-
-def are_bands(sh0: Tensor, shN: Tensor, params: Mapping[str, Tensor]) -> bool:
-    """Whether these colours are the raw sh0, or it with an offset, and the first bands of the raw shN, so that their gradients
-    are those of the parameters. Read from the autograd graph: slices of cat((sh0, shN), 1).
-    """
-    cat, also = (_sliced(x.grad_fn, start) for x, start in ((sh0, 0), (shN, 1)))
-    if cat is None or cat is not also:
-        return False
-    cat = cat.next_functions[0][0] if cat.name() == _CAST else cat
-    if cat is None or cat.name() != "CatBackward0" or cat._saved_dim not in _SECOND:
-        return False
-    parts = [node for node, _ in cat.next_functions]
-    if len(parts) != 2:
-        return False
-    constant = parts[0]
-    if constant is not None and constant.name() == "AddBackward0":
-        constant = next((node for node, _ in constant.next_functions if _leaf(node) is params["sh0"]), None)
-    return _leaf(constant) is params["sh0"] and _leaf(parts[1]) is params["shN"]
-
-
-def _sliced(node: Any, start: int) -> Any:
-    """The node of x, where `node` is that of x[:, start:…]."""
-    if node is None or node.name() != "SliceBackward0" or node._saved_dim != 1 or node._saved_start != start:
-        return None
-    return node.next_functions[0][0]
-
-
-def _leaf(node: Any) -> Tensor | None:
-    """The parameter that a node is a view of, all of it and in its order, in any type."""
-    while node is not None and node.name() in (*_VIEWS, _CAST):
-        node = node.next_functions[0][0]
-    leaf: Tensor | None = getattr(node, "variable", None)
-    return leaf
-
-
 Target = Literal["lr", "hr"] | Camera
 """What a host draws: the view of this iteration at one of its sizes, or what a camera without a photo sees."""
 
@@ -278,13 +229,14 @@ class HostOutput:
     """What a host's render function returned, as its adapter passes it to an `Attachment`.
 
     Args:
-        hooked: a tensor that the host computes its loss from. Its gradient marks the start of the host's backward pass.
+        marks: tensors whose gradient comes in every backward pass over the rendering, before that of any parameter; a drawing by
+            this package's rasterizers needs none. The host must not change them in place.
         returned: what the host's own render function returns.
     """
 
     shot: AutogradShot
-    hooked: Tensor
     returned: Any
+    marks: Sequence[Tensor] = ()
 
 
 RenderAt = Callable[[Target, Float[Tensor, " N"] | None, View], HostOutput]

@@ -32,7 +32,7 @@ from rasterizers import native
 
 ALONE: Final = "alone"
 _ITERATIONS: Final = 1_000  # of the run that the loops are a part of
-_FROM: Final = 300  # the measured steps begin here: HR takes part, at half its size where skips.coarse_until says so
+_FROM: Final = 301  # the measured steps begin here: HR takes part, at half its size where skips.coarse_until says so
 _WARM_UPS: Final = 6
 _COUNTED: Final = 6  # steps whose operations are counted: pseudo views come at every second
 _IN_FLOAT64: Final = 2_000  # Gaussians of the loop whose merged gradient is compared

@@ -30,7 +30,7 @@ def end_with_strategies(conductor: Conductor, settings: Any, name: str, first: i
     until = getattr(settings, name, None)
     if until is not None and (end := _end_of_densification(conductor, int(until), first)) < until:
         _log.info(
-            "densification ends at %s=%d instead of %d (%s).", name, end, until, _forbidding(conductor, end + 1 - first)
+            "densification ends at %s=%d instead of %d (%s).", name, end, until, _forbidding(conductor, end - first)
         )
         setattr(settings, name, end)
 
@@ -53,21 +53,23 @@ def require_end(conductor: Conductor, until: int | None, name: str, first: int =
         )
     _log.warning(
         "the host densifies until %s=%d, but %s ends densification at %d. Lower %s to that iteration.",
-        name, until, _forbidding(conductor, end + 1 - first), end, name,
+        name, until, _forbidding(conductor, end - first), end, name,
     )  # fmt: skip
 
 
 def _end_of_densification(conductor: Conductor, until: int, first: int) -> int:
     """The first iteration, in the host's count, from which on the strategies no longer allow densification; at most `until`.
 
-    A host has an end, but cannot be asked at each iteration: it densifies where a strategy forbids it earlier, with a warning.
+    Strategies hear of what a host changes in iteration t before `after_step(t)`, as of what this package's trainer changes after
+    iteration t - 1. A host has an end, but cannot be asked at each iteration: it densifies where a strategy forbids it earlier,
+    with a warning.
     """
-    allowed = [i for i in range(first, until) if conductor.may_densify(i + 1 - first)]
+    allowed = [i for i in range(first, until) if conductor.may_densify(max(1, i - first))]
     end = allowed[-1] + 1 if allowed else first
     if gaps := sorted({*range(first, end)} - {*allowed}):
         _log.warning(
             "%s forbids densification at %d of the iterations before %d, the first is %d, but the host densifies there: "
-            "only the end can be set from here.", _forbidding(conductor, gaps[0] + 1 - first), len(gaps), end, gaps[0],
+            "only the end can be set from here.", _forbidding(conductor, max(1, gaps[0] - first)), len(gaps), end, gaps[0],
         )  # fmt: skip
     return end
 

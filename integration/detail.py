@@ -11,7 +11,8 @@ from torch import Tensor
 from clear_strategies.merging.detail import DetailRates
 from rasterizers.geometry import SH_C0
 
-_EPS: Final = 1e-15  # Adam's, as in 3DGS: gradients of mean losses are near 1e-6
+DETAIL_EPS: Final = 1e-15
+"""Adam's, as in 3DGS: gradients of mean losses are near 1e-6."""
 
 
 def detail_adam(detail: torch.nn.Parameter, rates: DetailRates) -> torch.optim.Adam:
@@ -19,7 +20,7 @@ def detail_adam(detail: torch.nn.Parameter, rates: DetailRates) -> torch.optim.A
     argument is dropped, since others are visible at HR.
     """
     fused = detail.device.type in ("cpu", "cuda")  # one operation
-    adam = torch.optim.Adam([detail], lr=rates.rate, eps=_EPS, fused=fused)
+    adam = torch.optim.Adam([detail], lr=rates.rate, eps=DETAIL_EPS, fused=fused)
     adam.register_step_pre_hook(lambda _, args, kwargs: (
         tuple(value for value in args if not isinstance(value, Tensor)),
         {name: value for name, value in kwargs.items() if name != "visibility"},

@@ -19,7 +19,7 @@ from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
-_PATIENCE: Final = 10  # iterations with extra views of which none has ever made a step, before a warning
+_PATIENCE: Final = 10  # iterations with extra views, one after the other, of which none made a step, before a warning
 
 
 class ExtraSteps:
@@ -40,7 +40,7 @@ class ExtraSteps:
         self._gradients: list[Grads] = []
         self._rendered: Mapping[str, Tensor] = {}  # what they are gradients of
         self.stepping = False
-        self._ever_stepped, self._unused = False, 0  # iterations with extra views until the first step on one
+        self._has_stepped, self._unused = False, 0  # on those of this iteration; iterations since the last that did
 
     def render(self, extra_views: Sequence[ExtraView], t: int, render: Callable[[Camera], AutogradShot]) -> None:
         """Render the extra views of iteration t, without a gate and without f_det, and take their gradients."""
@@ -79,19 +79,19 @@ class ExtraSteps:
                 optimizer.grad_scale = scale  # type: ignore[attr-defined]
             for p, grad in zip(stepped, before, strict=True):
                 p.grad = grad
-        self._ever_stepped = True
+        self._has_stepped = True
         return len(self._gradients) if "means" in params else 0
 
     def forget(self) -> None:
-        """Before an iteration: drop the gradients of the one before, stepped on or not. Warn where none ever is."""
-        if self._gradients and not self._ever_stepped:
-            self._unused += 1
+        """Before an iteration: drop the gradients of the one before, stepped on or not. Warn where they no longer are."""
+        if self._gradients:
+            self._unused = 0 if self._has_stepped else self._unused + 1
             if self._unused == _PATIENCE:
                 _log.warning(
                     "extra views have no effect: they were rendered in %d iterations, and no optimizer that was passed stepped "
-                    "on them. Pass those that the loop steps.", _PATIENCE,
+                    "on them. Pass those that the loop steps, and put new ones in the same dictionary.", _PATIENCE,
                 )  # fmt: skip
-        self._gradients, self._rendered = [], {}
+        self._gradients, self._rendered, self._has_stepped = [], {}, False
 
 
 @cache

@@ -51,7 +51,7 @@ class RowNumbers:
         self.restart()
 
     def restart(self) -> None:
-        """Number the rows from 1: operations of gsplat 1.4 write 0 where the origin is unknown."""
+        """Number the rows from 1: 0 is what a host writes that knows no origin, or adds a Gaussian that has none."""
         means = self._means()
         rows = torch.arange(1, len(means) + 1, device=means.device)
         self._numbered = len(means)
@@ -59,10 +59,11 @@ class RowNumbers:
         self._unchanged = self._entries[ROWS], self._entries[ROWS]._version
 
     def poll(self) -> Int[Tensor, " M"] | None:
-        """parents[M] of the change since the last call: row i comes from row parents[i]; None: the rows are the same.
+        """parents[M] of the change since the last call: row i comes from row parents[i], or from none where that is -1; None: the
+        rows are the same.
 
         Raises:
-            HostError: a densifier changed the parameters but not this one, or the origin of a row is unknown.
+            HostError: a densifier changed the parameters but not this one.
         """
         rows: Tensor = self._entries[ROWS]
         n = len(self._means())
@@ -74,11 +75,19 @@ class RowNumbers:
         of, version = self._unchanged
         if (rows is of and rows._version == version) or len(rows) != n:  # a scene moves Gaussians in place
             return None
-        if bool((rows == 0).any()):
-            raise HostError("gsplat 1.4 does not say where relocated Gaussians come from. Update it to 1.5 or later.")
-        parents, numbered = rows.detach() - 1, self._numbered
+        parents, numbered = rows.detach().long() - 1, self._numbered
         self.restart()
         return None if is_same(parents, numbered) else parents
+
+    @property
+    def remedy(self) -> str:
+        """What to do about Gaussians that come from no other, where something is stored of each."""
+        if self._as_parameter:
+            return (
+                f"As you add one, write to its row of the parameter {ROWS} the row of the Gaussian that it resembles, plus 1. Or "
+                "add them before that is stored, or leave out the strategy."
+            )
+        return "gsplat 1.4 does not say where relocated Gaussians come from. Update it to 1.5 or later."
 
     def remove(self) -> None:
         """Take the row numbers out of the host."""

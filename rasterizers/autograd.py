@@ -50,18 +50,20 @@ class Drawn(NamedTuple):
     depth: Float[Tensor, "H W"] | None = None
 
 
+TakeColours = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N B1"]], None]
+"""Gets a gradient of the spherical harmonics Y ⊗ ∇rgb by its factors: ∇rgb and Y."""
+
+
 @dataclass(slots=True, eq=False)
-class ColourGradient:
-    """The gradient of a drawing's spherical harmonics by its factors Y ⊗ ∇rgb, for a caller that takes these in place of tensors
-    as wide as the colours.
+class BackwardHook:
+    """What a caller does when a backward pass reaches a drawing.
 
     Attributes:
-        taken: asked when a backward pass has reached the drawing. If true, sh0 and shN get no gradient from this pass.
-        factors: (∇rgb [N, 3], Y [N, B1]) of the last pass that was taken.
+        reached: called in the pass, before the gradients of the drawing exist. It returns where this pass brings the gradient of
+            the colours, which `colors` then does not get; None: `colors` gets it, as every other tensor.
     """
 
-    taken: Callable[[], bool] = lambda: False
-    factors: tuple[Tensor, Tensor] | None = None
+    reached: Callable[[], TakeColours | None] = lambda: None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,79 +71,97 @@ class Drawing:
     """What `draw` drew.
 
     Args:
-        splats: as `draw` was given them, and image: as it returned it, both in the autograd graph.
-        colour: where a caller can take the gradient of the colours.
+        inputs: means, quats, scales, opacities and colors [N, K, 3] as they were given, and image: as it was returned, all in
+            the autograd graph.
+        hook: of the backward passes that reach it.
     """
 
     rendering: Rendering
-    splats: Splats
+    inputs: Mapping[str, Tensor]
     image: Float[Tensor, "H W 3"]
-    colour: ColourGradient
+    hook: BackwardHook
 
 
-_recordings: Final[list[list[Drawing]]] = []
+class _Recordings(threading.local):
+    """The lists that the drawings of this thread are added to, the innermost last."""
+
+    def __init__(self) -> None:
+        self.running: list[list[Drawing]] = []
+
+
+_recordings: Final = _Recordings()
 
 
 @contextmanager
 def recorded() -> Iterator[list[Drawing]]:
-    """What is drawn with gradients inside, by any code. Its VJP takes several cotangents in one pass and stops at the splats."""
+    """What this thread draws with gradients inside, by any code. Its VJP takes several cotangents in one pass and stops at what
+    was drawn.
+    """
     drawings: list[Drawing] = []
-    _recordings.append(drawings)
+    outer = _recordings.running
+    _recordings.running = [*outer, drawings]
     try:
         yield drawings
     finally:
-        _recordings.remove(drawings)
+        _recordings.running = outer
 
 
 class _Ahead(threading.local):
     """One image that is drawn together with another, before it is asked for.
 
     Attributes:
-        wanted: (fx, fy, cx, cy, width, height) of the image that the next drawing brings along.
-        kept: that image, and what it shows.
+        wanted: what the image shows, see `_shown`: its camera alone.
+        kept: that image, what it shows, and the splats: while these live, no other tensors lie at their addresses.
     """
 
-    wanted: tuple[float, float, float, float, int, int] | None = None
-    kept: tuple[tuple[Any, ...], Rendering] | None = None
+    wanted: Camera | None = None
+    kept: tuple[tuple[Any, ...], Rendering, Splats] | None = None
 
     def draw(self, rasterizer: Rasterizer, splats: Splats, camera: Camera) -> Rendering:
         """The image, from `kept` where it lies there."""
         if self.kept is not None and self.kept[0] == _shown(rasterizer, splats, camera):
             rendering, self.kept = self.kept[1], None
             return rendering
-        if self.wanted is None:
+        wanted = self.wanted
+        if wanted is None or camera.world_to_camera.tolist() != wanted.world_to_camera.tolist():
             return rasterizer(splats, camera)
-        (fx, fy, cx, cy, width, height), self.wanted = self.wanted, None
-        other = replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+        self.wanted = None
         plain = replace(splats, rgb_offset=None)
+        if splats.rgb_offset is None and _grid(camera) == _grid(wanted):  # it is this one
+            return rasterizer(splats, camera)
+        other = replace(wanted, world_to_camera=camera.world_to_camera)  # by the same tensor, as a backend sees at once
         ahead, rendering = rasterizer.render_scales([(plain, other), (splats, camera)])
-        self.kept = _shown(rasterizer, plain, other), ahead
+        self.kept = _shown(rasterizer, plain, other), ahead, plain
         return rendering
 
 
 _ahead: Final = _Ahead()
 
 
+def _grid(camera: Camera) -> tuple[float, ...]:
+    return camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
+
+
 def _shown(rasterizer: Rasterizer, splats: Splats, camera: Camera) -> tuple[Any, ...]:
     """What an image shows: equal for equal images, as long as the tensors are alive."""
     tensors = (getattr(splats, field.name) for field in fields(Splats))
     memory = [None if x is None else (x.data_ptr(), x.shape, x.stride(), x._version) for x in tensors]
-    numbers = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-    return rasterizer, memory, numbers, camera.world_to_camera.tolist()
+    return rasterizer, memory, _grid(camera), camera.world_to_camera.tolist()
 
 
 @contextmanager
-def drawing_ahead(K: Float[Tensor, "3 3"], width: int, height: int) -> Iterator[None]:
-    """The first drawing inside brings along another of the same splats from the same pose, by K and without `rgb_offset`.
+def drawing_ahead(viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, height: int) -> Iterator[None]:
+    """The first drawing inside from this pose brings along the one of the same splats by K and without `rgb_offset`.
 
-    A later `draw` of just that, here or after the block, takes it: the two share projection, colour and depth order.
+    A later drawing inside of just that takes it: the two share projection, colour and depth order. It is forgotten with the
+    block.
     """
     (fx, _, cx), (_, fy, cy), _ = K.tolist()
-    _ahead.wanted, _ahead.kept = (fx, fy, cx, cy, width, height), None
+    _ahead.wanted, _ahead.kept = Camera(viewmat.detach(), fx, fy, cx, cy, width, height), None
     try:
         yield
     finally:
-        _ahead.wanted = None
+        _ahead.wanted = _ahead.kept = None
 
 
 _P = ParamSpec("_P")
@@ -163,7 +183,13 @@ def uncompiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 @uncompiled
 def draw(
-    rasterizer: Rasterizer, splats: Splats, camera: Camera, means2d: Tensor | None = None, *, depth: bool = False
+    rasterizer: Rasterizer,
+    splats: Splats,
+    camera: Camera,
+    means2d: Tensor | None = None,
+    *,
+    depth: bool = False,
+    colors: Float[Tensor, "N K 3"] | None = None,
 ) -> Drawn:
     """Draw the splats. Gradients flow from the image and its alpha to the splats' tensors; depth has none.
 
@@ -172,27 +198,50 @@ def draw(
     Args:
         means2d: a tensor that receives the projected centres and whose `.grad` will be the screen gradient; None makes one.
         depth: also draw the expected depth.
+        colors: the tensor that `splats.sh0` and `splats.shN` are slices of, for a caller that has them as one.
 
     Raises:
         ValueError: the rasterizer lacks the trait `depth` that `depth=True` needs, or the pose requires a gradient.
         NotImplementedError: in `backward`, if the loss depends on the depth.
         RuntimeError: in `backward`, if the loss depends on these gradients, e.g. by a gradient penalty.
     """
-    rendered = _render(rasterizer, splats, camera, depth=depth)
+    if colors is None:
+        colors = torch.cat((splats.sh0, splats.shN), 1)
+    inputs = _Inputs(splats.means, splats.quats, splats.scales, splats.opacities, colors, splats.rgb_offset)
+    rendered = _render(rasterizer, inputs, 1 + splats.shN.shape[1], camera, depth=depth)
     if means2d is None:
         means2d = rendered.rendering.means2d.clone().requires_grad_()
     else:
         means2d.data.copy_(rendered.rendering.means2d)
-    return _in_graph(rendered, splats, means2d)
+    return _in_graph(rendered, inputs, means2d)
+
+
+class _Inputs(NamedTuple):
+    """The tensors that a drawing is a function of. The colours are one tensor, as hosts have them: autograd would fill others as
+    wide with zeros for the gradient of a slice.
+    """
+
+    means: Float[Tensor, "N 3"]
+    quats: Float[Tensor, "N 4"]
+    scales: Float[Tensor, "N 3"]
+    opacities: Float[Tensor, " N"]
+    colors: Float[Tensor, "N K 3"]
+    rgb_offset: Float[Tensor, "N 3"] | None
+
+    def splats(self, bands: int) -> Splats:
+        """The same without their graph, with the first bands of the colours."""
+        means, quats, scales, opacities, colors, offset = (x if x is None else x.detach() for x in self)
+        return Splats(means, quats, scales, opacities, colors[:, :1], colors[:, 1:bands], offset)  # type: ignore[arg-type, index]
 
 
 class _Rendered(NamedTuple):
     rendering: Rendering
     rasterizer: Rasterizer
     camera: Camera
+    bands: int  # of the colours
 
 
-def _render(rasterizer: Rasterizer, splats: Splats, camera: Camera, *, depth: bool) -> _Rendered:
+def _render(rasterizer: Rasterizer, inputs: _Inputs, bands: int, camera: Camera, *, depth: bool) -> _Rendered:
     if depth:
         require_depth(rasterizer)
     if torch.is_grad_enabled() and camera.world_to_camera.requires_grad:  # silence would leave the pose as it is
@@ -200,31 +249,32 @@ def _render(rasterizer: Rasterizer, splats: Splats, camera: Camera, *, depth: bo
             "poses have no gradient in this package, and camera.world_to_camera (viewmats) requires one; detach it, or draw "
             "with gsplat's own rasterization on a GPU."
         )
-    splats = _detached([getattr(splats, field.name) for field in fields(Splats)])
+    splats = inputs.splats(bands)
     with torch.no_grad():
         rendering = rasterizer(splats, camera, depth=True) if depth else _ahead.draw(rasterizer, splats, camera)
-    return _Rendered(rendering, rasterizer, camera)
+    return _Rendered(rendering, rasterizer, camera, bands)
 
 
 def _in_graph(
-    rendered: _Rendered, splats: Splats, means2d: Float[Tensor, "M 2"], rows: Int[Tensor, " M"] | None = None
+    rendered: _Rendered, inputs: _Inputs, means2d: Float[Tensor, "M 2"], rows: Int[Tensor, " M"] | None = None
 ) -> Drawn:
-    """What was rendered, as a function of the splats and of the projected centres, those of all or of these rows."""
-    tensors = [getattr(splats, field.name) for field in fields(Splats)]
-    colour = ColourGradient()
-    image, alpha, visible, depth = _Draw.apply(rendered, rows, colour, means2d, *tensors)  # type: ignore[no-untyped-call]
-    for drawings in _recordings if image.grad_fn is not None else ():
-        drawings.append(Drawing(rendered.rendering, splats, image, colour))
+    """What was rendered, as a function of the inputs and of the projected centres, those of all or of these rows."""
+    hook = BackwardHook()
+    image, alpha, visible, depth = _Draw.apply(rendered, rows, hook, means2d, *inputs)  # type: ignore[no-untyped-call]
+    for drawings in _recordings.running if image.grad_fn is not None else ():
+        drawings.append(
+            Drawing(rendered.rendering, {k: x for k, x in inputs._asdict().items() if k != "rgb_offset"}, image, hook)
+        )
     return Drawn(image, alpha, means2d, visible, depth)
 
 
 class _Draw(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, rendered: _Rendered, rows: Tensor | None, colour: ColourGradient, means2d: Tensor, *tensors: Tensor | None
+        ctx: Any, rendered: _Rendered, rows: Tensor | None, hook: BackwardHook, means2d: Tensor, *inputs: Tensor | None
     ) -> Any:  # fmt: skip
-        ctx.rendered, ctx.rows, ctx.colour, rendering = rendered, rows, colour, rendered.rendering
-        ctx.save_for_backward(*tensors)
+        ctx.rendered, ctx.rows, ctx.hook, rendering = rendered, rows, hook, rendered.rendering
+        ctx.save_for_backward(*inputs)
         ctx.mark_non_differentiable(visible := rendering.visible.data)
         ctx.set_materialize_grads(False)
         # Other tensors over the same memory: an output that ctx holds would hold ctx in turn, and nothing would free either.
@@ -239,41 +289,39 @@ class _Draw(torch.autograd.Function):
                 "the loss depends on a rendered depth, which has no gradient in this package; detach it, or draw with "
                 "gsplat's own rasterization on a GPU."
             )
-        rendering, rasterizer, camera = ctx.rendered
-        splats = _detached(ctx.saved_tensors)  # raises if one was changed in place since it was drawn
+        take_colours = ctx.hook.reached()
+        rendering, rasterizer, camera, bands = ctx.rendered
+        inputs = _Inputs(*ctx.saved_tensors)  # raises if one was changed in place since it was drawn
         if d_image is None:
             d_image = torch.zeros_like(rendering.image)
         if d_alpha is None or not bool(d_alpha.any()):
-            gradients = _gradients(rendering, d_image, ctx.colour)
+            drawn = [(rendering, d_image)]
         else:
             # With C the colour and T = 1 - alpha, I(b) = C + T b. The difference of two backgrounds has the gradient of T.
             b = rasterizer.background
             other = (0.0 if b[0] > 0.5 else 1.0, *b[1:])
             d_red = torch.zeros_like(d_image)
             d_red[..., 0] = d_alpha / (other[0] - b[0])
-            over_other = over(rasterizer, other)(splats, camera)
-            both = _gradients(rendering, d_image + d_red), _gradients(over_other, -d_red)
-            gradients = [g + h for g, h in zip(*both, strict=True)]
-        screen, *others, rgb = gradients
+            over_other = over(rasterizer, other)(inputs.splats(bands), camera)
+            drawn = [(rendering, d_image + d_red), (over_other, -d_red)]
+        each = [image.vjp(cotangent[None]) for image, cotangent in drawn]
+        names = ("screen", "means", "quats", "scales", "opacities", "rgb")
+        screen, *geometry, rgb = (
+            sum((getattr(g, name)[0] for g in each[1:]), getattr(each[0], name)[0]) for name in names
+        )
         screen = screen if ctx.rows is None else screen[ctx.rows]
-        return None, None, None, screen, *others, None if splats.rgb_offset is None else rgb
+        basis, colors = each[0].basis, None
+        if take_colours is not None:
+            take_colours(rgb, basis)
+        elif ctx.needs_input_grad[8]:
+            colors = outer(rgb, basis, inputs.colors.shape[1])
+        return None, None, None, screen, *geometry, colors, None if inputs.rgb_offset is None else rgb
 
 
-def _detached(tensors: Sequence[Tensor | None]) -> Splats:
-    return Splats(*(x if x is None else x.detach() for x in tensors))  # type: ignore[arg-type]
-
-
-def _gradients(
-    rendering: Rendering, cotangent: Float[Tensor, "H W 3"], colour: ColourGradient | None = None
-) -> list[Any]:
-    """The gradients of the tensors that `_Draw` takes, in their order; None for those of the colours where these are taken."""
-    g = rendering.vjp(cotangent[None])
-    bands: tuple[Tensor | None, ...]
-    if colour is not None and colour.taken():
-        colour.factors, bands = (g.rgb[0], g.basis), (None, None)
-    else:
-        bands = g.sh0[0], g.shN[0]
-    return [*(x[0] for x in (g.screen, g.means, g.quats, g.scales, g.opacities)), *bands, g.rgb[0]]
+def outer(rgb: Float[Tensor, "N 3"], basis: Float[Tensor, "N B1"], bands: int) -> Float[Tensor, "N K 3"]:
+    """The gradient of the colours from its factors, Y ⊗ ∇rgb, for as many bands; those that were not drawn have gradient 0."""
+    drawn = basis[..., None] * rgb[:, None]
+    return drawn if bands == basis.shape[1] else torch.nn.functional.pad(drawn, (0, 0, 0, bands - basis.shape[1]))
 
 
 @uncompiled
@@ -334,7 +382,7 @@ def rasterization(
     if sh_degree is None:
         colors, sh_degree = ((colors - low) / span - 0.5)[:, None] / SH_C0, 0
     colors = colors.to(means.dtype)  # gsplat takes spherical harmonics in float16, too
-    splats = Splats(means, quats, scales, opacities, colors[:, :1], colors[:, 1 : (sh_degree + 1) ** 2], rgb_offset)
+    inputs, bands = _Inputs(means, quats, scales, opacities, colors, rgb_offset), (sh_degree + 1) ** 2
     each = []
     for pose, K, over_color in zip(viewmats, Ks, behind, strict=True):
         background = tuple((x - low) / span for x in over_color)
@@ -343,10 +391,10 @@ def rasterization(
         )
         (fx, _, cx), (_, fy, cy), _ = K.tolist()
         camera = Camera(pose, fx, fy, cx, cy, width, height)
-        each.append(_render(rasterizer, splats, camera, depth=render_mode == "RGB+ED"))
-    info, centres, rows = _packed_info(each, splats) if packed else _info(each)
+        each.append(_render(rasterizer, inputs, bands, camera, depth=render_mode == "RGB+ED"))
+    info, centres, rows = _packed_info(each, inputs) if packed else _info(each)
     info |= {"width": width, "height": height, "n_cameras": len(each)}
-    views = [_in_graph(rendered, splats, u, i) for rendered, u, i in zip(each, centres, rows, strict=True)]
+    views = [_in_graph(rendered, inputs, u, i) for rendered, u, i in zip(each, centres, rows, strict=True)]
     images, alphas = _stacked([view.image for view in views]), _stacked([view.alpha for view in views])[..., None]
     if (low, span) != (0.0, 1.0):
         images = low + span * images
@@ -364,12 +412,12 @@ def _info(each: Sequence[_Rendered]) -> tuple[dict[str, Any], Sequence[Tensor], 
 
 
 def _packed_info(
-    each: Sequence[_Rendered], splats: Splats
+    each: Sequence[_Rendered], splats: _Inputs
 ) -> tuple[dict[str, Any], Sequence[Tensor], Sequence[Tensor]]:
     """The same of the visible alone, and which these are."""
     rows = [rendering.visible.nonzero()[:, 0] for rendering, *_ in each]
     columns = []
-    for i, (rendering, rasterizer, camera) in zip(rows, each, strict=True):
+    for i, (rendering, rasterizer, camera, _) in zip(rows, each, strict=True):
         settings = cast(RasterSettings, rasterizer)  # `over` has checked it
         f = footprints(splats.means[i], splats.quats[i], splats.scales[i], camera, settings.kernel)
         opacities = splats.opacities[i] * f.compensation if settings.antialiased else splats.opacities[i]

@@ -74,11 +74,9 @@ class SkipPolicy:
             _log.warning("skips.coarse_until has no effect: SR images are halved where data.views.sr_scale is even.")
         elif s.coarse_until > 0:
             phrases.append(f"HR at half its size until iteration {s.coarse_until}")
-        if in_host:
-            return phrases
         if s.hr_every > 1 and s.coarse_until > 0:
             phrases.append(f"HR in one of {s.hr_every} iterations until iteration {s.coarse_until}")
-        if s.plateau_gain == 0:
+        if in_host or s.plateau_gain == 0:
             return phrases
         if s.plateau_window == 0:
             _log.warning(

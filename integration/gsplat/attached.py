@@ -21,8 +21,9 @@ from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment
 from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot, Target
 from integration.densification import require_end, warn_if_score_is_unused
-from integration.detail import detail_adam, sh0_offset
+from integration.detail import sh0_offset
 from integration.lineage import RowNumbers
+from integration.optimizers import optimizers_of, step_detail
 from integration.replacing import replace_everywhere
 from rasterizers.autograd import drawing_ahead, recorded, uncompiled
 from rasterizers.geometry import SH_C0
@@ -39,7 +40,9 @@ class Attached:
     """The strategies of a conductor in a gsplat-style loop; `attach` makes one.
 
     Args:
-        params: gsplat's dict of leaves. optimizers: one for each of them.
+        params: gsplat's dict of leaves.
+        optimizers: a dict with one for each of them, or of which some step the Gaussians; they may be made anew in it. Or one
+            for all.
         views: all training views. A rendering is that of the view named by `rendering`, else of the one with its pose.
         strategy: gsplat's densification strategy, whose threshold scales P2G's score; None: a loop without one.
         state: where changes of structure are recorded, in place of `params`: the state of gsplat 1.4's strategy, or `signal` of
@@ -51,17 +54,18 @@ class Attached:
         masks: [h, w] by the name of a view, what the host multiplies the LR image by after rendering.
         own_background: the loop adds a background to its renderings itself; else the strategies may choose the `backgrounds` of
             calls that name none.
+        iterations: of the loop. Where HR would take part after them only, a warning says so before the first step.
 
     Raises:
         ValueError: there is no view, or a parameter is missing.
         HostError: a network makes the colours.
-        SettingError: densification outlasts the anchor.
+        SettingError: densification outlasts the anchor; a scheduler exists that an optimizer of all parameters cannot follow.
     """
 
     def __init__(
         self,
         params: MutableMapping[str, Any] | torch.nn.ParameterDict,
-        optimizers: MutableMapping[str, Any],
+        optimizers: MutableMapping[str, Any] | torch.optim.Optimizer,
         views: Sequence[View],
         conductor: Conductor,
         *,
@@ -74,6 +78,7 @@ class Attached:
         accumulation: int = 1,
         masks: Mapping[str, Tensor] | None = None,
         own_background: bool = False,
+        iterations: int | None = None,
     ) -> None:
         if not views:
             raise ValueError(
@@ -87,8 +92,7 @@ class Attached:
         means = params[self._names["means"]]
         if detail and "detail" not in params:
             params["detail"] = torch.nn.Parameter(means.new_zeros(len(means), 3))
-        if detail and "detail" not in optimizers:  # also where a checkpoint of the host held the parameter
-            optimizers["detail"] = detail_adam(params["detail"], conductor.detail)
+        self._optimizers = optimizers
         self._rows = RowNumbers(
             params if state is None else state, lambda: params[self._names["means"]], as_parameter=state is None
         )
@@ -97,6 +101,7 @@ class Attached:
         self._named: View | None = None
         self._has_drawn_bands = False  # after a call with spherical harmonics, one without them draws no colours
         self._product: tuple[Tensor, Tensor, Tensor] | None = None  # see `_gated`
+        self._trains_detail = detail
         self._is_ours = False  # the wrapped function is this package's, see `wrap`
         self._undo = ExitStack()
         stop, threshold = (getattr(strategy, name, None) for name in ("refine_stop_iter", "grow_grad2d"))
@@ -105,10 +110,9 @@ class Attached:
         self.attachment = Attachment(
             conductor, self.params, views=self._views, seed=seed, loss_scale=loss_scale, accumulation=accumulation,
             poll_parents=self._rows.poll, restart_parents=self._rows.restart, threshold=threshold, masks=masks,
-            own_background=own_background, reads_score=threshold is not None,
+            own_background=own_background, reads_score=threshold is not None, remedy=self._rows.remedy, iterations=iterations,
         )  # fmt: skip
-        # Those of the Gaussians; others, e.g. of poses, do not count.
-        self.attachment.hook([optimizers[name] for name in (*self._names.values(), "detail") if name in optimizers])
+        self._follow_optimizers()
 
     def params(self) -> dict[str, Tensor]:
         """The current leaves, by gsplat's names."""
@@ -146,7 +150,9 @@ class Attached:
             def render_at(target: Target, gate: Tensor | None, sized: View) -> HostOutput:
                 return self._render(rasterization, call, sized, target, gate)
 
-            return self.attachment.render_view(view, render_at)  # type: ignore[no-any-return]
+            self._follow_optimizers()
+            with self._together(call):
+                return self.attachment.render_view(view, render_at)  # type: ignore[no-any-return]
 
         setattr(wrapped, _ATTACHED, self)
         return wrapped
@@ -183,6 +189,21 @@ class Attached:
         self._undo.close()
         self._rows.remove()
 
+    def _follow_optimizers(self) -> None:
+        """Hook those that the host has now."""
+        params = self.params()
+        found = optimizers_of(self._optimizers, params, self._names.values())
+        if self._trains_detail:
+            found = step_detail(self._optimizers, found, self._params["detail"], self.attachment.conductor.detail)
+        self.attachment.hook(found)
+
+    def _together(self, call: Mapping[str, Any]) -> AbstractContextManager[None]:
+        """A context in which HR and LR share work, where this package draws both."""
+        if not self._is_ours:
+            return nullcontext()
+        pose, K = (call[name].detach().reshape(n, n) for name, n in (("viewmats", 4), ("Ks", 3)))
+        return drawing_ahead(pose, K, call["width"], call["height"])
+
     def _draws_colors(self, call: Mapping[str, Any]) -> bool:
         """Whether a call draws the colours of the scene, and not its depth alone, its normals or other features."""
         as_bands = call.get("sh_degree") is not None
@@ -218,10 +239,7 @@ class Attached:
             )
         if gate is not None:
             call["opacities"] = self._gated(call["opacities"], gate)
-        together: AbstractContextManager[None] = nullcontext()
         if target == "hr":
-            if self._is_ours:  # the LR image comes next
-                together = drawing_ahead(call["Ks"].detach().reshape(3, 3), call["width"], call["height"])
             call, factor = self._with_detail(call, trained=True), view.factor
             call["Ks"] = call["Ks"] * call["Ks"].new_tensor([[factor], [factor], [1]])
             call |= {"width": call["width"] * factor, "height": call["height"] * factor, "render_mode": "RGB"}
@@ -244,8 +262,8 @@ class Attached:
                     f"{view.lr.camera.width}x{view.lr.camera.height} pixels. Train at one resolution (nerfstudio: "
                     "num_downscales=0)."
                 )
-        with together:
-            return self._drawn(rasterization, call, params, gate)
+        aliases = () if self._is_ours else _aliased(call)
+        return self._drawn(rasterization, call, params, gate, aliases if target == "lr" else ())
 
     def _gated(self, opacities: Float[Tensor, " N"], gate: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
         """Their product, made once for both scales."""
@@ -254,8 +272,9 @@ class Attached:
         return self._product[2]
 
     def _drawn(
-        self, rasterization: Rasterization, call: Mapping[str, Any], params: Mapping[str, Tensor], gate: Tensor | None
-    ) -> HostOutput:
+        self, rasterization: Rasterization, call: Mapping[str, Any], params: Mapping[str, Tensor], gate: Tensor | None,
+        marks: Sequence[Tensor],
+    ) -> HostOutput:  # fmt: skip
         """One rendering. Gaussians that the gate drops are marked as not visible in its `info`."""
         with recorded() as drawings:
             result = rasterization(**call)
@@ -289,7 +308,7 @@ class Attached:
         }
         slot = ScreenGradientSlot(info["means2d"], size, rows=rows)
         shot = AutogradShot(image, means2d, visible, params, slot, drawn, drawings)
-        return HostOutput(shot, renders, (renders, alphas, info))
+        return HostOutput(shot, (renders, alphas, info), marks)
 
     def _background(self, call: Mapping[str, Any]) -> dict[str, Tensor]:
         """The `backgrounds` that the strategies choose for a call; none where it names its own."""
@@ -326,6 +345,15 @@ def require_bands(params: Mapping[str, Any] | torch.nn.ParameterDict) -> None:
             "strategies merge gradients of spherical harmonics: train with simple_trainer.py in place of simple_trainer_nht.py, "
             "without app_opt."
         )
+
+
+def _aliased(call: dict[str, Any]) -> tuple[Tensor, ...]:
+    """Put other tensors over the same memory in place of those of the call that require gradients; returns them. They have none
+    of the loop's hooks, and what the loop does to its renderings cannot reach theirs.
+    """
+    aliases = {name: x.view_as(x) for name, x in call.items() if isinstance(x, Tensor) and x.requires_grad}
+    call |= aliases
+    return tuple(aliases.values())
 
 
 def _visible(radii: Tensor, packed: bool) -> Bool[Tensor, "*shape"]:

@@ -123,7 +123,7 @@ class _Installed:
         self.views, self._splats = views, runner.splats
         self.attached = Attached(
             runner.splats, runner.optimizers, views, chosen, strategy=runner.cfg.strategy, seed=seed, masks=masks,
-            state=getattr(getattr(runner, "scene", None), "signal", None),
+            state=getattr(getattr(runner, "scene", None), "signal", None), iterations=runner.cfg.max_steps,
         )  # fmt: skip
         self.attached.replace_everywhere(rendering.rasterization)
         self._undo = ExitStack()

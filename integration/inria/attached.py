@@ -96,7 +96,8 @@ class Attached:
         self._warned: set[str] = set()
         self.attachment = Attachment(
             conductor, self.params, views=self.views.all, seed=seed, threshold=threshold, masks=self.views.masks,
-            poll_parents=lambda: self.detail.poll_parents(conductor.state_dict), own_background=own_background,
+            poll_parents=self.detail.poll_parents, own_background=own_background,
+            remedy="Nothing has their colour and rotation. End densification first.",
         )  # fmt: skip
         self._undo = ExitStack()
         self._undo.callback(replace_methods(gaussians, {

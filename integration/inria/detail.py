@@ -42,26 +42,11 @@ class DetailFeature:
         """f_det as an offset of the constant SH band."""
         return sh0_offset(self.value.detach(), sh0)
 
-    def poll_parents(self, state: Callable[[], Mapping[str, Tensor]]) -> Int[Tensor, " M"] | None:
-        """parents[M] of the changes since the last call; None: there were none.
-
-        Args:
-            state: returns what strategies store per Gaussian.
-
-        Raises:
-            HostError: the parent of a new Gaussian is unknown, but there is per-Gaussian state.
-        """
+    def poll_parents(self) -> Int[Tensor, " M"] | None:
+        """parents[M] of the changes since the last call, -1 where there is none; None: there were no changes."""
         self._follow_host()
         parents, self._parents = self._parents, None
-        if parents is None:
-            return None
-        unknown = int((parents < 0).sum())
-        if unknown and (names := ", ".join(state())):
-            raise HostError(
-                f"{unknown:,} new Gaussians have the colour and rotation of no old one, so their parents are unknown, but "
-                f"{names} is stored per Gaussian. End densification first."
-            )
-        return parents.clamp_min(0)
+        return parents
 
     def step(self) -> None:
         """One optimizer step, if there is a gradient; called when the host steps."""

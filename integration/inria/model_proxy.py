@@ -133,8 +133,10 @@ def host_output(
             f"render must return an image of {camera.width}x{camera.height} pixels, got shape {tuple(image.shape)}. Train "
             "at the resolution of the photos."
         )
-    if image._is_view():  # its hook would be lost where the host multiplies it in place by a mask
+    marks = () if drawings or not image.requires_grad else (image,)
+    if marks and image._is_view():  # its hook would be lost where the host multiplies it in place by a mask
         image = image.clone()
+        marks = (image,)
         result = {**result, "render": image}
     visible = radii > 0 if radii.dim() == 1 else (radii > 0).all(-1)
     if gate is not None:
@@ -151,7 +153,7 @@ def host_output(
     slot = ScreenGradientSlot(centres, (width, height), (2 / width, 2 / height), ranked=ranked)
     means2d = project(params["means"].detach(), camera)
     shot = AutogradShot(image.permute(1, 2, 0), means2d, visible, params, slot, drawings=drawings)
-    return HostOutput(shot, image, result)
+    return HostOutput(shot, result, marks)
 
 
 def project(means: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, "N 2"]:

@@ -119,15 +119,18 @@ def test_f_det_learns_at_a_lower_rate_in_a_short_run(iterations, share):
     assert host.optimizers["detail"].param_groups[0]["lr"] == pytest.approx(LearningRates().detail * share)
 
 
+@pytest.mark.parametrize("accumulation", [1, 2])
 @pytest.mark.parametrize("decay", [0.0, 0.5])
-def test_f_det_fades_at_the_decay_of_the_conductor(decay):
+def test_f_det_fades_once_a_step_at_the_decay_of_the_conductor(decay, accumulation):
     scene = toy.scene(20)
-    host = Host(scene)
-    attached(host, scene, Conductor(objective=HR_FROM_START, detail=DetailRates(decay=decay)))
+    host = Host(scene, accumulation=accumulation)
+    conductor = Conductor(objective=HR_FROM_START, detail=DetailRates(decay=decay))
+    attached(host, scene, conductor, accumulation=accumulation)
     host.splats["detail"].data += 1.0
     host.optimizers["detail"].param_groups[0]["lr"] = 0.0
-    host.train([scene.train[0].name])
-    assert float(host.splats["detail"].mean()) == pytest.approx(1 - decay)
+    host.train([scene.train[0].name] * accumulation)
+    faded = (1 - decay / accumulation) ** accumulation
+    assert float(host.splats["detail"].mean()) == pytest.approx(faded)
 
 
 def test_remove_restores_the_loop():

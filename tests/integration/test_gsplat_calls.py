@@ -89,6 +89,29 @@ def test_cameras_that_lie_close_together_are_told_apart(origin):
         assert clear._find_view(rounded) is view
 
 
+@pytest.mark.parametrize(("ratio", "found"), [(8, False), (12, True)])
+def test_the_nearest_camera_is_the_one_that_is_rendered_if_the_next_is_ten_times_as_far(ratio, found):
+    """Poses that a loop optimizes or adds noise to lie beside those of the photos."""
+    host, scene, noise = Host(toy.scene(20)), toy.scene(20), 1e-5
+    pose = scene.train[0].lr.camera.world_to_camera
+    views = []
+    for i, x in enumerate((noise, -ratio * noise)):
+        at = pose.clone()
+        at[0, 3] += x
+        views.append(
+            View(
+                f"frame{i}",
+                *(
+                    replace(p, camera=replace(p.camera, world_to_camera=at))
+                    for p in (scene.train[0].lr, scene.train[0].hr)
+                ),
+            )
+        )
+    clear = attach(host.splats, host.optimizers, views, Conductor())
+    with nullcontext() if found else pytest.raises(HostError, match="frame0 and frame1 have the same pose"):
+        assert clear._find_view(pose[None]) is views[0]
+
+
 @pytest.mark.parametrize("by_name", [False, True])
 def test_the_detail_feature_is_trained_in_a_loop_that_tells_every_optimizer_what_is_visible(by_name):
     host, _, render = started()
@@ -132,7 +155,7 @@ def test_the_gradient_of_the_colours_comes_by_its_factors_but_where_a_hook_looks
             host.splats["shN"].register_hook(seen.append)
         for i in range(2):  # the second with gradients of the first, which are not zeroed
             (render(i).mean() + penalty * host.splats["shN"].square().sum()).backward()
-        assert len(seen) == (2 if hooked else 0)
+        assert len(seen) == (4 if hooked else 0)  # of LR and of HR
         merged.append({name: p.grad for name, p in host.splats.items() if p.grad is not None})
     assert by_factors == [True, True, False, False]
     assert all(torch.allclose(g, merged[1][name], rtol=1e-5, atol=1e-9) for name, g in merged[0].items())

@@ -93,16 +93,35 @@ def test_a_densifier_that_forgets_a_parameter_is_an_error():
 
 def test_the_state_of_gsplat_1_4_carries_the_rows_and_must_know_their_origin():
     state, recorder = {}, toy.Recorder()
-    host, _, render = gsplat_host.started(recorder, state=state)
+    host, _, render = gsplat_host.started(recorder, SplatSuRe(), state=state)
     assert ROWS not in host.splats
     for name, p in host.splats.items():
         host.splats[name] = torch.nn.Parameter(p.detach()[1:])
     state[ROWS] = state[ROWS][1:]
     render()
     assert torch.equal(recorder.changes[0], torch.arange(1, 20))
+    for i in range(3):  # until something is stored of each Gaussian
+        render(i).mean().backward()
     state[ROWS] = torch.zeros_like(state[ROWS])
     with pytest.raises(HostError, match="does not say where relocated Gaussians come from"):
         render()
+
+
+@pytest.mark.parametrize("strategies", [(), (SplatSuRe(),)], ids=["nothing is stored", "something of each"])
+def test_gaussians_that_come_from_no_other_are_added_where_nothing_is_stored_of_each(strategies):
+    recorder = toy.Recorder()
+    host, _, render = gsplat_host.started(recorder, *strategies)
+    for i in range(3):
+        render(i).mean().backward()
+    for name, p in host.splats.items():  # as a loop adds rows to whatever it finds among its parameters
+        rows = torch.cat((p.detach(), torch.zeros_like(p[:2])))
+        host.splats[name] = torch.nn.Parameter(rows, requires_grad=p.requires_grad)
+    if strategies:
+        with pytest.raises(HostError, match=rf"2 new Gaussians come from no other, but SplatSuRe.*parameter {ROWS}"):
+            render()
+    else:
+        render().mean().backward()
+        assert recorder.changes[0].tolist() == [*range(20), 0, 0]
 
 
 def test_the_signals_of_a_scene_carry_the_rows_and_may_change_in_place():
@@ -168,3 +187,15 @@ def test_a_loop_goes_back_to_a_checkpoint_with_another_number_of_gaussians():
     render(1).mean().backward()
     assert len(recorder.changes) == 1
     assert {rows.shape for rows in clear.attachment.conductor.state_dict().values()} == {(20,)}
+
+
+@pytest.mark.parametrize("last", [4, 5])
+def test_gaussians_that_a_host_adds_in_the_step_of_the_anchor_are_there_before_it_is_taken(last):
+    """As with DefaultStrategy's refine_stop_iter at half of the steps, where SVS's anchor is."""
+    host, clear, render = gsplat_host.started(SVS(anchor_start=5, anchor_strength=0.01))
+    for t in range(1, 7):
+        render(t % 3).mean().backward()
+        if t == last:
+            for name, p in host.splats.items():
+                host.splats[name] = torch.nn.Parameter(p.detach()[1:], requires_grad=p.requires_grad)
+    assert clear.attachment.conductor.state_dict()["SVS.means"].shape == (19, 3)

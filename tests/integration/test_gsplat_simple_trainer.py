@@ -54,7 +54,7 @@ def test_its_checkpoint_and_its_ply_are_the_model_that_was_evaluated(trainer, ca
     with caplog.at_level(logging.INFO):
         assert trainer.run([*trainer.sr, *OVERRIDES], "--pose_noise", "0.01") == 0
     assert "8 merges" in caplog.text  # views are recognised by their index
-    assert "refine_stop_iter=3 instead of 7" in caplog.text  # SVS ends densification at half of the steps
+    assert "refine_stop_iter=4 instead of 7" in caplog.text  # SVS ends densification at half of the steps
     evaluated = torch.load(trainer.folder / "image.pt")
     splats = torch.load(trainer.folder / "ckpt.pt")["splats"]
     assert set(splats) == {"means", "quats", "scales", "opacities", "sh0", "shN"}

@@ -56,6 +56,16 @@ def test_as_many_pass_as_by_the_ordinary_statistic_and_in_the_scores_order(seed,
     assert set((scaled >= 5e-4).nonzero()[:, 0].tolist()) == set(score.argsort(descending=True)[:passing].tolist())
 
 
+def test_a_gaussian_counts_in_the_views_that_see_it():
+    """Half of all is above the threshold where it is seen, every other time: its mean is that of these views."""
+    scaler, half = ScoreScaler(threshold=1.0, half_life=1_000), torch.arange(8) < 4
+    ordinary, score = torch.where(half, 1.5, 0.5), torch.where(half, 0.4, 0.2)
+    for i in range(11):
+        hidden = half & (i % 2 == 1)
+        scaled = scaler(torch.where(hidden, 0.1, score), torch.where(hidden, 0.1, ordinary), ~hidden)
+    assert ((scaled >= 1) == half).all()
+
+
 def test_none_passes_without_a_score_and_absolute_gradients_decide_how_many_pass_with_one():
     scaled = ScoreScaler(threshold=1.0)(torch.rand(20) * 100, torch.rand(20) * 0.5, everyone(20))
     assert float(scaled.max()) < 1
@@ -173,10 +183,10 @@ def test_it_is_the_first_iteration_after_the_last_that_is_allowed(first, caplog)
     settings = SimpleNamespace(until=100)
     with caplog.at_level("INFO"):
         end_with_strategies(Conductor(Late(20, 60)), settings, "until", first)
-    assert settings.until == 59 + first
-    assert f"densification ends at until={59 + first} instead of 100 (Late)" in caplog.text
+    assert settings.until == 60 + first
+    assert f"densification ends at until={60 + first} instead of 100 (Late)" in caplog.text
     assert (
-        f"Late forbids densification at 19 of the iterations before {59 + first}, the first is {first}" in caplog.text
+        f"Late forbids densification at 20 of the iterations before {60 + first}, the first is {first}" in caplog.text
     )
 
 
@@ -193,8 +203,8 @@ def test_a_host_that_would_densify_after_the_anchor_is_refused_before_the_first_
     early = SVS(anchor_start=5, anchor_strength=0.01)
     if host == "gsplat":
         strategy = SimpleNamespace(refine_stop_iter=24, grow_grad2d=2e-4)
-        with pytest.raises(SettingError, match=r"before the anchor is taken, got 24. Set refine_stop_iter=4"):
+        with pytest.raises(SettingError, match=r"before the anchor is taken, got 24. Set refine_stop_iter=5"):
             gsplat_host.started(early, strategy=strategy)
     else:
-        with pytest.raises(SettingError, match=r"before the anchor is taken, got 24. Set densify_until_iter=5"):
+        with pytest.raises(SettingError, match=r"before the anchor is taken, got 24. Set densify_until_iter=6"):
             request.getfixturevalue("inria_attached")(early, densify_until=24)

@@ -365,7 +365,7 @@ def test_schedules_are_those_of_the_hosts_own_options(inria_host, inria_capture)
     gaussians, scene = inria_host.setup(opt)
     clear = install(gaussians, scene, opt, strategies="clear_paper", overrides=FROM_START[2:], sr=inria_capture / "sr")
     conductor = clear.attachment.conductor
-    assert opt.densify_until_iter == 15  # clear_paper takes its anchor at half of the iterations
+    assert opt.densify_until_iter == 16  # clear_paper takes its anchor after iteration 15, half of all
     assert conductor.may_densify(14)
     assert not conductor.may_densify(15)
     assert conductor.objective.lambda_hr(9) == conductor.objective.lambda_hr.peak  # full at 3,000 of 10,000

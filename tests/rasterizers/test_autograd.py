@@ -2,6 +2,7 @@
 
 import gc
 import inspect
+import threading
 import weakref
 from dataclasses import fields, replace
 
@@ -39,6 +40,85 @@ def test_what_was_drawn_is_freed_with_its_image(depth, monkeypatch):
     autograd.draw(ReferenceRasterizer(), leaves(scene(20)), camera(40, 30), depth=depth).image.sum().backward()
     gc.collect()
     assert drawn[0]() is None
+
+
+def drawn_in(splats):
+    return autograd.draw(ReferenceRasterizer(), splats, camera(40, 30))
+
+
+@pytest.mark.parametrize("inside", [0, 1])
+def test_a_recording_has_what_is_drawn_inside_of_it_and_ends_alone(inside):
+    splats = leaves(scene(20))
+    with autograd.recorded() as outer:
+        with autograd.recorded() as inner:
+            for _ in range(inside):
+                drawn_in(splats)
+        drawn_in(splats)
+    drawn_in(splats)
+    assert (len(outer), len(inner)) == (1 + inside, inside)
+
+
+def test_a_thread_records_its_own_drawings():
+    splats, both, seen = leaves(scene(20)), threading.Barrier(2), []
+
+    def work():
+        with autograd.recorded() as drawings:
+            both.wait()
+            drawn_in(splats)
+            both.wait()
+            seen.append(len(drawings))
+
+    threads = [threading.Thread(target=work) for _ in range(2)]
+    for step in ("start", "join"):
+        for thread in threads:
+            getattr(thread, step)()
+    assert seen == [1, 1]
+
+
+@pytest.fixture
+def together(monkeypatch):
+    """How many images were drawn together each time."""
+    numbers, render_scales = [], ReferenceRasterizer.render_scales
+
+    def counted(self, jobs, **more):
+        numbers.append(len(jobs))
+        return render_scales(self, jobs, **more)
+
+    monkeypatch.setattr(ReferenceRasterizer, "render_scales", counted)
+    return numbers
+
+
+def ahead(view):
+    return autograd.drawing_ahead(view.world_to_camera, intrinsics(view), view.width, view.height)
+
+
+def test_an_image_that_is_drawn_ahead_is_taken_inside_and_forgotten_with_the_block(together):
+    view, splats = camera(40, 30), scene(60)
+    shown, colors = replace(splats, rgb_offset=None), torch.cat((splats.sh0, splats.shN), 1)
+    expected = autograd.draw(ReferenceRasterizer(), shown, view, colors=colors).image
+    with ahead(view):
+        autograd.draw(ReferenceRasterizer(), splats, view.scaled(2), colors=colors)
+        assert together[-1] == 2
+        # While it is kept its tensors live, so that no others at their addresses are taken for them.
+        assert autograd._ahead.kept[2].means.data_ptr() == splats.means.data_ptr()
+        drawn = len(together)
+        assert torch.equal(autograd.draw(ReferenceRasterizer(), shown, view, colors=colors).image, expected)
+        assert len(together) == drawn
+        assert autograd._ahead.kept is None
+    with ahead(view):
+        autograd.draw(ReferenceRasterizer(), splats, view.scaled(2), colors=colors)
+    shown.means.data.add_(0.1)  # which torch does not count
+    assert not torch.equal(autograd.draw(ReferenceRasterizer(), shown, view, colors=colors).image, expected)
+
+
+def test_other_poses_and_the_image_itself_bring_no_other_along(together):
+    view, splats = camera(40, 30), replace(scene(60), rgb_offset=None)
+    pose = view.world_to_camera.clone()
+    pose[0, 3] += 1
+    with ahead(view):
+        autograd.draw(ReferenceRasterizer(), splats, replace(view, world_to_camera=pose))
+        autograd.draw(ReferenceRasterizer(), splats, view)
+    assert set(together) <= {1}
 
 
 @pytest.mark.parametrize("depth", [False, True])

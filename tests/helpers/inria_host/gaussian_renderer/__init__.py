@@ -29,7 +29,7 @@ def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, columns=3
     opacity = torch.nn.functional.dropout(pc.get_opacity[:, 0], dropout)  # DropGaussian's render does this itself
     splats = Splats(xyz, pc.get_rotation, scales, opacity, features[:, :1], features[:, 1:bands])
     behind = None if bg_color is None else tuple(bg_color.tolist())
-    drawn = autograd.draw(over(RASTERIZER, behind), splats, camera, InNdc.apply(dummy, w, h, ABSOLUTE))
+    drawn = autograd.draw(over(RASTERIZER, behind), splats, camera, InNdc.apply(dummy, w, h, ABSOLUTE), colors=features)
     return {
         "render": drawn.image.permute(2, 0, 1),
         "viewspace_points": dummy,

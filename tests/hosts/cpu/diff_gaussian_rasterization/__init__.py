@@ -33,17 +33,17 @@ class GaussianRasterizer(torch.nn.Module):
         background = tuple(float(x) for x in s.bg)
         scales, bands = scales * s.scale_modifier, (s.sh_degree + 1) ** 2
 
-        def draw(sh0, rest, background=(0.0, 0.0, 0.0), offset=None):
+        def draw(colors, bands=1, background=(0.0, 0.0, 0.0), offset=None):
             rasterizer = rasterizers.load("torch", near=0.2, background=background, **smooth)
-            splats = Splats(means3D, rotations, scales, opacities[:, 0], sh0, rest)
-            return autograd.draw(rasterizer, splats, camera, offset)
+            splats = Splats(means3D, rotations, scales, opacities[:, 0], colors[:, :1], colors[:, 1:bands])
+            return autograd.draw(rasterizer, splats, camera, offset, colors=colors)
 
-        drawn = draw(shs[:, :1], shs[:, 1:bands], background, InNdc.apply(means2D, w, h, HOST == "mip-splatting"))
+        drawn = draw(shs, bands, background, InNdc.apply(means2D, w, h, HOST == "mip-splatting"))
         image, radii = drawn.image.permute(2, 0, 1).contiguous(), 3 * drawn.visible.int()
         if HOST in ("mip-splatting", "dropgaussian"):
             return image, radii
         z = (means3D @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3])[:, 2:].clamp_min(0.2)
         value = (1 / z if HOST == "3dgs" else z).expand(-1, 3)
         with torch.set_grad_enabled(HOST == "fsgs"):  # 3DGS's loss reads it only where a scene has depth maps
-            depth = draw((value[:, None] - 0.5) / SH_C0, shs[:, 1:1]).image.permute(2, 0, 1)[:1]
+            depth = draw((value[:, None] - 0.5) / SH_C0).image.permute(2, 0, 1)[:1]
         return (image, radii, depth, drawn.alpha[None]) if HOST == "fsgs" else (image, radii, depth)

@@ -1,0 +1,66 @@
+"""The optimizers of a host's loop, which it may join, split, and make anew in mid-training."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, MutableMapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from clear_strategies.errors import SettingError
+from clear_strategies.merging.detail import DetailRates
+from integration.detail import DETAIL_EPS, detail_adam
+
+_DETAIL = "detail"
+
+
+def optimizers_of(
+    given: Mapping[str, Any] | torch.optim.Optimizer, params: Mapping[str, Tensor], names: Iterable[str]
+) -> list[torch.optim.Optimizer]:
+    """Those that step the Gaussians: they have these names, or hold one of the parameters. Others, e.g. of poses, do not count.
+
+    Args:
+        given: the host's, by the names of its parameters or by any, or a single one.
+    """
+    if isinstance(given, torch.optim.Optimizer):
+        return [given]
+    leaves, known = {id(p) for p in params.values()}, {*names, _DETAIL}
+    found = [o for name, o in given.items() if name in known or not leaves.isdisjoint(map(id, _stepped(o)))]
+    return list({id(o): o for o in found}.values())
+
+
+def step_detail(
+    given: MutableMapping[str, Any] | torch.optim.Optimizer,
+    found: list[torch.optim.Optimizer],
+    detail: torch.nn.Parameter,
+    rates: DetailRates,
+) -> list[torch.optim.Optimizer]:
+    """`found`, of which one now steps f_det: a group of the only one where it steps several parameters, for such a loop steps no
+    other, else an Adam of its own in the host's dictionary.
+
+    Raises:
+        SettingError: a learning rate scheduler counts the groups of the only optimizer.
+    """
+    if any(p is detail for o in found for p in _stepped(o)):
+        return found
+    if isinstance(given, torch.optim.Optimizer) or (len(found) == 1 and len(_stepped(found[0])) > 1):
+        only = found[0]
+        if getattr(only.step, "_wrapped_by_lr_sched", False):
+            raise SettingError(
+                "optimizers: f_det becomes a group of the optimizer, whose learning rate scheduler exists already and counts its "
+                "groups. Make the scheduler after attach(), or attach(detail=False)."
+            )
+        group = {"params": [detail], "name": _DETAIL, "lr": rates.rate}
+        only.add_param_group(group | ({"eps": DETAIL_EPS} if "eps" in only.defaults else {}))
+        if not isinstance(given, torch.optim.Optimizer):
+            given.setdefault(_DETAIL, only)
+        return found
+    if _DETAIL not in given:  # also where a checkpoint of the host held the parameter
+        given[_DETAIL] = detail_adam(detail, rates)
+        return [*found, given[_DETAIL]]
+    return found
+
+
+def _stepped(optimizer: Any) -> list[Tensor]:
+    return [p for group in getattr(optimizer, "param_groups", ()) for p in group["params"]]

@@ -1,0 +1,161 @@
+"""What is rendered and not merged yet, and a backward pass of the host that may end that."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from weakref import WeakMethod
+
+import torch
+from torch import Tensor
+
+from clear_strategies.errors import HostError
+from clear_strategies.kernels.merge import Colour
+from clear_strategies.merging.in_place import RoutedGradients, dense
+from clear_strategies.merging.iteration import HrGradients
+from integration.autograd_shot import DrawnGradients, HostOutput
+from integration.colours import are_accumulated, are_joined
+from rasterizers.autograd import TakeColours
+
+Reached = Callable[[int], TakeColours | None]
+"""Called when a backward pass has reached the nth rendering and no parameter yet; what it returns is that of
+`rasterizers.autograd.BackwardHook.reached`.
+"""
+
+
+@dataclass(slots=True, eq=False)
+class BackwardPass:
+    """A backward pass over a rendering, from where it has reached it.
+
+    Args:
+        task: torch's number of the pass.
+        params: the leaves then.
+        renderings: the numbers of those that it has reached.
+        colour: the gradient of sh0 and shN that it has brought as factors, so that their `.grad` lacks it.
+
+    Attributes:
+        before: `.grad` as it was, by name, where it was there.
+    """
+
+    task: int
+    params: Mapping[str, Tensor]
+    renderings: set[int] = field(default_factory=set)
+    colour: Colour | None = None
+    before: dict[str, Tensor] = field(init=False)
+    _found: dict[str, tuple[Tensor | None, int]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        grads = {name: p.grad for name, p in self.params.items()}
+        self.before = {name: g.detach().clone() for name, g in grads.items() if g is not None}
+        self._found = {name: (g, 0 if g is None else g._version) for name, g in grads.items()}
+
+    def take(self, rgb: Tensor, basis: Tensor) -> None:
+        """Keep the gradient of the colours."""
+        self.colour = Colour(rgb, basis)
+
+    def accumulated(self) -> list[str]:
+        """The parameters that it has given a gradient to, f_det apart."""
+        of_colour = () if self.colour is None else ("sh0", "shN")
+        return [name for name in self.params if name in of_colour or (name != "detail" and self._has_changed(name))]
+
+    def _has_changed(self, name: str) -> bool:
+        before, version = self._found[name]
+        now = self.params[name].grad
+        return now is not before or (now is not None and now._version != version)
+
+
+@dataclass(slots=True, eq=False)
+class Pending:
+    """A rendering of a training view that waits for the host's backward pass.
+
+    Args:
+        nth: its number. output: None once everything that is trained is merged.
+        hr: the gradients of HR, and routed: the same of the raw parameters; None where HR takes no part.
+        screen: the screen gradient of LR and the pass that it came in, where a densifier reads it.
+        merged: the parameters that a pass has brought, which no other may.
+    """
+
+    nth: int
+    view: str
+    output: HostOutput | None
+    hr: HrGradients[DrawnGradients] | None
+    routed: RoutedGradients | None
+    screen: dict[int, Tensor] = field(default_factory=dict)
+    merged: set[str] = field(default_factory=set)
+
+    def listen(self, reached: WeakMethod[Reached], *, to_screen: bool) -> None:
+        """Have `reached` called in every backward pass over the rendering.
+
+        The reference is weak, and nothing that autograd holds refers to this object: its tensors would never be freed.
+        """
+        if self.output is None:
+            return
+        nth, screen = self.nth, self.screen
+
+        def called() -> TakeColours | None:
+            return None if (alive := reached()) is None else alive(nth)
+
+        for drawing in self.output.shot.drawings:
+            drawing.hook.reached = called
+        for mark in self.output.marks:
+            mark.register_hook(lambda _: _and_nothing(called()))  # type: ignore[no-untyped-call]
+        centres = self.output.shot.gradient_slot.tensor
+        if to_screen and centres.requires_grad:
+
+            def keep(gradient: Tensor) -> None:
+                screen.clear()
+                screen[current_pass()] = gradient.detach()
+
+            centres.register_hook(keep)  # type: ignore[no-untyped-call]
+
+    def may_take_factors(self, params: Mapping[str, Tensor]) -> bool:
+        """Parts 2 and 3 of the rule of colours.py."""
+        drawing = None if self.output is None else self.output.shot.drawing
+        if drawing is None or not self.merged.isdisjoint(("sh0", "shN")):
+            return False
+        return are_joined(drawing.inputs["colors"], params) and are_accumulated(params)
+
+    def routed_of(self, names: Iterable[str], params: Mapping[str, Tensor]) -> RoutedGradients | None:
+        """g^HR of these parameters alone."""
+        routed, wanted = self.routed, set(names)
+        if routed is None or wanted.issuperset(routed.grads.keys() | ({"sh0", "shN"} if routed.colour else set())):
+            return routed
+        grads = dict(routed.grads)
+        if routed.colour is not None:
+            grads |= dense({}, routed.colour, {name: params[name] for name in ("sh0", "shN")})
+        return replace(routed, grads={name: g for name, g in grads.items() if name in wanted}, colour=None)
+
+    def require_alone(self, of: BackwardPass) -> None:
+        """Raise a HostError for a pass that adds to parameters by another rendering, too."""
+        if of.renderings == {self.nth}:
+            return
+        if self.nth in of.renderings:
+            raise HostError(
+                "one backward pass reaches two renderings of training views, but each is merged by itself. With several views "
+                "for a step, call backward() after each rendering and set accumulation=, or use joint_loss. For a second pass "
+                "over the same view, call the function that was wrapped, its __wrapped__."
+            )
+        raise HostError(
+            f"a backward pass reaches an earlier rendering than that of {self.view}, but only the last can be merged. Call "
+            "backward() after each rendering; with several views for a step, set accumulation=."
+        )
+
+    def require_first(self, names: Iterable[str], correcting: str) -> None:
+        """Raise a HostError where another pass over the rendering has brought the same, and a strategy has used it."""
+        if correcting and (again := [name for name in names if name in self.merged]):
+            raise HostError(
+                f"a second backward pass over the rendering of {self.view} adds to the gradient of {', '.join(again)}, which is "
+                f"merged already: {correcting} compares HR with the gradient of the whole loss. Sum the losses and call "
+                "backward() once; what is only looked at, take by torch.autograd.grad. For a second pass over the same view, "
+                "call the function that was wrapped, its __wrapped__."
+            )
+
+
+def _and_nothing(_: object) -> None:
+    """What a hook returns that leaves the gradient as it is."""
+
+
+def current_pass() -> int:
+    """Torch's number of the backward pass under way in this thread; -1: there is none."""
+    number: int = torch._C._current_graph_task_id()
+    return number

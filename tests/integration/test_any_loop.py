@@ -1,0 +1,46 @@
+"""Whatever the loop: the gradient is right, or the step is refused and says why. Loops are put together of parts."""
+
+from contextlib import nullcontext
+
+import pytest
+
+from integration import HostError
+from tests.helpers.backends import needs
+from tests.helpers.loops import Loop, Running, loop_of, ordinary_but_for_one
+
+pytestmark = needs("cpp")
+STEPS = 2
+
+
+def require_right(loop: Loop, caplog) -> None:
+    """Each step has the gradient of plain autograd and Eq. 8, or the refusal that the loop's parts are meant to have."""
+    running = Running(loop)
+    with pytest.raises(HostError, match=loop.refusal()) if loop.refusal() else nullcontext():
+        for number in range(STEPS):
+            try:
+                brought = running.step(number)
+            except AssertionError as error:
+                raise AssertionError(f"step {number} of {loop}: {error}") from error
+            except HostError as error:
+                if number or "first optimizer step, but no backward() has given" not in str(error):
+                    raise
+                break  # no step has brought a gradient of a Gaussian
+            assert ("no strategy takes part" in caplog.text) == (not brought), loop
+    running.clear.remove()
+
+
+def differences(loop: Loop) -> str:
+    return ", ".join(f"{name}: {x}" for name, x in vars(loop).items() if x != getattr(Loop(), name)) or "ordinary"
+
+
+@pytest.mark.parametrize("loop", ordinary_but_for_one(), ids=differences)
+def test_a_loop_that_is_ordinary_but_for_one_part_has_the_merged_gradient_or_is_refused(loop, caplog):
+    require_right(loop, caplog)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hundred", range(10))
+def test_a_thousand_loops_of_any_parts(hundred, caplog):
+    for seed in range(100 * hundred, 100 * hundred + 100):
+        caplog.clear()
+        require_right(loop_of(seed), caplog)

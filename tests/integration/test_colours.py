@@ -1,0 +1,58 @@
+"""The rule of integration/colours.py, by what torch says of a graph: a version that names its nodes otherwise fails here."""
+
+import pytest
+import torch
+from torch.nn import Parameter
+
+from integration.colours import are_accumulated, are_joined
+from tests.helpers.loops import COLOURS
+
+
+def params():
+    """Of three Gaussians; the others are what `COLOURS` may add."""
+    shapes = {"sh0": (3, 1, 3), "shN": (3, 15, 3), "means": (3, 3), "offset": (1, 1, 3), "gain": (1,)}
+    return {name: Parameter(torch.ones(shape)) for name, shape in shapes.items()}
+
+
+@pytest.mark.parametrize("how", COLOURS)
+def test_factors_are_the_whole_gradient_where_two_leaves_lie_side_by_side_and_nowhere_else(how):
+    p = params()
+    assert are_joined(COLOURS[how](p), p) == (how in ("joined", "negative dimension"))
+
+
+def hooks():
+    yield lambda p, colors: colors.retain_grad()
+    yield lambda p, colors: colors.register_hook(lambda g: None)
+    yield lambda p, colors: p["sh0"].register_hook(lambda g: None)
+    yield lambda p, colors: p["shN"].register_post_accumulate_grad_hook(lambda q: None)
+    yield lambda p, colors: p["shN"].requires_grad_(False)
+    yield lambda p, colors: p.update(sh0=Parameter(torch.ones(3, 1, 3)))
+    yield lambda p, colors: p.pop("shN")
+
+
+@pytest.mark.parametrize("changes", hooks())
+def test_no_hook_looks_at_them_and_the_leaves_are_those_that_train(changes):
+    p = params()
+    colors = COLOURS["joined"](p)
+    assert are_joined(colors, p)
+    changes(p, colors)
+    assert not are_joined(colors, p)
+
+
+@pytest.mark.parametrize(
+    ("backward", "accumulated"),
+    [
+        (lambda loss, p: loss.backward(), True),
+        (lambda loss, p: loss.backward(inputs=[p["sh0"], p["shN"]]), True),
+        (lambda loss, p: loss.backward(inputs=[p["sh0"]]), False),
+        (lambda loss, p: torch.autograd.grad(loss, [p["sh0"], p["shN"]]), False),
+        (lambda loss, p: torch.autograd.grad(loss, p["means"]), False),
+    ],
+)
+def test_the_pass_under_way_adds_to_both_of_their_gradients(backward, accumulated):
+    p, seen = params(), []
+    colors = COLOURS["joined"](p)
+    loss = (colors * p["means"].sum()).sum()
+    loss.register_hook(lambda _: seen.append(are_accumulated(p)))
+    backward(loss, p)
+    assert seen == [accumulated]

@@ -1,0 +1,182 @@
+"""A host's optimizers and gradient scaler: f_det and the extra views follow them, and a step without the strategies is told."""
+
+import functools
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from clear_strategies import GCO, P2G, Conductor
+from clear_strategies.compose import conductor as composed_conductor
+from clear_strategies.errors import SettingError
+from clear_strategies.merging.detail import DetailRates
+from clear_strategies.merging.skips import Skips
+from integration import HostError
+from integration.gsplat import attach
+from rasterizers import autograd
+from tests.helpers import gsplat_host, toy
+from tests.helpers.gsplat_host import Host, attached, started
+from tests.helpers.host_parts import HR_FROM_START, photometric
+
+ADAM = {"lr": 1e-3, "eps": 1e-15}
+
+
+def separate(splats):
+    return {name: torch.optim.Adam([p], **ADAM) for name, p in splats.items() if p.is_floating_point()}
+
+
+@pytest.mark.parametrize("clips", [False, True])
+def test_an_overflow_is_a_step_that_the_scaler_skips_for_f_det_too(clips):
+    scene, scaler = toy.scene(20), torch.amp.GradScaler("cpu", init_scale=2.0**14)
+    host = Host(scene, rasterization=functools.partial(autograd.rasterization, backend="torch"), scaler=scaler)
+    conductor = Conductor(GCO(), objective=HR_FROM_START, detail=DetailRates(decay=0))
+    attached(host, scene, conductor, loss_scale=scaler.get_scale)
+    for i in range(4):
+        view, before = scene.train[i % 3], host.splats["detail"].detach().clone()
+        loss = photometric(host.render(view.lr.camera, 3)[0][0], view.lr.image) * (float("inf") if i == 2 else 1.0)
+        scaler.scale(loss).backward()
+        for o in host.optimizers.values():
+            scaler.unscale_(o)
+        if clips:
+            torch.nn.utils.clip_grad_norm_([p for p in host.splats.values() if p.grad is not None], 1.0)
+        for o in host.optimizers.values():
+            scaler.step(o)
+            o.zero_grad()
+        scaler.update()
+        assert torch.equal(host.splats["detail"], before) == (i == 2)
+    assert all(bool(p.isfinite().all()) for p in host.splats.values())
+
+
+def test_extra_views_are_stepped_on_by_optimizers_that_are_made_anew_and_it_is_told_where_they_no_longer_are(caplog):
+    host, clear, render = started(toy.ShowsDark())
+    for i in range(20):
+        if i == 3:
+            host.optimizers.update(separate(host.splats))
+        render(i % 3).mean().backward()
+        for optimizer in host.optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad()
+    assert clear.attachment.counts["extra views"] == 20
+    unknown = torch.optim.Adam([p for p in host.splats.values() if p.requires_grad])
+    assert "no effect" not in caplog.text
+    for i in range(11):
+        render(i % 3).mean().backward()
+        unknown.step()
+    assert caplog.text.count("put new ones in the same dictionary") == 1
+
+
+def test_f_det_is_a_group_of_the_only_optimizer_unless_a_scheduler_counts_the_groups():
+    scene = toy.scene(20)
+    for scheduled in (False, True):
+        host = Host(scene)
+        groups = [{"params": [p], "name": name} for name, p in host.splats.items()]
+        only = torch.optim.Adam(groups, **ADAM)
+        clear = Conductor(GCO(), objective=HR_FROM_START)
+        if scheduled:
+            schedule = torch.optim.lr_scheduler.LambdaLR(only, lambda _: 1.0)
+            with pytest.raises(SettingError, match=r"Make the scheduler after attach\(\)"):
+                attach(host.splats, only, scene.train, clear)
+            attach(host.splats, only, scene.train, clear, detail=False)
+        else:
+            attach(host.splats, only, scene.train, clear)
+            schedule = torch.optim.lr_scheduler.LambdaLR(only, lambda _: 1.0)
+            assert only.param_groups[-1]["name"] == "detail"
+        schedule.step()
+
+
+def frozen(host, render):
+    for p in host.splats.values():
+        p.requires_grad_(False)
+
+
+def asked(host, render):
+    torch.autograd.grad(render().mean(), host.splats["means"])
+
+
+def detached(host, render):
+    kept = dict(host.splats)
+    drawn = {name: p.detach() for name, p in kept.items()}
+    gsplat_host.drawn(host.rasterization, drawn, host.photos["view0"].camera)
+
+
+@pytest.mark.parametrize(
+    ("does", "cause"),
+    [
+        (lambda host, render: None, "none of its renderings was recognised.*cameras that were passed"),
+        (frozen, "all parameters of the Gaussians are frozen.*require gradients"),
+        (asked, r"no backward\(\) has given means, quats.*view0.*by loss\.backward\(\)"),
+        (detached, "the rendering of view0 does not depend on means, quats.*not detached"),
+        (lambda host, render: render(), r"no backward\(\) has given means, quats"),
+    ],
+)
+def test_a_step_without_a_strategy_is_refused_at_first_and_told_later_with_its_cause(does, cause, caplog):
+    host, _, render = started()
+    means = host.optimizers["means"]
+    does(host, render)
+    with pytest.raises(HostError, match=cause):
+        means.step()
+    host, clear, render = started()
+    render().mean().backward()
+    host.optimizers["means"].step()
+    assert "no strategy takes part" not in caplog.text
+    does(host, render)
+    for _ in range(3):
+        host.optimizers["means"].step()
+    assert caplog.text.count("the host makes a step in which no strategy takes part") == 1
+    assert clear.attachment.counts["steps of the host alone"] == 3
+
+
+def test_a_step_inside_of_the_backward_pass_is_refused():
+    host, _, render = started()
+    host.splats["means"].register_post_accumulate_grad_hook(lambda p: host.optimizers["means"].step())
+    with pytest.raises(HostError, match=r"steps inside of its backward pass"):
+        render().mean().backward()
+
+
+@pytest.mark.parametrize("accumulation", [1, 2])
+def test_the_densifier_reads_a_score_that_has_the_scale_of_its_own_gradients(accumulation):
+    """As `unscale_` and its mean over the passes expect it."""
+    read = []
+    for scale, passes in ((1.0, 1), (64.0, accumulation)):
+        scene = toy.scene(20)
+        host = Host(scene)
+        clear = attach(
+            host.splats, host.optimizers, scene.train, Conductor(P2G(patch=4), objective=HR_FROM_START),
+            strategy=SimpleNamespace(refine_stop_iter=0, grow_grad2d=1e-4), loss_scale=lambda scale=scale: scale,
+            accumulation=passes,
+        )  # fmt: skip
+        host.rasterization = clear.wrap(host.rasterization)
+        renders, _, info = host.render(scene.train[0].lr.camera, 3)
+        (scale / passes * photometric(renders[0], scene.train[0].lr.image)).backward()
+        assert clear.attachment.counts["scores written"] == 1
+        read.append(info["means2d"].grad * passes / scale)
+    assert bool(read[0].any())
+    assert torch.allclose(*read, rtol=1e-5, atol=0)
+
+
+def test_hr_is_left_out_of_every_second_step_but_where_the_densifier_reads_its_score():
+    for threshold, drawn in ((None, 3), (1e-4, 6)):
+        scene = toy.scene(20)
+        host = Host(scene)
+        conductor = Conductor(P2G(patch=4), objective=HR_FROM_START, skips=Skips(coarse_until=100, hr_every=2))
+        strategy = SimpleNamespace(refine_stop_iter=0, grow_grad2d=threshold)
+        clear = attached(host, scene, conductor, strategy=strategy)
+        host.train([scene.train[i % 3].name for i in range(6)])
+        assert clear.attachment.counts["HR renders"] == drawn
+        assert clear.attachment.counts["merges"] == 6
+
+
+def test_a_loop_that_ends_before_hr_takes_part_is_told(caplog):
+    caplog.set_level("INFO")
+    scene = toy.scene(20)
+    host = Host(scene)
+    clear = attached(host, scene, composed_conductor("gco"), iterations=120)
+    assert "HR takes part from step 501 on" in caplog.text
+    assert "501 on, but the loop has 120 steps. Make the conductor for the length of the loop" in caplog.text
+    host.train([view.name for view in scene.train])
+    clear.remove()
+    assert "HR took no part in the 3 steps of this loop: it would from step 501 on" in caplog.text
+    caplog.clear()
+    attached(Host(scene), scene, composed_conductor("gco", iterations=120), iterations=120)
+    assert "HR takes part from step 7 on" in caplog.text
+    assert "the loop has" not in caplog.text
