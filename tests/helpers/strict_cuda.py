@@ -75,6 +75,7 @@ class Graph:
         self.captured = self.invalid = False
         self.calls: list[tuple[Callable[..., Any], Any]] = []
         self.pooled: Pool = {}
+        self.on_host: Pool = {}  # what a generator of the CPU has drawn meanwhile, which may be read
 
     def capture_begin(self, pool: Pool | None = None, capture_error_mode: str = "global") -> None:
         self.cuda.ask("begin", graph=self)
@@ -132,6 +133,10 @@ class _Operations(TorchDispatchMode):
         cuda, graph, kwargs = self.cuda, self.cuda.state.capture, kwargs or {}
         if graph is None:
             return op(*args, **kwargs)
+        if kwargs.get("generator") is not None:
+            drawn = op(*args, **kwargs)
+            graph.on_host[_address(drawn)] = drawn
+            return drawn
         name = op.overloadpacket.__name__
         is_masked = name.startswith(("index", "_index")) and any(x.dtype == torch.bool for x in _tensors(args[1:2]))
         if is_masked or {torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape} & set(op.tags):
@@ -181,7 +186,8 @@ class _Functions(TorchFunctionMode):
         self.cuda = cuda
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if (act := self.ACTS.get(func)) is not None:
+        act, graph = self.ACTS.get(func), self.cuda.state.capture
+        if act is not None and not (graph is not None and _address(args[0]) in graph.on_host):
             self.cuda.ask(act)
         return args[0] if act == "pin" else func(*args, **(kwargs or {}))
 

@@ -183,6 +183,7 @@ KINDS = {
     ),
     "robust": lambda: start(SometimesRobust(), density=False),
     "degree": lambda: start(density=False, degree_every=5),
+    "background": lambda: start(cs.RandomBackground(until=1_350), cs.FadingOpacity(rate=0.002), density=False),
     "dropout": lambda: start(density=False, dropout=Late()),
     "λ_HR > 0": lambda: start(density=False, rises_at=6),
     "scores are collected": lambda: start(scores_from=6),
