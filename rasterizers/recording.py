@@ -1,16 +1,16 @@
-"""Work on a device that is recorded once and then done again without the Python that launched it.
+"""Work on CUDA that is recorded once and then done again without the Python that launched it.
 
-On CUDA a recording consists of CUDA graphs. On the CPU, where Warp's kernels run for tests, it consists of torch's operations
-and of Warp's graphs between them. A replay runs the same kernels on the same memory. What changes from one replay to the next
+A recording consists of CUDA graphs. A replay runs the same kernels on the same memory. What changes from one replay to the next
 must lie in tensors that are written before it: a number that Python passed to a kernel or to torch is the same in every replay.
 """
 
 from __future__ import annotations
 
+import gc
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from functools import cache, partial
+from contextlib import ExitStack, contextmanager, suppress
+from functools import cache
 from typing import Any, Final, Generic, TypeVar, cast
 
 import torch
@@ -26,28 +26,35 @@ class Recording(Generic[T]):
     """What `work` did on the device. It is done once while it is recorded, and again by each `replay`.
 
     Args:
-        device: the device of all tensors of `work`, which runs on torch's current stream.
+        device: the CUDA device of all tensors of `work`, which runs on a stream of its own.
         work: launches by torch and by `rasterizers.warp_runtime`. It must not read a number from the device, but in a `pause`.
-            What it does once, such as to compile kernels or to fill caches, must have been done.
+            What it does once, such as to compile kernels or to fill caches, must have been done, in a scope of `on_side_stream`.
 
     Attributes:
         result: what `work` returned. Its tensors receive new values in every replay.
 
     Raises:
-        RuntimeError: `work` does what cannot be recorded.
+        RuntimeError: `work` does what cannot be recorded. Live work can go on: the capture has been ended, and of the part
+            that was being recorded nothing has been done.
     """
 
     def __init__(self, device: torch.device, work: Callable[[], T]) -> None:
+        self._stream = _side_stream(device)
+        self._pool = torch.cuda.graph_pool_handle()  # one for all graphs, since they run in order
         self._parts: list[tuple[Callable[[], None], Callable[[], bool]]] = []
-        self._recorder: _Recorder = _Graphs(device) if device.type == "cuda" else _Calls()
-        _running.recording = self
-        try:
-            with self._recorder.scope(), self._recorder:
+        self._watch = _Watch(device.type)
+        self._graph: Any = None  # which is being captured, and what ends that
+        self._ends = ExitStack()
+        with on_side_stream(device), _without_garbage_collection(), _running_as(self):
+            try:
                 self._begin()
                 self.result = work()
                 self._end(lambda: True)
-        finally:
-            _running.recording = None
+            except BaseException:
+                with suppress(Exception):  # a capture that failed is ended by an error, too
+                    self._ends.close()
+                _failed.append(self._graph)
+                raise
 
     def pause(self, read: Callable[[], R], holds: Callable[[], bool]) -> R:
         """End a part of the work, and return what the host reads of it.
@@ -61,21 +68,9 @@ class Recording(Generic[T]):
         self._begin()
         return found
 
-    def _begin(self) -> None:
-        self._recorder.begin()
-        self._recorder.active = True
-
-    def _end(self, holds: Callable[[], bool]) -> None:
-        self._recorder.active = False
-        self._parts.append((self._recorder.end(), holds))
-
-    def launched(self, again: Callable[[], Callable[[], Any]], tensors: Iterable[Any]) -> None:
-        """Add a launch that torch does not see. It has been made, and reads and writes these tensors.
-
-        Args:
-            again: makes what launches again, where a graph does not do that.
-        """
-        self._recorder.launched(again, tensors)
+    def launched(self, tensors: Iterable[Any]) -> None:
+        """Note a launch that torch does not see, which reads and writes these tensors."""
+        self._watch.keep(tensors)
 
     def replay(self) -> bool:
         """Do the work again; False: it ended at a `pause` where what was recorded does not hold."""
@@ -84,6 +79,51 @@ class Recording(Generic[T]):
             if not holds():
                 return False
         return True
+
+    def _begin(self) -> None:
+        import warp as wp
+
+        graph, stream, ends = cast(Any, torch.cuda.CUDAGraph()), warp_stream(self._stream), self._ends
+        self._graph = graph
+        ends.callback(graph.capture_end)  # before anything can fail
+        graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
+        ends.callback(lambda: self._watch.kept.append(wp.capture_end(stream=stream)))
+        wp.capture_begin(stream=stream, external=True)  # else the memory of Warp's sort would leak
+        ends.enter_context(self._watch)
+
+    def _end(self, holds: Callable[[], bool]) -> None:
+        self._ends.close()
+        self._graph.replay()  # to record is not to run
+        self._parts.append((self._graph.replay, holds))
+
+
+_failed: Final[list[Any]] = []
+"""Graphs whose capture failed. Torch's allocator does not forget those that CUDA ended by an error, and asks them later."""
+
+
+class _Watch(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Keeps the tensors that operations of torch read and write and that were allocated before, and refuses to read a number
+    before CUDA does, which would make the capture invalid.
+    """
+
+    def __init__(self, device: str) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self._device = device
+        self._own: set[int] = set()  # addresses of the memory that the work has allocated
+        self.kept: list[Any] = []
+
+    def keep(self, tensors: Iterable[Any]) -> None:
+        self.kept += [x for x in tensors if isinstance(x, Tensor) and x.untyped_storage().data_ptr() not in self._own]
+
+    def __torch_dispatch__(self, op: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        if op.overloadpacket is torch.ops.aten._local_scalar_dense and args[0].device.type == self._device:
+            raise RuntimeError("recorded work must not read a number from the device.")
+        result = op(*args, **kwargs)
+        if not (op.is_view or op._schema.is_mutable):
+            self._own |= {x.untyped_storage().data_ptr() for x in tree_leaves(result) if isinstance(x, Tensor)}
+        self.keep(tree_leaves((args, kwargs)))
+        return result
 
 
 class _Running(threading.local):
@@ -98,99 +138,43 @@ def running() -> Recording[Any] | None:
     return _running.recording
 
 
-class _Recorder(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Records while it is entered. Each operation of torch calls it, and it keeps the tensors that were allocated before."""
-
-    def __init__(self) -> None:
-        super().__init__()  # type: ignore[no-untyped-call]
-        self._own: set[int] = set()  # addresses of the memory that the work has allocated
-        self._kept: list[Any] = []
-        self.active = False
-
-    def scope(self) -> AbstractContextManager[Any]:
-        return nullcontext()
-
-    def begin(self) -> None:
-        raise NotImplementedError
-
-    def end(self) -> Callable[[], None]:
-        """End a part; returns what does it again."""
-        raise NotImplementedError
-
-    def launched(self, again: Callable[[], Callable[[], Any]], tensors: Iterable[Any]) -> None:
-        self._keep(tensors)
-
-    def _keep(self, tensors: Iterable[Any]) -> None:
-        self._kept += [x for x in tensors if isinstance(x, Tensor) and x.untyped_storage().data_ptr() not in self._own]
-
-    def __torch_dispatch__(self, op: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        call = partial(op, *args, **(kwargs or {}))
-        result = call()
-        if not self.active:
-            return result
-        if op.overloadpacket is torch.ops.aten._local_scalar_dense:
-            raise RuntimeError("recorded work must not read a number from the device.")
-        made = [x for x in tree_leaves(result) if isinstance(x, Tensor)]
-        if not (op.is_view or op._schema.is_mutable):
-            self._own |= {x.untyped_storage().data_ptr() for x in made}
-        self.called(op, call, made)
-        self._keep(tree_leaves((args, kwargs)))
-        return result
-
-    def called(self, op: Any, call: Callable[[], Any], made: list[Tensor]) -> None:
-        """An operation of torch that has returned these tensors."""
+@contextmanager
+def _running_as(recording: Recording[Any]) -> Iterator[None]:
+    _running.recording = recording
+    try:
+        yield
+    finally:
+        _running.recording = None
 
 
-class _Graphs(_Recorder):  # type: ignore[no-untyped-call]
-    """Records CUDA graphs. All of them take their memory from one pool, since they run in order."""
+@contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    """What the collector frees may be memory or an event of CUDA, and so end a capture."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
-    def __init__(self, device: torch.device) -> None:
-        super().__init__()
-        self._stream = _side_stream(device)
-        self._pool: Any = None
-        self._capturing: tuple[Any, Any] | None = None  # torch's graph, and Warp's stream
 
-    @contextmanager
-    def scope(self) -> Iterator[None]:
-        outer = torch.cuda.current_stream(self._stream.device)
-        self._stream.wait_stream(outer)
-        try:
-            with torch.cuda.stream(self._stream):
-                yield
-        finally:
-            if self._capturing is not None:  # the work failed, and so may this
-                with suppress(RuntimeError):
-                    self._end_capture()
-            outer.wait_stream(self._stream)
-
-    def begin(self) -> None:
-        import warp as wp
-
-        stream, graph = warp_stream(self._stream), cast(Any, torch.cuda.CUDAGraph())
-        graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
-        self._capturing, self._pool = (graph, stream), graph.pool()
-        wp.capture_begin(stream=stream, external=True)  # else the memory of Warp's sort would leak
-
-    def end(self) -> Callable[[], None]:
-        graph = self._end_capture()
-        graph.replay()  # to record is not to run
-        replay: Callable[[], None] = graph.replay
-        return replay
-
-    def _end_capture(self) -> Any:
-        import warp as wp
-
-        (graph, stream), self._capturing = cast(tuple[Any, Any], self._capturing), None
-        try:
-            self._kept.append(wp.capture_end(stream=stream))
-        finally:
-            graph.capture_end()
-        return graph
+@contextmanager
+def on_side_stream(device: torch.device) -> Iterator[None]:
+    """A scope whose work runs on the stream that graphs are captured on, which torch's default stream cannot be: after what was
+    launched before the scope, and before what is launched after it.
+    """
+    outer, side = torch.cuda.current_stream(device), _side_stream(device)
+    side.wait_stream(outer)
+    try:
+        with torch.cuda.stream(side):
+            yield
+    finally:
+        outer.wait_stream(side)
 
 
 @cache
 def _side_stream(device: torch.device) -> Any:
-    """The stream that graphs are captured on, which torch's default stream cannot be."""
     return torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
 
 
@@ -200,50 +184,3 @@ def warp_stream(stream: torch.cuda.Stream) -> Any:
     import warp as wp
 
     return wp.stream_from_torch(stream)
-
-
-class _Calls(_Recorder):  # type: ignore[no-untyped-call]
-    """Records the calls, and makes them. Launches between two operations of torch become one graph of Warp's."""
-
-    def begin(self) -> None:
-        self._again: list[Callable[[], Any]] = []
-        self._launches: list[Callable[[], Any]] = []
-
-    def end(self) -> Callable[[], None]:
-        self._join()
-        calls = self._again
-
-        def replay() -> None:
-            for call in calls:
-                call()
-
-        return replay
-
-    def launched(self, again: Callable[[], Callable[[], Any]], tensors: Iterable[Any]) -> None:
-        self._keep(tensors)
-        self._launches.append(again())
-
-    def _join(self) -> None:
-        if not self._launches:
-            return
-        import warp as wp
-
-        wp.capture_begin(device="cpu")  # on a CPU to capture is not to run, either
-        for launch in self._launches:
-            launch()
-        self._again.append(partial(wp.capture_launch, wp.capture_end(device="cpu")))
-        self._launches = []
-
-    def called(self, op: Any, call: Callable[[], Any], made: list[Tensor]) -> None:
-        self._kept.append(made)
-        if op._schema.is_mutable:
-            self._join()
-            self._again.append(call)
-        elif made and not op.is_view and not op.overloadpacket.__name__.startswith(("empty", "new_empty")):
-            self._join()
-            self._again.append(partial(_written_anew, made, call))
-
-
-def _written_anew(made: list[Tensor], call: Callable[[], Any]) -> None:
-    for tensor, value in zip(made, tree_leaves(call()), strict=True):
-        tensor.copy_(value)

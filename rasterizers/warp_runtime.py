@@ -9,12 +9,11 @@ from __future__ import annotations
 import ctypes
 import math
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from functools import cache, partial
+from functools import cache
 from itertools import pairwise
 from struct import Struct
-from types import SimpleNamespace
 from typing import Any, Final
 
 import torch
@@ -85,7 +84,7 @@ def launch(
         recorded = _recorded.launches[key] = _Launch(kernel, device, block)
     recorded.prepare(size, arguments).launch()
     if (recording := running()) is not None:
-        recording.launched(lambda: _Launch(kernel, device, block).recordable(size, arguments), arguments)
+        recording.launched(arguments)
 
 
 class _Launch:
@@ -123,14 +122,6 @@ class _Launch:
             if self.on_cuda:
                 command.params_addr[index] = ctypes.addressof(params[index])
         return command
-
-    def recordable(self, size: tuple[int, ...], arguments: Sequence[Any]) -> Callable[[], None]:
-        """A function that launches the kernel with these arguments. To capture it on a CPU, Warp needs the arrays."""
-        command = self.prepare(size, arguments)
-        if not self.on_cuda:
-            command.fwd_args = [_original(kind, x) for kind, x in zip(self.kinds, command.params[1:], strict=True)]
-        launches: Callable[[], None] = command.launch
-        return launches
 
     def _described(self, index: int, layout: Any, tensor: Tensor) -> Any:
         known = self.arrays[index - 1]
@@ -185,9 +176,8 @@ def sort_pairs(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
         )
     arrays[0].ptr, arrays[1].ptr = keys.data_ptr(), values.data_ptr()
     wp.utils.radix_sort_pairs(*arrays, count, end_bit=bits)
-    if (recording := running()) is not None:  # `arrays` will lie elsewhere at the next sort
-        again = partial(wp.utils.radix_sort_pairs, *map(wp.from_torch, (keys, values)), count, end_bit=bits)
-        recording.launched(lambda: again, (keys, values))
+    if (recording := running()) is not None:
+        recording.launched((keys, values))
 
 
 def array(tensor: Tensor | None, kind: Any) -> Any:
@@ -216,24 +206,6 @@ def array(tensor: Tensor | None, kind: Any) -> Any:
     steps = *strides[: n - 1], last[-1][1] if last else math.prod(inner)
     in_bytes = [step * tensor.element_size() for step in steps]
     return type(_empty_array())(tensor.data_ptr(), 0, n, lengths, in_bytes)
-
-
-def _original(kind: Any, packed: Any) -> Any:
-    """What a kernel's argument of type `kind` was made of: an array, or the arrays of a structure."""
-    import warp as wp
-
-    if wp.types.is_array(kind):
-        if not packed.data:
-            return None
-        n = kind.ndim
-        return wp.array(
-            ptr=packed.data, dtype=kind.dtype, shape=packed.shape[:n], strides=packed.strides[:n], device="cpu"
-        )
-    if isinstance(packed, ctypes.Structure):
-        return SimpleNamespace(
-            **{name: _original(field.type, getattr(packed, name)) for name, field in kind.vars.items()}
-        )
-    return packed
 
 
 def struct(kind: Any, rows: Mapping[str, Tensor | None], **values: Any) -> Any:

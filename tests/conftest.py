@@ -1,7 +1,7 @@
 """Fixtures shared by all tests."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
@@ -88,3 +88,24 @@ def ptx_of(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, tmp_
         return assembly
 
     return compiled
+
+
+@pytest.fixture
+def strict_cuda(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The CPU stands in for a CUDA device, see `tests.helpers.strict_cuda`."""
+    pytest.importorskip("warp")
+    from tests.helpers import strict_cuda
+
+    with strict_cuda.installed(monkeypatch) as cuda:
+        yield cuda
+
+
+@pytest.fixture(params=["stand-in", "cuda"])
+def recorded_on(request: pytest.FixtureRequest) -> torch.device:
+    """A device that records: the CPU that stands in for one, and a GPU."""
+    if request.param == "stand-in":
+        request.getfixturevalue("strict_cuda")
+        return torch.device("cpu")
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    return torch.device("cuda")

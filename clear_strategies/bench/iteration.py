@@ -125,6 +125,8 @@ def measure(results: Results, *, scene: str, backend: str | None, repeats: int, 
     if affordable(truth_backend(), workload, "errors", results.note):
         table["error"] = table["stage"].map(errors(workload, view, rasterizer))
     results.tables |= {"iteration": table, "iteration_turns": turns}
+    if "replayed" in trainings and "replayed" not in set(table["stage"]):
+        results.note("No iteration was replayed, and those called so were live: the log says why.")
     lr, hr = view.lr.camera, view.hr.camera
     results.note(
         f"{workload.name}: {len(workload.splats):,} Gaussians, LR {lr.width}x{lr.height} and HR {hr.width}x{hr.height}, "

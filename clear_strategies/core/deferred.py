@@ -21,8 +21,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from rasterizers.recording import running
-
 
 class Deferred(NamedTuple):
     """A function of scalars that have not been read yet. The function may log."""
@@ -50,8 +48,8 @@ Number = Scalar | Deferred | Element
 
 
 def is_immediate(x: Tensor) -> bool:
-    """Whether scalars computed from x are read at once: x is in the CPU's memory, and nothing is being recorded."""
-    return x.device.type == "cpu" and running() is None
+    """Whether scalars computed from x are read at once: x is in the CPU's memory."""
+    return x.device.type == "cpu"
 
 
 def scalar(x: Tensor) -> Scalar:

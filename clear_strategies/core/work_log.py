@@ -17,8 +17,6 @@ import torch
 from jaxtyping import Shaped
 from torch import Tensor
 
-from rasterizers.recording import running
-
 _BATCH: Final = 1024  # pairs of events that are kept before those that the device has passed are read
 
 
@@ -57,10 +55,10 @@ class WorkLog:
         return self._entries
 
     def stage(self, name: str) -> AbstractContextManager[None]:
-        """Count and time a block. Seconds are wall-clock on the CPU and device time on CUDA. Stages do not nest, and what is
-        recorded is not timed.
+        """Count and time a block. Seconds are wall-clock on the CPU and device time on CUDA. Stages do not nest, and in a scope
+        of `noted` they are neither counted nor timed.
         """
-        if running() is not None:
+        if self._noted is not None:
             return nullcontext()
         return _Stage(self, name)
 
@@ -77,7 +75,7 @@ class WorkLog:
 
     @contextmanager
     def noted(self) -> Iterator[list[tuple[str, str, int | Tensor]]]:
-        """A scope in which skips are not counted but noted: the arguments of each `skip`."""
+        """A scope of work that is recorded: its skips are not counted but noted, as the arguments of each `skip`."""
         self._noted = []
         try:
             yield self._noted

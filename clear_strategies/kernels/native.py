@@ -10,7 +10,6 @@ from torch import Tensor
 
 from rasterizers.interface import BackendUnavailable
 from rasterizers.native import load_kernels
-from rasterizers.recording import running
 
 
 def available() -> bool:
@@ -28,8 +27,8 @@ def module() -> ModuleType:
 
 
 def runs(x: Tensor) -> bool:
-    """Whether the kernels take this tensor: float32 in the CPU's memory, and no recording would miss what they do."""
-    return x.device.type == "cpu" and x.dtype == torch.float32 and available() and running() is None
+    """Whether the kernels take this tensor: float32 in the CPU's memory."""
+    return x.device.type == "cpu" and x.dtype == torch.float32 and available()
 
 
 def takes(*tensors: Tensor) -> bool:

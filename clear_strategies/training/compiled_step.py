@@ -136,8 +136,7 @@ class CompiledStep:
         self._rule: CorrectionRule | None = None if corrector is None else corrector.correction_rule()
         self._regularizer: Strategy | None = next((s for s in conductor.strategies if overrides(s, "regularize")), None)
         self._changing: Tensor | None = None  # the numbers of the step on the device, of a recording
-        self._examined: tuple[int, Sequence[Tensor | None]] | None = None
-        self._quiet = False
+        self._examined: dict[bool, tuple[int, Sequence[Tensor | None], bool]] = {}  # by whether there is an anchor
 
     @property
     def records(self) -> bool:
@@ -256,15 +255,19 @@ class CompiledStep:
         result holds: a pass that skips the bands leaves them quiet, and momentum does not vanish.
         """
         tensors = (self.optimizer.first["shN"], self.optimizer.second["shN"], anchor)
-        if self._examined is not None:
-            examined_at, same = self._examined
-            known = examined_at <= active if self._quiet else examined_at == active
+        anchored = anchor is not None
+        if anchored in self._examined:
+            examined_at, same, quiet = self._examined[anchored]
+            known = examined_at <= active if quiet else examined_at == active
             if known and all(a is b for a, b in zip(same, tensors, strict=True)):
-                return self._quiet
+                return quiet
         moved = any(bool(moments[:, active:].any()) for moments in tensors[:2] if moments is not None)
         pulled = anchor is not None and not torch.equal(anchor[:, active:], shN[:, active:])
-        self._examined, self._quiet = (active, tensors), not (moved or pulled)
-        return self._quiet
+        quiet = not (moved or pulled)
+        if not quiet:  # this pass moves the bands, and so the other kind of pass has to look again
+            self._examined = {key: entry for key, entry in self._examined.items() if not entry[2]}
+        self._examined[anchored] = active, tensors, quiet
+        return quiet
 
     def _note_skips(self, stepped: kernel.StepCounts, bands: int, all_bands: int) -> None:
         skip = self.conductor.work_log.skip

@@ -26,11 +26,15 @@ from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.given import Given, GivenExtra, GivenView, L, Learned, LearnedView
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Rasterizer, Recordable
-from rasterizers.recording import Recording
+from rasterizers.recording import Recording, on_side_stream
 from rasterizers.warp_runtime import sent
 
 _log = logging.getLogger(__name__)
 
+LIVE: Final = "live in place of a replay"
+"""The work log's entry for iterations and extra views that were not replayed. It has no runs, so that none seem saved."""
+
+_FAILED: Final = "a recording failed"
 _MOST_KINDS: Final = 8  # a recording keeps the memory of an iteration
 
 
@@ -72,50 +76,58 @@ class _Kind:
 
 
 class Replays:
-    """The recordings of one training."""
+    """The recordings of one training. The work log counts the iterations that were live, by the reason, under `LIVE`."""
 
     def __init__(self, s: TrainState, rasterizer: Recordable, compiled_step: CompiledStep) -> None:
         self._state, self._rasterizer, self._count = s, rasterizer, compiled_step.count
         self._recorded: dict[_Kind, _Recorded | None] = {}  # None: seen once
         self._addresses: tuple[int, ...] = ()
-        self._device, self._failed = s.device, False
+        self._failed = False
 
     def learn(self, given: Given, learn: Callable[..., L]) -> L | None:
         """See `given.Replayer`.
 
         An iteration of a new kind is live first, so that kernels are compiled and caches filled, and is recorded the next time.
+        Whatever fails in a recording or a replay, it is live, and so are all that follow.
         """
+        if self._failed:
+            self._note_live(_FAILED)
+            return None
         kind = self._kind(given)
         if kind.addresses != self._addresses:  # the structure has changed, and with it everything that was recorded
             self._recorded.clear()
             self._addresses = kind.addresses
         if kind not in self._recorded:
-            if len(self._recorded) < _MOST_KINDS:
-                self._recorded[kind] = None
-            return None
-        optimizer, recorded = self._state.optimizer, self._recorded[kind]
-        steps = optimizer.steps
-        learned: L | None = None
-        if recorded is not None:
-            learned = recorded.replay(given)
-        elif not self._failed:
-            recorded = _Recorded(self._state, self._rasterizer, given, self._count)
-            learned = self._record(recorded, given, learn)
-        # Lists that were too short are recorded anew, with space for more pairs.
-        self._recorded[kind] = None if learned is None else recorded
-        if learned is None:
-            optimizer.steps = steps
-        return learned
-
-    def _record(self, recorded: _Recorded, given: Given, learn: Callable[..., L]) -> L | None:
+            if len(self._recorded) == _MOST_KINDS:
+                self._note_live(f"more than {_MOST_KINDS} kinds of iterations")
+                return None
+            self._recorded[kind] = None
+            self._note_live("the first of its kind")
+            with on_side_stream(self._state.device):  # some caches are of a stream
+                return learn(self._state, self._rasterizer, given)
+        optimizer, steps = self._state.optimizer, self._state.optimizer.steps
         try:
-            return recorded.record(given, learn)
-        except RuntimeError as error:
-            if self._device.type == "cpu":  # what is recorded there has been done
-                raise
-            self._failed = True
-            _log.warning("fit.replay: an iteration could not be recorded, so that all are live from now on: %s", error)
-            return None
+            recorded = self._recorded[kind] = self._done(self._recorded[kind], given, learn)
+            reason = "the recorded lists of pairs are too short"  # recorded anew, with space for more
+        except Exception as error:
+            self._failed, recorded, reason = True, None, _FAILED
+            self._recorded.clear()
+            cause = f"{type(error).__name__}: {error}".partition("\n")[0]
+            _log.warning("fit.replay ends at t=%d, and iterations are live from now on: %s", given.t, cause)
+        if recorded is not None:
+            return cast(L, recorded.learned(given))
+        optimizer.steps = steps
+        self._note_live(reason)
+        return None
+
+    def _done(self, recorded: _Recorded | None, given: Given, learn: Callable[..., L]) -> _Recorded | None:
+        """What has done the iteration; None where the recording does not hold for it, before anything has changed."""
+        if recorded is None:
+            return _Recorded(self._state, self._rasterizer, given, self._count, learn)
+        return recorded if recorded.replay(given) else None
+
+    def _note_live(self, reason: str) -> None:
+        self._state.conductor.work_log.skip(LIVE, reason)
 
     def _kind(self, given: Given) -> _Kind:
         s, λ = self._state, self._state.conductor.objective.lambda_hr(given.t)
@@ -134,32 +146,42 @@ class Replays:
 class _Recorded:
     """The recording of one kind of iteration, and the tensors from which it reads what it is given."""
 
-    def __init__(self, s: TrainState, rasterizer: Recordable, given: Given, count: Callable[[int], None]) -> None:
+    def __init__(
+        self, s: TrainState, rasterizer: Recordable, given: Given, count: Callable[[int], None], learn: Callable[..., Learned]
+    ) -> None:  # fmt: skip
         self._count, self._state, self._device, owner = count, s, s.device, s.conductor.owner("observe")
         self._look_up = None if owner is None else owner.looked_up
         self._numbers_of = rasterizer.numbers_of
-        self._own, self._background = self._copied(given), s.field.means.new_empty(1, 3)
-        self._rasterizer = rasterizer if given.background is None else rasterizer.over_changing(self._background)
-        self._written = self._read_of(self._own)
+        own, self._background = self._copied(given), s.field.means.new_empty(1, 3)
+        drawn_by = rasterizer if given.background is None else rasterizer.over_changing(self._background)
+        self._written = self._read_of(own)
 
-    def record(self, given: Given, learn: Callable[..., L]) -> L:
-        def work() -> tuple[L, Tensor, Callable[[Tensor], dict[str, Number]]]:
-            learned = learn(self._state, self._rasterizer, self._own)
-            counts = {f"skip {k}": count for k, (*_, count) in enumerate(skips) if isinstance(count, Tensor)}
+        def work() -> tuple[Learned, Tensor, Callable[[Tensor], dict[str, Number]]]:
+            learned = learn(s, drawn_by, own)
+            counts = {f"skip {k}": count for k, (*_, count) in enumerate(self._skips) if isinstance(count, Tensor)}
             return learned, *deferred.gathered(learned.row | counts)
 
         self._write(given)
-        with self._state.conductor.work_log.noted() as skips:
-            self._recording: Recording[Any] = Recording(self._device, work)
-        self._skips = skips
-        return cast(L, self._learned(given))
+        with s.conductor.work_log.noted() as self._skips:
+            self._recording = Recording(s.device, work)
 
-    def replay(self, given: Given) -> Any | None:
-        """What the iteration learns; None where the recording does not hold for it, before anything has changed."""
+    def replay(self, given: Given) -> bool:
+        """Do the iteration; False where the recording does not hold for it, before anything has changed."""
         self._write(given)
         with self._state.conductor.work_log.stage("replayed"):
-            done = self._recording.replay()
-        return self._learned(given) if done else None
+            return self._recording.replay()
+
+    def learned(self, given: Given) -> Learned:
+        """What the iteration made, with the numbers of its history copied: the next one overwrites them."""
+        learned, numbers, row_of = self._recording.result
+        row, skip = row_of(numbers.clone()), self._state.conductor.work_log.skip
+        for k, (name, reason, count) in enumerate(self._skips):
+            counted = row.pop(f"skip {k}", None)
+            skip(name, reason, counted.vector[counted.k].long() if isinstance(counted, deferred.Element) else count)
+        if isinstance(given, GivenExtra):
+            return Learned(row)
+        update = cast(LearnedView, learned).update
+        return LearnedView(row, replace(update, step=replace(update.step, t=given.t, view=given.view)))
 
     def _copied(self, given: Given) -> Given:
         """The same with tensors and cameras of its own, and photos that no background shows through."""
@@ -191,20 +213,6 @@ class _Recorded:
         if given.background is not None:
             self._background.copy_(sent(torch.tensor([given.background], dtype=torch.float32), self._device))
         self._count(given.t)
-
-    def _learned(self, given: Given) -> Learned:
-        """What the last replay made, with the numbers of its history copied: the next one overwrites them."""
-        learned, numbers, row_of = self._recording.result
-        row, skip = row_of(numbers.clone()), self._state.conductor.work_log.skip
-        for k, (name, reason, count) in enumerate(self._skips):
-            counted = row.pop(f"skip {k}", None)
-            skip(name, reason, counted.vector[counted.k].long() if isinstance(counted, deferred.Element) else count)
-        if deferred.is_immediate(numbers):
-            deferred.resolve([row])
-        if isinstance(given, GivenExtra):
-            return Learned(row)
-        step = replace(learned.update.step, t=given.t, view=given.view)
-        return LearnedView(row, replace(learned.update, step=step))
 
 
 def _clone(x: Tensor | None) -> Tensor | None:

@@ -1,29 +1,37 @@
-"""Recordings on the CPU, and in which order graphs are captured on CUDA."""
+"""Recordings, on the CPU that stands in for a CUDA device and on a GPU; and that the stand-in refuses what CUDA refuses."""
 
-from contextlib import nullcontext
-from types import SimpleNamespace
-from unittest.mock import Mock
+import gc
+import re
+import weakref
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
 
 import pytest
 import torch
+from torch.utils._python_dispatch import _disable_current_modes
 
-from rasterizers import recording
-from rasterizers.recording import Recording, running
+from rasterizers.recording import Recording, on_side_stream, running
 from tests.helpers import toy
-from tests.helpers.backends import cotangents, everything, needs, require_same_bits
+from tests.helpers.backends import cotangents, everything, moved, needs, require_same_bits
+from tests.helpers.cuda_rules import RULES
+from tests.helpers.strict_cuda import Graph, Stream, StrictCuda
 
+wp: Any = pytest.importorskip("warp")
+pytestmark = needs("warp")
 CPU = torch.device("cpu")
 
 
-def test_a_replay_reads_what_has_been_written_since():
-    x, total = torch.arange(4.0), torch.zeros(())
+def test_a_replay_reads_what_has_been_written_since(recorded_on):
+    x, total = torch.arange(4.0, device=recorded_on), torch.zeros((), device=recorded_on)
 
     def work():
+        assert not gc.isenabled()
         doubled = 2 * x[1:].view(3, 1)
         total.add_(doubled.sum())
-        return doubled, torch.zeros(2) + x[0]
+        return doubled, torch.zeros(2, device=recorded_on) + x[0]
 
-    recorded = Recording(CPU, work)
+    recorded = Recording(recorded_on, work)
     doubled, first = recorded.result
     assert (doubled.flatten().tolist(), first.tolist(), float(total)) == ([2, 4, 6], [0, 0], 12)
     x.add_(1)
@@ -32,39 +40,48 @@ def test_a_replay_reads_what_has_been_written_since():
     assert running() is None
 
 
-def test_a_replay_ends_where_what_follows_does_not_hold():
-    x, found, read = torch.zeros(()), torch.zeros(()), []
+def test_a_replay_ends_where_what_follows_does_not_hold(recorded_on):
+    x, found, read = torch.zeros((), device=recorded_on), torch.zeros((), device=recorded_on), []
 
     def work():
         found.copy_(x)
+        doubled = 2 * x  # memory that both graphs use
         current = running()
         assert current is not None
         read.append(current.pause(lambda: float(found), lambda: float(x) < 2))
-        found.add_(10)
+        found.add_(10 + doubled)
 
-    recorded = Recording(CPU, work)
+    recorded = Recording(recorded_on, work)
     assert [recorded.replay(), float(found), read] == [True, 10, [0]]
     x.fill_(2)
     assert [recorded.replay(), float(found)] == [False, 2]
 
 
-def test_reading_a_number_is_refused_and_nothing_is_recorded_any_more():
-    with pytest.raises(RuntimeError, match="must not read a number"):
-        Recording(CPU, lambda: torch.ones(()).item())
-    assert running() is None
+def test_a_recording_keeps_what_it_reads(recorded_on):
+    def record():
+        x = torch.arange(3.0, device=recorded_on)
+        return Recording(recorded_on, lambda: x + 1), weakref.ref(x)
+
+    recorded, x = record()
+    assert x() is not None
+    assert recorded.replay()
+    del recorded
+    assert x() is None
 
 
-@needs("warp")
-def test_a_rendering_is_replayed_for_another_camera_background_and_number_of_pairs():
+def test_a_rendering_is_replayed_for_another_camera_background_and_number_of_pairs(recorded_on):
     import rasterizers
 
-    rasterizer, splats, v = rasterizers.load("warp", device="cpu"), toy.splats(60), cotangents(2, 64, 96)
-    own, background = toy.camera(0.0), torch.tensor([[0.1, 0.2, 0.3]])
-    numbers = rasterizer.numbers_of(own, CPU)
-    recorded = Recording(CPU, lambda: everything(rasterizer.over_changing(background)(splats, own), v))
+    rasterizer = rasterizers.load("warp", device=recorded_on.type)
+    splats, v = moved(toy.splats(60), recorded_on), cotangents(2, 64, 96).to(recorded_on)
+    own, background = toy.camera(0.0), torch.tensor([[0.1, 0.2, 0.3]], device=recorded_on)
+    numbers = rasterizer.numbers_of(own, recorded_on)
+    with on_side_stream(recorded_on):
+        everything(rasterizer.over_changing(background)(splats, own), v)
+    recorded = Recording(recorded_on, lambda: everything(rasterizer.over_changing(background)(splats, own), v))
     for angle, color in ((0.3, (0.5, 0.0, 1.0)), (0.7, (1.0, 1.0, 1.0)), (0.0, (0.0, 0.0, 0.0))):
         camera = toy.camera(angle)
-        for x, y in zip(numbers, rasterizer.numbers_of(camera, CPU), strict=True):
+        for x, y in zip(numbers, rasterizer.numbers_of(camera, recorded_on), strict=True):
             x.copy_(y)
         background.copy_(torch.tensor([color]))
         assert recorded.replay()
@@ -75,39 +92,154 @@ def test_a_rendering_is_replayed_for_another_camera_background_and_number_of_pai
     assert torch.equal(recorded.result[0], image)
 
 
-@needs("warp")
-@pytest.mark.parametrize("fails", [False, True])
-def test_on_cuda_each_part_is_captured_and_replayed_and_warp_knows(fails, monkeypatch):
-    import warp as wp
+def test_the_side_stream_waits_for_earlier_work_and_later_work_for_it(strict_cuda, monkeypatch):
+    waits = []
+    monkeypatch.setattr(Stream, "wait_stream", lambda self, other: waits.append((self, other)))
+    with on_side_stream(CPU):
+        side, legacy = strict_cuda.current, strict_cuda.state.legacy
+        assert waits == [(side, legacy)]
+    assert waits == [(side, legacy), (legacy, side)]
 
-    order, stream = [], Mock(device=torch.device("cuda"))
 
-    def graph():
-        names = {n: (lambda *_, n=n, **__: order.append(n)) for n in ("capture_begin", "capture_end", "replay")}
-        return SimpleNamespace(**names, pool=lambda: "pool")
+class Before(Recording[Any]):
+    """A recording as it was: the pool is asked for in the capture, which nothing remembers until then."""
 
-    monkeypatch.setattr(recording, "_side_stream", lambda device: stream)
-    monkeypatch.setattr(recording, "warp_stream", lambda stream: stream)
-    for name, fake in {
-        "CUDAGraph": graph,
-        "current_stream": lambda device: stream,
-        "stream": lambda s: nullcontext(),
-    }.items():
-        monkeypatch.setattr(torch.cuda, name, fake)
-    for name in ("capture_begin", "capture_end"):
-        monkeypatch.setattr(wp, name, lambda *, stream, external=None, n=name: order.append(f"wp.{n}"))
+    def _begin(self) -> None:
+        graph: Any = torch.cuda.CUDAGraph()
+        graph.capture_begin(pool=None, capture_error_mode="thread_local")
+        self._ends.callback(graph.capture_end)
+        self._capturing, self._pool = graph, graph.pool()
 
-    def work():
-        current = running()
-        assert current is not None
-        current.pause(lambda: order.append("read"), lambda: True)
-        if fails:
-            raise ValueError("no")
 
-    part = ["capture_begin", "wp.capture_begin", "wp.capture_end", "capture_end"]
-    with pytest.raises(ValueError, match="no") if fails else nullcontext():
-        recorded = Recording(torch.device("cuda"), work)
-    assert order == [*part, "replay", "read", *part] + ["replay"] * (not fails)
-    if not fails:
-        order.clear()
-        assert [recorded.replay(), order] == [True, ["replay", "replay"]]
+def test_asking_for_the_pool_in_the_capture_is_refused(strict_cuda):
+    """The first fault that a GPU showed."""
+    with pytest.raises(
+        RuntimeError, match=re.escape("Called CUDAGraph::pool() without a preceding successful capture")
+    ):
+        Before(CPU, lambda: torch.zeros(1))
+
+
+def test_a_capture_that_is_never_ended_ends_all_live_work(strict_cuda, monkeypatch):
+    """What followed from it: on leaving the scope the main stream waited, and everything failed from then on."""
+    monkeypatch.setattr(Before, "_begin", lambda self: torch.cuda.CUDAGraph().capture_begin())
+    with pytest.raises(RuntimeError, match="would make the legacy stream depend on a capturing blocking stream"):
+        Before(CPU, lambda: 1 / 0)
+    with pytest.raises(RuntimeError, match="not permitted when stream is capturing: cudaMalloc"):
+        torch.zeros(1).add_(1)
+
+
+def after_the_end(act):
+    def example(cuda, x):
+        cuda.state.capture.capture_end()
+        act(cuda, x)
+
+    return example
+
+
+def with_memory_that_is_freed(cuda, x):
+    graph = cuda.state.capture
+    with _disable_current_modes():
+        older = torch.ones(1)
+    x.add_(older)
+    del older
+    graph.capture_end()
+    graph.replay()
+
+
+def with_a_sort(cuda, _):
+    cuda.state.warp_knows = False
+    keys, values = (wp.from_torch(torch.zeros(4, dtype=torch.int32)) for _ in range(2))
+    wp.utils.radix_sort_pairs(keys, values, 2, end_bit=8)
+
+
+def after_a_failure(cuda, x):
+    with suppress(RuntimeError):
+        x.tolist()
+    x.add_(1)
+
+
+def on_the_default_stream(act):
+    def example(cuda, x):
+        with torch.cuda.stream(cuda.state.legacy):
+            act(cuda, x)
+
+    return example
+
+
+EXAMPLES: dict[str, list[Callable[[StrictCuda, torch.Tensor], object]]] = {
+    "pool_before_the_end": [lambda cuda, x: cuda.state.capture.pool()],
+    "replay_before_the_end": [lambda cuda, x: cuda.state.capture.replay()],
+    "begin_on_the_default_stream": [on_the_default_stream(lambda cuda, x: torch.cuda.CUDAGraph().capture_begin())],
+    "begin_of_a_graph_that_is_captured": [lambda cuda, x: [(g := cuda.state.capture).capture_end(), g.capture_begin()]],
+    "second_begin": [lambda cuda, x: torch.cuda.CUDAGraph().capture_begin()],
+    "end_without_begin": [lambda cuda, x: torch.cuda.CUDAGraph().capture_end()],
+    "warp_joins_what_is_captured": [after_the_end(lambda cuda, x: wp.capture_begin(stream=cuda.current, external=True))],
+    "warp_ends_what_it_began": [lambda cuda, x: [wp.capture_end(stream=cuda.current) for _ in range(2)]],
+    "sort_that_warp_does_not_know_of": [with_a_sort],
+    "waiting_for_the_device": [
+        lambda cuda, x: x.item(), lambda cuda, x: bool(x), lambda cuda, x: x.tolist(), lambda cuda, x: x.cpu(),
+        lambda cuda, x: x.numpy(), lambda cuda, x: x.nonzero(), lambda cuda, x: x[x > 0],
+        lambda cuda, x: torch.cuda.synchronize(),
+    ],
+    "pinning_memory": [lambda cuda, x: x.pin_memory()],
+    "sending_numbers_of_python": [lambda cuda, x: torch.tensor([1.0]), lambda cuda, x: x.new_tensor(2.0)],
+    "allocating_outside_the_pool": [
+        lambda cuda, x: wp.empty(3, device="cpu"), on_the_default_stream(lambda cuda, x: torch.empty(3))
+    ],
+    "waiting_for_a_capturing_stream": [lambda cuda, x: cuda.state.legacy.wait_stream(cuda.current)],
+    "a_capturing_stream_waiting": [lambda cuda, x: cuda.current.wait_stream(cuda.state.legacy)],
+    "work_on_another_stream": [on_the_default_stream(lambda cuda, x: x.add_(1))],
+    "anything_after_a_failure": [after_a_failure],
+    "reading_memory_that_was_freed": [with_memory_that_is_freed],
+}  # fmt: skip
+"""For each rule what it refuses: acts in a capture, with a tensor of one number that was allocated before it."""
+
+ACTS = [pytest.param(name, act, id=f"{name}-{nth}") for name, acts in EXAMPLES.items() for nth, act in enumerate(acts)]
+
+
+def test_every_rule_has_an_example():
+    assert [rule.__name__ for rule in RULES] == list(EXAMPLES)
+
+
+@pytest.mark.parametrize(("name", "act"), ACTS)
+def test_the_stand_in_refuses_what_cuda_refuses(name, act, strict_cuda):
+    (message,) = [rule.__doc__ for rule in RULES if rule.__name__ == name]
+    x = torch.zeros(1)
+    with on_side_stream(CPU):
+        graph = torch.cuda.CUDAGraph()
+        graph.capture_begin()
+        with pytest.raises(RuntimeError, match=re.escape(message)):
+            act(strict_cuda, x)
+        with suppress(RuntimeError):
+            graph.capture_end()
+
+
+@pytest.mark.parametrize(("name", "act"), ACTS)
+def test_after_work_that_cannot_be_recorded_live_work_goes_on_and_other_work_is_recorded(name, act, strict_cuda):
+    x = torch.zeros(1)
+    with pytest.raises(RuntimeError):
+        Recording(CPU, lambda: act(strict_cuda, x))
+    s = strict_cuda.state
+    assert (s.capture, s.warp_knows, strict_cuda.current, running(), gc.isenabled()) == (
+        None,
+        False,
+        s.legacy,
+        None,
+        True,
+    )
+    x.zero_().add_(1)
+    recorded = Recording(CPU, lambda: x + 1)
+    x.add_(1)
+    assert (recorded.replay(), recorded.result.tolist()) == (True, [3])
+
+
+@pytest.mark.parametrize("fails", ["CUDAGraph.capture_begin", "wp.capture_begin", "wp.capture_end", "CUDAGraph.replay"])
+def test_where_a_call_of_cuda_fails_live_work_goes_on(fails, strict_cuda, monkeypatch):
+    def failing(*_, **__):
+        raise RuntimeError("out of memory")
+
+    owner, name = fails.split(".")
+    monkeypatch.setattr(wp if owner == "wp" else Graph, name, failing)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        Recording(CPU, lambda: torch.zeros(1))
+    assert torch.zeros(1).add_(1).item() == 1

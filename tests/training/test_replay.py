@@ -1,51 +1,71 @@
-"""Replayed iterations, on the CPU: the bits of the live ones, and every reason to be live."""
+"""Replayed iterations: the bits of the live ones, and every reason to be live."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import pytest
 import torch
 
 import clear_strategies as cs
 import rasterizers
+from clear_strategies.core.view import ExtraView, View
+from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.density.mcmc import MCMC
-from clear_strategies.kernels.per_gaussian import dispatch
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
-from clear_strategies.training import checkpoint
+from clear_strategies.training import checkpoint, loop, replay
 from clear_strategies.training.compiled_step import CompiledStep
-from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
-from clear_strategies.training.replay import replays_for
+from clear_strategies.training.replay import LIVE, replays_for
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
+from rasterizers.recording import running
 from tests.helpers.backends import needs
 from tests.helpers.short_run import SCENE, tensors, with_depth
 from tests.training.test_resume import without_time
 
 pytestmark = needs("warp")
 ROUND = 50  # iterations between changes of the structure
+FIRST = "the first of its kind"
+FAILED = "a recording failed"
 
 
 @pytest.fixture(autouse=True)
-def _kernels_of_warp(monkeypatch):
-    monkeypatch.setattr(dispatch, "DEVICES", {"cpu"})
+def device(recorded_on, monkeypatch) -> None:
+    """Live iterations, too, run as on CUDA."""
+    monkeypatch.setattr("tests.training.test_replay.DEVICE", recorded_on)
 
 
-def start(*more, iterations=500, density=True) -> TrainState:
+DEVICE = torch.device("cpu")
+
+
+def start(
+    *more: cs.Strategy,
+    iterations: int = 500,
+    density: bool = True,
+    scene: Scene = SCENE,
+    rises_at: int = 20,
+    degree_every: int = 150,
+    scores_from: int = 1,
+    **of_svs: Any,
+) -> TrainState:
     """A training of everything that `best` is made of, over which λ_HR rises and falls, and with an anchor."""
     from clear_strategies.kernels.gaussian_step.warp import WarpGaussianStep
 
     objective = cs.Objective(
-        lambda_hr=WarmupDecay(final=0.1, start=20, full=60, decay_from=400, end=500), kernels="warp"
+        lambda_hr=WarmupDecay(final=0.1, start=rises_at, full=60, decay_from=400, end=500), kernels="warp"
     )
-    svs = cs.SVS(dropout=Ramp(full=200), looks=0, anchor_start=300, anchor_strength=0.01, anchor_weights={"means": 1.0})
+    defaults = {"dropout": Ramp(full=200), "anchor_start": 300, "anchor_weights": {"means": 1.0}}
+    svs = cs.SVS(looks=0, anchor_strength=0.01, **(defaults | of_svs))
     conductor = cs.Conductor(cs.GCO(), cs.P2G(), svs, *more, objective=objective, statistics_from=1)
     state = TrainState.start(
-        with_depth(SCENE), conductor,
-        settings=FitSettings(iterations=iterations, scale_schedule=False, degree_every=150, seed=5),
+        with_depth(scene).to(DEVICE), conductor,
+        settings=FitSettings(iterations=iterations, scale_schedule=False, degree_every=degree_every, seed=5),
         density=DensitySettings(
-            start=1, stop=300 if density else 2, statistics_from=1, every=ROUND, reset_every=120, threshold=1e-5, max_gaussians=80
+            start=1, stop=300 if density else 2, statistics_from=scores_from, every=ROUND, reset_every=120, threshold=1e-5,
+            max_gaussians=80,
         ),
         rates=LearningRates(means=LogLinear(end=500), detail_decay=0.01, cool_from=450, end=500),
         mip=MipFilter(every=15, last=1),
@@ -55,12 +75,20 @@ def start(*more, iterations=500, density=True) -> TrainState:
 
 
 def trained(state: TrainState, *, replayed: bool, until: int) -> TrainState:
-    rasterizer = rasterizers.load("warp", device="cpu")
+    rasterizer = rasterizers.load("warp", device=DEVICE.type)
     if replayed and state.replays is None:
         state.replays = replays_for(state, rasterizer)
     while state.t <= until:
-        iterate(state, rasterizer)
+        loop.iterate(state, rasterizer)
     return state
+
+
+def both(make: Callable[[], TrainState], until: int) -> TrainState:
+    """The replayed training, after a comparison with the live one."""
+    live, replayed = (trained(make(), replayed=r, until=until) for r in (False, True))
+    require_same(replayed, live)
+    assert live.conductor.work_log.state_dict().keys().isdisjoint({"replayed", LIVE})
+    return replayed
 
 
 def require_same(found: TrainState, expected: TrainState) -> None:
@@ -72,7 +100,16 @@ def require_same(found: TrainState, expected: TrainState) -> None:
 
 
 def skipped(state: TrainState) -> dict[str, dict[str, int]]:
-    return {stage: entry.skipped for stage, entry in state.conductor.work_log.entries.items() if entry.skipped}
+    entries = state.conductor.work_log.entries.items()
+    return {stage: entry.skipped for stage, entry in entries if entry.skipped and stage != LIVE}
+
+
+def replays_of(state: TrainState) -> int:
+    return state.conductor.work_log.entries["replayed"].runs
+
+
+def live_in(state: TrainState) -> dict[str, int]:
+    return state.conductor.work_log.entries[LIVE].skipped
 
 
 @pytest.mark.slow
@@ -82,21 +119,93 @@ def test_five_hundred_replayed_iterations_have_the_bits_of_live_ones(moves):
         more = [cs.PseudoViews(count=8, reach=0.1), cs.FadingOpacity(rate=0.002), cs.RandomBackground(until=1_350)]
         return start(*more, *([MCMC(start=50, stop=300, every=ROUND, per_point=3.0)] if moves == "mcmc" else []))
 
-    live, replayed = (trained(best(), replayed=r, until=500) for r in (False, True))
-    require_same(replayed, live)
-    assert live.conductor.work_log.state_dict().keys().isdisjoint({"replayed"})
+    replayed = both(best, 500)
     assert replays_of(replayed) > 600  # of 500 views and 250 extra views
-    assert len(live.field) > 12
+    assert len(replayed.field) > 12
+    assert live_in(replayed).keys() <= {FIRST, "the recorded lists of pairs are too short"}
 
 
 def test_replays_have_the_bits_of_live_iterations_also_after_resuming(tmp_path):
-    live, replayed = (trained(start(density=False), replayed=r, until=12) for r in (False, True))
-    require_same(replayed, live)
-    assert replays_of(replayed) == 12 - 3  # nothing is dropped at t=1, t=2 is live, and t=3 is recorded
+    replayed = both(lambda: start(density=False), 12)
+    # Nothing is dropped at t=1, t=2 is live, and t=3 is recorded.
+    assert (replays_of(replayed), live_in(replayed)) == (12 - 3, {FIRST: 2})
     path = checkpoint.save(tmp_path, replayed.checkpoint({}))
-    resumed = start(density=False)
+    resumed, live = start(density=False), trained(start(density=False), replayed=False, until=20)
     resumed.restore(checkpoint.load(path), path)
-    require_same(*(trained(state, replayed=state is not live, until=20) for state in (resumed, live)))
+    require_same(trained(resumed, replayed=True, until=20), live)
+
+
+def cropped(view: View, columns: int) -> View:
+    """The view without its last LR columns."""
+
+    def cut(photo, n):
+        width = photo.camera.width - n
+        return replace(photo, camera=replace(photo.camera, width=width), image=photo.image[:, :width].contiguous())
+
+    return replace(view, lr=cut(view.lr, columns), hr=cut(view.hr, columns * view.factor), truth=None)
+
+
+def masked(view: View, rows: int) -> View:
+    """The view without its first LR rows; without a mask for 0."""
+    if not rows:
+        return view
+    shown = torch.ones(view.lr.image.shape[:2], dtype=torch.bool)
+    shown[:rows] = False
+    return view.hiding(shown)
+
+
+@dataclass(frozen=True)
+class SometimesRobust(cs.Strategy):
+    """Shows the field the photo of another view, as one that was invented in part at every third iteration."""
+
+    def on_views(self, views: Sequence[View]) -> None:
+        self.__dict__["photo"] = views[0].lr
+
+    def extra_views(self, t: int) -> Sequence[ExtraView]:
+        photo = self.__dict__["photo"]
+        return [ExtraView(photo, torch.ones_like(photo.image[..., 0]), robust=t % 3 == 0)]
+
+
+@dataclass(frozen=True)
+class Late(Ramp):
+    """Dropout that begins at t=6."""
+
+    def __call__(self, t: int) -> float:
+        return 0.2 if t >= 6 else 0.0
+
+
+KINDS = {
+    "masks": lambda: start(
+        density=False, scene=replace(SCENE, train=tuple(masked(v, 3 * k) for k, v in enumerate(SCENE.train)))
+    ),
+    "size of the photos": lambda: start(
+        density=False, scene=replace(SCENE, train=tuple(cropped(v, 2 * (k == 1)) for k, v in enumerate(SCENE.train)))
+    ),
+    "robust": lambda: start(SometimesRobust(), density=False),
+    "degree": lambda: start(density=False, degree_every=5),
+    "background": lambda: start(cs.RandomBackground(until=1_350), cs.FadingOpacity(rate=0.002), density=False),
+    "dropout": lambda: start(density=False, dropout=Late()),
+    "λ_HR > 0": lambda: start(density=False, rises_at=6),
+    "scores are collected": lambda: start(scores_from=6),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("differs", KINDS)
+def test_what_differs_between_iterations_is_copied_or_makes_them_of_two_kinds(differs):
+    replayed = both(KINDS[differs], 14)
+    assert replays_of(replayed) >= 7
+    assert live_in(replayed).keys() == {FIRST}
+
+
+def test_an_anchored_step_and_that_of_an_extra_view_are_both_recorded():
+    """Whether bands above the active degree are still is asked of the device once for each of the two."""
+    replayed = both(
+        lambda: start(
+            cs.PseudoViews(count=8, reach=0.1), density=False, anchor_start=5, anchor_weights=cs.SVS().anchor_weights
+        ), 16,
+    )  # fmt: skip
+    assert replays_of(replayed) >= 12
+    assert live_in(replayed).keys() == {FIRST}
 
 
 def test_where_lists_are_too_short_the_iteration_is_live_and_recorded_anew():
@@ -108,22 +217,56 @@ def test_where_lists_are_too_short_the_iteration_is_live_and_recorded_anew():
         trained(state, replayed=state is replayed, until=12)
     require_same(replayed, live)
     assert replays_of(replayed) == 5 + 1 + 2  # t=9 ends at the count, and t=10 is recorded
+    assert live_in(replayed) == {FIRST: 2, "the recorded lists of pairs are too short": 1}
 
 
-def test_where_a_graph_cannot_be_recorded_all_iterations_are_live(monkeypatch, caplog):
-    live, other = (trained(start(density=False), replayed=r, until=2) for r in (False, True))
-
-    def fails(*_):
-        raise RuntimeError("operation not permitted when stream is capturing")
-
-    monkeypatch.setattr("clear_strategies.training.replay.Recording", fails)
-    other.replays._device = torch.device("cuda")  # where what is recorded has not been done yet
-    require_same(trained(other, replayed=True, until=6), trained(live, replayed=False, until=6))
-    assert caplog.text.count("could not be recorded, so that all are live from now on: operation not permitted") == 1
+def test_kinds_beyond_the_most_are_live_and_counted(monkeypatch):
+    monkeypatch.setattr(replay, "_MOST_KINDS", 1)
+    replayed = both(lambda: start(density=False, degree_every=6), 9)
+    assert live_in(replayed) == {FIRST: 1, "more than 1 kinds of iterations": 8}
 
 
-def replays_of(state: TrainState) -> int:
-    return state.conductor.work_log.entries["replayed"].runs
+def fails(*_: object) -> None:
+    raise ValueError("of no kind that is expected\nand a second line")
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        lambda x: x.tolist(),
+        lambda x: x[x > 0],
+        lambda x: x.new_tensor([1.0]),
+        lambda x: x.pin_memory(),
+        fails,
+    ],
+    ids=["reads numbers", "reads a mask", "sends numbers", "pins memory", "an error of another kind"],
+)
+def test_what_cannot_be_recorded_is_live_from_then_on_and_one_line_says_why(fault, monkeypatch, caplog):
+    learn = loop.learn
+
+    def faulty(s, rasterizer, given):
+        learned = learn(s, rasterizer, given)
+        if running() is not None:
+            fault(s.field.means.data)
+        return learned
+
+    monkeypatch.setattr(loop, "learn", faulty)
+    assert live_in(both(lambda: start(density=False), 8)) == {FIRST: 2, FAILED: 6}
+    require_one_line(caplog, 3)
+
+
+def test_where_a_replay_fails_iterations_are_live_from_then_on(monkeypatch, caplog):
+    live, other = (trained(start(density=False), replayed=r, until=5) for r in (False, True))
+    monkeypatch.setattr(replay.Recording, "replay", fails)
+    require_same(trained(other, replayed=True, until=8), trained(live, replayed=False, until=8))
+    assert (replays_of(other), live_in(other)) == (3, {FIRST: 2, FAILED: 3})
+    require_one_line(caplog, 6)
+
+
+def require_one_line(caplog: pytest.LogCaptureFixture, t: int) -> None:
+    (line,) = [r.getMessage() for r in caplog.records if "fit.replay" in r.getMessage()]
+    assert line.startswith(f"fit.replay ends at t={t}, and iterations are live from now on: ")
+    assert "\n" not in line
 
 
 @dataclass(frozen=True)
@@ -145,7 +288,7 @@ class Routes(cs.P2G):
 def test_what_cannot_be_recorded_is_live_and_the_log_says_why(change, reason, caplog):
     state = start()
     change(state)
-    assert replays_for(state, rasterizers.load("warp", device="cpu")) is None
+    assert replays_for(state, rasterizers.load("warp", device=DEVICE.type)) is None
     assert reason in caplog.text
 
 

@@ -1,0 +1,167 @@
+"""What CUDA, torch and Warp refuse of streams and graphs: the list by which `strict_cuda` stands in for a GPU.
+
+A fault that is found on a GPU becomes a rule here first. Each docstring is the error's message, and says who refuses; without a
+name it is the CUDA runtime. What it refuses in a capture makes that capture invalid; where the source does not say so, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+
+@dataclass
+class Act:
+    """What is about to be done.
+
+    Args:
+        what: "pool", "begin", "end" and "replay" of a graph; "warp begin" and "warp end"; "wait" for another stream; "work",
+            "allocate", "sort", "read", "send" and "pin".
+        on: the stream. graph: whose pool, beginning, end or replay it is. other: the stream that is waited for.
+        freed: the graph reads memory that is no more. by_warp: memory is Warp's, not torch's.
+    """
+
+    what: str
+    on: Any
+    graph: Any = None
+    other: Any = None
+    freed: bool = False
+    by_warp: bool = False
+
+
+@dataclass
+class State:
+    """Torch's default stream, the graph that is being captured, and whether Warp knows of that."""
+
+    legacy: Any
+    capture: Any = None
+    warp_knows: bool = False
+
+    def captures(self, stream: Any) -> bool:
+        return self.capture is not None and self.capture.stream is stream
+
+
+Rule = Callable[[Act, State], bool]
+RULES: Final[list[Rule]] = []
+CHECKS: Final[list[Rule]] = []
+"""Those that torch checks before CUDA hears of it, so that a capture goes on."""
+
+
+def rule(refuses: Rule) -> Rule:
+    RULES.append(refuses)
+    return refuses
+
+
+def check(refuses: Rule) -> Rule:
+    CHECKS.append(refuses)
+    return rule(refuses)
+
+
+# The first fault that a GPU showed.
+@check
+def pool_before_the_end(a: Act, _: State) -> bool:
+    """Called CUDAGraph::pool() without a preceding successful capture (torch)."""
+    return a.what == "pool" and not a.graph.captured
+
+
+@check
+def replay_before_the_end(a: Act, _: State) -> bool:
+    """Called CUDAGraph::replay without a preceding successful capture (torch)."""
+    return a.what == "replay" and not a.graph.captured
+
+
+@check
+def begin_on_the_default_stream(a: Act, s: State) -> bool:
+    """CUDA graphs must be captured on a non-default stream (torch)."""
+    return a.what == "begin" and a.on is s.legacy
+
+
+@check
+def begin_of_a_graph_that_is_captured(a: Act, _: State) -> bool:
+    """This CUDAGraph instance already owns a captured graph (torch)."""
+    return a.what == "begin" and a.graph.captured
+
+
+@rule
+def second_begin(a: Act, s: State) -> bool:
+    """Operation not permitted: a capture is under way already."""
+    return a.what == "begin" and s.capture is not None
+
+
+@rule
+def end_without_begin(a: Act, s: State) -> bool:
+    """Operation failed: this graph is not being captured, or not on this stream (torch, CUDA)."""
+    return a.what == "end" and not (s.capture is a.graph and s.captures(a.on))
+
+
+@rule
+def warp_joins_what_is_captured(a: Act, s: State) -> bool:
+    """External capture reported, but the stream is not capturing (Warp's capture_begin)."""
+    return a.what == "warp begin" and not s.captures(a.on)
+
+
+@rule
+def warp_ends_what_it_began(a: Act, s: State) -> bool:
+    """Graph capture is not active on this stream (Warp's capture_end)."""
+    return a.what == "warp end" and not s.warp_knows
+
+
+@rule
+def sort_that_warp_does_not_know_of(a: Act, s: State) -> bool:
+    """Allocating a temporary sort buffer during unregistered graph capture (Warp; a warning, and the memory leaks)."""
+    return a.what == "sort" and s.capture is not None and not s.warp_knows
+
+
+@rule
+def waiting_for_the_device(a: Act, s: State) -> bool:
+    """Operation not permitted when stream is capturing: the host waits, to read numbers or to know how many there are."""
+    return a.what == "read" and s.capture is not None
+
+
+@rule
+def pinning_memory(a: Act, s: State) -> bool:
+    """Operation not permitted when stream is capturing: cudaHostAlloc, in the modes global and thread_local."""
+    return a.what == "pin" and s.capture is not None
+
+
+@rule
+def sending_numbers_of_python(a: Act, s: State) -> bool:
+    """Operation not permitted when stream is capturing: a copy from memory that is not pinned, as of torch.tensor."""
+    return a.what == "send" and s.capture is not None
+
+
+@rule
+def allocating_outside_the_pool(a: Act, s: State) -> bool:
+    """Operation not permitted when stream is capturing: cudaMalloc, by Warp or by torch on a stream that is not captured."""
+    return a.what == "allocate" and s.capture is not None and (a.by_warp or not s.captures(a.on))
+
+
+@rule
+def waiting_for_a_capturing_stream(a: Act, s: State) -> bool:
+    """Operation would make the legacy stream depend on a capturing blocking stream."""
+    return a.what == "wait" and s.captures(a.other)
+
+
+@rule
+def a_capturing_stream_waiting(a: Act, s: State) -> bool:
+    """Dependency created on uncaptured work in another stream."""
+    return a.what == "wait" and s.captures(a.on)
+
+
+@rule
+def work_on_another_stream(a: Act, s: State) -> bool:
+    """Operation on a stream that is not captured: refused on the default stream, and missing from the graph on others."""
+    return a.what in ("work", "sort", "replay") and s.capture is not None and not s.captures(a.on)
+
+
+@rule
+def anything_after_a_failure(a: Act, s: State) -> bool:
+    """Operation failed due to a previous error during capture. So does the end, which ends the capture all the same."""
+    return s.capture is not None and s.capture.invalid and a.what not in ("end", "warp end")
+
+
+@rule
+def reading_memory_that_was_freed(a: Act, _: State) -> bool:
+    """The graph reads memory that has been freed since it was captured (torch's check_input_liveness)."""
+    return a.what == "replay" and a.freed

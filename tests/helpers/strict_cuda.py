@@ -1,0 +1,253 @@
+"""A stand-in for CUDA's streams and graphs, for tensors in the CPU's memory, which refuses what `cuda_rules` says.
+
+As on a GPU, what is captured is not done: results are NaN or 0 until a replay. A graph does not keep the memory that it reads.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import weakref
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any, Final
+
+import pytest
+import torch
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
+from torch.utils._pytree import tree_leaves, tree_map
+
+from tests.helpers.cuda_rules import CHECKS, RULES, Act, State
+
+Pool = dict[int, torch.Tensor]
+"""Memory of graphs, by address. None of it is used a second time."""
+
+
+@dataclass(eq=False)
+class Stream:
+    """A `torch.cuda.Stream`."""
+
+    cuda: StrictCuda
+
+    def wait_stream(self, other: Stream) -> None:
+        self.cuda.ask("wait", on=self, other=other)
+
+
+class StrictCuda:
+    """The device: one at a time, see `installed`."""
+
+    def __init__(self) -> None:
+        self.current = Stream(self)
+        self.state = State(self.current)
+
+    def ask(self, what: str, on: Stream | None = None, **more: Any) -> None:
+        """Refuse the act where a rule does."""
+        act, capture = Act(what, on or self.current, **more), self.state.capture
+        for refuses in RULES:
+            if refuses(act, self.state):
+                if capture is not None and refuses not in CHECKS:
+                    capture.invalid = True
+                raise RuntimeError(refuses.__doc__)
+
+    def do(self, call: Callable[..., Any], *arguments: Any) -> None:
+        """Call, or note the call of what is captured."""
+        if (graph := self.state.capture) is None:
+            call(*arguments)
+        else:
+            graph.calls.append((call, tree_map(graph.reference, arguments)))
+
+    @contextlib.contextmanager
+    def using(self, stream: Stream) -> Iterator[None]:
+        """`torch.cuda.stream`."""
+        outer, self.current = self.current, stream
+        try:
+            yield
+        finally:
+            self.current = outer
+
+
+class Graph:
+    """A `torch.cuda.CUDAGraph`."""
+
+    def __init__(self, cuda: StrictCuda) -> None:
+        self.cuda, self.stream = cuda, cuda.current
+        self.captured = self.invalid = False
+        self.calls: list[tuple[Callable[..., Any], Any]] = []
+        self.pooled: Pool = {}
+        self.on_host: Pool = {}  # what a generator of the CPU has drawn meanwhile, which may be read
+
+    def capture_begin(self, pool: Pool | None = None, capture_error_mode: str = "global") -> None:
+        self.cuda.ask("begin", graph=self)
+        self.pooled = {} if pool is None else pool
+        self.stream, self.cuda.state.capture = self.cuda.current, self
+
+    def capture_end(self) -> None:
+        self.cuda.ask("end", graph=self)
+        self.cuda.state.capture = None
+        if self.invalid:
+            raise RuntimeError("Operation failed due to a previous error during capture.")
+        self.captured = True
+
+    def pool(self) -> Pool:
+        self.cuda.ask("pool", graph=self)
+        return self.pooled
+
+    def replay(self) -> None:
+        arguments = [tree_map(_referent, given) for _, given in self.calls]
+        self.cuda.ask("replay", graph=self, freed=any(x is _FREED for x in tree_leaves(arguments)))
+        with _disable_current_modes(), torch.no_grad():
+            for (call, _), given in zip(self.calls, arguments, strict=True):
+                call(*given)
+
+    def reference(self, x: Any) -> Any:
+        """A tensor of the pool itself; a weak reference to another, which others have to keep."""
+        return weakref.ref(x) if isinstance(x, torch.Tensor) and _address(x) not in self.pooled else x
+
+
+_FREED: Final = object()
+
+
+def _referent(x: Any) -> Any:
+    if not isinstance(x, weakref.ref):
+        return x
+    return _FREED if (tensor := x()) is None else tensor
+
+
+def _address(x: torch.Tensor) -> int:
+    return x.untyped_storage().data_ptr()
+
+
+def _tensors(tree: Any) -> list[torch.Tensor]:
+    return [x for x in tree_leaves(tree) if isinstance(x, torch.Tensor)]
+
+
+class _Operations(TorchDispatchMode):
+    """Torch's operations: asked, and in a capture noted in place of done."""
+
+    def __init__(self, cuda: StrictCuda) -> None:
+        super().__init__()
+        self.cuda = cuda
+
+    def __torch_dispatch__(self, op: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        cuda, graph, kwargs = self.cuda, self.cuda.state.capture, kwargs or {}
+        if graph is None:
+            return op(*args, **kwargs)
+        if kwargs.get("generator") is not None:
+            drawn = op(*args, **kwargs)
+            graph.on_host[_address(drawn)] = drawn
+            return drawn
+        name = op.overloadpacket.__name__
+        is_masked = name.startswith(("index", "_index")) and any(x.dtype == torch.bool for x in _tensors(args[1:2]))
+        if is_masked or {torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape} & set(op.tags):
+            cuda.ask("read")
+        if name.startswith("lift_fresh"):
+            cuda.ask("send")
+        if op.is_view:
+            return op(*args, **kwargs)
+        if op._schema.is_mutable:
+            cuda.ask("work")
+            cuda.do(lambda args, kwargs: op(*args, **kwargs), args, kwargs)
+            return _written(op._schema, args, kwargs)
+        cuda.ask("allocate")
+        cuda.ask("work")
+        result = op(*args, **kwargs)  # for its shape
+        made, theirs = _tensors(result), {_address(x) for x in _tensors((args, kwargs))}
+        for x in made:
+            if _address(x) not in theirs:
+                graph.pooled[_address(x)] = x.detach().fill_(torch.nan if x.is_floating_point() else 0)
+        if not name.startswith(("empty", "new_empty")):
+            cuda.do(partial(_write_anew, op), made, args, kwargs)
+        return result
+
+
+def _written(schema: Any, args: Any, kwargs: Any) -> Any:
+    """What an operation returns that writes to its arguments: these."""
+    given = dict(zip((a.name for a in schema.arguments), args, strict=False)) | kwargs
+    written = [given[a.name] for a in schema.arguments if a.alias_info is not None and a.alias_info.is_write]
+    returned = tuple(written[: len(schema.returns)])
+    return returned[0] if len(returned) == 1 else returned or None
+
+
+def _write_anew(op: Any, made: list[torch.Tensor], args: Any, kwargs: Any) -> None:
+    for tensor, value in zip(made, tree_leaves(op(*args, **kwargs)), strict=True):
+        tensor.copy_(value)
+
+
+class _Functions(TorchFunctionMode):
+    """What torch does on a CPU without an operation."""
+
+    ACTS: Final = {
+        torch.Tensor.tolist: "read", torch.Tensor.numpy: "read", torch.Tensor.cpu: "read", torch.Tensor.pin_memory: "pin",
+    }  # fmt: skip
+
+    def __init__(self, cuda: StrictCuda) -> None:
+        super().__init__()
+        self.cuda = cuda
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        act, graph = self.ACTS.get(func), self.cuda.state.capture
+        if act is not None and not (graph is not None and _address(args[0]) in graph.on_host):
+            self.cuda.ask(act)
+        return args[0] if act == "pin" else func(*args, **(kwargs or {}))
+
+
+@contextlib.contextmanager
+def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
+    """A scope in which torch, Warp and this package take the CPU for a CUDA device."""
+    import warp as wp
+
+    from clear_strategies.core import deferred
+    from clear_strategies.kernels import native, per_gaussian
+    from clear_strategies.training import replay
+    from rasterizers import recording, warp_runtime
+    from rasterizers.warp_backend import frame, settings
+
+    wp.init()
+    cuda = StrictCuda()
+    sort, prepare, allocate = wp.utils.radix_sort_pairs, warp_runtime._Launch.prepare, wp.empty
+
+    def warp_begins(*, stream: Stream, external: bool) -> None:
+        cuda.ask("warp begin", on=stream)
+        cuda.state.warp_knows = True
+
+    def warp_ends(*, stream: Stream) -> None:
+        cuda.ask("warp end", on=stream)
+        cuda.state.warp_knows = False
+
+    def sorts(keys: Any, values: Any, count: int, end_bit: int) -> None:
+        cuda.ask("sort")
+        arrays = [wp.array(ptr=x.ptr, shape=x.shape, dtype=x.dtype, device=x.device) for x in (keys, values)]
+        cuda.do(lambda: sort(*arrays, count, end_bit=end_bit))
+
+    def prepared(launcher: Any, size: Any, arguments: Any) -> Any:
+        def launch() -> None:
+            cuda.ask("work")
+            cuda.do(lambda *given: prepare(launcher, size, given).launch(), *arguments)
+
+        return type("Command", (), {"launch": staticmethod(launch)})
+
+    def allocates(*args: Any, **kwargs: Any) -> Any:
+        cuda.ask("allocate", by_warp=True)
+        return allocate(*args, **kwargs)
+
+    patches: dict[Any, dict[str, Any]] = {
+        torch.cuda: {
+            "CUDAGraph": partial(Graph, cuda), "stream": cuda.using, "current_stream": lambda device: cuda.current,
+            "graph_pool_handle": dict, "synchronize": lambda device=None: cuda.ask("read"),
+        },
+        wp: {"capture_begin": warp_begins, "capture_end": warp_ends, "empty": allocates},
+        wp.utils: {"radix_sort_pairs": sorts},
+        warp_runtime._Launch: {"prepare": prepared},
+        recording: {"_side_stream": cache(lambda device: Stream(cuda)), "warp_stream": lambda stream: stream},
+        deferred: {"is_immediate": lambda x: False},
+        native: {"available": lambda: False},
+        per_gaussian: {"DEVICES": {"cpu"}},
+        frame: {"DEFERRED_COUNTS": {"cpu": True}},
+        **{m: {"sent": lambda numbers, device: numbers.pin_memory()} for m in (warp_runtime, settings, replay)},
+    }  # fmt: skip
+    for owner, values in patches.items():
+        for name, value in values.items():
+            monkeypatch.setattr(owner, name, value)
+    with _Functions(cuda), _Operations(cuda):
+        yield cuda
