@@ -42,6 +42,14 @@ STOPS: Final = (*_TWICE, *_HANGUPS)
 _ANNOUNCEMENTS: Final = tuple(getattr(signal, name) for name in ("SIGUSR1", "SIGUSR2") if hasattr(signal, name))
 
 
+_collected: Final = list[list[int]]()  # by each `deferred_signals`
+
+
+def asked() -> bool:
+    """Whether a signal waits for the end of the step in progress."""
+    return any(_collected)
+
+
 @contextmanager
 def deferred_signals() -> Iterator[list[int]]:
     """Collect the first of `STOPS` instead of stopping in the middle of a step; after it SIGINT and SIGTERM act at once. SIGHUP
@@ -67,9 +75,11 @@ def deferred_signals() -> Iterator[list[int]]:
     except ValueError:  # not the main thread, which alone may set handlers
         yield pending
         return
+    _collected.append(pending)
     try:
         yield pending
     finally:
+        _collected.pop()
         for s, handler in before.items():
             signal.signal(s, handler)
 
