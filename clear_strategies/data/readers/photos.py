@@ -14,7 +14,7 @@ from typing import Final, Literal
 from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.data.capture import MORE_PHOTOS, Capture
 from clear_strategies.data.masks import masks_among
-from clear_strategies.data.photo_files import SUFFIXES, focal_35mm, image_size
+from clear_strategies.data.photo_files import SUFFIXES, focal_35mm
 from clear_strategies.data.photo_folders import (
     folders_of_images,
     images_in,
@@ -98,17 +98,15 @@ def read(
     if root.is_file():
         raise DataError(root, "photos", "is a file", _instead_of(root))
     _tell_of_other_poses(root)
-    root = _folder_in(root)
+    root, images = _photos_in(root)
     base = Path(cache) if cache is not None else cache_folder() / "sfm"
     if base.resolve().is_relative_to(root.resolve()):
         raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
-    paths = usable(root, _once_each(list_images(root)), lambda path: path, skip_faulty=skip_faulty)
+    paths = usable(root, _once_each(images), lambda path: path, skip_faulty=skip_faulty)
     require_text((name, *(path.name for path in paths)))
     if len(paths) < sfm.FEWEST:
         raise DataError(root, "images", f"there are {len(paths)}, poses need at least {sfm.FEWEST}", MORE_PHOTOS)
     photos = {path: focal_35mm(path) for path in paths}  # unreadable photos are refused before the long work
-    for path in paths:
-        image_size(path, turn=True)
     precise = len(paths) <= _FEW if precise == "auto" else precise
     folder = base / _key(paths, max_side, max_features, precise, seed)
     if (folder / sfm.MODEL).is_file():
@@ -134,16 +132,15 @@ def _instead_of(file: Path) -> str:
     return "give the folder of the photos or of the capture"
 
 
-def _folder_in(root: Path) -> Path:
-    """The folder of the photos: `root`, its folder `images`, or where neither has any, the only one below that has."""
+def _photos_in(root: Path) -> tuple[Path, list[Path]]:
+    """The photos and their folder: `root`, its folder `images`, or where neither has any, the only one below that has."""
     for folder in (root, named(root, "images")):
-        if images_in(folder):
-            return folder
-    if len(below := folders_of_images(root)) != 1:
-        return root  # which `list_images` refuses
-    (only,) = below
-    _log.warning("%s holds no image; those in %s are used.", root, only.relative_to(root).as_posix())
-    return only
+        if images := images_in(folder):
+            return folder, images
+    if len(below := folders_of_images(root)) == 1:
+        (root,), above = below, root
+        _log.warning("%s holds no image; those in %s are used.", above, root.relative_to(above).as_posix())
+    return root, list_images(root)
 
 
 def _tell_of_other_poses(root: Path) -> None:
