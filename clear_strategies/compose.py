@@ -6,6 +6,7 @@ conductor("clear", "strategies.gco.tolerance=0.1", iterations=30_000)
 from __future__ import annotations
 
 import hashlib
+import logging
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -28,6 +29,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from clear_strategies import files
 from clear_strategies.errors import SettingError, of_hydra, one_line
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.detail import DetailRates
@@ -36,6 +38,8 @@ from clear_strategies.merging.skips import Skips
 from clear_strategies.schedules import REFERENCE_ITERATIONS, scaled
 from clear_strategies.settings import CHANGES_NO_RESULT, TARGET, build, missing, with_defaults
 from clear_strategies.strategies.base import Strategy
+
+_log = logging.getLogger(__name__)
 
 _PACKAGE: Final = Path(__file__).resolve().parent
 # In a wheel conf/ lies inside the package, in a checkout beside it.
@@ -119,7 +123,7 @@ def _detail(config: DictConfig) -> DetailRates:
 
 
 def tree(config: DictConfig, without: Iterable[str] = ()) -> dict[str, Any]:
-    """A composed configuration as plain values, interpolations resolved.
+    """A composed configuration as plain values, interpolations resolved, paths with `~` expanded.
 
     Raises:
         SettingError: an interpolation leads to nothing, or to a value that is missing.
@@ -137,7 +141,15 @@ def tree(config: DictConfig, without: Iterable[str] = ()) -> dict[str, Any]:
                 f"strategies.{name}: has settings ({', '.join(node)}), and takes no part. Add it, +strategy={name}, or leave out "
                 "what sets them; readings=literal sets those of p2g and svs."
             )
-    return {key: value for key, value in values.items() if key not in without}
+    return {key: _expanded(value) for key, value in values.items() if key not in without}
+
+
+def _expanded(node: Any) -> Any:
+    if isinstance(node, Mapping):
+        return {key: _expanded(value) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_expanded(value) for value in node]
+    return files.expanded(node) if isinstance(node, str) else node
 
 
 def flat(node: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
@@ -183,15 +195,21 @@ def quoted(value: str) -> str:
 
 def require_each_once(overrides: Iterable[str]) -> None:
     """Raise a SettingError for a strategy that is named twice, since Hydra merges the two into one silently, and for one before
-    a method that brings more than strategies, which a method does not set aside.
+    a method that brings more than strategies, which a method does not set aside. Warn of the strategies that it does.
     """
     also_brought: str | None = None
+    before = list[str]()
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         if override.key_or_group == "method" and also_brought is not None:
             raise SettingError(f"+method={override.value()}: sets strategies aside, and {also_brought}. Leave it out.")
+        if override.key_or_group == "method" and before and override.value():
+            message = "%s has no effect: %s replaces the strategies before it. What is written behind the method is added to it."
+            _log.warning(message, " ".join(before), override.input_line)
         if override.key_or_group != "strategy" or override.is_sweep_override():
             continue
         value = override.value()
+        if value != "baseline":  # no strategy
+            before.append(str(override.input_line))
         options = [str(option) for option in (value if isinstance(value, list) else [value])]
         for option in options:
             if other_groups := [part for part in _parts(option) if part.startswith("/")]:

@@ -8,9 +8,11 @@ run's run.log has all three.
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import logging
 import logging.handlers
+import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,7 +24,46 @@ _OURS: Final = ("clear_strategies", "rasterizers", "integration")
 _LIBRARIES: Final = (
     "asyncio", "fontTools", "imageio", "kornia", "matplotlib", "PIL", "py", "torch", "trimesh", "viser", "websockets",
 )  # fmt: skip
+_LEFT: Final = (errno.EPIPE, errno.EIO)
 _PREFIXES: Final = {logging.WARNING: "warning: ", logging.ERROR: "error: ", logging.CRITICAL: "error: "}
+
+
+class _Readerless(io.FileIO):
+    """The descriptor of an output. What follows after who reads it has left is dropped."""
+
+    def write(self, data: Any) -> int:
+        try:
+            return super().write(data)
+        except OSError as error:
+            if error.errno not in _LEFT:
+                raise
+            gone = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(gone, self.fileno())
+            os.close(gone)
+            return len(data)
+
+
+def steady() -> None:
+    """Make stdout and stderr those of a program that goes on after who reads it has left, as head does, or after its terminal was
+    closed; letters that the console does not have are escaped. Every program begins with this.
+    """
+    for name in ("stdout", "stderr"):
+        if (stream := getattr(sys, name)) is None:  # the program was started without it
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115 - as long as the program
+        elif stream is getattr(sys, f"__{name}__"):  # else of a test or a notebook
+            setattr(sys, name, _steady(stream))
+
+
+def _steady(stream: io.TextIOWrapper) -> io.TextIOWrapper:
+    if not isinstance(getattr(stream.buffer, "raw", stream.buffer), io.FileIO):  # the console of Windows
+        stream.reconfigure(errors="backslashreplace")
+        return stream
+    stream.flush()
+    raw, at_once = _Readerless(stream.fileno(), "w", closefd=False), stream.write_through
+    return io.TextIOWrapper(
+        raw if at_once else io.BufferedWriter(raw),
+        stream.encoding, errors="backslashreplace", line_buffering=stream.line_buffering, write_through=at_once,
+    )  # fmt: skip
 
 
 class Console(logging.StreamHandler[Any]):
@@ -34,6 +75,8 @@ class Console(logging.StreamHandler[Any]):
     """
 
     def __init__(self, stream: TextIO | io.TextIOBase | None = None, *, verbose: bool = False) -> None:
+        if stream is None:
+            steady()  # a launcher's processes do not pass `run.main`
         super().__init__(stream if stream is not None else sys.stdout)
         self.setLevel(logging.DEBUG if verbose else logging.INFO)
         self.addFilter(lambda record: record.levelno > logging.WARNING or record.name.split(".")[0] not in _LIBRARIES)

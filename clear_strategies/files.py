@@ -22,6 +22,11 @@ _KEPT: Final = 40  # characters of a file's name in that of its part, so that a 
 _LARGEST: Final = 64 << 30
 
 
+def expanded(path: str) -> str:
+    """A path with the user's folder in place of a `~` in front, which a shell replaces only where a word begins with it."""
+    return os.path.expanduser(path)  # noqa: PTH111 - Path.expanduser raises where there is no such user
+
+
 def write_bytes(path: Path, data: bytes) -> None:
     """Write a file beside the target, flush it to disk, then rename it to the target."""
     with replacing(path) as partial:

@@ -13,7 +13,7 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -27,9 +27,10 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from clear_strategies import console, files
-from clear_strategies.compose import CONF, composed, flat, quoted, require_each_once
+from clear_strategies.compose import CONF, composed, flat, options, quoted, require_each_once
 from clear_strategies.errors import ClearError, SettingError
 from clear_strategies.jobs import exit_codes
+from clear_strategies.training.signals import STOPS
 
 _log = logging.getLogger(__name__)
 
@@ -63,11 +64,16 @@ def main(overrides: Sequence[str] | None = None) -> None:
 
 def readable(word: str) -> str:
     """A word of the command line, its value quoted where Hydra's grammar has no such value, as paths may have any letters, or
-    where it would take a path with a comma for two.
+    where it would take a path with a comma for two. A `~` of Hydra's own folders is expanded; `compose.tree` does the others.
     """
     key, equals, value = word.partition("=")
-    if not equals or word.startswith("-"):
+    if not equals:
         return word
+    if word.startswith("-"):
+        return f"{key}={files.expanded(value)}"
+    if key.lstrip("+").startswith("hydra."):
+        value = files.expanded(value)
+        word = f"{key}={value}"
     try:
         OverridesParser.create().parse_override(word)
     except HydraException:
@@ -85,16 +91,23 @@ def _require_known_flags(arguments: Sequence[str]) -> None:
 
 
 def _no_such_setting(key: str) -> str:
-    """The message for an override that names no setting, with the most similar one."""
+    """The message for an override that names no setting, with the options of its group that have it, or the most similar one."""
     if (CONF / key).is_dir():
         return f"{key}: no choice of this group is there to be replaced, so it is added: +{key}=…."
     words = [word for word in sys.argv[1:] if not word.startswith(("-", "hydra."))]
     overrides = [word for word in words if word.partition("=")[0].lstrip("+") != key]
-    try:
-        settings: Any = OmegaConf.to_container(composed(overrides, "config"))
-        near = difflib.get_close_matches(key, flat(settings), 1, 0.8)
-    except SettingError:  # another override is wrong as well
-        near = []
+
+    def settings(*chosen: str) -> Collection[str]:
+        try:
+            return flat(OmegaConf.to_container(composed([*overrides, *chosen], "config")))  # type: ignore[arg-type]
+        except SettingError:  # another override is wrong as well
+            return ()
+
+    group = key.partition(".")[0]
+    if having := [option for option in options(group) if key in settings(f"{group}={option}")]:
+        train = ", or let the command find it: clear-strategies train FOLDER" if key == "data.path" else ""
+        return f"{key}: there is no such setting without one of {', '.join(f'{group}={o}' for o in having)}. Add it{train}."
+    near = difflib.get_close_matches(key, settings(), 1, 0.8)
     remedy = f"Did you mean {near[0]}?" if near else "clear-strategies --cfg job prints all of them."
     return f"{key}: there is no such setting. {remedy}"
 
@@ -139,7 +152,7 @@ def _end(error: BaseException, ending: exit_codes.Ending, folder: Path, *, resum
         return
     with suppress(OSError):
         folder.rmdir()  # where nothing was written
-    if code - exit_codes.SIGNALS not in (signal.SIGINT, signal.SIGTERM) and code > exit_codes.SIGNALS:
+    if code > exit_codes.SIGNALS and code - exit_codes.SIGNALS not in STOPS:
         signal.raise_signal(code - exit_codes.SIGNALS)  # all is saved: now the launcher's handler may resubmit the job
     sys.exit(code)
 
@@ -148,15 +161,16 @@ class SweepCallback(Callback):
     """Runs at the beginning and end of a sweep, in the process that was started; jobs may run in other processes."""
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        # As Ctrl-C; else joblib's workers would go on without us.
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        for stop in STOPS:  # as Ctrl-C; else joblib's workers would go on without us
+            if signal.getsignal(stop) is not signal.SIG_IGN:
+                signal.signal(stop, signal.default_int_handler)
         for note in Path(config.hydra.sweep.dir).rglob(FAILED):  # of an earlier sweep
             note.unlink()
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         folder = Path(config.hydra.sweep.dir)
         _report(folder)
-        if failed := sorted(note.read_text().strip() for note in folder.rglob(FAILED)):
+        if failed := sorted(note.read_text(encoding="utf-8").strip() for note in folder.rglob(FAILED)):
             _log.error("%d job(s) failed: %s", len(failed), " | ".join(failed))
             sys.exit(exit_codes.UNUSABLE)
 

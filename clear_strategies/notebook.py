@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies import console
+from clear_strategies.commands import path_of
 from clear_strategies.commands import train as train_command
 from clear_strategies.compose import composed
 from clear_strategies.core.checks import refuse
@@ -25,6 +26,7 @@ from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
+from clear_strategies.hydra_app import readable
 from clear_strategies.jobs import exit_codes, job
 from clear_strategies.jobs.device import BY_NAME
 from clear_strategies.jobs.saved import SavedSplat, open_splat
@@ -48,7 +50,7 @@ class Run:
     rasterizer: str | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "folder", Path(self.folder))
+        object.__setattr__(self, "folder", path_of(str(self.folder)))
         if not (self.folder / "metrics.json").is_file():
             raise DataError(self.folder, "metrics.json", "is not there, so no run has finished here", "train first")
 
@@ -94,8 +96,10 @@ def train(photos: str | Path | None = None, *settings: str, folder: str | Path |
         DataError: a photo or a file cannot be used.
     """
     exit_codes.require("train")
+    console.steady()
     console.show()
-    overrides = list(settings) if photos is None else train_command.overrides([str(photos), *settings])
+    words = [readable(word) for word in settings]
+    overrides = words if photos is None else train_command.overrides([str(photos), *words])
     if photos is None and not any(word.startswith(train_command.CHOOSE_STRATEGIES) for word in settings):
         overrides.append("+strategy=best")
     for word in overrides:
@@ -107,9 +111,9 @@ def train(photos: str | Path | None = None, *settings: str, folder: str | Path |
     if (lr := config.data.get("save_lr")) is not None:
         rule = "must be null, since a run that writes LR images does not train"
         refuse("data.save_lr", rule, lr, f"clear-strategies train PHOTOS data.save_lr={lr} on the command line")
-    name = "demo" if photos is None else Path(photos).resolve().stem
+    name = "demo" if photos is None else path_of(str(photos)).resolve().stem
     now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S-%f")
-    into = Path(folder) if folder is not None else Path("outputs") / name / now
+    into = path_of(str(folder)) if folder is not None else Path("outputs") / name / now
     into.mkdir(parents=True, exist_ok=True)
     threads = torch.get_num_threads()
     try:

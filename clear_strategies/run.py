@@ -10,12 +10,10 @@ from __future__ import annotations
 import atexit
 import gc
 import logging
-import os
-import signal
 import sys
 from importlib import import_module
 
-from clear_strategies import commands
+from clear_strategies import commands, console
 from clear_strategies.jobs import exit_codes
 
 
@@ -23,13 +21,11 @@ def main() -> None:
     """The command line: a subcommand, or Hydra's."""
     atexit.register(gc.freeze)  # else Python looks through all of torch's objects before it ends, for 0.3 s
     logging.captureWarnings(True)  # of libraries: they are for run.log
+    console.steady()
     try:
         command = commands.named(sys.argv[1:])
         command() if command is not None else import_module("clear_strategies.hydra_app").main()
         sys.stdout.flush()
-    except BrokenPipeError:  # who read the output has left, as head does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left of it goes there when Python ends
-        sys.exit(exit_codes.SIGNALS + signal.SIGPIPE)
     except (Exception, KeyboardInterrupt) as error:
         if (ending := exit_codes.describe(error)) is None:
             raise

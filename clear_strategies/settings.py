@@ -38,7 +38,7 @@ _MISSING: Final = "???"
 CHANGES_NO_RESULT: Final = frozenset(
     f"fit.{name}"
     for name in (
-        "checkpoint_every", "keep", "map_views", "memory", "probe_every", "probe_views", "resume",
+        "checkpoint_every", "keep", "map_views", "memory", "overwrite", "probe_every", "probe_views", "resume",
         "threads", "verbose", "video", "viewer",
     )
 ) | {"rasterizer.memory"}  # fmt: skip

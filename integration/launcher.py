@@ -12,7 +12,9 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from clear_strategies.console import show_in_host
+from clear_strategies import console
+from clear_strategies.commands import path_of
+from clear_strategies.compose import conductor
 from clear_strategies.errors import ClearError, DataError
 from integration.settings import Settings
 
@@ -34,7 +36,8 @@ def main(
             the list of what was attached (`Attached` of this host), which the script fills.
         otherwise: why that list may be empty at the end.
     """
-    show_in_host()
+    console.steady()
+    console.show_in_host()
     options = _parser(module, f"Run {script} with CLEAR.").parse_args(arguments)
     try:
         settings = _settings(options)
@@ -62,11 +65,11 @@ def _parser(module: str, description: str) -> argparse.ArgumentParser:
         help="what the Gaussians start from: the trainer's own points, or dense stereo between its training photos "
         "(%(default)s)",
     )  # fmt: skip
-    add("--sr", metavar="FOLDER", help="SR images, named like the photos")
-    add("--suffix", help="what the SR tool appended to the names, e.g. _x4")
-    add("--factor", type=int, help="HR pixels per LR pixel (%(default)s)")
+    add("--sr", type=path_of, metavar="FOLDER", help="SR images, named like the photos")
+    add("--suffix", default="", help="what the SR tool appended to the names, e.g. _x4")
+    add("--factor", type=int, default=4, help="HR pixels per LR pixel (%(default)s)")
     add(
-        "--save-lr", type=Path, metavar="FOLDER",
+        "--save-lr", type=path_of, metavar="FOLDER",
         help="write the photos as they are trained on (reduced, masked) for an SR tool to enlarge; then stop",
     )  # fmt: skip
     add("script", type=Path, help="the host's script")

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -16,7 +17,7 @@ from torch import Tensor
 from clear_strategies.core.points import MAX_POINTS, PointCloud
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.priors.interface import super_resolved
-from clear_strategies.data.view_names import bare, write_pngs
+from clear_strategies.data.view_names import write_pngs
 from clear_strategies.errors import DataError, HostError, SettingError
 from clear_strategies.geometry import stereo
 from clear_strategies.geometry.projection import intrinsics
@@ -45,7 +46,7 @@ class HostPhoto:
         mask: what the host's loss multiplies its rendering by, in [0, 1]; None: nothing is hidden.
 
     Raises:
-        DataError: one has another shape, or values outside of [0, 1].
+        DataError: one has another shape, or values outside of [0, 1]; or pose and K are no camera.
     """
 
     name: str
@@ -55,13 +56,20 @@ class HostPhoto:
     mask: Float[Tensor, "h w"] | None = None
 
     def __post_init__(self) -> None:
-        shape, K = tuple(self.image.shape), tuple(self.K.shape)
+        shape, K, pose = (tuple(x.shape) for x in (self.image, self.K, self.world_to_camera))
         if len(shape) != 3 or shape[-1] not in (3, 4):
             raise DataError(self.name, "image", f"must have shape [h, w, 3], got {shape}", "put the RGB channels last")
         if K != (3, 3):
             raise DataError(
                 self.name, "K", f"must have shape [3, 3], got {K}", "give the camera matrix of this photo alone"
             )
+        if pose != (4, 4):
+            remedy = "add the last row 0 0 0 1 to rotation and translation"
+            raise DataError(self.name, "world_to_camera", f"must have shape [4, 4], got {pose}", remedy)
+        try:
+            _ = self.camera
+        except ValueError as error:
+            raise DataError(self.name, "camera", str(error), "give OpenCV's world-to-camera and K in pixels") from error
         if self.image.dtype != torch.uint8:
             _require_range(self.name, "image", self.image)
         if self.mask is not None:
@@ -71,13 +79,17 @@ class HostPhoto:
             _require_range(self.name, "mask", self.mask)
 
     @property
+    def camera(self) -> Camera:
+        """At the size of the image, on the CPU, where cameras stay, see `Photo.to`."""
+        h, w = self.image.shape[:2]
+        (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
+        return Camera(self.world_to_camera.detach().float().cpu(), fx, fy, cx, cy, w, h)
+
+    @property
     def posed(self) -> Photo:
         """The photo with its camera, RGB in [0, 1]."""
         image = self.image.float() / 255 if self.image.dtype == torch.uint8 else self.image.float()
-        h, w = image.shape[:2]
-        (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
-        pose = self.world_to_camera.detach().float().cpu()  # cameras stay there, see `Photo.to`
-        return Photo(Camera(pose, fx, fy, cx, cy, w, h), image[..., :3].clamp(0, 1))  # reduced photos may overshoot
+        return Photo(self.camera, image[..., :3].clamp(0, 1))  # reduced photos may overshoot
 
     def view(self, sr: SuperResolve, factor: int) -> View:
         """See `view`."""
@@ -101,26 +113,39 @@ class HostPhoto:
 
 def view(
     name: str,
-    image: Float[Tensor, "h w 3"],
-    world_to_camera: Float[Tensor, "4 4"],
-    K: Float[Tensor, "3 3"],
+    image: Float[Tensor, "h w 3"] | np.ndarray,
+    world_to_camera: Float[Tensor, "4 4"] | np.ndarray,
+    K: Float[Tensor, "3 3"] | np.ndarray,
     sr: SuperResolve,
     factor: int = 4,
-    mask: Float[Tensor, "h w"] | None = None,
+    mask: Float[Tensor, "h w"] | np.ndarray | None = None,
 ) -> View:
     """One training view of a host, on the device of its image.
 
     Args:
-        name, image, world_to_camera, K: see `HostPhoto`.
+        name, image, world_to_camera, K: see `HostPhoto`. Arrays of numpy are taken, too.
         sr: gives the SR image. factor: HR pixels per LR pixel.
         mask: see `HostPhoto`. Photo and SR image are multiplied by it, so that a pixel that the host hides is hidden at both
             scales; the HR rendering must be as well, see `enlarged_mask`.
 
     Raises:
-        DataError: photo, mask or K has another shape; the SR image is not `factor` times as large as the photo; an image is not
-            in [0, 1] but for a network's overshoot.
+        DataError: photo, mask, pose or K has another shape, or is no array of numbers; the SR image is not `factor` times as
+            large as the photo; an image is not in [0, 1] but for a network's overshoot.
     """
-    return HostPhoto(name, image, world_to_camera, K, mask).view(sr, factor)
+    given = {"image": image, "world_to_camera": world_to_camera, "K": K}
+    tensors = {field: _tensor(name, field, value) for field, value in given.items()}
+    return HostPhoto(name, **tensors, mask=None if mask is None else _tensor(name, "mask", mask)).view(sr, factor)
+
+
+def _tensor(name: str, field: str, value: object) -> Tensor:
+    if isinstance(value, Tensor):
+        return value
+    array = np.asarray(value)
+    if array.dtype.kind not in "bfiu":
+        raise DataError(
+            name, field, f"must be a tensor or an array of numbers, got a {type(value).__name__}", "give one"
+        )
+    return torch.tensor(np.ascontiguousarray(array))
 
 
 def _require_range(name: str, what: str, values: Tensor) -> None:
@@ -131,12 +156,12 @@ def _require_range(name: str, what: str, values: Tensor) -> None:
 
 
 def require_unique(names: Iterable[str]) -> None:
-    """Refuse two photos of one name, with or without its ending: SR images are found by it, and strategies know a view by it.
+    """Refuse two photos of one name: SR images are found by it, and strategies know a view by it.
 
     Raises:
         DataError: there are two.
     """
-    if twice := [name for name, count in Counter(map(bare, names)).items() if count > 1]:
+    if twice := [name for name, count in Counter(names).items() if count > 1]:
         remedy = "give each its own; where folders have equal file names, name the views with their folders"
         raise DataError(twice[0], "name", "is that of two photos", remedy)
 

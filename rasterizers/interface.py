@@ -30,6 +30,10 @@ class BackendUnavailable(RuntimeError):
     """A backend that cannot run on this machine. The message says why, and what to install."""
 
 
+class OutdatedKernels(RuntimeError):
+    """Compiled kernels of other sources than those beside the Python that calls them. No other backend takes their place."""
+
+
 Color = tuple[float, float, float]
 """RGB in [0, 1]."""
 

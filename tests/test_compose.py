@@ -4,7 +4,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
-from clear_strategies import GCO, P2G, SVS, Conductor
+from clear_strategies import GCO, P2G, SVS, Conductor, hydra_app
+from clear_strategies import compose as compose_module
 from clear_strategies.compose import CONF, conductor, tree
 from clear_strategies.data.priors import BackProjected, Bicubic
 from clear_strategies.data.view_settings import ViewSettings
@@ -106,6 +107,33 @@ def test_every_option_composes_into_settings(group):
         chosen = f"{'+' * (group in ('strategy', 'method'))}{group}={name}"
         config = composed(chosen, *([NEEDED[chosen]] if chosen in NEEDED else []))
         assert isinstance(settings_of(tree(config)).conductor(1.0), Conductor), name
+
+
+# A strategy, a method, and what the warning says first; empty where nothing is set aside.
+ASIDE = {
+    "+strategy=gco +method=srgs": "+strategy=gco has no effect: +method=srgs replaces",
+    "+strategy=[gco,svs] +method=dropgaussian": "+strategy=[gco,svs] has no effect: +method=dropgaussian replaces",
+    "+method=srgs +strategy=gco": "",
+    "+strategy=baseline +method=srgs": "",
+    "+strategy=gco +method=[]": "",
+}
+
+
+@pytest.mark.parametrize("overrides", ASIDE)
+def test_a_strategy_that_a_method_sets_aside_is_told(overrides, caplog):
+    compose_module.composed(overrides.split(), "config")
+    said = [record.getMessage() for record in caplog.records]
+    assert said == [] if not ASIDE[overrides] else said[0].startswith(ASIDE[overrides])
+
+
+def test_a_tilde_is_the_users_folder_wherever_a_setting_is_a_path(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+    paths = {"data.path": "~/photos", "prior.path": "~/sr", "fit.resume": "~/run", "data.save_lr": "~"}
+    words = [hydra_app.readable(f"{key}={path}") for key, path in paths.items()]
+    values = tree(composed("data=colmap", "prior=images", *words))
+    assert values["data"]["reader"]["root"] == values["data"]["path"] == "/home/me/photos"
+    assert (values["prior"]["path"], values["fit"]["resume"]) == ("/home/me/sr", "/home/me/run")
+    assert values["data"]["save_lr"] == "/home/me"
 
 
 REFUSED = {

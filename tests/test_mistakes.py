@@ -49,7 +49,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for i in range(3):
         (here / "text" / f"{i}.jpg").write_text("no photo")
     (here / "file").write_text("no folder")
-    (here / "clip.mp4").write_text("no folder")
+    for file in ("clip.mp4", "photos.zip", "raws/IMG_1.CR2", "rig/cam1/0.jpg", "rig/cam2/0.jpg"):
+        (here / file).parent.mkdir(exist_ok=True, parents=True)
+        (here / file).write_text("no folder")
     (here / "damaged.ply").write_text("ply\nformat ascii 1.0\n")
     (here / "compressed.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 1\nproperty uint packed_position\nend_header\n"

@@ -8,11 +8,14 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, TextIO
 
 import pytest
 
+from clear_strategies import commands
 from clear_strategies.jobs import exit_codes
 from tests.helpers.command_line import TINY, environment, run, started, stopped_by, wait_for
+from tests.helpers.forked import Forked
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +46,44 @@ def test_a_run_leaves_everything_it_promises(finished):
     assert {"maps", "contact sheet and curves"} <= set(stages)
     pictures = [len(list(out.glob(kind))) for kind in ("renders/*.png", "views/*_truth.png", "maps/*/corrected.png")]
     assert pictures == [3, 3, 2]
+
+
+SAVING = ["+strategy=gco", *TINY, "hydra.run.dir=cut", "fit.checkpoint_every=0"]
+
+
+@pytest.mark.parametrize(
+    "signals", [(signal.SIGTERM,), (signal.SIGHUP,), (signal.SIGHUP,) * 3], ids=["SIGTERM", "SIGHUP", "three of SIGHUP"]
+)
+def test_a_signal_that_ends_a_run_saves_before(signals, tmp_path):
+    """Of a terminal that is closed, the system and the shell send SIGHUP."""
+    said = tmp_path / "said"
+    ended = started("-c", stopped_by(*signals, after=5), *SAVING, cwd=tmp_path, said=said).wait()
+    assert ended == 128 + signals[0], said.read_text()
+    assert f"Go on with fit.resume={tmp_path}/cut/checkpoints/step_0000006.safetensors." in said.read_text()
+    assert len(list((tmp_path / "cut/checkpoints").iterdir())) == 1
+
+
+def test_a_run_under_nohup_goes_on_after_its_terminal_is_closed(tmp_path):
+    said, nohup = tmp_path / "said", "import signal\nsignal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+    ended = started("-c", nohup + stopped_by(signal.SIGHUP, after=5), *SAVING, cwd=tmp_path, said=said).wait()
+    assert (ended, (tmp_path / "cut/metrics.json").is_file()) == (0, True), said.read_text()
+
+
+def test_a_terminal_that_is_closed_takes_nothing_of_a_run_with_it(tmp_path):
+    """Its bar is drawn on the terminal until then; what is written afterwards fails."""
+    code = (
+        "import os\n"
+        "master, terminal = os.openpty()\n"
+        "for stream in (1, 2):\n"
+        "    os.dup2(terminal, stream)\n"
+        "os.close(terminal)\n"
+    )
+    kill = "            os.kill"
+    closing = stopped_by(signal.SIGHUP, after=5).replace(kill, f"            os.close(master)\n{kill}")
+    process = started("-c", code + closing, *SAVING, cwd=tmp_path, said=tmp_path / "said")
+    log = tmp_path / "cut/run.log"
+    assert process.wait() == 128 + signal.SIGHUP, log.read_text()
+    assert f"stopped by SIGHUP before iteration 6. Go on with fit.resume={tmp_path}/cut/checkpoints/" in log.read_text()
 
 
 @pytest.mark.slow
@@ -159,10 +200,80 @@ def test_an_error_that_the_user_can_solve_is_one_line_and_an_exit_code(error, en
     assert (code, message[: len(ending[1])]) == ending
 
 
-def test_a_reader_that_leaves_is_no_error(tmp_path: Path) -> None:
+def gone() -> TextIO:
+    """The end of a pipe that nobody reads, as after `… | head`."""
     reads, writes = os.pipe()
     os.close(reads)
-    with os.fdopen(writes, "w") as gone:
-        ended = subprocess.run([sys.executable, "-m", "clear_strategies.run", "--help"], stdout=gone, cwd=tmp_path,
-                               env=environment(tmp_path), stderr=subprocess.PIPE, text=True, check=False)  # fmt: skip
-    assert (ended.returncode, ended.stderr) == (141, "")
+    return os.fdopen(writes, "w")
+
+
+@pytest.mark.parametrize("unread", [("stdout",), ("stderr",), ("stdout", "stderr")], ids="+".join)
+def test_a_run_trains_on_where_who_reads_its_output_has_left(unread, tmp_path):
+    with gone() as pipe, (tmp_path / "said").open("w") as said:
+        streams = {name: pipe if name in unread else said for name in ("stdout", "stderr")}
+        arguments = ["-m", "clear_strategies.run", "+strategy=gco", *TINY, "hydra.run.dir=here", "-v"]
+        code = Forked(*arguments, cwd=tmp_path, env=environment(tmp_path), **streams).wait()
+    assert (code, (tmp_path / "here/metrics.json").is_file()) == (0, True), (tmp_path / "said").read_text()
+    assert "done in" in (tmp_path / "here/run.log").read_text()
+
+
+QUICK = {
+    "clear_strategies.run": [
+        "--help",
+        *(f"{name} --help" for name in commands.NAMES),
+        "train nowhere-ü",
+        "render nowhere-ü",
+    ],
+    "clear_strategies.report": ["nowhere-ü"],
+    "clear_strategies.bench": ["--help"],
+    "integration.inria": ["nowhere-ü.py"],
+}
+LINES = [(module, line) for module, lines in QUICK.items() for line in lines]
+
+
+def command(module: str, line: str, cwd: Path, **streams: Any) -> subprocess.CompletedProcess[bytes]:
+    """A command whose console has ascii alone."""
+    words, env = [sys.executable, "-m", module, *line.split()], {**environment(cwd), "PYTHONIOENCODING": "ascii"}
+    return subprocess.run(words, cwd=cwd, env=env, check=False, **{"stderr": subprocess.PIPE, **streams})
+
+
+@pytest.mark.parametrize(("module", "line"), LINES, ids=map(" ".join, LINES))
+def test_a_command_ends_as_always_on_a_console_without_its_letters_and_without_a_reader(module, line, tmp_path):
+    with gone() as pipe:
+        ended = command(module, line, tmp_path, stdout=pipe)
+    assert ended.returncode == (0 if "--help" in line else 2), ended
+    assert ended.stderr == b"" if "--help" in line else b"nowhere-\\xfc" in ended.stderr, ended
+    assert b"Traceback" not in ended.stderr
+
+
+def test_letters_that_the_console_lacks_are_escaped_and_an_error_that_nobody_reads_has_its_exit_code(tmp_path):
+    assert (
+        b"[setting=value \\u2026]" in command("clear_strategies.run", "--help", tmp_path, stdout=subprocess.PIPE).stdout
+    )
+    with gone() as pipe:
+        assert command("clear_strategies.run", "train nowhere-ü", tmp_path, stderr=pipe).returncode == 2
+
+
+def test_a_run_on_an_ascii_console_writes_into_folders_of_any_letters_and_of_the_users(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    ascii_console = (
+        "import sys\nfor stream in (sys.stdout, sys.stderr):\n    stream.reconfigure(encoding='ascii', errors='strict')\n"
+        "from clear_strategies.run import main\nmain()\n"
+    )
+    arguments = ["+strategy=gco", *TINY, "fit.iterations=3", "hydra.run.dir=~/ü"]
+    process = started("-c", ascii_console, *arguments, cwd=tmp_path, said=tmp_path / "said")
+    assert process.wait() == 0, (tmp_path / "said").read_bytes()
+    assert (tmp_path / "home/ü/metrics.json").is_file()
+    assert b"home/\\xfc/contact_sheet.png" in (tmp_path / "said").read_bytes()
+    assert not (tmp_path / "~").exists()
+
+
+def test_a_program_that_was_started_without_stdout_ends_as_always(tmp_path):
+    shell = ["sh", "-c", f"exec {sys.executable} -m clear_strategies.run --help >&-"]
+    ended = subprocess.run(shell, cwd=tmp_path, env=environment(tmp_path), stderr=subprocess.PIPE, check=False)
+    assert (ended.returncode, ended.stderr) == (0, b"")
+
+
+def test_what_a_full_disk_takes_of_the_output_is_told(tmp_path):
+    with Path("/dev/full").open("w") as full:
+        assert command("clear_strategies.run", "--help", tmp_path, stdout=full).returncode == 3

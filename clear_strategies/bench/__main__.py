@@ -10,7 +10,6 @@ import logging
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
-from pathlib import Path
 from typing import Any, Final
 
 import torch
@@ -18,7 +17,7 @@ import torch
 from clear_strategies import console
 from clear_strategies.bench.results import Results
 from clear_strategies.bench.scenes import NAMES
-from clear_strategies.commands import positive
+from clear_strategies.commands import path_of, positive
 from clear_strategies.errors import ClearError
 from rasterizers.interface import PRESETS, BackendUnavailable
 
@@ -29,7 +28,7 @@ Options = Mapping[str, Mapping[str, Any]]
 
 _COMMON: Final[Options] = {
     "--threads": {"type": positive, "metavar": "N", "help": "threads of torch and the backends"},
-    "--out": {"type": Path, "metavar": "FOLDER", "help": "write tables (CSV), figures (PNG) and the machine here"},
+    "--out": {"type": path_of, "metavar": "FOLDER", "help": "write tables (CSV), figures (PNG) and the machine here"},
 }
 _SCENES: Final = f"{', '.join(NAMES)}, or a .ply"
 _TURNS: Final[Options] = {
@@ -69,6 +68,7 @@ QUESTIONS: Final[Mapping[str, tuple[str, Options]]] = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
+    console.steady()
     options = vars(parser().parse_args(arguments))
     question, threads = options.pop("question"), options.pop("threads")
     results = Results(_log.info, options.pop("out"))

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Final, NoReturn
 
 from clear_strategies.errors import SettingError
+from clear_strategies.files import expanded
 
 # Name and arguments, and what it does.
 COMMANDS: Final = {
@@ -46,13 +47,18 @@ def named(arguments: Sequence[str]) -> Callable[[], None] | None:
         return _help
     if name in NAMES:
         return lambda: import_module(f"{__name__}.{name}").main(list(arguments[1:]))
-    if name.startswith(("-", "+", "~")) or "=" in name:  # how flags and overrides begin
+    if is_of_hydra(name) or "=" in name:
         return None
     meant = _meant(name)
     remedy = (
         f"Did you mean {meant}?" if meant else "clear-strategies --help lists all; a setting is written name=value."
     )
     raise SettingError(f"{name}: there is no such command. {remedy}")
+
+
+def is_of_hydra(word: str) -> bool:
+    """Whether a word begins as flags and overrides do; `~/photos` is a path."""
+    return word.startswith(("-", "+", "~")) and expanded(word) == word
 
 
 def _meant(word: str) -> str | None:
@@ -91,12 +97,17 @@ def parser_of(command: str, description: str, *, run: bool = True) -> argparse.A
     parser = _Parser(prog=f"clear-strategies {command}", description=description)
     if run:
         parser.add_argument(
-            "run", type=Path, metavar="RUN", help="a run's folder, one of its checkpoints, or a PLY file"
+            "run", type=path_of, metavar="RUN", help="a run's folder, one of its checkpoints, or a PLY file"
         )
         which = "cpp, torch, warp, gsplat, or another package's class by its dotted name (default: the run's own)"
         parser.add_argument("--rasterizer", metavar="NAME", help=which)
     parser.add_argument("-v", "--verbose", action="store_true", help="say more")
     return parser
+
+
+def path_of(text: str) -> Path:
+    """The type of an argument that is a path."""
+    return Path(expanded(text))
 
 
 def positive(text: str) -> int:

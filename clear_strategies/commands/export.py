@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from pathlib import Path
 
 from clear_strategies import console
-from clear_strategies.commands import parser_of
+from clear_strategies.commands import parser_of, path_of
 from clear_strategies.errors import SettingError
 
 _log = logging.getLogger(__name__)
@@ -16,7 +15,7 @@ _log = logging.getLogger(__name__)
 def main(arguments: Sequence[str]) -> None:
     """Write what the arguments ask for."""
     parser = parser_of("export", "Write a saved run in the standard layout of 3DGS; f_det and the 3D filter included.")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="where it goes (default: RUN/NAME.ply)")
+    parser.add_argument("--out", type=path_of, metavar="FILE", help="where it goes (default: RUN/NAME.ply)")
     kept = "degree of view-dependent colour that is kept (3)"
     parser.add_argument("--sh", type=int, choices=range(4), default=3, metavar="0..3", help=kept)
     options = parser.parse_args(arguments)

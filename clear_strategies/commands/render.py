@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from clear_strategies import console
-from clear_strategies.commands import parser_of, positive
+from clear_strategies.commands import parser_of, path_of, positive
 from clear_strategies.errors import SettingError
 
 if TYPE_CHECKING:
@@ -65,22 +65,26 @@ def main(arguments: Sequence[str]) -> None:
 
 def cameras_of(splat: SavedSplat, path: str, frames: int) -> dict[str, Camera]:
     """The cameras that `--path` names, by the names of their pictures."""
-    from clear_strategies.data.view_names import file_stem
+    from clear_strategies.data.view_names import file_stems
     from clear_strategies.viewing.cameras import read_cameras, through
 
     if path == _LOOP:
         if not splat.cameras:
             _log.warning("no cameras.json lies with %s: the path sways in front of the splat.", splat.folder)
         return {str(i): camera for i, camera in enumerate(through(splat.poses(), frames))}
+    cameras = splat.cameras
     if path in ("train", "test"):
         chosen = [saved for saved in splat.cameras if saved.split == path]
         if not chosen:
             raise SettingError(f"--path {path}: {splat.folder} has no {path} cameras. Try --path {_LOOP}.")
-    elif Path(path).is_file():
-        chosen = read_cameras(Path(path))
+    elif (file := path_of(path)).is_file():
+        chosen = cameras = read_cameras(file)
     else:
         raise SettingError(f"--path: must be {_LOOP}, train, test or a file of cameras, got {path}.")
-    return {file_stem(saved.name): saved.camera for saved in chosen}
+    count = Counter(saved.name for saved in cameras)  # Inria's are without their endings
+    names = {saved: f"{saved.name}_{i}" if count[saved.name] > 1 else saved.name for i, saved in enumerate(cameras)}
+    stems = file_stems(names.values())
+    return {stems[names[saved]]: saved.camera for saved in chosen}
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -88,7 +92,7 @@ def _parser() -> argparse.ArgumentParser:
     which = "cameras: a video of a smooth loop through the training cameras (default); train, test: pictures from these"
     which += " cameras; or the cameras.json of a run or of Inria's 3DGS: pictures from its cameras"
     parser.add_argument("--path", default=_LOOP, metavar="WHICH", help=which)
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="where the files go (default: RUN/rendered)")
+    parser.add_argument("--out", type=path_of, metavar="FOLDER", help="where the files go (default: RUN/rendered)")
     parser.add_argument("--frames", type=positive, default=120, help="of the video (%(default)s)")
     width = f"width of the pictures (default: that of the HR camera, of a video at most {_LONGEST})"
     parser.add_argument("--width", type=positive, metavar="PX", help=width)

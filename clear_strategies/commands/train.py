@@ -12,6 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Final
 
+from clear_strategies.commands import is_of_hydra, path_of
 from clear_strategies.errors import SettingError
 
 # The photos are trained on at up to two megapixels, where an iteration takes about half a second of a core.
@@ -48,9 +49,13 @@ def main(arguments: list[str]) -> None:
 
 def overrides(arguments: Sequence[str]) -> list[str]:
     """The arguments of the command as Hydra's; the SettingErrors as of `main`."""
-    if not arguments or arguments[0].startswith(("-", "+", "~")):
+    if not arguments or is_of_hydra(arguments[0]):
         raise SettingError("train needs a folder of photos first: clear-strategies train PHOTOS [setting=value …].")
-    path, rest = Path(arguments[0]), arguments[1:]
+    path, rest = path_of(arguments[0]), arguments[1:]
+    if "://" in arguments[0]:
+        raise SettingError(
+            f"train: {arguments[0]} is an address. Download what is there, and name the folder of the photos."
+        )
     if not path.exists():
         raise SettingError(f"train: {path} is not there. Name the folder of the photos or of the capture.")
     from clear_strategies.compose import quoted

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from clear_strategies.data.lenses import Lens
 from clear_strategies.data.masks import check_mask, read_mask
-from clear_strategies.data.photo_files import has_alpha, image_size, read_image
+from clear_strategies.data.photo_files import has_alpha, image_size, is_on_its_side, read_image
+from clear_strategies.data.photo_folders import normalized
 from clear_strategies.data.priors.interface import Prior
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera, Color
@@ -81,7 +82,7 @@ class Frame:
             return (load((1.0, 1.0, 1.0)) - load(BLACK)).mean(dim=2).clamp(0, 1)
 
         through = transparency if has_alpha(path) else None
-        return Frame(name, camera, partial(load, background), split, sfm_id, lens, shown, through)
+        return Frame(normalized(name), camera, partial(load, background), split, sfm_id, lens, shown, through)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,10 +158,10 @@ def lens_notes(frames: Sequence[Frame]) -> dict[str, str]:
 
 def _turned_as(path: Path, lens: Lens) -> bool | None:
     """As `read_image` takes it, for a photo whose lens may be that of the stored or of the upright pixels."""
-    if lens.width == lens.height:
+    if lens.width == lens.height or not is_on_its_side(path):
         return None
-    width, height = stored = image_size(path, turn=False)
-    return None if stored == image_size(path, turn=True) else (width > height) != (lens.width > lens.height)
+    width, height = image_size(path, turn=False)
+    return None if width == height else (width > height) != (lens.width > lens.height)
 
 
 def _load(path: Path, lens: Lens, pinhole: Lens, turn: bool | None, background: Color | None) -> Float[Tensor, "H W 3"]:

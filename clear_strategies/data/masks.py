@@ -16,7 +16,7 @@ from torch import Tensor
 
 from clear_strategies.data.lenses import Lens
 from clear_strategies.data.photo_files import SUFFIXES, image_size, is_lossy, read_image
-from clear_strategies.data.photo_folders import images_in, some
+from clear_strategies.data.photo_folders import alike, images_in, some
 from clear_strategies.errors import DataError
 
 _log = logging.getLogger(__name__)
@@ -39,7 +39,7 @@ def masks_of(root: Path, paths: Iterable[Path], given: Mapping[Path, Path] = Map
         for folder in filter(Path.is_dir, dict.fromkeys(_folders(root, parent))):
             masks = folders.setdefault(folder, _by_name(folder))
             for photo in images_in(parent):
-                names = (photo.stem.lower(), photo.name.lower())
+                names = (alike(photo.stem), alike(photo.name))
                 if mask := next((masks[name] for name in names if name in masks), None):
                     found.setdefault(photo, mask)
                     used.add(mask)
@@ -54,8 +54,8 @@ def masks_of(root: Path, paths: Iterable[Path], given: Mapping[Path, Path] = Map
 
 def masks_among(photos: Sequence[Path]) -> dict[Path, Path]:
     """The masks that lie among the photos of a folder, by the photo: 0001.jpg.mask.png of RealityCapture, 0001_mask.png."""
-    named = {name.lower(): photo for photo in photos for name in (photo.stem, photo.name)}
-    marked = {file: _MARKED.sub(r"\g<1>", stem) for file in photos if (stem := file.stem.lower())}
+    named = {alike(name): photo for photo in photos for name in (photo.stem, photo.name)}
+    marked = {file: _MARKED.sub(r"\g<1>", stem) for file in photos if (stem := alike(file.stem))}
     return {named[name]: file for file, name in marked.items() if named.get(name, file).stem != file.stem}
 
 
@@ -76,7 +76,7 @@ def _by_name(folder: Path) -> dict[str, Path]:
     files = sorted(images_in(folder), key=lambda file: file.suffix.lower() != SUFFIXES[0])
     for names in (r"\g<0>", r"\g<1>"):
         for file in files:
-            masks.setdefault(_MARKED.sub(names, file.stem.lower()), file)
+            masks.setdefault(_MARKED.sub(names, alike(file.stem)), file)
     return masks
 
 

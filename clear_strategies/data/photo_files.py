@@ -98,6 +98,12 @@ def image_size(path: Path, *, turn: bool | None = None) -> tuple[int, int]:
         return (height, width) if turn and _orientation_of(image) in _ON_THE_SIDE else (width, height)
 
 
+def is_on_its_side(path: Path) -> bool:
+    """Whether the EXIF block turns the stored pixels by a quarter, from the header only; the DataErrors as of `read_image`."""
+    with _opened(path, False) as image:
+        return _orientation_of(image) in _ON_THE_SIDE
+
+
 def has_alpha(path: Path) -> bool:
     """Whether the file may have transparent pixels, from the header only; the DataErrors as of `read_image`."""
     with _opened(path, False) as image:
@@ -123,9 +129,14 @@ def focal_35mm(path: Path) -> float | None:
 
 def write_png(path: Path, image: Float[Tensor, "H W 3"] | Float[Tensor, "H W"]) -> None:
     """8-bit PNG, written atomically; a [H, W] image is grey. Values outside [0, 1] are clamped."""
+    write_bytes(path, png_bytes(image))
+
+
+def png_bytes(image: Float[Tensor, "H W 3"] | Float[Tensor, "H W"]) -> bytes:
+    """The file of `write_png`."""
     buffer = io.BytesIO()
     Image.fromarray(to_bytes(image)).save(buffer, format="PNG", compress_level=PNG_LEVEL)
-    write_bytes(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
 @contextmanager

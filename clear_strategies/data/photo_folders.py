@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 import os
+import shlex
+import unicodedata
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path, PureWindowsPath
 from typing import Final, TypeVar
@@ -16,28 +18,53 @@ from clear_strategies.errors import DataError
 _log = logging.getLogger(__name__)
 
 _FOLDERS: Final = ("images", "images_2", "images_4", "images_8")
+_BELOW: Final = ("*/*", "*/*/*")  # a memory card has DCIM/100CANON
+_NO_PHOTOS: Final = ("mask", "masks")  # names of folders
 _LISTED: Final = 5  # names in a message, at most
+FRAMES: Final = "ffmpeg -i VIDEO -vf thumbnail=15 -fps_mode passthrough -q:v 2 FOLDER/%03d.jpg"
+HDR: Final = "-vf thumbnail=15,scale=out_primaries=bt709:out_transfer=iec61966-2-1,format=rgb24 (ffmpeg 8)"
+# What people have in place of photos, by its endings, and what makes photos of it.
+_OTHER_KINDS: Final = {
+    "raw photos": (
+        ".3fr .arw .cr2 .cr3 .dng .nef .orf .pef .raf .raw .rw2 .srw",
+        "develop them, all alike, to TIFF or JPEG: darktable-cli FILE FOLDER/FILE.tif for each, or a batch of RawTherapee",
+    ),
+    "videos": (
+        ".avi .insv .m4v .mkv .mov .mp4 .mts .webm",
+        f"give a folder of photos; of a video: {FRAMES}; of one in HDR: {HDR}",
+    ),
+    "archives": (".7z .gz .rar .tar .tgz .xz .zip", "unpack them, and give the folder: unzip FILE -d FOLDER, or tar -xf FILE"),
+    "splats or points": (".ply .sog .splat .spz", "give a folder of photos; clear-strategies view FILE shows a PLY"),
+    "images of another format": (
+        ".avif .bmp .exr .gif .hdr .jxl .jp2 .psd .tga",
+        "save them as PNG or JPEG: mogrify -format png FILE",
+    ),
+}  # fmt: skip
 
 _Entry = TypeVar("_Entry")
 
 
 def image_folder(root: Path, name: str | None = None) -> Path:
-    """The folder of photos in `root`; without a name, the first of images, images_2, images_4, images_8, else `root` itself."""
+    """The folder of photos in `root`; without a name, the first of images, images_2, images_4, images_8, else `root`
+    itself, else the only folder below it that holds images.
+    """
     present = [folder for name in _FOLDERS if (folder := named(root, name)).is_dir()]
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
     if name is not None:
-        if not (root / name).is_dir():
+        if not (folder := named(root, name)).is_dir():
             remedy = f"choose one of {', '.join(path.name for path in present)}" if present else "check the path"
-            raise DataError(root / name, "images", "is no folder", remedy)
-        return root / name
-    if not present and not images_in(root):
-        problem, remedy = (
-            f"has none of the folders {', '.join(_FOLDERS)}",
-            "name the folder of photos: data.reader.images=FOLDER",
-        )
-        raise DataError(root, "images", problem, remedy)
-    return present[0] if present else root
+            raise DataError(folder, "images", "is no folder", remedy)
+        return folder
+    if present or images_in(root):
+        return present[0] if present else root
+    problem, remedy = (
+        f"has none of the folders {', '.join(_FOLDERS)}",
+        "name the folder of photos: data.reader.images=FOLDER",
+    )
+    if len(others := folders_of_images(root)) == 1:
+        return next(iter(others))
+    raise DataError(root, "images", f"{problem}, but {_counted(root, others)}" if others else problem, remedy)
 
 
 def folder_note(folder: Path) -> str:
@@ -47,12 +74,45 @@ def folder_note(folder: Path) -> str:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The image files of a folder, by their suffix, in order of names, without hidden ones; a DataError where there is none."""
+    """The image files of a folder, by their suffix, in order of names, without hidden ones; a DataError where there is none, with
+    what is there in their place.
+    """
     if not folder.is_dir():
         raise DataError(folder, "folder", "is not there", "check the path")
-    if not (images := images_in(folder)):
-        raise DataError(folder, "images", f"holds no image ({', '.join(SUFFIXES)})", "check the path")
-    return images
+    if images := images_in(folder):
+        return images
+    problem, remedy = f"holds no image ({', '.join(SUFFIXES)})", "check the path"
+    if inside := folders_of_images(folder):
+        problem, remedy = f"{problem}, but {_counted(folder, inside)}", "give one of these folders"
+    elif other := in_place_of_photos(path for pattern in ("*", *_BELOW) for path in sorted(folder.glob(pattern))):
+        problem, remedy = f"{problem}, but {other[0]}", other[1]
+    raise DataError(folder, "images", problem, remedy)
+
+
+def folders_of_images(root: Path) -> dict[Path, int]:
+    """The folders up to two below this one that hold images other than masks, and how many."""
+    images = [path for pattern in _BELOW for path in images_in(root, pattern)]
+    return dict(Counter(path.parent for path in images if path.parent.name.lower() not in _NO_PHOTOS))
+
+
+def _counted(root: Path, folders: Mapping[Path, int]) -> str:
+    """Folders with the numbers of their photos, those with most first."""
+    most = sorted(folders.items(), key=lambda item: -item[1])
+    return some([f"{folder.relative_to(root).as_posix()} holds {count}" for folder, count in most])
+
+
+def in_place_of_photos(paths: Iterable[Path]) -> tuple[str, str] | None:
+    """What these files are, of the kind that most of them have, and what makes photos of it; None for no known kind."""
+    kind_of = {ending: kind for kind, (endings, _) in _OTHER_KINDS.items() for ending in endings.split()}
+    of_kind = dict[str, list[Path]]()
+    for path in paths:
+        if (kind := kind_of.get(path.suffix.lower())) and path.is_file() and not path.name.startswith("."):
+            of_kind.setdefault(kind, []).append(path)
+    if not of_kind:
+        return None
+    kind, found = max(of_kind.items(), key=lambda item: len(item[1]))
+    remedy = _OTHER_KINDS[kind][1].replace("FILE", shlex.quote(found[0].name))
+    return f"{kind} ({len(found)}): {some([path.name for path in found])}", remedy
 
 
 def images_in(folder: Path, pattern: str = "*") -> list[Path]:
@@ -68,28 +128,39 @@ def require_text(names: Iterable[str]) -> None:
             raise DataError(shown, "name", "must be UTF-8, has another byte", "rename this folder or photo")
 
 
+def normalized(name: str) -> str:
+    """A name with its letters composed, as names are compared: those of zips from a Mac are decomposed, and look the same."""
+    return unicodedata.normalize("NFC", name)
+
+
+def alike(name: str) -> str:
+    """What names have in common that differ in the case or the composition of their letters alone."""
+    return normalized(name).lower()
+
+
 def named(folder: Path, name: str) -> Path:
-    """What lies in a folder under this name, whatever the case of its letters; a path to nothing where it does not."""
+    """What lies in a folder under a name that is `alike`; a path to nothing where there is none."""
     path = folder / name
     if path.exists() or not folder.is_dir():
         return path
-    return next((other for other in sorted(folder.iterdir()) if other.name.lower() == name.lower()), path)
+    wanted = alike(name)
+    return next((folder / other for other in sorted(os.listdir(folder)) if alike(other) == wanted), path)  # noqa: PTH208 - faster
 
 
 def finder(folder: Path) -> Callable[[str], Path]:
     """How each reader finds the files that a capture names, in or below a folder.
 
     A name is taken as it stands, without an ending as that of a PNG file. Where no such file is there, backslashes separate
-    folders, letters may have another case, the beginning of an absolute path may differ, the folder's own name may stand first,
-    and the ending is that of the only image of this name. Where all of this finds none, the path leads to nothing.
+    folders, names need only be `alike`, the beginning of an absolute path may differ, the folder's own name may stand first, and
+    the ending is that of the only image of this name. Where all of this finds none, the path leads to nothing.
     """
 
     @cache
     def entries(parent: Path) -> dict[str, list[Path]]:
-        """What lies there, in lower case: by name, and images also by their names without ending."""
+        """What lies there, by what is `alike` of its name, and images also of their names without ending."""
         found: dict[str, list[Path]] = {}
         for path in sorted(parent.iterdir()) if parent.is_dir() else ():
-            for key in {path.name.lower(), (path.stem if path.suffix.lower() in SUFFIXES else path.name).lower()}:
+            for key in {alike(path.name), alike(path.stem if path.suffix.lower() in SUFFIXES else path.name)}:
                 found.setdefault(key, []).append(path)
         return found
 
@@ -97,10 +168,10 @@ def finder(folder: Path) -> Callable[[str], Path]:
         parent, last = folder, PureWindowsPath(parts[-1])
         for part in parts[:-1]:
             there = parent / part
-            same = [] if os.path.isdir(there) else entries(parent).get(part.lower(), [])  # noqa: PTH112 - as in `is_file`
+            same = [] if os.path.isdir(there) else entries(parent).get(alike(part), [])  # noqa: PTH112 - as in `is_file`
             parent = next((path for path in same if path.is_dir()), there)
         for key in (last.name, last.stem) if last.suffix[1:2].isalpha() else (last.name,):  # "rgb.0001" has no ending
-            files = [path for path in entries(parent).get(key.lower(), []) if path.is_file()]
+            files = [path for path in entries(parent).get(alike(key), []) if path.is_file()]
             if len(files) == 1:
                 return files[0]
         return None
@@ -112,7 +183,7 @@ def finder(folder: Path) -> Callable[[str], Path]:
                 return folder / exact.relative_to(inside) if exact.is_relative_to(inside) else exact
         path = PureWindowsPath(name)
         parts = [part for part in path.parts if part != path.anchor]
-        twice = len(parts) > 1 and parts[0].lower() == folder.absolute().name.lower()
+        twice = len(parts) > 1 and alike(parts[0]) == alike(folder.absolute().name)
         starts = range(len(parts) if path.anchor else min(1 + twice, len(parts)))
         missing = folder.joinpath(*(parts[-1:] if path.anchor else parts))
         return next(filter(None, (below(parts[i:]) for i in starts)), missing)

@@ -195,7 +195,7 @@ def _read_vertices(path: Path) -> tuple[np.ndarray, str]:
 
 def _split_header(path: Path, head: bytes) -> tuple[str, int]:
     """The lines between `ply` and `end_header`, and the offset behind them."""
-    if not (first := re.match(rb"\s*ply\s*\n", head)):
+    if not (first := re.match(rb"(?:\xef\xbb\xbf)?\s*ply\s*\n", head)):
         raise DataError(path, "header", "does not begin with a line `ply`", "give a .ply file")
     if not (last := re.search(rb"^[ \t]*end_header[ \t\r]*\n", head, re.MULTILINE)):
         problem = f"has no line `end_header` in its first {_LONGEST_HEADER} bytes"

@@ -66,6 +66,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
             progress(len(made))
     train, test = tuple(made[: len(train_frames)]), tuple(made[len(train_frames) :])
     require_shown(train)
+    _warn_if_equal(train)
     with work_log.stage("initial points"):
         initial = initial_points(
             cloud, [v.lr for v in train], hr=[v.hr for v in train], hr_is_photo=views.photos_are == "both",
@@ -249,6 +250,16 @@ def _check_places(capture: Capture, cameras: Sequence[Camera], cloud: CloudSetti
             "stereo and training lose detail. Subtract the same point from all camera centres and points of the capture.",
             apart, away, rounded,
         )  # fmt: skip
+
+
+def _warn_if_equal(train: Sequence[View]) -> None:
+    """Warn of photos that are all the same, as of one that was copied or a lens cap: their poses may be right, depth is not."""
+    first, *others = (view.lr.image for view in train)
+    if others and all(torch.equal(first, image) for image in others):
+        _log.warning(
+            "the %d photos are all equal: there is nothing to see depth by. Give the photos that were taken.",
+            len(train),
+        )
 
 
 def scene_notes(

@@ -5,6 +5,7 @@ A file is data: a configuration that is read from one passes `plain_settings`, a
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -27,7 +28,10 @@ _T = TypeVar("_T")
 def read(path: Path) -> Any:
     """The content of a file; a DataError where it is no JSON, which has neither NaN nor numbers beyond a float."""
     try:
-        return msgspec.json.decode(read_bytes(path, most=_LARGEST))
+        data = read_bytes(path, most=_LARGEST)
+        return msgspec.json.decode(
+            data.decode(json.detect_encoding(data))
+        )  # some editors write a byte order mark, or UTF-16
     except RecursionError as error:
         raise DataError(path, "json", "is nested too deeply", "write it again") from error
     except (msgspec.DecodeError, UnicodeDecodeError) as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,9 +10,10 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.data.photo_files import SUFFIXES, image_size, write_png
-from clear_strategies.data.photo_folders import list_images
+from clear_strategies.data.photo_files import SUFFIXES, image_size, png_bytes
+from clear_strategies.data.photo_folders import alike, list_images, named, normalized
 from clear_strategies.errors import DataError
+from clear_strategies.files import read_bytes, write_bytes
 
 
 def bare(name: str) -> str:
@@ -20,27 +22,42 @@ def bare(name: str) -> str:
     return stem if f"{dot}{suffix}".lower() in SUFFIXES else name
 
 
-def file_stem(name: str) -> str:
-    """The stem of the view's files in a flat folder, unique as the view's name is: "cam1_0001" of "cam1/0001.png"."""
-    return bare(name).replace("/", "_")
+def file_stems(names: Iterable[str]) -> dict[str, str]:
+    """The stems of the views' files in a flat folder, by the views' names: "cam1_0001" of "cam1/0001.png". Views that would have
+    the same, on a disk that ignores the case of letters too, keep their endings: "0000.jpg" and "0000.png".
+    """
+    stems = {name: bare(name).replace("/", "_") for name in names}
+    shared, taken = Counter(map(alike, stems.values())), set[str]()
+    for name, stem in sorted(stems.items()):
+        stems[name] = name.replace("/", "_") if shared[alike(stem)] > 1 else stem
+        while alike(stems[name]) in taken:
+            stems[name] += "_"
+        taken.add(alike(stems[name]))
+    return stems
 
 
 def matching(names: Sequence[str], wanted: str) -> list[str]:
     """The names that are `wanted`, with or without suffix; if there is none, those whose file name is."""
+    wanted = normalized(wanted)
     return [n for n in names if wanted in (n, bare(n))] or [n for n in names if wanted in (_file(n), _file(bare(n)))]
 
 
 def write_pngs(folder: Path, images: Iterable[tuple[str, Float[Tensor, "h w 3"]]]) -> int:
-    """Write images by their views' names, and return how many. `ViewFiles` finds files of the same names."""
-    written = set[Path]()
+    """Write images by their views' names, and return how many. `ViewFiles` finds files of the same names.
+
+    Raises:
+        DataError: a name is that of two views, or of a file that is there and holds another image, such as the photo itself.
+    """
+    written = dict[str, str]()
     for name, image in images:
-        file = folder / f"{bare(name)}.png"
-        if file in written:
-            raise DataError(
-                file, "file name", "is that of two photos", "give every photo its own name, without its ending"
-            )
-        write_png(file, image)
-        written.add(file)
+        stem = bare(name) if alike(bare(name)) not in written.values() else name
+        file, png = folder / f"{stem}.png", png_bytes(image)
+        if name in written or alike(stem) in written.values():
+            raise DataError(file, "file name", "is that of two photos", "give every photo its own name")
+        if file.exists() and read_bytes(file) != png:
+            raise DataError(file, "file", "is there, and holds another image", "give another folder, or move the file")
+        write_bytes(file, png)
+        written[name] = alike(stem)
     return len(written)
 
 
@@ -58,21 +75,26 @@ class ViewFiles:
 
     def file(self, name: str, width: int, height: int) -> Path:
         """The image of the view; a DataError where it has none or several, one of another view, or of another size."""
+        name = normalized(name)
         view = bare(name)
-        below, stem = self.folder / view.rpartition("/")[0], _file(view) + self.suffix
+        below, stem, whole = (
+            named(self.folder, view.rpartition("/")[0]),
+            _file(view) + self.suffix,
+            _file(name) + self.suffix,
+        )
         folder = below if below.is_dir() else self.folder
-        if stem not in self._listed.get(folder, {}):
+        if self._listed.get(folder, {}).keys().isdisjoint((stem, whole)):
             self._listed[folder] = {}
             for path in list_images(folder):
-                self._listed[folder].setdefault(path.stem, []).append(path)
-        files = self._listed[folder].get(stem, [])
+                self._listed[folder].setdefault(normalized(path.stem), []).append(path)
+        files = self._listed[folder].get(whole) or self._listed[folder].get(stem, [])
         if not files:
             raise DataError(folder, _file(view), f"has no {self.what} {stem} ({', '.join(SUFFIXES)})", self.remedy)
         if len(files) > 1:
             twins = " and ".join(file.name for file in files)
             raise DataError(folder, _file(view), f"has {twins} for one view", "keep one of them")
-        if (other := self._view_of.setdefault(files[0], view)) != view:
-            problem = f"would be that of two views, {other} and {view}"
+        if (other := self._view_of.setdefault(files[0], name)) != name:
+            problem = f"would be that of two views, {other} and {name}"
             remedy = f"put the {self.what}s into subfolders like those of the photos"
             raise DataError(files[0], self.what, problem, remedy)
         if (size := image_size(files[0])) != (width, height):

@@ -64,9 +64,9 @@ def _library_errors() -> tuple[type[Exception], ...]:
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    from rasterizers.interface import BackendUnavailable
+    from rasterizers.interface import BackendUnavailable, OutdatedKernels
 
-    return BackendUnavailable, HydraException, OmegaConfBaseException
+    return BackendUnavailable, HydraException, OmegaConfBaseException, OutdatedKernels
 
 
 def require(extra: str) -> None:

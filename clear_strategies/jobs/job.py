@@ -20,6 +20,7 @@ from clear_strategies import files
 from clear_strategies.compose import tree
 from clear_strategies.data.prepare import save_lr
 from clear_strategies.data.scene import Scene
+from clear_strategies.errors import DataError
 from clear_strategies.jobs import device, exit_codes, resume
 from clear_strategies.jobs import scene as scenes
 from clear_strategies.jobs.settings import JobSettings, settings_of
@@ -55,8 +56,8 @@ def run(
 
     Raises:
         SettingError, StrategyConflict: the configuration cannot be used.
-        DataError: a file cannot be used, another job is at work in the folder, or the folder holds a run of another
-            configuration.
+        DataError: a file cannot be used, another job is at work in the folder, or the folder holds a run that is neither resumed
+            nor to be overwritten, or is one of another configuration.
     """
     values = tree(config)
     settings = settings_of(values)
@@ -65,7 +66,11 @@ def run(
     conductor = settings.conductor(settings.fit.stretch)
     drawing = device.drawing(settings.rasterizer, settings.fit.device)
     with files.hold(folder), signals.interrupted("before training began"):
-        if not resume.begun(folder):
+        begun = resume.begun(folder)
+        if begun and settings.fit.resume is None and not settings.fit.overwrite and settings.data.save_lr is None:
+            remedy = "take another folder, go on with fit.resume=auto, or replace it with fit.overwrite=true"
+            raise DataError(folder, "folder", f"holds the {begun} of a run, which this one would remove", remedy)
+        if not begun:
             claim()
         return _Job(settings, conductor, drawing, resume.comparable(values), folder, overrides, claim).run()
 

@@ -55,9 +55,11 @@ def _held(path: Path) -> str:
     return hashlib.sha256(repr(listed).encode()).hexdigest()[:12]
 
 
-def begun(folder: Path) -> bool:
-    """Whether a run has been in this folder, finished or not."""
-    return (folder / "metrics.json").exists() or newest(folder) is not None
+def begun(folder: Path) -> str | None:
+    """What a run has left in this folder, "results" or "checkpoints"; None where there was none."""
+    if (folder / "metrics.json").exists():
+        return "results"
+    return "checkpoints" if newest(folder) is not None else None
 
 
 def finished(folder: Path, config: Mapping[str, Any], scene: Callable[[], Scene]) -> Metrics | None:

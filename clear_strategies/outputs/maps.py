@@ -34,7 +34,6 @@ from clear_strategies.core.gradients import Grads
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.scene import Scene
-from clear_strategies.data.view_names import file_stem
 from clear_strategies.geometry.projection import times_seen
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.outputs import figures
@@ -84,16 +83,18 @@ class ViewMaps(NamedTuple):
 
 
 def write_maps(
-    folder: Path, views: Sequence[View], painter: Painter, conductor: Conductor, rasterizer: Rasterizer, t: int
-) -> None:
+    folder: Path, stems: Mapping[str, str], views: Sequence[View], painter: Painter, conductor: Conductor,
+    rasterizer: Rasterizer, t: int,
+) -> None:  # fmt: skip
     """Write maps.json and, for each view, a folder of 8-bit grey PNGs (value = 255 × number) and maps.png.
 
     Args:
+        stems: see `file_stems`.
         views: at least one. The other arguments are those of `view_maps`.
     """
     means: dict[str, Mapping[str, float]] = {}
     for view in views:
-        view_folder, of_view = folder / file_stem(view.name), view_maps(painter, conductor, rasterizer, view, t)
+        view_folder, of_view = folder / stems[view.name], view_maps(painter, conductor, rasterizer, view, t)
         means[view.name] = of_view.means
         for name, values in of_view.maps.items():
             write_png(view_folder / f"{name}.png", values)

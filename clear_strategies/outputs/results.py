@@ -18,7 +18,7 @@ from clear_strategies.core.images import DownKernel
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.ply import GaussianPly, write_gaussians
 from clear_strategies.data.scene import Scene
-from clear_strategies.data.view_names import file_stem
+from clear_strategies.data.view_names import file_stems
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.figures import SheetRow, spaced, write_contact_sheet, write_curves
@@ -74,21 +74,22 @@ def write_results(
     import pandas as pd  # here, as those whose settings are refused need not wait for it
 
     field, work_log, settings = state.field, state.conductor.work_log, state.settings
+    stems = file_stems(view.name for view in (*scene.train, *scene.test))
     history = pd.DataFrame(list(state.history_as_floats()))
     with work_log.stage("evaluate"):
         evaluation = metrics.evaluate(scene, lambda camera: field.render(rasterizer, camera).cpu(), down=down)
     for name, image in evaluation.renders.items():
-        write_png(folder / "renders" / f"{file_stem(name)}.png", image)
+        write_png(folder / "renders" / f"{stems[name]}.png", image)
     export_ply(folder / "point_cloud.ply", field, antialiased=antialiased)
     synthetic = " · SYNTHETIC prior" * scene.synthetic_prior
     title = f"{scene.name} · {chosen.title} · {state.t - 1} iterations · seed {settings.seed}{synthetic}"
     with work_log.stage("maps"):
         if mapped := spaced(state.views, settings.map_views):
-            write_maps(folder / "maps", mapped, painter, state.conductor, rasterizer, state.t - 1)
+            write_maps(folder / "maps", stems, mapped, painter, state.conductor, rasterizer, state.t - 1)
             write_coverage(folder / _COVERAGE, scene, painter, title)
     memory.release()  # the gradients that the maps are made of: several times the field
     with work_log.stage("contact sheet and curves"):
-        _write_sheet(folder, scene, evaluation, title)
+        _write_sheet(folder, scene, stems, evaluation, title)
         write_curves(folder / "curves.png", {chosen.title: history}, title)
     with work_log.stage("video"):
         _write_video(folder / "path.mp4", [view.hr.camera for view in scene.train], painter, settings.video)
@@ -135,7 +136,7 @@ def remove_earlier(folder: Path, *, all_files: bool) -> None:
 
     Args:
         all_files: also the other files of that run, which would be taken for those of the new run. The views in its
-            metrics.json name them; all other files stay.
+            metrics.json and cameras.json name them; all other files stay.
     """
     path = folder / _METRICS
     if not path.exists():
@@ -144,7 +145,8 @@ def remove_earlier(folder: Path, *, all_files: bool) -> None:
     stems: set[str] = set()
     with suppress(DataError):  # damaged, or of another program
         content = metrics.read(path, "")
-        stems = {file_stem(name) for part in (content.test, content.train) for name in part.views}
+        stems |= {*file_stems(name for part in (content.test, content.train) for name in part.views).values()}
+        stems |= {*file_stems(saved.name for saved in cameras.read_cameras(folder / cameras.FILE)).values()}
     path.unlink()
     if not (all_files and stems):
         return
@@ -166,14 +168,14 @@ def _write_video(path: Path, train: Sequence[Camera], painter: Painter, frames: 
         _log.info("no video of the camera path is written: %s", missing)
 
 
-def _write_sheet(folder: Path, scene: Scene, evaluation: Evaluation, title: str) -> None:
+def _write_sheet(folder: Path, scene: Scene, stems: Mapping[str, str], evaluation: Evaluation, title: str) -> None:
     """Of a few views the LR photo, the SR image and the render, and where the truth is known, the truth and the error."""
     rows, part = [], evaluation.test or evaluation.train
     rendered = [view for view in (*scene.test, *scene.train) if view.name in evaluation.renders]
     for view in spaced(rendered, _SHEET_VIEWS):
         for kind, shown in {"lr": view.lr.image, "prior": view.hr.image, "truth": view.truth}.items():
             if shown is not None:
-                write_png(folder / "views" / f"{file_stem(view.name)}_{kind}.png", shown)
+                write_png(folder / "views" / f"{stems[view.name]}_{kind}.png", shown)
         columns: dict[str, Tensor] = {}
         if not view.hr_is_photo:
             columns["LR, enlarged"] = images.upsample(view.lr.image, view.factor, "nearest")

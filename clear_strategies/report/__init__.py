@@ -22,6 +22,7 @@ from typing import Any, Final
 import numpy as np
 
 from clear_strategies import console, files
+from clear_strategies.commands import path_of
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.errors import ClearError, DataError
 from clear_strategies.outputs.figures import SheetRow, write_contact_sheet, write_curves
@@ -41,8 +42,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m clear_strategies.report", description=(__doc__ or "").split("\n")[0]
     )
-    parser.add_argument("folders", nargs="+", type=Path, metavar="DIR", help="a run's folder, or a folder of runs")
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="where the report goes (default: the first DIR)")
+    parser.add_argument("folders", nargs="+", type=path_of, metavar="DIR", help="a run's folder, or a folder of runs")
+    parser.add_argument("--out", type=path_of, metavar="FOLDER", help="where the report goes (default: the first DIR)")
+    console.steady()
     options = parser.parse_args(arguments)
     console.show()
     out = options.out or options.folders[0]
@@ -51,8 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ClearError, OSError) as error:
         _log.error("%s", error)
         return 2
-    encoding = sys.stdout.encoding or "utf-8"
-    sys.stdout.write(text.encode(encoding, "replace").decode(encoding))  # a terminal may lack ↑
+    sys.stdout.write(text)
     return 0
 
 

@@ -38,6 +38,8 @@ class FitSettings:
         resume: a run's folder or one of its checkpoints: continue from there, bit for bit. auto: look into the run's own
             folder. If the run is finished, train nothing; if it has checkpoints, continue from the newest one; else start
             from the beginning.
+        overwrite: train even where a run has been in the folder, whose checkpoints and results are then removed. Else this is
+            refused, unless `resume` is set.
         device: cpu or cuda: where field, views and optimizer are. None: cuda if torch finds it and the rasterizer draws
             there, else cpu. A run may be resumed on another device; its bits then differ.
         threads: number of threads of torch and the kernels. None: all cores, divided by the jobs that run at once (joblib).
@@ -60,6 +62,7 @@ class FitSettings:
     verbose: bool = False
     viewer: bool = False
     resume: str | None = None
+    overwrite: bool = False
     device: Device | None = None
     threads: int | None = None
 

@@ -16,7 +16,7 @@ _log = logging.getLogger(__name__)
 
 
 class Interrupted(ClearError):
-    """The run was asked to stop (Ctrl-C, SIGTERM, a cluster's own signal).
+    """The run was asked to stop (Ctrl-C, SIGTERM, SIGHUP, a cluster's own signal).
 
     Args:
         when: for the message, "before iteration 8".
@@ -33,14 +33,27 @@ class Interrupted(ClearError):
         return 128 + self.signum
 
 
-_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+_TWICE: Final = (signal.SIGINT, signal.SIGTERM)  # a second one acts at once
+# The terminal was closed, or its connection lost: the system sends several of them.
+_HANGUPS: Final = tuple(getattr(signal, name) for name in ("SIGHUP",) if hasattr(signal, name))
+STOPS: Final = (*_TWICE, *_HANGUPS)
+"""Signals that end a run, which saves before."""
 # A cluster announces the end of a job with these, if the job's launcher has set a handler.
 _ANNOUNCEMENTS: Final = tuple(getattr(signal, name) for name in ("SIGUSR1", "SIGUSR2") if hasattr(signal, name))
 
 
+_collected: Final = list[list[int]]()  # by each `deferred_signals`
+
+
+def asked() -> bool:
+    """Whether a signal waits for the end of the step in progress."""
+    return any(_collected)
+
+
 @contextmanager
 def deferred_signals() -> Iterator[list[int]]:
-    """Collect the first SIGINT or SIGTERM instead of stopping in the middle of a step; a second one acts at once.
+    """Collect the first of `STOPS` instead of stopping in the middle of a step; after it SIGINT and SIGTERM act at once. SIGHUP
+    is not collected where it is ignored, as under nohup.
 
     SIGUSR1 and SIGUSR2 are collected where they have a handler (one that resubmits the job, say), since that handler
     would exit before anything is saved. All handlers are restored when `fit` raises Interrupted, so that the caller can
@@ -50,20 +63,23 @@ def deferred_signals() -> Iterator[list[int]]:
 
     def note(signum: int, _frame: FrameType | None) -> None:
         pending.append(signum)
-        again = " Once more to leave at once." if signum in _SIGNALS else ""
+        again = " Once more to leave at once." if signum in _TWICE else ""
         _log.warning("%s: finishing this step, then saving.%s", signal.Signals(signum).name, again)
-        for s in _SIGNALS:
+        for s in _TWICE:
             signal.signal(s, before[s])
 
     handled = [s for s in _ANNOUNCEMENTS if callable(signal.getsignal(s))]
+    handled += [s for s in _HANGUPS if signal.getsignal(s) is not signal.SIG_IGN]
     try:
-        before = {s: signal.signal(s, note) for s in (*_SIGNALS, *handled)}
+        before = {s: signal.signal(s, note) for s in (*_TWICE, *handled)}
     except ValueError:  # not the main thread, which alone may set handlers
         yield pending
         return
+    _collected.append(pending)
     try:
         yield pending
     finally:
+        _collected.pop()
         for s, handler in before.items():
             signal.signal(s, handler)
 

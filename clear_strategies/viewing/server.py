@@ -32,6 +32,7 @@ from nerfview._renderer import InterruptRenderException, Renderer
 from clear_strategies.core.images import to_bytes
 from clear_strategies.errors import one_line
 from clear_strategies.geometry.cameras import looked_at
+from clear_strategies.training import signals
 from clear_strategies.viewing.look import Painter, Pixels, colored, depth_range
 from rasterizers.interface import Camera
 
@@ -177,7 +178,7 @@ def watched(painter: Painter, cameras: Sequence[Camera], title: str) -> Iterator
             viewer.update(iteration, 1)
             if viewer.server.get_clients():
                 time.sleep(_TURN)
-            while viewer.state == "paused":
+            while viewer.state == "paused" and not signals.asked():
                 time.sleep(_PATIENCE)
         finally:
             held = viewer.lock.acquire()

@@ -5,18 +5,20 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from pathlib import Path
 from types import ModuleType
 from typing import Final
 
 import torch
 
-from rasterizers.interface import BackendUnavailable
+from rasterizers.interface import BackendUnavailable, OutdatedKernels
 
 _log = logging.getLogger(__name__)
 
@@ -48,6 +50,20 @@ def kernel_threads(n: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+def _require_same_sources(package: str, module: ModuleType) -> None:
+    """Refuse a module that CMake has made from other files than lie beside the package; in a wheel there are none."""
+    folders = [
+        Path(folder) / "src" for name in (package, __name__) for folder in importlib.import_module(name).__path__
+    ]
+    files = [file for folder in folders for file in sorted(folder.glob("*.[ch]pp"))]
+    sums = "".join(hashlib.sha256(file.read_bytes()).hexdigest() for file in files)
+    if files and hashlib.sha256(sums.encode()).hexdigest() != getattr(module, "sources", None):
+        raise OutdatedKernels(
+            f"the compiled kernels of {package} were made from other sources than those in {files[0].parent}, as after git pull. "
+            "Install again: pip install -e ."
+        )
+
+
 @cache
 def load_kernels(package: str, isa: str | None = None) -> ModuleType:
     """One of `package`'s modules `_avx512`, `_avx2` and `_baseline`.
@@ -57,6 +73,7 @@ def load_kernels(package: str, isa: str | None = None) -> ModuleType:
 
     Raises:
         BackendUnavailable: none was compiled, or this processor cannot run the requested one.
+        OutdatedKernels: they were compiled from other sources.
     """
     try:
         baseline = importlib.import_module(f"{package}._baseline")
@@ -66,6 +83,7 @@ def load_kernels(package: str, isa: str | None = None) -> ModuleType:
             "times slower on a CPU: install a C++20 compiler (Debian: apt install g++; macOS: xcode-select --install) and "
             "install clear-strategies again."
         ) from error
+    _require_same_sources(package, baseline)
     supported = [*baseline.instruction_sets(), "baseline"]
     requested, source = isa or os.environ.get(_VARIABLE), "isa" if isa else _VARIABLE
     if requested and requested not in supported:

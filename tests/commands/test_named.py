@@ -41,6 +41,7 @@ def test_overrides_and_flags_are_hydras(first):
         ("Train", "Did you mean train?"),
         ("photos/", "Did you mean clear-strategies train photos/?"),
         ("my photos/", "Did you mean clear-strategies train 'my photos/'?"),
+        ("~/photos", "Did you mean clear-strategies train '~/photos'?"),  # in quotes, which no shell expands
         ("views", "Did you mean clear-strategies train views?"),  # a folder that is there
         ("point_cloud.ply", "Did you mean clear-strategies view point_cloud.ply?"),
         ("fit.iterations", "clear-strategies --help lists all; a setting is written name=value."),
@@ -94,6 +95,16 @@ def hydra_undone(monkeypatch) -> Iterator[None]:
     [
         *((f"{group}=clear", rf"^{group}: .* it is added: \+{group}=") for group in ("strategy", "method", "readings")),
         ("fit.nothing_like_it=1", r"fit\.nothing_like_it: there is no such setting\. clear-strategies --cfg job"),
+        (
+            "data.path=here",
+            r"data\.path: there is no such setting without one of data=blender, data=colmap, data=llff, data=nerfstudio, "
+            r"data=photos\. Add it, or let the command find it: clear-strategies train FOLDER\.",
+        ),
+        ("data.reader.skip_faulty=true", r"without one of data=blender, data=colmap, .*, data=photos\. Add it\."),
+        (
+            "prior.path=here",
+            r"prior\.path: there is no such setting without one of prior=images, prior=onnx\. Add it\.",
+        ),
         ("fit.iteration=1", r"fit\.iteration: there is no such setting\. Did you mean fit\.iterations\?"),
         ("--multrun", r"--multrun: there is no such flag\. A setting is written name=value"),
     ],

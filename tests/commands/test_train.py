@@ -1,10 +1,15 @@
 """`clear-strategies train PHOTOS`: which reader, which settings, and what it says to a wrong argument."""
 
+from pathlib import Path
+
 import pytest
 
-from clear_strategies import compose, hydra_app
+from clear_strategies import commands, compose, hydra_app
 from clear_strategies.commands import train
 from clear_strategies.compose import composed, tree
+from clear_strategies.errors import SettingError
+from clear_strategies.notebook import Run
+from tests.helpers.finished_run import make_run
 
 
 def test_of_several_formats_the_one_that_may_hold_the_others_is_read_and_named_strategies_replace_best(tmp_path):
@@ -53,6 +58,23 @@ def test_a_plain_path_needs_no_quotes_and_a_path_that_looks_like_a_number_is_tex
     overrides = train.overrides([name])
     assert (f"data.path={name}" in overrides) == plain
     assert composed(overrides, "config").data.path == name
+
+
+def test_a_tilde_that_no_shell_expanded_is_the_users_folder(tmp_path, monkeypatch):
+    """In the argument of `train`, in Hydra's own folders, and in the arguments of the other commands."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "photos").mkdir()
+    assert f"data.path={tmp_path}/photos" in train.overrides(["~/photos"])
+    for key in ("hydra.run.dir", "+hydra.sweep.dir", "--config-dir"):
+        assert hydra_app.readable(f"{key}=~/out/${{now:%H}}") == f"{key}={tmp_path}/out/${{now:%H}}"
+    assert commands.parser_of("view", "").parse_args(["~/run"]).run == tmp_path / "run"
+    make_run(tmp_path / "done")
+    assert Run(Path("~/done")).folder == tmp_path / "done"
+
+
+def test_an_address_is_told_to_be_downloaded():
+    with pytest.raises(SettingError, match=r"https://a\.b/c\.zip is an address\. Download what is there"):
+        train.overrides(["https://a.b/c.zip"])
 
 
 @pytest.mark.parametrize("name", ["it's", 'a "b" c', "a, b", "a (1)", "a=b", "[x", "a{b}"])

@@ -12,7 +12,7 @@ import torch
 from PIL import Image, ImageOps
 
 from clear_strategies.data import photo_files, photo_folders
-from clear_strategies.data.readers.photos import FRAMES, HDR
+from clear_strategies.data.photo_folders import FRAMES, HDR
 from clear_strategies.errors import DataError
 
 ENDINGS = (".png", ".jpg", ".webp", ".tiff")

@@ -15,8 +15,8 @@ from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, 
 from clear_strategies.errors import DataError, SettingError
 from rasterizers import Camera
 from tests.helpers.captures import POINTS_AT_RANDOM as POINTS
+from tests.helpers.captures import alike, in_a_row, papers
 from tests.helpers.captures import alike as capture
-from tests.helpers.captures import in_a_row, papers
 
 # ---- splits and sizes: the papers' view indices and pixel counts; what is refused before a photo is decoded
 # Training indices among the n photos of each LLFF scene, and the number of test views: the 3-view protocol of RegNeRF,
@@ -171,12 +171,34 @@ def test_saved_lr_images_are_those_of_their_views_and_no_two_are_saved_as_one(tm
         torch.testing.assert_close(view.lr.image, expected.lr.image, atol=1 / 255, rtol=0)
     for name in ("0001.png", "0002.png"):
         write_png(tmp_path / name, torch.zeros(4, 4, 3))
-    with pytest.raises(DataError, match=r"0001.png: LR image: would be that of two views, cam1/0001 and cam2/0001"):
+    with pytest.raises(
+        DataError, match=r"0001.png: LR image: would be that of two views, cam1/0001.png and cam2/0001.png"
+    ):
         check_headers(rig().frames, papers(lr_folder=str(tmp_path)))
-    both = [replace(frame, name=name) for frame, name in zip(capture(2).frames, ("a.png", "a.jpg"), strict=True)]
-    scene = prepare(Capture("twins", tuple(both)), papers(train=2, test_every=0), Bicubic(), POINTS)
-    with pytest.raises(DataError, match="is that of two photos"):
-        save_lr(scene, tmp_path)
+    write_png(tmp_path / "lr/cam1/0001.png", torch.zeros(16, 16, 3))  # a photo, say
+    with pytest.raises(
+        DataError, match=r"cam1/0001\.png: file: is there, and holds another image: give another folder"
+    ):
+        save_lr(saved, tmp_path / "lr")
+
+
+def test_lr_images_of_photos_that_differ_in_their_endings_are_found_again(tmp_path):
+    frames = in_a_row((16, 16), (16, 16)).frames
+    shades = (torch.zeros(16, 16, 3), torch.ones(16, 16, 3))
+    both = [
+        replace(frame, name=name, load=lambda shade=shade: shade)
+        for frame, name, shade in zip(frames, ("a.jpg", "a.png"), shades, strict=True)
+    ]
+    twins = Capture("twins", tuple(both))
+    save_lr(prepare(twins, papers(train=2, test_every=0), Bicubic(), POINTS), tmp_path)
+    read = prepare(twins, papers(train=2, test_every=0, lr_folder=str(tmp_path)), Bicubic(), POINTS)
+    assert [float(view.lr.image.mean()) for view in read.train] == [0, 1]
+
+
+@pytest.mark.parametrize(("photos", "warned"), [(alike(3), True), (in_a_row((16, 16), (24, 16)), False)])
+def test_photos_that_are_all_equal_are_told_though_their_poses_are_known(photos, warned, caplog):
+    prepare(photos, papers(train=2, test_every=0), Bicubic(), POINTS)
+    assert ("photos are all equal: there is nothing to see depth by" in caplog.text) == warned
 
 
 @pytest.mark.parametrize("init", ["sfm", "sfm_train", "ply"])

@@ -83,7 +83,7 @@ def test_the_sr_setting_chooses_the_prior_and_sr_images_are_found_by_the_photos_
 def test_masks_equal_stems_and_photos_that_stay_on_disk_are_refused(tmp_path):
     with pytest.raises(DataError, match="mask"):
         views_from_datamanager(DataManager(mask=torch.ones(16, 24, 1)), Bicubic(), 4)
-    twins = DataManager(files=("a/0.jpg", "b/0.png", "a/1.jpg"))
+    twins = DataManager(files=("a/0.jpg", "b/0.jpg", "a/1.jpg"))
     with pytest.raises(DataError, match="is that of two photos"):
         views_from_datamanager(twins, Bicubic(), 4)
     with pytest.raises(DataError, match="is that of two photos"):

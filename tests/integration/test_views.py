@@ -3,6 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
@@ -56,8 +57,39 @@ def test_sr_images_may_overshoot_but_not_have_other_values_and_names_are_unique(
     sharp = of_host(image=1.1 * PHOTO.image - 0.03)
     assert float(sharp.lr.image.min()) >= 0
     P2G(patch=4).patch_maps(sharp)
-    with pytest.raises(DataError, match=r"0001: name: is that of two photos"):
-        require_unique(["0002.png", "0001.png", "0001.jpg"])
+    with pytest.raises(DataError, match=r"0001.png: name: is that of two photos"):
+        require_unique(["0002.png", "0001.png", "0001.png"])
+
+
+def test_arrays_of_numpy_are_taken_as_tensors_are():
+    arrays = {"image": PHOTO.image.numpy()[::-1], "mask": np.ones((16, 24), np.float32)}
+    arrays |= {"world_to_camera": PHOTO.camera.world_to_camera.double().numpy(), "K": intrinsics(PHOTO.camera).tolist()}
+    found = of_host(**arrays)
+    assert torch.equal(found.lr.image, PHOTO.image.flip(0))
+    assert found.lr.camera.fx == pytest.approx(PHOTO.camera.fx)
+    bytes_of = (PHOTO.image * 255).round().to(torch.uint8).numpy()
+    assert float((of_host(image=bytes_of).lr.image - PHOTO.image).abs().max()) < 1 / 255
+
+
+POSE = PHOTO.camera.world_to_camera
+MISFITS = {
+    "a 3x3 pose": (
+        {"world_to_camera": POSE[:3, :3]},
+        r"world_to_camera: must have shape \[4, 4\], got \(3, 3\): add the last row",
+    ),
+    "a 3x4 pose": ({"world_to_camera": POSE[:3]}, r"world_to_camera: must have shape \[4, 4\], got \(3, 4\)"),
+    "a pose with scale": ({"world_to_camera": POSE * 2}, r"photo: camera: world_to_camera must be a rotation"),
+    "no focal length": ({"K": torch.zeros(3, 3)}, r"photo: camera: focal lengths and image sizes must be positive"),
+    "a path": ({"image": "a.png"}, r"photo: image: must be a tensor or an array of numbers, got a str"),
+    "no pose": ({"world_to_camera": None}, r"world_to_camera: must be a tensor or an array of numbers, got a NoneType"),
+}
+
+
+@pytest.mark.parametrize("name", MISFITS)
+def test_what_is_no_photo_with_a_camera_is_refused_with_the_rule(name):
+    settings, message = MISFITS[name]
+    with pytest.raises(DataError, match=message):
+        of_host(**settings)
 
 
 @pytest.mark.parametrize(
@@ -142,7 +174,7 @@ def test_photos_of_one_name_in_two_folders_have_their_own_sr_images(dataset, tmp
         assert torch.allclose(one.hr.image, expected.hr.image, atol=1 / 255)
     for name, one in zip(NAMES, dataset.train, strict=True):
         write_png(tmp_path / "flat" / name.split("/")[1], images.quantize(one.hr.image))
-    with pytest.raises(DataError, match="would be that of two views, cam1/0001 and cam2/0001"):
+    with pytest.raises(DataError, match=r"would be that of two views, cam1/0001.png and cam2/0001.png"):
         views_of(dataset, tmp_path / "flat")
 
 

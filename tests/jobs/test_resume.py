@@ -1,5 +1,6 @@
 """Resuming a job: what must agree with the run before, and what may differ."""
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +9,7 @@ import hydra
 import pytest
 from omegaconf import OmegaConf
 
+import clear_strategies
 from clear_strategies.compose import CONF, tree
 from clear_strategies.errors import DataError
 from clear_strategies.jobs import job, resume
@@ -117,7 +119,8 @@ def test_that_few_photos_have_a_pose_is_said_first_and_last(tmp_path: Path, monk
 
 
 @pytest.mark.parametrize(
-    "refused", ["fit.iterations=-3", "fit.seed=9 fit.resume=auto", "data.path=nowhere", "+strategy=[gco,gco]"]
+    "refused",
+    ["fit.iterations=-3", "fit.seed=9 fit.resume=auto", "data.path=nowhere", "+strategy=[gco,gco]", "fit.video=0"],
 )
 def test_a_command_that_is_refused_writes_nothing_into_the_folder_of_a_run(refused: str, finished_run: Path) -> None:
     def state() -> dict[Path, int]:
@@ -128,6 +131,24 @@ def test_a_command_that_is_refused_writes_nothing_into_the_folder_of_a_run(refus
     ended = run(*words, "hydra.run.dir=run", *refused.split(), cwd=finished_run.parent)
     assert ended.returncode == 2, ended.stdout + ended.stderr
     assert state() == before
+
+
+@pytest.mark.parametrize("left", ["results", "checkpoints"])
+def test_a_second_run_replaces_the_first_only_where_it_is_asked_to(
+    left: str, finished_run: Path, tmp_path: Path
+) -> None:
+    folder, photos = shutil.copytree(finished_run, tmp_path / "run"), finished_run.parent / "photos"
+    if left == "checkpoints":  # it was stopped
+        (folder / "metrics.json").unlink()
+    remedy = "take another folder, go on with fit.resume=auto, or replace it with fit.overwrite=true"
+    with pytest.raises(
+        DataError, match=rf"run: folder: holds the {left} of a run, which this one would remove: {remedy}"
+    ):
+        train_on(photos, folder)
+    with pytest.raises(DataError, match=f"holds the {left}"):
+        clear_strategies.train(photos, *MOVED, folder=folder)
+    train_on(photos, folder, "fit.overwrite=true", "fit.seed=1")
+    assert json.loads((folder / "metrics.json").read_text())["seed"] == 1
 
 
 @pytest.fixture(scope="module")

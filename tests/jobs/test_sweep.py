@@ -112,11 +112,12 @@ JOBLIB = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
 
 @joblib
 @pytest.mark.slow
-def test_a_stopped_joblib_sweep_leaves_no_worker(tmp_path):
+@pytest.mark.parametrize("stop", [signal.SIGTERM, signal.SIGHUP])
+def test_a_stopped_joblib_sweep_leaves_no_worker(stop, tmp_path):
     sweep = [*SWEEP, *JOBLIB, "+strategy=baseline,gco", "fit.iterations=100_000"]
     process = started(*DOOR, *sweep, cwd=tmp_path, said=tmp_path / "said", session=True)
     wait_for(lambda: all((tmp_path / "all" / job / "cameras.json").exists() for job in ("0", "1")))
-    process.terminate()
+    process.send_signal(stop)
     assert process.wait() == 130, (tmp_path / "said").read_text()
 
     def gone() -> bool:

@@ -15,6 +15,7 @@ import rasterizers
 from clear_strategies import GCO, P2G, SVS, Conductor, DepthMap, Grads, Objective, RandomBackground, Strategy, View
 from clear_strategies.core.conflicts import conflict_ratio
 from clear_strategies.data.photo_files import read_image
+from clear_strategies.data.view_names import file_stems
 from clear_strategies.outputs.maps import MAPS, ViewMaps, view_maps, write_maps
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.training.loop import iterate
@@ -47,7 +48,7 @@ def maps_of(state: TrainState, view: View | None = None, t: int = 1, **settings:
 
 def written(folder: Path, state: TrainState, views: Sequence[View]) -> dict[str, Any]:
     """The content of maps.json."""
-    write_maps(folder, views, *drawn_by(state), 1)
+    write_maps(folder, file_stems(view.name for view in views), views, *drawn_by(state), 1)
     content: dict[str, Any] = json.loads((folder / "maps.json").read_text())
     return content
 

@@ -79,19 +79,29 @@ def test_without_test_views_training_views_are_shown_and_what_cannot_be_written_
     assert not names(tmp_path) & {"maps/", "path.mp4"}
 
 
-def test_photos_of_two_cameras_with_one_file_name_have_files_of_their_own(tmp_path, state, monkeypatch):
+TWINS = {
+    ("left/0000.png", "right/0000.png"): {"left_0000", "right_0000"},
+    ("0000.jpg", "0000.png"): {"0000.jpg", "0000.png"},
+    ("A.jpg", "a.jpg"): {"A.jpg", "a.jpg_"},  # on a disk that ignores case
+    ("a/0.jpg", "a_0.jpg"): {"a_0.jpg", "a_0.jpg_"},
+}
+
+
+@pytest.mark.parametrize("rig", TWINS)
+def test_photos_with_similar_names_have_files_of_their_own_that_go_together(rig, tmp_path, state, monkeypatch):
     for name in ("write_curves", "write_contact_sheet"):
         monkeypatch.setattr(results, name, lambda *_: None)
-    rig = ("left/0000.png", "right/0000.png")
     views = tuple(replace(view, name=name) for view, name in zip(SCENE.train, rig, strict=False))
     scene = replace(SCENE, train=views, test=views)
     monkeypatch.setattr(state, "views", views)
     write(tmp_path, state, scene=scene, map_views=2)
     write_cameras(tmp_path, scene)
-    stems = {"left_0000", "right_0000"}
+    stems = TWINS[rig]
     assert names(tmp_path / "renders") == {f"{stem}.png" for stem in stems}
     assert {name.rpartition("_")[0] for name in names(tmp_path / "views")} == stems
     assert names(tmp_path / "maps") == {"maps.json", "coverage.png", *(f"{stem}/" for stem in stems)}
+    results.remove_earlier(tmp_path, all_files=True)
+    assert names(tmp_path) == set()
 
 
 def test_an_earlier_run_goes_with_all_of_its_files_and_no_other(tmp_path: Path, state: TrainState) -> None:

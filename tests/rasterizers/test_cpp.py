@@ -8,8 +8,11 @@ import pytest
 import torch
 
 import rasterizers
+from clear_strategies import kernels
+from clear_strategies.jobs import exit_codes
 from rasterizers import BackendUnavailable, Camera, native
 from rasterizers.cpp import CppRasterizer
+from rasterizers.interface import OutdatedKernels
 from rasterizers.testing import check_rasterizer, scene
 from tests.helpers.backends import camera, cotangents, dense_scene, everything, needs, require_same_bits
 
@@ -94,6 +97,23 @@ def test_kernels_use_as_many_threads_as_torch_outside_of_kernel_threads_which_an
 def test_without_compiled_kernels_the_error_says_what_to_install():
     with pytest.raises(BackendUnavailable, match=r"C\+\+20 compiler"):
         native.load_kernels("rasterizers.reference")
+
+
+@pytest.mark.parametrize("stated", ["of yesterday", None])
+def test_kernels_of_other_sources_are_refused_and_nothing_takes_their_place(stated, monkeypatch):
+    """As after `git pull` without a new install, None before modules stated their sources."""
+    for package in ("rasterizers.cpp", "clear_strategies.kernels"):
+        module = native.load_kernels(package, "baseline")
+        if stated is None:
+            monkeypatch.delattr(module, "sources")
+        else:
+            monkeypatch.setattr(module, "sources", stated)
+    native.load_kernels.cache_clear()
+    for load in (cpp, kernels.native.available, rasterizers.fastest):
+        with pytest.raises(OutdatedKernels, match=r"from other sources .* Install again: pip install") as refused:
+            load()
+        assert exit_codes.describe(refused.value) == (2, str(refused.value))
+    native.load_kernels.cache_clear()
 
 
 def test_an_instruction_set_that_the_processor_lacks_is_refused(monkeypatch):

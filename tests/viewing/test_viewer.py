@@ -2,6 +2,8 @@
 
 import itertools
 import math
+import os
+import signal
 import threading
 import time
 from dataclasses import replace
@@ -21,6 +23,7 @@ from clear_strategies.errors import SettingError
 from clear_strategies.jobs import exit_codes
 from clear_strategies.jobs.saved import open_splat
 from clear_strategies.training.field import GaussianField
+from clear_strategies.training.signals import deferred_signals
 from clear_strategies.viewing.look import Painter, colored, depth_range
 from tests.helpers import toy, wall
 from tests.helpers.command_line import TINY, run
@@ -129,6 +132,11 @@ def test_a_viewer_is_there_while_a_run_trains_and_draws_between_two_iterations_a
         began = time.monotonic()
         after_step(3)
         assert time.monotonic() - began > 0.25
+        viewers[0].state = "paused"
+        with deferred_signals() as pending:
+            os.kill(os.getpid(), signal.SIGTERM)
+            after_step(4)  # a paused run is saved, too
+        assert pending == [signal.SIGTERM]
     with pytest.raises(OSError, match="refused"):
         urlopen(viewers[0].address, timeout=20)  # noqa: S310
 

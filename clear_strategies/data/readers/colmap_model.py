@@ -10,7 +10,7 @@ import logging
 import math
 import re
 import struct
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
@@ -89,9 +89,12 @@ class Model:
     points: Points
 
 
-def model_folders(root: Path) -> tuple[Path, ...]:
-    """Where a scene's model may lie."""
-    return (root / "sparse" / "0", root / "sparse", root / "colmap" / "sparse" / "0", root)
+def model_folders(root: Path) -> Iterator[Path]:
+    """Where a scene's model may lie: COLMAP's mapper numbers the models that it leaves in `sparse`."""
+    for sparse in (named(root, "sparse"), root / "colmap" / "sparse"):
+        yield from sorted(sparse.glob("[0-9]*"), key=lambda folder: (len(folder.name), folder.name))
+        yield sparse
+    yield root
 
 
 def is_model(folder: Path) -> bool:
@@ -106,52 +109,59 @@ def _files(folder: Path, ending: str | None = None) -> list[Path]:
 
 
 def find_model(root: Path) -> Path:
-    """The folder of the sparse model; of the several that COLMAP's mapper may leave in `sparse`, the one with most photos.
+    """The folder of the sparse model; of several that lie in one folder, the one with most photos. A warning says which, unless
+    it is the only one, in sparse/0 or without a number.
 
     Raises:
         DataError: there is none, or one of several cannot be read.
     """
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
-    folder = next(filter(is_model, model_folders(root)), None)
-    if folder is None:
+    models = list(filter(is_model, model_folders(root)))
+    if not models:
         raise DataError(
-            root, "sparse model", "no cameras.bin or cameras.txt in sparse/0, sparse, colmap/sparse/0 or here",
+            root, "sparse model", "no cameras.bin or cameras.txt in sparse/0, sparse/1 …, sparse, colmap/sparse or here",
             "run COLMAP first, or use data=photos for photos without poses",
         )  # fmt: skip
-    numbered = sorted(folder.parent.glob("[1-9]*")) if folder.name == "0" else []
-    models = [folder, *filter(is_model, numbered)]
-    if len(models) == 1:
-        return folder
-    photos = {model: len(read_images(_files(model)[1])) for model in models}
-    largest = max(models, key=lambda model: photos[model])
-    others = ", ".join(f"{model.name} with {photos[model]}" for model in models if model != largest)
+    beside = [model for model in models if model.parent == models[0].parent]
+    if len(beside) == 1:
+        if models[0] != root and models[0].name[0] in "123456789":
+            _log.warning("%s: there is no model in 0, and the one in %s is used.", models[0].parent, models[0].name)
+        return models[0]
+    photos = {model: len(read_images(_files(model)[1])) for model in beside}
+    largest = max(beside, key=lambda model: photos[model])
+    others = ", ".join(f"{model.name} with {photos[model]}" for model in beside if model != largest)
     _log.warning(
         "%s: COLMAP left %d models. The largest, %s with %d photos, is used; the others are not: %s.",
-        root, len(models), largest.name, photos[largest], others,
+        root, len(beside), largest.name, photos[largest], others,
     )  # fmt: skip
     return largest
 
 
 def read_model(folder: Path) -> Model:
-    """Cameras, images and points of a model folder; a DataError where a file is missing or not what it should be."""
+    """Images of a model folder, the cameras that they use, and points; a DataError where a file is missing or not what it should
+    be. What the tracks say of images that are not listed, as after photos were removed, is left out with a warning.
+    """
     cameras, listing, points3d = _files(folder)
-    lenses, images = read_cameras(cameras), read_images(listing)
+    images = read_images(listing)
     if not images:
         raise DataError(listing, "images", "there is none", "run COLMAP's mapper to its end")
+    lenses = read_cameras(cameras, {image.camera for image in images})
     for image in images:
         if image.camera not in lenses:
             raise _damaged(listing, image.name, f"has the unknown camera {image.camera}")
     points = read_points(points3d)
-    unknown = np.setdiff1d(points.track[:, 1], [image.id for image in images])
-    if len(unknown):
-        raise _damaged(points3d, "track", f"names the unknown image {unknown[0]}")
-    return Model(folder, listing, lenses, images, points)
+    listed = np.isin(points.track[:, 1], [image.id for image in images])
+    if not listed.all():
+        message = "%s: %s of %s entries of the tracks name images that %s does not list, such as %d, and are left out."
+        count, unlisted = (f"{n:,}" for n in ((~listed).sum(), len(listed))), points.track[~listed, 1]
+        _log.warning(message, points3d, *count, listing.name, unlisted[0])
+    return Model(folder, listing, lenses, images, points._replace(track=points.track[listed]))
 
 
-def read_cameras(path: Path) -> dict[int, Lens]:
-    """The lens of each camera, by its id; the DataErrors of `read_model`."""
-    return _by_id(path, _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path))
+def read_cameras(path: Path, used: Set[int] | None = None) -> dict[int, Lens]:
+    """The lens of each camera that is `used`, None: of all, by its id; the DataErrors of `read_model`. No other is checked."""
+    return _by_id(path, _binary_cameras(path, used) if path.suffix == ".bin" else _text_cameras(path, used))
 
 
 def read_images(path: Path) -> list[Image]:
@@ -194,11 +204,6 @@ def _by_id(path: Path, records: Iterable[tuple[int, _T]]) -> dict[int, _T]:
             raise _damaged(path, f"id {number}", "occurs twice")
         found[number] = record
     return found
-
-
-def _parameters_of(path: Path, where: str, model: str) -> list[str]:
-    terms_of(path, where, model)  # refuses those that are not supported
-    return _MODELS[model].split()
 
 
 def _lens(path: Path, where: str, model: str, size: tuple[int, int], parameters: Iterable[float]) -> Lens:
@@ -250,13 +255,18 @@ class _Bytes:
             raise _damaged(self.path, "end", f"{left} bytes are left over")
 
 
-def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+def _binary_cameras(path: Path, used: Set[int] | None) -> Iterator[tuple[int, Lens]]:
     file = _Bytes(path)
     for i in range(file.count("number of cameras")):
         number, kind, width, height = file.take(_CAMERA, f"camera {i}")
         where, model = f"camera {number}", dict(enumerate(_MODELS)).get(kind, f"number {kind}")
-        layout = struct.Struct(f"<{len(_parameters_of(path, where, model))}d")
-        yield number, _lens(path, where, model, (width, height), file.take(layout, f"parameters of {where}"))
+        wanted = used is None or number in used
+        if wanted or model not in _MODELS:  # of an unknown model the length is unknown, too
+            terms_of(path, where, model)  # refuses those that are not supported
+        layout = struct.Struct(f"<{len(_MODELS[model].split())}d")
+        parameters = file.take(layout, f"parameters of {where}")
+        if wanted:
+            yield number, _lens(path, where, model, (width, height), parameters)
     file.finish()
 
 
@@ -279,12 +289,16 @@ def _binary_points(path: Path) -> Iterator[_Point]:
     file.finish()
 
 
-def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+def _text_cameras(path: Path, used: Set[int] | None) -> Iterator[tuple[int, Lens]]:
     for line, cells in _rows(path):
+        (number,) = _numbers(path, line, cells[:1], _whole)
+        if used is not None and number not in used:
+            continue
         if len(cells) < 4:
             raise _damaged(path, f"line {line}", f"has {len(cells)} of at least 5 columns")
-        number, width, height = _numbers(path, line, (cells[0], *cells[2:4]), _whole)
-        expected = len(_parameters_of(path, f"line {line}", cells[1]))
+        width, height = _numbers(path, line, cells[2:4], _whole)
+        terms_of(path, f"line {line}", cells[1])  # refuses those that are not supported
+        expected = len(_MODELS[cells[1]].split())
         if len(cells) != 4 + expected:
             raise _damaged(path, f"line {line}", f"has {len(cells) - 4} parameters, {cells[1]} has {expected}")
         yield number, _lens(path, f"line {line}", cells[1], (width, height), _numbers(path, line, cells[4:], float))

@@ -18,7 +18,7 @@ from clear_strategies.data.capture import BLACK, Capture, Frame, SfmPoints, lens
 from clear_strategies.data.lenses import Lens, lens_of, pose_from_opengl
 from clear_strategies.data.masks import masks_of
 from clear_strategies.data.photo_files import image_size
-from clear_strategies.data.photo_folders import finder, image_folder, named, usable
+from clear_strategies.data.photo_folders import finder, image_folder, named, some, usable
 from clear_strategies.data.ply import read_points
 from clear_strategies.data.strict_json import Number, read_object, typed
 from clear_strategies.errors import DataError
@@ -70,12 +70,17 @@ def read(
     paths = [find(transform.file_path) for transform in transforms]
     lists = typed(file, content, _Lists)
     splits: dict[Path, str] = {}
+    removed = list[str]()
     for key, side in _SIDES.items():
         for name in getattr(lists, key):
-            if splits.setdefault(find(name), side) != side:
-                raise DataError(file, key, f"{name!r} is for training, too", "list each photo once")
             if find(name) not in paths:
-                raise DataError(file, "split", f"lists {name!r}, which is no frame's file_path", "correct the lists")
+                removed.append(name)
+            elif splits.setdefault(find(name), side) != side:
+                raise DataError(file, key, f"{name!r} is for training, too", "list each photo once")
+    if removed:
+        _log.warning(
+            "%s: its split lists name %d photos that are no frame's file_path: %s.", file, len(removed), some(removed)
+        )
     shared = os.path.commonprefix([path.parent.parts for path in paths])  # noqa: RUF071 - compares tuples of folders
     photos = [("/".join(path.parts[len(shared) :]), path, splits.get(path)) for path in paths]
     frames = frames_of({file: transforms}, {file: photos}, background=background, skip_faulty=skip_faulty)

@@ -14,8 +14,17 @@ from typing import Final, Literal
 from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.data.capture import MORE_PHOTOS, Capture
 from clear_strategies.data.masks import masks_among
-from clear_strategies.data.photo_files import focal_35mm, image_size
-from clear_strategies.data.photo_folders import images_in, list_images, named, require_text, some, usable
+from clear_strategies.data.photo_files import SUFFIXES, focal_35mm
+from clear_strategies.data.photo_folders import (
+    folders_of_images,
+    images_in,
+    in_place_of_photos,
+    list_images,
+    named,
+    require_text,
+    some,
+    usable,
+)
 from clear_strategies.data.priors import cache_folder
 from clear_strategies.data.readers import colmap, sfm
 from clear_strategies.data.readers.colmap_model import read_model
@@ -25,8 +34,6 @@ from clear_strategies.errors import DataError
 _log = logging.getLogger(__name__)
 
 _HEIC: Final = (".heic", ".heif")
-FRAMES: Final = "ffmpeg -i VIDEO -vf thumbnail=15 -fps_mode passthrough -q:v 2 FOLDER/%03d.jpg"
-HDR: Final = "-vf thumbnail=15,scale=out_primaries=bt709:out_transfer=iec61966-2-1,format=rgb24 (ffmpeg 8)"
 _FEW: Final = 30  # photos, up to which precise=auto is true
 _HEAD: Final = 1 << 16  # bytes of a file that tell what it is
 _LOOKED_INTO: Final = 50  # files of a kind, at most
@@ -42,7 +49,7 @@ _OTHERS: Final = (
     ("cameras/*.json", b'"t_00"', "Polycam", _CONVERT.format("polycam", "/..")),
     ("metadata*", b'"poses"', "Record3D", _CONVERT.format("record3d", "")),
     ("poses_bounds.npy", b"NUMPY", "LLFF", "put the COLMAP model that they were made from into {root}/sparse/0"),
-    *((f"{place}cameras.*", b"", "COLMAP", _HERE) for place in ("*/", "*/sparse/", "*/sparse/0/")),
+    *((f"{place}cameras.[bt]*", b"", "COLMAP", _HERE) for place in ("*/", "*/*/", "*/*/*/")),
 )
 
 
@@ -66,7 +73,7 @@ def read(
     """Read a folder of photos of one scene. Poses are estimated from all of them and kept in a cache.
 
     Args:
-        root: the folder; or one whose photos lie in its subfolder `images`.
+        root: the folder; or one whose photos lie in its subfolder `images`, or in the only folder below it that holds any.
         cache: folder of the poses; None: ~/.cache/clear-strategies/sfm, or $CLEAR_CACHE/sfm. Not in the photos' folder.
         max_side: features are extracted from photos reduced to this many pixels.
         max_features: of a photo, those of the coarsest scales; memory and time of matching grow with its square.
@@ -89,21 +96,17 @@ def read(
     require_whole("data.reader.seed", seed, least=0)
     root, name = Path(root), Path(root).resolve().name
     if root.is_file():
-        remedy = f"give a folder of photos; of a video: {FRAMES}; of one in HDR: {HDR}"
-        raise DataError(root, "photos", "is a file", remedy)
+        raise DataError(root, "photos", "is a file", _instead_of(root))
     _tell_of_other_poses(root)
-    if (inside := named(root, "images")).is_dir() and not images_in(root):
-        root = inside
+    root, images = _photos_in(root)
     base = Path(cache) if cache is not None else cache_folder() / "sfm"
     if base.resolve().is_relative_to(root.resolve()):
         raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
-    paths = usable(root, _once_each(list_images(root)), lambda path: path, skip_faulty=skip_faulty)
+    paths = usable(root, _once_each(images), lambda path: path, skip_faulty=skip_faulty)
     require_text((name, *(path.name for path in paths)))
     if len(paths) < sfm.FEWEST:
         raise DataError(root, "images", f"there are {len(paths)}, poses need at least {sfm.FEWEST}", MORE_PHOTOS)
     photos = {path: focal_35mm(path) for path in paths}  # unreadable photos are refused before the long work
-    for path in paths:
-        image_size(path, turn=True)
     precise = len(paths) <= _FEW if precise == "auto" else precise
     folder = base / _key(paths, max_side, max_features, precise, seed)
     if (folder / sfm.MODEL).is_file():
@@ -120,8 +123,30 @@ def read(
     return replace(capture, name=name, notes={**capture.notes, "poses": poses, "photos": root.name}, unplaced=unplaced)
 
 
+def _instead_of(file: Path) -> str:
+    """What to give in place of a file."""
+    if file.suffix.lower() in SUFFIXES:
+        return f"give the folder of all photos: clear-strategies train {shlex.quote(str(file.parent))}"
+    if other := in_place_of_photos([file]):
+        return other[1]
+    return "give the folder of the photos or of the capture"
+
+
+def _photos_in(root: Path) -> tuple[Path, list[Path]]:
+    """The photos and their folder: `root`, its folder `images`, or where neither has any, the only one below that has."""
+    for folder in (root, named(root, "images")):
+        if images := images_in(folder):
+            return folder, images
+    if len(below := folders_of_images(root)) == 1:
+        (root,), above = below, root
+        _log.warning("%s holds no image; those in %s are used.", above, root.relative_to(above).as_posix())
+    return root, list_images(root)
+
+
 def _tell_of_other_poses(root: Path) -> None:
     """Warn of poses that are there, and would be estimated anew; a DataError where there are no photos beside them."""
+    if (sparse := named(root, "sparse")).is_dir():  # else `colmap` would read it
+        _log.warning("%s holds no model (cameras.bin and images.bin, or .txt): the poses are estimated anew.", sparse)
     for pattern, content, tool, remedy in _OTHERS:
         for file in filter(Path.is_file, sorted(root.glob(pattern))[:_LOOKED_INTO]):
             with file.open("rb") as opened:

@@ -17,6 +17,7 @@
 NB_MODULE(CLEAR_MODULE, m) {
   nanobind::set_leak_warnings(false);  // a script that ends while it holds a rendering has done nothing wrong
   m.attr("isa") = CLEAR_NAME;
+  m.attr("sources") = CLEAR_SOURCES;
   m.def("instruction_sets", &clear::instruction_sets);
   clear::bind_losses(m);
   clear::bind_merge(m);

@@ -151,6 +151,7 @@ void bind_frame(nb::module_& m) {
 NB_MODULE(CLEAR_MODULE, m) {
   nanobind::set_leak_warnings(false);  // a script that ends while it holds a rendering has done nothing wrong
   m.attr("isa") = CLEAR_NAME;
+  m.attr("sources") = CLEAR_SOURCES;
   m.def("instruction_sets", &clear::instruction_sets);
   nb::exception<clear::OverBudget>(m, "OverBudget", PyExc_MemoryError);
 #if defined(CLEAR_DOUBLE)

@@ -87,7 +87,10 @@ def test_two_files_that_a_name_could_mean_are_not_chosen_from(tmp_path: Path) ->
             "images/cam0",
             r"images, such as a\.png; it holds 3 others, such as cam0/a\.png: .*data\.reader\.images=(\S+)",
         ),
-        ("photos", r"has none of the folders images, .*: name the folder of photos: data\.reader\.images=FOLDER"),
+        (
+            "photos",
+            r"none of the folders images, .*, but more holds 3, photos holds 3: name .*: data\.reader\.images=FOLDER",
+        ),
     ],
 )
 def test_where_no_photo_is_there_the_message_says_what_is(moved: str, message: str, tmp_path: Path) -> None:
@@ -97,6 +100,7 @@ def test_where_no_photo_is_there_the_message_says_what_is(moved: str, message: s
         (root / "images" / name).rename(root / moved / name)
     if moved == "photos":
         (root / "images").rmdir()
+        shutil.copytree(root / moved, root / "more")
     with pytest.raises(DataError, match=message):
         colmap.read(root)
     assert len(colmap.read(root, images=moved).frames) == 3  # the remedy

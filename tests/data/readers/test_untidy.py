@@ -1,18 +1,23 @@
 """Captures with poses and folders of photos as people have them: each ends well, or with a line that names file and remedy."""
 
+import codecs
 import os
 import shutil
+import struct
 import sys
+import unicodedata
 from collections.abc import Callable, Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import pytest
 import torch
 from PIL import Image
 
+from clear_strategies.commands.train import detect
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.photo_files import read_image
-from clear_strategies.data.readers import photos
+from clear_strategies.data.readers import colmap, photos
+from clear_strategies.data.view_names import ViewFiles, matching
 from clear_strategies.errors import DataError
 from tests.helpers import captures
 from tests.helpers.captures import GOOD, HEIGHT, NAMES, READERS, WIDTH
@@ -73,6 +78,137 @@ def test_reading_poses_decodes_no_photo(kind: str, tmp_path: Path) -> None:
     for frame in READERS[kind](root).frames:
         with pytest.raises(DataError, match="pixels: cannot be decoded"):
             frame.load()
+
+
+def moved(old: str, new: str, empty: bool = False) -> Callable[[Path], None]:
+    def move(root: Path) -> None:
+        (root / new).parent.mkdir(parents=True, exist_ok=True)
+        (root / old).rename(root / new)
+        if empty:
+            (root / old).mkdir(parents=True)
+
+    return move
+
+
+def appended(file: str, text: str) -> Callable[[Path], None]:
+    return lambda root: (root / file).write_text((root / file).read_text() + text)
+
+
+def encoded(file: str, encoding: str) -> Callable[[Path], None]:
+    return lambda root: (root / file).write_text((root / file).read_text(), encoding=encoding)
+
+
+def unused_cameras(root: Path) -> None:
+    """A panorama and a camera of size 0 in front of the one in use."""
+    file = root / "sparse/0/cameras.bin"
+    others = struct.pack("<iiQQ", 7, 17, 100, 50) + struct.pack("<iiQQ3d", 8, 0, 0, 0, 1.0, 1.0, 1.0)
+    file.write_bytes(struct.pack("<Q", 3) + others + file.read_bytes()[8:])
+
+
+def unlisted_in_tracks(root: Path) -> None:
+    """Both points are also seen by a photo 9 that is no longer listed."""
+    if (text := root / "sparse/0/points3D.txt").is_file():
+        text.write_text(text.read_text().replace(" 0\n", " 0 9 0\n"))
+        return
+    file = root / "sparse/0/points3D.bin"
+    points = file.read_bytes()[8:]
+    size, ends = 8 + 24 + 3 + 8 + 8 + 16, struct.pack("<ii", 9, 0)
+    grown = [
+        points[i : i + size - 24] + struct.pack("<Q", 3) + points[i + size - 16 : i + size] + ends for i in (0, size)
+    ]
+    file.write_bytes(struct.pack("<Q", 2) + b"".join(grown))
+
+
+CAMERAS, LISTS = "sparse/0/cameras.txt", {"train_filenames": ["images/a.png", "images/gone.png"]}
+ONE_IS_LEFT, OF_TRACKS = "there is no model in 0, and the one in {} is used", "2 of 6 entries of the tracks name images"
+# How the capture is written, what is done to it, and the line that says so, empty where there is nothing to say.
+POSED: dict[str, tuple[str, Callable[[Path], object], str]] = {
+    "sparse/1 alone": ("colmap", moved("sparse/0", "sparse/1"), ONE_IS_LEFT.format(1)),
+    "sparse/1 beside an empty sparse/0": ("colmap", moved("sparse/0", "sparse/1", empty=True), ONE_IS_LEFT.format(1)),
+    "sparse/12 alone": ("colmap_txt", moved("sparse/0", "sparse/12"), ONE_IS_LEFT.format(12)),
+    "colmap/sparse/2 alone": ("colmap", moved("sparse/0", "colmap/sparse/2"), ONE_IS_LEFT.format(2)),
+    "Sparse with a capital letter": ("colmap", moved("sparse", "Sparse"), ""),
+    "an empty model before the right one": (
+        "colmap",
+        lambda root: [
+            shutil.copytree(root / "sparse/0", root / "sparse/1"),
+            (root / "sparse/0/images.bin").write_bytes(struct.pack("<Q", 0)),
+        ],
+        "The largest, 1 with 3 photos, is used",
+    ),
+    "an unused panoramic camera": ("colmap_txt", appended(CAMERAS, "2 EQUIRECTANGULAR 100 50\n"), ""),
+    "an unused camera of an unknown model": ("colmap_txt", appended(CAMERAS, "2 PANORAMIC 100 50 x\n"), ""),
+    "an unused camera of size 0": ("colmap_txt", appended(CAMERAS, "2 SIMPLE_PINHOLE 0 0 1 0 0\n"), ""),
+    "a line of an unused camera that is cut": ("colmap_txt", appended(CAMERAS, "2 PINHOLE\n"), ""),
+    "unused cameras in binary": ("colmap", unused_cameras, ""),
+    "tracks of a photo that is not listed": ("colmap_txt", unlisted_in_tracks, OF_TRACKS),
+    "the same in binary": ("colmap", unlisted_in_tracks, OF_TRACKS),
+    "a split list that names a photo without a frame": (
+        "nerfstudio",
+        lambda root: captures.edit(root / "transforms.json", lambda value: value.update(LISTS)),
+        "its split lists name 1 photos that are no frame's file_path: images/gone.png",
+    ),
+    "a byte order mark": ("nerfstudio", encoded("transforms.json", "utf-8-sig"), ""),
+    "UTF-16, as PowerShell writes it": ("nerfstudio", encoded("transforms.json", "utf-16"), ""),
+    "a byte order mark in a Blender scene": ("blender", encoded("transforms_train.json", "utf-8-sig"), ""),
+    "a byte order mark in COLMAP's text": ("colmap_txt", encoded("sparse/0/images.txt", "utf-8-sig"), ""),
+    "photos in a folder of another name": ("colmap", moved("images", "photos"), ""),
+    "photos two folders below": ("colmap", moved("images", "DCIM/100CANON"), ""),
+}
+
+
+@pytest.mark.parametrize("skip_faulty", [False, True])
+@pytest.mark.parametrize("name", POSED)
+def test_an_untidy_capture_is_read_whole_and_the_log_says_what_was_left_out(name, skip_faulty, tmp_path, caplog):
+    kind, spoil, line = POSED[name]
+    root = GOOD[kind](tmp_path / "capture")
+    spoil(root)
+    assert detect(root) == kind.removesuffix("_txt")
+    capture = READERS[kind](root, skip_faulty=skip_faulty)
+    captures.require_poses(capture)
+    said = [record.getMessage() for record in caplog.records]
+    assert (not line and not said) or any(line in message for message in said if line), said
+    if "tracks" in line:
+        assert sorted(capture.points.track_image.tolist()) == sorted(i for track in captures.TRACKS for i in track)
+
+
+def test_a_ply_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
+    text = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n"
+    (tmp_path / "points.ply").write_bytes(codecs.BOM_UTF8 + text.encode())
+    root = captures.nerfstudio(tmp_path)
+    captures.edit(root / "transforms.json", lambda value: value.update(ply_file_path="points.ply"))
+    assert READERS["nerfstudio"](root).points.means.tolist() == [[1, 2, 3]]
+
+
+def test_photos_in_several_folders_are_not_chosen_from(tmp_path: Path) -> None:
+    root = captures.colmap_bin(tmp_path)
+    (root / "images").rename(root / "cam1")
+    captures.write_photos(root / "more" / "cam2")
+    with pytest.raises(DataError, match=r"but cam1 holds 3, more/cam2 holds 3: name the folder of photos: data.reader"):
+        colmap.read(root)
+
+
+@pytest.mark.parametrize("kind", ["colmap_txt", "blender", "nerfstudio"])
+def test_names_are_the_same_whether_their_letters_are_composed_or_not(kind: str, tmp_path: Path) -> None:
+    """In lists, of photos, of their masks, of SR images, and on the command line."""
+
+    def composed(path: str) -> str:
+        return str(PurePosixPath(path).with_name(f"é{PurePosixPath(path).name}"))
+
+    root = GOOD[kind](tmp_path / "capture", listed=composed)
+    for photo in [*root.rglob("*.png")]:
+        decomposed = photo.rename(photo.with_name(unicodedata.normalize("NFD", f"é{photo.name}")))
+        (mask := root / "masks" / f"é{photo.name}").parent.mkdir(exist_ok=True)
+        Image.new("L", (WIDTH, HEIGHT), 255).save(mask)
+        (tmp_path / "sr").mkdir(exist_ok=True)
+        shutil.copy(decomposed, tmp_path / "sr")
+    frames = READERS[kind](root).frames
+    assert sorted(Path(frame.name).stem for frame in frames) == ["éa", "éb", "éc"]
+    assert all(frame.shown is not None for frame in frames)
+    files = ViewFiles(tmp_path / "sr", "SR image", "", "")
+    assert all(files.file(frame.name, WIDTH, HEIGHT).is_file() for frame in frames)
+    names = [frame.name for frame in frames]
+    assert matching(names, unicodedata.normalize("NFD", names[0])) == [names[0]]
 
 
 # ---- folders of photos as phones and people leave them: each ends well, or with one line that names the file and the remedy
@@ -196,6 +332,79 @@ def test_photos_may_lie_in_the_folder_images(of_photos):
     folder.rename(folder.parent / "scene" / "images")
     capture = photos.read(folder.parent / "scene", folder.parent / "cache")
     assert (capture.name, len(capture.frames)) == ("scene", 3)
+
+
+@pytest.mark.parametrize("place", ["DCIM/100CANON", "images/cam1", "Images", "of_the_day"])
+def test_photos_in_the_only_folder_that_holds_any_are_used_with_a_line(place: str, of_photos, caplog) -> None:
+    folder, _ = of_photos
+    root = folder.parent / "scene"
+    (root / place).parent.mkdir(parents=True)
+    captures.write_photos(root / "masks")  # no photos
+    folder.rename(root / place)
+    capture = photos.read(root, folder.parent / "cache")
+    assert [frame.name for frame in capture.frames] == ALL
+    assert (f"holds no image; those in {place} are used" in caplog.text) == (place != "Images")
+
+
+def beside_each_other(folder: Path, *names: str) -> None:
+    """Only these files, in place of the photos."""
+    for photo in folder.iterdir():
+        photo.unlink()
+    for name in names:
+        (folder / name).parent.mkdir(exist_ok=True, parents=True)
+        (folder / name).write_bytes(b"never opened")
+
+
+# What lies in the folder, and what the message says of it.
+NO_PHOTOS: dict[str, tuple[tuple[str, ...], str]] = {
+    "several folders of photos": (
+        ("cam1/0.jpg", "cam1/1.jpg", "cam2/0.jpg"),
+        "but cam1 holds 2, cam2 holds 1: give one of",
+    ),
+    "raw photos": (
+        ("IMG_1.CR2", "IMG_2.CR2", "notes.txt"),
+        r"but raw photos \(2\): IMG_1.CR2, IMG_2.CR2: develop them",
+    ),
+    "raw photos on a card": (("DCIM/100CANON/IMG_1.CR3",), r"but raw photos \(1\): IMG_1.CR3: develop them"),
+    "an archive": (("my photos.zip",), "unpack them, and give the folder: unzip 'my photos.zip' -d FOLDER"),
+    "a video": (("clip.MOV",), "ffmpeg -i VIDEO -vf thumbnail=15"),
+    "another format": (("a.avif", "b.avif", "c.bmp"), "save them as PNG or JPEG: mogrify -format png a.avif"),
+    "nothing": ((), r"holds no image \(.png, .*\): check the path"),
+    "what a Mac leaves of raw photos": (("._IMG_1.CR2",), "check the path"),
+}
+
+
+@pytest.mark.parametrize("name", NO_PHOTOS)
+def test_where_there_is_no_photo_the_message_says_what_there_is_and_what_makes_photos_of_it(name, of_photos):
+    folder, read = of_photos
+    names, message = NO_PHOTOS[name]
+    beside_each_other(folder, *names)
+    with pytest.raises(DataError, match=message):
+        read()
+
+
+# A file in place of a folder, and what the message says.
+FILES = {
+    "photos.zip": "unpack them, and give the folder: unzip photos.zip", "photos.tar.gz": "or tar -xf photos.tar.gz",
+    "a.PNG": "give the folder of all photos: clear-strategies train ", "scene.ply": "clear-strategies view scene.ply shows",
+    "a.nef": "develop them", "clip.mp4": "ffmpeg -i VIDEO", "cameras.txt": "give the folder of the photos or of the capture",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_in_place_of_a_folder_is_told_by_its_kind(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).touch()
+    assert detect(tmp_path / name) == "photos"
+    with pytest.raises(DataError, match=rf"{name}: photos: is a file: .*{FILES[name]}"):
+        photos.read(tmp_path / name)
+
+
+def test_a_folder_sparse_that_holds_no_model_is_told_before_poses_are_estimated(of_photos, caplog) -> None:
+    folder, read = of_photos
+    (folder / "sparse/0").mkdir(parents=True)
+    (folder / "sparse/0/points3D.bin").touch()
+    read()
+    assert "sparse holds no model (cameras.bin and images.bin, or .txt): the poses are estimated anew" in caplog.text
 
 
 def test_photos_turned_by_exif_are_upright(of_photos):
