@@ -38,7 +38,7 @@ PYTHON = [
     pytest.param(block, id=f"{name(page)}-{i}") for page in PAGES for i, block in enumerate(blocks(page, "python"))
 ]
 # Commands of other programs: nothing of them is checked, but that extras exist.
-FOREIGN = r"(python3? -m (venv|pip|build)|cibuildwheel|\.|pip install|for|done|wait|ns-train|mkdocs|pre-commit|cd) ?"
+FOREIGN = r"(python3? -m (venv|pip|build)|cibuildwheel|\.|pip install|for|done|wait|ns-train|mkdocs|pre-commit|cd|git clone|sed|eval) ?"
 
 TAKEN: set[str] = set()  # words that chose a file for a job of a sweep, of any command
 READ_BY_ARGPARSE = ("render", "export", "view", "doctor")  # subcommands; the others read Hydra's words
@@ -167,7 +167,7 @@ NOT_RUN = {
     "the reader's scenes": r"FOLDER|scenes/|multirun/",
     "another trainer": r"-m integration\.(gsplat|inria) |^ns-train",
     "installation, the gate": r"^(python3? -m (venv|build|pytest)|cibuildwheel|pip install)\b",
-    "other programs": r"^(for|done|wait)\b",
+    "other programs": r"^(for|done|wait|sed|eval)\b",
     "an environment": r"^\. ",
     "waits for a browser": r"^clear-strategies view",
     "takes minutes, or a file that the viewer saves": r"--frames 240|flight\.json",

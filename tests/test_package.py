@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tomllib
 from dataclasses import replace
-from importlib import import_module
+from importlib import import_module, metadata
 from pathlib import Path
 
 import pytest
@@ -85,7 +85,7 @@ def test_a_run_has_its_numbers_and_its_gaussians_by_gsplats_names_and_renders_fr
 def test_a_folder_without_a_finished_run_and_a_wrong_setting_are_told(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no run has finished here"):
         cs.Run(tmp_path)
-    with pytest.raises(SettingError, match="iteration"):
+    with pytest.raises(SettingError, match=r"fit\.iteration: .* Did you mean fit\.iterations\?"):
         cs.train(None, "fit.iteration=3", folder=tmp_path / "run")
     with pytest.raises(SettingError, match=r"data\.save_lr: must be null, since .* on the command line"):
         cs.train(None, f"data.save_lr={tmp_path / 'lr'}", folder=tmp_path / "run")
@@ -146,6 +146,12 @@ HEAVY = {
 }
 HOSTS = [f"integration.{host}" for host in ("gsplat", "inria", "nerfstudio")]
 MODULES = ["clear_strategies", "rasterizers", "integration", *HOSTS, "clear_strategies.geometry"]
+
+
+def test_the_version_is_that_of_the_installed_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert clear_strategies.__version__ == metadata.version("clear-strategies")
+    monkeypatch.setattr(metadata, "version", lambda name: metadata.distribution(f"no-{name}").version)
+    assert clear_strategies.__version__ == "source checkout"
 
 
 def test_importing_is_light_and_of_the_package_alone_imports_no_torch():
