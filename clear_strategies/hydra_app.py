@@ -50,7 +50,9 @@ def main(overrides: Sequence[str] | None = None) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     arguments = sys.argv[1:] if overrides is None else overrides
     _require_known_flags(arguments)
-    if completed := re.match(r"(\S+ )train \S+ (.*)", os.environ.get("COMP_LINE", "")):  # settings behind `train PHOTOS`
+    if completed := re.match(
+        r"(\S+ )train \S+ (.*)", os.environ.get("COMP_LINE", "")
+    ):  # settings behind `train PHOTOS`
         os.environ["COMP_LINE"] = line = f"{completed[1]}+strategy=best {completed[2]}"
         os.environ["COMP_POINT"] = str(len(line))
     sys.argv[1:] = [_VERBOSE if a in ("-v", "--verbose") else readable(a) for a in arguments]  # Hydra reads them there
