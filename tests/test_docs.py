@@ -38,7 +38,10 @@ PYTHON = [
     pytest.param(block, id=f"{name(page)}-{i}") for page in PAGES for i, block in enumerate(blocks(page, "python"))
 ]
 # Commands of other programs: nothing of them is checked, but that extras exist.
-FOREIGN = r"(python3? -m (venv|pip|build)|cibuildwheel|\.|pip install|for|done|wait|ns-train|mkdocs|pre-commit|cd|git clone|sed|eval) ?"
+FOREIGN = (
+    r"(python3? -m (venv|pip|build)|cibuildwheel|\.|pip install|for|done|wait|ns-train|mkdocs|pre-commit|cd"
+    r"|git clone|sed|eval) ?"
+)
 
 TAKEN: set[str] = set()  # words that chose a file for a job of a sweep, of any command
 READ_BY_ARGPARSE = ("render", "export", "view", "doctor")  # subcommands; the others read Hydra's words

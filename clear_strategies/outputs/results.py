@@ -145,6 +145,7 @@ def remove_earlier(folder: Path, *, all_files: bool) -> None:
     with suppress(DataError):  # damaged, or of another program
         content = metrics.read(path, "")
         stems = {file_stem(name) for part in (content.test, content.train) for name in part.views}
+        stems |= {file_stem(saved.name) for saved in cameras.read_cameras(folder / cameras.FILE)}
     path.unlink()
     if not (all_files and stems):
         return
@@ -170,8 +171,10 @@ def _write_sheet(folder: Path, scene: Scene, evaluation: Evaluation, title: str)
     """Of a few views the LR photo, the SR image and the render, and where the truth is known, the truth and the error."""
     rows, part = [], evaluation.test or evaluation.train
     rendered = [view for view in (*scene.test, *scene.train) if view.name in evaluation.renders]
+    for view in (*scene.train, *scene.test):  # the viewer shows them beside the rendering
+        write_png(folder / "views" / f"{file_stem(view.name)}_lr.png", view.lr.image)
     for view in spaced(rendered, _SHEET_VIEWS):
-        for kind, shown in {"lr": view.lr.image, "prior": view.hr.image, "truth": view.truth}.items():
+        for kind, shown in {"prior": view.hr.image, "truth": view.truth}.items():
             if shown is not None:
                 write_png(folder / "views" / f"{file_stem(view.name)}_{kind}.png", shown)
         columns: dict[str, Tensor] = {}
