@@ -20,9 +20,10 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from PIL import Image
 
-from clear_strategies import Conductor
+from clear_strategies import Conductor, compose
 from clear_strategies.commands import train
 from clear_strategies.compose import CONF
+from clear_strategies.files import write_text
 from tests.helpers import command_line, documented
 from tests.helpers.configs import jobs_of, loader
 from tests.helpers.pages import DOCS, OURS, PAGES, ROOT, blocks, commands, loaded, name
@@ -140,6 +141,24 @@ def test_the_notebook_runs(run_block):
     code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
     assert all(cell["outputs"] for cell in cells if cell["cell_type"] == "code")  # python docs/figures.py notebook
     run_block("\n".join(code).replace("fit.iterations=300", "fit.iterations=30"))
+
+
+def test_the_guides_reader_reads_a_folder_and_is_chosen_for_it(tmp_path, monkeypatch):
+    (block,) = blocks(DOCS / "how-to" / "own-reader.md", "python")
+    (tmp_path / "your_package.py").write_text(block)
+    (option,) = blocks(DOCS / "how-to" / "own-reader.md", "yaml")
+    write_text(tmp_path / "conf" / "data" / "mine.yaml", option)
+    monkeypatch.setattr(compose, "CONF", tmp_path / "conf")
+    monkeypatch.syspath_prepend(tmp_path)
+    for i in range(3):
+        Image.new("RGB", (24, 16), (80 * i, 0, 0)).save(tmp_path / f"{i}.png")
+    rows = "".join(f"{i}.png,24,16,30,30,{i},0,-2\n" for i in range(3))
+    (tmp_path / "poses.csv").write_text(f"file,width,height,fx,fy,x,y,z\n{rows}")
+    assert train.detect(tmp_path) == "mine"
+    capture = importlib.import_module("your_package").read(tmp_path)
+    assert [frame.name for frame in capture.frames] == ["0.png", "1.png", "2.png"]
+    assert capture.frames[2].camera.center.tolist() == [2, 0, -2]
+    assert capture.frames[2].load()[0, 0].tolist() == pytest.approx([160 / 255, 0, 0])
 
 
 @pytest.mark.slow
