@@ -148,9 +148,11 @@ def test_the_notebook_runs_and_has_saved_what_it_shows(run_block):
         for source, outputs in code.items()
         if source.startswith(("run.metrics", "{name: "))
     )
-    assert run.metrics["test"]["mean"]["ours"] == pytest.approx(scores, abs=0.05)  # processors round differently
+    found = run.metrics["test"]["mean"]["ours"]
+    assert found.pop("psnr") == pytest.approx(scores.pop("psnr"), abs=0.15)  # processors round differently
+    assert found == pytest.approx(scores, abs=0.01)
     assert {name: rows.shape[1:] for name, rows in run.splats.items()} == {name: n[1:] for name, n in shapes.items()}
-    assert len(run.splats["means"]) == pytest.approx(shapes["means"][0], rel=0.02)
+    assert len(run.splats["means"]) == pytest.approx(shapes["means"][0], rel=0.05)
 
 
 def test_the_guides_reader_reads_a_folder_and_is_chosen_for_it(tmp_path, monkeypatch):
