@@ -186,8 +186,8 @@ def _write_sheet(folder: Path, scene: Scene, evaluation: Evaluation, title: str)
             columns["ground truth"] = view.truth
             columns["error of ours"] = (columns["ours"] - view.truth).abs().mean(-1)
         captions = {"ours": f"{score.psnr:.2f} dB, SSIM {score.ssim:.3f}"}
-        shown = {name: image.numpy() for name, image in columns.items()}
-        rows.append(SheetRow(view.name, shown, captions, [name for name, pixels in shown.items() if pixels.ndim == 3]))
+        pixels = {name: image.numpy() for name, image in columns.items()}
+        rows.append(SheetRow(view.name, pixels, captions, [name for name, image in pixels.items() if image.ndim == 3]))
     note = _TRAINED_ON if not scene.test else "" if scene.test[0].hr_is_photo else _OWN_PHOTO
     write_contact_sheet(folder / "contact_sheet.png", rows, title, note)
 
