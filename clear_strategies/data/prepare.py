@@ -278,7 +278,11 @@ def scene_notes(
         **exposure,
         **_back_projection(train, views.downsample),
         **({} if network is None else {"SR network": f"{fingerprint(network)} (SHA-256)"}),
-        **({"the SR images add": f"{_added_detail(train):.1f} grey levels to bicubic interpolation, on average"} if sr else {}),
+        **(
+            {"the SR images add": f"{_added_detail(train):.1f} grey levels to bicubic interpolation, on average"}
+            if sr
+            else {}
+        ),
         "initial points": f"{len(points):,}: {points.source}",
         "points use test views": points.uses_test_views,
     }
