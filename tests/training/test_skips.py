@@ -69,7 +69,7 @@ def test_a_skip_that_cannot_act_is_a_warning_and_not_in_the_plan(caplog):
     half, rest, window = SkipPolicy(replace(skips, hr_every=2)).descriptions([view])
     assert half == "HR at half its size until iteration 10"
     assert rest == "HR in one of 2 iterations until iteration 10"
-    assert "500 iterations gain less than 1.0%" in window
+    assert "by less than 1.0% in 500 iterations" in window
     assert not caplog.records
     odd = replace(view, hr=view.hr.reduced(4))  # by a factor of 1
     assert SkipPolicy(replace(skips, plateau_window=0)).descriptions([odd]) == []
