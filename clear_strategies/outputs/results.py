@@ -187,7 +187,9 @@ def _write_sheet(folder: Path, scene: Scene, evaluation: Evaluation, title: str)
             columns["error of ours"] = (columns["ours"] - view.truth).abs().mean(-1)
         captions = {"ours": f"{score.psnr:.2f} dB, SSIM {score.ssim:.3f}"}
         pixels = {name: image.numpy() for name, image in columns.items()}
-        rows.append(SheetRow(view.name, pixels, captions, [name for name, image in pixels.items() if image.ndim == 3]))
+        pictures = [name for name, image in pixels.items() if image.ndim == 3]
+        given = [name for name in pictures if name != "ours"]  # these differ most where there is most detail
+        rows.append(SheetRow(view.name, pixels, captions, given if len(given) > 1 else pictures))
     note = _TRAINED_ON if not scene.test else "" if scene.test[0].hr_is_photo else _OWN_PHOTO
     write_contact_sheet(folder / "contact_sheet.png", rows, title, note)
 
