@@ -38,6 +38,8 @@ __all__ = [
     "Update", "View", "train",
 ]  # fmt: skip
 
+__version__: str  # of the installed package
+
 _NAMES: Final = {  # by the module of this package that they are defined in
     "core.evidence": ("Evidence",),
     "core.gradients": ("ATTRIBUTES", "CONFLICT_GROUPS", "Grads", "Shot"),
@@ -64,6 +66,8 @@ _HOMES: Final = {name: f"{__name__}.{module}" for module, names in _NAMES.items(
 
 def __getattr__(name: str) -> Any:
     """Import one of `__all__`; called for names that the module does not have yet."""
+    if name == "__version__":
+        return _version()
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     found = getattr(import_module(_HOMES[name]), name)
@@ -71,5 +75,14 @@ def __getattr__(name: str) -> Any:
     return found
 
 
+def _version() -> str:
+    from importlib import metadata
+
+    try:
+        return metadata.version("clear-strategies")
+    except metadata.PackageNotFoundError:  # on the path, and not installed
+        return "source checkout"
+
+
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, "__version__"})

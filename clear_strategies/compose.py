@@ -5,6 +5,7 @@ conductor("clear", "strategies.gco.tolerance=0.1", iterations=30_000)
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import logging
 import re
@@ -45,8 +46,6 @@ _PACKAGE: Final = Path(__file__).resolve().parent
 # In a wheel conf/ lies inside the package, in a checkout beside it.
 CONF: Final = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / "conf"
 
-_PLAIN: Final = re.compile(r"(/|\./|(\.\./)+)?[A-Za-z_][\w./-]*", re.ASCII)  # needs no quotes, for Hydra or a shell
-_NO_TEXT: Final = ("null", "true", "false", "nan", "inf")
 _LONGEST_NAME: Final = 200  # bytes of a folder's name; most file systems take 255
 
 OPTIONS: Final = "clear_strategies_conf"
@@ -176,21 +175,52 @@ def composed(overrides: list[str], config: str = "conductor") -> DictConfig:
         with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
             return hydra.compose(config, overrides)
     except (HydraException, OmegaConfBaseException) as error:
-        problem = of_hydra(error).rstrip(".")
-        raise SettingError(f"{' '.join(overrides)}: {problem}. See conf/ for what there is.") from error
+        raise not_composed(error, overrides, config) from error
     finally:
         GlobalHydra.instance().hydra = before
+
+
+def not_composed(error: Exception, overrides: Sequence[str], config: str) -> SettingError:
+    """The error for overrides that Hydra cannot compose; where there is no such setting, it names the most similar one."""
+    if (unknown := re.match(r"Could not (?:override|delete from config\.) '([^']+)'", str(error))) is None:
+        return SettingError(of_hydra(error))
+    key = unknown[1]
+    if (CONF / key).is_dir():
+        return SettingError(f"{key}: no choice of this group is there to be replaced, so it is added: +{key}=….")
+    remedy = "clear-strategies --cfg job prints all of them."
+    try:
+        settings: Any = OmegaConf.to_container(composed([o for o in overrides if _key(o) != key], config))
+        if near := difflib.get_close_matches(key, flat(settings), 1, 0.8):
+            remedy = f"Did you mean {near[0]}?"
+        elif config == "conductor":
+            remedy = f"A conductor has settings of {', '.join(settings)}."
+    except SettingError:  # another override is wrong as well
+        pass
+    return SettingError(f"{key}: there is no such setting. {remedy}")
+
+
+def _key(override: str) -> str:
+    return override.lstrip("+~").partition("=")[0]
 
 
 def quoted(value: str) -> str:
     """A string of Hydra's grammar: paths may contain spaces, commas, brackets, equals signs and `${`, or look like
     numbers. A backslash is itself, except before a quote or `${`, where both libraries want two.
     """
-    if _PLAIN.fullmatch(value) and value.lower() not in _NO_TEXT:
+    if _is_itself(value):
         return value
     for_omegaconf = re.sub(r"(\\*)\$\{", r"\1\1\\${", value)
     for_hydra = re.sub(r"(\\*)('|\Z)", lambda end: end[1] * 2 + ("\\'" if end[2] else ""), for_omegaconf)
     return f"'{for_hydra}'"
+
+
+def _is_itself(value: str) -> bool:
+    """Whether Hydra and OmegaConf read the unquoted value as this string."""
+    try:
+        parsed = OverridesParser.create().parse_override(f"key={value}")
+    except HydraException:
+        return False
+    return not parsed.is_sweep_override() and parsed.value() == value and not set("$\\") & set(value)
 
 
 def require_each_once(overrides: Iterable[str]) -> None:

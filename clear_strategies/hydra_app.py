@@ -7,7 +7,6 @@ docs/reference/files.md lists them. metrics.json is written last, so a folder th
 
 from __future__ import annotations
 
-import difflib
 import logging
 import os
 import re
@@ -27,7 +26,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from clear_strategies import console, files
-from clear_strategies.compose import CONF, composed, flat, options, quoted, require_each_once
+from clear_strategies.compose import CONF, not_composed, quoted, require_each_once
 from clear_strategies.errors import ClearError, SettingError
 from clear_strategies.jobs import exit_codes
 from clear_strategies.training.signals import STOPS
@@ -38,8 +37,8 @@ FAILED: Final = "failed.txt"
 """In the folder of a sweep's job: why it failed."""
 _VERBOSE: Final = "fit.verbose=true"
 _FLAGS: Final = (
-    "--help", "--hydra-help", "--version", "--cfg", "--resolve", "--package", "--run", "--multirun", "--shell-completion",
-    "--config-path", "--config-name", "--config-dir", "--info",
+    "--help", "--hydra-help", "--cfg", "--resolve", "--package", "--run", "--multirun", "--shell-completion",
+    "--config-path", "--config-name", "--config-dir", "--experimental-rerun", "--info",
 )  # fmt: skip
 
 
@@ -52,14 +51,18 @@ def main(overrides: Sequence[str] | None = None) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     arguments = sys.argv[1:] if overrides is None else overrides
     _require_known_flags(arguments)
+    if completed := re.match(
+        r"(\S+ )train \S+ (.*)", os.environ.get("COMP_LINE", "")
+    ):  # settings behind `train PHOTOS`
+        os.environ["COMP_LINE"] = line = f"{completed[1]}+strategy=best {completed[2]}"
+        os.environ["COMP_POINT"] = str(len(line))
     sys.argv[1:] = [_VERBOSE if a in ("-v", "--verbose") else readable(a) for a in arguments]  # Hydra reads them there
     exit_codes.require("train")
     try:
         hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(job)()
     except ConfigCompositionException as error:
-        if (unknown := re.match(r"Could not override '([^']+)'", str(error))) is None:
-            raise
-        raise SettingError(_no_such_setting(unknown[1])) from error
+        overrides = [word for word in sys.argv[1:] if not word.startswith(("-", "hydra."))]
+        raise not_composed(error, overrides, "config") from error
 
 
 def readable(word: str) -> str:
@@ -88,28 +91,6 @@ def _require_known_flags(arguments: Sequence[str]) -> None:
         if flag.startswith("--") and flag != "--verbose" and not any(known.startswith(flag) for known in _FLAGS):
             remedy = "A setting is written name=value, and clear-strategies --cfg job prints all of them."
             raise SettingError(f"{flag}: there is no such flag. {remedy}")
-
-
-def _no_such_setting(key: str) -> str:
-    """The message for an override that names no setting, with the options of its group that have it, or the most similar one."""
-    if (CONF / key).is_dir():
-        return f"{key}: no choice of this group is there to be replaced, so it is added: +{key}=…."
-    words = [word for word in sys.argv[1:] if not word.startswith(("-", "hydra."))]
-    overrides = [word for word in words if word.partition("=")[0].lstrip("+") != key]
-
-    def settings(*chosen: str) -> Collection[str]:
-        try:
-            return flat(OmegaConf.to_container(composed([*overrides, *chosen], "config")))  # type: ignore[arg-type]
-        except SettingError:  # another override is wrong as well
-            return ()
-
-    group = key.partition(".")[0]
-    if having := [option for option in options(group) if key in settings(f"{group}={option}")]:
-        train = ", or let the command find it: clear-strategies train FOLDER" if key == "data.path" else ""
-        return f"{key}: there is no such setting without one of {', '.join(f'{group}={o}' for o in having)}. Add it{train}."
-    near = difflib.get_close_matches(key, settings(), 1, 0.8)
-    remedy = f"Did you mean {near[0]}?" if near else "clear-strategies --cfg job prints all of them."
-    return f"{key}: there is no such setting. {remedy}"
 
 
 def job(config: DictConfig) -> float | None:

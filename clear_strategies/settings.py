@@ -13,6 +13,7 @@ import functools
 import importlib
 import inspect
 import math
+import re
 import types
 import typing
 import warnings
@@ -129,10 +130,15 @@ def _called(node: Mapping[str, Any], key: str) -> Any:
 
 
 def _with_key(message: str, key: str, parameters: Mapping[str, Any]) -> str:
-    """The message with the key of the configuration in front, which is that of the field that the message begins with."""
+    """The message with the key of the configuration in front, which is that of the field that the message begins with, and
+    with the whole key of the field in its remedy.
+    """
     if not key or message.startswith((f"{key}.", f"{key}:")):
         return message
-    return f"{key}.{message}" if message.partition(" ")[0].rstrip(":") in parameters else f"{key}: {message}"
+    if (name := message.partition(" ")[0].rstrip(":")) not in parameters:
+        return f"{key}: {message}"
+    with_keys = re.sub(rf"(?<![\w.]){name}=", f"{key}.{name}=", message)
+    return f"{key}.{with_keys}"
 
 
 def _located(target: Any) -> Callable[..., Any]:

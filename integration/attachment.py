@@ -173,9 +173,9 @@ class Attachment:
         self.counts["HR renders in parts"] += 1
         if self.counts["HR renders in parts"] == 1:
             _log.info(
-                "The host draws %d times for one rendering, so that each gradient of HR takes a backward pass of its own; with "
-                "46,000 Gaussians a step takes 1.4 times as long. Draw what is only looked at under torch.no_grad(), and what "
-                "serves the loss of LR alone outside of the function that was wrapped.", n,
+                "The host calls its rasterizer %d times for one rendering, so each of the two HR gradients needs a backward "
+                "pass of its own: with 46,000 Gaussians a step takes 1.4 times as long. Call it under torch.no_grad() for "
+                "what is only looked at, and outside of the wrapped function for what only the LR loss needs.", n,
             )  # fmt: skip
 
     @property

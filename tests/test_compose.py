@@ -41,13 +41,14 @@ def test_names_and_overrides_are_those_of_the_command_line_and_milestones_stretc
     ("said", "named"),
     [
         (("nope",), "strategy=nope: there is no such option"),
-        (("gco", "strategies.gco.tau=1"), "strategies.gco.tau"),
+        (("gco", "strategies.gco.tau=1"), "strategies.gco.tau: there is no such setting"),
+        (("best", "strategies.gco.tolerence=1"), r"tolerence: there .* Did you mean strategies\.gco\.tolerance\?"),
         (("gco", "strategies.gco.tolerance=2"), "tolerance: must lie in"),
         (("gco,gco",), "gco twice"),
         (("gco,clear",), "gco twice"),
         (("gco,best",), "gco twice"),
         (("best,svs",), "svs twice"),
-        (("gco", "fit.iterations=3"), "fit"),
+        (("gco", "fit.iterations=3"), r"fit\.iterations: .* A conductor has settings of .*objective"),
         (("gco", "+readings=literal"), r"strategies.p2g: has settings .*\+strategy=p2g"),
     ],
 )

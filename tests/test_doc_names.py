@@ -6,6 +6,8 @@ import importlib
 import inspect
 import re
 import subprocess
+from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -14,7 +16,7 @@ from omegaconf import OmegaConf
 import clear_strategies
 from clear_strategies import Strategy
 from clear_strategies.compose import CONF, composed
-from tests.helpers.pages import DOCS, HOOKS, OURS, PAGES, ROOT, loaded, name
+from tests.helpers.pages import DOCS, GENERATE, OURS, PAGES, ROOT, loaded, name
 
 
 def test_the_public_api_lists_what_the_package_exports_and_tests_that_the_paper_page_names_exist():
@@ -32,10 +34,10 @@ def test_the_public_api_lists_what_the_package_exports_and_tests_that_the_paper_
 def test_what_a_page_names_exists(page):
     """Links, paths, `file:symbol`, and dotted names; a table of files has its folder in the heading."""
     text = page.read_text()
-    for target in re.findall(r"\]\(((?!http)[^)#]+)(?:#[^)]*)?\)", text):
-        path = (page.parent / target).resolve()
-        generated = path.is_relative_to(DOCS) and path.relative_to(DOCS).as_posix() in HOOKS.GENERATED
-        assert path.exists() or generated, target
+    for target, _, anchor in (link.partition("#") for link in re.findall(r"\]\(((?!https?:)[^)\s]+)\)", text)):
+        path = (page.parent / target).resolve() if target else page
+        assert path.exists(), target
+        assert not anchor or anchor in anchors(path), f"{target}#{anchor}"
     paths = re.findall(r"`((?:clear_strategies|rasterizers|integration|conf|tests|docs)/[\w./-]*)`", text)
     for folder, rows in re.findall(r"^\| file of `([^`]+)` \|.*\n\|[-|]+\|\n((?:\|.*\n)+)", text, re.MULTILINE):
         cells = [row.split("|")[1] for row in rows.splitlines()]
@@ -45,6 +47,20 @@ def test_what_a_page_names_exists(page):
     assert not [f"{file}:{symbol}" for file, symbol in stations if not holds(ROOT / file, symbol)]
     dotted = re.findall(rf"`((?:{'|'.join(OURS)})(?:\.\w+)+)", text)
     assert not [one for one in dict.fromkeys(dotted) if not exists(one)]
+
+
+@cache
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub makes them; those of the site are tested by `mkdocs build --strict`."""
+    prose = re.sub(r"^( *)```.*?^\1```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    found: Counter[str] = Counter()
+    listed = set()
+    for heading in re.findall(r"^#{1,6} +(.*)$", prose, re.MULTILINE):
+        words = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).strip().lower()
+        slug = re.sub(r"[^\w\- ]", "", words).replace(" ", "-")
+        listed.add(f"{slug}-{found[slug]}" if found[slug] else slug)
+        found[slug] += 1
+    return listed
 
 
 def holds(file: Path, symbol: str) -> bool:
@@ -117,15 +133,21 @@ def test_config_fields_that_pages_name_exist():
             assert described or select != "absent", f"{name(page)}: {field}"
 
 
-GROUPS = HOOKS.groups()
+GROUPS = GENERATE.groups()
 
 
 def test_the_configuration_page_describes_every_choice_and_every_setting():
-    assert HOOKS.undescribed(GROUPS) == []
-    page = HOOKS.page(GROUPS)
+    assert GENERATE.undescribed(GROUPS) == []
+    page = GENERATE.configuration(GROUPS)
     for path in CONF.rglob("*.yaml"):
         if not path.stem.startswith("_") and path.parent != CONF:
             assert f"| `{path.stem}` |" in page, path
+
+
+def test_the_pages_that_are_made_from_the_code_are_committed_as_they_are_made():
+    pytest.importorskip("griffe2md")
+    changed = [name(path) for path, made in GENERATE.pages().items() if path.read_text() != made]
+    assert not changed, "run python docs/generate.py"
 
 
 def test_the_table_of_hooks_shows_the_hooks_of_a_strategy():

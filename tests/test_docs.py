@@ -1,6 +1,7 @@
 """What the documentation says runs: its commands, its Python, its tutorials. tests/test_doc_names.py checks what it names."""
 
 import argparse
+import ast
 import fnmatch
 import importlib
 import importlib.util
@@ -12,6 +13,7 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
@@ -20,9 +22,10 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from PIL import Image
 
-from clear_strategies import Conductor
+from clear_strategies import Conductor, compose
 from clear_strategies.commands import train
 from clear_strategies.compose import CONF
+from clear_strategies.files import write_text
 from tests.helpers import command_line, documented
 from tests.helpers.configs import jobs_of, loader
 from tests.helpers.pages import DOCS, OURS, PAGES, ROOT, blocks, commands, loaded, name
@@ -38,7 +41,10 @@ PYTHON = [
     pytest.param(block, id=f"{name(page)}-{i}") for page in PAGES for i, block in enumerate(blocks(page, "python"))
 ]
 # Commands of other programs: nothing of them is checked, but that extras exist.
-FOREIGN = r"(python3? -m (venv|pip|build)|cibuildwheel|\.|pip install|for|done|wait|ns-train|mkdocs|pre-commit|cd) ?"
+FOREIGN = (
+    r"(python3? -m (venv|pip|build)|cibuildwheel|\.|pip install|for|done|wait|ns-train|mkdocs|pre-commit|cd"
+    r"|git clone|sed|eval) ?"
+)
 
 TAKEN: set[str] = set()  # words that chose a file for a job of a sweep, of any command
 READ_BY_ARGPARSE = ("render", "export", "view", "doctor")  # subcommands; the others read Hydra's words
@@ -115,12 +121,12 @@ def require_parsable(module: str, arguments: list[str], monkeypatch: pytest.Monk
 def run_block(tmp_path, monkeypatch):
     """Runs a Python block as a program of its own, in an empty folder."""
 
-    def run(block: str) -> None:
+    def run(block: str) -> ModuleType:
         (tmp_path / "documented.py").write_text(block)
         monkeypatch.chdir(tmp_path)
         monkeypatch.syspath_prepend(tmp_path)
         monkeypatch.delitem(sys.modules, "documented", raising=False)
-        importlib.import_module("documented")
+        return importlib.import_module("documented")
 
     return run
 
@@ -132,11 +138,39 @@ def test_python_blocks_run(block, run_block):
 
 
 @pytest.mark.slow
-def test_the_notebook_runs(run_block):
+def test_the_notebook_runs_and_has_saved_what_it_shows(run_block):
+    """`python docs/figures.py notebook` saves it anew."""
     cells = json.loads((DOCS / "tutorial" / "notebook.ipynb").read_text())["cells"]
-    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
-    assert all(cell["outputs"] for cell in cells if cell["cell_type"] == "code")  # python docs/figures.py notebook
-    run_block("\n".join(code).replace("fit.iterations=300", "fit.iterations=30"))
+    code = {"".join(cell["source"]): cell["outputs"] for cell in cells if cell["cell_type"] == "code"}
+    run = run_block("\n".join(code)).run
+    scores, shapes = (
+        ast.literal_eval("".join(outputs[0]["data"]["text/plain"]))
+        for source, outputs in code.items()
+        if source.startswith(("run.metrics", "{name: "))
+    )
+    found = run.metrics["test"]["mean"]["ours"]
+    assert found.pop("psnr") == pytest.approx(scores.pop("psnr"), abs=0.15)  # processors round differently
+    assert found == pytest.approx(scores, abs=0.01)
+    assert {name: rows.shape[1:] for name, rows in run.splats.items()} == {name: n[1:] for name, n in shapes.items()}
+    assert len(run.splats["means"]) == pytest.approx(shapes["means"][0], rel=0.05)
+
+
+def test_the_guides_reader_reads_a_folder_and_is_chosen_for_it(tmp_path, monkeypatch):
+    (block,) = blocks(DOCS / "how-to" / "own-reader.md", "python")
+    (tmp_path / "your_package.py").write_text(block)
+    (option,) = blocks(DOCS / "how-to" / "own-reader.md", "yaml")
+    write_text(tmp_path / "conf" / "data" / "mine.yaml", option)
+    monkeypatch.setattr(compose, "CONF", tmp_path / "conf")
+    monkeypatch.syspath_prepend(tmp_path)
+    for i in range(3):
+        Image.new("RGB", (24, 16), (80 * i, 0, 0)).save(tmp_path / f"{i}.png")
+    rows = "".join(f"{i}.png,24,16,30,30,{i},0,-2\n" for i in range(3))
+    (tmp_path / "poses.csv").write_text(f"file,width,height,fx,fy,x,y,z\n{rows}")
+    assert train.detect(tmp_path) == "mine"
+    capture = importlib.import_module("your_package").read(tmp_path)
+    assert [frame.name for frame in capture.frames] == ["0.png", "1.png", "2.png"]
+    assert capture.frames[2].camera.center.tolist() == [2, 0, -2]
+    assert capture.frames[2].load()[0, 0].tolist() == pytest.approx([160 / 255, 0, 0])
 
 
 @pytest.mark.slow
@@ -156,6 +190,10 @@ def test_the_readmes_diff_stands_in_the_example():
     for there, here in (renamed | {"rasterization = attached": ""}).items():
         marked = marked.replace(there, here)
     assert marked == added
+    (gco,) = blocks(ROOT / "README.md", "python")
+    assert len([line for line in gco.splitlines() if line.strip()]) <= 10
+    assert len(blocks(ROOT / "README.md", "bash")) == 2  # the commands of the gate
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 150
 
 
 # Commands of the README and the guides that no test runs, and why; `test_commands_are_understood` reads all of them.
@@ -163,7 +201,7 @@ NOT_RUN = {
     "the reader's scenes": r"FOLDER|scenes/|multirun/",
     "another trainer": r"-m integration\.(gsplat|inria) |^ns-train",
     "installation, the gate": r"^(python3? -m (venv|build|pytest)|cibuildwheel|pip install)\b",
-    "other programs": r"^(for|done|wait)\b",
+    "other programs": r"^(for|done|wait|sed|eval)\b",
     "an environment": r"^\. ",
     "waits for a browser": r"^clear-strategies view",
     "takes minutes, or a file that the viewer saves": r"--frames 240|flight\.json",

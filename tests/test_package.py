@@ -2,11 +2,13 @@
 
 import ast
 import importlib
+import os
+import shutil
 import subprocess
 import sys
 import tomllib
 from dataclasses import replace
-from importlib import import_module
+from importlib import import_module, metadata
 from pathlib import Path
 
 import pytest
@@ -41,6 +43,19 @@ def test_a_name_is_that_of_its_module(name):
     assert name in dir(clear_strategies)
 
 
+@pytest.mark.slow
+def test_mypy_checks_a_users_file_against_the_packages_as_they_are_installed(tmp_path: Path) -> None:
+    """They stand among other people's packages, of whose types mypy takes those alone that have a `py.typed`."""
+    for package in ("clear_strategies", "rasterizers", "integration"):
+        (tmp_path / "site" / package).parent.mkdir(exist_ok=True)
+        (tmp_path / "site" / package).symlink_to(ROOT / package)
+    shutil.copy(ROOT / "tests" / "helpers" / "users_file.py", tmp_path / "mine.py")
+    command = [sys.executable, "-m", "mypy", "--strict", "mine.py"]
+    environment = os.environ | {"PYTHONPATH": str(tmp_path / "site")}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 # ---- training from Python: what `train` returns
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> cs.Run:
@@ -70,7 +85,7 @@ def test_a_run_has_its_numbers_and_its_gaussians_by_gsplats_names_and_renders_fr
 def test_a_folder_without_a_finished_run_and_a_wrong_setting_are_told(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no run has finished here"):
         cs.Run(tmp_path)
-    with pytest.raises(SettingError, match="iteration"):
+    with pytest.raises(SettingError, match=r"fit\.iteration: .* Did you mean fit\.iterations\?"):
         cs.train(None, "fit.iteration=3", folder=tmp_path / "run")
     with pytest.raises(SettingError, match=r"data\.save_lr: must be null, since .* on the command line"):
         cs.train(None, f"data.save_lr={tmp_path / 'lr'}", folder=tmp_path / "run")
@@ -131,6 +146,12 @@ HEAVY = {
 }
 HOSTS = [f"integration.{host}" for host in ("gsplat", "inria", "nerfstudio")]
 MODULES = ["clear_strategies", "rasterizers", "integration", *HOSTS, "clear_strategies.geometry"]
+
+
+def test_the_version_is_that_of_the_installed_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert clear_strategies.__version__ == metadata.version("clear-strategies")
+    monkeypatch.setattr(metadata, "version", lambda name: metadata.distribution(f"no-{name}").version)
+    assert clear_strategies.__version__ == "source checkout"
 
 
 def test_importing_is_light_and_of_the_package_alone_imports_no_torch():

@@ -88,7 +88,7 @@ REFUSED = {
     "inner.size: must be a whole number, got 2.0": {"share": 1, "inner": target(Inner, size=2.0)},
     "inner.mode: must be a or b, got 'c'": {"share": 1, "inner": target(Inner, mode="c")},
     "inner.size must be at least 1, got 0.": {"share": 1, "inner": target(Inner, size=0)},
-    "inner.size: must not be 8, got 8: size=7": {"share": 1, "inner": target(Inner, size=8)},
+    "inner.size: must not be 8, got 8: it.inner.size=7": {"share": 1, "inner": target(Inner, size=8)},
     "inner: it is too large.": {"share": 1, "inner": target(Inner, size=10)},
     "inner: nowhere.Mine cannot be imported": {"share": 1, "inner": {TARGET: "nowhere.Mine"}},
     "inner: builtins.nothing cannot be imported": {"share": 1, "inner": {TARGET: "builtins.nothing"}},

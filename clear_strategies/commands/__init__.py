@@ -20,6 +20,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Final, NoReturn
 
+import clear_strategies
 from clear_strategies.errors import SettingError
 from clear_strategies.files import expanded
 
@@ -45,6 +46,8 @@ def named(arguments: Sequence[str]) -> Callable[[], None] | None:
     name = arguments[0] if arguments else "help"
     if name in ("help", "--help", "-h"):
         return _help
+    if "--version" in arguments:
+        return lambda: print(f"clear-strategies {clear_strategies.__version__}")  # noqa: T201
     if name in NAMES:
         return lambda: import_module(f"{__name__}.{name}").main(list(arguments[1:]))
     if is_of_hydra(name) or "=" in name:

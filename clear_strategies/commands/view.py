@@ -37,8 +37,8 @@ def main(arguments: Sequence[str]) -> None:
     from clear_strategies.viewing.server import SplatViewer
 
     viewer = SplatViewer(
-        splat.painter, [saved.camera for saved in splat.cameras], title=splat.name, port=options.port, host=options.host,
-        out=splat.folder / "rendered",
+        splat.painter, {saved.name: saved.camera for saved in splat.cameras}, title=splat.name, photo=splat.photo,
+        port=options.port, host=options.host, out=splat.folder / "rendered",
     )  # fmt: skip
     _log.info("%s (Ctrl-C ends it)", viewer.address)
     if not options.no_browser:

@@ -289,7 +289,11 @@ def scene_notes(
         **exposure,
         **_back_projection(train, views.downsample),
         **({} if network is None else {"SR network": f"{fingerprint(network)} (SHA-256)"}),
-        **({"the SR images add": f"{_added_detail(train):.1f} grey levels to bicubic, on average"} if sr else {}),
+        **(
+            {"the SR images add": f"{_added_detail(train):.1f} grey levels to bicubic interpolation, on average"}
+            if sr
+            else {}
+        ),
         "initial points": f"{len(points):,}: {points.source}",
         "points use test views": points.uses_test_views,
     }
@@ -332,8 +336,8 @@ def _added_detail(views: Sequence[View]) -> float:
     added = _grey_levels((v.hr.image - images.upsample(v.lr.image, v.factor)).abs() for v in views)
     if added < _ROUNDING:
         _log.warning(
-            "the SR images add %.2f grey levels to bicubic: HR still constrains the field between LR pixels, but there "
-            "is no detail to route, and no strategy can find any.", added,
+            "the SR images differ from bicubic interpolation by %.2f grey levels only. They hold hardly any detail, so the "
+            "strategies can add none.", added,
         )  # fmt: skip
     return added
 

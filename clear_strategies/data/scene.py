@@ -70,7 +70,9 @@ def require_shown(views: Sequence[View]) -> None:
         remedy = "a mask is 0 where it hides, and alpha where it is transparent: invert them, or train without them"
         raise DataError(empty[0], "masks or alpha", problem, remedy)
     if empty:
-        _log.warning("%d of %d photos teach nothing, since %s: %s.", len(empty), len(views), why, some(empty))
+        _log.warning(
+            "%d of %d photos are not used in training, since %s: %s.", len(empty), len(views), why, some(empty)
+        )
     masked = [float(view.lr.shown.float().mean()) for view in views if view.lr.shown is not None]
     if masked and sum(masked) < _LITTLE * len(masked):
         message = "masks hide %.0f%% of their %d photos. A mask is 0 where it hides: are they upside down?"

@@ -207,8 +207,8 @@ class Density(Densifier):
         room = max(0, s.max_gaussians - len(score))
         if wanted > room and not self._warned_of_cap:
             _log.warning(
-                "the cap of %d Gaussians binds: %d want to densify, %d may. Raise density.max_gaussians, or "
-                "density.threshold.", s.max_gaussians, wanted, room,
+                "the limit of %d Gaussians is reached: %d are to be cloned or split, and there is room for %d. "
+                "Raise density.max_gaussians, or density.threshold.", s.max_gaussians, wanted, room,
             )  # fmt: skip
             self._warned_of_cap = True
         return topk_mask(score, min(wanted, room))

@@ -85,17 +85,22 @@ class MCMC(Strategy):
     def densifier(self, field: GaussianField, views: Sequence[View], seed: int) -> Sampler | None:
         """The sampler; None, and a message with the reason, where sampling would be of no use."""
         if self.stop < _SHORT_RUN:
-            reason = f"until t={self.stop} there is less time than sampling needs ({_SHORT_RUN})"
+            reason = (
+                f"it needs {2 * _SHORT_RUN:,} iterations or more, {_SHORT_RUN} of them for sampling, and in this run sampling "
+                f"stops at iteration {self.stop}"
+            )
         elif cut_out((view.lr for view in views), views[0].background):
-            reason = "the photos show an object before a plain background, so few Gaussians are held by no photo"
+            reason = (
+                "the photos show an object before a plain background, where few Gaussians are invisible in all photos"
+            )
         elif (spacing := _spacing(field, [view.lr.camera for view in views])) > _DENSE:
             reason = (
-                f"the initial points lie {spacing:.1f} LR px apart, more than {_DENSE:g}. Dense ones come from stereo "
-                "(data.cloud.init=stereo)"
+                f"the initial points lie {spacing:.1f} LR pixels apart, more than {_DENSE:g}. data.cloud.init=stereo makes "
+                "denser ones"
             )
         else:
             return Sampler(self, len(field), seed=seed)
-        _log.info("MCMC has no effect: %s.", reason)
+        _log.info("mcmc is off: %s.", reason)
         return None
 
 

@@ -18,6 +18,7 @@ from omegaconf import DictConfig
 
 from clear_strategies import files
 from clear_strategies.compose import tree
+from clear_strategies.core.images import to_bytes
 from clear_strategies.data.prepare import save_lr
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DataError
@@ -168,7 +169,11 @@ class _Job:
             return nullcontext()
         from clear_strategies.viewing.server import watched
 
-        return watched(painter, [view.hr.camera for view in scene.train], f"{scene.name} · {self.chosen.title}")
+        photos = {view.name: view.lr.image for view in scene.train}
+        return watched(
+            painter, {view.name: view.hr.camera for view in scene.train}, f"{scene.name} · {self.chosen.title}",
+            lambda name: to_bytes(photos[name]),
+        )  # fmt: skip
 
     def _train(
         self, scene: Scene, there: Scene, state: TrainState, drawing: device.ReadyRasterizer

@@ -10,12 +10,15 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from clear_strategies.compose import options
 from clear_strategies.core.gradients import PARAMETERS
+from clear_strategies.core.images import to_bytes
+from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.ply import read_gaussians
+from clear_strategies.data.view_names import file_stem
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.jobs import device
 from clear_strategies.jobs.device import ReadyRasterizer
@@ -57,6 +60,15 @@ class SavedSplat:
     painter: Painter
     cameras: Sequence[SavedCamera]
     antialiased: bool
+
+    def photo(self, name: str) -> UInt8[np.ndarray, "h w 3"] | None:
+        """The LR photo of a camera, which the run has saved; None where there is none."""
+        path = self.folder / "views" / f"{file_stem(name)}_lr.png"
+        try:
+            return to_bytes(read_image(path)) if path.is_file() else None
+        except DataError as error:
+            _log.warning("%s", error)
+            return None
 
     def poses(self) -> list[Camera]:
         """The training cameras, or, where none are known, one that sees the whole splat."""

@@ -71,7 +71,9 @@ class SkipPolicy:
         """
         s, phrases = self.skips, []
         if s.coarse_until > 0 and not any(map(_halves, views)):
-            _log.warning("skips.coarse_until has no effect: SR images are halved where data.views.sr_scale is even.")
+            _log.warning(
+                "skips.coarse_until has no effect: SR images are halved only where data.views.sr_scale is even."
+            )
         elif s.coarse_until > 0:
             phrases.append(f"HR at half its size until iteration {s.coarse_until}")
         if s.hr_every > 1 and s.coarse_until > 0:
@@ -80,11 +82,12 @@ class SkipPolicy:
             return phrases
         if s.plateau_window == 0:
             _log.warning(
-                "skips.plateau_gain has no effect: plateau_window is less than an iteration of so short a run."
+                "skips.plateau_gain has no effect: in this short run plateau_window is less than one iteration."
             )
         else:
             phrases.append(
-                f"the iterations until {s.plateau_to} once {s.plateau_window} iterations gain less than {s.plateau_gain:.1%}"
+                f"all iterations up to {s.plateau_to}, once the loss of the training views falls by less than "
+                f"{s.plateau_gain:.1%} in {s.plateau_window} iterations"
             )
         return phrases
 

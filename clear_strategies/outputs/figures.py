@@ -1,7 +1,7 @@
 """Pictures by matplotlib, which need no display: curves over the iterations, and sheets of images.
 
-On a sheet images are laid out in whole pixels: a render is shown pixel for pixel, a small one at a whole multiple, because a
-resized image does not show the detail that this library is about.
+On a sheet images are laid out in whole pixels: a small image is shown at a whole multiple, and of a large one, which is reduced,
+a part is shown pixel for pixel, because a resized image does not show the detail that this library is about.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -51,7 +51,9 @@ _STYLES: Final = [{"color": color, "linestyle": dash} for dash, color in product
 ERROR_MAX: Final = 0.25  # the colours of an error map end here
 _GAP: Final = 8  # px
 _LINE: Final = 16  # height of a line of small print, px
-_NARROW, _WIDE = 240, 640  # the least and the greatest width at which an image is shown, px
+_NARROW, _WIDE, _TALL = 240, 512, 384  # the least and the greatest width and the greatest height of a shown image, px
+_ENLARGED: Final = 4  # how many times larger than its image a part is shown, if the image is not reduced
+_SCREEN: Final = 1600  # px: letters of a larger sheet are larger, because screens show it reduced
 
 
 def spaced(items: Sequence[Item], count: int) -> Sequence[Item]:
@@ -93,6 +95,10 @@ def write_curves(path: Path, histories: Mapping[str, pd.DataFrame], title: str) 
             y = points[column]
             if smooth:  # over a 50th of the rows
                 y = y.rolling(max(1, len(y) // 50)).mean()
+            for reset in (
+                history.reindex(columns=["t", "opacities_reset"]).dropna()["t"] if over == "t" and len(y) else ()
+            ):
+                known["opacities are reset"] = axis.axvline(reset, color=FAINT, linewidth=1, linestyle=":", zorder=0)
             if len(y):
                 marker = "o" if column == "psnr_test" else None
                 style = {"linewidth": 1.4, "marker": marker, "markersize": 3.5, **_STYLES[i % len(_STYLES)]}
@@ -129,20 +135,40 @@ class SheetRow:
     """Images by their column, RGB [H, W, 3] or an error [H, W], and the line below each.
 
     Args:
-        name: of the row. frame: the window [rows, columns] that is outlined in each image.
+        name: of the row.
+        compared: the columns by which a part of the images is chosen, the one where these differ most; it is outlined, and shown
+            below. Empty: none is.
     """
 
     name: str
     images: Mapping[str, np.ndarray]
     captions: Mapping[str, str] = field(default_factory=dict)
-    frame: tuple[slice, slice] | None = None
+    compared: Collection[str] = ()
 
 
-def magnification(width: int) -> float:
-    """How many times larger an image of this width is shown: a whole number, so that pixels stay squares, or less than 1
-    for an image that is too wide.
+def magnification(height: int, width: int) -> float:
+    """How many times larger an image is shown: a whole number, so that pixels stay squares, or less than 1 for one that is
+    too large.
     """
-    return math.ceil(_NARROW / width) if width <= _WIDE else _WIDE / width
+    if height > _TALL or width > _WIDE:
+        return min(_WIDE / width, _TALL / height)
+    return max(1, min(math.ceil(_NARROW / width), _TALL // height))
+
+
+def window(images: Sequence[np.ndarray]) -> tuple[slice, slice]:
+    """The part [rows, columns] of RGB images [H, W, 3] where they differ most, the central one where all are equal. Of images
+    that a sheet reduces it is as large as they are shown, and square at most where they are upright.
+    """
+    deviation = np.stack(list(images)).std(axis=0).mean(axis=-1)
+    times = magnification(*deviation.shape)
+    h, w = (max(1, round(size * times) if times < 1 else size // _ENLARGED) for size in deviation.shape)
+    h = min(h, w) if times < 1 else h
+    tops, lefts = (
+        range(0, size - part + 1, max(1, part // 4)) for size, part in zip(deviation.shape, (h, w), strict=True)
+    )
+    windows = [(slice(top, top + h), slice(left, left + w)) for top in tops for left in lefts]
+    middle = windows[len(windows) // 2]
+    return max(windows, key=lambda window: float(deviation[window].sum())) if deviation.any() else middle
 
 
 def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: str = "") -> None:
@@ -154,43 +180,51 @@ def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: 
 
     columns = list(dict.fromkeys(column for row in rows for column in row.images))
     shapes = [image.shape for row in rows for image in row.images.values()]
-    times = magnification(max(shape[1] for shape in shapes))
+    times = magnification(*(max(shape[axis] for shape in shapes) for axis in (0, 1)))
     cell_h, cell_w = (round(times * max(shape[axis] for shape in shapes)) for axis in (0, 1))
-    heads = [textwrap.wrap(column, cell_w // 7) or [""] for column in columns]
-    left, top, row_h = 2 * _LINE, (4 + max(map(len, heads))) * _LINE, cell_h + 2 * _LINE + _GAP
+    parts = [window([row.images[name] for name in row.compared]) if row.compared else None for row in rows]
+    zoom = 1 if times < 1 else int(times) * _ENLARGED
+    part_h = [0 if part is None else zoom * (part[0].stop - part[0].start) + _GAP for part in parts]
+    larger = max(1.0, max(len(columns) * cell_w, len(rows) * cell_h + sum(part_h)) / _SCREEN)
+    line = round(_LINE * larger)
+    heads = [textwrap.wrap(column, round(cell_w / 7 / larger)) or [""] for column in columns]
+    left, top = 2 * line, (4 + max(map(len, heads))) * line
+    tops = [top + j * (cell_h + 2 * line + _GAP) + sum(part_h[:j]) for j in range(len(rows) + 1)]
     right, with_bar = left + len(columns) * (cell_w + _GAP), any(len(shape) == 2 for shape in shapes)
-    width, height = right + 5 * _LINE * with_bar, top + len(rows) * row_h + _LINE
+    width, height = right + 5 * line * with_bar, tops[-1] + line
     figure, error = Figure(figsize=(width / DPI, height / DPI), dpi=DPI), None
 
-    def text(x: float, y: float, words: str, **style: Any) -> None:
-        style = {"fontsize": 8.5, "ha": "center", "va": "center", "color": INK, **AS_WRITTEN, **style}
+    def text(x: float, y: float, words: str, size: float = 8.5, **style: Any) -> None:
+        style = {"fontsize": size * larger, "ha": "center", "va": "center", "color": INK, **AS_WRITTEN, **style}
         figure.text(x / width, 1 - y / height, words, **style)
 
     def box(x: float, y: float, w: float, h: float) -> tuple[float, float, float, float]:
         return x / width, 1 - (y + h) / height, w / width, h / height
 
-    text(_GAP, 1.5 * _LINE, title, fontsize=12, ha="left")
+    def image(shown: np.ndarray, x: int, y: int) -> Any:
+        return figure.figimage(shown, x, height - y - len(shown), cmap="magma", vmin=0, vmax=ERROR_MAX)
+
+    text(_GAP, 1.5 * line, title, 12, ha="left")
     for i, lines in enumerate(heads):
         x = left + i * (cell_w + _GAP)
-        text(x + cell_w / 2, top - _LINE / 2, "\n".join(lines), fontsize=10, va="bottom")
-        for j, row in enumerate(rows):
-            y, pixels = top + j * row_h, row.images.get(columns[i])
-            if pixels is not None:
-                shown = _resized(pixels, times)
-                drawn = figure.figimage(shown, x, height - y - len(shown), cmap="magma", vmin=0, vmax=ERROR_MAX)
+        text(x + cell_w / 2, top - line / 2, "\n".join(lines), 10, va="bottom")
+        for y, row, part, below in zip(tops, rows, parts, part_h, strict=False):
+            if (pixels := row.images.get(columns[i])) is not None:
+                drawn = image(_resized(pixels, times), x, y)
                 error = drawn if pixels.ndim == 2 else error
-                if row.frame is not None:
-                    down, across = (slice(times * s.start, times * s.stop) for s in row.frame)
+                if part is not None:
+                    image(_resized(pixels[part], zoom), x, y + cell_h + _GAP)
+                    down, across = (slice(times * s.start, times * s.stop) for s in part)
                     place = box(x + across.start, y + down.start, across.stop - across.start, down.stop - down.start)
                     figure.add_artist(Rectangle(place[:2], *place[2:], fill=False, color="white", linewidth=1))
-            text(x + cell_w / 2, y + cell_h + _LINE, row.captions.get(columns[i], ""))
-    for j, row in enumerate(rows):
-        text(_LINE, top + j * row_h + cell_h / 2, row.name, rotation=90, color=FAINT)
-    text(left, height - _LINE, note, ha="left", color=FAINT)
+            text(x + cell_w / 2, y + cell_h + below + line, row.captions.get(columns[i], ""))
+    for y, row in zip(tops, rows, strict=False):
+        text(line, y + cell_h / 2, row.name, rotation=90, color=FAINT)
+    text(left, height - line, note, ha="left", color=FAINT)
     if error is not None:
         bar = figure.colorbar(error, cax=figure.add_axes(box(right, top, 12, cell_h)), extend="max", extendfrac=0.03)
-        bar.set_label("mean |difference| over RGB", fontsize=8, color=INK)
-        bar.ax.tick_params(labelsize=8, colors=INK)
+        bar.set_label("mean |difference| over RGB", fontsize=8 * larger, color=INK)
+        bar.ax.tick_params(labelsize=8 * larger, colors=INK)
         bar.outline.set_visible(False)
     save_png(figure, path)
 

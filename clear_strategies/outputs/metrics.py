@@ -43,13 +43,13 @@ from rasterizers.interface import Camera
 _log = logging.getLogger(__name__)
 
 NOTE: Final = (
-    "bicubic and prior are made from the view's own LR photo, which a run never sees of a test view: they show what "
-    "that photo allows, not what view synthesis can reach"
+    "bicubic and prior enlarge the LR photo of the view itself, which a run never sees of a test view: they show what "
+    "this photo holds, not what can be learned from the other photos"
 )
 
 _LEGEND: Final = (
-    "  PSNR, SSIM: more is better; GMSD, the error of edges: less; blur, above 0 softer than the photo and below it harder: "
-    "closer to 0."
+    "  Higher PSNR and SSIM are better, and lower GMSD, the error of edges. blur is above 0 where the picture is softer than "
+    "the photo, and below 0 where it is harder."
 )
 
 MOST_TRAIN: Final = 50  # training views that are scored; of more, those spaced evenly

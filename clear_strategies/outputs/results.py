@@ -145,8 +145,8 @@ def remove_earlier(folder: Path, *, all_files: bool) -> None:
     stems: set[str] = set()
     with suppress(DataError):  # damaged, or of another program
         content = metrics.read(path, "")
-        stems |= {*file_stems(name for part in (content.test, content.train) for name in part.views).values()}
-        stems |= {*file_stems(saved.name for saved in cameras.read_cameras(folder / cameras.FILE)).values()}
+        stems = {file_stem(name) for part in (content.test, content.train) for name in part.views}
+        stems |= {file_stem(saved.name) for saved in cameras.read_cameras(folder / cameras.FILE)}
     path.unlink()
     if not (all_files and stems):
         return
@@ -172,8 +172,10 @@ def _write_sheet(folder: Path, scene: Scene, stems: Mapping[str, str], evaluatio
     """Of a few views the LR photo, the SR image and the render, and where the truth is known, the truth and the error."""
     rows, part = [], evaluation.test or evaluation.train
     rendered = [view for view in (*scene.test, *scene.train) if view.name in evaluation.renders]
+    for view in (*scene.train, *scene.test):  # the viewer shows them beside the rendering
+        write_png(folder / "views" / f"{file_stem(view.name)}_lr.png", view.lr.image)
     for view in spaced(rendered, _SHEET_VIEWS):
-        for kind, shown in {"lr": view.lr.image, "prior": view.hr.image, "truth": view.truth}.items():
+        for kind, shown in {"prior": view.hr.image, "truth": view.truth}.items():
             if shown is not None:
                 write_png(folder / "views" / f"{stems[view.name]}_{kind}.png", shown)
         columns: dict[str, Tensor] = {}
@@ -185,7 +187,10 @@ def _write_sheet(folder: Path, scene: Scene, stems: Mapping[str, str], evaluatio
             columns["ground truth"] = view.truth
             columns["error of ours"] = (columns["ours"] - view.truth).abs().mean(-1)
         captions = {"ours": f"{score.psnr:.2f} dB, SSIM {score.ssim:.3f}"}
-        rows.append(SheetRow(view.name, {name: image.numpy() for name, image in columns.items()}, captions))
+        pixels = {name: image.numpy() for name, image in columns.items()}
+        pictures = [name for name, image in pixels.items() if image.ndim == 3]
+        given = [name for name in pictures if name != "ours"]  # these differ most where there is most detail
+        rows.append(SheetRow(view.name, pixels, captions, given if len(given) > 1 else pictures))
     note = _TRAINED_ON if not scene.test else "" if scene.test[0].hr_is_photo else _OWN_PHOTO
     write_contact_sheet(folder / "contact_sheet.png", rows, title, note)
 

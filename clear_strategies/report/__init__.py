@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from markupsafe import Markup, escape
 
 from clear_strategies import console, files
 from clear_strategies.commands import path_of
@@ -34,7 +35,6 @@ __all__ = ["FinishedRun", "collect", "compare", "layout", "main", "markdown", "n
 _log = logging.getLogger(__name__)
 
 _LONGEST: Final = 60  # characters of a scene in the name of a file
-_ENLARGED: Final = 4  # how many times larger the part of a comparison is shown
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -87,9 +87,17 @@ def _write_page(path: Path, sections: Sequence[Mapping[str, Any]]) -> None:
     from jinja2 import Environment, FileSystemLoader
 
     environment = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True)
+    environment.filters["in_code"] = _in_code
     scenes = [section["title"] for section in sections if "pictures" in section]
     title = f"Report: {', '.join(scenes) if len(scenes) < 4 else f'{len(scenes)} scenes'}"
     files.write_text(path, environment.get_template("page.html.j2").render(title=title, sections=sections))
+
+
+def _in_code(note: str) -> Markup:
+    """A note of the Markdown table as HTML: what stands between backticks is code."""
+    return Markup("").join(
+        Markup("<code>{}</code>").format(part) if i % 2 else escape(part) for i, part in enumerate(note.split("`"))
+    )
 
 
 def _file_names(scenes: Iterable[str]) -> dict[str, str]:
@@ -128,22 +136,5 @@ def _compare_renders(path: Path, scene: str, runs: Mapping[str, FinishedRun]) ->
         _log.warning("%s: the runs rendered at different sizes, so there is no comparison image.", scene)
         return False
     captions = {method: f"mean of its views: {run.numbers['psnr']:.2f} dB" for method, run in runs.items()}
-    write_contact_sheet(path, _whole_and_part(tiles, truth, captions), f"{scene} · {Path(view).stem}")
+    write_contact_sheet(path, [SheetRow("", {**tiles, **truth}, captions, tiles)], f"{scene} · {Path(view).stem}")
     return True
-
-
-def _whole_and_part(
-    tiles: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], captions: Mapping[str, str]
-) -> list[SheetRow]:
-    """The images, and below each the window where the tiles differ most, enlarged; the central one where all are equal."""
-    deviation = np.stack(list(tiles.values())).std(axis=0).mean(axis=-1)
-    h, w = (max(1, size // _ENLARGED) for size in deviation.shape)
-    tops, lefts = (
-        range(0, size - part + 1, max(1, part // 4)) for size, part in zip(deviation.shape, (h, w), strict=True)
-    )
-    windows = [(slice(top, top + h), slice(left, left + w)) for top in tops for left in lefts]
-    middle = windows[len(windows) // 2]
-    window = max(windows, key=lambda window: float(deviation[window].sum())) if deviation.any() else middle
-    whole = {**tiles, **truth}
-    part = {name: tile[window].repeat(_ENLARGED, 0).repeat(_ENLARGED, 1) for name, tile in whole.items()}
-    return [SheetRow("", whole, frame=window), SheetRow("", part, captions)]

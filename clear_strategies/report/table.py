@@ -56,7 +56,7 @@ def layout(table: pd.DataFrame) -> pd.DataFrame:
             delta = _numbers(table["psnr_delta"], table["psnr_delta_error"], "+.2f")
             cells["Δ"] = delta if several else [""] * len(table)
             cells["best"] = _numbers(table["psnr_best"], None, form)
-    cells["seeds"] = list(table["seeds"])
+    cells["seed"] = list(table["seeds"])
     return pd.DataFrame({name: column for name, column in cells.items() if any(column)})
 
 

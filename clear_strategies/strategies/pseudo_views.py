@@ -83,8 +83,7 @@ class PseudoViews(Strategy):
         background = views[0].background
         if cut_out(photos.values(), background):
             _log.info(
-                "no pseudo views are made: the photos show an object before a plain background, and where a photo shows "
-                "the background nothing can hide."
+                "pseudo_views is off: the photos show an object before a plain background, where pseudo views lower the PSNR."
             )
             return
         aside, borders = self._moved_aside(views, photos), []

@@ -172,6 +172,7 @@ def _row(s: TrainState) -> dict[str, Number]:
         "lambda_hr": s.conductor.objective.lambda_hr(s.t),
         "n_gaussians": float(len(s.field)),
         "detail_abs": deferred.scalar(s.field.detail.data.abs().mean()),
+        **({"opacities_reset": 1.0} if s.reset_due(s.t) else {}),  # the curves mark it, as PSNR falls then
     }
 
 

@@ -115,12 +115,14 @@ class TrainState:
         if not self.conductor.skips.settled(self.history, done):
             return
         s = self.conductor.skips.skips
-        reason = f"the training views' loss fell by less than {s.plateau_gain:.1%} in {s.plateau_window} iterations"
+        reason = (
+            f"the loss of the training views fell by less than {s.plateau_gain:.1%} in {s.plateau_window} iterations"
+        )
         self.t = min(s.plateau_to, self.settings.iterations) + 1
         left_out = self.t - done - 1
         self.optimizer.steps += left_out  # the learning rates follow the iteration
         self.conductor.work_log.skip("iterations", reason, left_out)
-        _log.info("t=%d: %s; training goes on at t=%d.", done, reason, self.t)
+        _log.info("no progress: skipping from iteration %d to %d, since %s.", done, self.t, reason)
 
     def refilter(self) -> None:
         cameras = [(v.hr if self.mip.cameras == "hr" else v.lr).camera for v in self.views]

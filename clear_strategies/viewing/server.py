@@ -17,7 +17,7 @@ import threading
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
 from weakref import WeakKeyDictionary
@@ -27,7 +27,7 @@ import numpy as np
 import torch
 import viser
 from jaxtyping import Float
-from nerfview._renderer import InterruptRenderException, Renderer
+from torch import Tensor
 
 from clear_strategies.core.images import to_bytes
 from clear_strategies.errors import one_line
@@ -45,40 +45,41 @@ _FOV: Final = (1e-3, 3.1)  # radians
 _ASPECT: Final = (1 / 25, 25.0)  # width by height: beyond, nerfview asks for pictures without pixels
 _FARTHEST: Final = 1e9  # world units, of a camera from the origin
 _PATIENCE: Final = 0.02  # seconds between looks at the button while the run is paused
-_PICTURE: Final = 30.0  # seconds that the last picture may take once the viewer closes
+_NONE: Final = np.zeros((1, 1, 3), np.uint8)
+_PHOTO: Final = 300  # px, the width of the panel: an LR photo has less
 _TURN: Final = 0.002  # seconds that the lock is free after an iteration, so that a thread that waits for it gets it
 
 
-class _Sizes(nerfview.RenderTabState):  # type: ignore[misc]
-    """nerfview's state of the panel, with sizes that can be drawn: a slider's range binds the page alone."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        least, most = _SIZES.get(name, (None, None))
-        super().__setattr__(name, value if least is None or most is None else min(max(value, least), most))
+Photos = Callable[[str], Pixels | None]
 
 
 class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no types
-    """nerfview's viewer of what a painter draws, and of its depth.
+    """nerfview's viewer of what a painter draws, and of its depth; a choice of cameras moves it to one, and shows its photo.
 
     Args:
-        cameras: of the run; the first is where it begins.
+        cameras: of the run, by name; the first is where it begins.
+        photo: the photo of a camera by its name; None where there is none.
         mode: "training": with its progress, and buttons that pause and resume it. nerfview draws while it holds `lock`.
     """
 
     def __init__(
-        self, painter: Painter, cameras: Sequence[Camera], *, title: str, port: int = 8080, host: str = "127.0.0.1",
-        out: Path | None = None, mode: Literal["rendering", "training"] = "rendering",
+        self, painter: Painter, cameras: Mapping[str, Camera], *, title: str, photo: Photos = lambda _: None,
+        port: int = 8080, host: str = "127.0.0.1", out: Path | None = None,
+        mode: Literal["rendering", "training"] = "rendering",
     ) -> None:  # fmt: skip
-        self._painter, self._told = painter, set[tuple[str, int]]()
-        self._drawable = WeakKeyDictionary[Any, Any]()  # the last camera of each browser
+        self._painter, self._cameras, self._photo, self._failed = painter, cameras, photo, ""
         # A browser that goes away while its picture is drawn.
         warnings.filterwarnings("ignore", message=".*it will never be delivered")
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its address; whoever opens it does
             server = viser.ViserServer(host=host, port=port, verbose=False, label=title)
         if cameras:
-            _aim(server, cameras)
+            _aim(server, list(cameras.values()))
         super().__init__(server, self._render, output_dir=out, mode=mode)
         server.gui.set_panel_label(title)
+        # nerfview's theme, without the button that uploads the scene.
+        server.gui.configure_theme(
+            control_layout="collapsible", dark_mode=True, show_logo=False, show_share_button=False
+        )
 
     @property
     def address(self) -> str:
@@ -123,17 +124,53 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         focal, world_to_camera = height / 2 / math.tan(fov / 2), np.linalg.inv(pose.astype(np.float64))
         camera = Camera(torch.from_numpy(world_to_camera), focal, focal, width / 2, height / 2, width, height)
         if not self._depth.value:
+            self._say(f"Drawn: the colour of {len(self._painter.field):,} Gaussians, as the metrics see it.")
             return to_bytes(self._painter.color(camera))
         depth = self._painter.depth(camera)
-        return colored(depth, *depth_range(depth))
+        near, far = depth_range(depth)
+        self._say(f"Drawn: depth, bright at {near:.3g} and dark at {far:.3g} world units; grey where nothing is.")
+        return colored(depth, near, far)
+
+    def _say(self, drawn: str) -> None:
+        if self._drawn.content != drawn:
+            self._drawn.content = drawn
+
+    def _jump(self, client: viser.ClientHandle, name: str) -> None:
+        """Look from a camera, so that its whole photo is seen."""
+        camera, seen = self._cameras[name], client.camera
+        with client.atomic():
+            seen.position, seen.look_at, seen.up_direction = _stand(camera, looked_at(list(self._cameras.values())))
+            seen.fov = 2 * math.atan(max(camera.height / camera.fy, camera.width / camera.fx / seen.aspect) / 2)
 
     def _init_rendering_tab(self) -> None:
         super()._init_rendering_tab()
         self.render_tab_state = _Sizes()
 
     def _populate_rendering_tab(self) -> None:
-        self._depth = self.server.gui.add_checkbox("Depth", False, order=0)
+        gui = self.server.gui
+        self._drawn = gui.add_markdown("", order=-1)
+        self._depth = gui.add_checkbox("Depth", False, order=0)
         self._depth.on_update(self.rerender)
+        if self._cameras:
+            chosen = gui.add_dropdown("Camera", tuple(self._cameras), order=0, hint="Look from the place of a photo.")
+            again = gui.add_button("Look from it again", order=0)
+            shown = gui.add_image(_NONE, label="Its photo", order=0, visible=False)
+
+            def show_photo() -> None:
+                photo = self._photo(chosen.value)
+                shown.visible = photo is not None
+                if photo is not None:
+                    times = -(-_PHOTO // photo.shape[1])
+                    shown.image = photo.repeat(times, 0).repeat(times, 1)
+
+            def jump(event: Any) -> None:
+                show_photo()
+                if event.client is not None:
+                    self._jump(event.client, chosen.value)
+
+            show_photo()
+            chosen.on_update(jump)
+            again.on_click(jump)
         super()._populate_rendering_tab()
         self._rendering_tab_handles["viewer_res_slider"].value = self.render_tab_state.viewer_res = _SIZE
         self._rendering_folder.expand_by_default = False
@@ -158,13 +195,15 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
 
 
 @contextlib.contextmanager
-def watched(painter: Painter, cameras: Sequence[Camera], title: str) -> Iterator[Callable[[int], None]]:
+def watched(
+    painter: Painter, cameras: Mapping[str, Camera], title: str, photo: Photos = lambda _: None
+) -> Iterator[Callable[[int], None]]:
     """A viewer while a run trains. Yields a function to call after each iteration, with its number.
 
     The caller holds nerfview's lock, except in that function: the field is never drawn while an iteration changes it, and the
     run's bits are those of a run without a viewer.
     """
-    viewer = SplatViewer(painter, cameras, title=title, mode="training")
+    viewer = SplatViewer(painter, cameras, title=title, photo=photo, mode="training")
     _log.info("look while it trains: %s", viewer.address)
     held, began = viewer.lock.acquire(), time.monotonic()
 
@@ -203,11 +242,19 @@ def _require_drawable(state: Any) -> None:
 
 def _aim(server: viser.ViserServer, cameras: Sequence[Camera]) -> None:
     """Look from the first camera at the distance of the point that all of them look at."""
-    poses, first, start = [camera.world_to_camera.double() for camera in cameras], cameras[0], server.initial_camera
-    up = -torch.stack(poses)[:, 1, :3].mean(0)
+    up = -torch.stack([camera.world_to_camera.double() for camera in cameras])[:, 1, :3].mean(0)
     server.scene.set_up_direction(tuple((up / up.norm().clamp_min(1e-9)).tolist()))
-    distance = float((looked_at(cameras) - first.center.double()).norm())
-    start.position = tuple(first.center.tolist())
-    start.look_at = tuple((first.center.double() + distance * poses[0][2, :3]).tolist())
-    start.up = tuple((-poses[0][1, :3]).tolist())
+    stand, first, start = _stand(cameras[0], looked_at(cameras)), cameras[0], server.initial_camera
+    start.position, start.look_at, start.up = stand
     start.fov = 2 * math.atan(first.height / 2 / first.fy)
+
+
+Vector = tuple[float, float, float]
+
+
+def _stand(camera: Camera, focus: Float[Tensor, " 3"]) -> tuple[Vector, Vector, Vector]:
+    """Where a camera is, what it looks at, at the distance of `focus`, and where up is."""
+    pose, center = camera.world_to_camera.double(), camera.center.double()
+    distance = float((focus - center).norm())
+    x, y, z = (tuple(v.tolist()) for v in (center, center + distance * pose[2, :3], -pose[1, :3]))
+    return x, y, z

@@ -16,12 +16,12 @@ from gsplat import rasterization as cuda_rasterization
 from gsplat.strategy import DefaultStrategy
 from torch import Tensor
 
-from clear_strategies.compose import conductor
+from clear_strategies.compose import conductor  # +
 from clear_strategies.geometry import stereo
 from clear_strategies.kernels import losses
 from integration.examples.demo import Demo, Render, load_demo, splats_with_optimizers
-from integration.gsplat import attach
-from integration.views import view
+from integration.gsplat import attach  # +
+from integration.views import view  # +
 from rasterizers import native
 from rasterizers.autograd import rasterization as cpu_rasterization
 

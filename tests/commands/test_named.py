@@ -5,6 +5,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from importlib import metadata
 
 import pytest
 from hydra.core.global_hydra import GlobalHydra
@@ -27,6 +28,12 @@ def test_help_lists_the_commands_and_then_where_research_begins(arguments, capsy
     assert rows[: len(commands.NAMES)] == commands.NAMES
     for word in ("+strategy=clear", "-m ", "--cfg job", "--hydra-help"):
         assert word in said[said.index("research") :]
+
+
+@pytest.mark.parametrize("arguments", [["--version"], ["train", "--version"], ["+strategy=clear", "--version"]])
+def test_the_version_is_this_packages_and_not_hydras(arguments, capsys):
+    commands.named(arguments)()
+    assert capsys.readouterr().out == f"clear-strategies {metadata.version('clear-strategies')}\n"
 
 
 @pytest.mark.parametrize("first", ["+strategy=clear", "fit.iterations=3", "~data.reader.width", "-m", "--cfg", "-v"])
@@ -112,6 +119,16 @@ def hydra_undone(monkeypatch) -> Iterator[None]:
 def test_a_wrong_override_is_refused_with_what_was_meant(word, message):
     with pytest.raises(SettingError, match=message):
         hydra_app.main([word])
+
+
+@pytest.mark.usefixtures("hydra_undone")
+@pytest.mark.parametrize("line", ["clear-strategies fit.itera", "clear-strategies train photos fit.itera"])
+def test_the_shell_completes_settings_also_behind_train(line, monkeypatch, capsys):
+    monkeypatch.setenv("COMP_LINE", line)
+    monkeypatch.setenv("COMP_POINT", str(len(line)))
+    monkeypatch.setattr(sys, "argv", ["clear-strategies", "-sc", "query=bash"])
+    hydra_app.main()
+    assert capsys.readouterr().out.split() == ["fit.iterations="]
 
 
 @pytest.mark.usefixtures("hydra_undone")

@@ -50,9 +50,18 @@ def test_a_folder_of_any_name_becomes_data_path(tmp_path, name):
 
 
 @pytest.mark.parametrize(
-    ("name", "plain"), [("photos", True), ("a/b-c.d", True), ("1e5", False), ("null", False), ("my photos", False)]
+    ("name", "plain"),
+    [
+        ("photos", True),
+        ("a/b-c.d", True),
+        ("1e5", False),
+        ("null", False),
+        ("my photos", True),
+        (" photos", False),
+        ("a,b", False),
+    ],
 )
-def test_a_plain_path_needs_no_quotes_and_a_path_that_looks_like_a_number_is_text(tmp_path, monkeypatch, name, plain):
+def test_a_path_is_quoted_only_where_hydra_would_read_something_else(tmp_path, monkeypatch, name, plain):
     monkeypatch.chdir(tmp_path)
     (tmp_path / name).mkdir(parents=True)
     overrides = train.overrides([name])

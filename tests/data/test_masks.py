@@ -139,7 +139,7 @@ def test_masks_that_hide_all_photos_are_refused_and_of_one_are_told(tmp_path: Pa
         save(tmp_path / "masks" / name, 0 * LEFT)
         if i == 0:
             prepared(tmp_path, colmap.read)
-            assert "1 of 3 photos teach nothing" in caplog.text
+            assert "1 of 3 photos are not used in training" in caplog.text
             assert "a.png" in caplog.text
     with pytest.raises(
         DataError, match=r"a\.png: masks or alpha: show nothing of 3 of 3 photos: a.*: a mask is 0 where"

@@ -36,7 +36,7 @@ def test_the_detail_of_sr_images_is_measured_and_its_absence_reported(prior, lea
     with caplog.at_level(logging.WARNING):
         scene = prepare(ROOM, papers(train=2), prior, POINTS)
     assert least <= float(scene.notes["the SR images add"].split()[0]) <= most
-    assert ("there is no detail to route" in caplog.text) == (least == 0)
+    assert ("They hold hardly any detail" in caplog.text) == (least == 0)
 
 
 def test_back_projected_sr_images_shrink_to_the_photos_and_keep_how_far_they_were():

@@ -63,10 +63,10 @@ def test_where_sampling_is_of_no_use_density_control_stays_and_that_is_said(capl
     long = replace(EVERY, stop=750)
     assert long.densifier(theta, views, 0).cap == round(EVERY.per_point * N)
     assert EVERY.densifier(theta, views, 0) is None
-    assert "there is less time than sampling needs" in caplog.text
+    assert "mcmc is off: it needs 1,500 iterations or more" in caplog.text
     theta.scales.data[:] = 2.0
     assert long.densifier(theta, views, 0) is None
-    assert "MCMC has no effect: the initial points lie" in caplog.text
+    assert "mcmc is off: the initial points lie" in caplog.text
     theta.scales.data[:] = -6.0
     assert long.densifier(theta, shown(1.0, (1.0, 1.0, 1.0)), 0) is None
     assert "an object before a plain background" in caplog.text

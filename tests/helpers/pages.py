@@ -11,7 +11,7 @@ from types import ModuleType
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.rglob("*.md"))]
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted(DOCS.rglob("*.md"))]
 OURS = ("clear_strategies", "rasterizers", "integration")
 
 
@@ -24,18 +24,19 @@ def loaded(path: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(f"docs_{path.stem}", path)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
-    sys.path.insert(0, str(path.parent))  # as mkdocs does
+    sys.path.insert(0, str(path.parent))  # as Python and mkdocs do
     spec.loader.exec_module(module)
     sys.path.remove(str(path.parent))
     return module
 
 
-HOOKS = loaded(DOCS / "hooks.py")
+GENERATE = loaded(DOCS / "generate.py")
 
 
 def blocks(page: Path, *languages: str) -> list[str]:
-    """The fenced blocks of these languages; those inside lists are dedented."""
-    found = re.findall(rf"^( *)```(?:{'|'.join(languages)})\n(.*?)^ *```", page.read_text(), re.DOTALL | re.MULTILINE)
+    """The fenced blocks of these languages; those inside lists are dedented, signatures of a reference left out."""
+    text = GENERATE.API.sub("", page.read_text())
+    found = re.findall(rf"^( *)```(?:{'|'.join(languages)})\n(.*?)^ *```", text, re.DOTALL | re.MULTILINE)
     return [re.sub(rf"^{indent}", "", text, flags=re.MULTILINE) for indent, text in found]
 
 

@@ -215,7 +215,7 @@ def test_a_host_that_draws_twice_for_one_rendering_has_the_same_gradients_and_is
         for i in range(2):
             render(i).mean().backward()
         gradients.append({name: p.grad for name, p in host.splats.items() if p.grad is not None})
-    assert caplog.text.count("The host draws 2 times for one rendering") == (0 if looked_at else 1)
+    assert caplog.text.count("The host calls its rasterizer 2 times for one rendering") == (0 if looked_at else 1)
     assert clear.attachment.counts["HR renders in parts"] == (0 if looked_at else 2)
     for name, g in gradients[0].items():
         assert torch.allclose(gradients[1][name], g, rtol=1e-4, atol=1e-7), name

@@ -8,7 +8,7 @@ import torch
 from matplotlib.figure import Figure
 
 from clear_strategies.outputs import figures, maps
-from clear_strategies.outputs.figures import SheetRow, write_contact_sheet
+from clear_strategies.outputs.figures import SheetRow, magnification, window, write_contact_sheet
 from tests.helpers import wall
 from tests.helpers.image_files import array, holds, read
 
@@ -73,6 +73,20 @@ def test_images_of_any_size_are_shown_at_a_whole_multiple(tmp_path, sizes, times
     sheet = read(tmp_path / "sheet.png")
     for shown in rows:
         assert all(holds(sheet, image, times=times) for image in shown.images.values() if image.ndim == 3)
+
+
+def test_of_an_image_that_is_reduced_a_part_is_shown_at_its_own_pixels_and_upright_photos_make_no_tower(
+    tmp_path,
+) -> None:
+    columns = ("LR, enlarged", "SR prior", "ours", "ground truth", "another")
+    same = {name: array(k, 1160, 776) for k, name in enumerate(columns)}
+    rows = [SheetRow(str(i), same, compared=columns) for i in range(4)]
+    write_contact_sheet(tmp_path / "sheet.png", rows, "upright")
+    sheet = read(tmp_path / "sheet.png")
+    part = window([*same.values()])
+    assert all(holds(sheet, image[part], times=1) for image in same.values())
+    assert sheet.shape[0] < 3 * sheet.shape[1]
+    assert magnification(1160, 776) * 1160 == pytest.approx(384)
 
 
 def test_every_caption_and_the_small_print_are_on_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

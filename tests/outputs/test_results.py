@@ -73,8 +73,10 @@ def test_without_test_views_training_views_are_shown_and_what_cannot_be_written_
     with caplog.at_level("DEBUG"):
         write(tmp_path, state, scene=scene, video=2)
     assert names(tmp_path / "renders") == {f"{view.name}.png" for view in SCENE.train}
-    times = round(magnification(SCENE.train[0].hr.image.shape[1]))
-    assert holds(read(tmp_path / "contact_sheet.png"), SCENE.train[0].hr.image.numpy(), times=times)
+    times = round(magnification(*SCENE.train[0].hr.image.shape[:2]))
+    sheet, image = read(tmp_path / "contact_sheet.png"), SCENE.train[0].hr.image.numpy()
+    corners = image[:16, :24], image[-16:, -24:]
+    assert any(holds(sheet, corner, times=times) for corner in corners)  # an outline crosses one at most
     assert "pip install imageio-ffmpeg" in caplog.text
     assert not names(tmp_path) & {"maps/", "path.mp4"}
 

@@ -1,6 +1,7 @@
 """The report: its command, its files, its table, its pictures, its rows, and the runs that it finds."""
 
 import csv
+import math
 import os
 import re
 import statistics
@@ -12,9 +13,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 
 from clear_strategies import DataError, files, report
-from clear_strategies.outputs.figures import write_contact_sheet, write_curves
+from clear_strategies.outputs.figures import SheetRow, window, write_contact_sheet, write_curves
 from clear_strategies.settings import CHANGES_NO_RESULT
 from tests.helpers.finished_run import averages_of, cells, make_run, rows_of, scores, table_of
 from tests.helpers.image_files import array, holds, read
@@ -46,7 +49,7 @@ def test_the_page_shows_every_table_note_and_picture_as_text_and_refers_to_files
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "<b>clear" not in page
     assert page.count("&lt;b&gt;clear&lt;/b&gt;") == 3  # two scenes and their average
-    assert "All runs of fern: `data=llff`." in page
+    assert "All runs of fern: <code>data=llff</code>." in page
     pictures = set(re.findall(r'src="([^"]+)"', page))
     assert pictures == {f"{kind}_{scene}.png" for kind in ("comparison", "curves") for scene in ("fern", "horns")}
     assert all((tmp_path / picture).is_file() for picture in pictures)
@@ -96,13 +99,13 @@ def test_a_comparison_enlarges_the_part_where_runs_differ_most(tmp_path: Path) -
     other = base.copy()
     other[32:48, 120:180] = array(1, 16, 60)  # a quarter of the size each way, on the grid of windows
     other[0, 0] = 1 - other[0, 0]
-    rows = report._whole_and_part({"one": base, "two": other}, {"truth": array(2, 64, 240)}, {"one": "20 dB"})
-    write_contact_sheet(tmp_path / "c.png", rows, "scene · view")
+    tiles = {"one": base, "two": other}
+    row = SheetRow("", {**tiles, "truth": array(2, 64, 240)}, {"one": "20 dB"}, compared=tiles)
+    write_contact_sheet(tmp_path / "c.png", [row], "scene · view")
     drawn = read(tmp_path / "c.png")
     for tile in (base, other, array(2, 64, 240)):
         assert holds(drawn, tile[32:48, 120:180], times=4)
-    whole, _ = report._whole_and_part({"one": base, "two": base}, {}, {})
-    assert whole.frame == (slice(24, 40), slice(90, 150))  # equal runs: the centre
+    assert window([base, base]) == (slice(24, 40), slice(90, 150))  # equal runs: the centre
 
 
 def history(**columns: float) -> pd.DataFrame:
@@ -121,6 +124,16 @@ def test_runs_without_history_are_not_drawn_and_dollars_are_no_mathematics(tmp_p
     assert not np.array_equal(nine, none)
 
 
+def test_the_curves_mark_the_iterations_that_reset_opacities(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    marked: list[float] = []
+    monkeypatch.setattr(Axes, "axvline", lambda axis, x, **style: marked.append(x) or Line2D([], []))
+    run = history(loss_lr=0.1, n_gaussians=100.0)
+    write_curves(
+        tmp_path / "c.png", {"run": run.assign(opacities_reset=[1.0 if t == 7 else math.nan for t in run["t"]])}, ""
+    )
+    assert marked == [7.0, 7.0]  # over the iterations, where there is something to draw
+
+
 # ---- seeds are averaged, settings are distinguished, and differences are paired
 def test_runs_that_differ_in_their_seed_share_a_row(tmp_path: Path) -> None:
     for seed, psnr in enumerate((20.0, 21.0, 25.0)):
@@ -128,7 +141,7 @@ def test_runs_that_differ_in_their_seed_share_a_row(tmp_path: Path) -> None:
     assert rows_of(tmp_path)["clear"]["psnr"] == 22.0
     (line,) = (c for c in cells(table_of(tmp_path)) if c["method"] == "clear")
     assert line["PSNR (dB) ↑"] == "22.00 ± 2.65"  # deviations -2, -1, 3: sqrt(14 / 2)
-    assert (line["best"], line["seeds"], line["Gaussians"]) == ("25.00", "0, 1, 2", "1,200 ± 0")
+    assert (line["best"], line["seed"], line["Gaussians"]) == ("25.00", "0, 1, 2", "1,200 ± 0")
 
 
 @pytest.mark.parametrize(

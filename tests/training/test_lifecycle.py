@@ -107,7 +107,7 @@ def test_the_cap_binds_and_is_said(caplog):
     density.score[:] = density.ordinary[:] = torch.arange(12) + 1.0
     density.count[:] = 1
     assert len(density.restructure(field, optimizer, 10)) == 14
-    assert "the cap of 14 Gaussians binds: 12 want to densify, 2 may" in caplog.text
+    assert "the limit of 14 Gaussians is reached: 12 are to be cloned or split, and there is room for 2" in caplog.text
 
 
 def test_statistics_are_means_over_the_views_that_saw_a_gaussian_and_at_least_ten_rounds_fit():

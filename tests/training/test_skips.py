@@ -69,7 +69,7 @@ def test_a_skip_that_cannot_act_is_a_warning_and_not_in_the_plan(caplog):
     half, rest, window = SkipPolicy(replace(skips, hr_every=2)).descriptions([view])
     assert half == "HR at half its size until iteration 10"
     assert rest == "HR in one of 2 iterations until iteration 10"
-    assert "500 iterations gain less than 1.0%" in window
+    assert "by less than 1.0% in 500 iterations" in window
     assert not caplog.records
     odd = replace(view, hr=view.hr.reduced(4))  # by a factor of 1
     assert SkipPolicy(replace(skips, plateau_window=0)).descriptions([odd]) == []
@@ -135,7 +135,7 @@ def test_a_plateau_is_left_out_and_the_run_has_its_end(caplog):
         fit(state, toy.scene(), toy.RASTERIZER)
     assert [int(row["t"]) for row in state.history] == [*range(1, 9), 18, 19, 20]
     assert state.optimizer.steps == ITERATIONS  # so the learning rates are those of the end
-    assert "training goes on at t=18" in caplog.text
+    assert "to 18, since the loss of the training views fell by less than" in caplog.text
     assert sum(state.conductor.work_log.entries["iterations"].skipped.values()) == 9
 
 

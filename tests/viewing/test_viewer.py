@@ -67,6 +67,10 @@ def test_depth_is_unknown_where_nothing_is_and_numbers_are_blended_over_black(fi
     torch.testing.assert_close(painter.numbers(CAMERA, torch.full((len(field),), 0.5)), ones / 2)
 
 
+def numbered(splat):
+    return {f"view{i}": camera for i, camera in enumerate(splat.poses())}
+
+
 def close(found, exact):
     assert found.shape == exact.shape
     assert np.abs(found.astype(int) - exact).max() <= 1
@@ -74,7 +78,7 @@ def close(found, exact):
 
 def test_the_viewer_shows_what_is_measured_or_its_depth_and_closes(saved_run, tmp_path):
     server, splat = pytest.importorskip(SERVER, exc_type=ImportError), open_splat(saved_run[0])
-    viewer = server.SplatViewer(splat.painter, splat.poses(), title="toy", port=8321, out=tmp_path)
+    viewer = server.SplatViewer(splat.painter, numbered(splat), title="toy", port=8321, out=tmp_path)
     try:
         assert viewer.address.startswith("http://127.0.0.1:")
         close(viewer.draw(POSE, FOV, (96, 64)), to_bytes(splat.painter.color(CAMERA)))
@@ -118,7 +122,7 @@ def test_a_viewer_is_there_while_a_run_trains_and_draws_between_two_iterations_a
         with viewers[0].lock:
             drawn.set()
 
-    with server.watched(splat.painter, splat.poses(), "toy") as after_step:
+    with server.watched(splat.painter, numbered(splat), "toy") as after_step:
         after_step(1)
         assert b"<html" in urlopen(viewers[0].address, timeout=20).read()  # noqa: S310 - our own address
         threading.Thread(target=draw).start()

@@ -1,7 +1,9 @@
-"""What `mkdocs build` adds to the pages: the configuration reference, from conf/ and the classes that its `_target_`s name.
+"""Writes the pages of docs/reference that are made from the code; a test compares them with it: `python docs/generate.py`.
 
-A field's type and default come from the signature of the class, its description from the `Args:` of the docstring, or
-from the comment beside it in the YAML file where the docstring says nothing. Nothing of the page is written by hand.
+`configuration.md` is made from conf/ and the classes that its `_target_`s name. A field's type and default come from the
+signature of the class, its description from the `Args:` of the docstring, or from the comment beside it in the YAML file where
+the docstring says nothing. On the other pages, what stands between `<!-- api NAME -->` and `<!-- end -->` is made from the
+signatures and docstrings of a module, class or function; `<!-- api NAME alone -->` leaves out the members.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ import dataclasses
 import importlib
 import inspect
 import re
+import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
@@ -17,14 +20,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import signatures  # beside this file; mkdocs puts its folder on the path
+import signatures  # beside this file
 from omegaconf import DictConfig, OmegaConf
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 CONF: Final = ROOT / "conf"
-PAGE: Final = "reference/configuration.md"
-GENERATED: Final = frozenset({PAGE})
-OURS: Final = frozenset({"clear_strategies", "rasterizers", "integration"})
+REFERENCE: Final = ROOT / "docs" / "reference"
+API: Final = re.compile(r"(<!-- api (\S+)( alone)? -->\n).*?(<!-- end -->)", re.DOTALL)
+OURS: Final = ("clear_strategies", "rasterizers", "integration")
 
 
 @dataclass(frozen=True)
@@ -57,16 +60,8 @@ class Group:
     sections: tuple[Section, ...]
 
 
-def on_files(files: Any, config: Any) -> Any:
-    """MkDocs calls this with the files of the site, to which the configuration reference is added."""
-    from mkdocs.structure.files import File
-
-    files.append(File.generated(config, PAGE, content=page(groups())))
-    return files
-
-
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """Links to files outside docs/ work in a checkout; the site does not hold those files and shows the text alone."""
+    """MkDocs calls this. Links to files outside docs/ work in a checkout; the site has no such files and shows the text alone."""
     here = Path(page.file.abs_src_path or ROOT).parent
 
     def text_alone(link: re.Match[str]) -> str:
@@ -74,6 +69,52 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
         return link[0] if target.is_relative_to(ROOT / "docs") else link[1]
 
     return re.sub(r"\[([^\]]+)\]\((\.\.[^)#]*)(?:#[^)]*)?\)", text_alone, markdown)
+
+
+def pages() -> dict[Path, str]:
+    """What each page that is made from the code holds now, by its path."""
+    api = Api()
+    made = {REFERENCE / "configuration.md": configuration(groups())}
+    for path in sorted(REFERENCE.glob("*.md")):
+        text = path.read_text(encoding="utf-8")
+        if path not in made and API.search(text):
+            made[path] = _formatted(API.sub(lambda p: f"{p[1]}\n{api(p[2], members=not p[3])}\n{p[4]}", text))
+    return made
+
+
+def _formatted(text: str) -> str:
+    """Markdown whose Python is as `ruff format` leaves it."""
+    command = [sys.executable, "-m", "ruff", "format", "--stdin-filename", "page.md", "-"]
+    return subprocess.run(command, input=text, capture_output=True, encoding="utf-8", check=True).stdout  # noqa: S603
+
+
+class Api:
+    """Markdown of the signatures and docstrings of this package, by griffe2md."""
+
+    def __init__(self) -> None:
+        import griffe
+
+        loader = griffe.GriffeLoader(
+            search_paths=[ROOT], docstring_parser=griffe.Parser.google, docstring_options={"warnings": False}
+        )
+        for package in OURS:
+            loader.load(package)
+        loader.resolve_aliases(implicit=False, external=False)
+        self._found = loader.modules_collection
+
+    def __call__(self, name: str, *, members: bool) -> str:
+        from griffe2md import ConfigDict, render_object_docs
+
+        item = self._found[name]
+        item = item.final_target if item.is_alias else item
+        options = ConfigDict(
+            heading_level=3, show_root_heading=not item.is_module, show_root_full_path=False, members_order="source",
+            show_root_members_full_path=False, show_object_full_path=False, show_signature_annotations=True, line_length=100,
+            show_if_no_docstring=False, show_bases=False, inherited_members=False, summary=False,
+            members=None if members else False,
+        )  # fmt: skip
+        text = render_object_docs(item, options)  # its links lead to places of a site that has every object
+        return re.sub(r"<code>(.*?)</code>", r"`\1`", re.sub(r"\[([^\[\]]*)\]\(#[^)]*\)", r"\1", text)).strip() + "\n"
 
 
 def groups() -> list[Group]:
@@ -121,8 +162,8 @@ def undescribed(listed: list[Group]) -> list[str]:
     return sorted({f"{s.key}.{setting.name}" for s in sections for setting in s.settings if not setting.description})
 
 
-def page(listed: list[Group]) -> str:
-    """The Markdown of the reference."""
+def configuration(listed: list[Group]) -> str:
+    """The Markdown of the reference of the configuration."""
     lines = [
         "# Configuration",
         "",
@@ -292,3 +333,8 @@ def _comments(text: str) -> dict[str, str]:
         elif note and current in comments and column > 0 and abs(note.start() - column) <= 1:
             comments[current] += " " + note[1].strip()
     return comments
+
+
+if __name__ == "__main__":
+    for path, text in pages().items():
+        path.write_text(text, encoding="utf-8")
