@@ -11,6 +11,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
+    from clear_strategies.core.conflicts import Products, Weights
     from clear_strategies.core.evidence import Evidence
     from clear_strategies.core.gradients import ATTRIBUTES, CONFLICT_GROUPS, Grads, Shot
     from clear_strategies.core.step import Step
@@ -33,14 +34,15 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ATTRIBUTES", "CONFLICT_GROUPS", "GCO", "MCMC", "P2G", "SVS", "AnchorError", "ClearError", "Conductor", "DataError",
-    "DepthMap", "Evidence", "ExtraView", "FadingOpacity", "Grads", "Objective", "Photo", "PseudoViews",
+    "DepthMap", "Evidence", "ExtraView", "FadingOpacity", "Grads", "Objective", "Photo", "Products", "PseudoViews",
     "RandomBackground", "Run", "SRStage", "ScreenGradients", "Shot", "SplatSuRe", "Step", "Strategy", "StrategyConflict",
-    "Update", "View", "train",
+    "Update", "View", "Weights", "train",
 ]  # fmt: skip
 
 __version__: str  # of the installed package
 
 _NAMES: Final = {  # by the module of this package that they are defined in
+    "core.conflicts": ("Products", "Weights"),
     "core.evidence": ("Evidence",),
     "core.gradients": ("ATTRIBUTES", "CONFLICT_GROUPS", "Grads", "Shot"),
     "core.step": ("Step",),

@@ -90,7 +90,7 @@ class ConductorSettings:
 def conductor(
     strategy: str | Sequence[str] = "clear", *overrides: str, iterations: int = REFERENCE_ITERATIONS
 ) -> Conductor:
-    """The strategies of conf/, with their objective, for a host's loop.
+    """The strategies of conf/, with their objective and `skips=hosts`, for a host's loop.
 
     Args:
         strategy: as after `+strategy=`: "clear", "gco", "gco,svs", "[gco,svs]", "baseline" …, or a list, ["gco", "svs"].
@@ -105,7 +105,8 @@ def conductor(
         raise SettingError(f"iterations must be at least 1, got {iterations}.")
     names = strategy.strip() if isinstance(strategy, str) else f"[{','.join(strategy)}]"
     chosen = f"+strategy=[{names}]" if "," in names and not names.startswith("[") else f"+strategy={names}"
-    config = composed([chosen, *overrides])
+    skips = () if any(_key(override) == "skips" for override in overrides) else ("skips=hosts",)
+    config = composed([chosen, *skips, *overrides])
     settings: ConductorSettings = build(tree(config, _TRAINERS))
     return settings.conductor(iterations / REFERENCE_ITERATIONS, _detail(config).of_run(iterations))
 
@@ -187,15 +188,25 @@ def not_composed(error: Exception, overrides: Sequence[str], config: str) -> Set
     key = unknown[1]
     if (CONF / key).is_dir():
         return SettingError(f"{key}: no choice of this group is there to be replaced, so it is added: +{key}=….")
+    others, group = [o for o in overrides if _key(o) != key], key.partition(".")[0]
+
+    def settings(*chosen: str) -> dict[str, Any]:
+        try:
+            return OmegaConf.to_container(composed([*others, *chosen], config))  # type: ignore[return-value]
+        except SettingError:  # another override is wrong as well
+            return {}
+
+    if having := [option for option in options(group) if key in flat(settings(f"{group}={option}"))]:
+        train = ", or let the command find it: clear-strategies train FOLDER" if key == "data.path" else ""
+        return SettingError(
+            f"{key}: there is no such setting without one of {', '.join(f'{group}={o}' for o in having)}. Add it{train}."
+        )
+    known = settings()
     remedy = "clear-strategies --cfg job prints all of them."
-    try:
-        settings: Any = OmegaConf.to_container(composed([o for o in overrides if _key(o) != key], config))
-        if near := difflib.get_close_matches(key, flat(settings), 1, 0.8):
-            remedy = f"Did you mean {near[0]}?"
-        elif config == "conductor":
-            remedy = f"A conductor has settings of {', '.join(settings)}."
-    except SettingError:  # another override is wrong as well
-        pass
+    if near := difflib.get_close_matches(key, flat(known), 1, 0.8):
+        remedy = f"Did you mean {near[0]}?"
+    elif known and config == "conductor":
+        remedy = f"A conductor has settings of {', '.join(known)}."
     return SettingError(f"{key}: there is no such setting. {remedy}")
 
 

@@ -37,8 +37,9 @@ from clear_strategies.core.view import View
 from clear_strategies.data.scene import require_shown
 from clear_strategies.errors import HostError, SettingError
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.merging.in_place import InPlaceMerge
+from clear_strategies.merging.in_place import merge_in_place
 from clear_strategies.strategies.base import overrides
+from clear_strategies.strategies.sr_stage import SRStage
 from integration.autograd_shot import AutogradShot, RenderAt
 from integration.densification import ScoreScaler, write_score
 from integration.extra_steps import ExtraSteps
@@ -114,7 +115,7 @@ class Attachment:
         self._detail_gradients = 0
         self._pending: Pending | None = None  # the last rendering
         self._pass: BackwardPass | None = None  # the last one that has reached a rendering
-        self._merge_in_place = InPlaceMerge(conductor)
+        self._merge_in_place: Callable[..., Mapping[str, deferred.Number]] = partial(merge_in_place, conductor)
         self._step: Step | None = None  # of the rendering, until `after_step`
         self._extra = ExtraSteps(conductor, params)
         self._logged: dict[str, deferred.Number] = {}
@@ -344,7 +345,7 @@ class Attachment:
             torch.autograd.Variable._execution_engine.queue_callback(lambda: self._on_backward_end(now))
         self._pass.renderings.add(nth)
         params = self._pass.params
-        whole = not (self._merge_in_place.takes_factors(params) and self._pending.may_take_factors(params))
+        whole = not self._pending.may_take_factors(params)
         return None if whole else self._pass.take
 
     @torch.no_grad()
@@ -359,7 +360,7 @@ class Attachment:
         if pending is None or (trained and not accumulated):
             return
         pending.require_alone(done)
-        using = [type(s).__name__ for s in map(self.conductor.owner, ("correct", "score")) if s is not None]
+        using = [type(s).__name__ for s in map(self.conductor.owner, ("reconcile", "score")) if s is not None]
         pending.require_first(accumulated, " and ".join(using))
         if names := [name for name in accumulated if name not in pending.merged]:
             self._merge(pending, done, names)
@@ -388,7 +389,8 @@ class Attachment:
             if detail.grad is not None:  # what the host has given it stays
                 done.before["detail"] = detail.grad
         conflict = self._merge_in_place(
-            params, pending.routed_of(names, done.params), self.t, before=done.before, lr_colour=done.colour, scale=scale,
+            params, pending.routed_of(names, done.params), None if hr is None else hr.step, self.t,
+            before=done.before, lr_colour=done.colour, scale=scale,
             must_be_finite=self._loss_scale is None,
         )  # fmt: skip
         pending.merged.update(names or ("detail",))

@@ -10,11 +10,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from clear_strategies.core.gradients import Grads, scale_rows
+from clear_strategies.core.gradients import Colour, Grads
 from clear_strategies.core.view import View
-from clear_strategies.kernels.merge import Colour
-from clear_strategies.merging.in_place import RoutedGradients, dense
-from clear_strategies.merging.iteration import HrGradients
+from clear_strategies.kernels.reconcile import dense
+from clear_strategies.merging.iteration import HrSide
 from integration.colours import are_joined, is_hooked
 from rasterizers.autograd import Drawing, outer
 from rasterizers.geometry import SH_C0
@@ -69,20 +68,6 @@ class ScreenGradientSlot:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DrawnGradients:
-    """∇ of one cotangent with respect to what the rasterizer was given.
-
-    Args:
-        values: by the names of `AutogradShot.drawn`; of this package's rasterizers means, quats, scales, opacities and rgb.
-        screen: the screen gradient, 1/pixel. basis: Y, where the gradient of the spherical harmonics is Y ⊗ rgb.
-    """
-
-    values: dict[str, Tensor]
-    screen: Float[Tensor, "N 2"]
-    basis: Float[Tensor, "N B1"] | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class AutogradShot:
     """A rendering by a host, differentiable by autograd.
 
@@ -123,22 +108,20 @@ class AutogradShot:
         """∇θ of every cotangent, each with `.screen`; the graph is kept. Frozen parameters have gradient 0."""
         results = []
         for g in self.gradients(cotangents):
-            values, colour = self._raw(g.values, g.basis)
-            detail = self._detail(g.values)
-            if detail is not None:
-                values["detail"] = detail
-            known = dense(values, colour, self.params)
+            known = dense(self._raw(g) + self._detail(g), self.params)
             zeros = {name: torch.zeros_like(p) for name, p in self.params.items() if name not in known}
             results.append(Grads(zeros | known, screen=g.screen))
         return results
 
-    def gradients(self, cotangents: Float[Tensor, "K H W 3"]) -> list[DrawnGradients]:
-        """The first part, for every cotangent."""
+    def gradients(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
+        """The first part, for every cotangent: by the names of `drawn`; of this package's rasterizers means, quats, scales,
+        opacities, and the colours by their factors.
+        """
         if self.drawing is not None:
             g = self.drawing.rendering.vjp(self._at_drawing(cotangents))
-            rows = {"means": g.means, "quats": g.quats, "scales": g.scales, "opacities": g.opacities, "rgb": g.rgb}
+            rows = {"means": g.means, "quats": g.quats, "scales": g.scales, "opacities": g.opacities}
             return [
-                DrawnGradients({name: x[k] for name, x in rows.items()}, g.screen[k], g.basis)
+                Grads({name: x[k] for name, x in rows.items()}, colour=Colour(g.rgb[k], g.basis), screen=g.screen[k])
                 for k in range(len(cotangents))
             ]
         slot = self.gradient_slot
@@ -152,56 +135,46 @@ class AutogradShot:
             )  # fmt: skip
             screen = gradients[-1] if projected else torch.zeros_like(slot.tensor)
             values = dict(zip(tensors, gradients, strict=False))
-            results.append(DrawnGradients(values, slot.per_gaussian(screen, len(self.visible))))
+            results.append(Grads(values, screen=slot.per_gaussian(screen, len(self.visible))))
         return results
 
-    def routed(self, hr: HrGradients[DrawnGradients], lambda_hf: float) -> RoutedGradients:
-        """g^HR of the raw parameters, and the gradient of f_det."""
-        g, detail = hr.base.values, None
-        if hr.hf is not None:
-            weight = hr.m * lambda_hf  # of each Gaussian
-            detail = self._detail(hr.hf.values)
-            detail = None if detail is None else scale_rows(detail, weight)  # m ∇L_HF        Eq. 12
-            # g^HR           Eq. 13
-            g = {name: _plus_rows(value, hr.hf.values[name], weight) for name, value in g.items()}
-        values, colour = self._raw(g, hr.base.basis)
-        return RoutedGradients(values, hr.step, colour, detail)
+    def routed(self, hr: HrSide[Grads], lambda_hf: float) -> Grads:
+        """g^HR of the raw parameters, and the gradient of f_det.  Eq. 12, 13"""
+        g = self._raw(hr.routed(lambda_hf))
+        detail = Grads() if hr.hf is None else self._detail(hr.hf) * (hr.m * lambda_hf)
+        return g + detail
 
-    def _raw(
-        self, g: Mapping[str, Tensor], basis: Float[Tensor, "N B1"] | None
-    ) -> tuple[dict[str, Tensor], Colour | None]:
+    def _raw(self, g: Grads) -> Grads:
         """The second part: from what was drawn to the raw parameters without f_det; sh0 and shN as factors where `are_joined`."""
         raw = {name: p for name, p in self.params.items() if p.requires_grad and name != "detail"}
         if self.drawing is None and self.drawn is None:  # g is theirs, with what their hooks have done to it
-            return {name: g[name] for name in raw}, None
+            return Grads({name: g[name] for name in raw})
         drawn, colour = dict(self.drawn or {}), None
-        if self.drawing is not None and basis is not None:
+        if self.drawing is not None and g.colour is not None:
             drawn = dict(self.drawing.inputs)
             if are_joined(drawn["colors"], self.params):
-                colour = Colour(g["rgb"], basis)
+                colour = g.colour
             else:
-                g = {**g, "colors": outer(g["rgb"], basis, drawn["colors"].shape[1])}
+                g = Grads({**g, "colors": outer(g.colour.rgb, g.colour.basis, drawn["colors"].shape[1])})
         direct = {name: g[name] for name, p in raw.items() if drawn.get(name) is p and not is_hooked(p)}
         graph = {name: x for name, x in drawn.items() if name in g and name not in direct and x.requires_grad}
         rest = {name: p for name, p in raw.items() if colour is None or name not in ("sh0", "shN")}
         if not graph or not rest:
-            return direct, colour
+            return Grads(direct, colour=colour)
         through = torch.autograd.grad(
             list(graph.values()), list(rest.values()), [g[name] for name in graph], retain_graph=True, allow_unused=True
         )
-        values = dict(direct)
-        for name, value in zip(rest, through, strict=True):
-            if value is not None:
-                values[name] = values[name] + value if name in values else value
-        return values, colour
+        found = {name: value for name, value in zip(rest, through, strict=True) if value is not None}
+        return Grads(direct, colour=colour) + found
 
-    def _detail(self, g: Mapping[str, Tensor]) -> Float[Tensor, "N 3"] | None:
+    def _detail(self, g: Grads) -> Grads:
         """The gradient of f_det, which is that of the colour."""
         if "detail" not in self.params:
-            return None
+            return Grads()
         if "colors" in g:
-            return g["colors"] if g["colors"].dim() == 2 else g["colors"][:, 0] / SH_C0
-        return g.get("rgb", g.get("detail"))
+            return Grads({"detail": g["colors"] if g["colors"].dim() == 2 else g["colors"][:, 0] / SH_C0})
+        found = g.get("detail") if g.colour is None else g.colour.rgb
+        return Grads() if found is None else Grads({"detail": found})
 
     def _at_drawing(self, cotangents: Float[Tensor, "K H W 3"]) -> Float[Tensor, "K H W 3"]:
         """The cotangents of what the rasterizer drew; the host may have changed it into `image`."""
@@ -209,15 +182,6 @@ class AutogradShot:
         if image.data_ptr() == drawn.data_ptr() and image.shape == drawn.shape and image.stride() == drawn.stride():
             return cotangents  # a view of all of it
         return torch.stack([torch.autograd.grad(image, drawn, c, retain_graph=True)[0] for c in cotangents])
-
-
-def _plus_rows(
-    a: Float[Tensor, "N ..."], b: Float[Tensor, "N ..."], weight: float | Float[Tensor, " N"]
-) -> Float[Tensor, "N ..."]:
-    """A + weight · b, row by row."""
-    if not isinstance(weight, Tensor):
-        return torch.add(a, b, alpha=weight)
-    return torch.addcmul(a, b, weight.to(b).view(-1, *[1] * (b.dim() - 1)))
 
 
 Target = Literal["lr", "hr"] | Camera

@@ -24,7 +24,6 @@ from clear_strategies.compose import conductor
 from clear_strategies.core.deferred import Number
 from clear_strategies.data.priors import Bicubic
 from clear_strategies.geometry import stereo
-from clear_strategies.merging.in_place import InPlaceMerge
 from integration.examples.demo import load_demo, splats_with_optimizers
 from integration.gsplat import attach
 from integration.views import view
@@ -70,7 +69,7 @@ class Loop:
             sr = chosen.prior(Bicubic())
             views = [view(*x, sr=sr) for x in zip(demo.names, self.photos, self.viewmats, self.Ks, strict=True)]
             attached = attach(self.splats, self.optimizers, views, chosen)
-            self.draw, self.merge = attached.wrap(self.draw), _TimedMerge(chosen)
+            self.draw, self.merge = attached.wrap(self.draw), _TimedMerge(attached.attachment._merge_in_place)
             attached.attachment.t, attached.attachment._merge_in_place = _FROM, self.merge
 
     def backward(self) -> None:
@@ -92,16 +91,17 @@ class Loop:
             optimizer.zero_grad()
 
 
-class _TimedMerge(InPlaceMerge):
+class _TimedMerge:
     """The merge, and the seconds that it has taken: of the processor, on a device by the wall clock."""
 
-    seconds = 0.0
+    def __init__(self, merge: Callable[..., Mapping[str, Number]]) -> None:
+        self._merge, self.seconds = merge, 0.0
 
     def __call__(self, params: Mapping[str, Tensor], *arguments: Any, **keywords: Any) -> Mapping[str, Number]:
         device = params["means"].device
         clock = time.perf_counter if device.type == "cuda" else time.process_time
         began = clock()
-        result = super().__call__(params, *arguments, **keywords)
+        result = self._merge(params, *arguments, **keywords)
         _wait(device)
         self.seconds += clock() - began
         return result

@@ -14,7 +14,6 @@ from typing import Any
 
 from clear_strategies import console
 from clear_strategies.commands import path_of
-from clear_strategies.compose import conductor
 from clear_strategies.errors import ClearError, DataError
 from integration.settings import Settings
 
@@ -66,8 +65,8 @@ def _parser(module: str, description: str) -> argparse.ArgumentParser:
         "(%(default)s)",
     )  # fmt: skip
     add("--sr", type=path_of, metavar="FOLDER", help="SR images, named like the photos")
-    add("--suffix", default="", help="what the SR tool appended to the names, e.g. _x4")
-    add("--factor", type=int, default=4, help="HR pixels per LR pixel (%(default)s)")
+    add("--suffix", help="what the SR tool appended to the names, e.g. _x4")
+    add("--factor", type=int, help="HR pixels per LR pixel (%(default)s)")
     add(
         "--save-lr", type=path_of, metavar="FOLDER",
         help="write the photos as they are trained on (reduced, masked) for an SR tool to enlarge; then stop",

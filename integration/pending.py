@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from weakref import WeakMethod
 
 import torch
 from torch import Tensor
 
+from clear_strategies.core.gradients import Colour, Grads
 from clear_strategies.errors import HostError
-from clear_strategies.kernels.merge import Colour
-from clear_strategies.merging.in_place import RoutedGradients, dense
-from clear_strategies.merging.iteration import HrGradients
-from integration.autograd_shot import DrawnGradients, HostOutput
+from clear_strategies.kernels.reconcile import dense
+from clear_strategies.merging.iteration import HrSide
+from integration.autograd_shot import HostOutput
 from integration.colours import are_accumulated, are_joined
 from rasterizers.autograd import TakeColours
 
@@ -78,8 +78,8 @@ class Pending:
     nth: int
     view: str
     output: HostOutput | None
-    hr: HrGradients[DrawnGradients] | None
-    routed: RoutedGradients | None
+    hr: HrSide[Grads] | None
+    routed: Grads | None
     screen: dict[int, Tensor] = field(default_factory=dict)
     merged: set[str] = field(default_factory=set)
 
@@ -115,15 +115,15 @@ class Pending:
             return False
         return are_joined(drawing.inputs["colors"], params) and are_accumulated(params)
 
-    def routed_of(self, names: Iterable[str], params: Mapping[str, Tensor]) -> RoutedGradients | None:
-        """g^HR of these parameters alone."""
-        routed, wanted = self.routed, set(names)
-        if routed is None or wanted.issuperset(routed.grads.keys() | ({"sh0", "shN"} if routed.colour else set())):
-            return routed
-        grads = dict(routed.grads)
-        if routed.colour is not None:
-            grads |= dense({}, routed.colour, {name: params[name] for name in ("sh0", "shN")})
-        return replace(routed, grads={name: g for name, g in grads.items() if name in wanted}, colour=None)
+    def routed_of(self, names: Iterable[str], params: Mapping[str, Tensor]) -> Grads | None:
+        """g^HR of these parameters alone, and the gradient of f_det."""
+        g, wanted = self.routed, {*names, "detail"}
+        if g is None or wanted.issuperset(params):
+            return g
+        if g.colour is not None:
+            bands = {name: params[name].detach() for name in ("sh0", "shN")}
+            g = Grads(g) + dense(Grads(colour=g.colour), bands)
+        return Grads({name: rows for name, rows in g.items() if name in wanted})
 
     def require_alone(self, of: BackwardPass) -> None:
         """Raise a HostError for a pass that adds to parameters by another rendering, too."""

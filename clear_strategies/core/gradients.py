@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import Any, Final, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -22,44 +22,71 @@ CONFLICT_GROUPS: Final = ("means", "sh0", "shN", "opacities", "scales", "quats")
 """The paper's six: position, base appearance, higher-order appearance, opacity, scale, rotation."""
 
 
-class Grads(dict[str, Tensor]):
-    """attribute -> gradient [N, …], with + and * by a number or by one number per Gaussian [N].
+class Colour(NamedTuple):
+    """A gradient of the spherical harmonics by its factors, Y ⊗ ∇rgb: three numbers a Gaussian and those of Y in place of 48.
 
-    An absent attribute has gradient 0. `screen` is the gradient of the projected centre [N, 2], 1/pixel; arithmetic
-    drops it, since it is a statistic and not the gradient of a parameter.
+    Args:
+        basis: Y of the active bands of each Gaussian, from the camera that drew it.
+    """
+
+    rgb: Float[Tensor, "N 3"]
+    basis: Float[Tensor, "N B1"]
+
+
+class Grads(dict[str, Tensor]):
+    """attribute -> gradient [N, …] of one loss, with + and * by a number or by one number per Gaussian [N].
+
+    An absent attribute has gradient 0.
+
+    Attributes:
+        colour: the gradient of sh0 and shN by its factors, in addition to what these have by name; None: there is none.
+        screen: the gradient of the projected centre [N, 2], 1/pixel; arithmetic drops it, since it is a statistic and not the
+            gradient of a parameter.
     """
 
     screen: Float[Tensor, "N 2"] | None
+    colour: Colour | None
 
-    def __init__(self, values: Mapping[str, Tensor] | None = None, *, screen: Tensor | None = None) -> None:
+    def __init__(
+        self, values: Mapping[str, Tensor] | None = None, *, colour: Colour | None = None, screen: Tensor | None = None
+    ) -> None:
         super().__init__(values or {})
-        self.screen = screen
+        self.colour, self.screen = colour, screen
 
-    def table(self) -> Mapping[str, Tensor]:
-        """What must be finite before a step, by name."""
-        return self
+    @property
+    def tensors(self) -> Mapping[str, Tensor]:
+        """What must be finite before a step, by name. Y is finite wherever a Gaussian is drawn, and is a third of the numbers."""
+        return self if self.colour is None else {**self, "rgb": self.colour.rgb}
 
     def __add__(self, other: Mapping[str, Tensor]) -> Grads:
-        total = Grads(self)
-        for name, value in other.items():
-            total[name] = total[name] + value if name in total else value
-        return total
+        return self.plus(other, 1.0)
 
-    def plus(self, other: Mapping[str, Tensor], factor: float) -> Grads:
-        """The sum with `factor` times another."""
-        total = Grads(self)
+    def plus(self, other: Mapping[str, Tensor], weight: float | Float[Tensor, " N"]) -> Grads:
+        """The sum with another, each of whose rows counts `weight` times.
+
+        Raises:
+            ValueError: both have `colour`, of two cameras.
+        """
+        total = Grads(self, colour=self.colour)
         for name, value in other.items():
-            total[name] = torch.add(total[name], value, alpha=factor) if name in total else value * factor
+            total[name] = _plus_rows(total[name], value, weight) if name in total else scale_rows(value, weight)
+        added = other.colour if isinstance(other, Grads) else None
+        if added is not None and total.colour is not None:
+            if total.colour.basis is not added.basis:
+                raise ValueError("colours that two cameras drew are not summed by their factors.")
+            total.colour = Colour(_plus_rows(total.colour.rgb, added.rgb, weight), added.basis)
+        elif added is not None:
+            total.colour = Colour(scale_rows(added.rgb, weight), added.basis)
         return total
 
     def __mul__(self, weight: float | Float[Tensor, " N"]) -> Grads:
-        return Grads({name: scale_rows(value, weight) for name, value in self.items()})
+        return Grads().plus(self, weight)
 
     __rmul__ = __mul__
 
     def without_detail(self) -> Grads:
         """The same without f_det, which is never corrected."""
-        return Grads({name: value for name, value in self.items() if name != "detail"})
+        return Grads({name: value for name, value in self.items() if name != "detail"}, colour=self.colour)
 
 
 @runtime_checkable
@@ -80,6 +107,15 @@ class Shot(Protocol):
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
         """∇θ of Σ cotangent·image on the raw parameters, one per cotangent, each with `.screen`."""
         ...
+
+
+def _plus_rows(
+    a: Float[Tensor, "N ..."], b: Float[Tensor, "N ..."], weight: float | Float[Tensor, " N"]
+) -> Float[Tensor, "N ..."]:
+    """A + weight · b, row by row."""
+    if not isinstance(weight, Tensor):
+        return torch.add(a, b, alpha=weight)
+    return torch.addcmul(a, b, weight.to(b).view(-1, *[1] * (b.dim() - 1)))
 
 
 def scale_rows(value: Float[Tensor, "N ..."], weight: float | Float[Tensor, " N"]) -> Float[Tensor, "N ..."]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 from jaxtyping import Bool, Int
 from torch import Tensor
@@ -20,16 +21,18 @@ class Step:
         view: what this iteration trains on: photo and SR image, each with a camera that knows its size in pixels.
         visible: the Gaussians that the HR render shows, [N]; None in an iteration without HR.
         evidence: the answer of `Strategy.observe`; None before it, and where no strategy gives one.
+        params: raw parameters by attribute (log scales, logit opacities), to read; empty where the structure has changed since.
     """
 
     t: int
     view: View
     visible: Bool[Tensor, " N"] | None = None
     evidence: Evidence | None = None
+    params: Mapping[str, Tensor] = field(default_factory=dict)
 
     def resized(self, parents: Int[Tensor, " M"]) -> Step:
         """The same step after the structure changed: row i of everything per Gaussian comes from row parents[i]."""
         visible = None if self.visible is None else self.visible[parents]
         e = self.evidence
         evidence = None if e is None else Evidence(e.reliability[parents], e.demand[parents])
-        return replace(self, visible=visible, evidence=evidence)
+        return replace(self, visible=visible, evidence=evidence, params={})

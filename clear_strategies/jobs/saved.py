@@ -18,7 +18,7 @@ from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.core.images import to_bytes
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.ply import read_gaussians
-from clear_strategies.data.view_names import file_stem
+from clear_strategies.data.view_names import file_stems
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.jobs import device
 from clear_strategies.jobs.device import ReadyRasterizer
@@ -63,7 +63,8 @@ class SavedSplat:
 
     def photo(self, name: str) -> UInt8[np.ndarray, "h w 3"] | None:
         """The LR photo of a camera, which the run has saved; None where there is none."""
-        path = self.folder / "views" / f"{file_stem(name)}_lr.png"
+        stem = file_stems(saved.name for saved in self.cameras)[name]
+        path = self.folder / "views" / f"{stem}_lr.png"
         try:
             return to_bytes(read_image(path)) if path.is_file() else None
         except DataError as error:
@@ -153,7 +154,7 @@ def _ply_in(folder: Path, path: Path) -> Path:
     return ply
 
 
-def _drawing(settings: Mapping[str, Any], name: str | None) -> Drawing:
+def _drawing(settings: Mapping[str, Any], name: str | None) -> ReadyRasterizer:
     """The rasterizer with the settings of a run, or the one that was asked for.
 
     The class is one of this repository, one that the configuration of an installed package names, or the one that was asked for:
@@ -179,7 +180,7 @@ def _drawing(settings: Mapping[str, Any], name: str | None) -> Drawing:
         return _made({**shared, TARGET: device.BY_NAME})
 
 
-def _made(node: Mapping[str, Any]) -> Drawing:
+def _made(node: Mapping[str, Any]) -> ReadyRasterizer:
     return device.drawing(build(device.rasterizer_node(with_defaults(node)), "rasterizer"), None)
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import math
+from collections.abc import Collection, Sequence
 from types import ModuleType
 
 import torch
 from torch import Tensor
+from torch.utils.dlpack import from_dlpack
 
 from rasterizers.interface import BackendUnavailable
 from rasterizers.native import load_kernels
@@ -24,6 +26,20 @@ def available() -> bool:
 def module() -> ModuleType:
     """The compiled module for this processor's instruction set; a BackendUnavailable where there is none."""
     return load_kernels("clear_strategies.kernels")
+
+
+def empty(shape: Sequence[int], dtype: torch.dtype = torch.float32) -> Tensor:
+    """Not initialized, in the CPU's memory that another such tensor has left: fresh pages cost more than filling them."""
+    numbers = math.prod(shape) * dtype.itemsize // torch.float32.itemsize
+    x: Tensor = from_dlpack(load_kernels("rasterizers.cpp").Frame.empty((numbers,)))
+    return x.view(dtype).view(*shape)
+
+
+def empty_like(x: Tensor) -> Tensor:
+    """Contiguous, of this shape and type, not initialized; in recycled memory where the kernels take it."""
+    if x.device.type == "cpu" and x.dtype == torch.float32 and available():
+        return empty(x.shape)
+    return torch.empty_like(x, memory_format=torch.contiguous_format)
 
 
 def runs(x: Tensor) -> bool:

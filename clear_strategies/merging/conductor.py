@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final, TypeVar
 
 import torch
@@ -11,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.core import images
-from clear_strategies.core.conflicts import conflict_ratio
+from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import require_finite, require_finite_losses
 from clear_strategies.core.gradients import Grads, Shot, screen_in_ndc, screen_norm, screen_of
@@ -19,9 +20,10 @@ from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, View
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import StrategyConflict
-from clear_strategies.kernels import per_gaussian
+from clear_strategies.kernels import native, per_gaussian, reconcile
+from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.detail import DetailRates
-from clear_strategies.merging.iteration import HrGradients, Merged, Stepper, Update, Weights, require_finite_parts
+from clear_strategies.merging.iteration import HrSide, LossWeights, Merged, Stepper, Update, require_finite_parts
 from clear_strategies.merging.objective import Losses, Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
 from clear_strategies.strategies.base import ScreenGradients, Strategy, by_class, overrides
@@ -31,7 +33,9 @@ _log = logging.getLogger(__name__)
 
 P = TypeVar("P")
 
-_ONE_ANSWER: Final = ("densifier", "background", "gate", "observe", "route", "correct", "score")
+_UNKNOWN: Final[Mapping[str, Tensor]] = {}
+_ONE_ANSWER: Final = ("densifier", "background", "gate", "observe", "route", "reconcile", "score")
+_ALSO_BY: Final = {"reconcile": ("correct",)}  # other hooks that answer the same
 
 
 class Conductor:
@@ -71,19 +75,20 @@ class Conductor:
         self._hr_cotangents: Tensor | None = None
         self._owner = dict.fromkeys(_ONE_ANSWER, Strategy())  # its hooks hold where no strategy overrides them
         for hook in _ONE_ANSWER:
-            owners = [s for s in strategies if overrides(s, hook)]
+            hooks = [hook, *_ALSO_BY.get(hook, ())]
+            owners = [s for s in strategies if any(overrides(s, name) for name in hooks)]
             if len(owners) > 1:
                 first, second = (type(s).__name__ for s in owners[:2])
                 raise StrategyConflict(
-                    f"{first} and {second} both implement {hook}(); exactly one strategy may. Remove one, or write a "
-                    "strategy that combines them."
+                    f"{first} and {second} both implement {'() or '.join(hooks)}(); exactly one strategy may. Remove one, or "
+                    "write a strategy that combines them."
                 )
             if owners:
                 self._owner[hook] = owners[0]
         self.regularizers = [s for s in strategies if overrides(s, "regularize")]
         others = ("regularize", "extra_views", "may_densify", "after_step")
         for s in strategies:
-            if not any(overrides(s, hook) for hook in (*_ONE_ANSWER, *others)):
+            if not any(overrides(s, hook) for hook in (*_ONE_ANSWER, "correct", *others)):
                 _log.warning("%s implements no hook; it has no effect.", type(s).__name__)
 
     def on_fit_start(
@@ -180,7 +185,7 @@ class Conductor:
         where = _where(view, t)
         require_finite_losses(where, l_lr.values, {"the LR photo": photo.image, "the LR render": low})
         g_lr: Any = None
-        from_hr: HrGradients[Any] | None = None
+        from_hr: HrSide[Any] | None = None
         if not reduced:
             with stage("backward LR"):
                 (g_lr,) = vjp(rendered, l_lr.cotangents)
@@ -189,9 +194,9 @@ class Conductor:
         else:
             # Where Î_LR is the area mean of Î_HR, the cotangent of L_LR passes through the same HR render.
             through_mean = images.area_mean_transposed(l_lr.cotangents, view.factor) if reduced else None
-            g_mean, from_hr = self._backward_hr(hr, Step(t, view, hr.visible), vjp, through_mean)
+            g_mean, from_hr = self._backward_hr(hr, Step(t, view, hr.visible, params=params), vjp, through_mean)
             g_lr = g_mean if reduced else g_lr
-        step = Step(t, view) if from_hr is None else from_hr.step
+        step = Step(t, view, params=params) if from_hr is None else from_hr.step
         with stage("strategies" if stepper is None else stepper.stage):
             score = ordinary = None
             if scored:
@@ -204,7 +209,7 @@ class Conductor:
                 grads, conflict = merged.grads, merged.conflict
             else:
                 require_finite_parts(where, g_lr, from_hr)
-                grads, conflict = None, stepper.step(params, g_lr, from_hr, t)
+                grads, conflict = None, stepper.step(params, rendered, g_lr, from_hr, t)
         losses = {} if from_hr is None else from_hr.losses
         return Update(step, grads, score, ordinary, conflict, {**l_lr.values, **losses}, self.logs())
 
@@ -216,15 +221,17 @@ class Conductor:
         vjp: Callable[[Any, Tensor], Sequence[Any]] | None = None,
         *,
         apart: bool = True,
-    ) -> HrGradients[Any]:
+        params: Mapping[str, Tensor] = _UNKNOWN,
+    ) -> HrSide[Any]:
         """Compare Î_HR with the SR image, backpropagate both losses in one pass, and ask for the evidence.
 
         Args:
             vjp: maps a shot and K cotangents to K gradients, each with `.screen`; None: `Shot.vjp`.
             apart: False: the gradient of L_base + λ_HF L_HF as `base`, where no strategy routes or scores by the two apart.
+            params: for `Step.params`.
         """
         apart = apart or self.owner("route") is not None or self.owner("score") is not None
-        return self._backward_hr(hr, Step(t, view, hr.visible), vjp or _vjp, apart=apart)[1]
+        return self._backward_hr(hr, Step(t, view, hr.visible, params=params), vjp or _vjp, apart=apart)[1]
 
     def extra_views(self, t: int) -> list[ExtraView]:
         """The pictures that the field should match at t besides the view; each gets a step on `extra_loss`."""
@@ -249,40 +256,73 @@ class Conductor:
         require_finite_losses(f"t={t}, an extra view", loss.values, {"its picture": target, "the render": image})
         return loss._replace(cotangents=loss.cotangents * weight)
 
-    def merge(self, params: Mapping[str, Tensor], g_lr: Grads, hr: HrGradients[Grads] | None, t: int) -> Merged:
+    def merge(self, params: Mapping[str, Tensor], g_lr: Grads, hr: HrSide[Grads] | None, t: int) -> Merged:
         """The merge: g_LR + λ_HR ĝ_HR + λ∇L_stab.
 
         Args:
             params: raw parameters by attribute. g_lr: ∇(λ_LR L_LR). hr: None where HR was not rendered.
         """
+        g_lr = g_lr.without_detail()
         if hr is None:
-            return Merged(g_lr + self._regularize(params, t))
-        g_hf = None if hr.hf is None else hr.hf * hr.m * self.objective.lambda_hf  # m ∇L_HF        Eq. 12
-        g_hr = (hr.base if g_hf is None else hr.base + g_hf).without_detail()  # g^HR           Eq. 13
-        detail = None if g_hf is None else g_hf.get("detail")  # f_det: never corrected, never from L_base
-        return self.merge_routed(params, g_lr, g_hr, detail, hr.step, t)
+            return self.merge_routed(params, g_lr, Grads(), None, t)
+        return self.merge_routed(params, g_lr, hr.routed(self.objective.lambda_hf), hr.step, t)
 
     def merge_routed(
-        self, params: Mapping[str, Tensor], g_lr: Grads, g_hr: Grads, detail: Tensor | None, step: Step, t: int
-    ) -> Merged:
+        self, params: Mapping[str, Tensor], g_lr: Grads, g_hr: Grads, step: Step | None, t: int,
+        out: Mapping[str, Tensor] | None = None,
+    ) -> Merged:  # fmt: skip
         """The merge after routing.
 
         Args:
-            g_hr: g^HR of Eq. 13. detail: m λ_HF ∇L_HF of f_det; None: it has none.
+            g_hr: g^HR of Eq. 13, and m λ_HF ∇L_HF of f_det; empty without HR. step: the iteration, with the evidence.
+            out: receives the merged gradient, by attribute, contiguous; None: new tensors, for what has a gradient.
         """
-        λ, g_lr = self.objective.lambda_hr(t), g_lr.without_detail()
+        λ, plus = self.objective.lambda_hr(t), self.regularized(params, t)
+        if out is None:
+            known = [name for name in params if name in plus or reconcile.has(g_lr, name) or reconcile.has(g_hr, name)]
+            out = {name: native.empty_like(params[name]) for name in known}
         conflict: Mapping[str, Number] = {}
-        corrected = g_hr
-        if λ > 0:
-            conflict = conflict_ratio(g_lr, g_hr)  # before correction
-            corrected = self._owner["correct"].correct(g_lr, g_hr, step)  # ĝ^HR           Eq. 6, 7, 11
-        g = g_lr.plus(corrected, λ)  # Eq. 8
-        if detail is not None:
-            g["detail"] = detail * λ
-        return Merged(g + self._regularize(params, t), g_hr, corrected, conflict)  # Eq. 16
+        weights = Weights()
+        if λ > 0 and reconcile.comparable(g_lr, g_hr):
+            products = reconcile.products(g_lr, g_hr)
+            conflict = products.conflict()  # before correction
+            answer = self.reconciled(products, step, lambda: (dense(g_lr, out), dense(g_hr.without_detail(), out)))
+            if isinstance(answer, Weights):
+                weights = answer  # ĝ^HR           Eq. 6, 7, 11
+            else:
+                g_hr = Grads({**answer, **{name: g for name, g in g_hr.items() if name == "detail"}})
+        finite = reconcile.apply(out, g_lr, g_hr, weights, lambda_hr=λ, plus=plus)  # Eq. 8, 16
+        return Merged(Grads(out), conflict, finite)
+
+    def reconciled(
+        self, products: Products, step: Step | None, both: Callable[[], tuple[Grads, Grads]]
+    ) -> Weights | Grads:  # fmt: skip
+        """How the strategies reconcile g_HR with g_LR: the weights of `reconcile`, or ĝ_HR where one overrides `correct`.
+
+        Args:
+            both: g_LR and g^HR with every number, which only `correct` needs.
+        """
+        s = self._owner["reconcile"]
+        if overrides(s, "correct"):
+            return s.correct(*both(), step)
+        weights = s.reconcile(products, step)
+        if not isinstance(weights, Weights):
+            raise TypeError(f"{type(s).__name__}.reconcile must return Weights(keep, remove), got {weights!r:.80}.")
+        return weights
+
+    def regularized(self, params: Mapping[str, Tensor], t: int) -> Grads:
+        """What the strategies add to the merged gradient; empty: nothing.  Eq. 16"""
+        total = Grads()
+        for s in self.regularizers:
+            g = s.regularize(params, t)
+            if g is None:
+                self.work_log.skip("regularize", "no anchor yet")
+            else:
+                total = Grads(g) if not total else total + g
+        return total
 
     def scores(
-        self, screen_lr: Float[Tensor, "N 2"], hr: HrGradients[Any] | None, weights: Weights
+        self, screen_lr: Float[Tensor, "N 2"], hr: HrSide[Any] | None, weights: LossWeights
     ) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
         """The densification score of the strategies, and the ordinary ‖∇_u L‖ that holds without them.
 
@@ -332,7 +372,7 @@ class Conductor:
     def owner(self, hook: str) -> Strategy | None:
         """The strategy that answers a hook which only one may answer; None: no strategy does."""
         s = self._owner[hook]
-        return s if overrides(s, hook) else None
+        return None if type(s) is Strategy else s
 
     def logs(self) -> dict[str, Number]:
         """The scalars that the strategies logged in the last iteration."""
@@ -350,7 +390,7 @@ class Conductor:
         vjp: Callable[..., Sequence[Any]],
         lr_cotangents: Tensor | None = None,
         apart: bool = True,
-    ) -> tuple[Any | None, HrGradients[Any]]:
+    ) -> tuple[Any | None, HrSide[Any]]:
         """∇(λ_LR L_LR) where its cotangents [1, H, W, 3] are given, and the gradients of the HR losses."""
         stage = self.work_log.stage
         with stage("losses HR"):
@@ -371,22 +411,12 @@ class Conductor:
         base, hf = gradients if len(gradients) > 1 else (gradients[0], None)
         with stage("evidence"):
             evidence = self._owner["observe"].observe(step, hr)  # q, a, w        Eq. 9, 10
-            step = Step(step.t, step.view, step.visible, evidence)
+            step = replace(step, evidence=evidence)
             m = 1.0 if hf is None else self._owner["route"].route(step)  # m              Eq. 12
-        return g_lr, HrGradients(base, hf, _size(hr.image), step, m, losses.values)
-
-    def _regularize(self, params: Mapping[str, Tensor], t: int) -> Grads:
-        total = Grads()
-        for s in self.regularizers:
-            g = s.regularize(params, t)
-            if g is None:
-                self.work_log.skip("regularize", "no anchor yet")
-            else:
-                total = total + g
-        return total
+        return g_lr, HrSide(base, hf, _size(hr.image), step, m, losses.values)
 
 
-def _screen_gradients(lr: Float[Tensor, "N 2"], hr: HrGradients[Any], weights: Weights) -> ScreenGradients:
+def _screen_gradients(lr: Float[Tensor, "N 2"], hr: HrSide[Any], weights: LossWeights) -> ScreenGradients:
     hf = None if hr.hf is None else screen_of(hr.hf)
     return ScreenGradients(lr, *per_gaussian.screens(lr, screen_of(hr.base), hf, hr.size, weights))
 

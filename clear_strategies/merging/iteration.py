@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -17,18 +17,14 @@ from clear_strategies.core.gradients import Grads
 from clear_strategies.core.step import Step
 from clear_strategies.kernels import native
 
-G = TypeVar("G")
-"""The gradient of one loss in the form that a `Stepper` takes, with `screen` and `table()` of `Grads`, which it is in the
-readable path.
-"""
+G = TypeVar("G", bound=Grads)
 
-
-Weights = tuple[float, float] | Tensor
+LossWeights = tuple[float, float] | Tensor
 """λ_HR(t) and λ_HR(t) λ_HF: two numbers, or a tensor of them on the device, [2]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HrGradients(Generic[G]):
+class HrSide(Generic[G]):
     """What the HR render of one view gives: its gradients, the evidence, and the routing weights.
 
     Args:
@@ -45,21 +41,24 @@ class HrGradients(Generic[G]):
     m: float | Float[Tensor, " N"] = 1.0
     losses: Mapping[str, Scalar] = field(default_factory=dict)
 
+    def routed(self, lambda_hf: float) -> Grads:
+        """g^HR, and m λ_HF ∇L_HF of f_det, which is never corrected and gets nothing of L_base.  Eq. 12, 13"""
+        g = self.base.without_detail()
+        return g if self.hf is None else g.plus(self.hf, self.m * lambda_hf)
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Merged:
+
+class Merged(NamedTuple):
     """One view's gradients, merged.
 
     Args:
         grads: g_LR + λ_HR ĝ_HR + λ∇L_stab, for the optimizer.  Eq. 8, 16
-        hr: g^HR before correction (Eq. 13), without f_det. corrected: the same after correction; None without HR.
         conflict: share of Gaussians in conflict before correction, by group and as "gaussian".
+        finite: whether every number of `grads` is; on a device it is not known yet.
     """
 
     grads: Grads
-    hr: Grads | None = None
-    corrected: Grads | None = None
-    conflict: Mapping[str, Number] = field(default_factory=dict)
+    conflict: Mapping[str, Number]
+    finite: Number
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,30 +103,34 @@ class Stepper(Protocol[G]):
         """One gradient per cotangent, in the form that `step` takes."""
         ...
 
-    def step(self, params: Mapping[str, Tensor], g_lr: G, hr: HrGradients[G] | None, t: int) -> Mapping[str, Number]:
-        """Merge, and step `params` and the optimizer's moments in place; returns the conflict ratios by group."""
+    def step(
+        self, params: Mapping[str, Tensor], shot: Any, g_lr: G, hr: HrSide[G] | None, t: int
+    ) -> Mapping[str, Number]:  # fmt: skip
+        """Merge, and step `params` and the optimizer's moments in place; returns the conflict ratios by group.
+
+        Args:
+            shot: one of the renderings that the gradients are of.
+        """
         ...
 
-    def weights(self, t: int) -> Weights:
+    def weights(self, t: int) -> LossWeights:
         """As `Objective.weights`."""
         ...
 
-    def step_extra(self, params: Mapping[str, Tensor], g_lr: G, t: int) -> None:
+    def step_extra(self, params: Mapping[str, Tensor], shot: Any, g_lr: G, t: int) -> None:
         """Step on the gradient of an extra view alone; nothing is regularized."""
         ...
 
 
-def require_finite_parts(where: str, g_lr: Any, hr: HrGradients[Any] | None) -> None:
+def require_finite_parts(where: str, g_lr: Grads, hr: HrSide[Any] | None) -> None:
     """Check what a `Stepper` merges: the gradients, and the weights of the strategies; those on a device are not read."""
-    if not deferred.is_immediate(g_lr.screen):
+    if g_lr.screen is None or not deferred.is_immediate(g_lr.screen):
         return
-    parts: dict[str, Mapping[str, Tensor]] = {"∇L_LR": g_lr.table()}
+    parts: dict[str, Mapping[str, Tensor]] = {"∇L_LR": g_lr.tensors}
     if hr is not None:
-        parts |= {"∇L_base": hr.base.table()} | ({} if hr.hf is None else {"∇L_HF": hr.hf.table()})
+        parts |= {"∇L_base": hr.base.tensors} | ({} if hr.hf is None else {"∇L_HF": hr.hf.tensors})
         weights = {} if hr.step.evidence is None else {"reliability": hr.step.evidence.reliability}
         parts["the evidence"] = weights | ({"m": hr.m} if isinstance(hr.m, Tensor) else {})
-    # The spherical harmonics of a direction are finite wherever the Gaussian is drawn, and are a third of the numbers.
-    looked_at = {p: {name: x for name, x in tensors.items() if name != "basis"} for p, tensors in parts.items()}
-    if not native.all_finite([x for tensors in looked_at.values() for x in tensors.values()]):
-        for part, tensors in looked_at.items():
+    if not native.all_finite([x for tensors in parts.values() for x in tensors.values()]):
+        for part, tensors in parts.items():
             require_finite(f"{where}: {part}", tensors)

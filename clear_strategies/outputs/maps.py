@@ -28,13 +28,13 @@ from torch import Tensor
 
 from clear_strategies import files
 from clear_strategies.core import images
-from clear_strategies.core.conflicts import GradientColumns
 from clear_strategies.core.evidence import PatchMaps
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.scene import Scene
 from clear_strategies.geometry.projection import times_seen
+from clear_strategies.kernels import reconcile
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.outputs import figures
 from clear_strategies.schedules import WarmupDecay
@@ -99,7 +99,7 @@ def write_maps(
         for name, values in of_view.maps.items():
             write_png(view_folder / f"{name}.png", values)
         _write_picture(view_folder / "maps.png", view, of_view)
-    corrector = conductor.owner("correct")
+    corrector = conductor.owner("reconcile")
     if corrector is None:
         _log.debug("maps: no strategy of this run corrects, so there is no corrected.png.")
     evidence = _evidence(conductor, views[0])
@@ -180,20 +180,21 @@ def _gradients(
     (g_lr,) = lr.vjp(objective.lr(lr.image.detach(), view.lr.image, view.lr.shown).cotangents)
     # The field is drawn over the scene's own background, whichever one a strategy would choose.
     opaque = replace(view, hr=replace(view.hr, transparency=None))
-    merged = aside.merge(field.raw(), g_lr, aside.hr_gradients(hr, opaque, t), t)
-    corrects = aside.owner("correct") is not None
-    return g_lr, cast(Grads, merged.hr), merged.corrected if corrects else None
+    from_hr = aside.hr_gradients(hr, opaque, t)
+    g_lr, g_hr = g_lr.without_detail(), from_hr.routed(objective.lambda_hf).without_detail()
+    owner = aside.owner("reconcile")
+    return g_lr, g_hr, None if owner is None else owner.correct(g_lr, g_hr, from_hr.step)
 
 
 def _compare(lr: Grads, hr: Grads, corrected: Grads | None) -> tuple[dict[str, Tensor], Bool[Tensor, " N"]]:
     """A number in [0, 1] per Gaussian for each map, and which Gaussians have both gradients: the others are 0."""
-    p = GradientColumns.of(lr, hr).products()
+    p = reconcile.products(lr, hr)
     dot, lr2, hr2 = (x.sum(1) for x in (p.dot, p.l2, p.h2))
     compared = (lr2 > 0) & (hr2 > 0)
     numbers = {}
     if corrected is not None:
         step = corrected + hr * -1.0
-        lost = GradientColumns.of(step, step).products().l2.sum(1) / hr2.clamp_min(torch.finfo(hr2.dtype).tiny)
+        lost = reconcile.products(step, step).l2.sum(1) / hr2.clamp_min(torch.finfo(hr2.dtype).tiny)
         numbers["corrected"] = torch.where(compared, lost.sqrt().clamp(0, 1), 0.0)
     numbers["conflict"] = ((dot < 0) & compared).to(dot)
     return numbers, compared

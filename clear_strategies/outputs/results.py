@@ -145,8 +145,8 @@ def remove_earlier(folder: Path, *, all_files: bool) -> None:
     stems: set[str] = set()
     with suppress(DataError):  # damaged, or of another program
         content = metrics.read(path, "")
-        stems = {file_stem(name) for part in (content.test, content.train) for name in part.views}
-        stems |= {file_stem(saved.name) for saved in cameras.read_cameras(folder / cameras.FILE)}
+        stems |= {*file_stems(name for part in (content.test, content.train) for name in part.views).values()}
+        stems |= {*file_stems(saved.name for saved in cameras.read_cameras(folder / cameras.FILE)).values()}
     path.unlink()
     if not (all_files and stems):
         return
@@ -173,7 +173,7 @@ def _write_sheet(folder: Path, scene: Scene, stems: Mapping[str, str], evaluatio
     rows, part = [], evaluation.test or evaluation.train
     rendered = [view for view in (*scene.test, *scene.train) if view.name in evaluation.renders]
     for view in (*scene.train, *scene.test):  # the viewer shows them beside the rendering
-        write_png(folder / "views" / f"{file_stem(view.name)}_lr.png", view.lr.image)
+        write_png(folder / "views" / f"{stems[view.name]}_lr.png", view.lr.image)
     for view in spaced(rendered, _SHEET_VIEWS):
         for kind, shown in {"prior": view.hr.image, "truth": view.truth}.items():
             if shown is not None:

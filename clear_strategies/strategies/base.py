@@ -2,32 +2,30 @@
 
 The hooks are phases of an iteration, so their order needs no configuration. `Strategy` answers each as if there were no
 strategy. At most one strategy may override each of the hooks with a single answer: densifier, background, gate, observe, route,
-correct, score.
+reconcile or correct, score.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from clear_strategies.core.compiled_rules import Anchor, CorrectionRule
+from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.evidence import Evidence, PatchMaps
-from clear_strategies.core.gradients import Grads, Shot
+from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, Shot
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, View
+from clear_strategies.kernels import native, reconcile
 from rasterizers.interface import Color
 
 _DEVICE, _SEED = "device", "seed"  # in the cache
-
-# A hook that compiled passes compute, and the fact that states it as data.
-_STATED_BY: Final = {"correct": "correction_rule", "regularize": "anchor"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,9 +106,34 @@ class Strategy:
         """How much of its high-frequency gradient does each Gaussian get? m >= 0; 1: all of it.  Eq. 12"""
         return 1.0
 
-    def correct(self, lr: Grads, hr: Grads, step: Step) -> Grads:
-        """How to reconcile the two gradients? Returns the corrected g_HR; g_LR is never changed.  Eq. 6, 7, 11"""
-        return hr
+    def reconcile(self, products: Products, step: Step | None) -> Weights:
+        """How to reconcile both gradients? ĝ_HR = keep · g_HR - remove · g_LR; g_LR is never changed.  Eq. 6, 7, 11
+
+        Args:
+            products: how the two relate, by Gaussian and attribute group.
+            step: the iteration, with the evidence; None in a call of `correct` that names none.
+        """
+        return Weights()
+
+    def correct(self, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor], step: Step | None = None) -> Grads:
+        """ĝ_HR, from two gradients by attribute: by the weights of `reconcile`.
+
+        A strategy that decides number by number overrides this hook in place of `reconcile`; it is given all numbers of both.
+
+        Args:
+            lr, hr: attribute -> gradient [N, …], any of `CONFLICT_GROUPS`; what only one of them has is not compared, and what
+                is None is left out.
+
+        Raises:
+            ValueError: both have gradients, but none of the same group, so that nothing could be compared.
+        """
+        lr, hr = (Grads({name: g for name, g in grads.items() if g is not None}) for grads in (lr, hr))
+        if not lr or not hr:
+            return hr
+        products = reconcile.products(lr, hr)
+        out = {name: native.empty_like(g) for name, g in hr.items() if name in CONFLICT_GROUPS}
+        reconcile.apply(out, lr, hr, self.reconcile(products, step), keeps_lr=False)
+        return Grads({**hr, **out})
 
     def regularize(self, params: Mapping[str, Tensor], t: int) -> Grads | None:
         """Before the optimizer step: a gradient to add. Several strategies may answer.  Eq. 16"""
@@ -143,7 +166,7 @@ class Strategy:
     def on_fit_end(self) -> None:
         """After the last iteration: release the memory that only training needs."""
 
-    # ---- facts about the strategy: the plan, the pictures and the compiled step read them -----------------------------
+    # ---- facts about the strategy: the plan, the pictures and recordings read them ------------------------------------
 
     def summary(self) -> str | None:
         """What the strategy has prepared for this run, a phrase for the plan; None: nothing."""
@@ -162,18 +185,10 @@ class Strategy:
         """The patch evidence that the strategy works with for this view; None: it uses none.  Eq. 9"""
         return None
 
-    def correction_rule(self) -> CorrectionRule | None:
-        """`correct` as data, for the compiled step; None: only the readable path computes it."""
-        return None
-
     def looked_up(self, view: View) -> Tensor | None:
         """What `observe` and `route` read of a view, if they and `score` depend on view and iteration by it and by what they are
         given alone, so that an iteration can be recorded: in a replay they read the tensor `View.looked_up`.
         """
-        return None
-
-    def anchor(self, n: int) -> Anchor | None:
-        """`regularize` for n Gaussians as data, for the compiled step; None: nothing is added now."""
         return None
 
     # ---- for subclasses ---------------------------------------------------------------------------------------------
@@ -207,25 +222,15 @@ def overrides(strategy: Strategy, hook: str) -> bool:
 
 
 def describes(strategy: Strategy, fact: str) -> bool:
-    """Whether `fact` ("correction_rule", "anchor", "looked_up") describes what the strategy's class does.
+    """Whether `fact` ("looked_up") describes what the strategy's class does.
 
-    A subclass that overrides any method of the class that states the fact no longer does the same:
-    it must state the fact itself, or takes the readable path.
+    A subclass that overrides any method of the class that states the fact no longer does the same: it must state the fact itself.
     """
     cls = type(strategy)
     stated_by = next(base for base in cls.__mro__ if fact in vars(base))
     return stated_by is not Strategy and all(
         getattr(cls, name) is method for name, method in _methods(stated_by).items()
     )
-
-
-def not_stated_as_data(strategies: Sequence[Strategy]) -> Iterator[str]:
-    """Why these strategies have no compiled merge: a sentence for each of them that computes what it does not state as data."""
-    for s in strategies:
-        if any(overrides(s, hook) and not describes(s, fact) for hook, fact in _STATED_BY.items()):
-            yield f"{type(s).__name__} does not state its arithmetic as data"
-    if sum(overrides(s, "regularize") for s in strategies) > 1:
-        yield "more than one strategy regularizes"
 
 
 def _methods(cls: type) -> dict[str, Any]:

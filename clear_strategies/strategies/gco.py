@@ -6,8 +6,10 @@ reaches the margin, for each Gaussian and each attribute group. LR gradients are
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, partial
 from typing import Final
 
 import torch
@@ -16,18 +18,22 @@ from torch import Tensor
 
 from clear_strategies.core import deferred
 from clear_strategies.core.checks import refuse, require_choice, require_number
-from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule
-from clear_strategies.core.conflicts import ConflictCounts, GradientColumns, counted
-from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads
+from clear_strategies.core.conflicts import Products, Weights
+from clear_strategies.core.deferred import Number
+from clear_strategies.core.gradients import CONFLICT_GROUPS
 from clear_strategies.core.step import Step
-from clear_strategies.kernels import merge
 from clear_strategies.strategies.base import Strategy
+
+_log = logging.getLogger(__name__)
 
 # The column of the share of corrections with ω at its lower bound: near 1, the prior agrees with LR.
 _AT_LOWER_BOUND: Final = "omega_at_lower_bound"
 _SCALES: Final = CONFLICT_GROUPS.index("scales")
 _QUATS: Final = CONFLICT_GROUPS.index("quats")
 _TINY: Final = torch.finfo(torch.float64).tiny
+# A Gaussian whose axes are equally long does not change when it is rotated: in exact arithmetic its rotation gradient is 0, in
+# floating point it is noise that would "conflict" one time in five.
+_ROTATION_NOISE: Final = 2.0**-18
 
 
 @dataclass(frozen=True)
@@ -39,8 +45,8 @@ class GCO(Strategy):
         weight_min, weight_max: bounds of ω where a conflict is corrected, 0 <= min <= max <= 1.
         groups: the attributes that are compared and corrected, each separately.
 
-    There is no ε: norms and products are in float64, where those of float32 gradients do not vanish, and a zero norm is no
-    conflict (F27). The opacity group has one dimension: its cosine is ±1, so every disagreement is a full conflict.
+    There is no ε: products are in float64, where those of float32 gradients do not vanish, and a zero norm is no conflict (F27).
+    The opacity group has one dimension: its cosine is ±1, so every disagreement is a full conflict.
     Without evidence q = 0, and the LR gradient prevails (F32).
 
     Raises:
@@ -70,74 +76,57 @@ class GCO(Strategy):
             return "lambda_LR is 0, so nothing can conflict"
         return "lambda_HR is 0 throughout" if lambda_hr == 0 else None
 
-    def correction_rule(self) -> CorrectionRule:
-        return CorrectionRule(self.groups, self.tolerance, self.weight_min, self.weight_max, self.report)
+    def reconcile(self, products: Products, step: Step | None) -> Weights:
+        """ĝ_HR = g_HR - ω (c + τ_c) ‖h‖ / ‖l‖ g_LR where c < -τ_c. Logs what was corrected."""
+        p, τ = products, self.tolerance
+        per_norm = (p.l2 * p.h2).clamp_min_(_TINY).rsqrt_()  # 1 / (‖l‖ ‖h‖)
+        c = p.dot * per_norm  # Eq. 6
+        below = c.add_(τ).clamp_max_(0)  # c + τ_c, how far a cosine lies below the margin; 0: no conflict
+        below[:, _QUATS] *= _turns_something(p.l2) & _turns_something(p.h2)
+        if len(self.groups) < len(CONFLICT_GROUPS):
+            below[:, [k for k, group in enumerate(CONFLICT_GROUPS) if group not in self.groups]] = 0
+        evidence = None if step is None else step.evidence
+        q = p.dot.new_zeros(1) if evidence is None else evidence.reliability.double()
+        ω = (below * ((1 - q) / (τ - 1))[:, None]).clamp_(self.weight_min, self.weight_max)  # s (1 - q), Eq. 11
+        self._report(p, below, ω, evidence is not None)
+        return Weights(remove=(ω * below).mul_(p.h2).mul_(per_norm))  # ω (c + τ_c) ‖h‖ / ‖l‖, Eq. 7
 
-    def correct(self, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor], step: Step | None = None) -> Grads:
-        """g̃_HR for every group; logs what was corrected. In one compiled pass where there is one for these tensors, with the same
-        decisions as `correct_in_torch` except where a cosine lies within 2e-7 of its bound.
+    def _report(self, p: Products, below: Float[Tensor, "N G"], ω: Float[Tensor, "N G"], has_evidence: bool) -> None:
+        """Log what was corrected; it is counted where somebody asks for it."""
+        groups = [group for group in self.groups if group in p.names]
+        if not groups:
+            self._warn_once(p.names)
+            return
 
-        Args:
-            lr, hr: attribute -> gradient [N, …], any of `CONFLICT_GROUPS`; what only one of them has is not compared, and what
-                is None is left out.
-            step: gives the reliability of Eq. 11; None: nothing is known of it, and conflicts are corrected in full.
+        @cache
+        def counted() -> tuple[Sequence[Number], ...]:
+            corrected = (below < 0).sum(0)
+            calm = len(below) - corrected  # where ω is at its lower bound, too
+            sums = corrected, ω.sum(0) - self.weight_min * calm, (ω <= self.weight_min).sum(0) - calm
+            return (p.comparable, *map(deferred.elements, sums))
 
-        Raises:
-            ValueError: both have gradients, but none of the same group, so that nothing could be corrected.
-        """
-        lr, hr = ({name: g for name, g in grads.items() if g is not None} for grads in (lr, hr))
-        q = None if step is None or step.evidence is None else step.evidence.reliability
-        both = [group for group in self.groups if group in lr and group in hr]
-        if not both or (compiled := merge.compiled(g[name] for name in both for g in (lr, hr))) is None:
-            return self.correct_in_torch(lr, hr, step)
-        rows = {
-            name: merge.Rows(
-                torch.empty_like(hr[name], memory_format=torch.contiguous_format), lr=lr[name], hr=hr[name]
-            )
-            for name in both
-        }
-        counts, _ = compiled(rows, self.correction_rule(), q, keeps_lr=False)
-        self.report(counts, both, q is not None)
-        return Grads(hr | {name: row.out for name, row in rows.items()})
+        def share(part: int, whole: int, of: Sequence[str] = groups) -> Number:
+            at = [CONFLICT_GROUPS.index(group) for group in of]
+            total = [deferred.defer(deferred.added, *(counted()[k][i] for i in at)) for k in (part, whole)]
+            return deferred.defer(deferred.ratio, *total)
 
-    def correct_in_torch(self, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor], step: Step | None = None) -> Grads:
-        """The same as equations, on any device: the specification of every compiled pass."""
-        if not lr or not hr:
-            return Grads(hr)
-        columns = GradientColumns.of(lr, hr, self.groups)
-        p, τ = columns.products(), self.tolerance
-        n = (p.l2 * p.h2).sqrt()
-        c = torch.where(n > 0, p.dot / n.clamp_min(_TINY), 0.0)  # Eq. 6
-        conflict = c < -τ
-        conflict[:, _QUATS] &= _turns_something(p.l2) & _turns_something(p.h2)
-        q = 0.0 if step is None or step.evidence is None else step.evidence.reliability.double()[:, None]
-        s = ((-c - τ) / (1 - τ)).clamp(0, 1)
-        ω = (s * (1 - q)).clamp(self.weight_min, self.weight_max)  # Eq. 11
-        multiple = torch.where(conflict, ω * (p.dot + τ * n) / p.l2, 0.0)
-        corrected = columns.minus(multiple, like=hr)  # Eq. 7
-        counts = replace(
-            counted(p), corrected=deferred.elements(conflict.sum(0)), omega=deferred.elements((ω * conflict).sum(0)),
-            at_lower_bound=deferred.elements((conflict & (ω <= self.weight_min)).sum(0)),
-        )  # fmt: skip
-        self.report(counts, columns.names, isinstance(q, Tensor))
-        return Grads({**hr, **corrected})
+        compared, corrected, weight, at_lower_bound = range(4)
+        self.log("corrected", partial(share, corrected, compared))
+        self.log("mean_omega", partial(share, weight, corrected))
+        for group in groups:
+            self.log(f"corrected_{group}", partial(share, corrected, compared, [group]))
+        if has_evidence and self.weight_min > 0:
+            self.log(_AT_LOWER_BOUND, partial(share, at_lower_bound, corrected))
 
-    def report(self, counts: ConflictCounts, groups: Sequence[str], has_evidence: bool) -> None:
-        """Log what was corrected in these groups."""
-        at = [CONFLICT_GROUPS.index(group) for group in groups if group in self.groups]
-        compared, corrected, ω, at_bound = (
-            deferred.defer(deferred.added, *(values[k] for k in at))
-            for values in (counts.comparable, counts.corrected, counts.omega, counts.at_lower_bound)
-        )
-        self.log("corrected", deferred.defer(deferred.ratio, corrected, compared))
-        self.log("mean_omega", deferred.defer(deferred.ratio, ω, corrected))
-        for k in at:
-            share = deferred.defer(deferred.ratio, counts.corrected[k], counts.comparable[k])
-            self.log(f"corrected_{CONFLICT_GROUPS[k]}", share)
-        if corrected != 0 and has_evidence and self.weight_min > 0:
-            self.log(_AT_LOWER_BOUND, deferred.defer(deferred.ratio, at_bound, corrected))
+    def _warn_once(self, names: Sequence[str]) -> None:
+        if not self.cache.get("warned"):
+            self.cache["warned"] = True
+            _log.warning(
+                "GCO has no effect: it compares %s, and both scales have a gradient of %s alone. Set strategies.gco.groups.",
+                ", ".join(self.groups), ", ".join(names),
+            )  # fmt: skip
 
 
 def _turns_something(squares: Float[Tensor, "N G"]) -> Bool[Tensor, " N"]:
-    """Whether a gradient of the rotation is more than rounding noise, see `ROTATION_NOISE`."""
-    return squares[:, _QUATS] > ROTATION_NOISE**2 * squares[:, _SCALES]
+    """Whether a gradient of the rotation is more than rounding noise, see `_ROTATION_NOISE`."""
+    return squares[:, _QUATS] > _ROTATION_NOISE**2 * squares[:, _SCALES]

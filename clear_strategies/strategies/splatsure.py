@@ -21,7 +21,7 @@ from torch import Tensor
 
 from clear_strategies.core import deferred
 from clear_strategies.core.checks import require_number, require_whole
-from clear_strategies.core.gradients import Grads
+from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.step import Step
 from clear_strategies.strategies.base import Strategy
 from rasterizers.interface import Camera
@@ -65,13 +65,14 @@ class SplatSuRe(Strategy):
     def without_effect(self, *, lambda_lr: float, lambda_hr: float, lambda_hf: float) -> str | None:
         return "lambda_HR is 0 throughout" if lambda_hr == 0 else None
 
-    def correct(self, lr: Grads, hr: Grads, step: Step) -> Grads:
-        """W g_HR, attribute by attribute."""
-        rows = next(iter(hr.values()))
-        w = self.weight(step.view.name).to(rows) if self.state else rows.new_ones(len(rows))
+    def reconcile(self, products: Products, step: Step | None) -> Weights:
+        """W g_HR."""
+        if step is None or not self.state:
+            return Weights()
+        w = self.weight(step.view.name)
         if step.visible is not None:
             self.log("mean_hr_weight", deferred.mean(w, step.visible))
-        return hr * w
+        return Weights(keep=w)
 
     def weight(self, name: str) -> Float[Tensor, " N"]:
         """1 - score in the view called `name`, and 1 where that view samples best.

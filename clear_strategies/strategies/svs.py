@@ -16,12 +16,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.checks import require_choice, require_number, require_whole
-from clear_strategies.core.compiled_rules import Anchor
 from clear_strategies.core.gradients import ATTRIBUTES, Grads
 from clear_strategies.core.points import spread
 from clear_strategies.core.seeds import dropout_mask
 from clear_strategies.core.step import Step
 from clear_strategies.errors import AnchorError
+from clear_strategies.kernels import native
 from clear_strategies.schedules import Ramp, milestone
 from clear_strategies.strategies.base import Strategy
 
@@ -87,27 +87,22 @@ class SVS(Strategy):
         return dropout_mask(n, p, self.seed, t, self.device)
 
     def regularize(self, params: Mapping[str, Tensor], t: int) -> Grads | None:
-        """∇ λ_stab Σ_i ‖θ_i - θ_i^a‖²_W, for every Gaussian, seen or not; None before the anchor."""
-        anchor = self.anchor(next(iter(params.values())).shape[0])
-        if anchor is None:
-            return None
-        return Grads(
-            {name: (params[name] - anchor.targets[name]) * k for name, k in anchor.stiffness.items() if name in params}
-        )  # Eq. 16
-
-    def anchor(self, n: int) -> Anchor | None:
-        """θ^a, and the stiffness 2 λ_stab W by attribute; None before the anchor is taken.
+        """∇ λ_stab Σ_i ‖θ_i - θ_i^a‖²_W, for every Gaussian, seen or not; None before the anchor.
 
         Raises:
-            AnchorError: `n` is not the number of Gaussians that were anchored.
+            AnchorError: the number of Gaussians is not that of the anchor.
         """
         if not self.state:
             return None
+        n = next(iter(params.values())).shape[0]
         self._require_same_number(n)
         strength = 2 * self.anchor_strength / (1 if self.reduction == "sum" else n)
-        unit = {"means": self._extent() ** 2} if "means" in self.state else {}
-        weights = {name: self.anchor_weights[name] / unit.get(name, 1.0) for name in self.state}
-        return Anchor(self.state, {name: strength * weight for name, weight in weights.items()})
+        pull = Grads()
+        for name in self.state.keys() & params.keys():
+            unit = self._extent() ** 2 if name == "means" else 1.0
+            difference = torch.sub(params[name], self.state[name], out=native.empty_like(params[name]))
+            pull[name] = difference.mul_(strength * self.anchor_weights[name] / unit)  # Eq. 16
+        return pull
 
     def without_effect(self, *, lambda_lr: float, lambda_hr: float, lambda_hf: float) -> str | None:
         if self.dropout.maximum == 0 and (self.anchor_strength == 0 or not any(self.anchor_weights.values())):

@@ -157,7 +157,7 @@ def learn_extra(s: TrainState, rasterizer: Rasterizer, given: GivenExtra) -> Lea
         if s.compiled_step is not None:
             (g,) = s.compiled_step.vjp(shot, losses.cotangents)
             require_finite_parts(where, g, None)
-            s.compiled_step.step_extra(θ.raw(), g, given.t)
+            s.compiled_step.step_extra(θ.raw(), shot, g, given.t)
         else:
             (grads,) = shot.vjp(losses.cotangents)
             require_finite(f"{where}: the gradient", grads)

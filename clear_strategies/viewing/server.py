@@ -27,6 +27,7 @@ import numpy as np
 import torch
 import viser
 from jaxtyping import Float
+from nerfview._renderer import InterruptRenderException, Renderer
 from torch import Tensor
 
 from clear_strategies.core.images import to_bytes
@@ -45,12 +46,20 @@ _FOV: Final = (1e-3, 3.1)  # radians
 _ASPECT: Final = (1 / 25, 25.0)  # width by height: beyond, nerfview asks for pictures without pixels
 _FARTHEST: Final = 1e9  # world units, of a camera from the origin
 _PATIENCE: Final = 0.02  # seconds between looks at the button while the run is paused
+_PICTURE: Final = 30.0  # seconds that the last picture may take once the viewer closes
 _NONE: Final = np.zeros((1, 1, 3), np.uint8)
 _PHOTO: Final = 300  # px, the width of the panel: an LR photo has less
 _TURN: Final = 0.002  # seconds that the lock is free after an iteration, so that a thread that waits for it gets it
 
-
 Photos = Callable[[str], Pixels | None]
+
+
+class _Sizes(nerfview.RenderTabState):  # type: ignore[misc]
+    """nerfview's state of the panel, with sizes that can be drawn: a slider's range binds the page alone."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        least, most = _SIZES.get(name, (None, None))
+        super().__setattr__(name, value if least is None or most is None else min(max(value, least), most))
 
 
 class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no types
@@ -67,7 +76,9 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         port: int = 8080, host: str = "127.0.0.1", out: Path | None = None,
         mode: Literal["rendering", "training"] = "rendering",
     ) -> None:  # fmt: skip
-        self._painter, self._cameras, self._photo, self._failed = painter, cameras, photo, ""
+        self._painter, self._cameras, self._photo = painter, cameras, photo
+        self._told = set[tuple[str, int]]()
+        self._drawable = WeakKeyDictionary[Any, Any]()  # the last camera of each browser
         # A browser that goes away while its picture is drawn.
         warnings.filterwarnings("ignore", message=".*it will never be delivered")
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its address; whoever opens it does

@@ -4,14 +4,17 @@ import itertools
 from dataclasses import dataclass
 from functools import partial
 
+import pytest
 import torch
 
 from clear_strategies import SVS, Conductor, Evidence, Objective
 from clear_strategies.core import deferred
-from clear_strategies.merging.iteration import HrGradients
+from clear_strategies.merging.iteration import HrSide
 from clear_strategies.schedules import WarmupDecay
-from clear_strategies.training.compiled_step import Factors
-from clear_strategies.training.field import GaussianField
+from clear_strategies.training import compiled_step
+from clear_strategies.training.compiled_step import CompiledStep, gradients_of
+from clear_strategies.training.field import FieldShot, GaussianField
+from clear_strategies.training.optim import Adam, LearningRates
 from rasterizers.interface import SplatGradients
 from tests.helpers import toy
 
@@ -38,23 +41,35 @@ class Case:
     z: torch.Tensor | None
 
     def factors(self, use: int, hr: str = "both") -> tuple:
-        a = self.fields[use]._activate(self.z)
-        (lr,), both = Factors.of(self.lr, a), Factors.of(self.hr, a)
-        return lr, self._bundle(*(both[k] if k < HR_COTANGENTS[hr] else None for k in (0, 1)))
+        """What a compiled step is given: the rendering, g_LR and what comes from HR."""
+        shot = object.__new__(FieldShot)
+        shot.activation = self.fields[use]._activate(self.z)
+        (lr,), both = gradients_of(self.lr), gradients_of(self.hr)
+        return shot, lr, self._bundle(*(both[k] if k < HR_COTANGENTS[hr] else None for k in (0, 1)))
 
     def grads(self, use: int, hr: str = "both") -> tuple:
         a = self.fields[use]._activate(self.z)
         hf = (a.vjp(self.hr, k, detail=True) if k < HR_COTANGENTS[hr] else None for k in (0, 1))
         return a.vjp(self.lr, 0, detail=False), self._bundle(*hf)
 
-    def _bundle(self, base, hf) -> HrGradients | None:
-        return None if base is None else HrGradients(base, hf, (1, 1), toy.step(evidence=self.e), self.m)
+    def _bundle(self, base, hf) -> HrSide | None:
+        return None if base is None else HrSide(base, hf, (1, 1), toy.step(evidence=self.e), self.m)
 
 
 def readable_merge(conductor, params, g_lr, hr, t) -> tuple:
     """The merged gradient and the conflict ratios of the readable path."""
     merged = conductor.merge(params, g_lr, hr, t)
     return merged.grads, merged.conflict
+
+
+def compiled_merge(step: CompiledStep, c: Case, hr: str = "both") -> tuple:
+    """The merged gradient of a compiled step, which Adam's first moment is where β₁ = 0, and the conflict ratios."""
+    params = {name: p.clone() for name, p in c.fields[1].raw().items()}
+    step.optimizer = Adam(params, LearningRates(), 1.0)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(compiled_step, "BETA1", 0.0)
+        conflict = step.step(params, *c.factors(1, hr), T)
+    return step.optimizer.first, conflict
 
 
 ANCHORING = partial(

@@ -198,7 +198,8 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     import warp as wp
 
     from clear_strategies.core import deferred
-    from clear_strategies.kernels import native, per_gaussian
+    from clear_strategies.kernels import native
+    from clear_strategies.kernels.per_gaussian import dispatch
     from clear_strategies.training import replay
     from rasterizers import recording, warp_runtime
     from rasterizers.warp_backend import frame, settings
@@ -242,7 +243,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         recording: {"_side_stream": cache(lambda device: Stream(cuda)), "warp_stream": lambda stream: stream},
         deferred: {"is_immediate": lambda x: False},
         native: {"available": lambda: False},
-        per_gaussian: {"DEVICES": {"cpu"}},
+        dispatch: {"DEVICES": {"cpu"}},
         frame: {"DEFERRED_COUNTS": {"cpu": True}},
         **{m: {"sent": lambda numbers, device: numbers.pin_memory()} for m in (warp_runtime, settings, replay)},
     }  # fmt: skip

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clear_strategies import P2G, Conductor, RandomBackground, SRStage, View
+from clear_strategies import P2G, Conductor, RandomBackground, View
 from clear_strategies.geometry.projection import intrinsics
-from clear_strategies.merging.in_place import InPlaceMerge
+from clear_strategies.merging.in_place import merge_in_place
 from integration import HostError
 from integration.gsplat import attach
 from rasterizers import autograd
@@ -139,13 +139,13 @@ def test_gradients_that_a_loop_asks_for_beside_its_backward_pass_leave_the_merge
 
 @pytest.mark.parametrize("penalty", [0.0, 1e-3])
 def test_the_gradient_of_the_colours_comes_by_its_factors_but_where_a_hook_looks_at_it(penalty, monkeypatch):
-    by_factors, merge = [], InPlaceMerge.__call__
+    by_factors = []
 
-    def spied(self, *arguments, lr_colour, **settings):
+    def spied(*arguments, lr_colour, **settings):
         by_factors.append(lr_colour is not None)
-        return merge(self, *arguments, lr_colour=lr_colour, **settings)
+        return merge_in_place(*arguments, lr_colour=lr_colour, **settings)
 
-    monkeypatch.setattr(InPlaceMerge, "__call__", spied)
+    monkeypatch.setattr("integration.attachment.merge_in_place", spied)
     merged = []
     for hooked in (False, True):
         host, _, render = started()
@@ -242,9 +242,8 @@ def test_all_renders_are_over_the_background_of_a_strategy_unless_the_loop_has_i
         return gsplat_host.rasterization(**call)
 
     host = Host(toy.scene(20), rasterization=recorded)
-    _, _, render = started(chosen, toy.ShowsDark(), SRStage(), host=host, own_background=own_background)
+    _, _, render = started(chosen, toy.ShowsDark(), host=host, own_background=own_background)
     render().mean().backward()
-    assert "SRStage has no effect here: the host draws no picture" in caplog.text
     assert ("RandomBackground has no effect here" in caplog.text) == own_background
     color = None if own_background else torch.tensor(chosen.background(1)).tolist()
     assert [b if b is None else b[0].tolist() for b in backgrounds] == [color] * 3

@@ -12,7 +12,7 @@ from clear_strategies.core.gradients import Grads, to_ndc
 from clear_strategies.core.step import Step
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.kernels.per_gaussian import activate, dispatch
-from clear_strategies.merging.iteration import HrGradients, Update
+from clear_strategies.merging.iteration import HrSide, Update
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
 from tests.helpers.backends import needs
@@ -94,7 +94,7 @@ def test_scores_and_their_sum(by_warp, score_by, hf):
     q, a, visible = torch.rand(N, generator=g), torch.rand(N, generator=g), torch.rand(N, generator=g) < 0.5
     lr, base, detail = (Grads(screen=1e-4 * numbers(N + k, 2)[:N]) for k in range(3))
     detail.screen[0] = 1e-25
-    hr = HrGradients(base, detail if hf else None, (96, 64), toy.step(1, Evidence(q, a)))
+    hr = HrSide(base, detail if hf else None, (96, 64), toy.step(1, Evidence(q, a)))
     conductor = cs.Conductor(cs.P2G(score_by=score_by))
 
     def statistics():

@@ -67,10 +67,12 @@ class Synchronisations(TorchDispatchMode):
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         name = func._schema.name
+        kwargs = kwargs or {}
+        moved = name != "aten::_to_copy" or kwargs.get("device") is not None  # else of another type, on its device
         masked = name == "aten::index" and any(i is not None and i.dtype == torch.bool for i in args[1])
-        if name in self.WAITING or masked:
+        if (name in self.WAITING and moved) or masked:
             self.operations.append(name)
-        return func(*args, **(kwargs or {}))
+        return func(*args, **kwargs)
 
 
 def test_the_host_does_not_wait_for_the_device(warp_step):
@@ -85,10 +87,10 @@ def test_the_host_does_not_wait_for_the_device(warp_step):
 
 @pytest.mark.slow
 def test_the_kernels_compile_for_cuda_on_a_machine_without(warp_step, ptx_of):
-    from clear_strategies.kernels.merge import warp as merge
+    from clear_strategies.kernels.reconcile import warp as reconcile
 
     ptx_of(warp_step.adam.write.module)
-    assert "fma.rn.f32" not in ptx_of(merge.decide.module, merge._LANES["cuda"])
-    assembly = ptx_of(warp_step.passes.step.module, warp_step.LANES["cuda"])  # the module of both kernels
+    assert "fma.rn.f32" not in ptx_of(reconcile.compare.module, reconcile._LANES["cuda"])
+    assembly = ptx_of(warp_step.passes.step.module, warp_step.LANES["cuda"])  # the module of all kernels
     assert ".local" not in assembly  # no spills: a thread's numbers are in registers
     assert "fma.rn.f32" not in assembly  # products and sums round as in torch

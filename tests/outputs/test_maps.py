@@ -13,9 +13,9 @@ from torch import Tensor
 
 import rasterizers
 from clear_strategies import GCO, P2G, SVS, Conductor, DepthMap, Grads, Objective, RandomBackground, Strategy, View
-from clear_strategies.core.conflicts import conflict_ratio
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.view_names import file_stems
+from clear_strategies.kernels.reconcile import products
 from clear_strategies.outputs.maps import MAPS, ViewMaps, view_maps, write_maps
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.training.loop import iterate
@@ -86,7 +86,9 @@ def test_patch_maps_are_p2gs_evidence_enlarged_to_hr_and_conflict_is_the_ratio_t
     lr, hr = state.field.render_scales(toy.RASTERIZER, view)
     (g_lr,) = lr.vjp(OBJECTIVE.lr(lr.image, view.lr.image).cotangents)
     g_base, g_hf = hr.vjp(OBJECTIVE.hr(hr.image, view.hr.image).cotangents)
-    assert found.means["conflict"] == pytest.approx(conflict_ratio(g_lr, g_base + g_hf * 0.2)["gaussian"])
+    assert found.means["conflict"] == pytest.approx(
+        products(g_lr.without_detail(), g_base + g_hf * 0.2).conflict()["gaussian"]
+    )
     assert 0 < found.means["conflict"] < 1
 
 

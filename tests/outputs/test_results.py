@@ -42,7 +42,7 @@ def write(folder: Path, state: TrainState, *, scene: Scene = SCENE, map_views: i
     state = replace(state, settings=replace(state.settings, map_views=map_views, video=video))
     return write_results(
         folder, scene, state, toy.RASTERIZER, Painter(state.field, lambda **_: toy.RASTERIZER), Chosen(None, ["gco", "p2g"]),
-        backend="torch", down="bicubic", seconds=1.5, config={"fit": {"seed": 0}}, antialiased=False,
+        backend="torch", down="bicubic", seconds=1.5, config={"fit.seed": 0}, antialiased=False,
     )  # fmt: skip
 
 
@@ -61,7 +61,7 @@ def test_conflict_csv_holds_columns_of_history_csv_and_the_ply_says_how_it_was_d
     content = json.loads((tmp_path / "metrics.json").read_text())
     assert content["conflict"]["gaussian"] == pytest.approx(mean)
     assert content["test"]["mean"]["ours"] == pytest.approx(asdict(evaluation.mean("test")))
-    assert (content["scene"], content["config"]) == ("toy", {"fit": {"seed": 0}})
+    assert (content["scene"], content["config"]) == ("toy", {"fit.seed": 0})
     assert not read_gaussians(tmp_path / "point_cloud.ply").antialiased
 
 

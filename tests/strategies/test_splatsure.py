@@ -20,7 +20,8 @@ def visit(strategy: SplatSuRe, name: str, distance: float, shown: list[bool], me
     """One iteration of a view: the weights of its HR gradients."""
     photo = Photo(camera(distance), torch.zeros(8, 8, 3))
     step = Step(1, View(name, photo, photo), torch.tensor(shown))
-    corrected = strategy.correct(Grads(), Grads({"opacities": torch.ones(len(shown))}), step)["opacities"]
+    one = Grads({"opacities": torch.ones(len(shown))})
+    corrected = strategy.correct(one, one, step)["opacities"]
     strategy.after_step({"means": torch.zeros(len(shown), 3) if means is None else means}, step)
     return corrected
 

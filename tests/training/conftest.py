@@ -1,10 +1,12 @@
 """The passes of the compiled per-Gaussian step."""
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
 
+from clear_strategies.core.conflicts import Weights
 from clear_strategies.kernels.gaussian_step import Attribute
 from clear_strategies.kernels.gaussian_step.cpp import CppGaussianStep
 from rasterizers.interface import BackendUnavailable
@@ -46,8 +48,17 @@ class Elsewhere:
             if x is not None:
                 x.copy_(self.there.pop(id(x))[1])
 
-    def step(self, attributes, rule, q, step):
+    def products(self):
+        found = self.passes.products()
+        dot, l2, h2 = (x.cpu() for x in (found.dot, found.l2, found.h2))
+        return replace(found, dot=dot, l2=l2, h2=h2)
+
+    def dense(self, lr, hr):
+        self.passes.dense(*({name: self.bring(x) for name, x in g.items()} for g in (lr, hr)))
+        self.fetch(*lr.values(), *hr.values())
+
+    def step(self, attributes, weights, step):
         brought = {name: Attribute(*map(self.bring, a)) for name, a in attributes.items()}
-        found = self.passes.step(brought, rule, self.bring(q), step)
-        self.fetch(*(x for a in attributes.values() for x in (a.p, a.m, a.v, a.merged)))
+        found = self.passes.step(brought, Weights(*map(self.bring, weights)), step)
+        self.fetch(*(x for a in attributes.values() for x in (a.p, a.m, a.v)))
         return found

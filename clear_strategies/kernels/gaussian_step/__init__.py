@@ -1,7 +1,7 @@
-"""The per-Gaussian step of one iteration in compiled code: its inputs and its outputs.
+"""The per-Gaussian step of one iteration in compiled code, for gradients that are never stored: the same three as
+`kernels.reconcile` (products, the strategy's weights, apply), with the chain rule to the raw parameters before and Adam behind.
 
-It computes what the readable path computes, which specifies it: `merging.conductor.Conductor.merge`,
-`strategies.gco.GCO.correct`, `strategies.svs.SVS.regularize`, `training.field.Activation.vjp`, `training.optim.Adam.step` and
+It is specified by `merging.conductor.Conductor.merge`, `training.field.Activation.vjp`, `training.optim.Adam.step` and
 `training.field.GaussianField.constrain`. `training.compiled_step` calls it; tests/training/test_compiled_step.py compares.
 
 `cpp.CppGaussianStep` runs on the CPU and returns Python numbers. `warp.WarpGaussianStep` runs on CUDA and returns tensors
@@ -17,8 +17,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 from jaxtyping import Int
 from torch import Tensor
 
-from clear_strategies.core.compiled_rules import CorrectionRule
-from clear_strategies.core.conflicts import ConflictCounts
+from clear_strategies.core.conflicts import Products, Weights
 
 
 class Attribute(NamedTuple):
@@ -26,21 +25,19 @@ class Attribute(NamedTuple):
 
     Args:
         rate: learning rate over the bias of the first moment.
-        anchor: θ^a; adds (θ - θ^a) · `stiffness` to the gradient.
+        hr: ĝ_HR where a strategy has computed it; λ_HR times it is added to the gradient. plus: what regularizers add to it.
         keep: factor of the parameter's decay per step.
         limit: the parameter is clamped to ±limit.
-        merged: receives the merged gradient; no step is taken then.
     """
 
     p: Tensor
     m: Tensor
     v: Tensor
     rate: float
-    anchor: Tensor | None = None
-    stiffness: float = 0.0
+    hr: Tensor | None = None
+    plus: Tensor | None = None
     keep: float = 1.0
     limit: float = float("inf")
-    merged: Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,27 +61,20 @@ class StepSettings:
     changing: Tensor | None = None
 
 
-class StepCounts(NamedTuple):
-    """What a step did.
-
-    Args:
-        conflicts: before and by the correction. still: rows that were skipped because they would not change.
-    """
-
-    conflicts: ConflictCounts
-    still: int | Int[Tensor, ""]
-
-
 @runtime_checkable
 class GaussianStep(Protocol):
-    """The pass over one view's gradients. Implementations take them as `cpp.CppGaussianStep` does."""
+    """The gradients of one view's losses, and the passes over them. Implementations take them as `cpp.CppGaussianStep` does."""
+
+    def products(self) -> Products:
+        """The inner products of g_LR and g^HR."""
+        ...
+
+    def dense(self, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor]) -> None:
+        """Write g_LR and g^HR of the raw parameters into contiguous tensors of their shapes."""
+        ...
 
     def step(
-        self, attributes: Mapping[str, Attribute], rule: CorrectionRule | None, q: Tensor | None, settings: StepSettings
-    ) -> StepCounts:
-        """Count conflicts, merge, correct, add the anchor's gradient and apply Adam, in place.
-
-        Args:
-            rule: None: nothing is corrected. q: reliability [N], None: 0.
-        """
+        self, attributes: Mapping[str, Attribute], weights: Weights, settings: StepSettings
+    ) -> int | Int[Tensor, ""]:  # fmt: skip
+        """Merge, and apply Adam in place; returns the number of rows that were skipped because they would not change."""
         ...

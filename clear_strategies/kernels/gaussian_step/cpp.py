@@ -6,13 +6,14 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import torch
 from torch import Tensor
 
-from clear_strategies.core.compiled_rules import CorrectionRule
-from clear_strategies.core.conflicts import ConflictCounts
+from clear_strategies.core.conflicts import Products, Weights
+from clear_strategies.core.gradients import CONFLICT_GROUPS
 from clear_strategies.kernels import native
-from clear_strategies.kernels.gaussian_step import Attribute, StepCounts, StepSettings
-from clear_strategies.kernels.merge.cpp import correction_table
+from clear_strategies.kernels.gaussian_step import Attribute, StepSettings
+from clear_strategies.kernels.reconcile.tables import addresses, weight_tables
 from rasterizers.native import threads
 
 
@@ -38,12 +39,19 @@ class CppGaussianStep:
         lambda_hf: float,
     ) -> None:
         kernels: Any = native.module()
-        self._step = kernels.GaussianStep(dict(activation), lr, base, hf, lr["basis"].shape[1], lambda_hf)
+        self._passes = kernels.GaussianStep(dict(activation), lr, base, hf, lr["basis"].shape[1], lambda_hf)
+        self._n = len(lr["basis"])
 
-    def step(
-        self, attributes: Mapping[str, Attribute], rule: CorrectionRule | None, q: Tensor | None, settings: StepSettings
-    ) -> StepCounts:
+    def products(self) -> Products:
+        table = native.empty((3, len(CONFLICT_GROUPS), self._n), torch.float64)
+        return Products(CONFLICT_GROUPS, *(x.T for x in table), *self._passes.products(table.data_ptr(), threads()))
+
+    def dense(self, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor]) -> None:
+        self._passes.dense(dict(lr), dict(hr), math.prod(lr["shN"].shape[1:]), threads())
+
+    def step(self, attributes: Mapping[str, Attribute], weights: Weights, settings: StepSettings) -> int:
         tables = {name: a._asdict() | {"width": math.prod(a.p.shape[1:])} for name, a in attributes.items()}
         numbers = {slot: getattr(settings, slot) for slot in StepSettings.__slots__ if slot != "changing"}
-        conflicts, still = self._step.step(tables, correction_table(rule, q), numbers, threads())
-        return StepCounts(ConflictCounts(*conflicts), still)
+        rows = weight_tables(weights, self._n, torch.device("cpu"))
+        still: int = self._passes.step(tables, addresses(rows), numbers, threads())
+        return still

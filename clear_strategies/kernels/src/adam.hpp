@@ -14,16 +14,15 @@ struct AdamStep {
   float per_bias2, eps;  // 1 / bias of the second moment
 };
 
-// One parameter tensor with its moments [N, width], its anchor and its limits.
+// One parameter tensor with its moments [N, width], what is added to its gradient, and its limits.
 struct Attribute {
   float *p, *m, *v;
   int width;
-  const float* anchor = nullptr;  // θ^a, or null
-  float stiffness = 0;            // 2 λ_stab W
-  float rate;                     // - learning rate / bias of the first moment
-  float keep = 1;                 // factor of the decay per step (f_det), 1: none
+  const float* hr = nullptr;    // ĝ_HR where a strategy has corrected it by itself, in place of the one of the losses; or null
+  const float* plus = nullptr;  // added to the merged gradient, or null
+  float rate;                   // - learning rate / bias of the first moment
+  float keep = 1;               // factor of the decay per step (f_det), 1: none
   float limit = std::numeric_limits<float>::infinity();
-  float* merged = nullptr;        // receives the merged gradient; no step is taken then
 };
 
 CLEAR_INLINE Floats clamp_keeping_nan(const Floats& x, const Floats& limit) {
@@ -33,7 +32,7 @@ CLEAR_INLINE Floats clamp_keeping_nan(const Floats& x, const Floats& limit) {
 struct Adam {
   Floats p, m, v;
 
-  // Decay and step. `g` includes the anchor's gradient.
+  // Decay and step.
   CLEAR_INLINE void step(const AdamStep& s, const Attribute& a, const Floats& g) {
     m = multiply_add(g, s.gain1, m * Floats(s.beta1));
     v = multiply_add(g * Floats(s.gain2), g, v * Floats(s.beta2));
@@ -42,49 +41,39 @@ struct Adam {
   }
 };
 
-// g + ∇ λ_stab ‖θ - θ^a‖²_W
-CLEAR_INLINE Floats with_anchor(const Attribute& a, const Floats& g, const Floats& p, const Floats& anchor) {
-  return g + (p - anchor) * Floats(a.stiffness);  // Eq. 16
+// The merged gradient with what the losses do not give: + λ_HR ĝ_HR + plus, for `count` numbers from `offset` on.
+CLEAR_INLINE Floats with_given(const Attribute& a, Floats g, float lambda_hr, std::int64_t offset, int count) {
+  if (a.hr) g += load_some(a.hr + offset, count) * Floats(lambda_hr);
+  if (a.plus) g += load_some(a.plus + offset, count);
+  return g;
 }
 
 // Steps sixteen numbers, and clamps them to the limit.
-CLEAR_INLINE void step_sixteen(const AdamStep& s, const Attribute& a, float* p, float* m, float* v, const float* anchor,
-                               const float* g_in) {
+CLEAR_INLINE void step_sixteen(const AdamStep& s, const Attribute& a, float* p, float* m, float* v, const Floats& g) {
   Adam x{Floats::load(p), Floats::load(m), Floats::load(v)};
-  Floats g = Floats::load(g_in);
-  if (anchor) g = with_anchor(a, g, x.p, Floats::load(anchor));
   x.step(s, a, g);
   clamp_keeping_nan(x.p, a.limit).store(p);
   x.m.store(m), x.v.store(v);
 }
 
-// Steps `count` numbers from `offset` on.
-inline void step_numbers(const AdamStep& s, const Attribute& a, std::int64_t offset, int count, const float* g) {
-  if (a.merged) {
-    for (int j = 0; j < count; ++j) {
-      float from_anchor = a.anchor ? (a.p[offset + j] - a.anchor[offset + j]) * a.stiffness : 0.0f;
-      a.merged[offset + j] = a.anchor ? g[j] + from_anchor : g[j];
-    }
-    return;
-  }
+// Steps `count` numbers from `offset` on. `g` is padded to whole vectors.
+inline void step_numbers(const AdamStep& s, const Attribute& a, float lambda_hr, std::int64_t offset, int count, const float* g) {
   float *p = a.p + offset, *m = a.m + offset, *v = a.v + offset;
-  const float* anchor = a.anchor ? a.anchor + offset : nullptr;
   int j = 0;
   for (; j + kLanes <= count; j += kLanes)
-    step_sixteen(s, a, p + j, m + j, v + j, anchor ? anchor + j : nullptr, g + j);
+    step_sixteen(s, a, p + j, m + j, v + j, with_given(a, Floats::load(g + j), lambda_hr, offset + j, kLanes));
   if (j == count) return;
-  float last[5][kLanes] = {};  // the rest of the last rows
+  float last[4][kLanes] = {};  // the rest of the last rows
   std::size_t bytes = sizeof(float) * (count - j);
   std::memcpy(last[0], p + j, bytes), std::memcpy(last[1], m + j, bytes), std::memcpy(last[2], v + j, bytes);
-  std::memcpy(last[4], g + j, bytes);
-  if (anchor) std::memcpy(last[3], anchor + j, bytes);
-  step_sixteen(s, a, last[0], last[1], last[2], anchor ? last[3] : nullptr, last[4]);
+  std::memcpy(last[3], g + j, bytes);
+  step_sixteen(s, a, last[0], last[1], last[2], with_given(a, Floats::load(last[3]), lambda_hr, offset + j, count - j));
   std::memcpy(p + j, last[0], bytes), std::memcpy(m + j, last[1], bytes), std::memcpy(v + j, last[2], bytes);
 }
 
 // A row that takes no step: decay and clamp only.
 inline void rest_row(const Attribute& a, std::int64_t row) {
-  if (a.merged || (a.keep == 1 && a.limit == std::numeric_limits<float>::infinity())) return;
+  if (a.keep == 1 && a.limit == std::numeric_limits<float>::infinity()) return;
   for (int d = 0; d < a.width; ++d) {
     float& p = a.p[row * a.width + d];
     p *= a.keep;
@@ -117,14 +106,11 @@ CLEAR_INLINE bool all_zero(const float* values, int count) {
   return any << 1 == 0;
 }
 
-// Whether a row with gradient 0 would stay as it is: both moments are 0, and it equals its anchor.
+// Whether a row to which the losses give nothing would stay as it is: both moments and what is added are 0.
 inline bool is_still(const Attribute& a, std::int64_t row, int width) {
   std::int64_t at = row * a.width;
   if (!all_zero(a.m + at, width) || !all_zero(a.v + at, width)) return false;
-  if (a.anchor)
-    for (int d = 0; d < width; ++d)
-      if (!(a.p[at + d] == a.anchor[at + d])) return false;
-  return true;
+  return (!a.hr || all_zero(a.hr + at, width)) && (!a.plus || all_zero(a.plus + at, width));
 }
 
 }  // namespace clear

@@ -24,9 +24,33 @@ class GaussianStep {
     if (base.is_none() && !hf.is_none()) throw nb::value_error("hf needs base");
   }
 
-  // Steps `attributes` {name: {p, m, v, anchor, merged, width, stiffness, rate, keep, limit}} in place.
-  // Returns `counts`, and the still rows.
-  nb::tuple step(nb::dict attributes, nb::object correction, nb::dict settings, int threads) const {
+  // Writes the inner products of both gradients to `to`, float64 [3, 6, n]; returns `counts`.
+  nb::tuple products(Address to, int threads) const {
+    require_hr();
+    nb::gil_scoped_release release;
+    Conflicts found = clear::products(g_, {at<double>(to), g_.n}, threads);
+    nb::gil_scoped_acquire acquire;
+    return counts(found);
+  }
+
+  // Writes both gradients into tables {name: tensor} of the six groups, where shN has `width` numbers a row.
+  void dense(nb::dict lr, nb::dict hr, int width, int threads) const {
+    require_hr();
+    if (width % 3 || width < 3 * (g_.bases - 1) || width > 45) throw nb::value_error("shN must hold the active bands");
+    Tensors tensors;
+    auto rows = [&](const nb::dict& t) {
+      std::int64_t n = g_.n;
+      return DenseRows{{tensors.rows<float>(t, "means", n, 3), tensors.rows<float>(t, "sh0", n, 3), tensors.rows<float>(t, "shN", n, width),
+                        tensors.rows<float>(t, "opacities", n, 1), tensors.rows<float>(t, "scales", n, 3),
+                        tensors.rows<float>(t, "quats", n, 4)}, width};
+    };
+    DenseRows low = rows(lr), high = rows(hr);
+    nb::gil_scoped_release release;
+    clear::dense(g_, low, high, threads);
+  }
+
+  // Steps `attributes` {name: {p, m, v, hr, plus, width, rate, keep, limit}} in place; returns the number of still rows.
+  std::int64_t step(nb::dict attributes, const WeightTables& weights, nb::dict settings, int threads) const {
     Tensors tensors;
     Step s;
     for (auto [name, attribute] : {std::pair{"means", &s.means}, {"quats", &s.quats}, {"scales", &s.scales},
@@ -42,23 +66,17 @@ class GaussianStep {
     s.width = nb::cast<int>(settings["width"]);
     if (s.width % 3 || s.width < 3 * (g_.bases - 1) || s.width > s.shN.width || s.width > 45)
       throw nb::value_error("width must be a multiple of 3 between the active bands' numbers and an shN row's");
-    Correction c;
-    bool corrects = !correction.is_none();
-    if (corrects) {
-      if (g_.n && !g_.base) throw nb::value_error("there is no HR gradient to correct");
-      c = correction_of(tensors, g_.n, nb::cast<nb::dict>(correction));
-    }
-    Stepped done;
-    {
-      nb::gil_scoped_release release;
-      done = clear::step(g_, corrects ? &c : nullptr, s, threads);
-    }
-    return nb::make_tuple(counts(done.conflicts), done.still);
+    nb::gil_scoped_release release;
+    return clear::step(g_, weights_at(weights), s, threads);
   }
 
  private:
   Gradients g_{};
   Tensors tensors_;
+
+  void require_hr() const {
+    if (g_.n && !g_.base) throw nb::value_error("there is no HR gradient to reconcile");
+  }
 
   SplatGradient gradient(const nb::dict& t) {
     std::int64_t n = g_.n;
@@ -74,9 +92,9 @@ class GaussianStep {
     a.p = tensors.rows<float>(t, "p", g_.n, a.width);
     a.m = tensors.rows<float>(t, "m", g_.n, a.width);
     a.v = tensors.rows<float>(t, "v", g_.n, a.width);
-    a.anchor = tensors.rows<const float>(t, "anchor", g_.n, a.width, true);
-    a.merged = tensors.rows<float>(t, "merged", g_.n, a.width, true);
-    a.stiffness = number("stiffness"), a.rate = -number("rate"), a.keep = number("keep"), a.limit = number("limit");
+    a.hr = tensors.rows<const float>(t, "hr", g_.n, a.width, true);
+    a.plus = tensors.rows<const float>(t, "plus", g_.n, a.width, true);
+    a.rate = -number("rate"), a.keep = number("keep"), a.limit = number("limit");
     return a;
   }
 };
@@ -85,8 +103,9 @@ inline void bind_step(nb::module_& m) {
   nb::class_<GaussianStep>(m, "GaussianStep")
       .def(nb::init<nb::dict, nb::dict, nb::object, nb::object, std::int64_t, double>(), nb::arg("activation"), nb::arg("lr"),
            nb::arg("base").none(), nb::arg("hf").none(), nb::arg("bases"), nb::arg("lambda_hf"))
-      .def("step", &GaussianStep::step, nb::arg("attributes"), nb::arg("correction").none(), nb::arg("settings"),
-           nb::arg("threads"));
+      .def("products", &GaussianStep::products, nb::arg("to"), nb::arg("threads"))
+      .def("dense", &GaussianStep::dense, nb::arg("lr"), nb::arg("hr"), nb::arg("width"), nb::arg("threads"))
+      .def("step", &GaussianStep::step, nb::arg("attributes"), nb::arg("weights"), nb::arg("settings"), nb::arg("threads"));
 }
 
 }  // namespace clear

@@ -1,13 +1,13 @@
-// What the bindings of the per-Gaussian passes share: pointers to tensors whose types and shapes are checked, the rule of a
-// correction, and counts.
+// What the bindings of the per-Gaussian passes share: pointers to tensors whose types and shapes are checked, weights, and counts.
 #pragma once
 
+#include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
 #include <string>
 #include <vector>
 
-#include "conflict.hpp"
+#include "products.hpp"
 #include "tensor.hpp"
 
 namespace clear {
@@ -42,16 +42,20 @@ class Tensors {
   std::vector<nb::ndarray<>> kept_;
 };
 
-inline Correction correction_of(Tensors& tensors, std::int64_t n, const nb::dict& t) {
-  auto number = [&](const char* name) { return nb::cast<double>(t[name]); };
-  Correction c;
-  auto groups = nb::cast<std::vector<bool>>(t["groups"]);
-  if (groups.size() != kGroups) throw nb::value_error("groups must have one entry per conflict group");
-  for (int k = 0; k < kGroups; ++k) c.corrects[k] = groups[k];
-  c.tolerance = number("tolerance"), c.weight_min = number("weight_min"), c.weight_max = number("weight_max");
-  c.rotation_noise = number("rotation_noise");
-  c.reliability = tensors.rows<const float>(t, "reliability", n, 1, true);
-  return c;
+using Address = std::uintptr_t;  // of contiguous memory of the CPU, 0 for none; the Python side sees to that
+
+template <class T>
+T* at(Address a) {
+  return reinterpret_cast<T*>(a);
+}
+
+// keep and remove: a number, and float64 rows that take its place where there are any, with the distance from one group to the next.
+using WeightTable = std::tuple<double, Address, std::int64_t>;
+using WeightTables = std::tuple<WeightTable, WeightTable>;
+
+inline Weights weights_at(const WeightTables& tables) {
+  auto weight = [](const WeightTable& t) { return Weight{std::get<0>(t), at<double>(std::get<1>(t)), std::get<2>(t)}; };
+  return {weight(std::get<0>(tables)), weight(std::get<1>(tables))};
 }
 
 template <class T, std::size_t K>
@@ -61,9 +65,7 @@ nb::list list(const T (&values)[K]) {
   return out;
 }
 
-// (comparable, opposed, corrected, Σ ω, at the lower bound) by group.
-inline nb::tuple counts(const Conflicts& c) {
-  return nb::make_tuple(list(c.comparable), list(c.opposed), list(c.corrected), list(c.omega), list(c.at_lower_bound));
-}
+// (comparable, opposed) by group.
+inline nb::tuple counts(const Conflicts& c) { return nb::make_tuple(list(c.comparable), list(c.opposed)); }
 
 }  // namespace clear

@@ -1,10 +1,10 @@
-// The Python module: image losses, the merge, and the per-Gaussian step. The bindings check types and shapes and release the GIL.
+// The Python module: image losses, the reconciliation of gradients, and the per-Gaussian step. The bindings check types and shapes and release the GIL.
 #include <nanobind/nanobind.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
 #include "bind_losses.hpp"
-#include "bind_merge.hpp"
+#include "bind_reconcile.hpp"
 #include "bind_step.hpp"
 #include "filter.hpp"
 #include "finite.hpp"
@@ -20,7 +20,7 @@ NB_MODULE(CLEAR_MODULE, m) {
   m.attr("sources") = CLEAR_SOURCES;
   m.def("instruction_sets", &clear::instruction_sets);
   clear::bind_losses(m);
-  clear::bind_merge(m);
+  clear::bind_reconcile(m);
   clear::bind_step(m);
   clear::bind_filter(m);
   clear::bind_sweep(m);

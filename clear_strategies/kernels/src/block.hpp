@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstdint>
+#include <initializer_list>
 
 #include "rows.hpp"
 
@@ -23,11 +24,20 @@ CLEAR_INLINE void load_columns(const float* rows, int count, Floats (&columns)[D
   for (int d = 0; d < D; ++d) columns[d] = Floats::load(a[d]);
 }
 
-CLEAR_INLINE Floats load_some(const float* values, int count) {
-  if (count == kLanes) return Floats::load(values);
-  float a[kLanes] = {};
+template <class T>
+CLEAR_INLINE Lanes<T> load_some(const T* values, int count) {
+  if (count == kLanes) return Lanes<T>::load(values);
+  T a[kLanes] = {};
   for (int i = 0; i < count; ++i) a[i] = values[i];
-  return Floats::load(a);
+  return Lanes<T>::load(a);
+}
+
+template <class T>
+CLEAR_INLINE void store_some(T* to, const Lanes<T>& values, int count) {
+  if (count == kLanes) return values.store(to);
+  T a[kLanes];
+  values.store(a);
+  for (int i = 0; i < count; ++i) to[i] = a[i];
 }
 
 // Prefetches the rows [row, end). There are more tensors here than the hardware prefetches.

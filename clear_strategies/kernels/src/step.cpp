@@ -1,7 +1,8 @@
 // Compiled with -ffp-contract=off: products and sums round as in torch, and multiply-adds are used only where torch uses
-// them, so that the step makes the same decisions as the readable path.
+// them.
 #include "step.hpp"
 
+#include <numeric>
 #include <vector>
 
 #include "chunks.hpp"
@@ -10,76 +11,130 @@
 namespace clear {
 namespace {
 
-struct RowTables {
-  Floats Y_lr, Y_hr, lr, base, hf;
-};
-
-// Sixteen numbers of g = g_LR + λ ĝ_HR in an shN row, from its factors.
-CLEAR_INLINE Floats expand(const Gradients& g, const Step& s, const RowTables& t, float m, double correction,
-                           const std::int32_t* band, const std::int32_t* channel) {
-  Floats l = pick(t.Y_lr, band) * pick(t.lr, channel);
-  if (!g.base) return l;
-  Floats Y = g.lr.basis == g.base.basis ? pick(t.Y_lr, band) : pick(t.Y_hr, band);
-  Floats h = Y * pick(t.base, channel);
-  if (g.hf) h += Y * pick(t.hf, channel) * Floats(m) * Floats(g.lambda_hf);  // Eq. 13
-  if (correction != 0) h = corrected(h, l, correction);
-  return l + h * Floats(s.lambda_hr);  // Eq. 8
-}
-
 CLEAR_INLINE Floats basis_row(const SplatGradient& g, int bases, std::int64_t row) {
   return load_some(g.basis + bases * row, bases);
 }
 
-class ChunkStep {
- public:
-  ChunkStep(const Gradients& g, const Correction* correction, const Step& s)
-      : g(g), correction(correction), s(s), plan(s.width) {}
+CLEAR_INLINE void group_products(const Gradients& g, const Block& b, std::int64_t i, int count, Products (&p)[kGroups]) {
+  p[kMeans] = products(b.lr.means, b.hr.means);
+  p[kSh0] = products(b.lr.sh0, b.hr.sh0);
+  p[kOpacities] = products(b.lr.opacities, b.hr.opacities);
+  p[kScales] = products(b.lr.scales, b.hr.scales);
+  p[kQuats] = products(b.lr.quats, b.hr.quats);
+  BasisProducts Y = basis_products(g.lr.basis, g.base.basis, g.bases, i, count);
+  Products rgb = products(b.lr.rgb, b.hr.rgb);
+  p[kShN] = {Y.cross * rgb.dot, Y.lr2 * rgb.l2, Y.hr2 * rgb.h2};
+}
 
-  Stepped run(std::int64_t number) const {
-    Stepped done;
-    Tally tally;
-    each_sixteen(g.n, number, [&](std::int64_t i, int count) { sixteen(i, count, done, tally); });
-    done.conflicts = tally.total();
-    return done;
+// The rows of a chunk of Gaussians in dense form.
+class ChunkDense {
+ public:
+  ChunkDense(const Gradients& g, const DenseRows& lr, const DenseRows& hr) : g(g), lr(lr), hr(hr), plan(lr.width) {}
+
+  void run(std::int64_t number) const {
+    each_sixteen(g.n, number, [&](std::int64_t i, int count) {
+      Block b;
+      load(g, i, count, b);
+      write(b.lr, g.lr, lr, i, count), write(b.hr, g.base, hr, i, count);
+    });
   }
 
  private:
   const Gradients& g;
-  const Correction* correction;
+  const DenseRows &lr, &hr;
+  const RowPlan plan;
+
+  void write(const RawGradients& raw, const SplatGradient& of, const DenseRows& to, std::int64_t i, int count) const {
+    columns(raw.means, to.of[kMeans], i, count), columns(raw.sh0, to.of[kSh0], i, count);
+    columns(raw.opacities, to.of[kOpacities], i, count), columns(raw.scales, to.of[kScales], i, count);
+    columns(raw.quats, to.of[kQuats], i, count);
+    float colour[4 * kLanes] = {}, row[3 * kLanes];
+    join_rows(colour, raw.rgb);
+    for (int k = 0; k < count && plan.width; ++k) {
+      Floats Y = basis_row(of, g.bases, i + k), rgb = Floats::load(colour + 3 * k);
+      for (int v = 0; v < plan.sixteens; ++v) (pick(Y, plan.band[v]) * pick(rgb, plan.channel[v])).store(row + plan.offset[v]);
+      std::copy_n(row, plan.width, to.of[kShN] + (i + k) * plan.width);
+    }
+  }
+
+  template <int D>
+  static CLEAR_INLINE void columns(const Floats (&values)[D], float* to, std::int64_t i, int count) {
+    float numbers[D * kLanes];
+    join_rows(numbers, values);
+    std::copy_n(numbers, D * count, to + D * i);
+  }
+};
+
+class ChunkStep {
+ public:
+  ChunkStep(const Gradients& g, const Weights& w, const Step& s) : g(g), w(w), s(s), plan(s.width) {}
+
+  // Returns the number of still rows.
+  std::int64_t run(std::int64_t number) const {
+    std::int64_t still = 0;
+    each_sixteen(g.n, number, [&](std::int64_t i, int count) { still += sixteen(i, count); });
+    return still;
+  }
+
+ private:
+  const Gradients& g;
+  const Weights& w;
   const Step& s;
   const RowPlan plan;
 
-  void sixteen(std::int64_t i, int count, Stepped& done, Tally& tally) const {
+  int sixteen(std::int64_t i, int count) const {
     fetch(g, i + kLanes);
     Block b;
     load(g, i, count, b);
     std::uint32_t rows = first_bits(count);
     std::uint32_t still = s.skips ? still_rows(b, i, rows) : 0;
-    done.still += __builtin_popcount(still);
     std::uint32_t moving = rows & ~still;
-
-    double shN_multiple[kLanes] = {};
-    if (g.base && s.lambda_hr > 0) {
-      Products p[kGroups];
-      group_products(g, b, i, count, p);
-      Multiples m = decide(p, correction, i, count, tally);
-      correct(m, kMeans, b.hr.means, b.lr.means), correct(m, kSh0, b.hr.sh0, b.lr.sh0);
-      correct(m, kOpacities, b.hr.opacities, b.lr.opacities), correct(m, kScales, b.hr.scales, b.lr.scales);
-      correct(m, kQuats, b.hr.quats, b.lr.quats);
-      if (m.any[kShN]) m.of[kShN].store(shN_multiple);
-    }
     if (moving) {  // still rows beside a moving one step too, which leaves them unchanged
-      step_columns(s.means, b.lr.means, b.hr.means, i, count);
-      step_columns(s.quats, b.lr.quats, b.hr.quats, i, count);
-      step_columns(s.scales, b.lr.scales, b.hr.scales, i, count);
-      step_columns(s.opacities, b.lr.opacities, b.hr.opacities, i, count);
-      step_columns(s.sh0, b.lr.sh0, b.hr.sh0, i, count);
+      Merged merged = merge(b, i, count);
+      step_columns(s.means, b.lr.means, i, count), step_columns(s.quats, b.lr.quats, i, count);
+      step_columns(s.scales, b.lr.scales, i, count), step_columns(s.opacities, b.lr.opacities, i, count);
+      step_columns(s.sh0, b.lr.sh0, i, count);
       step_detail(b, i, count);
-      step_rows(b, i, count, moving, shN_multiple);
+      step_rows(merged, i, count, moving);
+      return __builtin_popcount(still);
     }
-    if (moving) return;
     for (int k = 0; k < count; ++k) rest_row(s.scales, i + k), rest_row(s.opacities, i + k), rest_row(s.detail, i + k);
     for (const Attribute* a : {&s.means, &s.quats, &s.scales, &s.opacities, &s.sh0, &s.detail, &s.shN}) fetch_next(*a, i, i + kLanes);
+    return __builtin_popcount(still);
+  }
+
+  // The merged colours of sixteen Gaussians, of which shN's gradient is Y_LR ⊗ lr + Y_HR ⊗ hr; padded, because reads are sixteen wide.
+  struct Merged {
+    float lr[4 * kLanes] = {}, hr[4 * kLanes] = {};
+  };
+
+  // g_LR becomes g_LR + λ_HR ĝ_HR, and is that of shN as colours.
+  CLEAR_INLINE Merged merge(Block& b, std::int64_t i, int count) const {
+    Merged out;
+    if (g.base && s.lambda_hr > 0) {
+      add(kMeans, b.lr.means, b.hr.means, i, count), add(kSh0, b.lr.sh0, b.hr.sh0, i, count);
+      add(kOpacities, b.lr.opacities, b.hr.opacities, i, count), add(kScales, b.lr.scales, b.hr.scales, i, count);
+      add(kQuats, b.lr.quats, b.hr.quats, i, count);
+      if (one_basis()) {
+        add(kShN, b.lr.rgb, b.hr.rgb, i, count);
+      } else {  // l - λ remove l, and λ keep h
+        Floats none[3] = {0.0f, 0.0f, 0.0f};
+        Floats kept[3] = {b.hr.rgb[0], b.hr.rgb[1], b.hr.rgb[2]}, removed[3] = {0.0f, 0.0f, 0.0f};
+        reconcile(w, kShN, removed, b.lr.rgb, i, count), reconcile(w, kShN, kept, none, i, count);
+        for (int d = 0; d < 3; ++d) b.lr.rgb[d] += removed[d] * Floats(s.lambda_hr), kept[d] *= Floats(s.lambda_hr);
+        join_rows(out.hr, kept);
+      }
+    }
+    join_rows(out.lr, b.lr.rgb);
+    return out;
+  }
+
+  bool one_basis() const { return g.lr.basis == g.base.basis; }
+
+  template <int D>
+  CLEAR_INLINE void add(Group group, Floats (&l)[D], Floats (&h)[D], std::int64_t i, int count) const {
+    reconcile(w, group, h, l, i, count);
+    for (int d = 0; d < D; ++d) l[d] += h[d] * Floats(s.lambda_hr);
   }
 
   // Prefetches the rows that follow sixteen later. Spread over the step, because a processor has few loads under way at once.
@@ -88,37 +143,33 @@ class ChunkStep {
   }
 
   template <int D>
-  CLEAR_INLINE void step_columns(const Attribute& a, const Floats (&l)[D], const Floats (&h)[D], std::int64_t i, int count) const {
-    Floats merged[D];
-    for (int d = 0; d < D; ++d) merged[d] = g.base ? l[d] + h[d] * Floats(s.lambda_hr) : l[d];  // Eq. 8
+  CLEAR_INLINE void step_columns(const Attribute& a, const Floats (&merged)[D], std::int64_t i, int count) const {
     float numbers[D * kLanes];
     join_rows(numbers, merged);
-    step_numbers(s.adam, a, D * i, D * count, numbers);
+    step_numbers(s.adam, a, s.lambda_hr, D * i, D * count, numbers);
     fetch_next(a, i, i + kLanes);
   }
 
   // f_det gets only the routed gradient of L_HF, uncorrected.
   void step_detail(const Block& b, std::int64_t i, int count) const {
-    Floats none[3] = {0.0f, 0.0f, 0.0f}, routed[3] = {0.0f, 0.0f, 0.0f};
+    Floats routed[3] = {0.0f, 0.0f, 0.0f};
     if (g.hf)
-      for (int d = 0; d < 3; ++d) routed[d] = b.hf.rgb[d] * b.m * Floats(g.lambda_hf);
-    step_columns(s.detail, none, routed, i, count);
+      for (int d = 0; d < 3; ++d) routed[d] = b.hf.rgb[d] * b.m * Floats(g.lambda_hf) * Floats(s.lambda_hr);
+    step_columns(s.detail, routed, i, count);
   }
 
-  void step_rows(const Block& b, std::int64_t i, int count, std::uint32_t moving, const double (&correction)[kLanes]) const {
+  void step_rows(const Merged& merged, std::int64_t i, int count, std::uint32_t moving) const {
     if (!s.width) return;
-    float m[kLanes], lr[4 * kLanes] = {}, base[4 * kLanes] = {}, hf[4 * kLanes] = {};  // padded, because reads are sixteen wide
-    std::copy_n(g.lr.rgb + 3 * i, 3 * count, lr);
-    if (g.base) std::copy_n(g.base.rgb + 3 * i, 3 * count, base);
-    if (g.hf) std::copy_n(g.hf.rgb + 3 * i, 3 * count, hf), b.m.store(m);
+    bool two = g.base && !one_basis();
     for (int k = 0; k < count; ++k) {
       fetch_next(s.shN, i + k, i + k + 1);
       if (!(moving >> k & 1)) continue;
-      RowTables t{basis_row(g.lr, g.bases, i + k), {}, Floats::load(lr + 3 * k), Floats::load(base + 3 * k), Floats::load(hf + 3 * k)};
-      if (g.base && g.base.basis != g.lr.basis) t.Y_hr = basis_row(g.base, g.bases, i + k);
-      Floats gradient[3] = {0.0f, 0.0f, 0.0f};
-      for (int v = 0; v < plan.sixteens; ++v)
-        gradient[v] = expand(g, s, t, g.hf ? m[k] : 1, correction[k], plan.band[v], plan.channel[v]);
+      Floats Y = basis_row(g.lr, g.bases, i + k), rgb = Floats::load(merged.lr + 3 * k), gradient[3] = {0.0f, 0.0f, 0.0f};
+      for (int v = 0; v < plan.sixteens; ++v) gradient[v] = pick(Y, plan.band[v]) * pick(rgb, plan.channel[v]);
+      if (two) {
+        Y = basis_row(g.base, g.bases, i + k), rgb = Floats::load(merged.hr + 3 * k);
+        for (int v = 0; v < plan.sixteens; ++v) gradient[v] += pick(Y, plan.band[v]) * pick(rgb, plan.channel[v]);
+      }
       step_row(i + k, gradient);
     }
   }
@@ -126,10 +177,10 @@ class ChunkStep {
   CLEAR_INLINE void step_row(std::int64_t row, const Floats (&gradient)[3]) const {
     const Attribute& a = s.shN;
     std::int64_t at = row * a.width;
-    if (a.merged || a.width < kLanes) {
+    if (a.width < kLanes) {
       float numbers[3 * kLanes];
       for (int v = 0; v < plan.sixteens; ++v) gradient[v].store(numbers + plan.offset[v]);
-      step_numbers(s.adam, a, at, plan.width, numbers);
+      step_numbers(s.adam, a, s.lambda_hr, at, plan.width, numbers);
     } else if (plan.sixteens == 3) {
       step_sixteens<3>(at, gradient);
     } else if (plan.sixteens == 2) {
@@ -147,18 +198,14 @@ class ChunkStep {
       std::int64_t from = at + plan.offset[v];
       x[v] = {Floats::load(a.p + from), Floats::load(a.m + from), Floats::load(a.v + from)};
     }
-    for (int v = 0; v < V; ++v) {
-      Floats total = gradient[v];
-      if (a.anchor) total = with_anchor(a, total, x[v].p, Floats::load(a.anchor + at + plan.offset[v]));
-      x[v].step(s.adam, a, total);
-    }
+    for (int v = 0; v < V; ++v) x[v].step(s.adam, a, with_given(a, gradient[v], s.lambda_hr, at + plan.offset[v], kLanes));
     for (int v = 0; v < V; ++v) {
       std::int64_t to = at + plan.offset[v];
       x[v].p.store(a.p + to), x[v].m.store(a.m + to), x[v].v.store(a.v + to);
     }
   }
 
-  // Still rows: gradient, moments and the anchor's gradient are all 0, so a step would not change them.
+  // Still rows: gradients and moments are all 0, so a step would not change them.
   std::uint32_t still_rows(const Block& b, std::int64_t i, std::uint32_t rows) const {
     Floats total = magnitude(b.lr);
     if (g.base) total += magnitude(b.hr);
@@ -190,16 +237,33 @@ class ChunkStep {
 
 }  // namespace
 
-Stepped step(const Gradients& g, const Correction* correction, const Step& s, int threads) {
-  std::vector<Stepped> parts(chunks(g.n));
-  ChunkStep chunk_step(g, correction, s);
-  Pool::instance().run(threads, std::int64_t(parts.size()), [&](std::int64_t k) { parts[k] = chunk_step.run(k); });
-  Stepped total;
-  for (const Stepped& part : parts) {
-    total.conflicts.add(part.conflicts);
-    total.still += part.still;
-  }
+Conflicts products(const Gradients& g, ProductTable to, int threads) {
+  std::vector<Conflicts> parts(chunks(g.n));
+  Pool::instance().run(threads, std::int64_t(parts.size()), [&](std::int64_t number) {
+    each_sixteen(g.n, number, [&](std::int64_t i, int count) {
+      fetch(g, i + kLanes);
+      Block b;
+      load(g, i, count, b);
+      Products p[kGroups];
+      group_products(g, b, i, count, p);
+      to.write(p, i, count, parts[number]);
+    });
+  });
+  Conflicts total;
+  for (const Conflicts& part : parts) total.add(part);
   return total;
+}
+
+void dense(const Gradients& g, const DenseRows& lr, const DenseRows& hr, int threads) {
+  ChunkDense chunk(g, lr, hr);
+  Pool::instance().run(threads, chunks(g.n), [&](std::int64_t k) { chunk.run(k); });
+}
+
+std::int64_t step(const Gradients& g, const Weights& w, const Step& s, int threads) {
+  std::vector<std::int64_t> still(chunks(g.n));
+  ChunkStep chunk(g, w, s);
+  Pool::instance().run(threads, chunks(g.n), [&](std::int64_t k) { still[k] = chunk.run(k); });
+  return std::accumulate(still.begin(), still.end(), std::int64_t(0));
 }
 
 }  // namespace clear

@@ -1,12 +1,12 @@
-// The per-Gaussian step of one iteration, in one pass over the Gaussians: it counts conflicts, merges, corrects, adds the anchor's
-// gradient, and applies Adam.
+// The per-Gaussian step of one iteration: a pass for the inner products of both gradients, and, once their weights are known, one
+// that merges and applies Adam.
 //
-// It computes the gradients from their factors, which is cheaper than storing 59 numbers for each of three losses.
+// Both compute the gradients from their factors, which is cheaper than storing 59 numbers for each of three losses.
 // Sums are taken by chunk of Gaussians and added in the order of the chunks: the same bits for any number of threads.
 #pragma once
 
 #include "adam.hpp"
-#include "conflict.hpp"
+#include "products.hpp"
 
 namespace clear {
 
@@ -18,12 +18,19 @@ struct Step {
   int width = 0;      // numbers of an shN row that are stepped, a multiple of 3: the active bands', or all
 };
 
-struct Stepped {
-  Conflicts conflicts;
-  std::int64_t still = 0;  // rows that were skipped, because they would not change
+// Where the gradients of the raw parameters [n, width] go, in the order of the groups; shN's has `bands` bands.
+struct DenseRows {
+  float* of[kGroups];
+  int width;  // of shN
 };
 
-// Steps every attribute in place, or writes its merged gradient where `merged` is set.
-Stepped step(const Gradients& g, const Correction* correction, const Step& s, int threads);
+// Writes the inner products of g_LR and g^HR, and counts conflicts.
+Conflicts products(const Gradients& g, ProductTable to, int threads);
+
+// Writes g_LR and g^HR, for a strategy that corrects them number by number.
+void dense(const Gradients& g, const DenseRows& lr, const DenseRows& hr, int threads);
+
+// Steps every attribute in place; returns the number of rows that were skipped, because they would not change.
+std::int64_t step(const Gradients& g, const Weights& w, const Step& s, int threads);
 
 }  // namespace clear

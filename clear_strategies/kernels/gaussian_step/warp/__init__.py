@@ -1,6 +1,6 @@
 """The per-Gaussian step in Warp, for CUDA; the same kernels run on a CPU, to check them.
 
-Counts stay on the device: `StepCounts` holds tensors, int64 for counts and float64 for sums. Importing this
+Counts stay on the device, as int64. Importing this
 package imports Warp; call `rasterizers.warp_runtime.require_warp` first.
 """
 
@@ -11,11 +11,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
-from clear_strategies.core.compiled_rules import CorrectionRule
-from clear_strategies.kernels.gaussian_step import Attribute, StepCounts, StepSettings
-from clear_strategies.kernels.gaussian_step.warp import adam, conflict, passes, raw_gradients
+from clear_strategies.core.conflicts import Products, Weights
+from clear_strategies.core.gradients import CONFLICT_GROUPS
+from clear_strategies.kernels.gaussian_step import Attribute, StepSettings
+from clear_strategies.kernels.gaussian_step.warp import adam, passes, raw_gradients
+from clear_strategies.kernels.reconcile.tables import weight_tables
+from clear_strategies.kernels.reconcile.warp_functions import product_table, products_of, weights_of
 from rasterizers.warp_runtime import launch, on_stream, struct
 
 LANES: Final = {"cuda": 128, "cpu": 1}
@@ -71,13 +75,26 @@ class WarpGaussianStep:
             view,
         )
 
+    def products(self) -> Products:
+        self._require_hr()
+        lanes, device = self._lanes, self._like.device
+        blocks = -(-self._n // lanes)
+        table, counts = product_table(self._like, self._n, blocks)
+        with on_stream(device):
+            launch(passes.compare, [blocks], (*self._gradients, table, counts), device, block=lanes, together=True)
+        return products_of(CONFLICT_GROUPS, table, counts)
+
+    def dense(self, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor]) -> None:
+        self._require_hr()
+        width = math.prod(lr["shN"].shape[1:])
+        widths = {name: _WIDTHS.get(name, width) for name in CONFLICT_GROUPS}
+        rows = (self._rows(passes.Rows, g, widths, width=width) for g in (lr, hr))
+        with on_stream(self._like.device):
+            launch(passes.write_dense, [self._n], (*self._gradients, *rows), self._like.device, block=self._lanes)
+
     def step(
-        self, attributes: Mapping[str, Attribute], rule: CorrectionRule | None, q: Tensor | None, settings: StepSettings
-    ) -> StepCounts:
-        if self._n and rule is not None and not self._has_base:
-            raise ValueError("there is no HR gradient to correct.")
-        if q is not None:
-            self._require("reliability", q, 1)
+        self, attributes: Mapping[str, Attribute], weights: Weights, settings: StepSettings
+    ) -> int | Int[Tensor, ""]:  # fmt: skip
         parameters = [self._attribute(attributes[name], width) for name, width in _WIDTHS.items()]
         bands = self._attribute(attributes["shN"], math.prod(attributes["shN"].p.shape[1:]))
         least, most = 3 * (self._bases - 1), min(bands.width, 45)
@@ -87,22 +104,27 @@ class WarpGaussianStep:
             )
         colours = self._like.new_empty(1 if self._one_basis else 2, self._n, 3)
         moving = self._like.new_empty(self._n, dtype=torch.bool)
-        blocks = -(-self._n // self._lanes)
-        counts = self._like.new_empty(blocks, conflict.COUNTS, dtype=torch.int32)
-        omegas = self._like.new_empty(blocks, conflict.GROUPS, dtype=torch.float64)
         device, lanes, adam_step = self._like.device, self._lanes, settings.changing
+        blocks = -(-self._n // lanes)
+        stills = self._like.new_empty(blocks, dtype=torch.int32)
         if adam_step is None:
             adam_step = written(settings, {name: a.rate for name, a in attributes.items()}, device)
+        options = struct(
+            passes.StepOptions, {}, skips=settings.skips, width=settings.width, merges=self._has_base and settings.lambda_hr > 0
+        )  # fmt: skip
+        tables = weight_tables(weights, self._n, device)
         step = (
-            *self._gradients, conflict.rule_of(rule, q), q, _options(self._has_base, rule is not None, settings), adam_step,
-            *parameters, bands, colours, moving, counts, omegas,
+            *self._gradients, weights_of(tables), options, adam_step, *parameters, bands, colours, moving, stills,
         )  # fmt: skip
         of_bands = self._gradients[-1], self._like, self._hr_basis, colours, moving, adam_step, bands
         with on_stream(device):
             launch(passes.step, [blocks], step, device, block=lanes, together=True)
             launch(passes.step_bands, [self._n, settings.width], of_bands, device, block=lanes)
-        numbers = counts.sum(0)
-        return StepCounts(conflict.counts_of(numbers, omegas.sum(0)), numbers[-1] if settings.skips else 0)
+        return stills.sum() if settings.skips else 0
+
+    def _require_hr(self) -> None:
+        if self._n and not self._has_base:
+            raise ValueError("there is no HR gradient to reconcile.")
 
     @property
     def _lanes(self) -> int:
@@ -112,9 +134,9 @@ class WarpGaussianStep:
         """The kernels' structure. Between changes of the field it is the same in every iteration, and kept, as checked, by where
         the tensors lie.
         """
-        tensors = {"p": a.p, "m": a.m, "v": a.v, "anchor": a.anchor, "merged": a.merged}
+        tensors = {"p": a.p, "m": a.m, "v": a.v, "hr": a.hr, "plus": a.plus}
         where = [None if x is None else (x.data_ptr(), x.numel(), x.dtype) for x in tensors.values()]
-        key = *where, self._n, width, a.stiffness, a.keep, a.limit
+        key = *where, self._n, width, a.keep, a.limit
         if key not in _attributes:
             for name, tensor in tensors.items():
                 if tensor is not None:
@@ -122,8 +144,8 @@ class WarpGaussianStep:
             if len(_attributes) >= _MOST_ATTRIBUTES:
                 _attributes.clear()
             _attributes[key] = struct(
-                adam.Attribute, tensors, width=width, anchored=a.anchor is not None, merges=a.merged is not None,
-                bounded=a.keep != 1 or a.limit != math.inf, stiffness=a.stiffness, keep=a.keep, limit=a.limit,
+                adam.Attribute, tensors, width=width, given=a.hr is not None, added=a.plus is not None,
+                bounded=a.keep != 1 or a.limit != math.inf, keep=a.keep, limit=a.limit,
             )  # fmt: skip
         return _attributes[key]
 
@@ -149,13 +171,6 @@ class WarpGaussianStep:
             raise TypeError(f"{name} must be a contiguous float32 tensor {where}.")
         if tensor.dim() == 0 or tensor.shape[0] != self._n or tensor.numel() != self._n * width:
             raise ValueError(f"{name} must have {self._n} rows of {width} numbers, got shape {tuple(tensor.shape)}.")
-
-
-def _options(has_hr: bool, corrects: bool, settings: StepSettings) -> Any:
-    return struct(
-        passes.StepOptions, {}, skips=settings.skips, width=settings.width,
-        compares=has_hr and settings.lambda_hr > 0, corrects=corrects,
-    )  # fmt: skip
 
 
 def written(

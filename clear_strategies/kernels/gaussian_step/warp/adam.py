@@ -43,18 +43,17 @@ class AdamStep:
 
 @wp.struct
 class Attribute:
-    """A parameter tensor with its moments, row-major, its anchor and its limits."""
+    """A parameter tensor with its moments, row-major, what is added to its gradient, and its limits."""
 
     p: wp.array[wp.float32]
     m: wp.array[wp.float32]
     v: wp.array[wp.float32]
-    anchor: wp.array[wp.float32]  # θ^a
-    merged: wp.array[wp.float32]  # receives the merged gradient; no step is taken then
+    hr: wp.array[wp.float32]  # ĝ_HR where a strategy has computed it
+    plus: wp.array[wp.float32]
     width: wp.int32
-    anchored: wp.bool
-    merges: wp.bool
+    given: wp.bool  # there is `hr`
+    added: wp.bool  # there is `plus`
     bounded: wp.bool  # a row that takes no step may still decay or be clamped
-    stiffness: wp.float32  # 2 λ_stab W
     keep: wp.float32  # factor of the decay per step (f_det), 1: none
     limit: wp.float32
 
@@ -73,11 +72,10 @@ def step_number(
         return
     p = a.p[at]
     g = gradient
-    if a.anchored:
-        g += (p - a.anchor[at]) * a.stiffness  # Eq. 16
-    if a.merges:
-        a.merged[at] = g
-        return
+    if a.given:
+        g += a.hr[at] * adam.lambda_hr
+    if a.added:
+        g += a.plus[at]
     after = p * a.keep
     if moves:
         m = g * adam.gain1 + a.m[at] * adam.beta1
@@ -94,10 +92,12 @@ def step_number(
 
 @wp.func
 def is_still(a: Attribute, i: wp.int32, width: wp.int32) -> wp.bool:
-    """Whether a row with gradient 0 would stay as it is: both moments are 0, and it equals its anchor."""
+    """Whether a row to which the losses give nothing would stay as it is: both moments and what is added are 0."""
     for at in range(a.width * i, a.width * i + width):
         if a.m[at] != 0.0 or a.v[at] != 0.0:
             return False
-        if a.anchored and a.p[at] != a.anchor[at]:
+        if a.given and a.hr[at] != 0.0:
+            return False
+        if a.added and a.plus[at] != 0.0:
             return False
     return True

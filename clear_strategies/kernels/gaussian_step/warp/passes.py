@@ -1,12 +1,11 @@
-"""The kernels of the step: `step` counts conflicts, merges, corrects, adds the anchor's gradient and applies Adam, and
-`step_bands` does this for the rows of shN.
+"""The kernels of the step: `compare` writes the products of both gradients, `step` merges and applies Adam, and `step_bands` does
+this for the rows of shN; `write_dense` writes both gradients.
 
-`step` uses one thread per Gaussian. `step_bands` uses one per number, because shN has three quarters of all
-numbers and neighbouring threads then access neighbouring memory. `step` passes it a table of colours: the merged gradient
-of shN is Y ⊗ colour.
+They use one thread per Gaussian, `step_bands` one per number, because shN has three quarters of all numbers and neighbouring
+threads then access neighbouring memory. `step` passes it a table of colours: the merged gradient of shN is Y ⊗ colour.
 
-Products and sums round as in torch (no contraction), so that the step makes the same decisions as the readable path.
-Blocks sum their counts, and torch sums over the blocks: every sum has a fixed order.
+Products and sums round as in torch (no contraction). Blocks sum their counts, and torch sums over the blocks: every sum has a
+fixed order.
 """
 
 from __future__ import annotations
@@ -14,26 +13,32 @@ from __future__ import annotations
 import warp as wp
 
 from clear_strategies.kernels.gaussian_step.warp.adam import AdamStep, Attribute, is_still, step_number
-from clear_strategies.kernels.gaussian_step.warp.conflict import (
+from clear_strategies.kernels.gaussian_step.warp.raw_gradients import (
+    Activation,
+    Gradient,
+    RawGradient,
+    View,
+    basis_products,
+    load,
+    route_of,
+    size,
+)
+from clear_strategies.kernels.reconcile.warp_functions import (
     MEANS,
     OPACITIES,
     QUATS,
     SCALES,
     SH0,
     SHN,
-    Corrected,
     Counts,
-    Rule,
+    Products,
     Six,
-    correct,
-    corrected3,
+    Weights,
     counted,
-    group_products,
-    merged1,
-    merged3,
-    merged4,
+    reconciled,
+    store,
+    weight,
 )
-from clear_strategies.kernels.gaussian_step.warp.raw_gradients import Activation, Gradient, View, load, route_of, size
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -42,10 +47,107 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 class StepOptions:
     """The settings of a step that are the same in many."""
 
-    compares: wp.bool
-    corrects: wp.bool
+    merges: wp.bool  # there is a gradient of HR, and λ_HR > 0
     skips: wp.bool  # skip rows that would not change
     width: wp.int32  # numbers of an shN row that are stepped
+
+
+@wp.func
+def products3(low: wp.vec3, high: wp.vec3) -> wp.vec3d:
+    a, b = wp.vec3d(low), wp.vec3d(high)
+    return wp.vec3d(wp.dot(a, b), wp.dot(a, a), wp.dot(b, b))
+
+
+@wp.func
+def products4(low: wp.vec4, high: wp.vec4) -> wp.vec3d:
+    a, b = wp.vec4d(low), wp.vec4d(high)
+    return wp.vec3d(wp.dot(a, b), wp.dot(a, a), wp.dot(b, b))
+
+
+@wp.func
+def group_products(
+    low: RawGradient, high: RawGradient, lr: Gradient, base: Gradient, view: View, i: wp.int32
+) -> Products:
+    a, b = wp.float64(low.opacity), wp.float64(high.opacity)
+    means, sh0, scales = (
+        products3(low.means, high.means),
+        products3(low.sh0, high.sh0),
+        products3(low.scales, high.scales),
+    )
+    shN = wp.cw_mul(basis_products(lr, base, view, i), products3(low.rgb, high.rgb))
+    opacities, quats = wp.vec3d(a * b, a * a, b * b), products4(low.quats, high.quats)
+    p = Products()
+    p.dot = Six(means[0], sh0[0], shN[0], opacities[0], scales[0], quats[0])
+    p.l2 = Six(means[1], sh0[1], shN[1], opacities[1], scales[1], quats[1])
+    p.h2 = Six(means[2], sh0[2], shN[2], opacities[2], scales[2], quats[2])
+    return p
+
+
+@wp.func
+def merged3(low: wp.vec3, high: wp.vec3, w: Weights, group: wp.int32, i: wp.int32, λ: wp.float32) -> wp.vec3:
+    """The sum g_LR + λ ĝ_HR (Eq. 8)."""
+    keep, remove = weight(w.keep, group, i), weight(w.remove, group, i)
+    return low + wp.vec3(wp.vec3d(high) * keep - wp.vec3d(low) * remove) * λ
+
+
+@wp.func
+def merged4(low: wp.vec4, high: wp.vec4, w: Weights, group: wp.int32, i: wp.int32, λ: wp.float32) -> wp.vec4:
+    keep, remove = weight(w.keep, group, i), weight(w.remove, group, i)
+    return low + wp.vec4(wp.vec4d(high) * keep - wp.vec4d(low) * remove) * λ
+
+
+@wp.kernel
+def compare(
+    activation: Activation, lr: Gradient, base: Gradient, hf: Gradient, view: View,
+    table: wp.array2d[wp.float64], counts: wp.array[Counts],
+) -> None:  # fmt: skip
+    block, lane = wp.tid()
+    i, tally = block * wp.block_dim() + lane, Counts()
+    if i < view.n:
+        g_lr, g_hr, _ = load(activation, lr, base, hf, view, i)
+        products = group_products(g_lr, g_hr, lr, base, view, i)
+        store(products, table, i)
+        tally = counted(products)
+    wp.tile_store(counts, wp.tile_sum(wp.tile(tally, preserve_type=True)), offset=(block,))
+
+
+@wp.struct
+class Rows:
+    """The gradient of the raw parameters with every number, row-major."""
+
+    means: wp.array[wp.float32]
+    quats: wp.array[wp.float32]
+    scales: wp.array[wp.float32]
+    opacities: wp.array[wp.float32]
+    sh0: wp.array[wp.float32]
+    shN: wp.array[wp.float32]  # noqa: N815 - gsplat's name
+    width: wp.int32  # of shN
+
+
+@wp.func
+def write_rows(g: RawGradient, basis: wp.array[wp.float32], bases: wp.int32, i: wp.int32, to: Rows) -> None:
+    for d in range(3):
+        to.means[3 * i + d] = g.means[d]
+        to.scales[3 * i + d] = g.scales[d]
+        to.sh0[3 * i + d] = g.sh0[d]
+    for d in range(4):
+        to.quats[4 * i + d] = g.quats[d]
+    to.opacities[i] = g.opacity
+    for j in range(to.width):
+        number = wp.float32(0.0)
+        if 1 + j / 3 < bases:
+            number = basis[bases * i + 1 + j / 3] * g.rgb[j % 3]
+        to.shN[to.width * i + j] = number
+
+
+@wp.kernel
+def write_dense(
+    activation: Activation, lr: Gradient, base: Gradient, hf: Gradient, view: View, to_lr: Rows, to_hr: Rows
+) -> None:  # fmt: skip
+    i = wp.tid()
+    g_lr, g_hr, _ = load(activation, lr, base, hf, view, i)
+    write_rows(g_lr, lr.basis, view.bases, i, to_lr)
+    write_rows(g_hr, base.basis, view.bases, i, to_hr)
 
 
 @wp.kernel
@@ -55,8 +157,7 @@ def step(
     base: Gradient,
     hf: Gradient,
     view: View,
-    rule: Rule,
-    reliability: wp.array[wp.float32],
+    w: Weights,
     options: StepOptions,
     adams: wp.array[AdamStep],
     means: Attribute,
@@ -68,8 +169,7 @@ def step(
     shN: Attribute,
     colours: wp.array3d[wp.float32],
     moving: wp.array[wp.bool],
-    counts: wp.array[Counts],
-    omegas: wp.array[Six],
+    stills: wp.array[wp.int32],
 ) -> None:
     """One thread per Gaussian: steps everything but shN, for which it writes the merged colour to `colours`.
 
@@ -84,32 +184,25 @@ def step(
     still = still and is_still(means, i, 3) and is_still(quats, i, 4) and is_still(scales, i, 3)
     still = still and is_still(opacities, i, 1) and is_still(sh0, i, 3) and is_still(detail, i, 3)
     still = still and is_still(shN, i, options.width)
-    change, tally = Corrected(), Counts()
-    if options.compares:
-        products = group_products(g_lr, g_hr, lr, base, view, i)
-        if options.corrects:
-            change = correct(products, rule, reliability, i)
-        tally = counted(products, change)
-
-    moves, λ = not still, adam.lambda_hr
-    d_means = merged3(g_lr.means, g_hr.means, change.multiple[MEANS], λ)
-    d_quats = merged4(g_lr.quats, g_hr.quats, change.multiple[QUATS], λ)
-    d_scales = merged3(g_lr.scales, g_hr.scales, change.multiple[SCALES], λ)
-    d_opacity = merged1(g_lr.opacity, g_hr.opacity, change.multiple[OPACITIES], λ)
-    d_sh0 = merged3(g_lr.sh0, g_hr.sh0, change.multiple[SH0], λ)
+    moves, λ = not still, wp.float32(0.0)
+    if options.merges:
+        λ = adam.lambda_hr
+    d_means = merged3(g_lr.means, g_hr.means, w, MEANS, i, λ)
+    d_quats = merged4(g_lr.quats, g_hr.quats, w, QUATS, i, λ)
+    d_scales = merged3(g_lr.scales, g_hr.scales, w, SCALES, i, λ)
+    keep, remove = weight(w.keep, OPACITIES, i), weight(w.remove, OPACITIES, i)
+    d_opacity = g_lr.opacity + reconciled(g_hr.opacity, g_lr.opacity, keep, remove) * λ
+    d_sh0 = merged3(g_lr.sh0, g_hr.sh0, w, SH0, i, λ)
     # f_det gets only the routed gradient of L_HF, uncorrected
-    d_detail = g_hf.rgb * route_of(activation, view, i) * view.lambda_hf * λ
-    rgb_lr, rgb_hr = merged3(g_lr.rgb, g_hr.rgb, change.multiple[SHN], λ), wp.vec3()
+    d_detail = g_hf.rgb * route_of(activation, view, i) * view.lambda_hf * adam.lambda_hr
+    rgb_lr, rgb_hr = merged3(g_lr.rgb, g_hr.rgb, w, SHN, i, λ), wp.vec3()
     if not view.one_basis:
-        rgb_lr, rgb_hr = corrected3(g_lr.rgb, g_lr.rgb, change.multiple[SHN] * wp.float64(λ)), g_hr.rgb * λ
+        rgb_lr, rgb_hr = merged3(g_lr.rgb, wp.vec3(), w, SHN, i, λ), merged3(wp.vec3(), g_hr.rgb, w, SHN, i, λ)
 
-    omega = change.omega
-    if still:
-        tally[26] = 1
-    if at >= view.n:
-        tally, omega = Counts(), Six()
-    wp.tile_store(counts, wp.tile_sum(wp.tile(tally, preserve_type=True)), offset=(block,))
-    wp.tile_store(omegas, wp.tile_sum(wp.tile(omega, preserve_type=True)), offset=(block,))
+    count = wp.int32(0)
+    if still and at < view.n:
+        count = 1
+    wp.tile_store(stills, wp.tile_sum(wp.tile(count)), offset=(block,))
     if at >= view.n:
         return
 

@@ -1,0 +1,93 @@
+"""What every reconciliation of two gradients needs beside its weights, which are a strategy's (`Strategy.reconcile`):
+
+    products    ⟨l, h⟩, ‖l‖², ‖h‖² of every Gaussian, by attribute group
+    apply       g_LR + λ_HR (keep · g_HR - remove · g_LR) + what regularizers add                  Eq. 7, 8, 16
+
+`reference` specifies both. `cpp` computes them for float32 in the CPU's memory, `warp` on CUDA, and `reference` anything else.
+`kernels.gaussian_step` computes the same for the trainer of this package, whose gradients are never stored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from types import ModuleType
+
+import torch
+from torch import Tensor
+
+from clear_strategies.core.conflicts import Products, Weights
+from clear_strategies.core.deferred import Number
+from clear_strategies.core.gradients import Grads
+from clear_strategies.kernels import native
+from clear_strategies.kernels.reconcile import reference
+from clear_strategies.kernels.reconcile.tables import WIDEST, comparable, has
+from rasterizers.interface import BackendUnavailable
+from rasterizers.warp_runtime import require_warp
+
+__all__ = ["apply", "comparable", "dense", "has", "products"]
+
+
+def products(lr: Grads, hr: Grads) -> Products:
+    """The inner products of both gradients.
+
+    Raises:
+        ValueError: no two gradients are of one group.
+    """
+    chosen: ModuleType = _chosen(*lr.tensors.values(), *hr.tensors.values())
+    result: Products = chosen.products(lr, hr)
+    return result
+
+
+def apply(
+    out: Mapping[str, Tensor], lr: Grads, hr: Grads, weights: Weights, *, lambda_hr: float = 1.0, plus: Grads | None = None,
+    keeps_lr: bool = True,
+) -> Number:  # fmt: skip
+    """Write the merged gradient of these attributes; f_det takes part with keep 1.
+
+    Args:
+        out: contiguous, [N, …]; it may hold the tensors of `lr`. An attribute that no gradient has becomes 0.
+        keeps_lr: False: keep · g_HR - remove · g_LR alone.
+
+    Returns:
+        Whether every number of the result is finite, 0 or 1; on a device, it is not known yet.
+    """
+    plus = Grads() if plus is None else plus
+    chosen = _chosen(*out.values(), *lr.tensors.values(), *hr.tensors.values(), *plus.values())
+    finite: Number = chosen.apply(out, lr, hr, weights, lambda_hr, plus, keeps_lr)
+    return finite
+
+
+def dense(g: Grads, like: Mapping[str, Tensor]) -> Grads:
+    """The same with every number of the spherical harmonics, in the shapes of `like` and for its attributes alone."""
+    out = {name: g[name].reshape(x.shape) for name, x in like.items() if name in g}
+    if g.colour is not None:
+        bands = {name: native.empty_like(like[name]) for name in ("sh0", "shN") if name in like}
+        apply(bands, Grads(), g, Weights(), keeps_lr=False)
+        out |= bands
+    return Grads(out, screen=g.screen)
+
+
+def _chosen(*tensors: Tensor) -> ModuleType:
+    first = tensors[0]
+    if any(x.dtype != torch.float32 or x.device != first.device or x.shape[1:].numel() > WIDEST for x in tensors):
+        return reference
+    return _for_device(first.device.type)
+
+
+@cache
+def _for_device(device: str) -> ModuleType:
+    try:
+        if device == "cpu":
+            native.module()
+            from clear_strategies.kernels.reconcile import cpp
+
+            return cpp
+        if device == "cuda":
+            require_warp("the compiled merge", device, "torch merges in its place")
+            from clear_strategies.kernels.reconcile import warp
+
+            return warp
+    except BackendUnavailable:
+        pass
+    return reference
