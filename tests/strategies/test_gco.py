@@ -103,12 +103,14 @@ def test_zero_gradients_are_no_conflict_and_what_could_correct_nothing_is_refuse
         GCO().correct({"_xyz": g}, {"_xyz": -g})
 
 
-def test_rotation_noise_of_isotropic_gaussians_is_gated():
-    lr, hr = random_pair(5, norm_lr=1e-6, norm_hr=1e-6)
-    lr["quats"], hr["quats"] = lr["quats"] * 1e-7, hr["quats"] * 1e-7
+@pytest.mark.parametrize("noisy", [("lr",), ("hr",), ("lr", "hr")], ids="+".join)
+def test_a_rotation_gradient_that_is_rounding_at_one_scale_is_no_conflict(noisy):
+    pair = dict(zip(("lr", "hr"), random_pair(5, norm_lr=1e-6, norm_hr=1e-6), strict=True))
+    for scale in noisy:
+        pair[scale]["quats"] = pair[scale]["quats"] * 1e-7
     gco = GCO()
-    result = gco.correct(lr, hr, None)
-    assert torch.equal(result["quats"], hr["quats"])
+    result = gco.correct(**pair, step=None)
+    assert torch.equal(result["quats"], pair["hr"]["quats"])
     assert read(gco, "corrected_quats") == 0
     assert read(gco, "corrected_scales") > 0
 

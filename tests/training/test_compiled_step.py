@@ -360,6 +360,12 @@ def test_strategies_of_others_take_the_same_path(passes, make, degree):
     assert as_floats(conflict) == as_floats(found_conflict)
 
 
+@pytest.mark.parametrize("hr", HR_COTANGENTS)
+def test_f_det_decays_wherever_it_has_a_gradient_though_by_an_anchor_alone(passes, hr):
+    c, rates = case(40), LearningRates(detail_decay=0.1)
+    assert_same_state(c, three_steps(passes, c, conductors(Pulling), rates, hr), rates)
+
+
 class OwnAdam(Adam):
     pass
 

@@ -101,6 +101,18 @@ def test_split_children_lie_inside_their_parent_clones_are_copies_and_the_score_
     assert len(parents) == 15
 
 
+def test_split_children_lie_along_the_long_axis_of_their_parent():
+    field, optimizer, density = tagged(1)
+    field.scales.data[:] = torch.tensor([[0.5, 1e-4, 1e-4]]).log()
+    field.quats.data[:] = torch.tensor([[math.cos(0.3), 0, 0, math.sin(0.3)]])  # by 0.6 about z
+    density.score[:] = density.ordinary[:] = density.count[:] = 1.0
+    before = field.means.data.clone()
+    density.restructure(field, optimizer, 10)
+    x, y, z = (field.means.data - before).T
+    assert torch.allclose(torch.atan(y / x), torch.tensor(0.6), atol=0.02)
+    assert (z.abs() < 1e-3).all()
+
+
 def test_the_cap_binds_and_is_said(caplog):
     field, optimizer, _ = tagged()
     density = Density(DensitySettings(start=0, stop=100, max_gaussians=14), 12, extent=1.0, seed=0)
