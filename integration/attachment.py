@@ -131,7 +131,8 @@ class Attachment:
     def render_view(self, view: View, render_at: RenderAt) -> Any:
         """Render a training view at both scales; returns what the host's render function returns at LR."""
         self._finish_previous_step()
-        conductor, t, means = self.conductor, self.t, self.params()["means"]
+        conductor, t, params = self.conductor, self.t, {name: p.detach() for name, p in self.params().items()}
+        means = params["means"]
         conductor.forget_logs()
         z = conductor.gate(t, self._n)
         if z is not None:
@@ -146,12 +147,11 @@ class Attachment:
                 self._count_parts(len(shot.drawings))
             if (mask := self._masks.get(view.name)) is not None:
                 shot = replace(shot, image=shot.image * enlarged_mask(mask.to(shot.image), view.factor)[..., None])
-            hr = conductor.hr_gradients(
-                shot, view, t, AutogradShot.gradients, apart=shot.drawing is not None or "detail" in shot.params
-            )
+            apart = shot.drawing is not None or "detail" in shot.params
+            hr = conductor.hr_gradients(shot, view, t, AutogradShot.gradients, apart=apart, params=params)
             if conductor.objective.lambda_hr(t) > 0:
                 routed = shot.routed(hr, conductor.objective.lambda_hf)
-        self._step = Step(t, view) if hr is None else hr.step
+        self._step = Step(t, view, params=params) if hr is None else hr.step
         if self._passes == 0:  # one step of the host, however many passes it accumulates
             self._extra.forget()
             if extra_views := conductor.extra_views(t):

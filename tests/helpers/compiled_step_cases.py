@@ -1,7 +1,7 @@
 """Random gradients of one view, for comparing the compiled per-Gaussian step with the readable path."""
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import pytest
@@ -18,10 +18,11 @@ from clear_strategies.training.optim import Adam, LearningRates
 from rasterizers.interface import SplatGradients
 from tests.helpers import toy
 
-T = 5  # any iteration at which λ_HR = 1
+T = 5  # any iteration between `full` and `decay_from`
 HR_COTANGENTS = {"none": 0, "base": 1, "both": 2}
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "screen", "rgb")
 ALWAYS = WarmupDecay(start=0, full=1, decay_from=10, end=10)
+HALF = replace(ALWAYS, peak=0.5, final=0.5)
 
 
 def as_floats(numbers) -> dict[str, float]:
@@ -126,7 +127,7 @@ def case(n=1000, degree=3, kind="random", seed=0, bands=15, gate=False, evidence
     return Case(fields, lr, hr, m, e, z)
 
 
-def conductors(*makers, anchored=None, hf=0.2, λ=ALWAYS) -> tuple[Conductor, Conductor]:
+def conductors(*makers, anchored=None, hf=0.2, λ=HALF) -> tuple[Conductor, Conductor]:
     """Two equal conductors; if `anchored` is given, with an anchor that differs a little from that field."""
     makers = [ANCHORING if make is SVS else make for make in makers]
     both = tuple(Conductor(*(make() for make in makers), objective=Objective(lambda_hr=λ, lambda_hf=hf)) for _ in "ab")

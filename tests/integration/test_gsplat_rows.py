@@ -1,11 +1,12 @@
 """gsplat's own densifiers with CLEAR attached: which Gaussian came from which, and what follows them."""
 
 import copy
+from dataclasses import dataclass, field
 
 import pytest
 import torch
 
-from clear_strategies import GCO, P2G, SVS, Conductor, SplatSuRe
+from clear_strategies import GCO, P2G, SVS, Conductor, SplatSuRe, Strategy, Weights
 from clear_strategies.schedules import Ramp
 from integration import HostError
 from integration.gsplat import attach
@@ -187,6 +188,34 @@ def test_a_loop_goes_back_to_a_checkpoint_with_another_number_of_gaussians():
     render(1).mean().backward()
     assert len(recorder.changes) == 1
     assert {rows.shape for rows in clear.attachment.conductor.state_dict().values()} == {(20,)}
+
+
+@dataclass(frozen=True)
+class Reads(Strategy):
+    """Keeps the parameters that it is shown."""
+
+    seen: list = field(default_factory=list)
+
+    def reconcile(self, products, step):
+        self.seen.append({name: p.clone() for name, p in step.params.items()})
+        return Weights()
+
+    def after_step(self, params, step):
+        self.seen.append(step.params)
+
+
+def test_a_strategy_sees_the_raw_parameters_until_the_structure_changes():
+    reads = Reads()
+    host, clear, render = gsplat_host.started(reads)
+    before = {name: p.detach().clone() for name, p in clear.params().items()}
+    render(0).mean().backward()
+    for name, p in host.splats.items():
+        host.splats[name] = torch.nn.Parameter(p.detach()[1:], requires_grad=p.requires_grad)
+    render(1)
+    merging, stepped = reads.seen
+    assert merging.keys() == before.keys()
+    assert all(torch.equal(merging[name], p) for name, p in before.items())
+    assert not stepped
 
 
 @pytest.mark.parametrize("last", [4, 5])

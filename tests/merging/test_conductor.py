@@ -206,9 +206,10 @@ def test_a_scale_that_the_objective_needs_is_asked_for_and_hr_only_while_it_has_
 
 def test_routing_weighs_the_high_frequency_gradient_only(drawn):
     """By which alone the detail feature moves."""
-    _, view, lr, hr = drawn
+    field, view, lr, hr = drawn
     objective, p2g = Objective(lambda_hr=ALWAYS), P2G()
     update = updated(drawn, p2g)
+    assert torch.equal(update.step.params["means"], field.raw()["means"])
     (g_lr,) = lr.vjp(objective.lr(lr.image, view.lr.image).cotangents)
     g_base, g_hf = hr.vjp(objective.hr(hr.image, view.hr.image).cotangents)
     m = p2g.route(update.step)[:, None]

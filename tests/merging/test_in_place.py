@@ -6,9 +6,9 @@ from functools import partial
 import pytest
 import torch
 
-from clear_strategies import GCO, SVS, Conductor, Evidence, Grads, Objective
+from clear_strategies import GCO, SVS, Conductor, Evidence, Grads, Objective, Weights
 from clear_strategies.core import deferred
-from clear_strategies.core.gradients import Colour
+from clear_strategies.core.gradients import CONFLICT_GROUPS, Colour
 from clear_strategies.errors import DivergedError
 from clear_strategies.kernels import native, reconcile
 from clear_strategies.kernels.reconcile import dense, reference
@@ -80,6 +80,17 @@ def anchor(made: Conductor, params) -> None:
     made.after_step({name: p.detach() * 0.9 for name, p in params.items()}, toy.step(1))
 
 
+def by_the_conductor(made, params, g_hr, step, t, *, before, scale):
+    """What `merge_in_place` should do, written down."""
+    passed = {name: p.grad - before.get(name, 0) for name, p in params.items() if p.grad is not None}
+    lr, values = Grads(passed) * (1 / scale), {name: p.detach() for name, p in params.items()}
+    out = {name: torch.empty_like(p) for name, p in values.items()}
+    merged = made.merge_routed(values, lr, Grads() if g_hr is None else g_hr, step, t, out)
+    for name, g in out.items():
+        params[name].grad = before.get(name, 0) + scale * g
+    return merged.conflict
+
+
 @pytest.mark.parametrize("accumulated", [False, True])
 @pytest.mark.parametrize("factors", [False, True])
 @pytest.mark.parametrize(("anchored", "scale"), [(False, 1.0), (True, 0.5)])
@@ -90,9 +101,8 @@ def test_every_pass_agrees_with_the_conductor_in_float64(passes, accumulated, fa
         params, before, hr, step = setting(dtype, accumulated=accumulated, factors=factors, scale=scale)
         if anchored:
             anchor(made, params)
-        conflicts.append(
-            deferred.resolve([dict(merge_in_place(made, params, hr, step, T, before=before, scale=scale))])[0]
-        )
+        merge = merge_in_place if dtype == torch.float32 else by_the_conductor
+        conflicts.append(deferred.resolve([dict(merge(made, params, hr, step, T, before=before, scale=scale))])[0])
         results.append({name: p.grad.double() for name, p in params.items()})
         assert deferred.read([made.logs()["corrected"]])[0] > 0.1
     for name, exact in results[1].items():
@@ -121,13 +131,55 @@ def test_the_lr_gradient_of_the_colours_may_come_by_its_factors(passes, accumula
         if exact:
             for name, g in dense(Grads(colour=lr), {name: params[name].detach() for name in ("sh0", "shN")}).items():
                 params[name].grad = g if params[name].grad is None else params[name].grad + g
-        made = conductor()
-        merge_in_place(made, params, None if hr == "none" else routed, step, T, before=before, scale=scale,
-                       lr_colour=None if exact else lr)  # fmt: skip
+        made, routed = conductor(), None if hr == "none" else routed
+        merge = by_the_conductor if exact else partial(merge_in_place, lr_colour=lr)
+        merge(made, params, routed, step, T, before=before, scale=scale)
         assert hr == "none" or deferred.read([made.logs()["corrected"]])[0] > 0.1
         results.append({name: p.grad.double() for name, p in params.items()})
     for name, exact in results[1].items():
         assert (results[0][name] - exact).abs().max() <= 4e-6 * exact.abs().max(), name
+
+
+BASIS = torch.rand(N, 9, generator=torch.Generator().manual_seed(8)) - 0.5
+FORMS = {
+    "a number": 0.3, "0-dim": torch.tensor(0.4), "[N]": torch.linspace(0, 1, N),
+    "[N, G]": torch.linspace(1, 2, 6 * N).view(N, 6),
+}  # fmt: skip
+
+
+def rows_and_factors(seed: int, without: str) -> Grads:
+    rgb = drawn(seed + 2, ["means"])["means"]
+    return Grads(drawn(seed, [name for name in SHAPES if name != without]), colour=Colour(rgb, BASIS * seed))
+
+
+def whole(g: Grads, name: str) -> torch.Tensor:
+    """Every number of an attribute, [N, D] in float64: its rows, and its part of Y ⊗ ∇rgb."""
+    rows = g.get(name, torch.zeros(N, *SHAPES[name])).double().reshape(N, -1)
+    if g.colour is not None and name.startswith("sh"):
+        basis = g.colour.basis[:, :1] if name == "sh0" else g.colour.basis[:, 1:]
+        rows[:, : 3 * basis.shape[1]] += (basis[..., None] * g.colour.rgb[:, None]).flatten(1)
+    return rows
+
+
+@pytest.mark.parametrize("keeps_lr", [True, False])
+@pytest.mark.parametrize(("keep", "remove"), zip(FORMS, [*FORMS][1:] + [*FORMS][:1], strict=True))
+def test_weights_of_any_form_and_rows_beside_factors_are_merged_as_written(passes, keep, remove, keeps_lr):
+    """Eq. 7, 8 and 16, attribute by attribute. HR has no gradient of the means, which is 0 then."""
+    lr, hr, plus = rows_and_factors(1, "detail"), rows_and_factors(2, "means"), Grads(drawn(5, SHAPES))
+    out, weights = {name: torch.empty(N, *shape) for name, shape in SHAPES.items()}, Weights(FORMS[keep], FORMS[remove])
+    assert reconcile.apply(out, lr, hr, weights, lambda_hr=0.5, plus=plus, keeps_lr=keeps_lr)
+    found = reconcile.products(lr, hr)
+    for name in SHAPES:
+        l, h, k, r = whole(lr, name), whole(hr, name), 1.0, 0.0
+        pairs = []
+        if name != "detail":
+            at = CONFLICT_GROUPS.index(name)
+            k, r = (w[:, at, None] if w.dim() == 2 else w.view(-1, 1) for w in map(torch.as_tensor, weights))
+            pairs = [(found.dot[:, at], l * h), (found.h2[:, at], h * h)]
+            pairs += [(found.l2[:, at], l * l)] if name in found.names else []
+        merged = (l if keeps_lr else 0) + (0.5 if keeps_lr else 1) * (k * h - r * l) + whole(plus, name)
+        for x, exact in [*((x, numbers.sum(1)) for x, numbers in pairs), (out[name].double().view(N, -1), merged)]:
+            assert torch.allclose(x, exact, rtol=1e-5, atol=1e-6 * float(exact.abs().max())), name
 
 
 @pytest.mark.parametrize("names", [("means",), ("opacities", "sh0", "shN"), ("means", "quats", "scales", "detail")])

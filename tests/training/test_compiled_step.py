@@ -17,7 +17,6 @@ from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.kernels.gaussian_step.cpp import CppGaussianStep
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
 from clear_strategies.strategies.base import Strategy
-from clear_strategies.strategies.splatsure import SplatSuRe
 from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
@@ -349,7 +348,15 @@ class Pulling(Strategy):
         return Grads({name: 1e-6 * params[name] for name in ("shN", "detail")})
 
 
-@pytest.mark.parametrize("make", [Bolder, Halved, Signed, SplatSuRe])
+@dataclass(frozen=True)
+class Shared(Strategy):
+    """One weight a Gaussian for all groups; another for all Gaussians."""
+
+    def reconcile(self, products, step):
+        return Weights(torch.linspace(0, 1, len(products.dot), device=products.dot.device), 0.3)
+
+
+@pytest.mark.parametrize("make", [Bolder, Halved, Signed, Shared])
 @pytest.mark.parametrize("degree", [0, 2])
 def test_strategies_of_others_take_the_same_path(passes, make, degree):
     c = case(100, degree=degree, kind="sparse")

@@ -56,7 +56,7 @@ def _rows(g: Grads, name: str, width: int, like: Tensor | None = None) -> Float[
 
 
 def _weight(w: float | Tensor, name: str) -> float | Float[Tensor, "N 1"]:
-    if not isinstance(w, Tensor) or w.dim() == 0:
+    if not isinstance(w, Tensor):
         return w
     w = w.double()
-    return w[:, None] if w.dim() == 1 else w[:, CONFLICT_GROUPS.index(name), None]
+    return w[:, CONFLICT_GROUPS.index(name), None] if w.dim() == 2 else w.view(-1, 1)

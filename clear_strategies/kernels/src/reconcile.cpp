@@ -83,7 +83,8 @@ class Passes {
     each_sixteen(g.n, number, [&](std::int64_t i, int count) {
       for (std::size_t k = 0; k < g.attributes.size(); ++k) {
         const Rows& a = g.attributes[k];
-        merge(a, plans[k], w, !keeps_lr ? 1 : has(a, a.hr, g.hr) ? lambda_hr : 0, keeps_lr, i, count, finite);
+        bool corrects = has(a, a.hr, g.hr) || (a.group < kGroups && !w.remove.is(0));
+        merge(a, plans[k], w, !keeps_lr ? 1 : corrects ? lambda_hr : 0, keeps_lr, i, count, finite);
       }
     });
     return finite;
