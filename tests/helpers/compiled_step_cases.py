@@ -111,11 +111,11 @@ def case(n=1000, degree=3, kind="random", seed=0, bands=15, gate=False, evidence
         hr = SplatGradients(
             *(getattr(lr, f).repeat(2, *[1] * (getattr(lr, f).dim() - 1)) * sign for f in ATTRIBUTES), basis
         )
-    if kind == "sparse":  # most Gaussians are invisible, some are visible at one scale only
-        visible = torch.rand(n, generator=g) < 0.2
-        for s, rows in ((lr, visible), (hr, visible & (torch.rand(n, generator=g) < 0.5))):
+    if kind == "sparse":  # most Gaussians are invisible, and some have a gradient of one loss alone
+        for gradient, k in ((lr, 0), (hr, 0), (hr, 1)):
+            invisible = torch.rand(n, generator=g) > 0.2
             for name in ATTRIBUTES:
-                getattr(s, name)[:, ~rows] = 0
+                getattr(gradient, name)[k, invisible] = 0
     if kind == "zero":
         for s, name in itertools.product((lr, hr), ATTRIBUTES):
             getattr(s, name).zero_()

@@ -339,7 +339,7 @@ class Signed(Strategy):
     """Number by number, which no two weights a group can state."""
 
     def correct(self, lr, hr, step=None):
-        return Grads({name: torch.where(lr[name] * g < 0, 0.0, g) for name, g in hr.items()})
+        return Grads({name: torch.where(lr[name] * g > 0, g, 1e-7) for name, g in hr.items()})  # where both are 0, too
 
 
 @dataclass(frozen=True)
