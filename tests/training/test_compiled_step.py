@@ -359,10 +359,8 @@ class Shared(Strategy):
 @pytest.mark.parametrize("make", [Bolder, Halved, Signed, Shared])
 @pytest.mark.parametrize("degree", [0, 2])
 def test_strategies_of_others_take_the_same_path(passes, make, degree):
-    c = case(100, degree=degree, kind="sparse")
-    expected, conflict, found, found_conflict = both_ways(
-        passes, c, *conductors(make, SVS, Pulling, anchored=c.fields[0])
-    )
+    c, pulling = case(100, degree=degree, kind="sparse"), (SVS, Pulling) if degree else ()
+    expected, conflict, found, found_conflict = both_ways(passes, c, *conductors(make, *pulling, anchored=c.fields[0]))
     assert_same_gradient(c, expected, found)
     assert as_floats(conflict) == as_floats(found_conflict)
 
