@@ -252,11 +252,12 @@ def test_the_same_bits_for_any_number_of_threads(passes):
 
 
 def test_bases_of_both_scales_may_differ(passes):
-    c = case(64)
-    c.hr = replace(c.hr, basis=c.hr.basis * 1.5 + 0.1)
-    expected, conflict, found, found_conflict = both_ways(passes, c, *conductors(GCO))
-    assert_same_gradient(c, expected, found)
-    assert as_floats(conflict) == as_floats(found_conflict)
+    for make in (GCO, Signed):
+        c = case(64)
+        c.hr = replace(c.hr, basis=c.hr.basis * 1.5 + 0.1)
+        expected, conflict, found, found_conflict = both_ways(passes, c, *conductors(make))
+        assert_same_gradient(c, expected, found)
+        assert as_floats(conflict) == as_floats(found_conflict)
 
 
 def test_wrong_tensors_are_refused_at_the_border(passes):
