@@ -17,10 +17,10 @@ import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 from typing import Final, NoReturn
 
-import clear_strategies
 from clear_strategies.errors import SettingError
 from clear_strategies.files import expanded
 
@@ -47,7 +47,7 @@ def named(arguments: Sequence[str]) -> Callable[[], None] | None:
     if name in ("help", "--help", "-h"):
         return _help
     if "--version" in arguments:
-        return lambda: print(f"clear-strategies {clear_strategies.__version__}")  # noqa: T201
+        return _version
     if name in NAMES:
         return lambda: import_module(f"{__name__}.{name}").main(list(arguments[1:]))
     if is_of_hydra(name) or "=" in name:
@@ -72,6 +72,10 @@ def _meant(word: str) -> str | None:
     if "/" in word or Path(word).exists():
         return f"clear-strategies train {quoted}"
     return next(iter(difflib.get_close_matches(word.lower(), NAMES, 1)), None)
+
+
+def _version() -> None:
+    sys.stdout.write(f"clear-strategies {version('clear-strategies')}\n")
 
 
 def _help() -> None:

@@ -57,7 +57,7 @@ def test_every_method_trains(name, fused):
         scene, conductor, settings=scaled(settings, settings.stretch), density=density, rates=rates, mip=mip
     )
     compiled = state.compiled_step is not None
-    assert not (compiled and (fused == "off" or "splatsure" in name))
+    assert not (compiled and fused == "off")
     fit(state, scene, toy.RASTERIZER)
     drawn = {stage for stage in conductor.work_log.entries if stage.startswith("render")}
     if (name.endswith("_lr") and name != "srgs_lr") or name in ("dropgaussian", "s2gaussian"):

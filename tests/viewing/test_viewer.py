@@ -199,7 +199,7 @@ def browser(saved_run, monkeypatch):
     monkeypatch.setattr("nerfview._renderer.os._exit", refuse)
     opened = server.SplatViewer
     monkeypatch.setattr(server, "SplatViewer", lambda *a, **k: viewers.append(opened(*a, **k)) or viewers[0])
-    with server.watched(splat.painter, splat.poses(), "toy") as after_step:
+    with server.watched(splat.painter, numbered(splat), "toy") as after_step:
         browser = Browser(viewers[0], after_step)
         yield browser
         browser.socket.close()
@@ -315,7 +315,7 @@ def test_ctrl_c_while_a_training_waits_for_a_picture_is_not_hidden_by_an_error_o
             return lock.acquire()
 
     monkeypatch.setattr("nerfview.viewer.VIEWER_LOCK", Interrupted())
-    with pytest.raises(KeyboardInterrupt), server.watched(splat.painter, splat.poses(), "toy") as after_step:
+    with pytest.raises(KeyboardInterrupt), server.watched(splat.painter, numbered(splat), "toy") as after_step:
         after_step(1)
 
 
