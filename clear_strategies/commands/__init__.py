@@ -17,7 +17,6 @@ import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
-from importlib.metadata import version
 from pathlib import Path
 from typing import Final, NoReturn
 
@@ -75,7 +74,7 @@ def _meant(word: str) -> str | None:
 
 
 def _version() -> None:
-    sys.stdout.write(f"clear-strategies {version('clear-strategies')}\n")
+    sys.stdout.write(f"clear-strategies {import_module('clear_strategies').__version__}\n")
 
 
 def _help() -> None:

