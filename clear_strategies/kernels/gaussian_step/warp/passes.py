@@ -84,16 +84,16 @@ def group_products(
 
 
 @wp.func
-def merged3(low: wp.vec3, high: wp.vec3, w: Weights, group: wp.int32, i: wp.int32, λ: wp.float32) -> wp.vec3:
+def merged3(low: wp.vec3, high: wp.vec3, w: Weights, group: wp.int32, i: wp.int32, lambda_hr: wp.float32) -> wp.vec3:
     """The sum g_LR + λ ĝ_HR (Eq. 8)."""
     keep, remove = weight(w.keep, group, i), weight(w.remove, group, i)
-    return low + wp.vec3(wp.vec3d(high) * keep - wp.vec3d(low) * remove) * λ
+    return low + wp.vec3(wp.vec3d(high) * keep - wp.vec3d(low) * remove) * lambda_hr
 
 
 @wp.func
-def merged4(low: wp.vec4, high: wp.vec4, w: Weights, group: wp.int32, i: wp.int32, λ: wp.float32) -> wp.vec4:
+def merged4(low: wp.vec4, high: wp.vec4, w: Weights, group: wp.int32, i: wp.int32, lambda_hr: wp.float32) -> wp.vec4:
     keep, remove = weight(w.keep, group, i), weight(w.remove, group, i)
-    return low + wp.vec4(wp.vec4d(high) * keep - wp.vec4d(low) * remove) * λ
+    return low + wp.vec4(wp.vec4d(high) * keep - wp.vec4d(low) * remove) * lambda_hr
 
 
 @wp.kernel
