@@ -133,11 +133,12 @@ def write_rows(g: RawGradient, basis: wp.array[wp.float32], bases: wp.int32, i: 
     for d in range(4):
         to.quats[4 * i + d] = g.quats[d]
     to.opacities[i] = g.opacity
-    for j in range(to.width):
-        number = wp.float32(0.0)
-        if 1 + j / 3 < bases:
-            number = basis[bases * i + 1 + j / 3] * g.rgb[j % 3]
-        to.shN[to.width * i + j] = number
+    for band in range(to.width / 3):
+        basis_of_band = wp.float32(0.0)
+        if 1 + band < bases:
+            basis_of_band = basis[bases * i + 1 + band]
+        for channel in range(3):
+            to.shN[to.width * i + 3 * band + channel] = basis_of_band * g.rgb[channel]
 
 
 @wp.kernel
