@@ -106,7 +106,7 @@ def view_at(s: TrainState) -> View:
 
 @lru_cache(maxsize=1)  # an epoch's iterations ask for the same order
 def _order_of_views(seed: int, epoch: int, n: int) -> list[int]:
-    order: list[int] = torch.randperm(n, generator=generator_at(seed, epoch)).tolist()
+    order: list[int] = torch.randperm(n, generator=generator_at(seed, epoch), device="cpu").tolist()
     return order
 
 
