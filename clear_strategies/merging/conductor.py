@@ -283,7 +283,7 @@ class Conductor:
             out = {name: native.empty_like(params[name]) for name in known}
         conflict: Mapping[str, Number] = {}
         weights = Weights()
-        if λ > 0 and reconcile.comparable(g_lr, g_hr):
+        if λ > 0 and reconcile.common_groups(g_lr, g_hr):
             products = reconcile.products(g_lr, g_hr)
             conflict = products.conflict()  # before correction
             answer = self.reconciled(products, step, lambda: (dense(g_lr, out), dense(g_hr.without_detail(), out)))

@@ -18,14 +18,14 @@ from torch import Tensor
 
 from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.deferred import Number
-from clear_strategies.core.gradients import Grads
+from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads
 from clear_strategies.kernels import native
 from clear_strategies.kernels.reconcile import reference
-from clear_strategies.kernels.reconcile.tables import WIDEST, comparable, has
+from clear_strategies.kernels.reconcile.tables import WIDEST, common_groups, has
 from rasterizers.interface import BackendUnavailable
 from rasterizers.warp_runtime import require_warp
 
-__all__ = ["apply", "comparable", "dense", "has", "products"]
+__all__ = ["apply", "common_groups", "dense", "has", "products"]
 
 
 def products(lr: Grads, hr: Grads) -> Products:
@@ -34,8 +34,12 @@ def products(lr: Grads, hr: Grads) -> Products:
     Raises:
         ValueError: no two gradients are of one group.
     """
-    chosen: ModuleType = _chosen(*lr.tensors.values(), *hr.tensors.values())
-    result: Products = chosen.products(lr, hr)
+    if not (names := common_groups(lr, hr)):
+        raise ValueError(
+            f"the groups {', '.join(CONFLICT_GROUPS)} are compared, and no two gradients are of one: lr has "
+            f"{', '.join(lr) or 'none'}, hr has {', '.join(hr) or 'none'}. Name them so."
+        )
+    result: Products = _chosen(*lr.tensors.values(), *hr.tensors.values()).products(lr, hr, names)
     return result
 
 

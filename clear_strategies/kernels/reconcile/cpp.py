@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import torch
@@ -15,7 +15,6 @@ from clear_strategies.kernels import native
 from clear_strategies.kernels.reconcile.tables import (
     FIRST_BANDS,
     addresses,
-    common_groups,
     contiguous,
     row_width,
     weight_tables,
@@ -25,9 +24,9 @@ from rasterizers.native import threads
 _GROUPS: Final = {name: k for k, name in enumerate((*CONFLICT_GROUPS, "detail"))}
 
 
-def products(lr: Grads, hr: Grads) -> Products:
+def products(lr: Grads, hr: Grads, names: Sequence[str]) -> Products:
     """See `kernels.reconcile.products`."""
-    lr, hr, names = contiguous(lr), contiguous(hr), common_groups(lr, hr)
+    lr, hr = contiguous(lr), contiguous(hr)
     n = len(next(iter(lr.tensors.values())))
     rows = [_rows(name, row_width(name, lr, hr), n, lr.get(name), hr.get(name)) for name in names]
     table = native.empty((3, len(CONFLICT_GROUPS), n), torch.float64)

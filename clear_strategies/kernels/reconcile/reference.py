@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from jaxtyping import Float
@@ -12,12 +12,12 @@ from clear_strategies.core import deferred
 from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads
-from clear_strategies.kernels.reconcile.tables import FIRST_BANDS, common_groups, row_width
+from clear_strategies.kernels.reconcile.tables import FIRST_BANDS, row_width
 
 
-def products(lr: Grads, hr: Grads) -> Products:
+def products(lr: Grads, hr: Grads, names: Sequence[str]) -> Products:
     """See `kernels.reconcile.products`."""
-    names, columns = common_groups(lr, hr), []
+    columns = []
     for group in CONFLICT_GROUPS:
         width = row_width(group, lr, hr) if group in names else 0
         low, high = _rows(lr, group, width), _rows(hr, group, width)

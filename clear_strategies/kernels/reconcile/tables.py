@@ -23,20 +23,9 @@ def has(g: Grads, name: str) -> bool:
     return name in g or (g.colour is not None and name in FIRST_BANDS)
 
 
-def comparable(lr: Grads, hr: Grads) -> bool:
-    """Whether both gradients have one group."""
-    return any(has(lr, group) and has(hr, group) for group in CONFLICT_GROUPS)
-
-
 def common_groups(lr: Grads, hr: Grads) -> Sequence[str]:
-    """The groups that both gradients have. Raises ValueError where there is none."""
-    names = [group for group in CONFLICT_GROUPS if has(lr, group) and has(hr, group)]
-    if not names:
-        raise ValueError(
-            f"the groups {', '.join(CONFLICT_GROUPS)} are compared, and no two gradients are of one: lr has "
-            f"{', '.join(lr) or 'none'}, hr has {', '.join(hr) or 'none'}. Name them so."
-        )
-    return names
+    """The groups that both gradients have."""
+    return [group for group in CONFLICT_GROUPS if has(lr, group) and has(hr, group)]
 
 
 def contiguous(g: Grads) -> Grads:

@@ -6,7 +6,7 @@ this module imports Warp; call `rasterizers.warp_runtime.require_warp` first.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor
 from clear_strategies.core import conflicts
 from clear_strategies.core.deferred import Number, scalar
 from clear_strategies.core.gradients import Grads
-from clear_strategies.kernels.reconcile.tables import FIRST_BANDS, common_groups, contiguous, row_width, weight_tables
+from clear_strategies.kernels.reconcile.tables import FIRST_BANDS, contiguous, row_width, weight_tables
 from clear_strategies.kernels.reconcile.warp_functions import (
     MEANS,
     OPACITIES,
@@ -191,9 +191,9 @@ def combine(
     write(detail, i, d - sh0.width, wp.float64(1.0), wp.float64(0.0), o, finite)
 
 
-def products(lr: Grads, hr: Grads) -> conflicts.Products:
+def products(lr: Grads, hr: Grads, names: Sequence[str]) -> conflicts.Products:
     """See `kernels.reconcile.products`."""
-    lr, hr, names = contiguous(lr), contiguous(hr), common_groups(lr, hr)
+    lr, hr = contiguous(lr), contiguous(hr)
     like = next(iter(lr.tensors.values()))
     n, device, lanes = len(like), like.device, _LANES[like.device.type]
     blocks = -(-n // lanes)
