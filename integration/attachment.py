@@ -31,18 +31,20 @@ from jaxtyping import Int
 from torch import Tensor
 
 from clear_strategies.core import deferred
-from clear_strategies.core.gradients import conflict_columns
+from clear_strategies.core.gradients import Grads, conflict_columns
 from clear_strategies.core.step import Step
-from clear_strategies.core.view import View
+from clear_strategies.core.view import ExtraView, View
 from clear_strategies.data.scene import require_shown
 from clear_strategies.errors import HostError, SettingError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.in_place import merge_in_place
+from clear_strategies.merging.iteration import HrSide
 from clear_strategies.strategies.base import overrides
 from clear_strategies.strategies.sr_stage import SRStage
-from integration.autograd_shot import AutogradShot, RenderAt
+from integration.autograd_shot import AutogradShot
 from integration.densification import ScoreScaler, write_score
 from integration.extra_steps import ExtraSteps
+from integration.own_drawing import Drawable, OwnDrawing, RenderAt
 from integration.pending import BackwardPass, Pending, current_pass
 from integration.views import enlarged_mask, require_unique
 from rasterizers.autograd import TakeColours
@@ -117,8 +119,10 @@ class Attachment:
         self._pass: BackwardPass | None = None  # the last one that has reached a rendering
         self._merge_in_place: Callable[..., Mapping[str, deferred.Number]] = partial(merge_in_place, conductor)
         self._step: Step | None = None  # of the rendering, until `after_step`
-        self._extra = ExtraSteps(conductor, params)
+        self._extra = ExtraSteps(params)
         self._logged: dict[str, deferred.Number] = {}
+        self._replayed: Mapping[str, deferred.Number] = {}  # what the strategies have logged in the replay of HR
+        self._own_drawing = OwnDrawing(conductor, params()["means"].device)
         self._hooks: list[Any] = []
         self._hooked: list[torch.optim.Optimizer] = []
         self._stepped: set[int] = set()  # the optimizers that have made this step of the host
@@ -138,31 +142,54 @@ class Attachment:
         if z is not None:
             z = z.to(means)
         hr = routed = None
+        self._replayed = {}
         if self._wants_hr(t):
             self.counts["HR renders"] += 1
             view = conductor.skips.view(view, t)
-            with _random_state_kept(means.device):
-                shot = render_at("hr", z, view).shot
-            if len(shot.drawings) > 1:
-                self._count_parts(len(shot.drawings))
-            if (mask := self._masks.get(view.name)) is not None:
-                shot = replace(shot, image=shot.image * enlarged_mask(mask.to(shot.image), view.factor)[..., None])
-            apart = shot.drawing is not None or "detail" in shot.params
-            hr = conductor.hr_gradients(shot, view, t, AutogradShot.gradients, apart=apart, params=params)
-            if conductor.objective.lambda_hr(t) > 0:
-                routed = shot.routed(hr, conductor.objective.lambda_hf)
+            hr, routed = self._hr_side(view, t, z, render_at, params)
         self._step = Step(t, view, params=params) if hr is None else hr.step
         if self._passes == 0:  # one step of the host, however many passes it accumulates
             self._extra.forget()
             if extra_views := conductor.extra_views(t):
                 with _random_state_kept(means.device):
-                    self._extra.render(extra_views, t, lambda camera: render_at(camera, None, view).shot)
+                    self._extra.take(extra_views, lambda extra: self._of_extra(extra, view, t, render_at))
         output = render_at("lr", z, view)
+        if isinstance(output, Drawable):
+            raise TypeError("an adapter renders LR by the host's own function, got a Drawable.")
         self.counts["LR renders"] += 1
         self._pending = Pending(self.counts["LR renders"], view.name, output, hr, routed)
         scored = self._reads_score and hr is not None and conductor.owner("score") is not None
         self._pending.listen(WeakMethod(self._reached), to_screen=scored)
         return output.returned
+
+    def _hr_side(
+        self, view: View, t: int, z: Tensor | None, render_at: RenderAt, params: Mapping[str, Tensor]
+    ) -> tuple[HrSide[Grads], Grads | None]:
+        """The gradients of HR, and the same of the raw parameters where HR takes part in the merge."""
+        conductor, mask, device = self.conductor, self._masks.get(view.name), params["means"].device
+        with _random_state_kept(device):
+            drawn = render_at("hr", z, view)
+        fine = None if mask is None else enlarged_mask(mask.to(params["means"]), view.factor)[..., None]
+        if isinstance(drawn, Drawable):
+            work = self._own_drawing.hr(drawn, view, t, fine)
+            self._replayed = work.numbers
+            return work.hr, work.routed
+        shot = drawn.shot
+        if len(shot.drawings) > 1:
+            self._count_parts(len(shot.drawings))
+        if fine is not None:
+            shot = replace(shot, image=shot.image * fine.to(shot.image))
+        apart = shot.drawing is not None or "detail" in shot.params
+        hr = conductor.hr_gradients(shot, view, t, AutogradShot.gradients, apart=apart, params=params)
+        return hr, shot.routed(hr, conductor.objective.lambda_hf) if conductor.objective.lambda_hr(t) > 0 else None
+
+    def _of_extra(self, extra: ExtraView, view: View, t: int, render_at: RenderAt) -> Grads:
+        """The gradient of an extra view."""
+        drawn = render_at(extra.photo.camera, None, view)
+        if isinstance(drawn, Drawable):
+            return self._own_drawing.extra_view(drawn, extra, t)
+        (g,) = drawn.shot.vjp(self.conductor.extra_loss(drawn.shot.image, extra, t).cotangents)
+        return g
 
     def _wants_hr(self, t: int) -> bool:
         """Whether HR takes part at t. Where the host's densifier reads its score, no iteration is skipped."""
@@ -408,7 +435,7 @@ class Attachment:
                 self.counts["scores written"] += 1
         λ = self.conductor.objective.lambda_hr(self.t)
         losses = {} if hr is None else hr.losses
-        self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **conflict_columns(conflict)}
+        self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **self._replayed, **conflict_columns(conflict)}
         if self.counts["merges"] % _LOGGED_EVERY == 0:
             now = self.log
             losses_now = ", ".join(f"L_{name} {now[name]:.4f}" for name in losses) or "no HR"

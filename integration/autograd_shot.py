@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from clear_strategies.core.gradients import Colour, Grads
-from clear_strategies.core.view import View
+from clear_strategies.core.gradients import Grads, gradients_of
 from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.iteration import HrSide
 from integration.colours import are_joined, is_hooked
@@ -84,6 +83,7 @@ class AutogradShot:
         drawn: means, quats, scales, opacities and colors that the rasterizer was given, none of them with a hook; None: the raw
             parameters.
         drawings: by this package's rasterizers, for this image; a single one takes all cotangents in one pass.
+        mask: the image is a drawing that no graph holds, times this.
     """
 
     image: Float[Tensor, "H W 3"]
@@ -93,6 +93,7 @@ class AutogradShot:
     slot: ScreenGradientSlot | None = None
     drawn: Mapping[str, Tensor] | None = None
     drawings: Sequence[Drawing] = ()
+    mask: Float[Tensor, "H W 1"] | None = None
 
     @property
     def drawing(self) -> Drawing | None:
@@ -106,24 +107,17 @@ class AutogradShot:
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
         """∇θ of every cotangent, each with `.screen`; the graph is kept. Frozen parameters have gradient 0."""
-        results = []
-        for g in self.gradients(cotangents):
-            known = dense(self._raw(g) + self._detail(g), self.params)
-            zeros = {name: torch.zeros_like(p) for name, p in self.params.items() if name not in known}
-            results.append(Grads(zeros | known, screen=g.screen))
-        return results
+        return [
+            Grads(every_number(self._raw(g) + self._detail(g), self.params), screen=g.screen)
+            for g in self.gradients(cotangents)
+        ]
 
     def gradients(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
         """The first part, for every cotangent: by the names of `drawn`; of this package's rasterizers means, quats, scales,
         opacities, and the colours by their factors.
         """
         if self.drawing is not None:
-            g = self.drawing.rendering.vjp(self._at_drawing(cotangents))
-            rows = {"means": g.means, "quats": g.quats, "scales": g.scales, "opacities": g.opacities}
-            return [
-                Grads({name: x[k] for name, x in rows.items()}, colour=Colour(g.rgb[k], g.basis), screen=g.screen[k])
-                for k in range(len(cotangents))
-            ]
+            return gradients_of(self.drawing.rendering.vjp(self._at_drawing(cotangents)))
         slot = self.gradient_slot
         tensors = {name: x for name, x in (self.drawn or self.params).items() if x.requires_grad}
         projected = [slot.tensor] if slot.tensor.requires_grad else []  # gsplat's 3DGUT draws without projected centres
@@ -145,27 +139,12 @@ class AutogradShot:
         return g + detail
 
     def _raw(self, g: Grads) -> Grads:
-        """The second part: from what was drawn to the raw parameters without f_det; sh0 and shN as factors where `are_joined`."""
-        raw = {name: p for name, p in self.params.items() if p.requires_grad and name != "detail"}
-        if self.drawing is None and self.drawn is None:  # g is theirs, with what their hooks have done to it
-            return Grads({name: g[name] for name in raw})
-        drawn, colour = dict(self.drawn or {}), None
-        if self.drawing is not None and g.colour is not None:
-            drawn = dict(self.drawing.inputs)
-            if are_joined(drawn["colors"], self.params):
-                colour = g.colour
-            else:
-                g = Grads({**g, "colors": outer(g.colour.rgb, g.colour.basis, drawn["colors"].shape[1])})
-        direct = {name: g[name] for name, p in raw.items() if drawn.get(name) is p and not is_hooked(p)}
-        graph = {name: x for name, x in drawn.items() if name in g and name not in direct and x.requires_grad}
-        rest = {name: p for name, p in raw.items() if colour is None or name not in ("sh0", "shN")}
-        if not graph or not rest:
-            return Grads(direct, colour=colour)
-        through = torch.autograd.grad(
-            list(graph.values()), list(rest.values()), [g[name] for name in graph], retain_graph=True, allow_unused=True
-        )
-        found = {name: value for name, value in zip(rest, through, strict=True) if value is not None}
-        return Grads(direct, colour=colour) + found
+        """The second part, without f_det."""
+        if self.drawing is not None:
+            return to_parameters(g, self.drawing.inputs, self.params)
+        if self.drawn is not None:
+            return to_parameters(g, self.drawn, self.params)
+        return Grads({name: g[name] for name in _trained(self.params)})  # with what their hooks have done to it
 
     def _detail(self, g: Grads) -> Grads:
         """The gradient of f_det, which is that of the colour."""
@@ -178,10 +157,47 @@ class AutogradShot:
 
     def _at_drawing(self, cotangents: Float[Tensor, "K H W 3"]) -> Float[Tensor, "K H W 3"]:
         """The cotangents of what the rasterizer drew; the host may have changed it into `image`."""
+        if self.mask is not None:
+            return cotangents * self.mask
         image, drawn = self.image, self.drawing.image  # type: ignore[union-attr]
         if image.data_ptr() == drawn.data_ptr() and image.shape == drawn.shape and image.stride() == drawn.stride():
             return cotangents  # a view of all of it
         return torch.stack([torch.autograd.grad(image, drawn, c, retain_graph=True)[0] for c in cotangents])
+
+
+def to_parameters(g: Grads, drawn: Mapping[str, Tensor], params: Mapping[str, Tensor]) -> Grads:
+    """From the gradients of what was drawn to those of the raw parameters, without f_det, through the host's own graph.
+
+    Args:
+        g: by the names of `drawn`, the colours by their factors where this package drew them. Those of sh0 and shN stay factors
+            where `are_joined`.
+    """
+    raw, colour = _trained(params), None
+    if g.colour is not None:
+        if are_joined(drawn["colors"], params):
+            colour = g.colour
+        else:
+            g = Grads({**g, "colors": outer(g.colour.rgb, g.colour.basis, drawn["colors"].shape[1])})
+    direct = {name: g[name] for name, p in raw.items() if drawn.get(name) is p and not is_hooked(p)}
+    graph = {name: x for name, x in drawn.items() if name in g and name not in direct and x.requires_grad}
+    rest = {name: p for name, p in raw.items() if colour is None or name not in ("sh0", "shN")}
+    if not graph or not rest:
+        return Grads(direct, colour=colour)
+    through = torch.autograd.grad(
+        list(graph.values()), list(rest.values()), [g[name] for name in graph], retain_graph=True, allow_unused=True
+    )
+    found = {name: value for name, value in zip(rest, through, strict=True) if value is not None}
+    return Grads(direct, colour=colour) + found
+
+
+def every_number(g: Grads, params: Mapping[str, Tensor]) -> Grads:
+    """The same with a number for each of the parameters; 0 where there is no gradient."""
+    known = dense(g, params)
+    return Grads({name: torch.zeros_like(p) for name, p in params.items() if name not in known} | known)
+
+
+def _trained(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name: p for name, p in params.items() if p.requires_grad and name != "detail"}
 
 
 Target = Literal["lr", "hr"] | Camera
@@ -201,9 +217,3 @@ class HostOutput:
     shot: AutogradShot
     returned: Any
     marks: Sequence[Tensor] = ()
-
-
-RenderAt = Callable[[Target, Float[Tensor, " N"] | None, View], HostOutput]
-"""Renders by the host's own renderer, opacities multiplied by the gate: with f_det at HR, without it for any other target. The
-view is that of the iteration, with an SR image of the size that is due.
-"""

@@ -13,9 +13,6 @@ from torch import Tensor
 
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.view import ExtraView
-from clear_strategies.merging.conductor import Conductor
-from integration.autograd_shot import AutogradShot
-from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
@@ -35,19 +32,17 @@ class ExtraSteps:
         stepping: whether a step on an extra view is under way, so that hooks on the host's steps do not count it.
     """
 
-    def __init__(self, conductor: Conductor, params: Callable[[], Mapping[str, Tensor]]) -> None:
-        self._conductor, self._params = conductor, params
+    def __init__(self, params: Callable[[], Mapping[str, Tensor]]) -> None:
+        self._params = params
         self._gradients: list[Grads] = []
         self._rendered: Mapping[str, Tensor] = {}  # what they are gradients of
         self.stepping = False
         self._has_stepped, self._unused = False, 0  # on those of this iteration; iterations since the last that did
 
-    def render(self, extra_views: Sequence[ExtraView], t: int, render: Callable[[Camera], AutogradShot]) -> None:
-        """Render the extra views of iteration t, without a gate and without f_det, and take their gradients."""
+    def take(self, extra_views: Sequence[ExtraView], gradient: Callable[[ExtraView], Grads]) -> None:
+        """Take the gradient of each extra view, which is rendered without a gate and without f_det."""
         self._rendered = {name: p for name, p in self._params().items() if name != "detail"}
-        for extra in extra_views:
-            shot = render(extra.photo.camera)
-            self._gradients += shot.vjp(self._conductor.extra_loss(shot.image, extra, t).cotangents)
+        self._gradients += [gradient(extra) for extra in extra_views]
 
     @torch.no_grad()
     def step(self, optimizer: torch.optim.Optimizer) -> int:

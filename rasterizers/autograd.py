@@ -34,6 +34,12 @@ _WITHOUT_EFFECT: Final = {
 _SUPPORTED: Final = {"camera_model": "pinhole", "with_ut": False, "with_eval3d": False, "rolling_shutter": "GLOBAL"}
 
 
+_TAKEN: Final = {
+    "means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height", "near_plane", "eps2d", "sh_degree",
+    "packed", "backgrounds", "render_mode", "absgrad", "rasterize_mode", "backend", "rgb_offset",
+}  # fmt: skip
+
+
 class Drawn(NamedTuple):
     """An image, and its depth if `draw` had `depth=True`, in the autograd graph of their splats.
 
@@ -402,6 +408,28 @@ def rasterization(
         images = images + (1 - alphas.detach()) * (backgrounds - backgrounds.detach())[:, None, None]
     depths = [view.depth for view in views if view.depth is not None]
     return torch.cat((images, torch.stack(depths)[..., None]), -1) if depths else images, alphas, info
+
+
+def rasterizer_of(arguments: Mapping[str, Any], backend: str) -> Rasterizer:
+    """The rasterizer that draws the colours of a call of gsplat's `rasterization`, over a black background.
+
+    Args:
+        arguments: of the call, by name. backend: of `rasterizers.load`.
+
+    Raises:
+        ValueError: this package does not draw the same: an argument that only gsplat supports, other colours than spherical
+            harmonics, several cameras.
+        BackendUnavailable: the backend is not installed, or has no such device.
+    """
+    more = {name: value for name, value in arguments.items() if name not in _TAKEN}
+    mode = arguments.get("rasterize_mode", "classic")
+    _require_supported("RGB", mode, False, more)
+    n, colors, sh_degree = len(arguments["means"]), arguments["colors"], arguments.get("sh_degree")
+    if sh_degree is None or arguments["means"].dim() != 2 or arguments["means"].dtype != torch.float32:
+        raise ValueError("only float32 Gaussians of one scene with spherical harmonics are drawn.")
+    _require_shapes(n, colors, arguments["viewmats"], arguments["Ks"], arguments.get("backgrounds"), sh_degree)
+    near, eps2d = arguments.get("near_plane", 0.01), arguments.get("eps2d", 0.3)
+    return _loaded(backend, arguments["means"].device.type, near, eps2d, mode == "antialiased")
 
 
 def _info(each: Sequence[_Rendered]) -> tuple[dict[str, Any], Sequence[Tensor], Sequence[None]]:

@@ -179,8 +179,9 @@ def _side_stream(device: torch.device) -> Any:
 
 
 @cache
-def warp_stream(stream: torch.cuda.Stream) -> Any:
+def warp_stream(stream: Any) -> Any:
     """Torch's stream as a Warp stream. Cached, because Warp keeps the scratch memory of its sort with the stream."""
     import warp as wp
 
+    wp.init()  # the recorded work may be torch's alone
     return wp.stream_from_torch(stream)

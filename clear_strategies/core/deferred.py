@@ -89,7 +89,8 @@ def gathered(row: Mapping[str, Number]) -> tuple[Float[Tensor, " K"], Callable[[
     found = {id(x): x for number in row.values() for x in _tensors(number)}
     firsts = dict(zip(found, accumulate((x.numel() for x in found.values()), initial=0), strict=False))
     parts = [x.reshape(-1) for x in found.values()]
-    vector = torch.cat([*parts, parts[0].new_empty(0, dtype=torch.float64)])
+    device = parts[0].device if parts else None
+    vector = torch.cat([*parts, torch.empty(0, dtype=torch.float64, device=device)])
 
     def of(number: Number, copy: Tensor) -> Number:
         if isinstance(number, Deferred):

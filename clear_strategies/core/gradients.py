@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core.deferred import Number
+from rasterizers.interface import SplatGradients
 
 PARAMETERS: Final = ("means", "quats", "scales", "opacities", "sh0", "shN")
 """gsplat's names for the raw parameters (log scales, logit opacities)."""
@@ -20,6 +21,9 @@ ATTRIBUTES: Final = (*PARAMETERS, "detail")
 
 CONFLICT_GROUPS: Final = ("means", "sh0", "shN", "opacities", "scales", "quats")
 """The paper's six: position, base appearance, higher-order appearance, opacity, scale, rotation."""
+
+
+_DRAWN: Final = ("means", "quats", "scales", "opacities")
 
 
 class Colour(NamedTuple):
@@ -87,6 +91,19 @@ class Grads(dict[str, Tensor]):
     def without_detail(self) -> Grads:
         """The same without f_det, which is never corrected."""
         return Grads({name: value for name, value in self.items() if name != "detail"}, colour=self.colour)
+
+
+def gradients_of(g: SplatGradients) -> list[Grads]:
+    """The gradients of what was drawn, one for each cotangent, that of the colours by its factors."""
+    basis = g.basis.contiguous()
+    each = zip(*(x.unbind() for x in (g.means, g.quats, g.scales, g.opacities, g.rgb, g.screen)), strict=True)
+    return [
+        Grads(
+            {name: x.contiguous() for name, x in zip(_DRAWN, rows, strict=True)},
+            colour=Colour(rgb.contiguous(), basis), screen=screen,
+        )
+        for *rows, rgb, screen in each
+    ]  # fmt: skip
 
 
 @runtime_checkable

@@ -378,6 +378,14 @@ class Conductor:
         """The scalars that the strategies logged in the last iteration."""
         return {name: x() if callable(x) else x for s in self.strategies for name, x in s.logs.items()}
 
+    def take_logs(self, known: Mapping[str, Number]) -> dict[str, Number]:
+        """The scalars that were logged besides the known ones, and which are then logged no more."""
+        taken = {name: x for name, x in self.logs().items() if name not in known}
+        for s in self.strategies:
+            for name in taken.keys() & s.logs.keys():
+                del s.logs[name]
+        return taken
+
     def forget_logs(self) -> None:
         """Before an iteration: what the strategies log from now on belongs to it."""
         for s in self.strategies:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from clear_strategies.core.conflicts import Weights
 from clear_strategies.core.deferred import Number
-from clear_strategies.core.gradients import CONFLICT_GROUPS, Colour, Grads
+from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, gradients_of
 from clear_strategies.kernels import gaussian_step as kernel
 from clear_strategies.kernels import native
 from clear_strategies.kernels.gaussian_step import cpp
@@ -29,7 +29,7 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide, LossWeights
 from clear_strategies.training.field import LOG_SCALE_LIMIT, LOGIT_LIMIT, Activation, FieldShot
 from clear_strategies.training.optim import BETA1, BETA2, Adam
-from rasterizers.interface import BackendUnavailable, SplatGradients
+from rasterizers.interface import BackendUnavailable
 from rasterizers.recording import running
 from rasterizers.warp_runtime import require_warp
 
@@ -40,7 +40,6 @@ FusedMode = Literal["auto", "off"]
 GaussianPass = Callable[..., kernel.GaussianStep]
 """`gaussian_step.cpp.CppGaussianStep`, or another class of its signature."""
 
-_ROWS: Final = ("means", "quats", "scales", "opacities")
 _AS_IT_IS: Final = Weights()
 _NOTHING: Final[Mapping[str, Tensor]] = {}
 _LIMITS: Final = {"opacities": LOGIT_LIMIT, "scales": LOG_SCALE_LIMIT}
@@ -80,19 +79,6 @@ def gaussian_pass(optimizer: Adam) -> GaussianPass:
     from clear_strategies.kernels.gaussian_step import warp
 
     return warp.WarpGaussianStep
-
-
-def gradients_of(g: SplatGradients) -> list[Grads]:
-    """The gradients of what was drawn, one for each cotangent, that of the colours by its factors."""
-    basis = g.basis.contiguous()
-    each = zip(*(x.unbind() for x in (g.means, g.quats, g.scales, g.opacities, g.rgb, g.screen)), strict=True)
-    return [
-        Grads(
-            {name: x.contiguous() for name, x in zip(_ROWS, rows, strict=True)},
-            colour=Colour(rgb.contiguous(), basis), screen=screen,
-        )
-        for *rows, rgb, screen in each
-    ]  # fmt: skip
 
 
 class CompiledStep:

@@ -83,8 +83,8 @@ L = TypeVar("L", bound=Learned)
 
 @runtime_checkable
 class Replayer(Protocol):
-    """Does what a recorded iteration did, see `training.replay.Replays`."""
+    """Calls `learn`, or does again what a recorded iteration did, see `training.replay`."""
 
-    def learn(self, given: Given, learn: Callable[..., L]) -> L | None:
-        """What the iteration learns; None where `learn` has to be called."""
+    def learn(self, given: Given, learn: Callable[..., L]) -> L:
+        """What the iteration learns."""
         ...

@@ -69,8 +69,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
 
 def _learned(s: TrainState, rasterizer: Rasterizer, given: Given, learn: Callable[..., L]) -> L:
     """What `learn` returns for the iteration, or a replay of it."""
-    replayed = None if s.replays is None else s.replays.learn(given, learn)
-    return learn(s, rasterizer, given) if replayed is None else replayed
+    return learn(s, rasterizer, given) if s.replays is None else s.replays.learn(given, learn)
 
 
 def learn(s: TrainState, rasterizer: Rasterizer, given: GivenView) -> LearnedView:

@@ -1,48 +1,48 @@
 """Iterations that are recorded and replayed: on a GPU, an iteration takes the host longer than the kernels.
 
 What an iteration does with its view (render, losses, gradients, merge and step, statistics), and with an extra view, is
-recorded once for each kind of iteration (`_Kind`), see `rasterizers.recording`, and done again while the tensors of the field
-lie where they lay. Before a replay, what the iteration is given is copied to where the recorded one read it: photo, SR image,
-what P2G looks up, cameras, dropout mask, background, and the numbers of the optimizer's step. All else is live: what strategies
-and densifier do after the step, and every iteration that cannot be replayed. A replay has the bits of the live iteration.
+recorded once for each kind of iteration, see `merging.replays`, and done again while the tensors of the field lie where they
+lay. Before a replay, what the iteration is given is copied to where the recorded one read it: photo, SR image, what P2G looks
+up, cameras, dropout mask, background, and the numbers of the optimizer's step. All else is live: what strategies and densifier
+do after the step, and every iteration that cannot be replayed. A replay has the bits of the live iteration.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from typing import Any, Final, cast
+from dataclasses import replace
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
-from clear_strategies.core import deferred
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.view import Photo, View
 from clear_strategies.kernels import losses
-from clear_strategies.strategies.base import describes, overrides
+from clear_strategies.merging.replays import (
+    Kind,
+    RecordedWork,
+    Replays,
+    copied,
+    looked_up_by,
+    why_strategies_are_not_recorded,
+    write,
+)
 from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.given import Given, GivenExtra, GivenView, L, Learned, LearnedView
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Rasterizer, Recordable
-from rasterizers.recording import Recording, on_side_stream
 from rasterizers.warp_runtime import sent
 
 _log = logging.getLogger(__name__)
 
-LIVE: Final = "live in place of a replay"
-"""The work log's entry for iterations and extra views that were not replayed. It has no runs, so that none seem saved."""
 
-_FAILED: Final = "a recording failed"
-_MOST_KINDS: Final = 8  # a recording keeps the memory of an iteration
-
-
-def replays_for(s: TrainState, rasterizer: Rasterizer) -> Replays | None:
+def replays_for(s: TrainState, rasterizer: Rasterizer) -> IterationReplays | None:
     """The replays of this training; None, and a log line with the reason, where its iterations cannot be recorded."""
     reason = next(_why_not(s, rasterizer), None)
     if reason is None and s.compiled_step is not None and isinstance(rasterizer, Recordable):
-        return Replays(s, rasterizer, s.compiled_step)
+        return IterationReplays(s, rasterizer, s.compiled_step)
     _log.warning("fit.replay has no effect: %s.", reason)
     return None
 
@@ -55,81 +55,31 @@ def _why_not(s: TrainState, rasterizer: Rasterizer) -> Iterator[str]:
     chosen = s.conductor.objective.kernels
     if (losses.running_on(s.device.type)[0] if chosen == "auto" else chosen) != "warp":
         yield "the losses are not those of Warp (objective.kernels)"
-    for strategy in s.conductor.strategies:
-        if any(overrides(strategy, hook) for hook in ("observe", "route", "score")) and not describes(
-            strategy, "looked_up"
-        ):
-            yield f"{type(strategy).__name__} does not state what it looks up of a view"
+    yield from why_strategies_are_not_recorded(s.conductor)
 
 
-@dataclass(frozen=True, slots=True)
-class _Kind:
-    """What Python decides by in an iteration: iterations of one kind launch the same kernels.
-
-    Args:
-        addresses: where the tensors lie that it reads and steps.
-    """
-
-    addresses: tuple[int, ...]
-    shapes: tuple[Any, ...]
-    facts: tuple[Any, ...]
-
-
-class Replays:
-    """The recordings of one training. The work log counts the iterations that were live, by the reason, under `LIVE`."""
+class IterationReplays:
+    """A `Replayer`: the recordings of one training."""
 
     def __init__(self, s: TrainState, rasterizer: Recordable, compiled_step: CompiledStep) -> None:
         self._state, self._rasterizer, self._count = s, rasterizer, compiled_step.count
-        self._recorded: dict[_Kind, _Recorded | None] = {}  # None: seen once
-        self._addresses: tuple[int, ...] = ()
-        self._failed = False
+        self._replays = Replays(s.device, s.conductor.work_log, "fit.replay")
 
-    def learn(self, given: Given, learn: Callable[..., L]) -> L | None:
-        """See `given.Replayer`.
+    def learn(self, given: Given, learn: Callable[..., L]) -> L:
+        """See `given.Replayer`."""
+        s, steps = self._state, self._state.optimizer.steps
 
-        An iteration of a new kind is live first, so that kernels are compiled and caches filled, and is recorded the next time.
-        Whatever fails in a recording or a replay, it is live, and so are all that follow.
-        """
-        if self._failed:
-            self._note_live(_FAILED)
-            return None
-        kind = self._kind(given)
-        if kind.addresses != self._addresses:  # the structure has changed, and with it everything that was recorded
-            self._recorded.clear()
-            self._addresses = kind.addresses
-        if kind not in self._recorded:
-            if len(self._recorded) == _MOST_KINDS:
-                self._note_live(f"more than {_MOST_KINDS} kinds of iterations")
-                return None
-            self._recorded[kind] = None
-            self._note_live("the first of its kind")
-            with on_side_stream(self._state.device):  # some caches are of a stream
-                return learn(self._state, self._rasterizer, given)
-        optimizer, steps = self._state.optimizer, self._state.optimizer.steps
-        try:
-            recorded = self._recorded[kind] = self._done(self._recorded[kind], given, learn)
-            reason = "the recorded lists of pairs are too short"  # recorded anew, with space for more
-        except Exception as error:
-            self._failed, recorded, reason = True, None, _FAILED
-            self._recorded.clear()
-            cause = f"{type(error).__name__}: {error}".partition("\n")[0]
-            _log.warning("fit.replay ends at t=%d, and iterations are live from now on: %s", given.t, cause)
-        if recorded is not None:
-            return cast(L, recorded.learned(given))
-        optimizer.steps = steps
-        self._note_live(reason)
-        return None
+        def live() -> L:
+            s.optimizer.steps = steps  # a recording or a replay that failed has counted one
+            return learn(s, self._rasterizer, given)
 
-    def _done(self, recorded: _Recorded | None, given: Given, learn: Callable[..., L]) -> _Recorded | None:
-        """What has done the iteration; None where the recording does not hold for it, before anything has changed."""
-        if recorded is None:
-            return _Recorded(self._state, self._rasterizer, given, self._count, learn)
-        return recorded if recorded.replay(given) else None
+        def record() -> _Recorded:
+            return _Recorded(s, self._rasterizer, given, self._count, learn)
 
-    def _note_live(self, reason: str) -> None:
-        self._state.conductor.work_log.skip(LIVE, reason)
+        learned: L = self._replays.do(self._kind(given), given.t, given, live=live, record=record)
+        return learned
 
-    def _kind(self, given: Given) -> _Kind:
+    def _kind(self, given: Given) -> Kind:
         s, λ = self._state, self._state.conductor.objective.lambda_hr(given.t)
         tables = s.field.raw(), s.optimizer.first, s.optimizer.second, s.density.state_dict(), s.conductor.state_dict()
         rows = [x for table in tables for x in table.values() if x.dim() > 0]  # others are no memory of the field's
@@ -140,7 +90,7 @@ class Replays:
         else:
             facts.append(given.extra.robust)
         shapes = [(photo.image.shape, photo.shown is None) for photo in given.photos]
-        return _Kind((len(s.field), *addresses), tuple(shapes), tuple(facts))
+        return Kind((len(s.field), *addresses), tuple(shapes), tuple(facts))
 
 
 class _Recorded:
@@ -149,35 +99,27 @@ class _Recorded:
     def __init__(
         self, s: TrainState, rasterizer: Recordable, given: Given, count: Callable[[int], None], learn: Callable[..., Learned]
     ) -> None:  # fmt: skip
-        self._count, self._state, self._device, owner = count, s, s.device, s.conductor.owner("observe")
-        self._look_up = None if owner is None else owner.looked_up
+        self._count, self._device, self._look_up = count, s.device, looked_up_by(s.conductor)
         self._numbers_of = rasterizer.numbers_of
         own, self._background = self._copied(given), s.field.means.new_empty(1, 3)
         drawn_by = rasterizer if given.background is None else rasterizer.over_changing(self._background)
-        self._written = self._read_of(own)
+        self._own = self._read_of(own)
 
-        def work() -> tuple[Learned, Tensor, Callable[[Tensor], dict[str, Number]]]:
+        def work() -> tuple[Learned, dict[str, Number]]:
             learned = learn(s, drawn_by, own)
-            counts = {f"skip {k}": count for k, (*_, count) in enumerate(self._skips) if isinstance(count, Tensor)}
-            return learned, *deferred.gathered(learned.row | counts)
+            return learned, learned.row
 
         self._write(given)
-        with s.conductor.work_log.noted() as self._skips:
-            self._recording = Recording(s.device, work)
+        self._work = RecordedWork(s.device, s.conductor.work_log, work)
 
     def replay(self, given: Given) -> bool:
-        """Do the iteration; False where the recording does not hold for it, before anything has changed."""
+        """See `Recorded`."""
         self._write(given)
-        with self._state.conductor.work_log.stage("replayed"):
-            return self._recording.replay()
+        return self._work.replay()
 
-    def learned(self, given: Given) -> Learned:
-        """What the iteration made, with the numbers of its history copied: the next one overwrites them."""
-        learned, numbers, row_of = self._recording.result
-        row, skip = row_of(numbers.clone()), self._state.conductor.work_log.skip
-        for k, (name, reason, count) in enumerate(self._skips):
-            counted = row.pop(f"skip {k}", None)
-            skip(name, reason, counted.vector[counted.k].long() if isinstance(counted, deferred.Element) else count)
+    def outcome(self, given: Given) -> Any:
+        """See `Recorded`."""
+        learned, row = self._work.outcome()
         if isinstance(given, GivenExtra):
             return Learned(row)
         update = cast(LearnedView, learned).update
@@ -186,14 +128,14 @@ class _Recorded:
     def _copied(self, given: Given) -> Given:
         """The same with tensors and cameras of its own, and photos that no background shows through."""
         copies = (p.over(given.background, given.behind) for p in given.photos)
-        photos = [Photo(replace(p.camera), p.image.clone(), _clone(p.shown)) for p in copies]
+        photos = [Photo(replace(p.camera), p.image.clone(), copied(p.shown)) for p in copies]
         if isinstance(given, GivenExtra):
             extra = replace(given.extra, photo=photos[0], weight=given.extra.weight.clone())
             return replace(given, extra=extra, background=None)
-        looked_up = None if self._look_up is None else _clone(self._look_up(given.view))
         lr, hr, *_ = [*photos, given.view.hr]  # where HR is not drawn, its size alone is read
+        looked_up = copied(self._look_up(given.view))
         view = View(given.view.name, lr, hr, background=given.behind, looked_up=looked_up)
-        return replace(given, view=view, gate=_clone(given.gate), background=None)
+        return replace(given, view=view, gate=copied(given.gate), background=None)
 
     def _read_of(self, given: Given) -> list[Tensor | None]:
         """All tensors that an iteration reads of what it is given."""
@@ -203,17 +145,10 @@ class _Recorded:
             read += [image, photo.shown, *self._numbers_of(photo.camera, self._device)]
         if isinstance(given, GivenExtra):
             return [*read, given.extra.weight]
-        return [*read, given.gate, None if self._look_up is None else self._look_up(given.view)]
+        return [*read, given.gate, self._look_up(given.view)]
 
     def _write(self, given: Given) -> None:
-        """Write what the iteration is given to where the recorded one reads it."""
-        for x, own in zip(self._read_of(given), self._written, strict=True):
-            if x is not None and own is not None:
-                own.copy_(x)
+        write(self._own, self._read_of(given))
         if given.background is not None:
             self._background.copy_(sent(torch.tensor([given.background], dtype=torch.float32), self._device))
         self._count(given.t)
-
-
-def _clone(x: Tensor | None) -> Tensor | None:
-    return None if x is None else x.clone()

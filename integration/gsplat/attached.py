@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import logging
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from typing import Any, Final
@@ -24,10 +25,13 @@ from integration.densification import require_end, warn_if_score_is_unused
 from integration.detail import sh0_offset
 from integration.lineage import RowNumbers
 from integration.optimizers import optimizers_of, step_detail
+from integration.own_drawing import Drawable
 from integration.replacing import replace_everywhere
-from rasterizers.autograd import drawing_ahead, recorded, uncompiled
+from rasterizers.autograd import drawing_ahead, rasterizer_of, recorded, uncompiled
 from rasterizers.geometry import SH_C0
-from rasterizers.interface import Camera
+from rasterizers.interface import BackendUnavailable, Camera, Rasterizer
+
+_log = logging.getLogger(__name__)
 
 _ATTACHED: Final = "clear_attached"  # attribute of a wrapped function: its Attached
 _SAME_POSE: Final = 1e-3  # largest difference between the entries of two poses of one camera
@@ -55,6 +59,9 @@ class Attached:
         own_background: the loop adds a background to its renderings itself; else the strategies may choose the `backgrounds` of
             calls that name none.
         iterations: of the loop. Where HR would take part after them only, a warning says so before the first step.
+        hr_by: what draws HR and extra views. "host": the function that is wrapped; a name of `rasterizers.load`: that rasterizer
+            of this package; "auto": on CUDA "warp", whose work is recorded and replayed, where it draws what the call asks for,
+            else "host". Pictures of the two differ by 3e-3 at most, where one blends a contribution of 1/255 and the other not.
 
     Raises:
         ValueError: there is no view, or a parameter is missing.
@@ -79,6 +86,7 @@ class Attached:
         masks: Mapping[str, Tensor] | None = None,
         own_background: bool = False,
         iterations: int | None = None,
+        hr_by: str = "auto",
     ) -> None:
         if not views:
             raise ValueError(
@@ -102,6 +110,7 @@ class Attached:
         self._has_drawn_bands = False  # after a call with spherical harmonics, one without them draws no colours
         self._product: tuple[Tensor, Tensor, Tensor] | None = None  # see `_gated`
         self._trains_detail = detail
+        self._hr_by, self._told_of_hr = hr_by, ""
         self._is_ours = False  # the wrapped function is this package's, see `wrap`
         self._undo = ExitStack()
         stop, threshold = (getattr(strategy, name, None) for name in ("refine_stop_iter", "grow_grad2d"))
@@ -147,7 +156,7 @@ class Attached:
             if view is None:  # a viewer, a camera without a photo
                 return rasterization(**self._with_detail(call, trained=False))
 
-            def render_at(target: Target, gate: Tensor | None, sized: View) -> HostOutput:
+            def render_at(target: Target, gate: Tensor | None, sized: View) -> HostOutput | Drawable:
                 return self._render(rasterization, call, sized, target, gate)
 
             self._follow_optimizers()
@@ -230,7 +239,7 @@ class Attached:
 
     def _render(
         self, rasterization: Rasterization, arguments: Mapping[str, Any], view: View, target: Target, gate: Tensor | None
-    ) -> HostOutput:  # fmt: skip
+    ) -> HostOutput | Drawable:  # fmt: skip
         call, params = {**arguments, **self._background(arguments)}, self.params()
         if len(call["means"]) != len(params["means"]):
             raise HostError(
@@ -240,7 +249,7 @@ class Attached:
         if gate is not None:
             call["opacities"] = self._gated(call["opacities"], gate)
         if target == "hr":
-            call, factor = self._with_detail(call, trained=True), view.factor
+            call, factor = call if self._own_rasterizer(call) else self._with_detail(call, trained=True), view.factor
             call["Ks"] = call["Ks"] * call["Ks"].new_tensor([[factor], [factor], [1]])
             call |= {"width": call["width"] * factor, "height": call["height"] * factor, "render_mode": "RGB"}
             call |= {"packed": False} if self._is_ours else {}  # nobody reads its `info`
@@ -262,8 +271,45 @@ class Attached:
                     f"{view.lr.camera.width}x{view.lr.camera.height} pixels. Train at one resolution (nerfstudio: "
                     "num_downscales=0)."
                 )
+        if target != "lr" and (own := self._own_rasterizer(call)) is not None:
+            return self._drawable(own, call, params, target)
         aliases = () if self._is_ours else _aliased(call)
         return self._drawn(rasterization, call, params, gate, aliases if target == "lr" else ())
+
+    def _own_rasterizer(self, call: Mapping[str, Any]) -> Rasterizer | None:
+        """What draws HR and extra views in place of the host's function; None: nothing does. The log says once, which."""
+        if self._hr_by == "host" or (self._hr_by == "auto" and call["means"].device.type != "cuda"):
+            return None
+        backend = "warp" if self._hr_by == "auto" else self._hr_by
+        try:
+            rasterizer = rasterizer_of(call, backend)
+        except (ValueError, BackendUnavailable) as error:
+            if self._hr_by != "auto":
+                raise
+            if self._told_of_hr != "host":
+                _log.info("HR and extra views are drawn by the host's own function: %s", error)
+            self._told_of_hr = "host"
+            return None
+        if self._told_of_hr != backend:
+            _log.info(
+                "HR and extra views are drawn by this package's rasterizer %s, LR by the host's function.", backend
+            )
+        self._told_of_hr = backend
+        return rasterizer
+
+    def _drawable(
+        self, rasterizer: Rasterizer, call: Mapping[str, Any], params: Mapping[str, Tensor], target: Target
+    ) -> Drawable:  # fmt: skip
+        """A call, as this package draws it."""
+        (fx, _, cx), (_, fy, cy), _ = call["Ks"].detach().reshape(3, 3).tolist()
+        pose = call["viewmats"].detach().reshape(4, 4).cpu()
+        camera = target if isinstance(target, Camera) else Camera(pose, fx, fy, cx, cy, call["width"], call["height"])
+        behind = call.get("backgrounds")
+        background = call["means"].new_zeros(1, 3) if behind is None else behind.detach().reshape(1, 3).float()
+        drawn = {name: call[name] for name in ("means", "quats", "scales", "opacities", "colors")}
+        return Drawable(
+            rasterizer, camera, drawn, (call["sh_degree"] + 1) ** 2, params.get("detail"), background, params
+        )
 
     def _gated(self, opacities: Float[Tensor, " N"], gate: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
         """Their product, made once for both scales."""

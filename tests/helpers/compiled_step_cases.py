@@ -9,10 +9,11 @@ import torch
 
 from clear_strategies import SVS, Conductor, Evidence, Objective
 from clear_strategies.core import deferred
+from clear_strategies.core.gradients import gradients_of
 from clear_strategies.merging.iteration import HrSide
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.training import compiled_step
-from clear_strategies.training.compiled_step import CompiledStep, gradients_of
+from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.field import FieldShot, GaussianField
 from clear_strategies.training.optim import Adam, LearningRates
 from rasterizers.interface import SplatGradients

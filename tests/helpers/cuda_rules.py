@@ -16,8 +16,8 @@ class Act:
     """What is about to be done.
 
     Args:
-        what: "pool", "begin", "end" and "replay" of a graph; "warp begin" and "warp end"; "wait" for another stream; "work",
-            "allocate", "sort", "read", "send" and "pin".
+        what: "pool", "begin", "end" and "replay" of a graph; "warp stream", "warp begin" and "warp end"; "wait" for another
+            stream; "work", "allocate", "sort", "read", "send" and "pin".
         on: the stream. graph: whose pool, beginning, end or replay it is. other: the stream that is waited for.
         freed: the graph reads memory that is no more. by_warp: memory is Warp's, not torch's.
     """
@@ -32,11 +32,12 @@ class Act:
 
 @dataclass
 class State:
-    """Torch's default stream, the graph that is being captured, and whether Warp knows of that."""
+    """Torch's default stream, the graph that is being captured, whether Warp knows of that, and whether it has begun."""
 
     legacy: Any
     capture: Any = None
     warp_knows: bool = False
+    warp_runs: bool = False
 
     def captures(self, stream: Any) -> bool:
         return self.capture is not None and self.capture.stream is stream
@@ -93,6 +94,13 @@ def second_begin(a: Act, s: State) -> bool:
 def end_without_begin(a: Act, s: State) -> bool:
     """Operation failed: this graph is not being captured, or not on this stream (torch, CUDA)."""
     return a.what == "end" and not (s.capture is a.graph and s.captures(a.on))
+
+
+# The second fault that a GPU showed.
+@check
+def a_stream_before_warp_begins(a: Act, s: State) -> bool:
+    """'NoneType' object has no attribute 'cuda_devices' (Warp's stream_from_torch, before `warp.init`)."""
+    return a.what == "warp stream" and not s.warp_runs
 
 
 @rule

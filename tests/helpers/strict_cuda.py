@@ -201,12 +201,20 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     from clear_strategies.kernels import native
     from clear_strategies.kernels.per_gaussian import dispatch
     from clear_strategies.training import replay
+    from integration import own_drawing
     from rasterizers import recording, warp_runtime
     from rasterizers.warp_backend import frame, settings
 
-    wp.init()
     cuda = StrictCuda()
-    sort, prepare, allocate = wp.utils.radix_sort_pairs, warp_runtime._Launch.prepare, wp.empty
+    sort, prepare, allocate, init = wp.utils.radix_sort_pairs, warp_runtime._Launch.prepare, wp.empty, wp.init
+
+    def initialises() -> None:
+        init()
+        cuda.state.warp_runs = True
+
+    def warp_stream(stream: Stream) -> Stream:
+        cuda.ask("warp stream", on=stream)
+        return stream
 
     def warp_begins(*, stream: Stream, external: bool) -> None:
         cuda.ask("warp begin", on=stream)
@@ -237,13 +245,17 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
             "CUDAGraph": partial(Graph, cuda), "stream": cuda.using, "current_stream": lambda device: cuda.current,
             "graph_pool_handle": dict, "synchronize": lambda device=None: cuda.ask("read"),
         },
-        wp: {"capture_begin": warp_begins, "capture_end": warp_ends, "empty": allocates},
+        wp: {
+            "init": initialises, "stream_from_torch": warp_stream, "capture_begin": warp_begins, "capture_end": warp_ends,
+            "empty": allocates,
+        },
         wp.utils: {"radix_sort_pairs": sorts},
         warp_runtime._Launch: {"prepare": prepared},
-        recording: {"_side_stream": cache(lambda device: Stream(cuda)), "warp_stream": lambda stream: stream},
+        recording: {"_side_stream": cache(lambda device: Stream(cuda))},
         deferred: {"is_immediate": lambda x: False},
         native: {"available": lambda: False},
         dispatch: {"DEVICES": {"cpu"}},
+        own_drawing: {"_RECORDING": {"cpu"}},
         frame: {"DEFERRED_COUNTS": {"cpu": True}},
         **{m: {"sent": lambda numbers, device: numbers.pin_memory()} for m in (warp_runtime, settings, replay)},
     }  # fmt: skip

@@ -147,6 +147,7 @@ def with_memory_that_is_freed(cuda, x):
 
 
 def with_a_sort(cuda, _):
+    wp.init()
     cuda.state.warp_knows = False
     keys, values = (wp.from_torch(torch.zeros(4, dtype=torch.int32)) for _ in range(2))
     wp.utils.radix_sort_pairs(keys, values, 2, end_bit=8)
@@ -173,6 +174,7 @@ EXAMPLES: dict[str, list[Callable[[StrictCuda, torch.Tensor], object]]] = {
     "begin_of_a_graph_that_is_captured": [lambda cuda, x: [(g := cuda.state.capture).capture_end(), g.capture_begin()]],
     "second_begin": [lambda cuda, x: torch.cuda.CUDAGraph().capture_begin()],
     "end_without_begin": [lambda cuda, x: torch.cuda.CUDAGraph().capture_end()],
+    "a_stream_before_warp_begins": [lambda cuda, x: wp.stream_from_torch(cuda.current)],
     "warp_joins_what_is_captured": [after_the_end(lambda cuda, x: wp.capture_begin(stream=cuda.current, external=True))],
     "warp_ends_what_it_began": [lambda cuda, x: [wp.capture_end(stream=cuda.current) for _ in range(2)]],
     "sort_that_warp_does_not_know_of": [with_a_sort],

@@ -13,12 +13,14 @@ from clear_strategies.core.view import ExtraView, View
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.density.mcmc import MCMC
+from clear_strategies.merging import replays
+from clear_strategies.merging.replays import LIVE
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
-from clear_strategies.training import checkpoint, loop, replay
+from clear_strategies.training import checkpoint, loop
 from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
-from clear_strategies.training.replay import LIVE, replays_for
+from clear_strategies.training.replay import replays_for
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from rasterizers.recording import running
@@ -221,9 +223,9 @@ def test_where_lists_are_too_short_the_iteration_is_live_and_recorded_anew():
 
 
 def test_kinds_beyond_the_most_are_live_and_counted(monkeypatch):
-    monkeypatch.setattr(replay, "_MOST_KINDS", 1)
+    monkeypatch.setattr(replays, "_MOST_KINDS", 1)
     replayed = both(lambda: start(density=False, degree_every=6), 9)
-    assert live_in(replayed) == {FIRST: 1, "more than 1 kinds of iterations": 8}
+    assert live_in(replayed) == {FIRST: 1, "more than 1 kinds": 8}
 
 
 def fails(*_: object) -> None:
@@ -257,7 +259,7 @@ def test_what_cannot_be_recorded_is_live_from_then_on_and_one_line_says_why(faul
 
 def test_where_a_replay_fails_iterations_are_live_from_then_on(monkeypatch, caplog):
     live, other = (trained(start(density=False), replayed=r, until=5) for r in (False, True))
-    monkeypatch.setattr(replay.Recording, "replay", fails)
+    monkeypatch.setattr(replays.Recording, "replay", fails)
     require_same(trained(other, replayed=True, until=8), trained(live, replayed=False, until=8))
     assert (replays_of(other), live_in(other)) == (3, {FIRST: 2, FAILED: 3})
     require_one_line(caplog, 6)

@@ -1,0 +1,165 @@
+"""Work that is recorded by its kind and replayed, in the trainer and in hosts; see `rasterizers.recording`.
+
+Work of a new kind is live first, so that kernels are compiled and caches filled. The next time it is recorded, and then it is
+replayed while the tensors that it reads lie where they lay. Whatever fails in a recording or a replay, all that follows is live.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Protocol, TypeVar
+
+import torch
+from torch import Tensor
+
+from clear_strategies.core import deferred
+from clear_strategies.core.deferred import Number
+from clear_strategies.core.work_log import WorkLog
+from clear_strategies.merging.conductor import Conductor
+from clear_strategies.strategies.base import describes, overrides
+from rasterizers.recording import Recording, on_side_stream
+
+_log = logging.getLogger(__name__)
+
+LIVE: Final = "live in place of a replay"
+"""The work log's entry for work that was not replayed, by the reason. It has no runs, so that none seem saved."""
+
+_FAILED: Final = "a recording failed"
+_MOST_KINDS: Final = 8  # a recording keeps the memory of its work
+
+T = TypeVar("T")
+G_contra = TypeVar("G_contra", contravariant=True)
+T_co = TypeVar("T_co", covariant=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What Python decides by in the work: work of one kind launches the same kernels.
+
+    Args:
+        addresses: where the tensors lie that it reads in place. When they change, every recording is dropped.
+        shapes, facts: whatever else Python looks at.
+    """
+
+    addresses: tuple[int, ...]
+    shapes: tuple[Any, ...]
+    facts: tuple[Any, ...]
+
+
+class Recorded(Protocol[G_contra, T_co]):
+    """A recording of one kind of work."""
+
+    def replay(self, given: G_contra) -> bool:
+        """Do the work; False where the recording does not hold for it, before anything has changed."""
+        ...
+
+    def outcome(self, given: G_contra) -> T_co:
+        """What the work has made."""
+        ...
+
+
+class Replays:
+    """The recordings of one training. The work log counts live work by the reason, under `LIVE`.
+
+    Args:
+        name: of what ends where a recording fails, for the log.
+    """
+
+    def __init__(self, device: torch.device, work_log: WorkLog, name: str) -> None:
+        self._device, self._work_log, self._name = device, work_log, name
+        self._recorded: dict[Kind, Any] = {}  # None: seen once
+        self._addresses: tuple[int, ...] = ()
+        self._failed = False
+
+    def do(self, kind: Kind, t: int, given: Any, *, live: Callable[[], T], record: Callable[[], Recorded[Any, T]]) -> T:
+        """Do the work: by a replay, while it is recorded, or live."""
+        if self._failed:
+            return self._live(live, _FAILED)
+        if kind.addresses != self._addresses:  # the structure has changed, and with it everything that was recorded
+            self._recorded.clear()
+            self._addresses = kind.addresses
+        if kind not in self._recorded:
+            if len(self._recorded) == _MOST_KINDS:
+                return self._live(live, f"more than {_MOST_KINDS} kinds")
+            self._recorded[kind] = None
+            with on_side_stream(self._device):  # some caches are of a stream
+                return self._live(live, "the first of its kind")
+        try:
+            known = self._recorded[kind]
+            recorded = record() if known is None else known if known.replay(given) else None
+            reason = "the recorded lists of pairs are too short"  # recorded anew, with space for more
+        except Exception as error:
+            self._failed, recorded, reason = True, None, _FAILED
+            self._recorded.clear()
+            cause = f"{type(error).__name__}: {error}".partition("\n")[0]
+            _log.warning("%s ends at t=%d, and iterations are live from now on: %s", self._name, t, cause)
+        self._recorded[kind] = recorded
+        return self._live(live, reason) if recorded is None else recorded.outcome(given)
+
+    def _live(self, live: Callable[[], T], reason: str) -> T:
+        self._work_log.skip(LIVE, reason)
+        return live()
+
+
+class RecordedWork:
+    """A recording of work, what it has skipped, and its numbers for the history and for logs.
+
+    Args:
+        work: returns what it makes, and numbers by name. See `Recording`.
+    """
+
+    def __init__(
+        self, device: torch.device, work_log: WorkLog, work: Callable[[], tuple[Any, Mapping[str, Number]]]
+    ) -> None:
+        self._work_log = work_log
+
+        def gathered() -> tuple[Any, Tensor, Callable[[Tensor], dict[str, Number]]]:
+            made, row = work()
+            counts = {f"skip {k}": count for k, (*_, count) in enumerate(self._skips) if isinstance(count, Tensor)}
+            return made, *deferred.gathered({**row, **counts})
+
+        with work_log.noted() as self._skips:
+            self._recording = Recording(device, gathered)
+
+    def replay(self) -> bool:
+        """See `Recorded`."""
+        with self._work_log.stage("replayed"):
+            return self._recording.replay()
+
+    def outcome(self) -> tuple[Any, dict[str, Number]]:
+        """What the work has made, whose tensors the next replay overwrites, and its numbers, copied."""
+        made, numbers, row_of = self._recording.result
+        row = row_of(numbers.clone())
+        for k, (name, reason, count) in enumerate(self._skips):
+            counted = row.pop(f"skip {k}", None)
+            on_device = isinstance(counted, deferred.Element)
+            self._work_log.skip(name, reason, counted.vector[counted.k].long() if on_device else count)  # type: ignore[union-attr]
+        return made, row
+
+
+def why_strategies_are_not_recorded(conductor: Conductor) -> Iterator[str]:
+    """The strategies that depend on a view by more than they state, as reasons."""
+    for strategy in conductor.strategies:
+        if any(overrides(strategy, hook) for hook in ("observe", "route", "score")) and not describes(
+            strategy, "looked_up"
+        ):
+            yield f"{type(strategy).__name__} does not state what it looks up of a view"
+
+
+def looked_up_by(conductor: Conductor) -> Callable[..., Tensor | None]:
+    """What a recording's iteration looks up of a view."""
+    owner = conductor.owner("observe")
+    return (lambda view: None) if owner is None else owner.looked_up
+
+
+def copied(x: Tensor | None) -> Tensor | None:
+    return None if x is None else x.clone()
+
+
+def write(own: Sequence[Tensor | None], given: Sequence[Tensor | None]) -> None:
+    """Write what work is given to where the recorded one reads it."""
+    for x, y in zip(own, given, strict=True):
+        if x is not None and y is not None:
+            x.copy_(y)

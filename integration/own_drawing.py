@@ -1,0 +1,242 @@
+"""HR and extra views drawn by this package's rasterizer, whatever draws the host's LR; on CUDA recorded and replayed.
+
+A host gives its rasterizer activated tensors, which a `Drawable` holds. What is made of them is one work: render, losses, both
+cotangents in one pass, evidence, routing. A recording reads copies of them, since a host makes new ones in each step. From there
+the gradients go on to the parameters through the host's own graph, which stays live.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, Final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.core.deferred import Number
+from clear_strategies.core.gradients import Grads, scale_rows
+from clear_strategies.core.view import ExtraView, Photo, View
+from clear_strategies.core.work_log import WorkLog
+from clear_strategies.merging.conductor import Conductor
+from clear_strategies.merging.iteration import HrSide
+from clear_strategies.merging.replays import (
+    Kind,
+    RecordedWork,
+    Replays,
+    copied,
+    looked_up_by,
+    why_strategies_are_not_recorded,
+    write,
+)
+from integration.autograd_shot import AutogradShot, HostOutput, Target, every_number, to_parameters
+from rasterizers.autograd import BackwardHook, Drawing
+from rasterizers.interface import Camera, Rasterizer, Recordable, Splats, over
+
+_log = logging.getLogger(__name__)
+
+_RECORDING: Final = {"cuda"}  # devices
+_TENSORS: Final = tuple(field.name for field in fields(Splats))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawable:
+    """What a host asks its rasterizer for, as one of this package draws it.
+
+    Args:
+        drawn: means, quats, scales, opacities and colors [N, K, 3], in the host's graph.
+        bands: of the colours, active. offset: f_det, at HR.
+        background: behind the picture.
+        params: raw parameters by gsplat's names.
+    """
+
+    rasterizer: Rasterizer
+    camera: Camera
+    drawn: Mapping[str, Tensor]
+    bands: int
+    offset: Float[Tensor, "N 3"] | None
+    background: Float[Tensor, "1 3"]
+    params: Mapping[str, Tensor]
+
+    @property
+    def splats(self) -> Splats:
+        """What is drawn, without its graph."""
+        means, quats, scales, opacities = (
+            self.drawn[name].detach() for name in ("means", "quats", "scales", "opacities")
+        )
+        colors, offset = self.drawn["colors"].detach(), None if self.offset is None else self.offset.detach()
+        return Splats(means, quats, scales, opacities, colors[:, :1], colors[:, 1 : self.bands], offset)
+
+
+RenderAt = Callable[[Target, Float[Tensor, " N"] | None, View], HostOutput | Drawable]
+"""Renders by the host's own renderer, opacities multiplied by the gate: with f_det at HR, without it for any other target. The
+view is that of the iteration, with an SR image of the size that is due. A `Drawable`, of any target but LR, is to be rendered.
+"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Given:
+    """What the work on one picture reads.
+
+    Args:
+        photo: what it is compared with, and its own camera. known: what strategies look up of its view, or the weight of the
+            pixels of an extra view.
+    """
+
+    splats: Splats
+    background: Float[Tensor, "1 3"]
+    camera: Camera
+    photo: Photo
+    known: Tensor | None
+    mask: Float[Tensor, "H W 1"] | None
+
+    def copied(self) -> _Given:
+        splats = Splats(**{name: copied(getattr(self.splats, name)) for name in _TENSORS})  # type: ignore[arg-type]
+        photo = Photo(self.photo.camera, self.photo.image.clone(), copied(self.photo.shown))
+        background, camera = self.background.clone(), replace(self.camera)
+        return _Given(splats, background, camera, photo, copied(self.known), copied(self.mask))
+
+    def tensors(self, rasterizer: Recordable) -> list[Tensor | None]:
+        splats = [getattr(self.splats, name) for name in _TENSORS]
+        numbers = rasterizer.numbers_of(self.camera, self.background.device)
+        return [*splats, self.background, *numbers, self.photo.image, self.photo.shown, self.known, self.mask]
+
+    @property
+    def shapes(self) -> tuple[Any, ...]:
+        tensors = [getattr(self.splats, name) for name in _TENSORS] + [
+            self.photo.image,
+            self.photo.shown,
+            self.known,
+            self.mask,
+        ]
+        return tuple(None if x is None else x.shape for x in tensors)
+
+    def shot(self, asked: Drawable) -> AutogradShot:
+        rasterizer = asked.rasterizer
+        if isinstance(rasterizer, Recordable):
+            rasterizer = rasterizer.over_changing(self.background)
+        else:
+            red, green, blue = self.background[0].tolist()
+            rasterizer = over(rasterizer, (red, green, blue))
+        r = rasterizer(self.splats, self.camera)
+        drawing = Drawing(r, asked.drawn, r.image, BackwardHook())
+        image = r.image if self.mask is None else r.image * self.mask
+        return AutogradShot(image, r.means2d, r.visible, asked.params, drawings=(drawing,), mask=self.mask)
+
+
+_Work = Callable[[_Given, bool], tuple[Any, dict[str, Number]]]
+"""Work on what is given, and whether it is being recorded. It returns what it makes, and its numbers where it is."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HrWork:
+    """What HR gives in an iteration.
+
+    Args:
+        hr: see `HrSide`. routed: the same of the raw parameters.
+        numbers: the losses, and what the strategies have logged, of a replay; empty where the work was live.
+    """
+
+    hr: HrSide[Grads]
+    routed: Grads
+    numbers: Mapping[str, Number]
+
+
+class _Recorded:
+    """The recording of one kind of work, and the tensors from which it reads what it is given."""
+
+    def __init__(self, work_log: WorkLog, rasterizer: Recordable, given: _Given, work: _Work) -> None:
+        own, self._rasterizer = given.copied(), rasterizer
+        self._own = own.tensors(rasterizer)
+        self._work = RecordedWork(given.background.device, work_log, lambda: work(own, True))
+
+    def replay(self, given: _Given) -> bool:
+        """See `Recorded`."""
+        write(self._own, given.tensors(self._rasterizer))
+        return self._work.replay()
+
+    def outcome(self, _: _Given) -> tuple[Any, dict[str, Number]]:
+        """See `Recorded`."""
+        return self._work.outcome()
+
+
+class OwnDrawing:
+    """Draws HR and extra views for one training of a host.
+
+    Args:
+        device: of the Gaussians. On CUDA the work is recorded and replayed.
+    """
+
+    def __init__(self, conductor: Conductor, device: torch.device) -> None:
+        self._conductor, self._look_up = conductor, looked_up_by(conductor)
+        self._replays: Replays | None = None
+        if device.type in _RECORDING:
+            self._replays = Replays(device, conductor.work_log, "the replay of HR")
+            if (reason := next(why_strategies_are_not_recorded(conductor), None)) is not None:
+                self._replays = None
+                _log.info("HR is not replayed: %s.", reason)
+
+    @torch.no_grad()
+    def hr(self, asked: Drawable, view: View, t: int, mask: Float[Tensor, "H W 1"] | None) -> HrWork:
+        """Draw the view at HR, compare it with the SR image, and route the gradients."""
+        conductor = self._conductor
+        photo = view.hr.over(conductor.background(t), view.background)
+        known = None if self._replays is None else self._look_up(view)
+        given = _Given(asked.splats, asked.background, asked.camera, photo, known, mask)
+
+        def work(given: _Given, recorded: bool) -> tuple[tuple[HrSide[Grads], Grads], dict[str, Number]]:
+            if not recorded:
+                return self._compared(given, asked, view, t), {}
+            logged = conductor.logs()
+            shown = View(view.name, view.lr, given.photo, background=view.background, looked_up=given.known)
+            made = self._compared(given, asked, shown, t)
+            return made, {**made[0].losses, **conductor.take_logs(logged)}
+
+        facts = ("hr", view.factor, view.background, conductor.objective.lambda_hr(t) > 0)
+        (hr, g), numbers = self._done(asked, given, t, facts, work)
+        params = {name: p.detach() for name, p in asked.params.items()}
+        hr = replace(hr, step=replace(hr.step, t=t, view=view, params=params))
+        detail = Grads({name: rows for name, rows in g.items() if name == "detail"})
+        return HrWork(hr, to_parameters(g, asked.drawn, asked.params) + detail, numbers)
+
+    @torch.no_grad()
+    def extra_view(self, asked: Drawable, extra: ExtraView, t: int) -> Grads:
+        """The gradient of `Conductor.extra_loss`, a number for each of the raw parameters."""
+        conductor = self._conductor
+        photo = extra.photo.over(conductor.background(t), extra.background)
+        given = _Given(asked.splats, asked.background, asked.camera, photo, extra.weight, None)
+
+        def work(given: _Given, recorded: bool) -> tuple[Grads, dict[str, Number]]:
+            shot = given.shot(asked)
+            shown = extra if given.known is None else replace(extra, photo=given.photo, weight=given.known)
+            (g,) = shot.gradients(conductor.extra_loss(shot.image, shown, t).cotangents)
+            return g, {}
+
+        g, _ = self._done(asked, given, t, ("extra", extra.background, extra.robust), work)
+        found = every_number(to_parameters(g, asked.drawn, asked.params), asked.params)
+        return Grads({name: x.clone() for name, x in found.items()})  # some are those that the next replay overwrites
+
+    def _compared(self, given: _Given, asked: Drawable, view: View, t: int) -> tuple[HrSide[Grads], Grads]:
+        """The HR side, and g^HR of what was drawn, with f_det's.  Eq. 9, 10, 12, 13"""
+        λ_hf = self._conductor.objective.lambda_hf
+        hr = self._conductor.hr_gradients(given.shot(asked), view, t, AutogradShot.gradients)
+        g = hr.routed(λ_hf)
+        if hr.hf is not None and hr.hf.colour is not None and asked.offset is not None:
+            g["detail"] = scale_rows(hr.hf.colour.rgb, hr.m * λ_hf)
+        return hr, g
+
+    def _done(
+        self, asked: Drawable, given: _Given, t: int, facts: tuple[Any, ...], work: _Work
+    ) -> tuple[Any, dict[str, Number]]:
+        """The work, live or by a replay."""
+        rasterizer, log = asked.rasterizer, self._conductor.work_log
+        if self._replays is None or not isinstance(rasterizer, Recordable):
+            return work(given, False)
+        state = [rows.data_ptr() for rows in self._conductor.state_dict().values()]
+        kind = Kind((len(asked.splats), *state), given.shapes, (rasterizer, asked.bands, *facts))
+        return self._replays.do(
+            kind, t, given,
+            live=lambda: work(given, False), record=lambda: _Recorded(log, rasterizer, given, work),
+        )  # fmt: skip
