@@ -151,8 +151,7 @@ class Attachment:
         if self._passes == 0:  # one step of the host, however many passes it accumulates
             self._extra.forget()
             if extra_views := conductor.extra_views(t):
-                with _random_state_kept(means.device):
-                    self._extra.take(extra_views, lambda extra: self._of_extra(extra, view, t, render_at))
+                self._extra.take(extra_views, lambda extra: self._of_extra(extra, view, t, render_at))
         output = render_at("lr", z, view)
         if isinstance(output, Drawable):
             raise TypeError("an adapter renders LR by the host's own function, got a Drawable.")
@@ -166,9 +165,7 @@ class Attachment:
         self, view: View, t: int, z: Tensor | None, render_at: RenderAt, params: Mapping[str, Tensor]
     ) -> tuple[HrSide[Grads], Grads | None]:
         """The gradients of HR, and the same of the raw parameters where HR takes part in the merge."""
-        conductor, mask, device = self.conductor, self._masks.get(view.name), params["means"].device
-        with _random_state_kept(device):
-            drawn = render_at("hr", z, view)
+        conductor, mask, drawn = self.conductor, self._masks.get(view.name), render_at("hr", z, view)
         fine = None if mask is None else enlarged_mask(mask.to(params["means"]), view.factor)[..., None]
         if isinstance(drawn, Drawable):
             work = self._own_drawing.hr(drawn, view, t, fine)
@@ -529,7 +526,9 @@ def _announce(conductor: Conductor, views: Sequence[View], *, own_background: bo
 
 
 @contextmanager
-def _random_state_kept(device: torch.device) -> Iterator[None]:
-    """Restore torch's random generators, so that a dropout inside the host's render drops the same at both scales."""
+def random_state_kept(device: torch.device) -> Iterator[None]:
+    """Restore torch's random generators after a host has drawn HR or an extra view, so that a dropout inside its function drops
+    the same at LR.
+    """
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
         yield

@@ -1,7 +1,8 @@
 """What the strategies cost in another trainer: `python -m clear_strategies.bench host`.
 
-A gsplat-style loop on the demo's photos, enlarged, alone and with a conductor attached. The Gaussians are the demo's points with
-noise, as many as asked for. The loops take turns, step by step, so that other work on the machine slows all of them alike.
+A gsplat-style loop on the demo's photos, enlarged, alone and with a conductor attached; on CUDA with LR drawn by gsplat and by
+this package. The Gaussians are the demo's points with noise, as many as asked for. The loops take turns, step by step, so that
+other work on the machine slows all of them alike.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ from integration.views import view
 from rasterizers import native
 
 ALONE: Final = "alone"
+_OURS: Final = ", ours"
+"""What a loop's name ends with whose LR is drawn by this package, where gsplat draws that of the others."""
 _ITERATIONS: Final = 1_000  # of the run that the loops are a part of
 _FROM: Final = 301  # the measured steps begin here: HR takes part, at half its size where skips.coarse_until says so
 _WARM_UPS: Final = 6
@@ -43,11 +46,12 @@ class Loop:
     Args:
         strategies: as in `conductor`, with overrides after it, "clear skips=none"; None: the loop alone.
         width: of the LR photos, px; SR images have four times as many.
+        ours: this package draws LR on CUDA, too; on a CPU it always does.
     """
 
     def __init__(
-        self, strategies: str | None, n: int, width: int, device: str, dtype: torch.dtype = torch.float32
-    ) -> None:
+        self, strategies: str | None, n: int, width: int, device: str, dtype: torch.dtype = torch.float32, *, ours: bool = False
+    ) -> None:  # fmt: skip
         demo, noise = load_demo(), torch.Generator().manual_seed(0)
         scale = width / demo.images.shape[2]
         photos = F.interpolate(demo.images.movedim(-1, 1), scale_factor=scale, mode="bilinear" if scale > 1 else "area")
@@ -62,7 +66,7 @@ class Loop:
         self.splats = {name: torch.nn.Parameter(p.detach().to(device, dtype)) for name, p in splats.items()}
         self.optimizers = {name: torch.optim.Adam([p], lr=1e-9, eps=1e-15) for name, p in self.splats.items()}
         self.photos, self.viewmats, self.Ks = (x.to(device, dtype) for x in (photos, demo.viewmats, Ks))
-        self.draw, self.merge, self.t = _rasterization(device), None, 0
+        self.draw, self.merge, self.t = _rasterization(device, ours=ours), None, 0
         if strategies is not None:
             name, *overrides = strategies.split()
             chosen = conductor(name, *overrides, iterations=_ITERATIONS)
@@ -117,9 +121,12 @@ def measure(
         SettingError: strategies that are none.
     """
     require_device(device)
-    names = [ALONE, *strategies]
+    names = [f"{name}{who}" for who in ("", _OURS)[: 1 + (device == "cuda")] for name in (ALONE, *strategies)]
     with native.kernel_threads(torch.get_num_threads()):
-        loops = {name: Loop(None if name == ALONE else name, gaussians, width, device) for name in names}
+        loops = {}
+        for name in names:
+            chosen = name.removesuffix(_OURS)
+            loops[name] = Loop(None if chosen == ALONE else chosen, gaussians, width, device, ours=chosen != name)
         turns = _timed(loops, repeats, device)
         rows, means = [], turns.groupby("loop").mean()
         for name, loop in loops.items():
@@ -192,8 +199,8 @@ def _error(strategies: str) -> dict[str, Any]:
     return {"loop": strategies} | {name: relative(g, exact) for name, g, exact in pairs if exact.any()}
 
 
-def _rasterization(device: str) -> Callable[..., Any]:
-    if device == "cuda":
+def _rasterization(device: str, *, ours: bool) -> Callable[..., Any]:
+    if device == "cuda" and not ours:
         from gsplat import rasterization as cuda_rasterization
 
         return cuda_rasterization  # type: ignore[no-any-return]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import torch
@@ -38,7 +38,6 @@ from rasterizers.interface import Camera, Rasterizer, Recordable, Splats, over
 _log = logging.getLogger(__name__)
 
 _RECORDING: Final = {"cuda"}  # devices
-_TENSORS: Final = tuple(field.name for field in fields(Splats))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,13 +60,13 @@ class Drawable:
     params: Mapping[str, Tensor]
 
     @property
-    def splats(self) -> Splats:
-        """What is drawn, without its graph."""
+    def tensors(self) -> tuple[Tensor | None, ...]:
+        """Means, quats, scales, opacities, the active bands of the colours and f_det, without their graph."""
         means, quats, scales, opacities = (
             self.drawn[name].detach() for name in ("means", "quats", "scales", "opacities")
         )
-        colors, offset = self.drawn["colors"].detach(), None if self.offset is None else self.offset.detach()
-        return Splats(means, quats, scales, opacities, colors[:, :1], colors[:, 1 : self.bands], offset)
+        offset = None if self.offset is None else self.offset.detach()
+        return means, quats, scales, opacities, self.drawn["colors"].detach()[:, : self.bands], offset
 
 
 RenderAt = Callable[[Target, Float[Tensor, " N"] | None, View], HostOutput | Drawable]
@@ -81,11 +80,12 @@ class _Given:
     """What the work on one picture reads.
 
     Args:
-        photo: what it is compared with, and its own camera. known: what strategies look up of its view, or the weight of the
-            pixels of an extra view.
+        drawn: see `Drawable.tensors`.
+        photo: what the picture is compared with.
+        known: what strategies look up of its view, or the weight of the pixels of an extra view.
     """
 
-    splats: Splats
+    drawn: tuple[Tensor | None, ...]
     background: Float[Tensor, "1 3"]
     camera: Camera
     photo: Photo
@@ -93,25 +93,23 @@ class _Given:
     mask: Float[Tensor, "H W 1"] | None
 
     def copied(self) -> _Given:
-        splats = Splats(**{name: copied(getattr(self.splats, name)) for name in _TENSORS})  # type: ignore[arg-type]
         photo = Photo(self.photo.camera, self.photo.image.clone(), copied(self.photo.shown))
-        background, camera = self.background.clone(), replace(self.camera)
-        return _Given(splats, background, camera, photo, copied(self.known), copied(self.mask))
+        drawn = tuple(None if x is None else x.clone(memory_format=torch.contiguous_format) for x in self.drawn)
+        return _Given(
+            drawn, self.background.clone(), replace(self.camera), photo, copied(self.known), copied(self.mask)
+        )
+
+    @property
+    def of_the_scene(self) -> list[Tensor | None]:
+        return [*self.drawn, self.photo.image, self.photo.shown, self.known, self.mask]
 
     def tensors(self, rasterizer: Recordable) -> list[Tensor | None]:
-        splats = [getattr(self.splats, name) for name in _TENSORS]
         numbers = rasterizer.numbers_of(self.camera, self.background.device)
-        return [*splats, self.background, *numbers, self.photo.image, self.photo.shown, self.known, self.mask]
+        return [*self.of_the_scene, self.background, *numbers]
 
     @property
     def shapes(self) -> tuple[Any, ...]:
-        tensors = [getattr(self.splats, name) for name in _TENSORS] + [
-            self.photo.image,
-            self.photo.shown,
-            self.known,
-            self.mask,
-        ]
-        return tuple(None if x is None else x.shape for x in tensors)
+        return tuple(None if x is None else x.shape for x in self.of_the_scene)
 
     def shot(self, asked: Drawable) -> AutogradShot:
         rasterizer = asked.rasterizer
@@ -120,7 +118,9 @@ class _Given:
         else:
             red, green, blue = self.background[0].tolist()
             rasterizer = over(rasterizer, (red, green, blue))
-        r = rasterizer(self.splats, self.camera)
+        means, quats, scales, opacities, colors, offset = self.drawn
+        splats = Splats(means, quats, scales, opacities, colors[:, :1], colors[:, 1:], offset)  # type: ignore[arg-type, index]
+        r = rasterizer(splats, self.camera)
         drawing = Drawing(r, asked.drawn, r.image, BackwardHook())
         image = r.image if self.mask is None else r.image * self.mask
         return AutogradShot(image, r.means2d, r.visible, asked.params, drawings=(drawing,), mask=self.mask)
@@ -184,7 +184,7 @@ class OwnDrawing:
         conductor = self._conductor
         photo = view.hr.over(conductor.background(t), view.background)
         known = None if self._replays is None else self._look_up(view)
-        given = _Given(asked.splats, asked.background, asked.camera, photo, known, mask)
+        given = _Given(asked.tensors, asked.background, asked.camera, photo, known, mask)
 
         def work(given: _Given, recorded: bool) -> tuple[tuple[HrSide[Grads], Grads], dict[str, Number]]:
             if not recorded:
@@ -206,7 +206,7 @@ class OwnDrawing:
         """The gradient of `Conductor.extra_loss`, a number for each of the raw parameters."""
         conductor = self._conductor
         photo = extra.photo.over(conductor.background(t), extra.background)
-        given = _Given(asked.splats, asked.background, asked.camera, photo, extra.weight, None)
+        given = _Given(asked.tensors, asked.background, asked.camera, photo, extra.weight, None)
 
         def work(given: _Given, recorded: bool) -> tuple[Grads, dict[str, Number]]:
             shot = given.shot(asked)
@@ -235,7 +235,7 @@ class OwnDrawing:
         if self._replays is None or not isinstance(rasterizer, Recordable):
             return work(given, False)
         state = [rows.data_ptr() for rows in self._conductor.state_dict().values()]
-        kind = Kind((len(asked.splats), *state), given.shapes, (rasterizer, asked.bands, *facts))
+        kind = Kind((len(asked.drawn["means"]), *state), given.shapes, (rasterizer, asked.bands, *facts))
         return self._replays.do(
             kind, t, given,
             live=lambda: work(given, False), record=lambda: _Recorded(log, rasterizer, given, work),

@@ -250,15 +250,32 @@ class _Rendered(NamedTuple):
 def _render(rasterizer: Rasterizer, inputs: _Inputs, bands: int, camera: Camera, *, depth: bool) -> _Rendered:
     if depth:
         require_depth(rasterizer)
-    if torch.is_grad_enabled() and camera.world_to_camera.requires_grad:  # silence would leave the pose as it is
-        raise ValueError(
-            "poses have no gradient in this package, and camera.world_to_camera (viewmats) requires one; detach it, or draw "
-            "with gsplat's own rasterization on a GPU."
-        )
+    _require_still(camera.world_to_camera)
     splats = inputs.splats(bands)
     with torch.no_grad():
         rendering = rasterizer(splats, camera, depth=True) if depth else _ahead.draw(rasterizer, splats, camera)
     return _Rendered(rendering, rasterizer, camera, bands)
+
+
+def _require_still(poses: Tensor) -> None:
+    if torch.is_grad_enabled() and poses.requires_grad:  # silence would leave the pose as it is
+        raise ValueError(
+            "poses have no gradient in this package, and camera.world_to_camera (viewmats) requires one; detach it, or draw "
+            "with gsplat's own rasterization on a GPU."
+        )
+
+
+def cameras_of(viewmats: Float[Tensor, "C 4 4"], Ks: Float[Tensor, "C 3 3"], width: int, height: int) -> list[Camera]:
+    """Gsplat's cameras. Equal ones are the same object, whose numbers a backend then has on the device."""
+    poses = zip(viewmats.detach().tolist(), Ks.detach().tolist(), strict=True)
+    return [_camera(tuple(map(tuple, pose)), viewmats.dtype, *K[0][::2], *K[1][1:], width, height) for pose, K in poses]
+
+
+@functools.lru_cache(maxsize=1024)
+def _camera(
+    pose: tuple[tuple[float, ...], ...], dtype: torch.dtype, fx: float, cx: float, fy: float, cy: float, width: int, height: int
+) -> Camera:  # fmt: skip
+    return Camera(torch.tensor(pose, dtype=dtype, device="cpu"), fx, fy, cx, cy, width, height)
 
 
 def _in_graph(
@@ -390,13 +407,12 @@ def rasterization(
     colors = colors.to(means.dtype)  # gsplat takes spherical harmonics in float16, too
     inputs, bands = _Inputs(means, quats, scales, opacities, colors, rgb_offset), (sh_degree + 1) ** 2
     each = []
-    for pose, K, over_color in zip(viewmats, Ks, behind, strict=True):
+    _require_still(viewmats)
+    for camera, over_color in zip(cameras_of(viewmats, Ks, width, height), behind, strict=True):
         background = tuple((x - low) / span for x in over_color)
         rasterizer = over(
             _loaded(backend, means.device.type, near_plane, eps2d, rasterize_mode == "antialiased"), background
         )
-        (fx, _, cx), (_, fy, cy), _ = K.tolist()
-        camera = Camera(pose, fx, fy, cx, cy, width, height)
         each.append(_render(rasterizer, inputs, bands, camera, depth=render_mode == "RGB+ED"))
     info, centres, rows = _packed_info(each, inputs) if packed else _info(each)
     info |= {"width": width, "height": height, "n_cameras": len(each)}

@@ -19,7 +19,7 @@ from clear_strategies.core.view import View
 from clear_strategies.errors import HostError
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.merging.conductor import Conductor
-from integration.attachment import Attachment
+from integration.attachment import Attachment, random_state_kept
 from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot, Target
 from integration.densification import require_end, warn_if_score_is_unused
 from integration.detail import sh0_offset
@@ -27,7 +27,7 @@ from integration.lineage import RowNumbers
 from integration.optimizers import optimizers_of, step_detail
 from integration.own_drawing import Drawable
 from integration.replacing import replace_everywhere
-from rasterizers.autograd import drawing_ahead, rasterizer_of, recorded, uncompiled
+from rasterizers.autograd import cameras_of, drawing_ahead, rasterizer_of, recorded, uncompiled
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import BackendUnavailable, Camera, Rasterizer
 
@@ -208,7 +208,7 @@ class Attached:
 
     def _together(self, call: Mapping[str, Any]) -> AbstractContextManager[None]:
         """A context in which HR and LR share work, where this package draws both."""
-        if not self._is_ours:
+        if not self._is_ours or self._own_rasterizer(call) is not None:
             return nullcontext()
         pose, K = (call[name].detach().reshape(n, n) for name, n in (("viewmats", 4), ("Ks", 3)))
         return drawing_ahead(pose, K, call["width"], call["height"])
@@ -274,7 +274,10 @@ class Attached:
         if target != "lr" and (own := self._own_rasterizer(call)) is not None:
             return self._drawable(own, call, params, target)
         aliases = () if self._is_ours else _aliased(call)
-        return self._drawn(rasterization, call, params, gate, aliases if target == "lr" else ())
+        if target == "lr":
+            return self._drawn(rasterization, call, params, gate, aliases)
+        with random_state_kept(call["means"].device):
+            return self._drawn(rasterization, call, params, gate, ())
 
     def _own_rasterizer(self, call: Mapping[str, Any]) -> Rasterizer | None:
         """What draws HR and extra views in place of the host's function; None: nothing does. The log says once, which."""
@@ -301,9 +304,12 @@ class Attached:
         self, rasterizer: Rasterizer, call: Mapping[str, Any], params: Mapping[str, Tensor], target: Target
     ) -> Drawable:  # fmt: skip
         """A call, as this package draws it."""
-        (fx, _, cx), (_, fy, cy), _ = call["Ks"].detach().reshape(3, 3).tolist()
-        pose = call["viewmats"].detach().reshape(4, 4).cpu()
-        camera = target if isinstance(target, Camera) else Camera(pose, fx, fy, cx, cy, call["width"], call["height"])
+        if isinstance(target, Camera):
+            camera = target
+        else:
+            (camera,) = cameras_of(
+                call["viewmats"].reshape(1, 4, 4), call["Ks"].reshape(1, 3, 3), call["width"], call["height"]
+            )
         behind = call.get("backgrounds")
         background = call["means"].new_zeros(1, 3) if behind is None else behind.detach().reshape(1, 3).float()
         drawn = {name: call[name] for name in ("means", "quats", "scales", "opacities", "colors")}

@@ -6,7 +6,7 @@ import functools
 import inspect
 import logging
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +16,7 @@ from torch import Tensor
 from clear_strategies.core.view import View
 from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
-from integration.attachment import Attachment
+from integration.attachment import Attachment, random_state_kept
 from integration.autograd_shot import HostOutput, Target
 from integration.densification import require_end, warn_if_score_is_unused
 from integration.inria.cameras import HostViews, enlarged_camera, replaced_camera
@@ -139,7 +139,8 @@ class Attached:
                 overrides = Overrides(gate, params.get("detail"))
                 call = signature.bind(camera, proxy(self._model, overrides), *args, **kwargs)
                 call.arguments |= self._bg_color(call.arguments.get("bg_color"))
-                with recorded() as drawings:
+                kept = nullcontext() if target == "lr" else random_state_kept(self._model._xyz.device)
+                with recorded() as drawings, kept:
                     result = render(*call.args, **call.kwargs)
                 output = host_output(
                     result, pinhole, params, gate, drawings, ranks_by_third_column=self._ranks_by_absgrad
