@@ -187,7 +187,8 @@ def to_parameters(g: Grads, drawn: Mapping[str, Tensor], params: Mapping[str, Te
         list(graph.values()), list(rest.values()), [g[name] for name in graph], retain_graph=True, allow_unused=True
     )
     found = {name: value for name, value in zip(rest, through, strict=True) if value is not None}
-    return Grads(direct, colour=colour) + found
+    both = {name: direct[name] + found[name] for name in direct.keys() & found.keys()}
+    return Grads({**direct, **found, **both}, colour=colour)
 
 
 def every_number(g: Grads, params: Mapping[str, Tensor]) -> Grads:

@@ -23,6 +23,7 @@ class Settings:
         factor: HR pixels per LR pixel.
         points: "own": the Gaussians start as the host makes them; "stereo": from dense stereo between its training photos.
         seed: of the strategies.
+        hr_by: what draws HR in a gsplat-style host, see `integration.gsplat.attach`; others draw it themselves.
 
     Raises:
         SettingError: `points` is neither of these.
@@ -35,6 +36,7 @@ class Settings:
     factor: int = 4
     points: Points = "own"
     seed: int = 0
+    hr_by: str = "auto"
 
     def __post_init__(self) -> None:
         wants_stereo(self.points)

@@ -211,7 +211,7 @@ def fit(
             return None
         return checkpoint.save(checkpoints, state.checkpoint(config or {}), keep=settings.keep)
 
-    if settings.replay:
+    if settings.replay or (settings.replay is None and state.device.type == "cuda"):
         state.replays = replays_for(state, rasterizer)
     clock = Clock(state.history_as_floats()[-1] if state.history else {})
     with deferred_signals() as pending, kernel_threads(state, rasterizer):

@@ -39,11 +39,13 @@ _log = logging.getLogger(__name__)
 
 
 def replays_for(s: TrainState, rasterizer: Rasterizer) -> IterationReplays | None:
-    """The replays of this training; None, and a log line with the reason, where its iterations cannot be recorded."""
+    """The replays of this training; None, and a log line with the reason, where its iterations cannot be recorded. That is a
+    warning where they were asked for.
+    """
     reason = next(_why_not(s, rasterizer), None)
     if reason is None and s.compiled_step is not None and isinstance(rasterizer, Recordable):
         return IterationReplays(s, rasterizer, s.compiled_step)
-    _log.warning("fit.replay has no effect: %s.", reason)
+    _log.log(logging.WARNING if s.settings.replay else logging.INFO, "Iterations are not replayed: %s.", reason)
     return None
 
 

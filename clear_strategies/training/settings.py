@@ -31,6 +31,7 @@ class FitSettings:
         fused: "auto" merges, corrects, anchors and steps in one compiled pass where it can, and skips rows that would
             not move; "off" takes the readable path.
         replay: record iterations and replay them, so that a GPU does not wait for Python; with rasterizer=warp. The bits stay.
+            None: on CUDA.
         map_views: number of training views with maps of reliability and correction in maps/; 0: none.
         video: number of frames of path.mp4, a loop through the training cameras, 24 a second; 0: none.
         verbose: also show on the console the details that run.log holds; `-v` on the command line.
@@ -56,7 +57,7 @@ class FitSettings:
     keep: int = 3
     memory: int | None = None
     fused: FusedMode = "auto"
-    replay: bool = False
+    replay: bool | None = None
     map_views: int = 3
     video: int = 72
     verbose: bool = False

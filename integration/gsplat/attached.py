@@ -248,8 +248,9 @@ class Attached:
             )
         if gate is not None:
             call["opacities"] = self._gated(call["opacities"], gate)
+        own = None if target == "lr" else self._own_rasterizer(call)
         if target == "hr":
-            call, factor = call if self._own_rasterizer(call) else self._with_detail(call, trained=True), view.factor
+            call, factor = self._with_detail(call, trained=True) if own is None else call, view.factor
             call["Ks"] = call["Ks"] * call["Ks"].new_tensor([[factor], [factor], [1]])
             call |= {"width": call["width"] * factor, "height": call["height"] * factor, "render_mode": "RGB"}
             call |= {"packed": False} if self._is_ours else {}  # nobody reads its `info`
@@ -271,7 +272,7 @@ class Attached:
                     f"{view.lr.camera.width}x{view.lr.camera.height} pixels. Train at one resolution (nerfstudio: "
                     "num_downscales=0)."
                 )
-        if target != "lr" and (own := self._own_rasterizer(call)) is not None:
+        if own is not None:
             return self._drawable(own, call, params, target)
         aliases = () if self._is_ours else _aliased(call)
         if target == "lr":
@@ -313,6 +314,7 @@ class Attached:
         behind = call.get("backgrounds")
         background = call["means"].new_zeros(1, 3) if behind is None else behind.detach().reshape(1, 3).float()
         drawn = {name: call[name] for name in ("means", "quats", "scales", "opacities", "colors")}
+        drawn["colors"] = drawn["colors"].to(drawn["means"].dtype)  # some hosts have them in float16
         return Drawable(
             rasterizer, camera, drawn, (call["sh_degree"] + 1) ** 2, params.get("detail"), background, params
         )

@@ -86,7 +86,7 @@ def install(
         if last is not None:
             last.finish()
         views = [photo.view(source, scale) for photo in photos]
-        runner.clear = last = _Installed(runner, views, masks, chosen, wanted.seed)
+        runner.clear = last = _Installed(runner, views, masks, chosen, wanted)
         installed(last.attached)
         result = train(runner)
         _log.info("%s.", last.attached.attachment.summary())
@@ -118,12 +118,12 @@ def require_supported(config: Any, processes: int = 1) -> None:
 class _Installed:
     """CLEAR in one Runner; its files hold f_base + f_det."""
 
-    def __init__(self, runner: Any, views: Any, masks: Any, chosen: Any, seed: int) -> None:
+    def __init__(self, runner: Any, views: Any, masks: Any, chosen: Any, wanted: Settings) -> None:
         rendering = sys.modules["gsplat.rendering"]
         self.views, self._splats = views, runner.splats
         self.attached = Attached(
-            runner.splats, runner.optimizers, views, chosen, strategy=runner.cfg.strategy, seed=seed, masks=masks,
-            state=getattr(getattr(runner, "scene", None), "signal", None), iterations=runner.cfg.max_steps,
+            runner.splats, runner.optimizers, views, chosen, strategy=runner.cfg.strategy, seed=wanted.seed, masks=masks,
+            state=getattr(getattr(runner, "scene", None), "signal", None), iterations=runner.cfg.max_steps, hr_by=wanted.hr_by,
         )  # fmt: skip
         self.attached.replace_everywhere(rendering.rasterization)
         self._undo = ExitStack()

@@ -1,6 +1,5 @@
 """HR and extra views that this package draws beside a host's own LR: the same gradients, live and replayed."""
 
-import functools
 from dataclasses import dataclass, replace
 
 import pytest
@@ -12,7 +11,6 @@ from clear_strategies.core.view import ExtraView
 from clear_strategies.merging.replays import LIVE
 from clear_strategies.schedules import Ramp
 from integration import own_drawing
-from rasterizers import autograd
 from rasterizers.recording import running
 from tests.helpers import toy
 from tests.helpers.backends import needs
@@ -40,11 +38,9 @@ def everything(**of_p2g) -> list[cs.Strategy]:
     return [cs.GCO(), cs.P2G(**of_p2g), cs.SVS(looks=0, dropout=Ramp(full=5), anchor_start=100), TwoPhotos()]
 
 
-def trained(
-    hr_by, *, steps=6, strategies=None, scene=SCENE, objective=HR_FROM_START, call=None, backend="torch", **settings
-):
+def trained(hr_by, *, steps=6, strategies=None, scene=SCENE, objective=HR_FROM_START, call=None, **settings):
     """The host's parameters, the log of each step, and the attachment."""
-    host = Host(scene, rasterization=functools.partial(autograd.rasterization, backend=backend), **(call or {}))
+    host = Host(scene, **(call or {}))
     conductor = Conductor(*(everything() if strategies is None else strategies), objective=objective)
     clear = attached(host, scene, conductor, hr_by=hr_by, **settings)
     host.degree = lambda step: 2 if step < 3 else 3
@@ -150,6 +146,53 @@ def test_replays_over_masks_and_backgrounds(monkeypatch, scene, detail):
     runs, live = both(monkeypatch, scene, steps=6, masks={scene.train[0].name: mask}, detail=detail)
     assert live.keys() == {FIRST}
     assert runs > 4
+
+
+@needs_warp
+def test_replays_over_densification_resets_evaluation_and_resuming(monkeypatch, recorded_on):
+    strategies = pytest.importorskip("gsplat.strategy")
+    scene = toy.scene(40).to(recorded_on)
+    names = [scene.train[i % 3].name for i in range(20)]
+
+    def begun(host):
+        host.degree = lambda step: 3
+        return attached(
+            host, scene, Conductor(cs.GCO(), cs.P2G(), objective=WARP), strategy=host.strategy, hr_by="warp"
+        )
+
+    def run():
+        torch.manual_seed(0)
+        host = Host(scene, extent=4.0, strategy=strategies.DefaultStrategy(
+            refine_start_iter=2, refine_stop_iter=14, refine_every=6, reset_every=9, grow_grad2d=2e-4, prune_opa=0.02
+        ))  # fmt: skip
+        clear = begun(host)
+
+        def evaluate():
+            with torch.no_grad():
+                host.render(scene.train[0].lr.camera)
+
+        host.train(names, between=evaluate)
+        logs = [clear.attachment.conductor.work_log]
+        clear.remove()
+        resumed = Host(scene, extent=4.0)
+        resumed.splats = {name: torch.nn.Parameter(p.detach().clone()) for name, p in host.splats.items()}
+        resumed.optimizers = {name: torch.optim.Adam([p], lr=1e-3) for name, p in resumed.splats.items()}
+        again = begun(resumed)
+        again.attachment.load_state_dict(clear.attachment.state_dict())
+        resumed.train(names[:5])
+        logs.append(again.attachment.conductor.work_log)
+        again.remove()
+        return {name: p.detach() for name, p in resumed.splats.items()}, logs
+
+    replayed, logs = run()
+    monkeypatch.setattr(own_drawing, "_RECORDING", set())
+    live, _ = run()
+    assert len(live["means"]) not in (40, 0)
+    assert not [name for name, x in live.items() if not torch.equal(x, replayed[name])]
+    assert [log.entries["replayed"].runs >= n for log, n in zip(logs, (10, 3), strict=True)] == [True, True]
+    assert {reason for log in logs for reason in log.entries[LIVE].skipped} <= {
+        FIRST, "the recorded lists of pairs are too short"
+    }  # fmt: skip
 
 
 @needs_warp
