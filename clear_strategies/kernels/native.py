@@ -7,6 +7,7 @@ from collections.abc import Collection, Sequence
 from types import ModuleType
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.utils.dlpack import from_dlpack
 
@@ -40,6 +41,14 @@ def empty_like(x: Tensor) -> Tensor:
     if x.device.type == "cpu" and x.dtype == torch.float32 and available():
         return empty(x.shape)
     return torch.empty_like(x, memory_format=torch.contiguous_format)
+
+
+def times(a: Float[Tensor, "N G"], b: Tensor) -> Float[Tensor, "N G"]:
+    """A · b, with a's type and layout; in recycled memory where the kernels are there."""
+    if a.device.type != "cpu" or not available():
+        return a * b
+    out = empty(a.shape, a.dtype) if a.is_contiguous() else empty(a.shape[::-1], a.dtype).T
+    return torch.mul(a, b, out=out)
 
 
 def runs(x: Tensor) -> bool:

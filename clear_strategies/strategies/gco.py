@@ -22,6 +22,7 @@ from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.gradients import CONFLICT_GROUPS
 from clear_strategies.core.step import Step
+from clear_strategies.kernels.native import times
 from clear_strategies.strategies.base import Strategy
 
 _log = logging.getLogger(__name__)
@@ -79,17 +80,17 @@ class GCO(Strategy):
     def reconcile(self, products: Products, step: Step | None) -> Weights:
         """ĝ_HR = g_HR - ω (c + τ_c) ‖h‖ / ‖l‖ g_LR where c < -τ_c. Logs what was corrected."""
         p, τ = products, self.tolerance
-        per_norm = (p.l2 * p.h2).clamp_min_(_TINY).rsqrt_()  # 1 / (‖l‖ ‖h‖)
-        c = p.dot * per_norm  # Eq. 6
+        per_norm = times(p.l2, p.h2).clamp_min_(_TINY).rsqrt_()  # 1 / (‖l‖ ‖h‖)
+        c = times(p.dot, per_norm)  # Eq. 6
         below = c.add_(τ).clamp_max_(0)  # c + τ_c, how far a cosine lies below the margin; 0: no conflict
         below[:, _QUATS] *= _turns_something(p.l2) & _turns_something(p.h2)
         if len(self.groups) < len(CONFLICT_GROUPS):
             below[:, [k for k, group in enumerate(CONFLICT_GROUPS) if group not in self.groups]] = 0
         evidence = None if step is None else step.evidence
         q = p.dot.new_zeros(1) if evidence is None else evidence.reliability.double()
-        ω = (below * ((1 - q) / (τ - 1))[:, None]).clamp_(self.weight_min, self.weight_max)  # s (1 - q), Eq. 11
+        ω = times(below, ((1 - q) / (τ - 1))[:, None]).clamp_(self.weight_min, self.weight_max)  # s (1 - q), Eq. 11
         self._report(p, below, ω, evidence is not None)
-        return Weights(remove=(ω * below).mul_(p.h2).mul_(per_norm))  # ω (c + τ_c) ‖h‖ / ‖l‖, Eq. 7
+        return Weights(remove=per_norm.mul_(p.h2).mul_(below).mul_(ω))  # ω (c + τ_c) ‖h‖ / ‖l‖, Eq. 7
 
     def _report(self, p: Products, below: Float[Tensor, "N G"], ω: Float[Tensor, "N G"], has_evidence: bool) -> None:
         """Log what was corrected; it is counted where somebody asks for it."""

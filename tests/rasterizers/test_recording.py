@@ -216,19 +216,14 @@ def test_the_stand_in_refuses_what_cuda_refuses(name, act, strict_cuda):
             graph.capture_end()
 
 
-@pytest.mark.parametrize(("name", "act"), ACTS)
+@pytest.mark.parametrize(("name", "act"), [act for act in ACTS if act.values[0] != "a_stream_before_warp_begins"])
 def test_after_work_that_cannot_be_recorded_live_work_goes_on_and_other_work_is_recorded(name, act, strict_cuda):
     x = torch.zeros(1)
     with pytest.raises(RuntimeError):
         Recording(CPU, lambda: act(strict_cuda, x))
     s = strict_cuda.state
-    assert (s.capture, s.warp_knows, strict_cuda.current, running(), gc.isenabled()) == (
-        None,
-        False,
-        s.legacy,
-        None,
-        True,
-    )
+    found = s.capture, s.warp_knows, strict_cuda.current, running(), gc.isenabled()
+    assert found == (None, False, s.legacy, None, True)
     x.zero_().add_(1)
     recorded = Recording(CPU, lambda: x + 1)
     x.add_(1)

@@ -289,11 +289,13 @@ class Routes(cs.P2G):
 )
 def test_what_cannot_be_recorded_is_live_and_the_log_says_why(change, reason, caplog):
     state = start()
+    state.settings = replace(state.settings, replay=True)
     change(state)
     assert replays_for(state, rasterizers.load("warp", device=DEVICE.type)) is None
     assert reason in caplog.text
 
 
 def test_other_rasterizers_are_not_recorded(caplog):
+    caplog.set_level("INFO")
     assert replays_for(start(), rasterizers.load("torch")) is None
     assert "ReferenceRasterizer cannot be recorded; rasterizer=warp can" in caplog.text
