@@ -204,7 +204,7 @@ def _rasterization(device: str, *, ours: bool) -> Callable[..., Any]:
         from gsplat import rasterization as cuda_rasterization
 
         return cuda_rasterization  # type: ignore[no-any-return]
-    from rasterizers.autograd import rasterization
+    from rasterizers.as_gsplat import rasterization
 
     return rasterization
 

@@ -31,7 +31,7 @@ from rasterizers.interface import (
 
 __all__ = [
     "PRESETS", "BackendUnavailable", "Camera", "RasterSettings", "Rasterizer", "Rendering", "SplatGradients", "Splats",
-    "Traits", "available", "fastest", "for_device", "load", "names",
+    "Traits", "available", "fastest", "for_device", "load", "names", "rasterization",
 ]  # fmt: skip
 
 # The module and the class of each backend. A backend imports its library when it is constructed.
@@ -114,3 +114,10 @@ def names() -> list[str]:
     The CUDA backends come first where there is CUDA; without it they run slowly or not at all, and come last.
     """
     return sorted(_BACKENDS, key=lambda name: (name in _ON_CUDA) != torch.cuda.is_available())
+
+
+def __getattr__(name: str) -> Any:
+    """`rasterization`, whose module asks for this one."""
+    if name == "rasterization":
+        return importlib.import_module("rasterizers.as_gsplat").rasterization
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,18 +1,17 @@
 """Rasterizers as differentiable torch functions.
 
-`draw` returns a rendering that is part of the autograd graph. `rasterization` has the signature of gsplat's function, so
-that a loop written for gsplat runs on a CPU. Each backward pass handles one cotangent; `Rendering.vjp` handles several, and
-`recorded` gives it to callers of code that draws.
+`draw` returns a rendering that is part of the autograd graph; `as_gsplat.rasterization` does so with gsplat's signature. Each
+backward pass handles one cotangent; `Rendering.vjp` handles several, and `recorded` gives it to callers of code that draws.
 """
 
 from __future__ import annotations
 
 import functools
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
-from enum import Enum
+from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, Final, NamedTuple, ParamSpec, TypeVar, cast
 
 import torch
@@ -20,24 +19,26 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-import rasterizers
-from rasterizers.checks import require_depth
-from rasterizers.geometry import SH_C0
-from rasterizers.interface import Camera, Rasterizer, RasterSettings, Rendering, Splats, over
-from rasterizers.reference.projection import footprints
+from rasterizers.ahead import draw_or_take
+from rasterizers.checks import require_absgrad, require_depth
+from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, WithAbsgrad, over
+from rasterizers.pose import pose_gradient
 
-# Arguments of gsplat 1.5 that change its speed, or leave out Gaussians that are too small or too far to matter.
-_WITHOUT_EFFECT: Final = {
-    "sparse_grad", "tile_size", "radius_clip", "far_plane", "channel_chunk", "distributed", "segmented",
-}  # fmt: skip
-# The only value that this package draws of each other argument; None for one that is not listed.
-_SUPPORTED: Final = {"camera_model": "pinhole", "with_ut": False, "with_eval3d": False, "rolling_shutter": "GLOBAL"}
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
 
-_TAKEN: Final = {
-    "means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height", "near_plane", "eps2d", "sh_degree",
-    "packed", "backgrounds", "render_mode", "absgrad", "rasterize_mode", "backend", "rgb_offset",
-}  # fmt: skip
+def uncompiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """The function, which `torch.compile` leaves as it is where compiled code calls it: the kernels take memory, not traces."""
+
+    @functools.wraps(function)
+    def called(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        if torch.compiler.is_compiling():
+            apart: Callable[_P, _R] = torch.compiler.disable(function)  # type: ignore[no-untyped-call]
+            return apart(*args, **kwargs)  # made here, since at import it would take a second
+        return function(*args, **kwargs)
+
+    return called
 
 
 class Drawn(NamedTuple):
@@ -112,81 +113,6 @@ def recorded() -> Iterator[list[Drawing]]:
         _recordings.running = outer
 
 
-class _Ahead(threading.local):
-    """One image that is drawn together with another, before it is asked for.
-
-    Attributes:
-        wanted: what the image shows, see `_shown`: its camera alone.
-        kept: that image, what it shows, and the splats: while these live, no other tensors lie at their addresses.
-    """
-
-    wanted: Camera | None = None
-    kept: tuple[tuple[Any, ...], Rendering, Splats] | None = None
-
-    def draw(self, rasterizer: Rasterizer, splats: Splats, camera: Camera) -> Rendering:
-        """The image, from `kept` where it lies there."""
-        if self.kept is not None and self.kept[0] == _shown(rasterizer, splats, camera):
-            rendering, self.kept = self.kept[1], None
-            return rendering
-        wanted = self.wanted
-        if wanted is None or camera.world_to_camera.tolist() != wanted.world_to_camera.tolist():
-            return rasterizer(splats, camera)
-        self.wanted = None
-        plain = replace(splats, rgb_offset=None)
-        if splats.rgb_offset is None and _grid(camera) == _grid(wanted):  # it is this one
-            return rasterizer(splats, camera)
-        other = replace(wanted, world_to_camera=camera.world_to_camera)  # by the same tensor, as a backend sees at once
-        ahead, rendering = rasterizer.render_scales([(plain, other), (splats, camera)])
-        self.kept = _shown(rasterizer, plain, other), ahead, plain
-        return rendering
-
-
-_ahead: Final = _Ahead()
-
-
-def _grid(camera: Camera) -> tuple[float, ...]:
-    return camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
-
-
-def _shown(rasterizer: Rasterizer, splats: Splats, camera: Camera) -> tuple[Any, ...]:
-    """What an image shows: equal for equal images, as long as the tensors are alive."""
-    tensors = (getattr(splats, field.name) for field in fields(Splats))
-    memory = [None if x is None else (x.data_ptr(), x.shape, x.stride(), x._version) for x in tensors]
-    return rasterizer, memory, _grid(camera), camera.world_to_camera.tolist()
-
-
-@contextmanager
-def drawing_ahead(viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, height: int) -> Iterator[None]:
-    """The first drawing inside from this pose brings along the one of the same splats by K and without `rgb_offset`.
-
-    A later drawing inside of just that takes it: the two share projection, colour and depth order. It is forgotten with the
-    block.
-    """
-    (fx, _, cx), (_, fy, cy), _ = K.tolist()
-    _ahead.wanted, _ahead.kept = Camera(viewmat.detach(), fx, fy, cx, cy, width, height), None
-    try:
-        yield
-    finally:
-        _ahead.wanted = _ahead.kept = None
-
-
-_P = ParamSpec("_P")
-_R = TypeVar("_R")
-
-
-def uncompiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """The function, which `torch.compile` leaves as it is where compiled code calls it: the kernels take memory, not traces."""
-
-    @functools.wraps(function)
-    def called(*args: _P.args, **kwargs: _P.kwargs) -> _R:
-        if torch.compiler.is_compiling():
-            apart: Callable[_P, _R] = torch.compiler.disable(function)  # type: ignore[no-untyped-call]
-            return apart(*args, **kwargs)  # made here, since at import it would take a second
-        return function(*args, **kwargs)
-
-    return called
-
-
 @uncompiled
 def draw(
     rasterizer: Rasterizer,
@@ -197,7 +123,7 @@ def draw(
     depth: bool = False,
     colors: Float[Tensor, "N K 3"] | None = None,
 ) -> Drawn:
-    """Draw the splats. Gradients flow from the image and its alpha to the splats' tensors; depth has none.
+    """Draw the splats. Gradients flow from the image and its alpha to the splats' tensors and the pose; depth has none.
 
     A loss of alpha draws the splats a second time, over another background, and takes a second backward pass.
 
@@ -207,22 +133,22 @@ def draw(
         colors: the tensor that `splats.sh0` and `splats.shN` are slices of, for a caller that has them as one.
 
     Raises:
-        ValueError: the rasterizer lacks the trait `depth` that `depth=True` needs, or the pose requires a gradient.
+        ValueError: the rasterizer lacks the trait `depth` that `depth=True` needs.
         NotImplementedError: in `backward`, if the loss depends on the depth.
         RuntimeError: in `backward`, if the loss depends on these gradients, e.g. by a gradient penalty.
     """
     if colors is None:
         colors = torch.cat((splats.sh0, splats.shN), 1)
-    inputs = _Inputs(splats.means, splats.quats, splats.scales, splats.opacities, colors, splats.rgb_offset)
-    rendered = _render(rasterizer, inputs, 1 + splats.shN.shape[1], camera, depth=depth)
+    inputs = Inputs(splats.means, splats.quats, splats.scales, splats.opacities, colors, splats.rgb_offset)
+    rendered = render(rasterizer, inputs, 1 + splats.shN.shape[1], camera, depth=depth)
     if means2d is None:
         means2d = rendered.rendering.means2d.clone().requires_grad_()
     else:
         means2d.data.copy_(rendered.rendering.means2d)
-    return _in_graph(rendered, inputs, means2d)
+    return in_graph(rendered, inputs, means2d, pose=camera.world_to_camera)
 
 
-class _Inputs(NamedTuple):
+class Inputs(NamedTuple):
     """The tensors that a drawing is a function of. The colours are one tensor, as hosts have them: autograd would fill others as
     wide with zeros for the gradient of a slice.
     """
@@ -240,50 +166,42 @@ class _Inputs(NamedTuple):
         return Splats(means, quats, scales, opacities, colors[:, :1], colors[:, 1:bands], offset)  # type: ignore[arg-type, index]
 
 
-class _Rendered(NamedTuple):
+class Rendered(NamedTuple):
     rendering: Rendering
     rasterizer: Rasterizer
     camera: Camera
     bands: int  # of the colours
 
 
-def _render(rasterizer: Rasterizer, inputs: _Inputs, bands: int, camera: Camera, *, depth: bool) -> _Rendered:
+def render(rasterizer: Rasterizer, inputs: Inputs, bands: int, camera: Camera, *, depth: bool) -> Rendered:
     if depth:
         require_depth(rasterizer)
-    _require_still(camera.world_to_camera)
     splats = inputs.splats(bands)
     with torch.no_grad():
-        rendering = rasterizer(splats, camera, depth=True) if depth else _ahead.draw(rasterizer, splats, camera)
-    return _Rendered(rendering, rasterizer, camera, bands)
+        rendering = rasterizer(splats, camera, depth=True) if depth else draw_or_take(rasterizer, splats, camera)
+    return Rendered(rendering, rasterizer, camera, bands)
 
 
-def _require_still(poses: Tensor) -> None:
-    if torch.is_grad_enabled() and poses.requires_grad:  # silence would leave the pose as it is
-        raise ValueError(
-            "poses have no gradient in this package, and camera.world_to_camera (viewmats) requires one; detach it, or draw "
-            "with gsplat's own rasterization on a GPU."
-        )
-
-
-def cameras_of(viewmats: Float[Tensor, "C 4 4"], Ks: Float[Tensor, "C 3 3"], width: int, height: int) -> list[Camera]:
-    """Gsplat's cameras. Equal ones are the same object, whose numbers a backend then has on the device."""
-    poses = zip(viewmats.detach().tolist(), Ks.detach().tolist(), strict=True)
-    return [_camera(tuple(map(tuple, pose)), viewmats.dtype, *K[0][::2], *K[1][1:], width, height) for pose, K in poses]
-
-
-@functools.lru_cache(maxsize=1024)
-def _camera(
-    pose: tuple[tuple[float, ...], ...], dtype: torch.dtype, fx: float, cx: float, fy: float, cy: float, width: int, height: int
-) -> Camera:  # fmt: skip
-    return Camera(torch.tensor(pose, dtype=dtype, device="cpu"), fx, fy, cx, cy, width, height)
-
-
-def _in_graph(
-    rendered: _Rendered, inputs: _Inputs, means2d: Float[Tensor, "M 2"], rows: Int[Tensor, " M"] | None = None
+def in_graph(
+    rendered: Rendered,
+    inputs: Inputs,
+    means2d: Float[Tensor, "M 2"],
+    rows: Int[Tensor, " M"] | None = None,
+    *,
+    pose: Float[Tensor, "4 4"] | None = None,
+    absgrad: Float[Tensor, "M 2"] | None = None,
 ) -> Drawn:
-    """What was rendered, as a function of the inputs and of the projected centres, those of all or of these rows."""
+    """What was rendered, as a function of the inputs, of the projected centres, those of all or of these rows, and of the pose.
+
+    Args:
+        absgrad: receives in each backward pass Σ|∂L/∂u| over the pixels, of the rows.
+    """
     hook = BackwardHook()
-    image, alpha, visible, depth = _Draw.apply(rendered, rows, hook, means2d, *inputs)  # type: ignore[no-untyped-call]
+    if absgrad is not None:
+        require_absgrad(rendered.rasterizer)
+    image, alpha, visible, depth = _Draw.apply(  # type: ignore[no-untyped-call]
+        rendered, rows, hook, absgrad, pose, means2d, *inputs
+    )
     for drawings in _recordings.running if image.grad_fn is not None else ():
         drawings.append(
             Drawing(rendered.rendering, {k: x for k, x in inputs._asdict().items() if k != "rgb_offset"}, image, hook)
@@ -294,9 +212,11 @@ def _in_graph(
 class _Draw(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, rendered: _Rendered, rows: Tensor | None, hook: BackwardHook, means2d: Tensor, *inputs: Tensor | None
+        ctx: Any, rendered: Rendered, rows: Tensor | None, hook: BackwardHook, absgrad: Tensor | None, pose: Tensor | None,
+        means2d: Tensor, *inputs: Tensor | None
     ) -> Any:  # fmt: skip
-        ctx.rendered, ctx.rows, ctx.hook, rendering = rendered, rows, hook, rendered.rendering
+        ctx.rendered, ctx.rows, ctx.hook, ctx.absgrad, rendering = rendered, rows, hook, absgrad, rendered.rendering
+        ctx.pose = None if pose is None else (pose.device, pose.dtype)
         ctx.save_for_backward(*inputs)
         ctx.mark_non_differentiable(visible := rendering.visible.data)
         ctx.set_materialize_grads(False)
@@ -314,7 +234,7 @@ class _Draw(torch.autograd.Function):
             )
         take_colours = ctx.hook.reached()
         rendering, rasterizer, camera, bands = ctx.rendered
-        inputs = _Inputs(*ctx.saved_tensors)  # raises if one was changed in place since it was drawn
+        inputs = Inputs(*ctx.saved_tensors)  # raises if one was changed in place since it was drawn
         if d_image is None:
             d_image = torch.zeros_like(rendering.image)
         if d_alpha is None or not bool(d_alpha.any()):
@@ -327,18 +247,28 @@ class _Draw(torch.autograd.Function):
             d_red[..., 0] = d_alpha / (other[0] - b[0])
             over_other = over(rasterizer, other)(inputs.splats(bands), camera)
             drawn = [(rendering, d_image + d_red), (over_other, -d_red)]
-        each = [image.vjp(cotangent[None]) for image, cotangent in drawn]
+        if ctx.absgrad is None:
+            each = [image.vjp(cotangent[None]) for image, cotangent in drawn]
+        else:
+            each = [cast(WithAbsgrad, image).vjp(cotangent[None], absgrad=True) for image, cotangent in drawn]
+            total = sum(g.absgrad[0] for g in each)
+            ctx.absgrad.add_(total if ctx.rows is None else total[ctx.rows])
         names = ("screen", "means", "quats", "scales", "opacities", "rgb")
         screen, *geometry, rgb = (
             sum((getattr(g, name)[0] for g in each[1:]), getattr(each[0], name)[0]) for name in names
         )
-        screen = screen if ctx.rows is None else screen[ctx.rows]
         basis, colors = each[0].basis, None
         if take_colours is not None:
             take_colours(rgb, basis)
-        elif ctx.needs_input_grad[8]:
+        elif ctx.needs_input_grad[10]:
             colors = outer(rgb, basis, inputs.colors.shape[1])
-        return None, None, None, screen, *geometry, colors, None if inputs.rgb_offset is None else rgb
+        pose = None
+        if ctx.needs_input_grad[4]:
+            means, quats, scales, opacities = (x[None] for x in geometry)
+            g = SplatGradients(means, quats, scales, opacities, screen[None], rgb[None], basis)
+            pose = pose_gradient(inputs.splats(bands), camera, g).to(*ctx.pose)
+        screen = screen if ctx.rows is None else screen[ctx.rows]
+        return None, None, None, None, pose, screen, *geometry, colors, None if inputs.rgb_offset is None else rgb
 
 
 def outer(rgb: Float[Tensor, "N 3"], basis: Float[Tensor, "N B1"], bands: int) -> Float[Tensor, "N K 3"]:
@@ -347,197 +277,10 @@ def outer(rgb: Float[Tensor, "N 3"], basis: Float[Tensor, "N B1"], bands: int) -
     return drawn if bands == basis.shape[1] else torch.nn.functional.pad(drawn, (0, 0, 0, bands - basis.shape[1]))
 
 
-@uncompiled
-def rasterization(
-    means: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
-    scales: Float[Tensor, "N 3"],
-    opacities: Float[Tensor, " N"],
-    colors: Float[Tensor, "N ..."],
-    viewmats: Float[Tensor, "C 4 4"],
-    Ks: Float[Tensor, "C 3 3"],
-    width: int,
-    height: int,
-    *,  # gsplat has its other arguments in another order
-    near_plane: float = 0.01,
-    eps2d: float = 0.3,
-    sh_degree: int | None = None,
-    packed: bool = False,
-    backgrounds: Float[Tensor, "C 3"] | None = None,
-    render_mode: str = "RGB",
-    absgrad: bool = False,
-    rasterize_mode: str = "classic",
-    backend: str = "auto",
-    rgb_offset: Float[Tensor, "N 3"] | None = None,
-    **more: Any,
-) -> tuple[Float[Tensor, "C H W D"], Float[Tensor, "C H W 1"], dict[str, Any]]:
-    """Stands in for gsplat's `rasterization` with a backend of this package: pinhole cameras, RGB and expected depth.
-
-    Args:
-        colors: [N, K, 3] spherical harmonics with `sh_degree` the active degree, or [N, 3] RGB in
-            any range, e.g. normals, if `sh_degree` is None.
-        render_mode: "RGB", or "RGB+ED" with the expected depth as a fourth channel of the images, to look at: a loss of
-            it raises `NotImplementedError` in `backward`.
-        packed: `info` is that of the visible Gaussians of each camera, one after the other. gsplat's default is True, and here
-            False, since on a CPU its ellipses take half as long as the image.
-        more: gsplat's other arguments. Those that change only how it computes (sparse_grad, tile_size …) have no effect.
-        backend: a name of `rasterizers.load`.
-        rgb_offset: added to the colours before their clamp at 0, with `sh_degree` only; gsplat has no such argument.
-
-    Returns:
-        images, alphas, and what gsplat's strategies read: `means2d` [C, N, 2] (`retain_grad` works),
-        `radii` [C, N, 2] (1 for the visible, 0 for the others), `width`, `height`, `n_cameras`. Packed, of M visible Gaussians:
-        `means2d` [M, 2], `gaussian_ids`, `camera_ids` and `batch_ids` [M], and in the graph of what they depend on, `depths` [M],
-        `conics` [M, 3] and `opacities` [M], times the factor of `rasterize_mode="antialiased"`; `radii` [M, 2] in pixels.
-
-    Raises:
-        ValueError: a mode or an argument that only gsplat supports, poses that require a gradient, or a wrong shape.
-        TypeError: an argument after `height` is given by position.
-    """
-    _require_supported(render_mode, rasterize_mode, absgrad, more)
-    _require_shapes(len(means), colors, viewmats, Ks, backgrounds, sh_degree)
-    behind = [[0.0] * 3] * len(viewmats) if backgrounds is None else backgrounds.tolist()
-    low, span = (0.0, 1.0) if sh_degree is not None else _low_and_span(colors, behind)
-    if sh_degree is None and rgb_offset is not None:
-        raise ValueError(
-            "rgb_offset is an offset of spherical harmonics, give sh_degree; RGB takes it as colors + rgb_offset."
-        )
-    if sh_degree is None:
-        colors, sh_degree = ((colors - low) / span - 0.5)[:, None] / SH_C0, 0
-    colors = colors.to(means.dtype)  # gsplat takes spherical harmonics in float16, too
-    inputs, bands = _Inputs(means, quats, scales, opacities, colors, rgb_offset), (sh_degree + 1) ** 2
-    each = []
-    _require_still(viewmats)
-    for camera, over_color in zip(cameras_of(viewmats, Ks, width, height), behind, strict=True):
-        background = tuple((x - low) / span for x in over_color)
-        rasterizer = over(
-            _loaded(backend, means.device.type, near_plane, eps2d, rasterize_mode == "antialiased"), background
-        )
-        each.append(_render(rasterizer, inputs, bands, camera, depth=render_mode == "RGB+ED"))
-    info, centres, rows = _packed_info(each, inputs) if packed else _info(each)
-    info |= {"width": width, "height": height, "n_cameras": len(each)}
-    views = [_in_graph(rendered, inputs, u, i) for rendered, u, i in zip(each, centres, rows, strict=True)]
-    images, alphas = _stacked([view.image for view in views]), _stacked([view.alpha for view in views])[..., None]
-    if (low, span) != (0.0, 1.0):
-        images = low + span * images
-    if backgrounds is not None and backgrounds.requires_grad:  # adds 0, whose gradient is the background's
-        images = images + (1 - alphas.detach()) * (backgrounds - backgrounds.detach())[:, None, None]
-    depths = [view.depth for view in views if view.depth is not None]
-    return torch.cat((images, torch.stack(depths)[..., None]), -1) if depths else images, alphas, info
-
-
-def rasterizer_of(arguments: Mapping[str, Any], backend: str) -> Rasterizer:
-    """The rasterizer that draws the colours of a call of gsplat's `rasterization`, over a black background.
-
-    Args:
-        arguments: of the call, by name. backend: of `rasterizers.load`.
-
-    Raises:
-        ValueError: this package does not draw the same: an argument that only gsplat supports, other colours than spherical
-            harmonics, several cameras.
-        BackendUnavailable: the backend is not installed, or has no such device.
-    """
-    more = {name: value for name, value in arguments.items() if name not in _TAKEN}
-    mode = arguments.get("rasterize_mode", "classic")
-    _require_supported("RGB", mode, False, more)
-    n, colors, sh_degree = len(arguments["means"]), arguments["colors"], arguments.get("sh_degree")
-    if sh_degree is None or arguments["means"].dim() != 2 or arguments["means"].dtype != torch.float32:
-        raise ValueError("only float32 Gaussians of one scene with spherical harmonics are drawn.")
-    _require_shapes(n, colors, arguments["viewmats"], arguments["Ks"], arguments.get("backgrounds"), sh_degree)
-    near, eps2d = arguments.get("near_plane", 0.01), arguments.get("eps2d", 0.3)
-    return _loaded(backend, arguments["means"].device.type, near, eps2d, mode == "antialiased")
-
-
-def _info(each: Sequence[_Rendered]) -> tuple[dict[str, Any], Sequence[Tensor], Sequence[None]]:
-    """What gsplat's strategies read, and the centres of each image."""
-    means2d = torch.stack([rendering.means2d for rendering, *_ in each]).requires_grad_()
-    radii = _stacked([rendering.visible for rendering, *_ in each]).int()[..., None].expand(-1, -1, 2)
-    return {"means2d": means2d, "radii": radii, "gaussian_ids": None}, means2d.unbind(), [None] * len(each)
-
-
-def _packed_info(
-    each: Sequence[_Rendered], splats: _Inputs
-) -> tuple[dict[str, Any], Sequence[Tensor], Sequence[Tensor]]:
-    """The same of the visible alone, and which these are."""
-    rows = [rendering.visible.nonzero()[:, 0] for rendering, *_ in each]
-    columns = []
-    for i, (rendering, rasterizer, camera, _) in zip(rows, each, strict=True):
-        settings = cast(RasterSettings, rasterizer)  # `over` has checked it
-        f = footprints(splats.means[i], splats.quats[i], splats.scales[i], camera, settings.kernel)
-        opacities = splats.opacities[i] * f.compensation if settings.antialiased else splats.opacities[i]
-        with torch.no_grad():  # where alpha falls below what is drawn
-            radii = (2 * (opacities / settings.alpha_min).log()).clamp_min(0).sqrt()[:, None] * f.deviations
-        columns.append((rendering.means2d[i], radii.ceil().clamp_min(1).int(), f.depths, f.conics, opacities))
-    means2d, radii, depths, conics, opacities = map(torch.cat, zip(*columns, strict=True))
-    means2d.requires_grad_()
-    ids = torch.cat(rows)
-    camera_ids = torch.cat([torch.full_like(i, camera) for camera, i in enumerate(rows)])
-    info = {
-        "means2d": means2d, "radii": radii, "depths": depths, "conics": conics, "opacities": opacities,
-        "gaussian_ids": ids, "camera_ids": camera_ids, "batch_ids": torch.zeros_like(ids),
-    }  # fmt: skip
-    return info, torch.split(means2d, [len(i) for i in rows]), rows
-
-
-def _stacked(tensors: Sequence[Tensor]) -> Tensor:
-    """One tensor of all; a single one is not copied."""
-    return tensors[0][None] if len(tensors) == 1 else torch.stack(list(tensors))
-
-
-def _low_and_span(colors: Float[Tensor, "N 3"], backgrounds: Sequence[Sequence[float]]) -> tuple[float, float]:
-    """RGB in any range is drawn as (RGB - low) / span, with colours >= 0 over backgrounds in [0, 1].
-
-    The weights of a pixel's colours and background sum to 1, so the image is low + span times what is drawn.
-    """
-    finite = colors.detach().nan_to_num(0, 0, 0)  # NaN is refused by the rasterizer
-    low = min(0.0, float(finite.min()) if len(finite) else 0.0, *map(min, backgrounds))
-    return low, max(1.0, max(map(max, backgrounds)) - low)
-
-
-def _require_shapes(
-    n: int, colors: Tensor, viewmats: Tensor, Ks: Tensor, backgrounds: Tensor | None, sh_degree: int | None
-) -> None:
-    cameras = len(viewmats)
-    shapes = {
-        "viewmats": (viewmats, (cameras, 4, 4)),
-        "Ks": (Ks, (cameras, 3, 3)),
-        "backgrounds": (backgrounds, (cameras, 3)),
-    }
-    for name, (value, shape) in shapes.items():
-        if value is not None and value.shape != shape:
-            inner = ", ".join(map(str, shape[1:]))
-            raise ValueError(f"{name} must have the shape [C, {inner}] for C cameras, got {list(value.shape)}.")
-    if sh_degree is None and colors.shape != (n, 3):
-        raise ValueError(
-            f"colors without sh_degree must be RGB of the shape [{n}, 3], got {list(colors.shape)}; draw other channels three "
-            "at a time."
-        )
-    if sh_degree is not None and (colors.dim() != 3 or colors.shape[1] < (sh_degree + 1) ** 2):
-        raise ValueError(
-            f"colors with sh_degree={sh_degree} must have the shape [{n}, K, 3] with K >= {(sh_degree + 1) ** 2}, got "
-            f"{list(colors.shape)}."
-        )
-
-
-def _require_supported(render_mode: str, rasterize_mode: str, absgrad: bool, more: Mapping[str, Any]) -> None:
-    refused = []
-    for name in more.keys() - _WITHOUT_EFFECT:
-        value, supported = more[name], _SUPPORTED.get(name)
-        value = value.name if isinstance(value, Enum) else value
-        if value is not supported and not (isinstance(value, str | bool) and value == supported):
-            refused.append(f"{name}={value!r}" if isinstance(value, str | bool | int | float) else name)
-    if refused:
-        raise ValueError(
-            f"this stand-in for gsplat's rasterization does not support {', '.join(sorted(refused))}. gsplat's own needs CUDA."
-        )
-    if render_mode not in ("RGB", "RGB+ED") or rasterize_mode not in ("classic", "antialiased") or absgrad:
-        raise ValueError(
-            "this stand-in for gsplat's rasterization draws render_mode='RGB' or 'RGB+ED', rasterize_mode='classic' or "
-            f"'antialiased', absgrad=False; got {render_mode!r}, {rasterize_mode!r}, {absgrad}. gsplat's own needs CUDA."
-        )
-
-
-@functools.lru_cache(maxsize=8)
-def _loaded(name: str, device: str, near: float, kernel: float, antialiased: bool) -> Rasterizer:
-    name = rasterizers.fastest(device) if name == "auto" else name
-    return rasterizers.load(name, near=near, kernel=kernel, antialiased=antialiased)
+def __getattr__(name: str) -> Any:
+    """`rasterization` and `drawing_ahead`, which stood here."""
+    if name == "rasterization":
+        return import_module("rasterizers.as_gsplat").rasterization
+    if name == "drawing_ahead":
+        return import_module("rasterizers.ahead").drawing_ahead
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -115,6 +115,14 @@ def require_depth(rasterizer: Rasterizer) -> None:
         )
 
 
+def require_absgrad(rasterizer: Rasterizer) -> None:
+    """Raise a ValueError for a rasterizer that has no absolute gradients."""
+    if not rasterizer.traits.absgrad:
+        raise ValueError(
+            f"{type(rasterizer).__name__} has no absolute gradients (its traits.absgrad is False); cpp, torch and warp do."
+        )
+
+
 def packed_rows(sh: Float[Tensor, "N B 3"]) -> Float[Tensor, "N B 3"]:
     """The tensor with contiguous rows. A view of the active bands has gaps between its rows, and is returned as it is."""
     return sh if sh.numel() == 0 or sh.stride()[1:] == (3, 1) else sh.contiguous()

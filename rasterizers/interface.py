@@ -169,6 +169,7 @@ class SplatGradients:
         screen: the screen gradient, with respect to the projected centre, in 1/pixel.
         rgb: with respect to the colour before its clamp; also the gradient of `rgb_offset`.
         basis: Y, the spherical harmonics of this view's directions.
+        absgrad: the sum over pixels of the absolute value of what each adds to `screen` (AbsGS), where it was asked for.
     """
 
     means: Float[Tensor, "K N 3"]
@@ -178,6 +179,7 @@ class SplatGradients:
     screen: Float[Tensor, "K N 2"]
     rgb: Float[Tensor, "K N 3"]
     basis: Float[Tensor, "N B1"]
+    absgrad: Float[Tensor, "K N 2"] | None = None
 
     @property
     def sh0(self) -> Float[Tensor, "K N 1 3"]:
@@ -235,12 +237,22 @@ class Traits:
         dtypes: the types that the splats' tensors may have.
         native_threads: it computes on the threads of `rasterizers.native`, not on torch's.
         depth: it draws expected depth. Without this trait nobody passes the argument `depth`, so its methods may lack it.
+        absgrad: its renderings are `WithAbsgrad`.
     """
 
     devices: frozenset[str]
     dtypes: frozenset[torch.dtype]
     native_threads: bool = False
     depth: bool = False
+    absgrad: bool = False
+
+
+class WithAbsgrad(Protocol):
+    """A rendering of a backend with the trait `absgrad`."""
+
+    def vjp(self, cotangents: Float[Tensor, "K H W 3"], *, absgrad: bool = False) -> SplatGradients:
+        """See `Rendering.vjp`; with `SplatGradients.absgrad`."""
+        ...
 
 
 @runtime_checkable

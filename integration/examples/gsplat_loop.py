@@ -23,7 +23,7 @@ from integration.examples.demo import Demo, Render, load_demo, splats_with_optim
 from integration.gsplat import attach  # +
 from integration.views import view  # +
 from rasterizers import native
-from rasterizers.autograd import rasterization as cpu_rasterization
+from rasterizers.as_gsplat import rasterization as cpu_rasterization
 
 
 def main(iterations: int, strategies: str | None, seed: int = 0) -> float:

@@ -27,7 +27,9 @@ from integration.lineage import RowNumbers
 from integration.optimizers import optimizers_of, step_detail
 from integration.own_drawing import Drawable
 from integration.replacing import replace_everywhere
-from rasterizers.autograd import cameras_of, drawing_ahead, rasterizer_of, recorded, uncompiled
+from rasterizers.ahead import drawing_ahead
+from rasterizers.as_gsplat import cameras_of, rasterizer_of
+from rasterizers.autograd import recorded, uncompiled
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import BackendUnavailable, Camera, Rasterizer
 

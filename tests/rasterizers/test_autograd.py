@@ -11,7 +11,8 @@ import torch
 
 import rasterizers
 from clear_strategies.geometry.projection import intrinsics
-from rasterizers import SplatGradients, Splats, autograd
+from rasterizers import SplatGradients, Splats, as_gsplat, autograd
+from rasterizers.ahead import _ahead
 from rasterizers.reference import ReferenceRasterizer
 from rasterizers.testing import pixels_of, scene
 from tests.helpers.backends import camera
@@ -100,11 +101,11 @@ def test_an_image_that_is_drawn_ahead_is_taken_inside_and_forgotten_with_the_blo
         autograd.draw(ReferenceRasterizer(), splats, view.scaled(2), colors=colors)
         assert together[-1] == 2
         # While it is kept its tensors live, so that no others at their addresses are taken for them.
-        assert autograd._ahead.kept[2].means.data_ptr() == splats.means.data_ptr()
+        assert _ahead.kept[2].means.data_ptr() == splats.means.data_ptr()
         drawn = len(together)
         assert torch.equal(autograd.draw(ReferenceRasterizer(), shown, view, colors=colors).image, expected)
         assert len(together) == drawn
-        assert autograd._ahead.kept is None
+        assert _ahead.kept is None
     with ahead(view):
         autograd.draw(ReferenceRasterizer(), splats, view.scaled(2), colors=colors)
     shown.means.data.add_(0.1)  # which torch does not count
@@ -182,10 +183,9 @@ def test_a_loss_of_alpha_has_the_gradient_of_another_background(background):
     [
         ({"camera_model": "fisheye"}, "does not support camera_model='fisheye'"),
         ({"rendermode": "D"}, "does not support rendermode='D'"), ({"with_ut": True}, "does not support with_ut=True"),
-        ({"covars": torch.zeros(60, 3, 3)}, "does not support covars"), ({"render_mode": "D"}, "needs CUDA"),
-        ({"colors": torch.zeros(60, 4, 3), "sh_degree": 3}, r"must .*\[60, K, 3\] with K >= 16, got \[60, 4, 3\]"),
-        ({"colors": torch.zeros(60, 16), "sh_degree": None},
-         r"must .*\[60, 3\], got \[60, 16\]; draw other channels three at a time"),
+        ({"covars": torch.zeros(60, 3, 3)}, "does not support covars"), ({"render_mode": "normals"}, "render_mode must be one"),
+        ({"colors": torch.zeros(60, 4, 3), "sh_degree": 3}, r"must .*\[60, K, 3\] with K >= 16, .*got \[60, 4, 3\]"),
+        ({"colors": torch.zeros(50, 16), "sh_degree": None}, r"must .*\[60, D\], .*got \[50, 16\]"),
     ],
 )  # fmt: skip
 def test_arguments_that_only_gsplat_supports_and_colors_of_another_shape_are_refused(arguments, message):
@@ -214,9 +214,6 @@ def test_backgrounds_have_a_gradient_and_gsplats_own_defaults_are_drawn():
     assert torch.equal(image, stand_in(backgrounds=background.detach())[0])
     image.sum().backward()
     assert torch.allclose(background.grad, (1 - alpha).sum().expand(1, 3))
-    # The eleventh is far_plane in gsplat; it was taken for eps2d.
-    with pytest.raises(TypeError, match="positional arguments"):
-        autograd.rasterization(*[None] * 9, 0.01, 1e10)
     given = inspect.signature(pytest.importorskip("gsplat").rasterization).parameters
     defaults = {name: p.default for name, p in given.items() if p.default is not p.empty and name != "sh_degree"}
     assert stand_in(**defaults)[0].shape == (1, 30, 40, 3)
@@ -226,22 +223,18 @@ def test_backgrounds_have_a_gradient_and_gsplats_own_defaults_are_drawn():
 def test_tensors_of_cameras_need_one_row_for_each(name):
     """Under pytest the shape annotations of `rasterization` would raise first."""
     right = {"viewmats": torch.zeros(2, 4, 4), "Ks": torch.zeros(2, 3, 3), "backgrounds": torch.zeros(2, 3)}
-    with pytest.raises(ValueError, match=rf"^{name} must have the shape \[C, .* for C cameras, got"):
-        autograd._require_shapes(5, torch.zeros(5, 3), **{**right, name: right[name][0]}, sh_degree=None)
+    geometry = torch.zeros(5, 4), torch.zeros(5, 3), torch.zeros(5), torch.zeros(5, 3)
+    shape = as_gsplat._Shape((), 5, 2, None, True)
+    with pytest.raises(ValueError, match=rf"^{name} must have the shape \[2, .*, got"):
+        shape.require(*geometry, **{**right, name: right[name][0]}, rgb_offset=None)
 
 
-def test_poses_that_should_learn_are_refused():
-    view = camera(40, 30)
-    pose = view.world_to_camera.float().requires_grad_()
-    draws = (
-        lambda: autograd.draw(ReferenceRasterizer(), scene(60), replace(view, world_to_camera=pose)).image,
-        lambda: stand_in(viewmats=pose[None])[0],
-    )
-    for draw in draws:
-        with pytest.raises(ValueError, match="poses have no gradient in this package"):
-            draw()
-        with torch.no_grad():  # an evaluation of a loop that gsplat trained
-            assert torch.isfinite(draw()).all()
+def test_gsplats_arguments_have_gsplats_order():
+    names = [
+        list(inspect.signature(f).parameters)
+        for f in (pytest.importorskip("gsplat").rasterization, rasterizers.rasterization)
+    ]
+    assert names[0][: names[1].index("backend")] == names[1][: names[1].index("backend")]
 
 
 def test_gsplats_strategy_reads_the_packed_info():

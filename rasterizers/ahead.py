@@ -1,0 +1,77 @@
+"""One image that is drawn together with another before it is asked for: hosts ask for the two scales of a view one by one."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields, replace
+from typing import Any, Final
+
+from jaxtyping import Float
+from torch import Tensor
+
+from rasterizers.interface import Camera, Rasterizer, Rendering, Splats
+
+
+class _Ahead(threading.local):
+    """One image that is drawn together with another, before it is asked for.
+
+    Attributes:
+        wanted: what the image shows, see `_shown`: its camera alone.
+        kept: that image, what it shows, and the splats: while these live, no other tensors lie at their addresses.
+    """
+
+    wanted: Camera | None = None
+    kept: tuple[tuple[Any, ...], Rendering, Splats] | None = None
+
+    def draw(self, rasterizer: Rasterizer, splats: Splats, camera: Camera) -> Rendering:
+        """The image, from `kept` where it lies there."""
+        if self.kept is not None and self.kept[0] == _shown(rasterizer, splats, camera):
+            rendering, self.kept = self.kept[1], None
+            return rendering
+        wanted = self.wanted
+        if wanted is None or camera.world_to_camera.tolist() != wanted.world_to_camera.tolist():
+            return rasterizer(splats, camera)
+        self.wanted = None
+        plain = replace(splats, rgb_offset=None)
+        if splats.rgb_offset is None and _grid(camera) == _grid(wanted):  # it is this one
+            return rasterizer(splats, camera)
+        other = replace(wanted, world_to_camera=camera.world_to_camera)  # by the same tensor, as a backend sees at once
+        ahead, rendering = rasterizer.render_scales([(plain, other), (splats, camera)])
+        self.kept = _shown(rasterizer, plain, other), ahead, plain
+        return rendering
+
+
+_ahead: Final = _Ahead()
+
+
+def _grid(camera: Camera) -> tuple[float, ...]:
+    return camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
+
+
+def _shown(rasterizer: Rasterizer, splats: Splats, camera: Camera) -> tuple[Any, ...]:
+    """What an image shows: equal for equal images, as long as the tensors are alive."""
+    tensors = (getattr(splats, field.name) for field in fields(Splats))
+    memory = [None if x is None else (x.data_ptr(), x.shape, x.stride(), x._version) for x in tensors]
+    return rasterizer, memory, _grid(camera), camera.world_to_camera.tolist()
+
+
+@contextmanager
+def drawing_ahead(viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, height: int) -> Iterator[None]:
+    """The first drawing inside from this pose brings along the one of the same splats by K and without `rgb_offset`.
+
+    A later drawing inside of just that takes it: the two share projection, colour and depth order. It is forgotten with the
+    block.
+    """
+    (fx, _, cx), (_, fy, cy), _ = K.tolist()
+    _ahead.wanted, _ahead.kept = Camera(viewmat.detach(), fx, fy, cx, cy, width, height), None
+    try:
+        yield
+    finally:
+        _ahead.wanted = _ahead.kept = None
+
+
+def draw_or_take(rasterizer: Rasterizer, splats: Splats, camera: Camera) -> Rendering:
+    """The image, or the same that was drawn ahead."""
+    return _ahead.draw(rasterizer, splats, camera)

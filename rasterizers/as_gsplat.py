@@ -1,0 +1,456 @@
+"""`rasterization` with the signature of gsplat's, for a loop that was written for gsplat: on a CPU, or on CUDA in its place.
+
+A picture is drawn three channels at a time. The first three are the spherical harmonics, or the first of the colours; every other
+channel is a number of each Gaussian, as the depth of its centre is and the 1 whose picture is alpha.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, Final, cast
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+import rasterizers
+from rasterizers.autograd import Inputs, Rendered, in_graph, render, uncompiled
+from rasterizers.geometry import SH_C0
+from rasterizers.interface import Camera, Rasterizer, RasterSettings, over
+from rasterizers.reference.projection import footprints
+
+_MODES: Final = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+_FARTHEST: Final = 1e10  # gsplat's default
+# The only value of each other argument that this package draws; None for one that is not listed. The others change the speed.
+_SUPPORTED: Final = {
+    "camera_model": "pinhole", "with_ut": False, "with_eval3d": False, "rolling_shutter": "GLOBAL", "distributed": False,
+}  # fmt: skip
+_WITHOUT_EFFECT: Final = {"sparse_grad", "tile_size", "channel_chunk", "segmented"}
+
+
+@uncompiled
+def rasterization(
+    means: Float[Tensor, "*B N 3"],
+    quats: Float[Tensor, "*B N 4"],
+    scales: Float[Tensor, "*B N 3"],
+    opacities: Float[Tensor, "*B N"],
+    colors: Float[Tensor, ...],
+    viewmats: Float[Tensor, "*B C 4 4"],
+    Ks: Float[Tensor, "*B C 3 3"],
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = _FARTHEST,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = False,
+    tile_size: int = 16,
+    backgrounds: Float[Tensor, "*B C D"] | None = None,
+    render_mode: str = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: str = "classic",
+    *,
+    backend: str = "auto",
+    rgb_offset: Float[Tensor, "*B N 3"] | None = None,
+    **more: Any,
+) -> tuple[Float[Tensor, "*B C H W X"], Float[Tensor, "*B C H W 1"], dict[str, Any]]:
+    """Draw Gaussians as gsplat's `rasterization` does, by a backend of this package: pinhole cameras, any number of channels.
+
+    Args:
+        means, quats, scales, opacities: of batches of scenes, or of one.
+        colors: with `sh_degree`, the active degree, spherical harmonics [*B, N, K, 3]; without it D channels [*B, N, D] in any
+            range. Either may be of each camera, [*B, C, N, …].
+        near_plane, far_plane: Gaussians beyond them are left out, and those whose radius is at most `radius_clip` px.
+        render_mode: "RGB", "D" (accumulated depth), "ED" (expected depth), or both: "RGB+D", "RGB+ED". Depth is that of the
+            centres along the camera's axis, the last channel, and has gradients.
+        packed: `info` is that of the visible Gaussians of each camera, one after the other. gsplat's default is True, and here
+            False, since on a CPU its ellipses take half as long as the image.
+        absgrad: after `backward()`, `info["means2d"].absgrad` is the sum over pixels of absolute gradients. Those of the colours
+            and of depth or further channels are summed apart.
+        more: gsplat's other arguments. Those that change only how it computes have no effect.
+        backend: a name of `rasterizers.load`.
+        rgb_offset: added to the colours before their clamp at 0, with `sh_degree` only; gsplat has no such argument.
+
+    Returns:
+        images, alphas, and `info`: `means2d` [*B, C, N, 2] (`retain_grad` works), `radii` [*B, C, N, 2] (1 for the visible, 0 for
+        the others), `depths`, `conics` and `opacities` of the visible, 0 of others, made when they are asked for, and `width`,
+        `height`, `n_cameras`, `n_batches`, `tile_size`. Packed, of M visible Gaussians: `means2d` [M, 2], `gaussian_ids`,
+        `camera_ids` and `batch_ids` [M], and in the graph of what they depend on, `depths` [M], `conics` [M, 3] and `opacities`
+        [M], times the factor of `rasterize_mode="antialiased"`; `radii` [M, 2] in pixels.
+
+        Gradients reach everything that is given but `Ks`. That of `viewmats` is exact along rigid motions.
+
+    Raises:
+        ValueError: a mode or an argument that only gsplat supports, or a wrong shape.
+    """
+    _require_supported(render_mode, rasterize_mode, more)
+    batch, cameras = means.shape[:-2], viewmats.shape[-3]
+    n_scenes = batch.numel()
+    shape = _Shape(batch, means.shape[-2], cameras, sh_degree, "RGB" in render_mode)
+    shape.require(quats, scales, opacities, colors, viewmats, Ks, backgrounds, rgb_offset)
+    if rgb_offset is not None and sh_degree is None:
+        raise ValueError(
+            "rgb_offset is an offset of spherical harmonics, give sh_degree; RGB takes it as colors + rgb_offset."
+        )
+    device = means.device.type
+    rasterizer = _loaded(backend, device, near_plane, eps2d, rasterize_mode == "antialiased")
+
+    def of_scene(x: Tensor, scene: int) -> Tensor:
+        return x if not batch else x.reshape(n_scenes, *x.shape[len(batch) :])[scene]
+
+    by_camera = colors.dim() == len(batch) + 3 + (sh_degree is not None)
+    views = []
+    for scene in range(n_scenes):
+        poses, K = of_scene(viewmats, scene), of_scene(Ks, scene)
+        own, behind = of_scene(colors, scene), None if backgrounds is None else of_scene(backgrounds, scene)
+        mu, q, s, opacity = (of_scene(x, scene) for x in (means, quats, scales, opacities))
+        offset = None if rgb_offset is None else of_scene(rgb_offset, scene)
+        for c, camera in enumerate(cameras_of(poses, K, width, height)):
+            left_in = _left_in(mu, q, s, opacity, camera, far_plane, radius_clip, eps2d)
+            inputs = Inputs(mu, q, s, left_in, own[c] if by_camera else own, offset)
+            views.append(
+                _View(
+                    rasterizer, camera, poses[c], inputs, sh_degree,
+                    None if behind is None else behind[c], render_mode, absgrad,
+                )
+            )  # fmt: skip
+    drawn = [view.parts() for view in views]
+    each = [parts[0].rendered for parts in drawn]
+    rows: Sequence[Tensor | None]
+    if packed:
+        info, centres, rows = _packed_info(each, [view.inputs for view in views], cameras)
+    else:
+        info, centres, rows = _info(each, views, (*batch, cameras))
+    if absgrad:
+        info["means2d"].absgrad = torch.zeros_like(info["means2d"])
+    info |= {"width": width, "height": height, "n_cameras": cameras, "n_batches": n_scenes, "tile_size": tile_size}
+    absolute: Sequence[Tensor | None] = _like_centres(info["means2d"], centres) if absgrad else [None] * len(views)
+    pictures = [
+        view.picture(parts, u, i, a) for view, parts, u, i, a in zip(views, drawn, centres, rows, absolute, strict=True)
+    ]
+    images, alphas = _stacked([image for image, _ in pictures]), _stacked([alpha for _, alpha in pictures])
+    lead = (*batch, cameras)
+    return images.view(*lead, *images.shape[1:]), alphas[..., None].view(*lead, *alphas.shape[1:], 1), info
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """Three channels: a picture of low + span · what was drawn.
+
+    Args:
+        keeps: how many of the three are wanted.
+    """
+
+    rendered: Rendered
+    inputs: Inputs
+    low: float
+    span: float
+    keeps: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _View:
+    """One camera's picture."""
+
+    rasterizer: Rasterizer
+    camera: Camera
+    pose: Float[Tensor, "4 4"]
+    inputs: Inputs
+    sh_degree: int | None
+    background: Float[Tensor, " D"] | None
+    render_mode: str
+    absgrad: bool
+
+    def parts(self) -> list[_Part]:
+        found = []
+        if "RGB" in self.render_mode and self.sh_degree is not None:
+            behind = [0.0] * 3 if self.background is None else self.background.tolist()
+            rendered = render(
+                over(self.rasterizer, cast(Any, tuple(behind))), self._typed(), (self.sh_degree + 1) ** 2, self.camera,
+                depth=False,
+            )  # fmt: skip
+            found.append(_Part(rendered, self._typed(), 0.0, 1.0, 3))
+        elif "RGB" in self.render_mode:
+            found += [self._channels(*x) for x in self._threes()]
+        if self.render_mode != "RGB":
+            means, pose = self.inputs.means, self.pose.to(self.inputs.means)
+            z = (means @ pose[2, :3] + pose[2, 3]).clamp_min(0)  # behind the camera nothing is drawn
+            found.append(self._channels(torch.stack((z, torch.ones_like(z), torch.zeros_like(z)), 1), None, 2))
+        return found
+
+    def picture(
+        self, parts: Sequence[_Part], means2d: Tensor, rows: Int[Tensor, " M"] | None, absgrad: Tensor | None
+    ) -> tuple[Float[Tensor, "H W X"], Float[Tensor, "H W"]]:
+        """The picture, and its alpha."""
+        pictures = []
+        alpha: Tensor | None = None
+        for part in parts:
+            drawn = in_graph(part.rendered, part.inputs, means2d, rows, pose=self.pose, absgrad=absgrad)
+            alpha = drawn.alpha if alpha is None else alpha
+            image = drawn.image if (part.low, part.span) == (0.0, 1.0) else part.low + part.span * drawn.image
+            pictures.append(image if part.keeps == 3 else image[..., : part.keeps])
+        if self.render_mode != "RGB":
+            last = pictures.pop()
+            depth, alpha = last[..., :1], last[..., 1]  # with exact gradients
+            pictures.append(depth / alpha[..., None].clamp_min(1e-10) if "ED" in self.render_mode else depth)
+        image = pictures[0] if len(pictures) == 1 else torch.cat(pictures, -1)
+        if (
+            self.background is not None
+            and self.background.requires_grad
+            and "RGB" in self.render_mode
+            and alpha is not None
+        ):
+            through = (1 - alpha.detach())[..., None] * (
+                self.background - self.background.detach()
+            )  # 0, for its gradient
+            image = image + torch.nn.functional.pad(through, (0, image.shape[-1] - through.shape[-1]))
+        return image, cast(Tensor, alpha)
+
+    def _typed(self) -> Inputs:
+        return self.inputs._replace(colors=self.inputs.colors.to(self.inputs.means.dtype))  # gsplat takes float16, too
+
+    def _threes(self) -> Iterator[tuple[Tensor, Tensor | None, int]]:
+        """The channels by threes, the background of each three, and how many of them there are."""
+        for first in range(0, self.inputs.colors.shape[-1], 3):
+            three = self.inputs.colors[:, first : first + 3]
+            behind = None if self.background is None else self.background.detach()[first : first + 3]
+            keeps = three.shape[1]
+            yield torch.nn.functional.pad(three, (0, 3 - keeps)), behind, keeps
+
+    def _channels(self, colors: Float[Tensor, "N 3"], background: Tensor | None, keeps: int) -> _Part:
+        behind = [0.0] * 3 if background is None else [*background.tolist(), *[0.0] * (3 - len(background))]
+        low, span = _low_and_span(colors, [behind])
+        colors = colors.to(self.inputs.means.dtype)
+        sh0 = ((colors - low) / span - 0.5)[:, None] / SH_C0
+        inputs = self.inputs._replace(colors=sh0, rgb_offset=None)
+        behind = [(x - low) / span for x in behind]
+        rendered = render(over(self.rasterizer, cast(Any, tuple(behind))), inputs, 1, self.camera, depth=False)
+        return _Part(rendered, inputs, low, span, keeps)
+
+
+def rasterizer_of(arguments: Mapping[str, Any], backend: str) -> Rasterizer:
+    """The rasterizer that draws the colours of a call of gsplat's `rasterization`, over a black background.
+
+    Args:
+        arguments: of the call, by name. backend: of `rasterizers.load`.
+
+    Raises:
+        ValueError: this package does not draw the same: an argument that only gsplat supports, other colours than spherical
+            harmonics of one scene, several cameras.
+        BackendUnavailable: the backend is not installed, or has no such device.
+    """
+    more = {name: value for name, value in arguments.items() if name not in _TAKEN}
+    mode, means = arguments.get("rasterize_mode", "classic"), arguments["means"]
+    _require_supported("RGB", mode, more)
+    sh_degree, cameras = arguments.get("sh_degree"), len(arguments["viewmats"])
+    if (
+        sh_degree is None
+        or means.dim() != 2
+        or arguments["colors"].dim() != 3
+        or means.dtype != torch.float32
+        or cameras != 1
+    ):
+        raise ValueError("only one view of float32 Gaussians of one scene with spherical harmonics is drawn.")
+    if arguments.get("far_plane", _FARTHEST) < _FARTHEST or arguments.get("radius_clip", 0.0) > 0:
+        raise ValueError("far_plane and radius_clip leave Gaussians out.")
+    near, eps2d = arguments.get("near_plane", 0.01), arguments.get("eps2d", 0.3)
+    return _loaded(backend, means.device.type, near, eps2d, mode == "antialiased")
+
+
+_TAKEN: Final = {
+    "means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height", "near_plane", "far_plane",
+    "radius_clip", "eps2d", "sh_degree", "packed", "backgrounds", "render_mode", "absgrad", "rasterize_mode", "backend",
+    "rgb_offset",
+}  # fmt: skip
+
+
+def cameras_of(viewmats: Float[Tensor, "C 4 4"], Ks: Float[Tensor, "C 3 3"], width: int, height: int) -> list[Camera]:
+    """Gsplat's cameras. Equal ones are the same object, whose numbers a backend then has on the device."""
+    poses = zip(viewmats.detach().tolist(), Ks.detach().tolist(), strict=True)
+    return [_camera(tuple(map(tuple, pose)), viewmats.dtype, *K[0][::2], *K[1][1:], width, height) for pose, K in poses]
+
+
+@functools.lru_cache(maxsize=1024)
+def _camera(
+    pose: tuple[tuple[float, ...], ...], dtype: torch.dtype, fx: float, cx: float, fy: float, cy: float, width: int, height: int
+) -> Camera:  # fmt: skip
+    return Camera(torch.tensor(pose, dtype=dtype, device="cpu"), fx, fy, cx, cy, width, height)
+
+
+def _left_in(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, camera: Camera, far_plane: float, radius_clip: float,
+    kernel: float,
+) -> Float[Tensor, " N"]:  # fmt: skip
+    """The opacities, 0 for what is too far or too small."""
+    if far_plane >= _FARTHEST and radius_clip <= 0:
+        return opacities
+    with torch.no_grad():
+        pose = camera.world_to_camera.to(means)
+        keep = means @ pose[2, :3] + pose[2, 3] <= far_plane
+        if radius_clip > 0:
+            f = footprints(means, quats, scales, camera, kernel)
+            radii = _extents(opacities, f.deviations, 1 / 255)
+            keep &= ~(radii <= radius_clip).all(-1)  # NaN, of those behind the camera, which are not drawn
+    return opacities * keep
+
+
+def _extents(
+    opacities: Float[Tensor, " M"], deviations: Float[Tensor, "M 2"], alpha_min: float
+) -> Float[Tensor, "M 2"]:
+    """Half the box in which alpha may reach alpha_min, whole px."""
+    return ((2 * (opacities / alpha_min).log()).clamp_min(0).sqrt()[:, None] * deviations).ceil().clamp_min(1)
+
+
+class _Info(dict[str, Any]):
+    """Gsplat's `info`. What a loop seldom reads is made when it is asked for."""
+
+    def __init__(self, values: Mapping[str, Any], ellipses: Any) -> None:
+        super().__init__(values)
+        self._ellipses = ellipses
+
+    def __missing__(self, name: str) -> Any:
+        if name not in ("depths", "conics", "opacities"):
+            raise KeyError(name)
+        self.update(self._ellipses())
+        return self[name]
+
+
+def _info(
+    each: Sequence[Rendered], views: Sequence[_View], lead: tuple[int, ...]
+) -> tuple[dict[str, Any], Sequence[Tensor], Sequence[None]]:
+    """What gsplat's strategies read, and the centres of each image."""
+    means2d = _stacked([rendering.means2d for rendering, *_ in each])
+    means2d = means2d.clone() if len(each) == 1 else means2d
+    means2d = means2d.view(*lead, *means2d.shape[1:]).requires_grad_()
+    visible = _stacked([rendering.visible for rendering, *_ in each])
+    radii = visible.view(*lead, -1).int()[..., None].expand(*(-1,) * (len(lead) + 1), 2)
+
+    def ellipses() -> dict[str, Tensor]:
+        found: dict[str, list[Tensor]] = {"depths": [], "conics": [], "opacities": []}
+        for rendered, view in zip(each, views, strict=True):
+            rows = rendered.rendering.visible.nonzero()[:, 0]
+            for name, values in _columns(rendered, view.inputs, rows).items():
+                if name in found:
+                    whole = values.new_zeros(len(view.inputs.means), *values.shape[1:])
+                    found[name].append(whole.index_copy(0, rows, values))
+        return {name: torch.stack(x).view(*lead, *x[0].shape) for name, x in found.items()}
+
+    flat = means2d.view(len(each), *means2d.shape[len(lead) :])
+    values = {"means2d": means2d, "radii": radii, "gaussian_ids": None, "camera_ids": None, "batch_ids": None}
+    return _Info(values, ellipses), flat.unbind(), [None] * len(each)
+
+
+def _packed_info(
+    each: Sequence[Rendered], splats: Sequence[Inputs], cameras: int
+) -> tuple[dict[str, Any], Sequence[Tensor], Sequence[Tensor]]:
+    """The same of the visible alone, and which these are."""
+    rows = [rendering.visible.nonzero()[:, 0] for rendering, *_ in each]
+    columns = [_columns(*x) for x in zip(each, splats, rows, strict=True)]
+    info: dict[str, Any] = {name: torch.cat([x[name] for x in columns]) for name in columns[0]}
+    info["means2d"].requires_grad_()
+    ids = torch.cat(rows)
+    view = torch.cat([torch.full_like(i, k) for k, i in enumerate(rows)])
+    info |= {"gaussian_ids": ids, "camera_ids": view % cameras, "batch_ids": view // cameras}
+    return info, torch.split(info["means2d"], [len(i) for i in rows]), rows
+
+
+def _columns(rendered: Rendered, splats: Inputs, rows: Int[Tensor, " M"]) -> dict[str, Tensor]:
+    """What gsplat says of the visible Gaussians."""
+    settings = cast(RasterSettings, rendered.rasterizer)  # `over` has checked it
+    f = footprints(splats.means[rows], splats.quats[rows], splats.scales[rows], rendered.camera, settings.kernel)
+    opacities = splats.opacities[rows] * f.compensation if settings.antialiased else splats.opacities[rows]
+    with torch.no_grad():  # where alpha falls below what is drawn
+        radii = _extents(opacities, f.deviations, settings.alpha_min).int()
+    means2d = rendered.rendering.means2d[rows]
+    return {"means2d": means2d, "radii": radii, "depths": f.depths, "conics": f.conics, "opacities": opacities}
+
+
+def _like_centres(means2d: Tensor, centres: Sequence[Tensor]) -> list[Tensor]:
+    """The rows of `means2d.absgrad` that belong to each of the centres."""
+    absgrad: Tensor = means2d.absgrad  # type: ignore[attr-defined]
+    return list(torch.split(absgrad.view(-1, 2), [len(x) for x in centres]))
+
+
+def _stacked(tensors: Sequence[Tensor]) -> Tensor:
+    """One tensor of all; a single one is not copied."""
+    return tensors[0][None] if len(tensors) == 1 else torch.stack(list(tensors))
+
+
+def _low_and_span(colors: Float[Tensor, "N 3"], backgrounds: Sequence[Sequence[float]]) -> tuple[float, float]:
+    """RGB in any range is drawn as (RGB - low) / span, with colours >= 0 over backgrounds in [0, 1].
+
+    The weights of a pixel's colours and background sum to 1, so the image is low + span times what is drawn.
+    """
+    finite = colors.detach().nan_to_num(0, 0, 0)  # NaN is refused by the rasterizer
+    low = min(0.0, float(finite.min()) if len(finite) else 0.0, *map(min, backgrounds))
+    return low, max(1.0, max(map(max, backgrounds)) - low)
+
+
+@dataclass(frozen=True, slots=True)
+class _Shape:
+    """What gsplat asks of the shapes: batch dimensions, Gaussians and cameras."""
+
+    batch: tuple[int, ...]
+    n: int
+    cameras: int
+    sh_degree: int | None
+    draws_colors: bool
+
+    def require(
+        self, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
+        backgrounds: Tensor | None, rgb_offset: Tensor | None,
+    ) -> None:  # fmt: skip
+        """Raise a ValueError for a tensor of another shape."""
+        b, n, c = self.batch, self.n, self.cameras
+        each = {
+            "quats": (quats, (*b, n, 4)), "scales": (scales, (*b, n, 3)), "opacities": (opacities, (*b, n)),
+            "viewmats": (viewmats, (*b, c, 4, 4)), "Ks": (Ks, (*b, c, 3, 3)), "rgb_offset": (rgb_offset, (*b, n, 3)),
+        }  # fmt: skip
+        for name, (value, shape) in each.items():
+            if value is not None and value.shape != shape:
+                raise ValueError(f"{name} must have the shape {list(shape)}, got {list(value.shape)}.")
+        if not self.draws_colors:
+            return
+        if not any(self._fits(colors, lead) for lead in ((*b, n), (*b, c, n))):
+            last = "D]" if self.sh_degree is None else f"K, 3] with K >= {(self.sh_degree + 1) ** 2}"
+            raise ValueError(
+                f"colors{'' if self.sh_degree is None else f' with sh_degree={self.sh_degree}'} must have the shape "
+                f"[{', '.join(map(str, (*b, n)))}, {last}, or that of each camera, got {list(colors.shape)}."
+            )
+        channels = 3 if self.sh_degree is not None else colors.shape[-1]
+        if backgrounds is not None and backgrounds.shape != (*b, c, channels):
+            raise ValueError(f"backgrounds must have the shape {[*b, c, channels]}, got {list(backgrounds.shape)}.")
+
+    def _fits(self, colors: Tensor, lead: tuple[int, ...]) -> bool:
+        if self.sh_degree is None:
+            return colors.shape[:-1] == lead
+        return colors.shape[:-2] == lead and colors.shape[-1] == 3 and colors.shape[-2] >= (self.sh_degree + 1) ** 2
+
+
+def _require_supported(render_mode: str, rasterize_mode: str, more: Mapping[str, Any]) -> None:
+    refused = []
+    for name in more.keys() - _WITHOUT_EFFECT:
+        value, supported = more[name], _SUPPORTED.get(name)
+        value = value.name if isinstance(value, Enum) else value
+        if value is not supported and not (isinstance(value, str | bool) and value == supported):
+            refused.append(f"{name}={value!r}" if isinstance(value, str | bool | int | float) else name)
+    if refused:
+        raise ValueError(
+            f"rasterizers.rasterization does not support {', '.join(sorted(refused))}. gsplat's own does, on CUDA."
+        )
+    if render_mode not in _MODES or rasterize_mode not in ("classic", "antialiased"):
+        raise ValueError(
+            f"render_mode must be one of {', '.join(_MODES)}, and rasterize_mode classic or antialiased, got {render_mode!r} and "
+            f"{rasterize_mode!r}."
+        )
+
+
+@functools.lru_cache(maxsize=8)
+def _loaded(name: str, device: str, near: float, kernel: float, antialiased: bool) -> Rasterizer:
+    name = rasterizers.fastest(device) if name == "auto" else name
+    return rasterizers.load(name, near=near, kernel=kernel, antialiased=antialiased)

@@ -1,0 +1,208 @@
+"""`rasterization`, with gsplat's signature: every call that gsplat's own test makes, against pixels composited one by one."""
+
+import itertools
+
+import pytest
+import torch
+
+import rasterizers
+from rasterizers import Camera, rasterization
+from rasterizers.geometry import spherical_harmonics
+from rasterizers.reference.projection import footprints
+from tests.helpers.backends import needs
+
+WIDTH, HEIGHT, N, CAMERAS = 20, 14, 24, 2
+BACKENDS = [pytest.param("torch", id="torch"), pytest.param("cpp", marks=needs("cpp"), id="cpp")]
+MODES = ["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+GRID = [
+    pytest.param(per_view, sh_degree, mode, packed, batch, id=f"{per_view}-{sh_degree}-{mode}-{packed}-{batch}")
+    for per_view, sh_degree, mode, packed, batch in itertools.product(
+        [True, False], [None, 3], MODES, [True, False], [(), (2,), (1, 2)]
+    )
+]
+"""Those of gsplat 1.5.3's `test_rasterization`, and with expected depth."""
+
+
+def gaussians(batch=(), dtype=torch.float64, seed=0):
+    g = torch.Generator().manual_seed(seed)
+
+    def random(*shape, low=0.0, high=1.0):
+        return low + (high - low) * torch.rand(*batch, *shape, dtype=dtype, generator=g)
+
+    splats = {
+        "means": random(N, 3, low=-1), "quats": random(N, 4, low=-1), "scales": random(N, 3, low=0.05, high=0.4),
+        "opacities": random(N, low=0.2),
+    }  # fmt: skip
+    return {name: x.requires_grad_() for name, x in splats.items()}
+
+
+def cameras(batch=(), dtype=torch.float64):
+    angles = torch.linspace(0.1, 0.5, CAMERAS, dtype=torch.float64)
+    poses = torch.eye(4, dtype=torch.float64).repeat(CAMERAS, 1, 1)
+    poses[:, 0, 0] = poses[:, 2, 2] = angles.cos()
+    poses[:, 0, 2], poses[:, 2, 0] = angles.sin(), -angles.sin()
+    poses[:, :3, 3] = torch.tensor([0.1, -0.2, 4.0])
+    K = torch.tensor([[24.0, 0, WIDTH / 2], [0, 23, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64)
+    viewmats, Ks = poses.expand(*batch, CAMERAS, 4, 4), K.expand(*batch, CAMERAS, 3, 3)
+    return viewmats.to(dtype).clone().requires_grad_(), Ks.to(dtype).clone()
+
+
+def colours(per_view, sh_degree, batch=(), channels=3, dtype=torch.float64):
+    g = torch.Generator().manual_seed(7)
+    lead = (*batch, CAMERAS, N) if per_view else (*batch, N)
+    shape = (*lead, channels) if sh_degree is None else (*lead, 16, 3)
+    x = 2 * torch.rand(*shape, dtype=dtype, generator=g) - (1 if sh_degree is None else 0.5)
+    return x.requires_grad_()
+
+
+def composited(splats, colors, pose, K, background=None, sh_degree=None, antialiased=False, kernel=0.3):
+    """One camera's channels, accumulated depth and alpha: each pixel by autograd over all Gaussians, nearest first."""
+    camera = Camera(pose, *K.diagonal()[:2].tolist(), *K[:2, 2].tolist(), WIDTH, HEIGHT)
+    f = footprints(splats["means"], splats["quats"], splats["scales"], camera, kernel)
+    opacities = splats["opacities"] * (f.compensation if antialiased else 1)
+    if sh_degree is not None:
+        directions = torch.nn.functional.normalize(splats["means"] - camera.center, dim=-1)
+        basis = spherical_harmonics(directions, (sh_degree + 1) ** 2 - 1)
+        colors = ((basis[..., None] * colors[:, : basis.shape[1]]).sum(1) + 0.5).clamp_min(0)
+    order = f.depths.argsort()
+    y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    dx, dy = (p.double()[..., None] - f.means2d[order, i] for i, p in enumerate((x, y)))
+    A, B, C = f.conics[order].unbind(-1)
+    alpha = opacities[order] * torch.exp(-0.5 * (A * dx * dx + C * dy * dy) - B * dx * dy)
+    alpha = torch.where(alpha >= 1 / 255, alpha.clamp_max(0.99), 0.0)
+    through = torch.cumprod(torch.cat((torch.ones_like(alpha[..., :1]), 1 - alpha), -1), -1)
+    weights = through[..., :-1] * alpha
+    image = weights @ colors[order] if background is None else weights @ colors[order] + through[..., -1:] * background
+    return image, (weights @ f.depths[order])[..., None], 1 - through[..., -1:]
+
+
+def expected(splats, colors, viewmats, Ks, mode, sh_degree=None, backgrounds=None, **settings):
+    """All cameras of all scenes."""
+    batch, per_view = viewmats.shape[:-3], colors.dim() == viewmats.dim() + (sh_degree is not None)
+    images, alphas = [], []
+    for scene in itertools.product(*map(range, batch)):
+        for c in range(viewmats.shape[-3]):
+            own = {name: x[scene] for name, x in splats.items()}
+            picture, depth, alpha = composited(
+                own, colors[(*scene, c)] if per_view else colors[scene], viewmats[(*scene, c)], Ks[(*scene, c)],
+                None if backgrounds is None else backgrounds[(*scene, c)], sh_degree, **settings,
+            )  # fmt: skip
+            depth = depth / alpha.clamp_min(1e-10) if "ED" in mode else depth
+            images.append(torch.cat([*[picture][: "RGB" in mode], *[depth][: mode != "RGB"]], -1))
+            alphas.append(alpha)
+    lead = viewmats.shape[:-2]
+    return torch.stack(images).view(*lead, *images[0].shape), torch.stack(alphas).view(*lead, *alphas[0].shape)
+
+
+def gradients(image, alpha, inputs):
+    """Of a loss that depends on everything that was drawn."""
+    g = torch.Generator().manual_seed(3)
+    weights = [torch.rand(x.shape, dtype=torch.float64, generator=g) for x in (image, alpha)]
+    loss = sum((w * x.double() ** 2).sum() for w, x in zip(weights, (image, alpha), strict=True))
+    return torch.autograd.grad(
+        loss, list(inputs.values()), allow_unused=True, materialize_grads=True, retain_graph=True
+    )
+
+
+def moved(viewmats, motion):
+    """The cameras after a small rigid motion each: [..., 6]."""
+    generator = motion.new_zeros(*motion.shape[:-1], 4, 4)
+    rows, columns, signs = [2, 0, 1, 1, 2, 0], [1, 2, 0, 2, 0, 1], [1, 1, 1, -1, -1, -1]
+    for i, (row, column, sign) in enumerate(zip(rows, columns, signs, strict=True)):
+        generator[..., row, column] = sign * motion[..., i % 3]
+    generator[..., :3, 3] = motion[..., 3:]
+    return torch.linalg.matrix_exp(generator) @ viewmats
+
+
+def require_close(found, exact, tolerance, names):
+    for name, x, y in zip(names, found, exact, strict=True):
+        error = float((x - y).abs().max() / y.abs().max().clamp_min(1e-12))
+        assert error <= tolerance, f"{name}: {error}"
+
+
+@pytest.mark.parametrize(("per_view", "sh_degree", "mode", "packed", "batch"), GRID)
+@needs("cpp")
+def test_every_call_of_gsplats_own_test(per_view, sh_degree, mode, packed, batch):
+    splats, colors, (viewmats, Ks) = gaussians(batch), colours(per_view, sh_degree, batch), cameras(batch)
+    call = {"sh_degree": sh_degree, "render_mode": mode, "packed": packed, "backend": "cpp"}
+    motion = torch.zeros(*batch, CAMERAS, 6, dtype=torch.float64, requires_grad=True)
+    inputs = {**splats, "colors": colors, "motion": motion}
+    poses = moved(viewmats.detach(), motion)
+    image, alpha, info = rasterization(*splats.values(), colors, poses, Ks, WIDTH, HEIGHT, **call)
+    exact, exact_alpha = expected(splats, colors, poses, Ks, mode, sh_degree)
+    require_close((image, alpha), (exact, exact_alpha), 1e-6, ("image", "alpha"))
+    exact_gradients = gradients(exact, exact_alpha, inputs)
+    require_close(gradients(image, alpha, inputs), exact_gradients, 1e-5, inputs)
+    m = len(info["gaussian_ids"]) if packed else None
+    lead = (m,) if packed else (*batch, CAMERAS, N)
+    assert [info[name].shape for name in ("means2d", "radii", "depths", "conics", "opacities")] == [
+        (*lead, 2), (*lead, 2), lead, (*lead, 3), lead
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("channels", [1, 2, 4, 7])
+@pytest.mark.parametrize("mode", ["RGB", "RGB+ED"])
+def test_any_number_of_channels_over_a_background_that_is_trained(backend, channels, mode):
+    splats, colors, (viewmats, Ks) = gaussians(), colours(False, None, channels=channels), cameras()
+    backgrounds = torch.rand(CAMERAS, channels, dtype=torch.float64, requires_grad=True)
+    inputs = {**splats, "colors": colors, "backgrounds": backgrounds}
+    call = {"backgrounds": backgrounds, "render_mode": mode, "rasterize_mode": "antialiased", "backend": backend}
+    image, alpha, _ = rasterization(*splats.values(), colors, viewmats, Ks, WIDTH, HEIGHT, **call)
+    exact, exact_alpha = expected(splats, colors, viewmats, Ks, mode, backgrounds=backgrounds, antialiased=True)
+    require_close((image, alpha), (exact, exact_alpha), 1e-6, ("image", "alpha"))
+    require_close(gradients(image, alpha, inputs), gradients(exact, exact_alpha, inputs), 1e-5, inputs)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_in_float32_values_and_gradients_are_those_of_float64(backend):
+    splats, colors, (viewmats, Ks) = gaussians(), colours(False, 3), cameras()
+    exact = expected(splats, colors, viewmats, Ks, "RGB+D", 3)
+    inputs = {name: x.detach().float().requires_grad_() for name, x in {**splats, "colors": colors}.items()}
+    image, alpha, _ = rasterization(
+        *inputs.values(), viewmats.detach().float(), Ks.float(), WIDTH, HEIGHT, sh_degree=3, render_mode="RGB+D",
+        backend=backend,
+    )  # fmt: skip
+    require_close((image, alpha), exact, 1e-4, ("image", "alpha"))
+    exact_gradients = gradients(*exact, {**splats, "colors": colors})
+    require_close(gradients(image, alpha, inputs), exact_gradients, 1e-3, inputs)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_what_lies_too_far_or_is_too_small_is_left_out(backend):
+    splats, colors, (viewmats, Ks) = gaussians(), colours(False, None), cameras()
+    call = {"backend": backend}
+    _, _, info = rasterization(*splats.values(), colors, viewmats, Ks, WIDTH, HEIGHT, packed=True, **call)
+    far, radius = float(info["depths"].median()), float(info["radii"].amax(1).median())
+    _, _, near = rasterization(
+        *splats.values(), colors, viewmats, Ks, WIDTH, HEIGHT, far_plane=far, packed=True, **call
+    )
+    _, _, large = rasterization(
+        *splats.values(), colors, viewmats, Ks, WIDTH, HEIGHT, radius_clip=radius, packed=True, **call
+    )
+    assert near["depths"].max() <= far
+    assert len(near["depths"]) == int((info["depths"] <= far).sum())
+    assert len(large["radii"]) == int((info["radii"] > radius).any(1).sum())
+
+
+@pytest.mark.parametrize(
+    ("call", "named"),
+    [
+        ({"camera_model": "fisheye"}, "camera_model='fisheye'"),
+        ({"with_ut": True}, "with_ut=True"),
+        ({"distributed": True}, "distributed=True"),
+        ({"covars": torch.zeros(N, 3, 3)}, "covars"),
+        ({"render_mode": "normals"}, "render_mode must be one of RGB, D, ED, RGB[+]D, RGB[+]ED"),
+        ({"backgrounds": torch.zeros(CAMERAS, 4)}, r"backgrounds must have the shape \[2, 3\]"),
+    ],
+)
+def test_what_is_not_drawn_is_refused_by_name(call, named):
+    splats, colors, (viewmats, Ks) = gaussians(), colours(False, None), cameras()
+    with pytest.raises(ValueError, match=named):
+        rasterization(*splats.values(), colors, viewmats, Ks, WIDTH, HEIGHT, **call)
+
+
+def test_the_names_of_before_go_on_working():
+    from rasterizers import autograd
+
+    assert autograd.rasterization is rasterization is rasterizers.rasterization
