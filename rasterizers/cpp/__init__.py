@@ -24,7 +24,11 @@ from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradie
 from rasterizers.native import load_kernels, threads
 
 _TRAITS: Final = Traits(
-    devices=frozenset({"cpu"}), dtypes=frozenset({torch.float32, torch.float64}), native_threads=True, depth=True
+    devices=frozenset({"cpu"}),
+    dtypes=frozenset({torch.float32, torch.float64}),
+    native_threads=True,
+    depth=True,
+    absgrad=True,
 )
 _LONGEST_SIDE: Final = 32 << 15  # px: bins of 32 px are numbered in 16 bits
 
@@ -133,14 +137,14 @@ class CppRendering:
         self.visible: Bool[Tensor, " N"] = frame.visible[grid]
         frame.native.draw(grid, self.image, self.alpha, self.depth, frame.threads)
 
-    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
-        """One pass for up to three cotangents; see `Rendering.vjp`."""
+    def vjp(self, cotangents: Float[Tensor, "K H W 3"], *, absgrad: bool = False) -> SplatGradients:
+        """One pass for up to three cotangents, with absolute gradients for one; see `Rendering.vjp`."""
         require_cotangents(cotangents, self.image)
         k, n, frame = len(cotangents), len(self.visible), self._frame
         means, quats, scales, screen, rgb = (frame.empty(k, n, width) for width in (3, 4, 3, 2, 3))
-        opacities = frame.empty(k, n)
+        opacities, absolute = frame.empty(k, n), frame.empty(k, n, 2) if absgrad else None
         frame.native.vjp(
             self._grid, cotangents.detach().to(self.image).contiguous(), *frame.shared,
-            means, quats, scales, opacities, screen, rgb, frame.threads,
+            means, quats, scales, opacities, screen, rgb, absolute, frame.threads,
         )  # fmt: skip
-        return SplatGradients(means, quats, scales, opacities, screen, rgb, frame.basis())
+        return SplatGradients(means, quats, scales, opacities, screen, rgb, frame.basis(), absolute)

@@ -100,8 +100,10 @@ def blend_vjp(
     grid: TileGrid,
     settings: RasterSettings,
     cotangents: Float[Tensor, "K T P 3"],
-) -> Float[Tensor, "K M1 W"]:
-    """Gradient of Σ cotangent·image with respect to the table, back to front.
+    *,
+    absgrad: bool = False,
+) -> tuple[Float[Tensor, "K M1 W"], Float[Tensor, "K M1 2"] | None]:
+    """Gradient of Σ cotangent·image with respect to the table, back to front, and the sums of its absolute values by the centre.
 
     With s_i = c_i·v and `behind` = Σ_{j>i} T_j α_j s_j + T_end background·v:  ∂/∂α_i = T_i s_i - behind / (1 - α_i).
     That of the column of depths is 0.
@@ -109,6 +111,7 @@ def blend_vjp(
     background = table.new_tensor(settings.background)
     monomials = _monomials(grid.tile, table)
     gradients = table.new_zeros(len(cotangents), *table.shape)
+    absolute = table.new_zeros(len(cotangents), len(table), 2) if absgrad else None
     for batch in passes:
         v = cotangents[:, batch.tiles]
         behind = batch.end * (v @ background)
@@ -125,10 +128,13 @@ def blend_vjp(
                 blended = weights * s
                 tail = blended.flip(1).cumsum(1).flip(1)  # includes i itself
                 d_alpha = slab.before * s - (tail - blended + behind[k][:, None]) / one_minus_alpha
-                d_rows = _table_gradient(slab.rows, d_alpha * sensitivity, weights @ v_k, batch.tiles, grid, monomials)
+                q = d_alpha * sensitivity
+                d_rows = _table_gradient(slab.rows, q, weights @ v_k, batch.tiles, grid, monomials)
+                if absolute is not None:
+                    absolute[k].index_add_(0, pairs.flatten(), _absolute(slab.rows, q, batch.tiles, grid).flatten(0, 1))
                 gradients[k, :, : d_rows.shape[-1]].index_add_(0, pairs.flatten(), d_rows.flatten(0, 1))
                 behind[k] += tail[:, 0]
-    return gradients
+    return gradients, absolute
 
 
 def _composite(
@@ -138,12 +144,8 @@ def _composite(
     settings: RasterSettings,
     through: Float[Tensor, "B P"],
 ) -> Slab:
-    u, v = rows[..., MEAN].unbind(-1)
-    A, B, C = rows[..., CONIC].unbind(-1)
-    pixel = torch.arange(grid.tile, dtype=rows.dtype, device=rows.device) + 0.5
-    dx = ((tiles % grid.columns * grid.tile)[:, None] + pixel)[:, None, None, :] - u[..., None, None]
-    dy = ((tiles // grid.columns * grid.tile)[:, None] + pixel)[:, None, :, None] - v[..., None, None]
-    A, B, C = (x[..., None, None] for x in (A, B, C))
+    dx, dy = _offsets(rows, tiles, grid)
+    A, B, C = (x[..., None, None] for x in rows[..., CONIC].unbind(-1))
 
     exponent = torch.addcmul(-0.5 * A * dx * dx, -B * dx, dy).sub_(0.5 * C * dy * dy)
     splat = exponent.flatten(2).exp_().mul_(rows[..., OPACITY])
@@ -153,6 +155,26 @@ def _composite(
     ends = bool((after[:, -1] < settings.transmittance_min).any())
     kept = _at_least(after, settings.transmittance_min) if ends else None
     return Slab(rows, splat, alpha, before, after, kept)
+
+
+def _offsets(
+    rows: Float[Tensor, "B L W"], tiles: Int[Tensor, " B"], grid: TileGrid
+) -> tuple[Float[Tensor, "B L 1 X"], Float[Tensor, "B L Y 1"]]:
+    """From the centres to the pixels of the tiles."""
+    u, v = rows[..., MEAN].unbind(-1)
+    pixel = torch.arange(grid.tile, dtype=rows.dtype, device=rows.device) + 0.5
+    dx = ((tiles % grid.columns * grid.tile)[:, None] + pixel)[:, None, None, :] - u[..., None, None]
+    dy = ((tiles // grid.columns * grid.tile)[:, None] + pixel)[:, None, :, None] - v[..., None, None]
+    return dx, dy
+
+
+def _absolute(
+    rows: Float[Tensor, "B L W"], q: Float[Tensor, "B L P"], tiles: Int[Tensor, " B"], grid: TileGrid
+) -> Float[Tensor, "B L 2"]:
+    """Σ|∂L/∂u| over the pixels of the tiles."""
+    dx, dy = _offsets(rows, tiles, grid)
+    A, B, C = (x[..., None, None] for x in rows[..., CONIC].unbind(-1))
+    return torch.stack([(q * d.flatten(2)).abs().sum(-1) for d in (A * dx + B * dy, B * dx + C * dy)], -1)
 
 
 def _table_gradient(

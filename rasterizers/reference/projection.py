@@ -62,7 +62,9 @@ class Projection:
         out[self.rows] = values
         return out
 
-    def vjp(self, table_gradients: Float[Tensor, "K M1 W"]) -> SplatGradients:
+    def vjp(
+        self, table_gradients: Float[Tensor, "K M1 W"], absgrad: Float[Tensor, "K M1 2"] | None = None
+    ) -> SplatGradients:
         """The splats' gradients from those of the table."""
         outputs = (self.means2d, self.conics, self.opacities, self.rgb)
         inputs = (*self.leaves, self.raw_rgb)
@@ -75,7 +77,9 @@ class Projection:
         means, quats, scales, opacities, rgb, screen = (
             torch.stack([self.scatter(g) for g in attribute]) for attribute in zip(*by_cotangent, strict=True)
         )
-        return SplatGradients(means, quats, scales, opacities, screen, rgb, basis=self.scatter(self.basis))
+        if absgrad is not None:
+            absgrad = torch.stack([self.scatter(g[: self.rows.shape[0]]) for g in absgrad])
+        return SplatGradients(means, quats, scales, opacities, screen, rgb, self.scatter(self.basis), absgrad)
 
 
 class Footprints(NamedTuple):

@@ -23,7 +23,7 @@ from typing import Any, Final
 import warp as wp
 
 from rasterizers.warp_backend.bins import exponent
-from rasterizers.warp_backend.types import PIXELS, SEGMENT, SUMS, TILE, Cuts, Grid, Row, ellipse_of
+from rasterizers.warp_backend.types import PIXELS, SEGMENT, SUMS, TILE, Cuts, Grid, Row, ellipse_of, width_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -259,22 +259,22 @@ def warp_sum(width: int) -> Any:
 
 
 @cache
-def blend_vjp(K: int, lanes: int, shuffles: bool) -> Any:  # noqa: PLR0915 - a kernel
+def blend_vjp(K: int, lanes: int, shuffles: bool, absolute: bool = False) -> Any:  # noqa: PLR0915 - a kernel
     """The VJP kernel for K cotangents, with `lanes` threads per segment.
 
     Each lane has `per_lane` pixels. For every pair it sums over its pixels, the lanes' sums are added up, and the result is
     stored at the pair's place: no atomics, a fixed order. A GPU uses a warp per segment, a CPU one thread.
 
     Args:
-        shuffles: add up by `warp_sum`.
+        shuffles: add up by `warp_sum`. absolute: also Σ|∂L/∂u| over the pixels, for one cotangent.
     """
-    per_lane, both, W = PIXELS // lanes, 2 * lanes, SUMS + 3
-    PairSums = wp.types.vector(length=W * K, dtype=wp.float32)
+    per_lane, both, W, width = PIXELS // lanes, 2 * lanes, SUMS + 3, width_of(K, absolute)
+    PairSums = wp.types.vector(length=width, dtype=wp.float32)
     Pixels = wp.types.vector(length=per_lane, dtype=wp.float32)
     Ends = wp.types.vector(length=per_lane, dtype=wp.int32)
     Behind = wp.types.matrix(shape=(per_lane, K), dtype=wp.float32)
     Cotangents = wp.types.matrix(shape=(per_lane * K, 3), dtype=wp.float32)
-    store = warp_sum(W * K)
+    store = warp_sum(width)
 
     @wp.kernel(module="unique", enable_backward=False)
     def blend_vjp(  # noqa: PLR0912, PLR0915
@@ -351,6 +351,9 @@ def blend_vjp(K: int, lanes: int, shuffles: bool) -> Any:  # noqa: PLR0915 - a k
                                 part[W * k + 3] += q * d[0] * d[0]
                                 part[W * k + 4] += q * d[0] * d[1]
                                 part[W * k + 5] += q * d[1] * d[1]
+                                if wp.static(absolute):
+                                    part[W] += wp.abs(q * (2.0 * g[2] * d[0] + g[3] * d[1]))
+                                    part[W + 1] += wp.abs(q * (g[3] * d[0] + 2.0 * g[4] * d[1]))
                             for c in range(3):
                                 part[W * k + SUMS + c] += weight * v[j * K + k, c]
                             behind[j, k] = behind[j, k] + weight * light_k
@@ -359,7 +362,7 @@ def blend_vjp(K: int, lanes: int, shuffles: bool) -> Any:  # noqa: PLR0915 - a k
                 else:
                     whole = wp.tile_sum(wp.tile(part, preserve_type=True))
                     sums = whole[0]
-                    for c in range(lane, W * K, lanes):
+                    for c in range(lane, width, lanes):
                         pair_sums[tile_and_place[1], c] = sums[c]
             half = lanes - half
 

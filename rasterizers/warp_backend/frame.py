@@ -272,8 +272,8 @@ class WarpRendering:
         )  # fmt: skip
         launch(blend(view.has_depth), [n_tiles, types.PIXELS], drawn, frame.like.device, block=types.PIXELS)
 
-    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
-        """One pass for up to three cotangents; see `Rendering.vjp`."""
+    def vjp(self, cotangents: Float[Tensor, "K H W 3"], *, absgrad: bool = False) -> SplatGradients:
+        """One pass for up to three cotangents, with absolute gradients for one; see `Rendering.vjp`."""
         require_cotangents(cotangents, self.image)
         frame, k, n = self._frame, cotangents.shape[0], self._frame.n
         v = cotangents.to(self._image).contiguous()
@@ -281,31 +281,38 @@ class WarpRendering:
             frame.empty(k, n, 3), frame.empty(k, n, 4), frame.empty(k, n, 3), frame.empty(k, n), frame.empty(k, n, 2),
             frame.empty(k, n, 3),
         )  # fmt: skip
+        absolute = frame.empty(k, n, 2) if absgrad else None
         capacity = padded(self._view.pairs)
         together = max(1, min(3, ((frame.settings.memory << 20) - capacity * PAIR_BYTES) // (capacity * SUMS_BYTES)))
         with on_stream(frame.like.device):
-            if k <= together:
-                self._fill(v, *out)
+            if absolute is not None:
+                for part in zip(*(x.split(1) for x in (v, *out, absolute)), strict=True):  # type: ignore[no-untyped-call]
+                    self._fill(*part)
+            elif k <= together:
+                self._fill(v, *out, None)
             else:
                 for part in zip(*(torch.split(x, together) for x in (v, *out)), strict=True):
-                    self._fill(*part)
-            return SplatGradients(means, quats, scales, opacities, screen, rgb, frame.basis())
+                    self._fill(*part, None)
+            return SplatGradients(means, quats, scales, opacities, screen, rgb, frame.basis(), absolute)
 
-    def _fill(self, v: Tensor, *out: Tensor) -> None:
-        """Fill the gradients for one to three cotangents."""
+    def _fill(self, v: Tensor, *out: Tensor | None) -> None:
+        """Fill the gradients for one to three cotangents, the last of them where absolute ones are wanted."""
+        absolute = out[-1] is not None
         frame, view, lists, k = self._frame, self._view, self._drawn_from, v.shape[0]
-        pair_sums = frame.empty(padded(view.pairs), k * (types.SUMS + 3))
+        pair_sums = frame.empty(padded(view.pairs), types.width_of(k, absolute))
         lanes = LANES[frame.settings.device]
+        kernel = blend_vjp(k, lanes, frame.settings.device == "cuda", absolute)
         frame.launch_blocks(
-            blend_vjp(k, lanes, frame.settings.device == "cuda"), -(-view.pairs // types.SEGMENT), lanes, view.grid, frame.cuts,
-            frame.background, view.ellipses, lists.tiles, lists.gaussians, lists.places, lists.ends, self._transmittance,
-            self._ended, self._marks, v, view.total, pair_sums,
+            kernel, -(-view.pairs // types.SEGMENT), lanes, view.grid, frame.cuts, frame.background, view.ellipses, lists.tiles,
+            lists.gaussians, lists.places, lists.ends, self._transmittance, self._ended, self._marks, v, view.total, pair_sums,
         )  # fmt: skip
         for stride in frame.folds:
-            frame.launch(fold(k), view.pairs, view.counts, view.firsts, lists.splats, view.total, stride, pair_sums)
+            frame.launch(
+                fold(k, absolute), view.pairs, view.counts, view.firsts, lists.splats, view.total, stride, pair_sums
+            )
         frame.launch(
-            project_vjp(k), frame.n, frame.pose, view.grid, frame.cuts, frame.means, frame.quats, frame.scales, view.opacities,
-            frame.slopes, frame.bands > 0, view.ellipses, view.counts, view.firsts, pair_sums, *out,
+            project_vjp(k, absolute), frame.n, frame.pose, view.grid, frame.cuts, frame.means, frame.quats, frame.scales,
+            view.opacities, frame.slopes, frame.bands > 0, view.ellipses, view.counts, view.firsts, pair_sums, *out,
         )  # fmt: skip
 
 

@@ -11,7 +11,19 @@ from rasterizers import geometry
 from rasterizers.warp_backend.bins import count_tiles, depth_key, reaches_image
 from rasterizers.warp_backend.colour import colour_of
 from rasterizers.warp_backend.geometry import Footprint, Sums, centre_of, footprint_of, geometry_of, geometry_vjp
-from rasterizers.warp_backend.types import FAR, SEGMENT, SUMS, Cuts, Ellipse, Grid, Pose, Row, ellipse_of, row_of
+from rasterizers.warp_backend.types import (
+    FAR,
+    SEGMENT,
+    SUMS,
+    Cuts,
+    Ellipse,
+    Grid,
+    Pose,
+    Row,
+    ellipse_of,
+    row_of,
+    width_of,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -139,9 +151,9 @@ def stride_of(count: wp.int32) -> wp.int32:
 
 
 @cache
-def fold(K: int) -> Any:
+def fold(K: int, absolute: bool = False) -> Any:
     """The kernel that adds up a Gaussian's pairs by `SEGMENT`, for those Gaussians that have more."""
-    PairSums = wp.types.vector(length=(SUMS + 3) * K, dtype=wp.float32)
+    PairSums = wp.types.vector(length=width_of(K, absolute), dtype=wp.float32)
 
     @wp.kernel(module="unique", enable_backward=False)
     def fold(
@@ -169,10 +181,10 @@ def fold(K: int) -> Any:
 
 
 @cache
-def project_vjp(K: int) -> Any:
-    """The VJP kernel for K cotangents."""
+def project_vjp(K: int, absolute: bool = False) -> Any:
+    """The VJP kernel for K cotangents, with absolute gradients for one."""
     W = SUMS + 3
-    PairSums = wp.types.vector(length=W * K, dtype=wp.float32)
+    PairSums = wp.types.vector(length=width_of(K, absolute), dtype=wp.float32)
 
     @wp.kernel(module="unique", enable_backward=False)
     def project_vjp(
@@ -195,6 +207,7 @@ def project_vjp(K: int) -> Any:
         d_opacities: wp.array2d[wp.float32],
         d_screen: wp.array2d[wp.vec2],
         d_rgb: wp.array2d[wp.vec3],
+        d_absolute: wp.array2d[wp.vec2],
     ) -> None:
         """One thread per Gaussian: adds its pairs' sums in the order of its tiles, and applies the projection's VJP."""
         i = wp.tid()
@@ -206,6 +219,8 @@ def project_vjp(K: int) -> Any:
                 d_opacities[k, i] = 0.0
                 d_screen[k, i] = wp.vec2(0.0, 0.0)
                 d_rgb[k, i] = wp.vec3(0.0, 0.0, 0.0)
+            if wp.static(absolute):
+                d_absolute[0, i] = wp.vec2(0.0, 0.0)
             return
         total = PairSums()
         for nth in range(0, counts[i], stride_of(counts[i])):
@@ -234,5 +249,7 @@ def project_vjp(K: int) -> Any:
             d_opacities[k, i] = sums.q / opacities[i]
             d_screen[k, i] = out.screen
             d_rgb[k, i] = rgb
+        if wp.static(absolute):
+            d_absolute[0, i] = wp.vec2(total[W], total[W + 1])
 
     return project_vjp

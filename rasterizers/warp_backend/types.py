@@ -16,6 +16,13 @@ PIXELS: Final = wp.constant(settings.TILE**2)
 SEGMENT: Final = wp.constant(settings.SEGMENT)
 SUMS: Final = wp.constant(6)
 """Sums of a pair for one cotangent before those of the colour: q = ∂L/∂(log alpha) and its moments."""
+
+
+def width_of(K: int, absolute: bool) -> int:
+    """Sums of a pair: for each of K cotangents `SUMS` and three of the colour, and two of absolute gradients."""
+    return (int(SUMS) + 3) * K + 2 * absolute
+
+
 FAR: Final = wp.constant(2**31 - 1)
 """The depth key of a Gaussian that is not drawn."""
 

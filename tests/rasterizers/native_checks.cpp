@@ -117,7 +117,7 @@ std::vector<double> drawn(int threads) {
   frame.draw(0, image.data(), alpha.data(), depth.data(), threads);
   std::vector<T> d_means(K * 3 * n), d_quats(K * 4 * n), d_scales(K * 3 * n), d_opacities(K * n), d_screen(K * 2 * n), d_rgb(K * 3 * n);
   frame.vjp(0, K, cotangents.data(), splats,
-            {d_means.data(), d_quats.data(), d_scales.data(), d_opacities.data(), d_screen.data(), d_rgb.data()}, threads);
+            {d_means.data(), d_quats.data(), d_scales.data(), d_opacities.data(), d_screen.data(), d_rgb.data(), nullptr}, threads);
   std::vector<double> all;
   for (const std::vector<T>* part : {&image, &alpha, &depth, &d_means, &d_quats, &d_scales, &d_opacities, &d_screen, &d_rgb})
     all.insert(all.end(), part->begin(), part->end());

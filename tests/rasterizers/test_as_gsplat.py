@@ -168,6 +168,29 @@ def test_in_float32_values_and_gradients_are_those_of_float64(backend):
     require_close(gradients(image, alpha, inputs), exact_gradients, 1e-3, inputs)
 
 
+ABSOLUTE = [*BACKENDS, pytest.param("warp", marks=needs("warp"), id="warp")]
+
+
+@pytest.mark.parametrize("backend", ABSOLUTE)
+@pytest.mark.parametrize("packed", [True, False])
+def test_absolute_gradients_are_summed_over_pixels(backend, packed):
+    """Each pixel's gradient of the centres, one backward pass for each."""
+    dtype = torch.float32 if backend == "warp" else torch.float64
+    splats, colors, (viewmats, Ks) = gaussians(dtype=dtype), colours(False, 3, dtype=dtype), cameras(dtype=dtype)
+    call = {"sh_degree": 3, "packed": packed, "backend": backend}
+    image, _, info = rasterization(*splats.values(), colors, viewmats, Ks, WIDTH, HEIGHT, absgrad=True, **call)
+    weights = torch.randn(image.shape, dtype=dtype, generator=torch.Generator().manual_seed(5))
+    (image * weights).sum().backward(retain_graph=True)
+    found, total = info["means2d"].absgrad.clone(), torch.zeros_like(info["means2d"])
+    for camera, y, x in itertools.product(range(CAMERAS), range(HEIGHT), range(WIDTH)):
+        (of_pixel,) = torch.autograd.grad(
+            (image * weights)[camera, y, x].sum(), info["means2d"], retain_graph=True, allow_unused=True
+        )
+        total += of_pixel.abs()
+    assert total.abs().max() > 0
+    assert torch.allclose(found, total, rtol=1e-4, atol=1e-5 * float(total.max()))
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_what_lies_too_far_or_is_too_small_is_left_out(backend):
     splats, colors, (viewmats, Ks) = gaussians(), colours(False, None), cameras()

@@ -122,10 +122,11 @@ void bind_frame(nb::module_& m) {
            [](F& self, int i, Read<T, -1, -1, -1, 3> cotangents, Read<T, -1, 3> means, Read<T, -1, 4> quats,
               Read<T, -1, 3> scales, Read<T, -1, 1, 3> sh0, Rows<T> shN, Write<T, -1, -1, 3> d_means,
               Write<T, -1, -1, 4> d_quats, Write<T, -1, -1, 3> d_scales, Write<T, -1, -1> d_opacities,
-              Write<T, -1, -1, 2> d_screen, Write<T, -1, -1, 3> d_rgb, int threads) {
+              Write<T, -1, -1, 2> d_screen, Write<T, -1, -1, 3> d_rgb, std::optional<Write<T, -1, -1, 2>> d_absgrad,
+              int threads) {
              Splats<T> splats = splats_of<T>(means, quats, scales, sh0, shN);
-             Gradients<T> out{d_means.data(),     d_quats.data(),  d_scales.data(),
-                              d_opacities.data(), d_screen.data(), d_rgb.data()};
+             Gradients<T> out{d_means.data(),  d_quats.data(), d_scales.data(), d_opacities.data(),
+                              d_screen.data(), d_rgb.data(),   d_absgrad ? d_absgrad->data() : nullptr};
              const int K = int(cotangents.shape(0));
              const T* v = cotangents.data();
              nb::gil_scoped_release release;
@@ -133,7 +134,7 @@ void bind_frame(nb::module_& m) {
            },
            nb::arg("grid"), tensor("cotangents"), tensor("means"), tensor("quats"), tensor("scales"), tensor("sh0"),
            tensor("shN"), tensor("d_means"), tensor("d_quats"), tensor("d_scales"), tensor("d_opacities"),
-           tensor("d_screen"), tensor("d_rgb"), nb::arg("threads"))
+           tensor("d_screen"), tensor("d_rgb"), tensor("d_absgrad").none(), nb::arg("threads"))
       .def("basis", [](F& self, Read<T, -1, 3> means, Read<T, -1, 4> quats, Read<T, -1, 3> scales,
                        Read<T, -1, 1, 3> sh0, Rows<T> shN, Write<T, -1, -1> out, int threads) {
         Splats<T> splats = splats_of<T>(means, quats, scales, sh0, shN);

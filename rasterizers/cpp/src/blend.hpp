@@ -133,12 +133,13 @@ void blend_block(const Segment<T>& segment, int block, const Settings<T>& s, Blo
 }
 
 // Sums over a block's pixels for the Gaussians of its bin.
-template <class T, int K>
+template <class T, int K, bool Absolute>
 struct BlockSums {
-  using Sums = PairSums<T, K>;
+  using Sums = PairSums<T, K, Absolute>;
   static constexpr int kRows = kLanes;  // Gaussians are collected until every lane has one
   T q[K][kRows][kLanes], weight[kRows][kLanes];
   T offset_x[kRows], offset_y[kRows];  // from the Gaussian's centre to the block's
+  T conic[Absolute ? 3 : 1][kRows];
   int place[kRows];
 
   // Not inlined: two copies beside the loop over Gaussians would exceed the instruction cache.
@@ -177,6 +178,14 @@ struct BlockSums {
         out[6 + c] = w.r[0] * parts.r[0];
         for (int i = 1; i < n; ++i) out[6 + c] += w.r[i] * parts.r[i];
       }
+      if constexpr (Absolute) {
+        const L A = conic[0][row], B = conic[1][row], C = conic[2][row];
+        const L each[2] = {absolute(v * (A * dx + B * dy)), absolute(v * (B * dx + C * dy))};
+        for (int c = 0; c < 2; ++c) {
+          out[6 + kColour + c] = each[c].r[0];
+          for (int i = 1; i < n; ++i) out[6 + kColour + c] += each[c].r[i];
+        }
+      }
     }
     T* out = sums[place[row]].numbers;
     auto quad = [&](int i) CLEAR_LAMBDA { return sum_quads(all[i], all[i + 1], all[i + 2], all[i + 3]); };
@@ -193,6 +202,7 @@ struct BlockSums {
       L(T(0)).store(weight[i]);
       for (int k = 0; k < K; ++k) L(T(0)).store(q[k][i]);
       offset_x[i] = offset_y[i] = T(0);
+      if constexpr (Absolute) conic[0][i] = conic[1][i] = conic[2][i] = T(0);
     }
     L w[kRows];
     for (int i = 0; i < kRows; ++i) w[i] = L::load(weight[i]);
@@ -210,6 +220,15 @@ struct BlockSums {
       for (int p = 0; p < kLanes; ++p)
         for (int c = 0; c < kColour; ++c) channels[c] += w[p] * L(cotangent[k][c][p]);
       for (int c = 0; c < kColour; ++c) out[6 + c] = channels[c];
+      if constexpr (Absolute) {
+        const L A = L::load(conic[0]), B = L::load(conic[1]), C = L::load(conic[2]);
+        out[6 + kColour] = out[7 + kColour] = L(T(0));
+        for (int p = 0; p < kLanes; ++p) {
+          const L dx = ox + L(T(p % kBlock) - T(1.5)), dy = oy + L(T(p / kBlock) - T(1.5));
+          out[6 + kColour] += absolute(v[p] * (A * dx + B * dy));
+          out[7 + kColour] += absolute(v[p] * (B * dx + C * dy));
+        }
+      }
     }
     constexpr int last = Sums::kRows - 1, rest = K * Sums::kWidth - last * kLanes;
     for (int r = 0; r < (rest > kQuad ? last + 1 : last); ++r) {
@@ -260,9 +279,9 @@ struct BlockBack {
 
 //   ∂I·v/∂α_i = T_i (c_i·v) - behind / (1 - α_i)
 // Where α is capped, the image does not depend on the ellipse.
-template <class T, int K>
+template <class T, int K, bool Absolute>
 void blend_block_vjp(const Segment<T>& segment, int block, const Settings<T>& s, const BlockEnd<T>& end,
-                     const T (&cotangent)[K][kColour][kLanes], BlockBack<T, K>& back, PairSums<T, K>* sums) {
+                     const T (&cotangent)[K][kColour][kLanes], BlockBack<T, K>& back, PairSums<T, K, Absolute>* sums) {
   using L = Lanes<T>;
   const PixelCentres<T> pixel(block);
   const L alpha_min = s.alpha_min, alpha_max = s.alpha_max, one = T(1);
@@ -288,7 +307,7 @@ void blend_block_vjp(const Segment<T>& segment, int block, const Settings<T>& s,
     behind[k] = L::load(back.behind[k]);
     for (int c = 0; c < kColour; ++c) v[k][c] = L::load(cotangent[k][c]);
   }
-  BlockSums<T, K> collected;
+  BlockSums<T, K, Absolute> collected;
   int count = 0;
   const Ellipse<T>* ellipses = segment.ellipses.data();
   for (int i = n - 1; i >= 0; --i) {
@@ -313,6 +332,8 @@ void blend_block_vjp(const Segment<T>& segment, int block, const Settings<T>& s,
     collected.offset_x[count] = centre_x - e.u;
     collected.offset_y[count] = centre_y - e.v;
     collected.place[count] = place;
+    if constexpr (Absolute)  // of the natural logarithm of alpha
+      collected.conic[0][count] = 2 / kLog2E<T> * e.A, collected.conic[1][count] = e.B / kLog2E<T>, collected.conic[2][count] = 2 / kLog2E<T> * e.C;
     if (++count == collected.kRows) collected.flush(count, cotangent, sums), count = 0;
   }
   collected.flush(count, cotangent, sums);

@@ -66,11 +66,12 @@ class Frame {
     View& view = views_.at(i);
     const std::int64_t image = std::int64_t(view.target.grid.width) * view.target.grid.height * kColour;
     for (int k = 0; k < K;) {
-      const int now = std::min(kMostCotangents, K - k);
+      const int now = out.absgrad ? 1 : std::min(kMostCotangents, K - k);
       const std::int64_t at = k * n_;
-      Gradients<T> part{out.means + 3 * at,     out.quats + 4 * at,  out.scales + 3 * at,
-                        out.opacities + at, out.screen + 2 * at, out.rgb + 3 * at};
-      if (now == 1) vjp_of<1>(view, cotangents + k * image, splats, part, threads);
+      Gradients<T> part{out.means + 3 * at,  out.quats + 4 * at, out.scales + 3 * at, out.opacities + at,
+                        out.screen + 2 * at, out.rgb + 3 * at,   out.absgrad ? out.absgrad + 2 * at : nullptr};
+      if (out.absgrad) vjp_of<1, true>(view, cotangents + k * image, splats, part, threads);
+      else if (now == 1) vjp_of<1>(view, cotangents + k * image, splats, part, threads);
       if constexpr (kMostCotangents > 1) {
         if (now == 2) vjp_of<2>(view, cotangents + k * image, splats, part, threads);
         if (now == 3) vjp_of<3>(view, cotangents + k * image, splats, part, threads);
@@ -205,9 +206,9 @@ class Frame {
             view.ends.data() + place * kBlocks};
   }
 
-  template <int K>
+  template <int K, bool Absolute = false>
   void vjp_of(View& view, const T* cotangents, const Splats<T>& splats, const Gradients<T>& out, int threads) {
-    using Sums = PairSums<T, K>;
+    using Sums = PairSums<T, K, Absolute>;
     const std::vector<Band> bands = bands_of(view, kBytesPerPair + sizeof(Sums));
     const bool whole = bands.size() == 1;
     Buffer<Sums> pair_sums, splat_sums;  // by pair; by Gaussian, when there are several bands
@@ -219,14 +220,14 @@ class Frame {
       if (view.bins.band != band) list(view, band, threads);
       pair_sums.reserve_lost(view.bins.pairs.size());
       Pool::instance().run(threads, band.bins(),
-                           [&](std::int64_t bin) { blend_vjp_bin<T, K>(job(view, bin), cotangents, pair_sums.data()); });
+                           [&](std::int64_t bin) { blend_vjp_bin<T, K, Absolute>(job(view, bin), cotangents, pair_sums.data()); });
       view.bins.has_masks = true;
       if (whole) break;
       Pool::instance().run(threads, chunks_of(n_),
                            [&](std::int64_t chunk) { add_band(view, chunk, pair_sums.data(), splat_sums.data()); });
     }
     Pool::instance().run(threads, chunks_of(n_), [&](std::int64_t chunk) {
-      vjp_of_chunk<K>(view, splats, chunk, whole, (whole ? pair_sums : splat_sums).data(), out);
+      vjp_of_chunk<K, Absolute>(view, splats, chunk, whole, (whole ? pair_sums : splat_sums).data(), out);
     });
   }
 
@@ -250,9 +251,9 @@ class Frame {
   }
 
   // The gradients of a chunk's Gaussians from `sums`, by pair where one band is the whole image, else by Gaussian.
-  template <int K>
-  void vjp_of_chunk(const View& view, const Splats<T>& splats, std::int64_t chunk, bool whole, const PairSums<T, K>* sums,
-                    const Gradients<T>& out) {
+  template <int K, bool Absolute>
+  void vjp_of_chunk(const View& view, const Splats<T>& splats, std::int64_t chunk, bool whole,
+                    const PairSums<T, K, Absolute>* sums, const Gradients<T>& out) {
     constexpr std::int64_t ahead = 6 * kLanes;
     const std::int64_t first = chunk * kChunk, end = std::min(n_, first + kChunk);
     auto touched = [&](std::int64_t i) {
@@ -271,7 +272,7 @@ class Frame {
     const std::int64_t known = sparse ? count : count + ahead;
     for (std::int64_t at = 0; at < count; at += kLanes) {
       const Group group(numbers + at, count - at);
-      Lanes<T> rows[PairSums<T, K>::kRows][kLanes];
+      Lanes<T> rows[PairSums<T, K, Absolute>::kRows][kLanes];
       fetch_rows(splats, view.target, slopes_, numbers + std::min(known, at + 2 * kLanes),
                  numbers + std::min(known, at + 3 * kLanes));
       if (whole) {

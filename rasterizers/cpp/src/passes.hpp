@@ -105,8 +105,8 @@ CLEAR_INLINE void fetch_cotangents(const BinJob<T>& job, const T* cotangents) {
 }
 
 // The backward pass of a bin, back to front. Writes the sums of all its pairs.
-template <class T, int K>
-void blend_vjp_bin(const BinJob<T>& job, const T* cotangents, PairSums<T, K>* pair_sums) {
+template <class T, int K, bool Absolute>
+void blend_vjp_bin(const BinJob<T>& job, const T* cotangents, PairSums<T, K, Absolute>* pair_sums) {
   const std::int64_t n = job.pairs();
   if (!n) return;
   static thread_local BinVjp<T, K> scratch;
@@ -119,14 +119,14 @@ void blend_vjp_bin(const BinJob<T>& job, const T* cotangents, PairSums<T, K>* pa
   bool started = false;
   for (std::int64_t first = (n - 1) / kSegment * kSegment; first >= 0; first -= kSegment) {
     const std::int64_t count = std::min<std::int64_t>(kSegment, n - first);
-    PairSums<T, K>* sums = pair_sums + job.bins.starts[job.bin] + first;
+    PairSums<T, K, Absolute>* sums = pair_sums + job.bins.starts[job.bin] + first;
     std::memset(static_cast<void*>(sums), 0, sizeof *sums * count);
     if (first >= end) continue;
     Segment<T>& part = thread_segment<T>();
     gather(job.ellipses, job.bins, job.bin, first, job.inside, part);
     if (!std::exchange(started, true)) start_vjp(job, cotangents, mine);
     each_bit(job.inside, [&](int b) {
-      if (part.lengths[b]) blend_block_vjp<T, K>(part, b, job.settings, job.ends[b], mine.cotangent[b], mine.back[b], sums);
+      if (part.lengths[b]) blend_block_vjp<T, K, Absolute>(part, b, job.settings, job.ends[b], mine.cotangent[b], mine.back[b], sums);
     });
   }
 }

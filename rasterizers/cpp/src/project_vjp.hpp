@@ -6,10 +6,10 @@
 
 namespace clear {
 
-// The output: the fields of rasterizers.interface.SplatGradients, [K, n, …]; every element is written.
+// The output: the fields of rasterizers.interface.SplatGradients, [K, n, …]; every element is written. `absgrad` may be null.
 template <class T>
 struct Gradients {
-  T *means, *quats, *scales, *opacities, *screen, *rgb;
+  T *means, *quats, *scales, *opacities, *screen, *rgb, *absgrad;
 };
 
 // Zeroes the gradients of `count` Gaussians.
@@ -19,6 +19,7 @@ void clear_gradients(std::int64_t n, std::int64_t first, std::int64_t count, con
     for (int k = 0; k < K; ++k) std::memset(tensor + (k * n + first) * width, 0, sizeof(T) * width * count);
   };
   zero(out.means, 3), zero(out.quats, 4), zero(out.scales, 3), zero(out.opacities, 1), zero(out.screen, 2), zero(out.rgb, 3);
+  if (out.absgrad) zero(out.absgrad, 2);
 }
 
 // Adds the pair sums of this band to the rows of each Gaussian of the group.
@@ -95,6 +96,10 @@ void project_vjp_group(const Pose& pose, const Settings<T>& s, const Splats<T>& 
     store_rows<1>(out.opacities + at, group, alone);
     store_rows<2>(out.screen + 2 * at, group, gradient.screen);
     store_rows<3>(out.rgb + 3 * at, group, rgb);
+    if (out.absgrad) {  // one cotangent
+      L sums_of_absolutes[2] = {where(real, sum[6 + kColour]), where(real, sum[7 + kColour])};
+      store_rows<2>(out.absgrad, group, sums_of_absolutes);
+    }
   }
 }
 

@@ -91,10 +91,11 @@ enum Field { kU, kV, kA, kB, kC, kPeak, kReach, kHalfX, kHalfY, kRed, kGreen, kB
 inline constexpr int kColour = 3, kColourAndDepth = 4;  // channels that are blended
 
 // Sums over the pixels of a (Gaussian, bin) pair, for each of K cotangents: q = ∂L/∂(log alpha), q's moments about the centre
-// x, y, xx, xy, yy, and ∂L/∂(r, g, b). Packed, because they are written, read and transposed by sixteen.
-template <class T, int K>
+// x, y, xx, xy, yy, and ∂L/∂(r, g, b); with absolute gradients also Σ|∂L/∂u|. Packed, because they are written, read and
+// transposed by sixteen.
+template <class T, int K, bool Absolute = false>
 struct alignas(kLanes * sizeof(T)) PairSums {
-  static constexpr int kWidth = 6 + kColour, kRows = (K * kWidth + kLanes - 1) / kLanes;
+  static constexpr int kWidth = 6 + kColour + (Absolute ? 2 : 0), kRows = (K * kWidth + kLanes - 1) / kLanes;
   T numbers[kRows * kLanes];
 };
 
