@@ -22,6 +22,8 @@ from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, Rasterizer, RasterSettings, over
 from rasterizers.reference.projection import footprints
 
+__all__ = ["cameras_of", "rasterization", "rasterizer_of"]
+
 _MODES: Final = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 _FARTHEST: Final = 1e10  # gsplat's default
 # The only value of each other argument that this package draws; None for one that is not listed. The others change the speed.

@@ -24,6 +24,8 @@ from rasterizers.checks import require_absgrad, require_depth
 from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, WithAbsgrad, over
 from rasterizers.pose import pose_gradient
 
+__all__ = ["BackwardHook", "Drawing", "Drawn", "TakeColours", "draw", "outer", "recorded", "uncompiled"]
+
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
