@@ -455,4 +455,5 @@ def _require_supported(render_mode: str, rasterize_mode: str, more: Mapping[str,
 @functools.lru_cache(maxsize=8)
 def _loaded(name: str, device: str, near: float, kernel: float, antialiased: bool) -> Rasterizer:
     name = rasterizers.fastest(device) if name == "auto" else name
-    return rasterizers.load(name, near=near, kernel=kernel, antialiased=antialiased)
+    where = rasterizers.for_device(name, device)
+    return rasterizers.load(name, near=near, kernel=kernel, antialiased=antialiased, **where)

@@ -30,7 +30,7 @@ def test_every_command_is_understood_and_a_step_that_fails_or_is_cut_off_stops_n
     assert "point_cloud.ply" in (out / "logs" / "same-bits.log").read_text()
     assert sum(map(int, (tmp_path / "limits").read_text().split())) <= 9 * 60
 
-    calls = [line.split() for line in (tmp_path / "calls").read_text().splitlines()]
+    calls = [line.split() for line in (tmp_path / "calls").read_text().splitlines() if "gsplat.cuda" not in line]
     modules = [words[words.index("-m") + 1] for words in calls]
     order = ["pytest", *["clear_strategies.run"] * 2, *["clear_strategies.bench"] * 3]
     assert modules == [*order, "clear_strategies.run", "clear_strategies.bench", "pytest", "clear_strategies.run"]

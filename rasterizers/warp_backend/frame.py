@@ -351,9 +351,15 @@ class CameraNumbers(NamedTuple):
     grid: Tensor
 
 
-@lru_cache(maxsize=1024)
 def numbers_of(camera: Camera, device: torch.device) -> CameraNumbers:
-    """Those of this camera object."""
+    """Those of this camera object. The device of tensors has a number, which "cuda" lacks."""
+    if device.type == "cuda" and device.index is None:
+        device = torch.device("cuda", torch.cuda.current_device())
+    return _numbers_of(camera, device)
+
+
+@lru_cache(maxsize=1024)
+def _numbers_of(camera: Camera, device: torch.device) -> CameraNumbers:
     pose, world = types.Pose(), camera.world_to_camera.double()
     rotation = world[:3, :3].flatten().tolist()
     pose.rotation, pose.exact_rotation = wp.mat33(*rotation), wp.mat33d(*rotation)

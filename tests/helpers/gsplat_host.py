@@ -41,7 +41,8 @@ class Host:
         self.rasterization, self.call = rasterization, {"packed": False, **call}
         self.photos = {v.name: v.lr for v in scene.train}
         raw = GaussianField.from_cloud(scene.cloud).raw()
-        self.splats = {k: torch.nn.Parameter(p.clone()) for k, p in raw.items() if k != "detail"}
+        device = scene.train[0].lr.image.device
+        self.splats = {k: torch.nn.Parameter(p.clone().to(device)) for k, p in raw.items() if k != "detail"}
         rates = LearningRates().at(0, extent)
         self.optimizers = {k: torch.optim.Adam([p], lr=rates[k], eps=eps) for k, p in self.splats.items()}
         self.strategy, self.state = strategy, None
