@@ -42,7 +42,7 @@ def test_a_run_leaves_everything_it_promises(finished):
     timing = (out / "timing.csv").read_text()
     assert "skipped" in timing
     stages = [line.split(",")[0] for line in timing.splitlines()[1:]]
-    assert stages[:2] == ["photos and SR images", "initial points"]
+    assert stages[:3] == ["capture and poses", "photos and SR images", "initial points"]
     assert {"maps", "contact sheet and curves"} <= set(stages)
     pictures = [len(list(out.glob(kind))) for kind in ("renders/*.png", "views/*_truth.png", "maps/*/corrected.png")]
     assert pictures == [3, 3, 2]

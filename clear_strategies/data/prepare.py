@@ -48,7 +48,9 @@ _BLURRED: Final = 3e-4  # rounding of positions, in distances of the cameras, th
 _ROUNDING: Final = 0.5  # grey levels: the largest difference that rounding to 8 bits makes
 
 
-def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSettings, *, seed: int = 0) -> Scene:
+def prepare(
+    capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSettings, *, seed: int = 0, work_log: WorkLog | None = None
+) -> Scene:  # fmt: skip
     """Split the frames, make LR and HR of each view, and make the initial points.
 
     What the headers of the photos show is checked before any photo is decoded; a DataError says what the capture cannot give.
@@ -59,7 +61,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     require_source(cloud, capture.points)
     _check_places(capture, [frame.camera for frame in train_frames], cloud)
     progress = Progress("photos and their SR images", "photos", len(frames))
-    made, work_log = list[View](), WorkLog()
+    made, work_log = list[View](), WorkLog() if work_log is None else work_log
     with work_log.stage("photos and SR images"):
         for frame, photo in zip(frames, photos_of(frames, views), strict=True):
             made.append(maker.view(frame, photo, required=len(made) < len(train_frames)))

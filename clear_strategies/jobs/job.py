@@ -7,9 +7,9 @@ import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -91,6 +91,7 @@ class _Job:
     folder: Path
     overrides: Sequence[str] | None
     claim: Callable[[], None]
+    began: float = field(default_factory=time.perf_counter)
 
     @property
     def chosen(self) -> plan.Chosen:
@@ -122,8 +123,9 @@ class _Job:
         level = logging.DEBUG if _in_sweep() else logging.INFO
         self._announce(scene, state, drawing, f"{threads} ({reason})", level)
         results.remove_earlier(folder, all_files=state.t == 1)
-        evaluation, seconds = self._train(scene, there, state, drawing)
-        _log.log(level, "%s", metrics.describe(folder, evaluation, seconds))
+        evaluation, training = self._train(scene, there, state, drawing)
+        seconds = time.perf_counter() - self.began
+        _log.log(level, "%s", metrics.describe(folder, evaluation, seconds, _parts(scene, state, training)))
         if _in_sweep():
             _log.info("%s", metrics.describe_job(HydraConfig.get().job.num, folder, evaluation, seconds))
         if few:
@@ -178,9 +180,10 @@ class _Job:
     def _train(
         self, scene: Scene, there: Scene, state: TrainState, drawing: device.ReadyRasterizer
     ) -> tuple[Evaluation, float]:
-        """Train to the end and write the files; return the scores and the seconds of training."""
+        """Train to the end and write the files; return the scores and the seconds of training in this command."""
         title, alone, painter = self.chosen.title, device.jobs_at_once() == 1, Painter(state.field, drawing.make)
-        began = time.perf_counter() - state.seconds  # with what a resumed run took before
+        before = state.seconds  # what a resumed run took
+        began = time.perf_counter()
         with signals.interrupted("before the run was finished", lambda: resume.newest(self.folder)):
             write_cameras(self.folder, scene)
             with (
@@ -189,14 +192,26 @@ class _Job:
             ):
                 checkpoints = self.folder / CHECKPOINTS
                 fit(state, there, drawing.rasterizer, checkpoints=checkpoints, config=self.compared, progress=progress)
-            seconds = time.perf_counter() - began
+            training = time.perf_counter() - began
             self.conductor.on_fit_end()  # its memory is for the results
             memory.release()
             evaluation = results.write_results(
-                self.folder, scene, state, drawing.rasterizer, painter, self.chosen, backend=drawing.name, seconds=seconds,
-                down=self.settings.data.views.downsample, config=self.compared, antialiased=drawing.rules.antialiased,
+                self.folder, scene, state, drawing.rasterizer, painter, self.chosen, backend=drawing.name,
+                seconds=before + training, down=self.settings.data.views.downsample, config=self.compared, antialiased=drawing.rules.antialiased,
             )  # fmt: skip
-        return evaluation, seconds
+        return evaluation, training
+
+
+_PREPARED: Final = "views prepared"
+_AFTER: Final = ("evaluate", "maps", "contact sheet and curves", "video")
+
+
+def _parts(scene: Scene, state: TrainState, training: float) -> dict[str, float]:
+    """The seconds of what a command does, one stage after the other."""
+    entries = state.conductor.work_log.entries
+    before = {**scene.work_log.entries, **{name: e for name, e in entries.items() if name == _PREPARED}}
+    after = sum(entries[name].seconds for name in _AFTER if name in entries)
+    return {**{name: e.seconds for name, e in before.items()}, "training": training, "scores and pictures": after}
 
 
 def _in_sweep() -> bool:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, cast
 
+from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.capture import MORE_PHOTOS, Capture
 from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.photo_folders import require_text
@@ -92,7 +93,9 @@ def load(
     Args:
         decorate: applied to the chosen prior, see `Conductor.prior`.
     """
-    capture, views = read(data, prior)
+    work_log = WorkLog()
+    with work_log.stage("capture and poses"):
+        capture, views = read(data, prior)
     if data.save_lr is not None:
         chosen: Prior = Bicubic()  # the images that the prior itself reads may not exist yet
     elif isinstance(prior, AutoPrior):
@@ -101,7 +104,7 @@ def load(
         chosen = prior(truth=_photos(at_hr(capture, views)))
     else:
         chosen = cast("Prior", prior)
-    scene = prepare(capture, views, decorate(cached(chosen)), data.cloud, seed=seed)
+    scene = prepare(capture, views, decorate(cached(chosen)), data.cloud, seed=seed, work_log=work_log)
     # Logged once the photos are known to be usable.
     if isinstance(prior, AutoPrior) and data.save_lr is None and views.photos_are != "both":
         if isinstance(chosen, Bicubic):

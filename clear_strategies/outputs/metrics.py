@@ -202,12 +202,17 @@ def _scores_of(view: View, image: Float[Tensor, "H W 3"], down: DownKernel) -> d
         return dict(zip(scored, threads.map(against.score, scored.values()), strict=True))
 
 
-def describe(folder: Path, evaluation: Evaluation, seconds: float) -> str:
-    """The mean scores of the test and training views: of the run, and of the images that it is compared with."""
+def describe(folder: Path, evaluation: Evaluation, seconds: float, parts: Mapping[str, float]) -> str:
+    """What the command took, and the mean scores of the test and training views, of the run and of what it is compared with.
+
+    Args:
+        seconds: of the whole command. parts: of its stages, by name; those that take a second or more are told.
+    """
     folder = _relative(folder)
     rows = [(part, *row) for part in ("test", "train") for row in _rows(part, evaluation)]
     width = max((len(image) for _, image, _ in rows), default=0)
-    lines = [f"done in {seconds:.0f} s: {folder}"]
+    told = ", ".join(f"{name} {_duration(part)}" for name, part in parts.items() if part >= 1)
+    lines = [f"done in {_duration(seconds)}{f' ({told})' if told else ''}: {folder}"]
     lines += [f"  {part:<5}  {image:<{width}}  {numbers}" for part, image, numbers in rows]
     if rows:
         lines.append(_LEGEND)
@@ -227,7 +232,12 @@ def describe_job(number: int, folder: Path, evaluation: Evaluation, seconds: flo
     """One line, of a job among many."""
     means = ((part, mean) for part in ("test", "train") if (mean := evaluation.mean(part)) is not None)
     score = next((f", {part} views {mean.psnr:.2f} dB" for part, mean in means), "")
-    return f"job {number}: done in {seconds:.0f} s{score}: {_relative(folder)}"
+    return f"job {number}: done in {_duration(seconds)}{score}: {_relative(folder)}"
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
 def _relative(folder: Path) -> Path:

@@ -353,7 +353,7 @@ class CameraNumbers(NamedTuple):
 
 def numbers_of(camera: Camera, device: torch.device) -> CameraNumbers:
     """Those of this camera object. The device of tensors has a number, which "cuda" lacks."""
-    if device.type == "cuda" and device.index is None:
+    if str(device) == "cuda":
         device = torch.device("cuda", torch.cuda.current_device())
     return _numbers_of(camera, device)
 

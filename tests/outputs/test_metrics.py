@@ -113,8 +113,10 @@ def rows(text: str) -> dict[str, str]:
 
 
 def test_the_images_that_ours_is_compared_with_stand_below_it() -> None:
-    text = describe(Path("run"), Evaluation(TABLE, {}, {}, {}, 0), 12.7)
-    assert text.startswith("done in 13 s: run\n")
+    text = describe(
+        Path("run"), Evaluation(TABLE, {}, {}, {}, 0), 72.7, {"poses": 60.2, "points": 0.4, "training": 12.0}
+    )
+    assert text.startswith("done in 1 min 13 s (poses 1 min 0 s, training 12 s): run\n")
     found = rows(text)
     assert list(found)[:3] == [f"test   {name}" for name in ("ours", "bicubic", "prior")]
     assert " ".join(found["test   ours"].split()) == "PSNR 23.50 dB SSIM 0.7000 GMSD 0.1000 blur +0.0100"
@@ -126,7 +128,7 @@ def test_the_images_that_ours_is_compared_with_stand_below_it() -> None:
 
 def test_what_is_missing_has_no_row_and_no_note() -> None:
     def told(*tables: Table, against: str = "HR photos") -> str:
-        return describe(Path("run"), Evaluation(*tables, {"train": against}, {}, 200), 12.7)
+        return describe(Path("run"), Evaluation(*tables, {"train": against}, {}, 200), 12.7, {})
 
     def images(text: str) -> list[str]:
         return [line.split()[1] for line in text.splitlines() if line.startswith("  train ")]
