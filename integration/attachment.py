@@ -166,11 +166,12 @@ class Attachment:
     ) -> tuple[HrSide[Grads], Grads | None]:
         """The gradients of HR, and the same of the raw parameters where HR takes part in the merge."""
         conductor, mask, drawn = self.conductor, self._masks.get(view.name), render_at("hr", z, view)
+        merges = conductor.objective.lambda_hr(t) > 0
         fine = None if mask is None else enlarged_mask(mask.to(params["means"]), view.factor)[..., None]
         if isinstance(drawn, Drawable):
             work = self._own_drawing.hr(drawn, view, t, fine)
             self._replayed = work.numbers
-            return work.hr, work.routed
+            return work.hr, work.routed if merges else None
         shot = drawn.shot
         if len(shot.drawings) > 1:
             self._count_parts(len(shot.drawings))
@@ -178,7 +179,7 @@ class Attachment:
             shot = replace(shot, image=shot.image * fine.to(shot.image))
         apart = shot.drawing is not None or "detail" in shot.params
         hr = conductor.hr_gradients(shot, view, t, AutogradShot.gradients, apart=apart, params=params)
-        return hr, shot.routed(hr, conductor.objective.lambda_hf) if conductor.objective.lambda_hr(t) > 0 else None
+        return hr, shot.routed(hr, conductor.objective.lambda_hf) if merges else None
 
     def _of_extra(self, extra: ExtraView, view: View, t: int, render_at: RenderAt) -> Grads:
         """The gradient of an extra view."""

@@ -197,7 +197,8 @@ class _Job:
             memory.release()
             evaluation = results.write_results(
                 self.folder, scene, state, drawing.rasterizer, painter, self.chosen, backend=drawing.name,
-                seconds=before + training, down=self.settings.data.views.downsample, config=self.compared, antialiased=drawing.rules.antialiased,
+                down=self.settings.data.views.downsample, seconds=before + training, config=self.compared,
+                antialiased=drawing.rules.antialiased,
             )  # fmt: skip
         return evaluation, training
 
