@@ -199,8 +199,7 @@ class OwnDrawing:
             made = self._compared(given, asked, shown, t)
             return made, {**made[0].losses, **conductor.take_logs(logged)}
 
-        facts = ("hr", view.factor, view.background, conductor.objective.lambda_hr(t) > 0)
-        (hr, g), numbers = self._done(asked, given, t, facts, work)
+        (hr, g), numbers = self._done(asked, given, t, ("hr", view.factor), work)
         params = {name: p.detach() for name, p in asked.params.items()}
         hr = replace(hr, step=replace(hr.step, t=t, view=view, params=params))
         routed = to_parameters(g, asked.drawn, asked.params)
@@ -221,7 +220,7 @@ class OwnDrawing:
             (g,) = shot.gradients(conductor.extra_loss(shot.image, shown, t).cotangents)
             return g, {}
 
-        g, _ = self._done(asked, given, t, ("extra", extra.background, extra.robust), work)
+        g, _ = self._done(asked, given, t, ("extra", extra.robust), work)
         found = every_number(to_parameters(g, asked.drawn, asked.params), asked.params)
         return Grads({name: x.clone() for name, x in found.items()})  # some are those that the next replay overwrites
 
@@ -241,8 +240,9 @@ class OwnDrawing:
         rasterizer, log = asked.rasterizer, self._conductor.work_log
         if self._replays is None or not can_be_recorded(rasterizer):
             return work(given, False)
-        state = [rows.data_ptr() for rows in self._conductor.state_dict().values()]
-        kind = Kind((len(asked.drawn["means"]), *state), given.shapes, (rasterizer, asked.bands, *facts))
+        asked_of = (self._conductor.owner(hook) for hook in ("observe", "route"))
+        state = [rows.data_ptr() for s in asked_of if s is not None for rows in s.state.values()]
+        kind = Kind((len(asked.drawn["means"]), *state), given.shapes, (rasterizer, *facts))
         return self._replays.do(
             kind, t, given,
             live=lambda: work(given, False), record=lambda: _Recorded(log, rasterizer, given, work),

@@ -55,11 +55,12 @@ class Photo:
         return replace(self, image=self.image.to(device), shown=shown, transparency=transparency)
 
     def over(self, color: Color | None, background: Color) -> Photo:
-        """The photo before `color` in place of `background`, as far as it is transparent; itself for None."""
+        """The photo before `color` in place of `background`, as far as it is transparent, and then opaque; itself for None."""
         if color is None or self.transparency is None:
             return self
         change = self.image.new_tensor(color) - self.image.new_tensor(background)
-        return replace(self, image=(self.image + self.transparency[..., None] * change).clamp(0, 1))
+        image = (self.image + self.transparency[..., None] * change).clamp(0, 1)
+        return replace(self, image=image, transparency=None)
 
     def factor_to(self, max_pixels: int) -> int:
         """The smallest whole factor that reduces it to at most `max_pixels`."""

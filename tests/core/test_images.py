@@ -88,6 +88,7 @@ def test_a_photo_before_another_background_is_composited_over_it():
     torch.testing.assert_close(over(white).reduced(2).over(sky, white).image, over(sky).reduced(2).image)
     photo = over(white)
     assert photo.over(None, white) is photo
+    assert (opaque := photo.over(sky, white)).over(white, sky) is opaque
     assert torch.equal(Photo(camera, rgb).over(sky, white).image, rgb)
     view = View("photo", photo.reduced(2), photo, background=white)
     assert view.brightened(torch.full((3,), 0.5)).lr.transparency is None

@@ -9,6 +9,7 @@ import clear_strategies as cs
 from clear_strategies import Conductor
 from clear_strategies.core.view import ExtraView
 from clear_strategies.merging.replays import LIVE
+from clear_strategies.merging.skips import Skips
 from clear_strategies.schedules import Ramp
 from integration import own_drawing
 from rasterizers.recording import running
@@ -34,18 +35,78 @@ class TwoPhotos(cs.Strategy):
         self.__dict__["views"] = views
 
 
-def everything(**of_p2g) -> list[cs.Strategy]:
-    return [cs.GCO(), cs.P2G(**of_p2g), cs.SVS(looks=0, dropout=Ramp(full=5), anchor_start=100), TwoPhotos()]
+@dataclass(frozen=True)
+class SometimesRobust(TwoPhotos):
+    """One of its photos was invented in part."""
+
+    def extra_views(self, t):
+        first, second = super().extra_views(t)
+        return first, replace(second, robust=True)
 
 
-def trained(hr_by, *, steps=6, strategies=None, scene=SCENE, objective=HR_FROM_START, call=None, **settings):
-    """The host's parameters, the log of each step, and the attachment."""
-    host = Host(scene, **(call or {}))
-    conductor = Conductor(*(everything() if strategies is None else strategies), objective=objective)
-    clear = attached(host, scene, conductor, hr_by=hr_by, **settings)
+@dataclass(frozen=True)
+class Sees(cs.GCO):
+    """Logs what it is told of its iteration."""
+
+    def reconcile(self, products, step):
+        self.log("t", step.t)
+        self.log("view", int(step.view.name[-1]))
+        self.log("means", float(step.params["means"].sum()))
+        return super().reconcile(products, step)
+
+
+@dataclass(frozen=True)
+class Trusts(cs.Strategy):
+    """Trusts HR by the factor of the view, and by a number of each Gaussian that is another one after some steps."""
+
+    def looked_up(self, view):
+        return view.lr.image.new_zeros(1)
+
+    def observe(self, step, hr):
+        trust = self.state.get("trust", torch.ones_like(hr.means2d[:, 0])) / step.view.factor
+        return cs.Evidence(trust, trust)
+
+    def route(self, step):
+        return step.evidence.reliability
+
+    def after_step(self, params, step):
+        if step.t == 10:
+            self.state["trust"] = params["opacities"].sigmoid()
+
+
+def everything() -> list[cs.Strategy]:
+    return [Sees(), cs.P2G(), cs.SVS(looks=0, dropout=Ramp(full=5), anchor_start=100), TwoPhotos()]
+
+
+def transparent(scene):
+    """The scene where the background shows through its photos, on the right more than on the left."""
+
+    def faded(photo):
+        through = torch.linspace(0, 1, photo.image.shape[1], device=photo.image.device)
+        return replace(photo, transparency=through.expand(photo.image.shape[:2]))
+
+    return replace(scene, train=tuple(replace(v, lr=faded(v.lr), hr=faded(v.hr)) for v in scene.train))
+
+
+def trained(
+    hr_by, *, steps=6, strategies=None, scene=SCENE, objective=HR_FROM_START, skips=None, calls=({},), **settings
+):  # fmt: skip
+    """The host's parameters, the log of each step, and the attachment.
+
+    Args:
+        calls: what the host gives its rasterizer besides, one after the other.
+    """
+    host = Host(scene, **calls[0])
+    strategies = everything() if strategies is None else strategies
+    clear = attached(host, scene, Conductor(*strategies, objective=objective, skips=skips), hr_by=hr_by, **settings)
     host.degree = lambda step: 2 if step < 3 else 3
     names, logs = [view.name for view in scene.train], []
-    host.train([names[i % len(names)] for i in range(steps)], between=lambda: logs.append(clear.attachment.log))
+
+    def between():
+        logs.append(clear.attachment.log)
+        host.call |= calls[len(logs) % len(calls)]
+
+    host.train([names[i % len(names)] for i in range(steps)], between=between)
     clear.remove()
     return {name: p.detach().clone() for name, p in host.splats.items()}, logs, clear
 
@@ -58,8 +119,9 @@ def require_close(found, expected):
 @pytest.mark.parametrize(
     "differs",
     [
-        {}, {"call": {"backgrounds": torch.tensor([[0.2, 0.5, 0.7]])}}, {"call": {"rasterize_mode": "antialiased"}},
+        {}, {"calls": [{"backgrounds": torch.tensor([[0.2, 0.5, 0.7]])}, {"rasterize_mode": "antialiased"}, {"sh_fp16": True}]},
         {"detail": False}, {"masks": True}, {"strategies": []},
+        {"scene": transparent(SCENE), "strategies": [*everything(), cs.RandomBackground()]},
     ],
     ids=lambda x: next(iter(x), "ordinary"),
 )  # fmt: skip
@@ -120,11 +182,11 @@ def scene(recorded_on):
     return SCENE.to(recorded_on)
 
 
-def both(monkeypatch, scene, **settings):
+def both(monkeypatch, **settings):
     """The replayed training, after a comparison with the live one: the same bits."""
-    replayed = trained("warp", scene=scene, objective=WARP, **settings)
+    replayed = trained("warp", objective=WARP, **settings)
     monkeypatch.setattr(own_drawing, "_RECORDING", set())
-    live = trained("warp", scene=scene, objective=WARP, **settings)
+    live = trained("warp", objective=WARP, **settings)
     assert not [name for name, x in live[0].items() if not torch.equal(x, replayed[0][name])]
     assert replayed[1] == live[1]
     entries = replayed[2].attachment.conductor.work_log.entries
@@ -133,19 +195,45 @@ def both(monkeypatch, scene, **settings):
 
 @needs_warp
 def test_replays_of_hr_and_of_extra_views_have_the_bits_of_live_ones(monkeypatch, scene):
-    runs, live = both(monkeypatch, scene, steps=9)
+    runs, live = both(monkeypatch, scene=scene, steps=9)
     assert live.keys() == {FIRST}
     assert runs > 9
 
 
-@needs_warp
-@pytest.mark.parametrize("detail", [True, False])
-def test_replays_over_masks_and_backgrounds(monkeypatch, scene, detail):
-    mask = torch.ones(scene.train[0].lr.image.shape[:2], device=scene.train[0].lr.image.device)
+def masked(scene):
+    """The mask of the first photo alone."""
+    mask = torch.ones_like(scene.train[0].lr.image[..., 0])
     mask[:5] = 0
-    runs, live = both(monkeypatch, scene, steps=6, masks={scene.train[0].name: mask}, detail=detail)
+    return {scene.train[0].name: mask}
+
+
+def of_two_factors(scene):
+    """The first photo has half the size of the others, and its SR image the same."""
+    first, *others = scene.train
+    return replace(scene, train=(replace(first, lr=first.lr.reduced(2)), *others))
+
+
+DIFFERS = {
+    "mask": lambda s: {"masks": masked(s)},
+    "mask, without f_det": lambda s: {"masks": masked(s), "detail": False},
+    "background of a strategy": lambda s: {"scene": transparent(s), "strategies": [*everything(), cs.RandomBackground()]},
+    "background of the loop": lambda s: {
+        "calls": [{"backgrounds": s.train[0].hr.image.new_tensor([[x, 0.5, 0.7]])} for x in (0.1, 0.2, 0.9)]
+    },
+    "rasterizer": lambda s: {"calls": [{"rasterize_mode": mode} for mode in ("classic", "antialiased")]},
+    "factor and state": lambda s: {"scene": of_two_factors(s), "strategies": [Trusts()], "steps": 18},
+    "every second without HR": lambda s: {"skips": Skips(coarse_until=100, hr_every=2)},
+    "state that HR does not read": lambda s: {"strategies": [cs.SplatSuRe(), cs.P2G()]},
+    "robust": lambda s: {"strategies": [SometimesRobust()]},
+}  # fmt: skip
+
+
+@needs_warp
+@pytest.mark.parametrize("differs", DIFFERS)
+def test_what_differs_between_steps_is_copied_or_makes_their_work_of_two_kinds(monkeypatch, scene, differs):
+    runs, live = both(monkeypatch, **{"scene": scene, "steps": 8, **DIFFERS[differs](scene)})
     assert live.keys() == {FIRST}
-    assert runs > 4
+    assert runs >= 3
 
 
 @needs_warp
