@@ -182,6 +182,24 @@ def test_weights_of_any_form_and_rows_beside_factors_are_merged_as_written(passe
             assert torch.allclose(x, exact, rtol=1e-5, atol=1e-6 * float(exact.abs().max())), name
 
 
+def test_opposed_are_gradients_of_a_cosine_below_0_where_neither_is_0(passes):
+    lr = Grads({"means": torch.tensor([[1.0, 0, 0], [1, 0, 0], [1, 0, 0], [0, 0, 0], [1, 0, 0]])})
+    hr = Grads({"means": torch.tensor([[-1.0, 0, 0], [0, 1, 0], [1, 0, 0], [1, 0, 0], [0, 0, 0]])})
+    found = reconcile.products(lr, hr)
+    of_means_and_whole = (found.comparable[0], found.comparable[-1], found.opposed[0], found.opposed[-1])
+    assert deferred.read(of_means_and_whole) == [3, 3, 1, 1]
+
+
+@pytest.mark.parametrize("wrong", [torch.ones(N - 1), torch.ones(1), torch.ones(N, 1), torch.ones(N, 7), torch.ones(6)])
+def test_weights_of_other_shapes_are_refused(passes, wrong):
+    g = Grads(drawn(1, ["means"]))
+    for weights in (Weights(keep=wrong), Weights(remove=wrong)):
+        with pytest.raises(
+            ValueError, match=r"Weights\.(keep|remove) must be a number, or a tensor \[1003\] or \[1003, 6\]"
+        ):
+            reconcile.apply({"means": torch.empty(N, 3)}, g, g, weights)
+
+
 @pytest.mark.parametrize("names", [("means",), ("opacities", "sh0", "shN"), ("means", "quats", "scales", "detail")])
 def test_frozen_attributes_stay_frozen(passes, names):
     made = conductor()

@@ -230,6 +230,32 @@ def test_bands_with_momentum_are_not_left_out(passes):
     assert bool((c.fields[1].shN.data[:, 10] != 0).all())
 
 
+@pytest.mark.parametrize(
+    ("degrees", "moved", "skipped"),
+    [((1, 1), {1: 10}, 12), ((2, 1), {}, 7), ((0, 1), {0: 1}, 12)],
+    ids=["momentum in other tensors", "a lower degree", "a higher degree"],
+)
+def test_bands_are_examined_again_where_their_momentum_may_be_another(passes, degrees, moved, skipped):
+    """`moved`: before which step a band of new tensors has momentum."""
+    states = []
+    for skips in (True, False):
+        cases = [case(20, degree=degree) for degree in degrees]
+        params, conductor = cases[0].fields[1].raw(), conductors()[1]
+        adam = Adam(params, LearningRates(), 1.0)
+        step = CompiledStep(conductor, adam, skips=skips, passes=passes)
+        for i, c in enumerate(cases):
+            if i in moved:
+                for moments, value in ((adam.first, 1e-3), (adam.second, 1e-6)):
+                    moments["shN"] = moments["shN"].clone()
+                    moments["shN"][:, moved[i]] = value
+            step.step(params, *c.factors(1), T)
+        states.append([*params.values(), *adam.first.values(), *adam.second.values()])
+        if skips:
+            entry = conductor.work_log.entries["SH bands in the optimizer"]
+            assert entry.skipped == {"above the active degree": skipped}
+    assert all(torch.equal(a, b) for a, b in zip(*states, strict=True))
+
+
 def test_the_same_bits_for_any_number_of_threads(passes):
     states = []
     threads = torch.get_num_threads()

@@ -12,7 +12,7 @@ from clear_strategies.core import deferred
 from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads
-from clear_strategies.kernels.reconcile.tables import FIRST_BANDS, row_width
+from clear_strategies.kernels.reconcile.tables import FIRST_BANDS, WeightTable, row_width, weight_tables
 
 
 def products(lr: Grads, hr: Grads, names: Sequence[str]) -> Products:
@@ -33,9 +33,11 @@ def apply(
     out: Mapping[str, Tensor], lr: Grads, hr: Grads, weights: Weights, lambda_hr: float, plus: Grads, keeps_lr: bool
 ) -> Number:
     """See `kernels.reconcile.apply`."""
+    first = next(iter(out.values()))
+    tables = weight_tables(weights, len(first), first.device)
     for name, to in out.items():
         low, high, added = (_rows(g, name, to.shape[1:].numel(), to) for g in (lr, hr, plus))
-        keep, remove = (_weight(w, name) for w in (weights if name in CONFLICT_GROUPS else Weights()))
+        keep, remove = (_weight(table, name) for table in tables) if name in CONFLICT_GROUPS else Weights()
         g_hr = keep * high - remove * low  # Eq. 7
         total = low + lambda_hr * g_hr if keeps_lr else g_hr  # Eq. 8
         to.copy_((total + added).view(to.shape))
@@ -55,8 +57,8 @@ def _rows(g: Grads, name: str, width: int, like: Tensor | None = None) -> Float[
     return rows
 
 
-def _weight(w: float | Tensor, name: str) -> float | Float[Tensor, "N 1"]:
-    if not isinstance(w, Tensor):
-        return w
-    w = w.double()
-    return w[:, CONFLICT_GROUPS.index(name), None] if w.dim() == 2 else w.view(-1, 1)
+def _weight(table: WeightTable, name: str) -> float | Float[Tensor, "N 1"]:
+    number, rows, stride = table
+    if rows is None:
+        return number
+    return (rows[CONFLICT_GROUPS.index(name)] if stride else rows)[:, None]
