@@ -222,18 +222,20 @@ class Running:
     def tensors(self):
         return {**{k: p for k, p in self.splats.items() if k != ROWS}, **self.beside}
 
-    def step(self, number: int) -> bool:
-        """One step of the host; whether a strategy took part. It is compared with the reference before the optimizers step."""
+    def step(self, number: int) -> int:
+        """One step of the host; its passes in which a strategy took part. It is compared with the reference before the
+        optimizers step.
+        """
         loop = self.loop
         if number == loop.frozen_from:
             for name in loop.frozen:
                 self.splats[name].requires_grad_(False).grad = None
-        brought = False
+        brought = 0
         for i in range(loop.accumulation):
             view = scene().train[(number + i) % 3]
             p = self.tensors()
             expected, by_this = reference(loop, self.conductor, {k: copied(x) for k, x in p.items()}, view)
-            brought |= by_this
+            brought += by_this
             hooks = []
             picture = pictures(loop, self.function, p, hooks)
             loss = loss_of(loop, p, picture(view.lr), view, hooks)
@@ -248,6 +250,8 @@ class Running:
             compare(p, expected)
             for hook in filter(None, hooks):
                 hook.remove()
+        passes = self.clear.attachment.state_dict()["passes"]
+        assert passes == brought, f"{passes} passes are counted, not {brought}"
         if loop.densified and number == 0:
             self.prune()
         trained = [p for name, p in self.splats.items() if p.grad is not None and bool(p.grad.any())]

@@ -16,6 +16,7 @@ from rasterizers import autograd
 from tests.helpers import gsplat_host, toy
 from tests.helpers.backends import needs
 from tests.helpers.gsplat_host import Host, started
+from tests.helpers.host_parts import HR_FROM_START, WITHOUT_HR
 
 
 def with_detail():
@@ -221,14 +222,42 @@ def test_a_host_that_draws_twice_for_one_rendering_has_the_same_gradients_and_is
         assert torch.allclose(gradients[1][name], g, rtol=1e-4, atol=1e-7), name
 
 
-@pytest.mark.parametrize("stepped", [True, False])
-def test_a_detail_feature_that_no_optimizer_steps_on_gives_a_warning(stepped, caplog):
-    host, _, render = started()
+@pytest.mark.parametrize(
+    ("stepped", "accumulation", "objective", "warnings"),
+    [
+        (False, 1, HR_FROM_START, 1),
+        (True, 1, HR_FROM_START, 0),
+        (False, 2, HR_FROM_START, 0),
+        (False, 1, WITHOUT_HR, 0),
+    ],
+)
+def test_a_detail_feature_whose_ten_gradients_no_optimizer_steps_on_gives_a_warning(
+    stepped, accumulation, objective, warnings, caplog
+):
+    scene = toy.scene(20)
+    host = Host(scene)
+    conductor = Conductor(P2G(patch=4), objective=objective, statistics_from=0)  # HR is drawn without λ_HR, too
+    clear = gsplat_host.attached(host, scene, conductor, accumulation=accumulation)
     for i in range(12):
-        render(i % 3).mean().backward()
+        host.render(scene.train[i % 3].lr.camera)[0].mean().backward()
         if stepped:
             host.optimizers["detail"].step()
-    assert caplog.text.count("f_det has no effect") == (0 if stepped else 1)
+    assert clear.attachment.counts["HR renders"] == 12
+    assert caplog.text.count("f_det has no effect") == warnings
+
+
+@pytest.mark.parametrize("before_the_drawing", [True, False])
+def test_what_a_loop_itself_adds_to_the_gradient_of_f_det_stays(before_the_drawing):
+    """Autograd goes backwards: what comes of a node that is older than the drawing comes after the drawing's gradient."""
+    merged = []
+    for adds in (0, 1):
+        host, _, render = started()
+        image = None if before_the_drawing else render()
+        penalty = adds * host.splats["detail"].sum()
+        image = render() if image is None else image
+        (image.mean() + penalty).backward()
+        merged.append(host.splats["detail"].grad)
+    assert torch.allclose(merged[1] - merged[0], torch.ones(20, 3))
 
 
 @pytest.mark.parametrize("own_background", [False, True])

@@ -192,30 +192,33 @@ def test_a_loop_goes_back_to_a_checkpoint_with_another_number_of_gaussians():
 
 @dataclass(frozen=True)
 class Reads(Strategy):
-    """Keeps the parameters that it is shown."""
+    """Keeps what it is shown of each Gaussian."""
 
     seen: list = field(default_factory=list)
 
     def reconcile(self, products, step):
-        self.seen.append({name: p.clone() for name, p in step.params.items()})
+        self.seen.append(({name: p.clone() for name, p in step.params.items()}, step.visible))
         return Weights()
 
     def after_step(self, params, step):
-        self.seen.append(step.params)
+        self.seen.append((step.params, step.visible))
 
 
-def test_a_strategy_sees_the_raw_parameters_until_the_structure_changes():
+def test_a_strategy_sees_the_raw_parameters_until_the_structure_changes_and_which_gaussians_are_visible():
     reads = Reads()
     host, clear, render = gsplat_host.started(reads)
+    host.splats["means"].data[5] += 1_000
     before = {name: p.detach().clone() for name, p in clear.params().items()}
     render(0).mean().backward()
     for name, p in host.splats.items():
         host.splats[name] = torch.nn.Parameter(p.detach()[1:], requires_grad=p.requires_grad)
     render(1)
-    merging, stepped = reads.seen
+    (merging, visible), (stepped, still_visible) = reads.seen
     assert merging.keys() == before.keys()
     assert all(torch.equal(merging[name], p) for name, p in before.items())
     assert not stepped
+    assert visible.tolist() == [i != 5 for i in range(20)]
+    assert torch.equal(still_visible, visible[1:])
 
 
 @pytest.mark.parametrize("last", [4, 5])

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from clear_strategies import GCO, P2G, Conductor
+from clear_strategies import GCO, P2G, SVS, Conductor
 from clear_strategies.compose import conductor as composed_conductor
 from clear_strategies.errors import SettingError
 from clear_strategies.merging.detail import DetailRates
@@ -126,6 +126,16 @@ def test_a_step_without_a_strategy_is_refused_at_first_and_told_later_with_its_c
     assert clear.attachment.counts["steps of the host alone"] == 3
 
 
+def test_a_step_begins_after_each_merge_whichever_optimizers_take_part():
+    host, clear, render = started()
+    for name in ("means", "scales"):
+        render().mean().backward()
+        host.optimizers[name].step()
+    assert clear.attachment.counts["steps of the host alone"] == 0
+    host.optimizers["scales"].step()
+    assert clear.attachment.counts["steps of the host alone"] == 1
+
+
 def test_a_step_inside_of_the_backward_pass_is_refused():
     host, _, render = started()
     host.splats["means"].register_post_accumulate_grad_hook(lambda p: host.optimizers["means"].step())
@@ -154,16 +164,29 @@ def test_the_densifier_reads_a_score_that_has_the_scale_of_its_own_gradients(acc
     assert torch.allclose(*read, rtol=1e-5, atol=0)
 
 
-def test_hr_is_left_out_of_every_second_step_but_where_the_densifier_reads_its_score():
-    for threshold, drawn in ((None, 3), (1e-4, 6)):
-        scene = toy.scene(20)
-        host = Host(scene)
-        conductor = Conductor(P2G(patch=4), objective=HR_FROM_START, skips=Skips(coarse_until=100, hr_every=2))
-        strategy = SimpleNamespace(refine_stop_iter=0, grow_grad2d=threshold)
-        clear = attached(host, scene, conductor, strategy=strategy)
-        host.train([scene.train[i % 3].name for i in range(6)])
-        assert clear.attachment.counts["HR renders"] == drawn
-        assert clear.attachment.counts["merges"] == 6
+@pytest.mark.parametrize(
+    ("threshold", "anchor_start", "with_hr"),
+    [(None, 100, [1, 3, 5]), (1e-4, 100, [1, 2, 3, 4, 5, 6]), (1e-4, 4, [1, 2, 3, 5])],
+)
+def test_hr_is_left_out_of_every_second_step_but_where_a_densifier_reads_its_score(threshold, anchor_start, with_hr):
+    """It has half its size then."""
+    scene, widths, logs = toy.scene(20), set(), []
+
+    @functools.wraps(autograd.rasterization)
+    def recorded(**call):
+        widths.add(call["width"])
+        return gsplat_host.rasterization(**call)
+
+    host = Host(scene, rasterization=recorded)
+    strategies = P2G(patch=4), SVS(anchor_start=anchor_start)
+    conductor = Conductor(*strategies, objective=HR_FROM_START, skips=Skips(coarse_until=100, hr_every=2))
+    strategy = SimpleNamespace(refine_stop_iter=0, grow_grad2d=threshold)
+    clear = attached(host, scene, conductor, strategy=strategy)
+    host.train([scene.train[i % 3].name for i in range(6)], between=lambda: logs.append(clear.attachment.log))
+    assert [int(log["t"]) for log in logs if "mean_q" in log] == with_hr
+    assert clear.attachment.counts["HR renders"] == len(with_hr)
+    assert clear.attachment.counts["merges"] == 6
+    assert widths == {24, 48}
 
 
 def test_a_loop_that_ends_before_hr_takes_part_is_told(caplog):
