@@ -27,7 +27,6 @@ from clear_strategies.merging.replays import (
     RecordedWork,
     Replays,
     copied,
-    looked_up_by,
     why_strategies_are_not_recorded,
     write,
 )
@@ -175,7 +174,7 @@ class OwnDrawing:
     """
 
     def __init__(self, conductor: Conductor, device: torch.device) -> None:
-        self._conductor, self._look_up = conductor, looked_up_by(conductor)
+        self._conductor = conductor
         self._replays: Replays | None = None
         if device.type in _RECORDING:
             self._replays = Replays(device, conductor.work_log, "the replay of HR")
@@ -188,14 +187,14 @@ class OwnDrawing:
         """Draw the view at HR, compare it with the SR image, and route the gradients."""
         conductor = self._conductor
         photo = view.hr.over(conductor.background(t), view.background)
-        known = None if self._replays is None else self._look_up(view)
+        known = None if self._replays is None else conductor.looked_up(view)
         given = _Given(asked.tensors, asked.background, asked.camera, photo, known, mask)
 
         def work(given: _Given, recorded: bool) -> tuple[tuple[HrSide[Grads], Grads], dict[str, Number]]:
             if not recorded:
                 return self._compared(given, asked, view, t), {}
             logged = conductor.logs()
-            shown = View(view.name, view.lr, given.photo, background=view.background, looked_up=given.known)
+            shown = View(view.name, view.lr, given.photo, background=view.background)
             made = self._compared(given, asked, shown, t)
             return made, {**made[0].losses, **conductor.take_logs(logged)}
 
@@ -227,7 +226,8 @@ class OwnDrawing:
     def _compared(self, given: _Given, asked: Drawable, view: View, t: int) -> tuple[HrSide[Grads], Grads]:
         """The HR side, and g^HR of what was drawn, with f_det's.  Eq. 9, 10, 12, 13"""
         λ_hf = self._conductor.objective.lambda_hf
-        hr = self._conductor.hr_gradients(given.shot(asked), view, t, AutogradShot.gradients)
+        shot = given.shot(asked)
+        hr = self._conductor.hr_gradients(shot, view, t, AutogradShot.gradients, looked_up=given.known)
         g = hr.routed(λ_hf)
         if hr.hf is not None and hr.hf.colour is not None and asked.offset is not None:
             g["detail"] = scale_rows(hr.hf.colour.rgb, hr.m * λ_hf)

@@ -22,6 +22,7 @@ class Step:
         visible: the Gaussians that the HR render shows, [N]; None in an iteration without HR.
         evidence: the answer of `Strategy.observe`; None before it, and where no strategy gives one.
         params: raw parameters by attribute (log scales, logit opacities), to read; empty where the structure has changed since.
+        looked_up: what the strategy that observes looks up of the view (`Strategy.looked_up`); None: it looks itself.
     """
 
     t: int
@@ -29,6 +30,7 @@ class Step:
     visible: Bool[Tensor, " N"] | None = None
     evidence: Evidence | None = None
     params: Mapping[str, Tensor] = field(default_factory=dict)
+    looked_up: Tensor | None = None
 
     def resized(self, parents: Int[Tensor, " M"]) -> Step:
         """The same step after the structure changed: row i of everything per Gaussian comes from row parents[i]."""

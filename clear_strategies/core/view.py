@@ -143,7 +143,6 @@ class View:
         disagreement: |D(I) - I_LR|, where I is the SR image as the network made it and `hr` is I after back-projection, which
             removes that difference. P2G measures the reliability by it. None where `hr` is I itself.
         background: RGB in [0, 1] behind the scene; pixels of this colour belong to no surface.
-        looked_up: in place of `Strategy.looked_up` of this view; None: the strategy computes it.
     """
 
     name: str
@@ -154,7 +153,6 @@ class View:
     depth: DepthMap | None = None
     disagreement: Float[Tensor, "h w 3"] | None = None
     background: Color = (0.0, 0.0, 0.0)
-    looked_up: Tensor | None = None
 
     @property
     def factor(self) -> int:

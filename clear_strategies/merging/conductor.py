@@ -127,6 +127,10 @@ class Conductor:
             self.work_log.skip("gate", "no Gaussian is dropped at this rate")
         return z
 
+    def looked_up(self, view: View) -> Tensor | None:
+        """What the strategy that observes looks up of a view, for `Step.looked_up`."""
+        return self._owner["observe"].looked_up(view)
+
     def background(self, t: int) -> Color | None:
         """The colour behind every rendering of iteration t; None: the scene's own."""
         return self._owner["background"].background(t)
@@ -156,6 +160,7 @@ class Conductor:
         stepper: Stepper[Any] | None = None,
         *,
         scored: bool = True,
+        looked_up: Tensor | None = None,
     ) -> Update:
         """The merged gradient of one view, in place of `backward()`.
 
@@ -164,6 +169,7 @@ class Conductor:
                 stands for the area mean of hr, where `wants_lr` is False or both scales have one size.
             stepper: merges and steps in one pass; None: the readable path below.
             scored: False: no densification reads the scores of this iteration.
+            looked_up: for `Step.looked_up`.
 
         Raises:
             ValueError: a scale that the objective needs was not rendered.
@@ -194,7 +200,8 @@ class Conductor:
         else:
             # Where Î_LR is the area mean of Î_HR, the cotangent of L_LR passes through the same HR render.
             through_mean = images.area_mean_transposed(l_lr.cotangents, view.factor) if reduced else None
-            g_mean, from_hr = self._backward_hr(hr, Step(t, view, hr.visible, params=params), vjp, through_mean)
+            drawn = Step(t, view, hr.visible, params=params, looked_up=looked_up)
+            g_mean, from_hr = self._backward_hr(hr, drawn, vjp, through_mean)
             g_lr = g_mean if reduced else g_lr
         step = Step(t, view, params=params) if from_hr is None else from_hr.step
         with stage("strategies" if stepper is None else stepper.stage):
@@ -222,16 +229,18 @@ class Conductor:
         *,
         apart: bool = True,
         params: Mapping[str, Tensor] = _UNKNOWN,
+        looked_up: Tensor | None = None,
     ) -> HrSide[Any]:
         """Compare Î_HR with the SR image, backpropagate both losses in one pass, and ask for the evidence.
 
         Args:
             vjp: maps a shot and K cotangents to K gradients, each with `.screen`; None: `Shot.vjp`.
             apart: False: the gradient of L_base + λ_HF L_HF as `base`, where no strategy routes or scores by the two apart.
-            params: for `Step.params`.
+            params, looked_up: for `Step`.
         """
         apart = apart or self.owner("route") is not None or self.owner("score") is not None
-        return self._backward_hr(hr, Step(t, view, hr.visible, params=params), vjp or _vjp, apart=apart)[1]
+        step = Step(t, view, hr.visible, params=params, looked_up=looked_up)
+        return self._backward_hr(hr, step, vjp or _vjp, apart=apart)[1]
 
     def extra_views(self, t: int) -> list[ExtraView]:
         """The pictures that the field should match at t besides the view; each gets a step on `extra_loss`."""

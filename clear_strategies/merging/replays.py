@@ -148,12 +148,6 @@ def why_strategies_are_not_recorded(conductor: Conductor) -> Iterator[str]:
             yield f"{type(strategy).__name__} does not state what it looks up of a view"
 
 
-def looked_up_by(conductor: Conductor) -> Callable[..., Tensor | None]:
-    """What a recording's iteration looks up of a view."""
-    owner = conductor.owner("observe")
-    return (lambda view: None) if owner is None else owner.looked_up
-
-
 def copied(x: Tensor | None) -> Tensor | None:
     return None if x is None else x.clone()
 

@@ -187,7 +187,7 @@ class Strategy:
 
     def looked_up(self, view: View) -> Tensor | None:
         """What `observe` and `route` read of a view, if they and `score` depend on view and iteration by it and by what they are
-        given alone, so that an iteration can be recorded: in a replay they read the tensor `View.looked_up`.
+        given alone, so that an iteration can be recorded: in a replay they read the tensor `Step.looked_up`.
         """
         return None
 

@@ -68,7 +68,7 @@ class P2G(Strategy):
 
     def observe(self, step: Step, hr: Shot) -> Evidence:
         """q_i and a_i of every Gaussian that is visible in this view."""
-        maps, visible = self.looked_up(step.view), hr.visible
+        visible, maps = hr.visible, self.looked_up(step.view) if step.looked_up is None else step.looked_up
         e = per_gaussian.evidence(maps, hr.means2d, visible, self.patch * step.view.factor)  # R and A at p(u_i)  Eq. 10
         self.log("mean_q", lambda: e.means(visible)[0])
         self.log("mean_w", lambda: e.means(visible)[1])
@@ -130,8 +130,6 @@ class P2G(Strategy):
 
     def looked_up(self, view: View) -> Float[Tensor, "2 ph pw"]:
         """R and A."""
-        if view.looked_up is not None:
-            return view.looked_up
         key = (view.name, view.factor)
         if key not in self.cache:
             maps = self.patch_maps(view)

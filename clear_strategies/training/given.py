@@ -21,6 +21,7 @@ class GivenView:
     Args:
         t: the iteration. view: as the skips leave it. scales: whether "lr" and "hr" are drawn.
         gate: zᵗ. background: behind everything that is drawn; None: the scene's own.
+        looked_up: see `Step.looked_up`; a recording has it.
     """
 
     t: int
@@ -28,6 +29,7 @@ class GivenView:
     scales: Mapping[str, bool]
     gate: Tensor | None
     background: Color | None
+    looked_up: Tensor | None = None
 
     @property
     def photos(self) -> Sequence[Photo]:

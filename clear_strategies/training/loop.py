@@ -83,7 +83,8 @@ def learn(s: TrainState, rasterizer: Rasterizer, given: GivenView) -> LearnedVie
             over(rasterizer, given.background), view, gate=given.gate, **given.scales
         )
     params = θ.raw()
-    u = conductor.update(params, lr, hr, view, t, s.compiled_step, scored=s.density.collects(t))
+    scored = s.density.collects(t)
+    u = conductor.update(params, lr, hr, view, t, s.compiled_step, scored=scored, looked_up=given.looked_up)
     if u.grads is not None:  # else the compiled step has made the step
         with stage("optimizer"):
             s.optimizer.step(params, u.grads)

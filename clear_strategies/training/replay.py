@@ -25,7 +25,6 @@ from clear_strategies.merging.replays import (
     RecordedWork,
     Replays,
     copied,
-    looked_up_by,
     why_strategies_are_not_recorded,
     write,
 )
@@ -101,7 +100,7 @@ class _Recorded:
     def __init__(
         self, s: TrainState, rasterizer: Recordable, given: Given, count: Callable[[int], None], learn: Callable[..., Learned]
     ) -> None:  # fmt: skip
-        self._count, self._device, self._look_up = count, s.device, looked_up_by(s.conductor)
+        self._count, self._device, self._look_up = count, s.device, s.conductor.looked_up
         self._numbers_of = rasterizer.numbers_of
         own, self._background = self._copied(given), s.field.means.new_empty(1, 3)
         drawn_by = rasterizer if given.background is None else rasterizer.over_changing(self._background)
@@ -135,9 +134,9 @@ class _Recorded:
             extra = replace(given.extra, photo=photos[0], weight=given.extra.weight.clone())
             return replace(given, extra=extra, background=None)
         lr, hr, *_ = [*photos, given.view.hr]  # where HR is not drawn, its size alone is read
+        view = View(given.view.name, lr, hr, background=given.behind)
         looked_up = copied(self._look_up(given.view))
-        view = View(given.view.name, lr, hr, background=given.behind, looked_up=looked_up)
-        return replace(given, view=view, gate=copied(given.gate), background=None)
+        return replace(given, view=view, gate=copied(given.gate), background=None, looked_up=looked_up)
 
     def _read_of(self, given: Given) -> list[Tensor | None]:
         """All tensors that an iteration reads of what it is given."""
@@ -147,7 +146,8 @@ class _Recorded:
             read += [image, photo.shown, *self._numbers_of(photo.camera, self._device)]
         if isinstance(given, GivenExtra):
             return [*read, given.extra.weight]
-        return [*read, given.gate, self._look_up(given.view)]
+        looked_up = self._look_up(given.view) if given.looked_up is None else given.looked_up
+        return [*read, given.gate, looked_up]
 
     def _write(self, given: Given) -> None:
         write(self._own, self._read_of(given))
