@@ -99,7 +99,7 @@ class CompiledStep:
     ) -> None:
         self.conductor, self.optimizer, self.skips = conductor, optimizer, skips
         self._passes = gaussian_pass(optimizer) if passes is None else passes
-        self._changing: Tensor | None = None  # the numbers of the step on the device, of a recording
+        self._numbers: Tensor | None = None  # see `_recorded_numbers`
         self._examined: tuple[int, Sequence[Tensor]] | None = None
         self._quiet = False
 
@@ -136,13 +136,20 @@ class CompiledStep:
 
         rates, bias2 = self.optimizer.advance()
         device, (_, λ_hf) = self.optimizer.first["means"].device, self.conductor.objective.weights(t)
-        self._changing = written(self._settings(t, bias2), rates, device, lambda_hf=λ_hf, out=self._changing)
+        self._numbers = written(self._settings(t, bias2), rates, device, lambda_hf=λ_hf, out=self._numbers)
+
+    @property
+    def _recorded_numbers(self) -> Tensor | None:
+        """What changes from one replay of a recording to the next, on the device: `count` has written it. None outside of one."""
+        return None if running() is None else self._numbers
 
     def weights(self, t: int) -> LossWeights:
         """λ_HR(t) and λ_HR(t) λ_HF; of a recording on the device."""
-        if running() is not None and self._changing is not None:
-            return self._changing[0, -2:]
-        return self.conductor.objective.weights(t)
+        if (numbers := self._recorded_numbers) is None:
+            return self.conductor.objective.weights(t)
+        from clear_strategies.kernels.gaussian_step.warp import loss_weights
+
+        return loss_weights(numbers)
 
     def step_extra(self, params: Mapping[str, Tensor], shot: FieldShot, g_lr: Grads, t: int) -> None:
         """Step on this gradient alone: nothing is regularized."""
@@ -165,8 +172,8 @@ class CompiledStep:
         Args:
             given: ĝ_HR, in place of that of the losses. decays: f_det decays.
         """
-        # Of a recording, `count` has written the numbers.
-        rates, bias2 = ({}, 1.0) if running() is not None else self.optimizer.advance()
+        numbers = self._recorded_numbers
+        rates, bias2 = self.optimizer.advance() if numbers is None else ({}, 1.0)
         keep = 1 - self.optimizer.rates.detail_decay if decays else 1.0
         attributes = {
             name: kernel.Attribute(
@@ -179,7 +186,7 @@ class CompiledStep:
         all_bands, active = params["shN"].shape[1], _table(g_lr)["basis"].shape[1] - 1
         quiet = self.skips and self._above_is_quiet(active, moved="shN" in plus or "shN" in given)
         bands = active if quiet else all_bands
-        settings = self._settings(t, bias2, self.skips, 3 * bands, self._changing if running() is not None else None)
+        settings = self._settings(t, bias2, self.skips, 3 * bands, numbers)
         still = gaussians.step(attributes, weights, settings)
         skip = self.conductor.work_log.skip
         if isinstance(still, Tensor) or still:  # a number on the device is not read here

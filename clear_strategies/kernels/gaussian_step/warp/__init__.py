@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from ctypes import sizeof
+from typing import Any, Final, cast
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.core.conflicts import Products, Weights
@@ -25,6 +26,8 @@ from rasterizers.warp_runtime import launch, on_stream, struct
 LANES: Final = {"cuda": 128, "cpu": 1}
 """Threads per block; on a CPU, Warp's blocks have one."""
 
+_STEP: Final = cast(Any, adam.AdamStep).ctype
+_BYTES: Final = 4  # of each of its numbers
 _WIDTHS: Final = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "sh0": 3, "detail": 3}
 _MOST_ATTRIBUTES: Final = 256
 _attributes: dict[tuple[Any, ...], Any] = {}
@@ -179,9 +182,9 @@ def written(
     """The numbers of a step on the device, as a row of `adam.AdamStep`; written into `out` where it is given.
 
     Args:
-        rates: each attribute's, see `Attribute`. lambda_hf: λ_HR λ_HF, the last number.
+        rates: each attribute's, see `Attribute`. lambda_hf: λ_HR λ_HF.
     """
-    out = torch.empty(1, adam.NUMBERS, device=device) if out is None else out
+    out = torch.empty(1, sizeof(_STEP) // _BYTES, device=device) if out is None else out
     numbers = struct(
         adam.AdamStep, {}, rates=struct(adam.Rates, {}, **{name: -rate for name, rate in rates.items()}), beta1=s.beta1,
         beta2=s.beta2, gain1=1 - s.beta1, gain2=1 - s.beta2, per_bias2=1 / s.bias2, eps=s.eps, lambda_hr=s.lambda_hr,
@@ -190,3 +193,9 @@ def written(
     with on_stream(device):
         launch(adam.write, [1], (numbers, out), device)
     return out
+
+
+def loss_weights(numbers: Tensor) -> Float[Tensor, " 2"]:
+    """λ_HR and λ_HR λ_HF, where `written` has put them."""
+    first, last = (getattr(_STEP, name).offset // _BYTES for name in ("lambda_hr", "lambda_hf"))
+    return numbers[0, first : last + 1]

@@ -4,12 +4,7 @@ multiplication here.
 
 from __future__ import annotations
 
-from typing import Final
-
 import warp as wp
-
-NUMBERS: Final = 15
-"""Of an `AdamStep`."""
 
 
 @wp.struct
@@ -38,7 +33,7 @@ class AdamStep:
     per_bias2: wp.float32  # 1 / bias of the second moment
     eps: wp.float32
     lambda_hr: wp.float32
-    lambda_hf: wp.float32  # λ_HR λ_HF, which no kernel reads
+    lambda_hf: wp.float32  # λ_HR λ_HF, next to it; no kernel here reads it
 
 
 @wp.struct
