@@ -180,13 +180,12 @@ def to_parameters(g: Grads, drawn: Mapping[str, Tensor], params: Mapping[str, Te
             g = Grads({**g, "colors": outer(g.colour.rgb, g.colour.basis, drawn["colors"].shape[1])})
     direct = {name: g[name] for name, p in raw.items() if drawn.get(name) is p and not is_hooked(p)}
     graph = {name: x for name, x in drawn.items() if name in g and name not in direct and x.requires_grad}
-    rest = {name: p for name, p in raw.items() if colour is None or name not in ("sh0", "shN")}
-    if not graph or not rest:
+    if not graph or not raw:
         return Grads(direct, colour=colour)
     through = torch.autograd.grad(
-        list(graph.values()), list(rest.values()), [g[name] for name in graph], retain_graph=True, allow_unused=True
+        list(graph.values()), list(raw.values()), [g[name] for name in graph], retain_graph=True, allow_unused=True
     )
-    found = {name: value for name, value in zip(rest, through, strict=True) if value is not None}
+    found = {name: value for name, value in zip(raw, through, strict=True) if value is not None}
     both = {name: direct[name] + found[name] for name in direct.keys() & found.keys()}
     return Grads({**direct, **found, **both}, colour=colour)
 

@@ -24,6 +24,7 @@ from tests.helpers.host_parts import HR_FROM_START, photometric
 COLOURS = {
     "joined": lambda p: torch.cat((p["sh0"], p["shN"]), 1),
     "with an offset": lambda p: torch.cat((p["sh0"] + p["offset"], p["shN"]), 1),
+    "by the means": lambda p: torch.cat((p["sh0"] + p["means"][:, None], p["shN"]), 1),
     "an offset with them": lambda p: torch.cat((p["offset"] + p["sh0"], p["shN"]), 1),
     "twice": lambda p: torch.cat((p["sh0"] + p["sh0"], p["shN"]), 1),
     "once and a half": lambda p: torch.cat((p["sh0"] + 0.5 * p["sh0"], p["shN"]), 1),
@@ -39,6 +40,7 @@ OPACITIES = {
     "sigmoid": lambda p: p["opacities"].sigmoid(),
     "faded": lambda p: p["opacities"].sigmoid() * p["gain"],
     "detached": lambda p: p["opacities"].detach().sigmoid(),
+    "by the colours": lambda p: (p["opacities"] + p["sh0"][:, 0, 0]).sigmoid(),
 }
 MEANS = {
     "leaf": lambda p: p["means"],
@@ -174,8 +176,9 @@ def loop_of(seed: int) -> Loop:
 
 
 def ordinary_but_for_one():
-    """Each part once in a loop that is ordinary else."""
-    loops = [
+    """Each part once in a loop that is ordinary else, and two halves that no strategy compares."""
+    loops = [Loop(passes="two halves", corrects=False)]
+    loops += [
         Loop(frozen=names, frozen_from=step)
         for names in dict.fromkeys(FROZEN)
         for step in CHOICES["frozen_from"]

@@ -20,6 +20,12 @@ def test_factors_are_the_whole_gradient_where_two_leaves_lie_side_by_side_and_no
     assert are_joined(COLOURS[how](p), p) == (how in ("joined", "negative dimension"))
 
 
+def test_the_two_have_the_type_that_was_drawn():
+    p = params()
+    p["sh0"] = Parameter(torch.ones(3, 1, 3, dtype=torch.float16))
+    assert not are_joined(COLOURS["joined"](p), p)
+
+
 def hooks():
     yield lambda p, colors: colors.retain_grad()
     yield lambda p, colors: colors.register_hook(lambda g: None)

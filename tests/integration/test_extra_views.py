@@ -114,6 +114,33 @@ def test_an_adam_of_all_parameters_makes_one_extra_step_which_a_scaler_of_losses
         assert torch.allclose(p, scaled[0][name], rtol=0, atol=1e-6), name
 
 
+def test_a_step_on_an_extra_view_moves_the_gaussians_alone_and_leaves_gradients_to_the_loop():
+    trainer, exposure = Host(toy.scene(20)), torch.nn.Parameter(torch.ones(1))
+    one = torch.optim.SGD([*trainer.splats.values(), exposure], lr=0.5)
+    trainer.optimizers = {"all": one}
+    _, clear, render = started(toy.ShowsDark(), host=trainer)
+    (render().mean() + exposure.sum()).backward()
+    before = {name: p.grad.clone() for name, p in trainer.splats.items() if p.grad is not None}
+    one.step()
+    assert clear.attachment.counts["extra views"] == 1
+    assert float(exposure) == 0.5
+    assert float(before["detail"].abs().max()) > 0
+    assert torch.allclose(trainer.splats["detail"], -one.param_groups[-1]["lr"] * before["detail"], rtol=1e-5, atol=0)
+    assert all(torch.equal(trainer.splats[name].grad, g) for name, g in before.items())
+
+
+def test_gaussians_that_were_replaced_since_make_no_step_on_an_extra_view():
+    """3DGS densifies before it steps."""
+    trainer, clear, render = started(toy.ShowsDark())
+    render().mean().backward()
+    for name, optimizer in trainer.optimizers.items():
+        trainer.splats[name] = torch.nn.Parameter(trainer.splats[name].detach().clone())
+        optimizer.param_groups[0]["params"] = [trainer.splats[name]]
+        optimizer.step()
+    assert clear.attachment.counts["merges"] == 1
+    assert clear.attachment.counts["extra views"] == 0
+
+
 def test_extra_views_that_no_optimizer_steps_on_give_a_warning(caplog):
     trainer = Host(toy.scene(20))
     unknown = torch.optim.Adam(list(trainer.splats.values()))

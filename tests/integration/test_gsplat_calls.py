@@ -200,6 +200,21 @@ def test_a_compiled_loop_has_the_same_gradients(backend, recwarn):
     assert not [warning for warning in recwarn if "ynamo" in str(warning.message)]
 
 
+def test_a_dropout_inside_of_the_hosts_function_drops_the_same_in_all_renderings_of_a_step():
+    dropped = []
+
+    @functools.wraps(autograd.rasterization)
+    def with_dropout(**call):
+        dropped.append(torch.rand(20) < 0.5)
+        return gsplat_host.rasterization(**call)
+
+    _, _, render = started(toy.ShowsDark(), host=Host(toy.scene(20), rasterization=with_dropout))
+    render()
+    hr, extra, lr = dropped
+    assert torch.equal(hr, lr)
+    assert torch.equal(extra, lr)
+
+
 @pytest.mark.parametrize("looked_at", [True, False])
 def test_a_host_that_draws_twice_for_one_rendering_has_the_same_gradients_and_is_told_what_it_costs(looked_at, caplog):
     caplog.set_level("INFO")

@@ -12,6 +12,7 @@ from clear_strategies.errors import SettingError
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.skips import Skips
 from integration import HostError
+from integration.detail import DETAIL_EPS
 from integration.gsplat import attach
 from rasterizers import autograd
 from tests.helpers import gsplat_host, toy
@@ -82,6 +83,19 @@ def test_f_det_is_a_group_of_the_only_optimizer_unless_a_scheduler_counts_the_gr
             schedule = torch.optim.lr_scheduler.LambdaLR(only, lambda _: 1.0)
             assert only.param_groups[-1]["name"] == "detail"
         schedule.step()
+
+
+@pytest.mark.parametrize("joined", [True, False])
+def test_f_det_is_stepped_by_the_only_optimizer_of_several_parameters_else_by_one_of_its_own(joined):
+    scene = toy.scene(20)
+    host = Host(scene)
+    first = torch.optim.Adam([*host.splats.values()] if joined else [host.splats["means"]])
+    optimizers = {"first": first}
+    attach(host.splats, optimizers, scene.train, Conductor())
+    assert (optimizers["detail"] is first) == joined  # where gsplat's densifiers look for it
+    group = optimizers["detail"].param_groups[-1]
+    assert [id(p) for p in group["params"]] == [id(host.splats["detail"])]
+    assert group["eps"] == DETAIL_EPS
 
 
 def frozen(host, render):
