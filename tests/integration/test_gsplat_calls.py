@@ -7,9 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clear_strategies import P2G, Conductor, RandomBackground, View
+from clear_strategies import P2G, SVS, Conductor, RandomBackground, View
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.merging.in_place import merge_in_place
+from clear_strategies.schedules import Ramp
 from integration import HostError
 from integration.gsplat import attach
 from rasterizers import autograd
@@ -17,6 +18,7 @@ from tests.helpers import gsplat_host, toy
 from tests.helpers.backends import needs
 from tests.helpers.gsplat_host import Host, started
 from tests.helpers.host_parts import HR_FROM_START, WITHOUT_HR
+from tests.helpers.loops import FUNCTIONS
 
 
 def with_detail():
@@ -213,6 +215,37 @@ def test_a_dropout_inside_of_the_hosts_function_drops_the_same_in_all_renderings
     hr, extra, lr = dropped
     assert torch.equal(hr, lr)
     assert torch.equal(extra, lr)
+
+
+def test_opacities_that_a_loop_keeps_are_multiplied_by_the_gate_of_each_step():
+    seen = []
+
+    @functools.wraps(autograd.rasterization)
+    def recorded(**call):
+        seen.append(call["opacities"].detach())
+        return gsplat_host.rasterization(**call)
+
+    host, _, _ = started(SVS(dropout=Ramp(full=2)), host=Host(toy.scene(20), rasterization=recorded))
+    kept = host.splats["opacities"].detach().sigmoid()
+    for _ in range(2):
+        function = lambda m, q, s, o, *more, **call: host.rasterization(m, q, s, kept, *more, **call)  # noqa: E731
+        gsplat_host.drawn(function, host.splats, host.photos["view0"].camera)[0].mean().backward()
+    hr, lr, next_hr, next_lr = seen
+    assert torch.equal(hr, lr)
+    assert torch.equal(next_hr, next_lr)
+    assert not torch.equal(hr, next_hr)
+
+
+@needs("cpp")
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_a_densifier_sees_no_radius_of_gaussians_that_the_gate_drops(function):
+    scene = toy.scene(20)
+    host, clear, _ = started(SVS(looks=0, dropout=Ramp(full=1)), host=Host(scene, rasterization=FUNCTIONS[function]))
+    _, _, info = host.render(scene.train[0].lr.camera)
+    dropped, seen = clear.attachment.conductor.gate(1, 20) == 0, (info["radii"][0] > 0).all(-1)
+    assert dropped.any()
+    assert seen.any()
+    assert not (dropped & seen).any()
 
 
 @pytest.mark.parametrize("looked_at", [True, False])

@@ -72,12 +72,13 @@ def test_none_passes_without_a_score_and_absolute_gradients_decide_how_many_pass
     zeros = torch.zeros(5)
     assert torch.equal(ScoreScaler(threshold=1.0)(zeros, torch.ones(5) * 2, everyone(5)), zeros)
     tensor = torch.zeros(1, 4, 2)
-    tensor.absgrad = torch.tensor([[[8.0, 0.0], [6.0, 0.0], [1.0, 0.0], [0.0, 0.0]]])  # 2x2 pixels: the same in NDC
     slot = ScreenGradientSlot(tensor, (2, 2))
     ordinary, score = torch.full((4,), 0.1), torch.tensor([0.4, 0.1, 0.3, 0.2])
-    assert score_for_host(slot, ordinary, ordinary, everyone(4), ScoreScaler(5.0)) is None
-    written = score_for_host(slot, score, ordinary, everyone(4), ScoreScaler(5.0))
-    assert (written >= 5).tolist() == [True, False, True, False]  # two pass, as by 8 and 6
+    for scale in (1.0, 64.0):
+        tensor.absgrad = scale * torch.tensor([[[8.0, 0], [6, 0], [1, 0], [0, 0]]])  # 2x2 pixels: the same in NDC
+        assert score_for_host(slot, ordinary, ordinary, everyone(4), ScoreScaler(5.0), scale) is None
+        written = score_for_host(slot, score, ordinary, everyone(4), ScoreScaler(5.0), scale)
+        assert (written >= 5).tolist() == [True, False, True, False]  # two pass, as by 8 and 6
 
 
 def test_the_factor_follows_recent_views_restarts_with_another_number_of_gaussians_and_is_restored():
