@@ -19,6 +19,7 @@ from tests.helpers.backends import needs
 from tests.helpers.gsplat_host import Host, started
 from tests.helpers.host_parts import HR_FROM_START, WITHOUT_HR
 from tests.helpers.loops import FUNCTIONS
+from tests.training.test_replay import cropped
 
 
 def with_detail():
@@ -234,6 +235,24 @@ def test_opacities_that_a_loop_keeps_are_multiplied_by_the_gate_of_each_step():
     assert torch.equal(hr, lr)
     assert torch.equal(next_hr, next_lr)
     assert not torch.equal(hr, next_hr)
+
+
+@needs("cpp")
+def test_a_square_picture_that_a_host_turns_has_the_gradients_of_what_was_drawn():
+    gradients, made = [], toy.scene(20)
+    for function in FUNCTIONS.values():
+
+        @functools.wraps(function)
+        def turned(function=function, **call):
+            renders, alphas, info = function(**call)
+            return renders.transpose(1, 2), alphas, info
+
+        scene = replace(made, train=tuple(cropped(view, 8) for view in made.train))
+        host, _, render = started(host=Host(scene, rasterization=turned), scene=scene)
+        render().square().mean().backward()
+        gradients.append({name: p.grad for name, p in host.splats.items() if p.grad is not None})
+    for name, g in gradients[0].items():
+        assert torch.allclose(gradients[1][name], g, rtol=1e-3, atol=1e-6 * float(g.abs().max()) + 1e-9), name
 
 
 @needs("cpp")

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -10,11 +11,12 @@ import torch
 import clear_strategies as cs
 import rasterizers
 from clear_strategies.core.view import ExtraView, View
+from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.density.mcmc import MCMC
 from clear_strategies.merging import replays
-from clear_strategies.merging.replays import LIVE
+from clear_strategies.merging.replays import LIVE, Kind, Replays
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
 from clear_strategies.training import checkpoint, loop
 from clear_strategies.training.compiled_step import CompiledStep
@@ -226,6 +228,17 @@ def test_kinds_beyond_the_most_are_live_and_counted(monkeypatch):
     monkeypatch.setattr(replays, "_MOST_KINDS", 1)
     replayed = both(lambda: start(density=False, degree_every=6), 9)
     assert live_in(replayed) == {FIRST: 1, "more than 1 kinds": 8}
+
+
+def test_recordings_of_an_earlier_structure_are_dropped():
+    recorded, kept = (
+        SimpleNamespace(replay=lambda _: True, outcome=lambda _: "replayed"),
+        Replays(DEVICE, WorkLog(), ""),
+    )
+    for address in range(2 * replays._MOST_KINDS):
+        kind = Kind((address,), (), ())
+        found = [kept.do(kind, 1, None, live=lambda: "live", record=lambda: recorded) for _ in range(3)]
+        assert found == ["live", "replayed", "replayed"]
 
 
 def fails(*_: object) -> None:
