@@ -107,6 +107,7 @@ PASSES = {
         lambda loss, p: backward(loss, p, "means", "quats", "scales", "opacities"),
     ),
     "two halves": passes(lambda loss, p: (loss / 2).backward(retain_graph=True), lambda loss, p: (loss / 2).backward()),
+    "two halves of the colours": passes(*[lambda loss, p: backward(loss / 2, p, "sh0", "shN", retain_graph=True)] * 2),
     "none": asked,
 }  # fmt: skip
 REFUSED = {"two summed": "two renderings of training views", "an earlier one": "an earlier rendering"}
@@ -158,7 +159,7 @@ class Loop:
         """What its rendering and its passes are refused with, whatever the rest is."""
         if self.rendering in REFUSED:
             return REFUSED[self.rendering]
-        return "a second backward pass" if self.passes == "two halves" and self.corrects else ""
+        return "a second backward pass" if self.passes.startswith("two halves") and self.corrects else ""
 
 
 CHOICES = {
@@ -177,7 +178,7 @@ def loop_of(seed: int) -> Loop:
 
 def ordinary_but_for_one():
     """Each part once in a loop that is ordinary else, and two halves that no strategy compares."""
-    loops = [Loop(passes="two halves", corrects=False)]
+    loops = [Loop(passes=passes, corrects=False) for passes in PASSES if passes.startswith("two halves")]
     loops += [
         Loop(frozen=names, frozen_from=step)
         for names in dict.fromkeys(FROZEN)

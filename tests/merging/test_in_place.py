@@ -220,14 +220,15 @@ def test_without_hr_the_authentic_gradient_passes_and_that_of_f_det_is_zero(pass
 
 
 def test_half_precision_is_merged_in_float32(passes):
-    merged = []
+    merged, scale = [], 2.0**14  # without it the gradient is below what float16 holds
     for dtype in (torch.float16, torch.float32):
-        params, before, hr, step = setting(torch.float32, accumulated=False, factors=True, scale=1.0)
-        g = params["shN"].grad.mul(2e4).to(torch.float16)
+        params, before, hr, step = setting(torch.float32, accumulated=False, factors=True, scale=scale)
+        g = params["shN"].grad.to(torch.float16)
         params["shN"] = torch.nn.Parameter(params["shN"].detach().to(dtype))
-        params["shN"].grad = g.to(dtype)
-        merge_in_place(conductor(), params, hr, step, T, before=before)
+        params["shN"].grad = held = g.to(dtype)
+        merge_in_place(conductor(), params, hr, step, T, before=before, scale=scale)
         merged.append(params["shN"].grad)
+        assert merged[-1] is held  # which a loop may hold, too
     assert merged[0].dtype == torch.float16
     assert torch.allclose(merged[0].float(), merged[1], rtol=2e-3, atol=1e-6)
 

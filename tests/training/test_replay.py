@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -292,12 +293,17 @@ class Routes(cs.P2G):
         return super().route(step) * step.t
 
 
+def has_only(hook: str, s: TrainState) -> None:
+    s.conductor.strategies = (type(hook, (cs.Strategy,), {hook: fails})(),)
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
         (lambda s: setattr(s, "compiled_step", None), "the per-Gaussian step is not that of Warp"),
         (lambda s: setattr(s.conductor, "objective", cs.Objective(kernels="torch")), "losses are not those of Warp"),
         (lambda s: setattr(s.conductor, "strategies", (Routes(),)), "Routes does not state what it looks up of a view"),
+        *((partial(has_only, hook), hook) for hook in ("observe", "route", "score")),
     ],
 )
 def test_what_cannot_be_recorded_is_live_and_the_log_says_why(change, reason, caplog):
