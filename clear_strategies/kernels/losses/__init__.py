@@ -23,7 +23,7 @@ from clear_strategies.kernels.losses.images import DEVICES, image_pair, supporte
 from clear_strategies.kernels.losses.reference import LossAndGradient
 from rasterizers.warp_runtime import runs_warp
 
-__all__ = ["Choice", "LossAndGradient", "haar_l1", "photometric", "require", "running_on"]
+__all__ = ["Choice", "LossAndGradient", "haar_l1", "photometric", "require", "running_on", "ssim"]
 
 _log = logging.getLogger(__name__)
 
@@ -73,6 +73,17 @@ def photometric(
         return reference.photometric(x, y, lambda_ssim, out)
     images = image_pair(DEVICES[kernels], x, y, out)
     return LossAndGradient(_compiled(kernels, x).photometric(images, 1 - lambda_ssim, lambda_ssim), images.gradient)
+
+
+def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], inset: int = 0) -> LossAndGradient:
+    """The mean SSIM of the windows about pixels at least `inset` from the border, with its gradient with respect to x.
+
+    On the CPU in C++ where that supports the images, else in torch.
+    """
+    if not (native.available() and supported(DEVICES["cpp"], x, y)):
+        return reference.ssim(x, y, inset)
+    images = image_pair(DEVICES["cpp"], x, y, None)
+    return LossAndGradient(1 + cpp.photometric(images, 0.0, -1.0, inset), images.gradient)
 
 
 def haar_l1(

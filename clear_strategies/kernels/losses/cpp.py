@@ -16,9 +16,9 @@ from clear_strategies.kernels.losses.images import ImagePair
 from rasterizers.native import threads
 
 
-def photometric(images: ImagePair, l1: float, dssim: float) -> Float[Tensor, ""]:
+def photometric(images: ImagePair, l1: float, dssim: float, inset: int = 0) -> Float[Tensor, ""]:
     """The value l1 · mean |x - y| + dssim · (1 - SSIM), in one pass; with dssim = 0 no SSIM is computed."""
-    l1_mean, dissimilarity = native.module().photometric(*images, l1, dssim, threads())
+    l1_mean, dissimilarity = native.module().photometric(*images, l1, dssim, inset, threads())
     return _scalar(l1 * l1_mean + dssim * dissimilarity)
 
 

@@ -44,8 +44,10 @@ def l1(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"]) -> LossAndGradient:
     return LossAndGradient(difference.abs().mean(), difference.sign() / difference.numel())
 
 
-def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"]) -> LossAndGradient:
+def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], inset: int = 0) -> LossAndGradient:
     """Mean structural similarity as 3DGS trains with it: zero padding, so borders count less.
+
+    The mean is over the windows about pixels that are at least `inset` from the border.
 
     With A1 = 2 μx μy + C1, A2 = 2 σxy + C2, B1 = μx² + μy² + C1, B2 = σx² + σy² + C2, the map is S = A1 A2 / (B1 B2).
     Computed in float64, because E[x²] - E[x]² in float32 loses the variance of flat regions. For evaluation use
@@ -56,14 +58,17 @@ def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"]) -> LossAndGradien
     A1, A2 = 2 * mu_x * mu_y + _C1, 2 * (e_xy - mu_x * mu_y) + _C2
     B1, B2 = mu_x * mu_x + mu_y * mu_y + _C1, (e_xx - mu_x * mu_x) + (e_yy - mu_y * mu_y) + _C2
     S = A1 * A2 / (B1 * B2)
+    counted = torch.zeros_like(S)
+    within = (..., slice(inset, S.shape[-2] - inset), slice(inset, S.shape[-1] - inset))
+    counted[within] = 1 / S[within].numel()
 
     # S depends on x through the three local means μx, E[xx], E[xy]; the window mean is its own transpose.
     d_mu_x = 2 * mu_y * (A2 - A1) / (B1 * B2) + 2 * mu_x * S * (1 / B2 - 1 / B1)
     d_e_xx = -S / B2
     d_e_xy = 2 * A1 / (B1 * B2)
-    g_mu, g_xx, g_xy = _window_mean(torch.stack((d_mu_x, d_e_xx, d_e_xy)))
-    gradient = (g_mu + 2 * X * g_xx + Y * g_xy) / S.numel()
-    return LossAndGradient(S.mean().to(x.dtype), gradient.movedim(0, -1).to(x.dtype))
+    g_mu, g_xx, g_xy = _window_mean(torch.stack((d_mu_x, d_e_xx, d_e_xy)) * counted)
+    gradient = g_mu + 2 * X * g_xx + Y * g_xy
+    return LossAndGradient(S[within].mean().to(x.dtype), gradient.movedim(0, -1).to(x.dtype))
 
 
 def haar_l1(

@@ -30,13 +30,15 @@ inline void bind_losses(nanobind::module_& m) {
   using namespace nb::literals;
   m.def(
       "photometric",
-      [](const ImageIn& x, const ImageIn& y, const ImageOut& gradient, float l1, float dssim, int threads) {
+      [](const ImageIn& x, const ImageIn& y, const ImageOut& gradient, float l1, float dssim, int inset, int threads) {
         ImagePair images = same_size(x, y, gradient);
+        if (inset < 0 || 2 * inset >= int(std::min(x.shape(0), x.shape(1))))
+          throw std::invalid_argument("no window lies so far inside the images.");
         nb::gil_scoped_release free;
-        PhotometricMeans means = photometric(images, {l1, dssim}, threads);
+        PhotometricMeans means = photometric(images, {l1, dssim}, inset, threads);
         return std::pair(means.l1, means.dssim);
       },
-      "x"_a.noconvert(), "y"_a.noconvert(), "gradient"_a.noconvert(), "l1"_a, "dssim"_a, "threads"_a,
+      "x"_a.noconvert(), "y"_a.noconvert(), "gradient"_a.noconvert(), "l1"_a, "dssim"_a, "inset"_a, "threads"_a,
       "Writes the gradient of l1 * mean|x - y| + dssim * (1 - SSIM); returns (mean|x - y|, 1 - SSIM).");
   m.def(
       "mean_ssim",

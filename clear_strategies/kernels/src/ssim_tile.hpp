@@ -92,13 +92,13 @@ inline float* scratch(std::size_t n) {
   return memory.data() + (-address % (kLanes * sizeof(float))) / sizeof(float);
 }
 
-// A tile at work.
+// A tile at work. SSIM is that of the windows about pixels at least `inset` from the border.
 class TileRun {
  public:
-  TileRun(const ImagePair& images, const Tile& tile, PhotometricWeights weights)
-      : im_(images), tile_(tile), left_(std::max(0, tile.left - kMargin)), length_(segment_length(images, tile)) {
-    const float share = 1.0f / (float(im_.height) * float(im_.row));
-    l1_scale_ = weights.l1 * share, ssim_scale_ = -weights.dssim * share;
+  TileRun(const ImagePair& images, const Tile& tile, PhotometricWeights weights, int inset = 0)
+      : im_(images), tile_(tile), inset_(inset), left_(std::max(0, tile.left - kMargin)), length_(segment_length(images, tile)) {
+    const auto share = [&](int inset) { return 1.0f / (float(im_.height - 2 * inset) * float(im_.row - 2 * inset * kChannels)); };
+    l1_scale_ = weights.l1 * share(0), ssim_scale_ = -weights.dssim * share(inset);
     const std::size_t ring = Images::floats(length_) + Maps::floats(length_);
     const std::size_t group = ColumnMoments::floats(length_) + ColumnSums::floats(length_);
     float* free = scratch(span(kDown) * ring + kDown * group + 3 * Single::floats(length_) + numbers());
@@ -109,7 +109,7 @@ class TileRun {
     for (float*& row : sums_) row = take(ColumnSums());
     inside_ = take(Single()), mine_ = take(Single()), gradient_ = take(Single());
     numbers_ = free;
-    mark(0, im_.row, inside_), mark(tile.left, tile.right, mine_);
+    mark(inset * kChannels, im_.row - inset * kChannels, inside_), mark(tile.left, tile.right, mine_);
   }
 
   // Writes the tile's part of the gradient; returns its part of the sums.
@@ -197,7 +197,7 @@ class TileRun {
     });
   }
 
-  // The maps of the rows from q on; zero outside the image.
+  // The maps of the rows from q on; zero where windows do not count.
   void forward(int q) {
     const Down<Images> down(images_, q - kReach);
     const auto alone = [](int, const Register& v) CLEAR_LAMBDA { return v; };
@@ -213,7 +213,7 @@ class TileRun {
     });
     for (int r = 0; r < kDown; ++r) {
       const int at = q + r;
-      if (at < 0 || at >= im_.height) {
+      if (at < inset_ || at >= im_.height - inset_) {
         std::fill_n(maps_[at], length_ * Maps::kStep, 0.0f);
       } else {
         ColumnMoments::continue_ends(moments_[r], length_);
@@ -304,6 +304,7 @@ class TileRun {
 
   ImagePair im_;
   Tile tile_;
+  int inset_;
   int left_, length_;  // the number of the image's rows that the tile's begin with; the length of their segments
   float l1_scale_, ssim_scale_;
   Ring<Images> images_;
