@@ -8,7 +8,7 @@ import runpy
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -20,40 +20,31 @@ from integration.settings import Settings
 _log = logging.getLogger(__name__)
 
 
-def main(
-    module: str,
-    script: str,
-    arguments: Sequence[str] | None,
-    hook: Callable[[Path | None, Settings], AbstractContextManager[list[Any]]],
-    otherwise: str,
-) -> int:
-    """The program `python -m <module> [options] script [its arguments]`; returns its exit status.
+@dataclass(frozen=True, slots=True)
+class Host:
+    """A trainer whose scripts a launcher runs.
 
     Args:
-        script: a description of the host's script.
+        script: a description of its script.
         hook: takes `--save-lr` and the settings of `install`; a context in which the script runs with CLEAR. Its value is
             the list of what was attached (`Attached` of this host), which the script fills.
         otherwise: why that list may be empty at the end.
     """
-    console.steady()
-    console.show_in_host()
-    options = _parser(module, f"Run {script} with CLEAR.").parse_args(arguments)
-    try:
-        settings = _settings(options)
-        with _as_script(options.script, options.rest), hook(options.save_lr, settings) as attached:
-            runpy.run_path(str(options.script), run_name="__main__")
-    except ClearError as error:
-        _log.error("%s", error)
-        return 2
-    if any(each.attachment.counts["merges"] for each in attached):
-        return 0
-    _log.error("%s trained without CLEAR: %s.", options.script, otherwise)
-    return 1
+
+    script: str
+    hook: Callable[[Path | None, Settings], AbstractContextManager[list[Any]]]
+    otherwise: str
 
 
-def _parser(module: str, description: str) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog=f"python -m {module}", description=description)
-    add = parser.add_argument
+def main(module: str, host: Host, arguments: Sequence[str] | None) -> int:
+    """The program `python -m <module> [options] script [its arguments]`; returns its exit status."""
+    return run(parser(module, f"Run {host.script} with CLEAR.").parse_args(arguments), lambda: host)
+
+
+def parser(module: str, description: str) -> argparse.ArgumentParser:
+    """Its options, by the names of `Settings`."""
+    made = argparse.ArgumentParser(prog=f"python -m {module}", description=description)
+    add = made.add_argument
     add("--strategies", metavar="NAMES", help="of conf/strategy: clear, gco, gco,svs … (%(default)s)")
     add(
         "--overrides", action="append", metavar="KEY=VALUE",
@@ -73,19 +64,45 @@ def _parser(module: str, description: str) -> argparse.ArgumentParser:
     )  # fmt: skip
     add("script", type=Path, help="the host's script")
     add("rest", nargs=argparse.REMAINDER, help="the arguments of the script")
-    parser.set_defaults(**asdict(Settings()) | {"overrides": []})
-    return parser
+    made.set_defaults(**asdict(Settings()) | {"overrides": []})
+    return made
+
+
+def run(options: argparse.Namespace, prepared: Callable[[], Host]) -> int:
+    """Run the script; returns the exit status.
+
+    Args:
+        options: of `parser`; with `strategies` None the script runs without CLEAR.
+        prepared: called when `sys.argv` and `sys.path` are the script's.
+    """
+    console.steady()
+    console.show_in_host()
+    try:
+        if not options.script.is_file():
+            raise DataError(options.script, "script", "is not there", "give the training script of your trainer")
+        settings = None if options.strategies is None else _settings(options)
+        with _as_script(options.script, options.rest):
+            host = prepared()
+            if settings is None:
+                runpy.run_path(str(options.script), run_name="__main__")
+                return 0
+            with host.hook(options.save_lr, settings) as attached:
+                runpy.run_path(str(options.script), run_name="__main__")
+    except ClearError as error:
+        _log.error("%s", error)
+        return 2
+    if any(each.attachment.counts["merges"] for each in attached):
+        return 0
+    _log.error("%s trained without CLEAR: %s.", options.script, host.otherwise)
+    return 1
 
 
 def _settings(options: argparse.Namespace) -> Settings:
     """The settings of `install`; what it would refuse is refused here, before the host loads its scene.
 
     Raises:
-        DataError: the script is missing.
         SettingError: the configuration or `points` is refused, or HR is used without SR images.
     """
-    if not options.script.is_file():
-        raise DataError(options.script, "script", "is not there", "give the training script of your trainer")
     chosen = vars(options)
     settings = Settings(**{f.name: chosen[f.name] for f in fields(Settings) if f.name in chosen})
     if options.save_lr is None:

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from clear_strategies.errors import HostError
 from integration import launcher
@@ -23,9 +23,7 @@ from integration.views import save_photos
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run simple_trainer.py with CLEAR; returns the exit status."""
-    return launcher.main(
-        "integration.gsplat", "gsplat's simple_trainer.py", arguments, _installed_by_cli, "no Runner was trained"
-    )
+    return launcher.main("integration.gsplat", HOST, arguments)
 
 
 @contextmanager
@@ -56,6 +54,8 @@ def _save_lr(runner: Any, folder: Path) -> None:
     save_photos(photos_of(runner.trainset), folder)
     raise SystemExit(0)
 
+
+HOST: Final = launcher.Host("gsplat's simple_trainer.py", _installed_by_cli, "no Runner was trained")
 
 if __name__ == "__main__":
     sys.exit(main())

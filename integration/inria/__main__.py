@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from clear_strategies.errors import HostError
 from integration import launcher
@@ -26,10 +26,7 @@ _log = logging.getLogger("integration.inria")  # __name__ is "__main__" here
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a train.py with CLEAR; returns the exit status."""
-    why = "it called no GaussianModel.training_setup, or made no step"
-    return launcher.main(
-        "integration.inria", "the train.py of a 3DGS-style trainer", arguments, _installed_by_training_setup, why
-    )
+    return launcher.main("integration.inria", HOST, arguments)
 
 
 @contextmanager
@@ -70,6 +67,12 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
         for each in attached:
             each.remove()
 
+
+HOST: Final = launcher.Host(
+    "the train.py of a 3DGS-style trainer",
+    _installed_by_training_setup,
+    "it called no GaussianModel.training_setup, or made no step",
+)
 
 if __name__ == "__main__":
     sys.exit(main())

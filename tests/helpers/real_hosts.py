@@ -14,7 +14,7 @@ from clear_strategies.data.photo_files import write_png
 from tests.helpers import toy
 
 ROOT = Path(__file__).resolve().parents[2]
-CPU = ROOT / "tests" / "hosts" / "cpu"
+HOSTS = ROOT / "tests" / "hosts"
 
 
 def checkout(name: str, script: str) -> Path:
@@ -26,14 +26,15 @@ def checkout(name: str, script: str) -> Path:
 
 
 def run(host: Path, *command: object, inside: str = "", more_paths: tuple[Path, ...] = (), status: int = 0) -> str:
-    """The output of a Python program in the host's folder, which must end with this exit status."""
-    paths = [CPU, *more_paths, ROOT, os.environ.get("PYTHONPATH", "")]
+    """The output of `integration.on_cpu` in the host's folder, which must end with this exit status."""
+    paths = [HOSTS / "networks", *more_paths, ROOT, os.environ.get("PYTHONPATH", "")]
     environment = {
-        **os.environ, "HOST": host.name, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(map(str, paths)),
+        **os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(map(str, paths)),
+        "TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": "1",  # the trainers' checkpoints are from before torch 2.6
     }  # fmt: skip
     done = subprocess.run(
-        [sys.executable, *map(str, command)], cwd=host / inside, env=environment, capture_output=True, text=True,
-        timeout=1_800, check=False,
+        [sys.executable, "-m", "integration.on_cpu", *map(str, command)], cwd=host / inside, env=environment,
+        capture_output=True, text=True, timeout=1_800, check=False,
     )  # fmt: skip
     assert done.returncode == status, done.stdout[-2_000:] + done.stderr[-4_000:]
     return done.stdout + done.stderr

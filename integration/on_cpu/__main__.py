@@ -1,0 +1,107 @@
+"""Run an unchanged trainer where there is no GPU: `python -m integration.on_cpu [--strategies best …] train.py -s data`.
+
+The trainer is one that draws with gsplat, or a 3DGS-style one, which has a module `gaussian_renderer`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import logging
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
+from itertools import pairwise
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any, Final
+
+import rasterizers
+from clear_strategies.errors import HostError
+from integration import launcher
+from integration.gsplat.__main__ import HOST as GSPLAT
+from integration.inria.__main__ import HOST as INRIA
+from integration.on_cpu import cuda, diff_gaussian_rasterization, fused_ssim, gsplat_functions
+from integration.on_cpu.simple_knn import distances_and_indices, mean_distances
+from integration.settings import Settings
+
+_log = logging.getLogger("integration.on_cpu")  # __name__ is "__main__" here
+
+REFUSED: Final = {
+    "with_ut": "leave it out: 3DGUT's projection is gsplat's alone",
+    "with_eval3d": "leave it out: 3DGUT's projection is gsplat's alone",
+    "camera_model=fisheye": "undistort the photos first",
+    "compression": "compress the result on a GPU",
+    "use_fused_bilagrid": "use_bilateral_grid alone does the same in torch",
+    "bilateral_grid_fused": "post_processing=bilateral_grid alone does the same in torch",
+    "post_processing=ppisp": "post_processing=bilateral_grid",
+    "optimizer_type=sparse_adam": "optimizer_type=default",
+    "compute_cov3D_python": "leave it out: the rasterizer computes them",
+    "ray_jitter": "leave it out",
+    "use_confidence": "leave it out",
+}
+"""Options of trainers, or single values of them, that need CUDA; and what to do instead."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a trainer on the CPU; returns the exit status."""
+    parser = launcher.parser("integration.on_cpu", "Run a trainer as it is, without a GPU.")
+    parser.set_defaults(strategies=None)
+    options = parser.parse_args(arguments)
+    if options.strategies is None:
+        _require_strategies(parser, options)
+    return launcher.run(options, lambda: prepared(options.script, options.rest))
+
+
+def prepared(script: Path, arguments: Sequence[str] = ()) -> launcher.Host:
+    """Replace what needs CUDA, for this script and from here on.
+
+    Raises:
+        HostError: an option of the script needs CUDA.
+    """
+    given = set(_given(arguments))
+    refused = [f"--{option} needs CUDA; on a CPU, {remedy}." for option, remedy in REFUSED.items() if option in given]
+    if refused:
+        raise HostError(" ".join(refused))
+    found = importlib.util.find_spec("gaussian_renderer")
+    renderer = None if found is None or found.origin is None else Path(found.origin).parent
+    cuda.replace()
+    sys.modules |= {
+        "diff_gaussian_rasterization": diff_gaussian_rasterization, "fused_ssim": fused_ssim,
+        "simple_knn": ModuleType("simple_knn"), "simple_knn._C": _knn(renderer),
+    }  # fmt: skip
+    draws_with_gsplat = renderer is None or any("gsplat" in file.read_text() for file in renderer.glob("*.py"))
+    if draws_with_gsplat and importlib.util.find_spec("gsplat") is not None:
+        gsplat_functions.replace()
+    _log.info("CUDA means the CPU here; images are drawn by rasterizer=%s.", rasterizers.fastest("cpu"))
+    return GSPLAT if renderer is None else INRIA
+
+
+def _knn(renderer: Path | None) -> Any:
+    """`simple_knn._C` as the sources beside the renderer declare it: in FSGS it returns indices, too."""
+    declared = Path() if renderer is None else renderer.parent / "submodules" / "simple-knn" / "spatial.h"
+    indices = declared.is_file() and "std::tuple" in declared.read_text()
+    return SimpleNamespace(distCUDA2=distances_and_indices if indices else mean_distances)
+
+
+def _given(arguments: Sequence[str]) -> Iterator[str]:
+    """The options among the arguments, as `name` and as `name=value`."""
+    for word, following in pairwise([*arguments, ""]):
+        if word.startswith("--"):
+            name, _, value = word[2:].partition("=")
+            yield from (name.replace("-", "_"), f"{name.replace('-', '_')}={value or following}")
+
+
+def _require_strategies(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Options of the strategies would do nothing without them."""
+    given = [
+        f.name
+        for f in fields(Settings)
+        if hasattr(options, f.name) and getattr(options, f.name) != parser.get_default(f.name)
+    ]
+    if given or options.save_lr:
+        parser.error(f"--{(given or ['save-lr'])[0]} has no effect without --strategies, e.g. --strategies best.")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

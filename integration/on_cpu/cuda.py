@@ -1,0 +1,139 @@
+"""CUDA in torch means the CPU: the device "cuda", `.cuda()`, and what trainers call of `torch.cuda`."""
+
+from __future__ import annotations
+
+import multiprocessing
+import resource
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+import torch
+from torch.overrides import TorchFunctionMode
+
+_CPU: Final = torch.device("cpu")
+_WITHOUT_EFFECT: Final = (
+    "init", "ipc_collect", "reset_max_memory_allocated", "reset_max_memory_cached", "reset_peak_memory_stats", "set_device",
+    "synchronize",
+)  # fmt: skip
+_MEMORY: Final = ("max_memory_allocated", "max_memory_reserved", "memory_allocated", "memory_reserved")
+_TENSORS: Final = ("BoolTensor", "ByteTensor", "DoubleTensor", "FloatTensor", "HalfTensor", "IntTensor", "LongTensor")
+
+
+def replace() -> None:
+    """From here on CUDA means the CPU, in this process and in those that it forks.
+
+    `torch.cuda.is_available()` stays false, and what is not replaced raises torch's own errors.
+    """
+    _CudaIsTheCpu().__enter__()  # type: ignore[no-untyped-call]
+    _replace(threading.Thread, "start", _started_with_it)
+    if "fork" in multiprocessing.get_all_start_methods():  # a process that is started anew has none of this
+        multiprocessing.set_start_method("fork", force=True)
+    _replace(torch, "load", _loaded_on_cpu)
+    for name in ("set_default_device", "set_default_tensor_type"):
+        _replace(torch, name, lambda function: lambda kind: function(_on_cpu(kind)))
+    cuda: Any = torch.cuda
+    for name in _WITHOUT_EFFECT:
+        setattr(cuda, name, lambda *_, **__: None)
+    for name in _MEMORY:
+        setattr(cuda, name, lambda *_, **__: _peak_memory())
+    for name in _TENSORS:
+        setattr(cuda, name, getattr(torch, name))
+    cuda.Event, cuda.device = Event, _Device
+    cuda.current_device = lambda: 0
+    cuda.get_device_name = lambda *_: "CPU"
+
+
+def _replace(owner: Any, name: str, make: Callable[[Any], Any]) -> None:
+    setattr(owner, name, make(getattr(owner, name)))
+
+
+def _on_cpu(x: Any) -> Any:
+    if isinstance(x, torch.device):
+        return _CPU if x.type == "cuda" else x
+    if isinstance(x, str) and x.startswith("torch.cuda."):
+        return x.replace("torch.cuda.", "torch.")
+    return "cpu" if isinstance(x, str) and (x == "cuda" or x.startswith("cuda:")) else x
+
+
+class _CudaIsTheCpu(TorchFunctionMode):
+    def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if function in (torch.Tensor.cuda, torch.Tensor.pin_memory):
+            return args[0]
+        named = {name: _on_cpu(x) for name, x in (kwargs or {}).items() if name != "pin_memory"}
+        if isinstance(named.get("device"), int):
+            named["device"] = _CPU
+        if function is torch.Tensor.to and len(args) > 1 and isinstance(args[1], int):
+            args = (args[0], _CPU, *args[2:])
+        if function is torch.device and args and _on_cpu(args[0]) != args[0]:
+            return _CPU  # without an index, as the device of the tensors
+        return function(*map(_on_cpu, args), **named)
+
+
+def _started_with_it(start: Callable[[threading.Thread], None]) -> Callable[[threading.Thread], None]:
+    """Threads have modes of their own."""
+
+    def started(thread: threading.Thread) -> None:
+        run = thread.run
+
+        def run_with_it() -> None:
+            with _CudaIsTheCpu():
+                run()
+
+        thread.run = run_with_it  # type: ignore[method-assign]
+        start(thread)
+
+    return started
+
+
+def _loaded_on_cpu(load: Callable[..., Any]) -> Callable[..., Any]:
+    def loaded(file: Any, map_location: Any = None, *args: Any, **kwargs: Any) -> Any:
+        return load(file, "cpu" if map_location is None else _on_cpu(map_location), *args, **kwargs)
+
+    return loaded
+
+
+class Event:
+    """`torch.cuda.Event` by the clock."""
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        self._time = 0.0
+
+    def record(self, *_: Any) -> None:
+        """The event is now."""
+        self._time = time.perf_counter()
+
+    def elapsed_time(self, other: Event) -> float:
+        """Milliseconds from this event to the other."""
+        return 1_000 * (other._time - self._time)
+
+    def query(self) -> bool:
+        """Whether what was called before it is done."""
+        return True
+
+    def synchronize(self) -> None:
+        """Nothing runs behind the program's back."""
+
+    def wait(self, *_: Any) -> None:
+        """The same."""
+
+
+class _Device:
+    """`with torch.cuda.device(0):`."""
+
+    def __init__(self, _: Any) -> None:
+        pass
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *_: Any) -> None:
+        pass
+
+
+def _peak_memory() -> int:
+    """The most memory that the process has had, in bytes."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

@@ -1,0 +1,226 @@
+"""`diff_gaussian_rasterization`, the CUDA rasterizer of 3DGS and its forks, over this package's rasterizers.
+
+A fork is known by its settings, and gets what its own rasterizer returns:
+
+| settings | trainers | returns |
+|---|---|---|
+| 3DGS's alone | 3DGS before October 2024, DropGaussian | image, radii |
+| `antialiasing` | 3DGS | image, radii, inverse depth [1, H, W] |
+| `kernel_size`, `subpixel_offset` | Mip-Splatting | image, radii |
+| `confidence` | FSGS | image, radii, depth [1, H, W], alpha [1, H, W] |
+
+Depths are sums over a pixel's Gaussians, weighted as their colours are, and differentiable. `means2D.grad` holds the gradient of
+the projected centres in NDC; for Mip-Splatting its third column is Σ (|∂L/∂x| + |∂L/∂y|) over the pixels.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, Final, NamedTuple, cast
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+import rasterizers
+from rasterizers import autograd
+from rasterizers.geometry import SH_C0
+from rasterizers.interface import Camera, Rasterizer, Splats, over
+from rasterizers.reference.projection import footprints
+
+_NEAR: Final = 0.2  # what 3DGS draws begins at this depth
+_KERNEL: Final = 0.3  # its 2D kernel's variance, px²
+
+
+class GaussianRasterizationSettings(NamedTuple):
+    """What a rasterizer draws: 3DGS's settings, and behind `debug` those that single forks have.
+
+    Args:
+        viewmatrix, projmatrix: world to camera, and world to clip space, both transposed.
+        prefiltered, debug: without effect.
+        antialiasing: scale the opacities to make up for the blur of the 2D kernel.
+        kernel_size: the variance of that kernel, px²; such settings are always antialiased.
+        subpixel_offset: must be 0.
+        confidence: factors of the gradients; must be 1.
+    """
+
+    image_height: int
+    image_width: int
+    tanfovx: float
+    tanfovy: float
+    bg: Tensor
+    scale_modifier: float
+    viewmatrix: Tensor
+    projmatrix: Tensor
+    sh_degree: int
+    campos: Tensor
+    prefiltered: bool = False
+    debug: bool = False
+    antialiasing: bool | None = None
+    kernel_size: float | None = None
+    subpixel_offset: Tensor | None = None
+    confidence: Tensor | None = None
+
+    def camera(self) -> Camera:
+        """The same view for this package's rasterizers."""
+        view, width, height = self.viewmatrix.detach(), self.image_width, self.image_height
+        projection = torch.linalg.solve(view.double(), self.projmatrix.double())
+        cx, cy = (float((projection[2, i] + 1) * size / 2) for i, size in enumerate((width, height)))
+        return Camera(view.T.contiguous(), width / 2 / self.tanfovx, height / 2 / self.tanfovy, cx, cy, width, height)
+
+    @property
+    def kernel(self) -> float:
+        """The variance of the 2D kernel, px²."""
+        return _KERNEL if self.kernel_size is None else float(self.kernel_size)
+
+    def rasterizer(self) -> Rasterizer:
+        """One that draws over black."""
+        return _loaded(self.kernel, self.kernel_size is not None or bool(self.antialiasing))
+
+
+@functools.lru_cache(maxsize=8)
+def _loaded(kernel: float, antialiased: bool) -> Rasterizer:
+    return rasterizers.load(rasterizers.fastest("cpu"), near=_NEAR, kernel=kernel, antialiased=antialiased)
+
+
+class GaussianRasterizer(torch.nn.Module):
+    """Draws the image of these settings.
+
+    Raises:
+        ValueError: `subpixel_offset` or `confidence` is used, which only the CUDA rasterizers of Mip-Splatting and FSGS have.
+    """
+
+    def __init__(self, raster_settings: GaussianRasterizationSettings) -> None:
+        super().__init__()
+        self.raster_settings = raster_settings
+        for name, neutral in (("subpixel_offset", 0), ("confidence", 1)):
+            value = getattr(raster_settings, name)
+            if value is not None and bool((value != neutral).any()):
+                raise ValueError(
+                    f"{name} must be {neutral} everywhere on a CPU; other values need the CUDA rasterizer."
+                )
+
+    def markVisible(self, positions: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:  # noqa: N802 - the name of 3DGS
+        """Which positions are far enough before the camera."""
+        return _depths(positions.detach(), self.raster_settings.camera()) > _NEAR
+
+    def forward(
+        self,
+        means3D: Float[Tensor, "N 3"],
+        means2D: Float[Tensor, "N 3"],
+        opacities: Float[Tensor, "N 1"],
+        shs: Float[Tensor, "N K 3"] | None = None,
+        colors_precomp: Float[Tensor, "N 3"] | None = None,
+        scales: Float[Tensor, "N 3"] | None = None,
+        rotations: Float[Tensor, "N 4"] | None = None,
+        cov3D_precomp: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
+        """The image [3, H, W], the radii [N] in pixels (0: not visible), and what the fork adds.
+
+        Args:
+            means2D: any values; its gradient will be that of the projected centres.
+
+        Raises:
+            ValueError: colours or shapes are given twice, not at all, or as covariances.
+        """
+        if cov3D_precomp is not None or scales is None or rotations is None:
+            raise ValueError(
+                "shapes must be given as scales and rotations; cov3D_precomp (--compute_cov3D_python) needs the CUDA "
+                "rasterizer."
+            )
+        s = self.raster_settings
+        camera, rasterizer = s.camera(), s.rasterizer()
+        shapes = _Shapes(means3D, rotations, scales * s.scale_modifier, opacities[:, 0])
+        absgrad = None if s.kernel_size is None else torch.zeros_like(means3D[:, :2], requires_grad=False)
+        low, bands = 0.0, 1  # RGB of any range is drawn as (RGB - low) / (1 - low), which is at least 0
+        if shs is not None and colors_precomp is None:
+            colors, bands = shs, (s.sh_degree + 1) ** 2
+        elif colors_precomp is not None and shs is None:
+            low = min(0.0, float(colors_precomp.detach().min())) if len(colors_precomp) else 0.0
+            colors = _constant((colors_precomp - low) / (1 - low))
+        else:
+            raise ValueError("exactly one of shs and colors_precomp must be given.")
+        red, green, blue = ((x - low) / (1 - low) for x in s.bg.tolist())
+        inputs = autograd.Inputs(*shapes, colors, None)
+        rendered = autograd.render(over(rasterizer, (red, green, blue)), inputs, bands, camera, depth=False)
+        centres = _InNdc.apply(means2D, rendered.rendering.means2d, absgrad, camera)  # type: ignore[no-untyped-call]
+        drawn = autograd.in_graph(rendered, inputs, centres, absgrad=absgrad)
+        image = drawn.image.permute(2, 0, 1).contiguous()
+        image = image if low == 0 else low + (1 - low) * image
+        radii = _radii(drawn.visible, shapes, camera, s.kernel)
+        if s.antialiasing is None and s.confidence is None:
+            return image, radii
+        z = _depths(means3D, camera)[:, None].clamp_min(_NEAR)
+        depth = _sum(rasterizer, camera, shapes, z if s.antialiasing is None else 1 / z)
+        return (image, radii, depth) if s.confidence is None else (image, radii, depth, drawn.alpha[None])
+
+
+class _Shapes(NamedTuple):
+    means: Tensor
+    rotations: Tensor
+    scales: Tensor
+    opacities: Tensor
+
+
+def _constant(rgb: Float[Tensor, "N 3"]) -> Float[Tensor, "N 1 3"]:
+    """RGB as spherical harmonics."""
+    return ((rgb - 0.5) / SH_C0)[:, None]
+
+
+def _sum(
+    rasterizer: Rasterizer, camera: Camera, shapes: _Shapes, values: Float[Tensor, "N 1"]
+) -> Float[Tensor, "1 H W"]:
+    """Σ w · value of a pixel's Gaussians.
+
+    A backward pass that reaches it draws it once more: most steps have no loss of it, and a strategy takes all gradients of the
+    image in one pass where the image is the only drawing.
+    """
+
+    def drawn(values: Tensor, *shapes: Tensor) -> Tensor:
+        colors = _constant(values.expand(-1, 3))
+        splats = Splats(*_Shapes(*shapes), colors, colors[:, 1:])
+        return autograd.draw(rasterizer, splats, camera, colors=colors).image[..., 0][None]
+
+    if torch.is_grad_enabled() and any(x.requires_grad for x in shapes):
+        return cast(Tensor, checkpoint(drawn, values, *shapes, use_reentrant=True, preserve_rng_state=False))
+    return drawn(values, *shapes)
+
+
+def _depths(means: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, " N"]:
+    pose = camera.world_to_camera.to(means)
+    return means @ pose[2, :3] + pose[2, 3]
+
+
+@torch.no_grad()
+def _radii(visible: Bool[Tensor, " N"], shapes: _Shapes, camera: Camera, kernel: float) -> Int[Tensor, " N"]:
+    """Three standard deviations along the longer axis, in pixels; 0: not visible."""
+    rows = visible.nonzero()[:, 0]
+    f = footprints(shapes.means[rows], shapes.rotations[rows], shapes.scales[rows], camera, kernel)
+    a, c = f.deviations.square().unbind(-1)
+    middle, determinant = (a + c) / 2, c / f.conics[:, 0]
+    longest = middle + (middle * middle - determinant).clamp_min(0.1).sqrt()  # the eigenvalue as 3DGS bounds it
+    radii = torch.zeros(len(visible), dtype=torch.int32)
+    radii[rows] = (3 * longest.sqrt()).ceil().int()
+    return radii
+
+
+class _InNdc(torch.autograd.Function):
+    """The projected centres. Their gradient goes to the host's tensor, in NDC, and behind it the sum of `absgrad`, which is used
+    up.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, centres: Tensor, absgrad: Tensor | None, camera: Camera) -> Tensor:
+        ctx.half, ctx.columns, ctx.absgrad = (camera.width / 2, camera.height / 2), points.shape[1], absgrad
+        return centres.clone()
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Any:
+        half = gradient.new_tensor(ctx.half)
+        ndc = gradient.new_zeros(len(gradient), ctx.columns)
+        ndc[:, :2] = gradient * half
+        if ctx.absgrad is not None:
+            ndc[:, 2] = ctx.absgrad @ half
+            ctx.absgrad.zero_()
+        return ndc, None, None, None

@@ -1,0 +1,92 @@
+"""What gsplat compiles for CUDA, as functions on the CPU; the rest of gsplat is torch, and stays."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import inspect
+import sys
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any, Final, cast
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+import rasterizers
+from clear_strategies.errors import HostError
+
+
+def replace() -> None:
+    """Replace `rasterization` and gsplat's CUDA functions; one that is not here raises `HostError` where it is called."""
+    sys.modules["gsplat.cuda._backend"] = cast(Any, SimpleNamespace(_C=None))  # nothing compiled is loaded, or built
+    gsplat, rendering, distributed, relocation_of, ops, wrapper = (
+        importlib.import_module(f"gsplat{name}")
+        for name in ("", ".rendering", ".distributed", ".relocation", ".strategy.ops", ".cuda._wrapper")
+    )
+    everything: Any = (gsplat, rendering, distributed, relocation_of, ops, wrapper)
+    in_torch = importlib.import_module("gsplat.cuda._torch_impl")
+    for name, ours in {
+        "rasterization": _rasterization(rendering.rasterization),
+        "quat_scale_to_covar_preci": in_torch._quat_scale_to_covar_preci,
+        "_make_lazy_cuda_func": function,
+        "cli": lambda train, config, verbose=False: train(0, 0, 1, config),
+    }.items():
+        for module in everything:
+            if hasattr(module, name):
+                setattr(module, name, ours)
+
+
+def _rasterization(theirs: Callable[..., Any]) -> Callable[..., Any]:
+    """Ours, for calls in gsplat's order and with its default of `packed`."""
+    signature = inspect.signature(theirs)
+
+    @functools.wraps(theirs)
+    def rasterization(*args: Any, **kwargs: Any) -> Any:
+        call = {"packed": signature.parameters["packed"].default} | signature.bind(*args, **kwargs).arguments
+        return rasterizers.rasterization(**call)
+
+    return rasterization
+
+
+def function(name: str) -> Callable[..., Any]:
+    """A function of gsplat's CUDA module."""
+
+    def absent(*_: Any, **__: Any) -> Any:
+        raise HostError(
+            f"gsplat's CUDA function {name} has no counterpart on a CPU. docs/how-to/on-a-laptop.md lists the options that work."
+        )
+
+    return _FUNCTIONS.get(name, absent)
+
+
+def _relocation(
+    opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, n_max: int, min_opacity: float = 0.0
+) -> tuple[Tensor, Tensor]:
+    """`gsplat.relocation`, of MCMC; the table of binomials is not needed."""
+    from clear_strategies.density.mcmc import relocation  # other trainers need not load the densifiers
+
+    return relocation(opacities, scales, ratios.long(), min_opacity)
+
+
+@torch.no_grad()
+def _adam(
+    param: Tensor,
+    grad: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    valid: Bool[Tensor, " N"],
+    lr: float,
+    beta1: float,
+    beta2: float,
+    eps: float,
+) -> None:
+    """A step of gsplat's `SelectiveAdam`: of the valid rows alone, without bias correction."""
+    rows = valid.nonzero()[:, 0]
+    mean[rows] = beta1 * mean[rows] + (1 - beta1) * grad[rows]
+    square[rows] = beta2 * square[rows] + (1 - beta2) * grad[rows].square()
+    param[rows] -= lr * mean[rows] / (square[rows].sqrt() + eps)
+
+
+_FUNCTIONS: Final[dict[str, Callable[..., Any]]] = {"relocation": _relocation, "adam": _adam}

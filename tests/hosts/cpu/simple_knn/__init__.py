@@ -1,1 +1,0 @@
-"""In place of the CUDA module of 3DGS-style trainers."""
