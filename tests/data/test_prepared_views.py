@@ -128,8 +128,10 @@ def test_transparent_photos_can_be_shown_before_any_background(tmp_path, photos_
     )
     for mine, expected in zip(white, black, strict=True):
         for scale in ("lr", "hr"):
-            moved, photo = getattr(mine, scale).over((0.0, 0.0, 0.0), mine.background), getattr(expected, scale)
-            assert moved.transparency.shape == photo.image.shape[:2]
+            transparent, photo = getattr(mine, scale), getattr(expected, scale)
+            assert transparent.transparency.shape == photo.image.shape[:2]
+            moved = transparent.over((0.0, 0.0, 0.0), mine.background)
+            assert moved.transparency is None
             torch.testing.assert_close(moved.image, photo.image, atol=2.5 / 255, rtol=0)
     assert prepare(capture(), replace(views, photos_are="hr"), Bicubic(), POINTS).train[0].lr.transparency is None
 
