@@ -164,7 +164,9 @@ def _outputs(
         def vjp(cotangents: Tensor) -> SplatGradients:
             outputs[f"losses {scale}"] = {"cotangents": cotangents.clone()}
             g = r.vjp(cotangents if given is None else given[f"losses {scale}"]["cotangents"].to(image))
-            outputs[f"backward {scale}"] = {f.name: x.clone() for f in fields(g) if (x := getattr(g, f.name)) is not None}
+            outputs[f"backward {scale}"] = {
+                f.name: x.clone() for f in fields(g) if (x := getattr(g, f.name)) is not None
+            }
             if given is None:
                 return g
             return SplatGradients(**{name: x.to(image) for name, x in given[f"backward {scale}"].items()})
