@@ -15,7 +15,7 @@ from clear_strategies.schedules import milestone
 from integration.gsplat import attach
 from integration.gsplat.attached import Attached
 from integration.views import view
-from rasterizers.autograd import rasterization
+from rasterizers import rasterization
 
 
 @dataclass(frozen=True)
