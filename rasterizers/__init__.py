@@ -13,7 +13,7 @@ from __future__ import annotations
 import importlib
 from contextlib import suppress
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import torch
 
@@ -28,9 +28,6 @@ from rasterizers.interface import (
     Splats,
     Traits,
 )
-
-if TYPE_CHECKING:
-    from rasterizers.as_gsplat import rasterization
 
 __all__ = [
     "PRESETS", "BackendUnavailable", "Camera", "RasterSettings", "Rasterizer", "Rendering", "SplatGradients", "Splats",

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, ParamSpec, TypeVar, cast
+from typing import Any, Final, NamedTuple, ParamSpec, TypeVar, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -24,14 +24,7 @@ from rasterizers.checks import require_absgrad, require_depth
 from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, WithAbsgrad, over
 from rasterizers.pose import pose_gradient
 
-if TYPE_CHECKING:
-    from rasterizers.ahead import drawing_ahead
-    from rasterizers.as_gsplat import rasterization
-
-__all__ = [
-    "BackwardHook", "Drawing", "Drawn", "TakeColours", "draw", "drawing_ahead", "outer", "rasterization", "recorded",
-    "uncompiled",
-]  # fmt: skip
+__all__ = ["BackwardHook", "Drawing", "Drawn", "TakeColours", "draw", "outer", "recorded", "uncompiled"]
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")

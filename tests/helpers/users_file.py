@@ -15,7 +15,7 @@ from clear_strategies.schedules import milestone
 from integration.gsplat import attach
 from integration.gsplat.attached import Attached
 from integration.views import view
-from rasterizers import rasterization
+from rasterizers.as_gsplat import rasterization
 
 
 @dataclass(frozen=True)
