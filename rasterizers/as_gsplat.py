@@ -99,8 +99,8 @@ def rasterization(
         raise ValueError(
             "rgb_offset is an offset of spherical harmonics, give sh_degree; RGB takes it as colors + rgb_offset."
         )
-    device = means.device.type
-    rasterizer = _loaded(backend, device, near_plane, eps2d, rasterize_mode == "antialiased")
+    colors = colors.to(means.dtype)  # gsplat takes float16, too
+    rasterizer = _loaded(backend, means.device.type, near_plane, eps2d, rasterize_mode == "antialiased")
 
     def of_scene(x: Tensor, scene: int) -> Tensor:
         return x if not batch else x.reshape(n_scenes, *x.shape[len(batch) :])[scene]
@@ -118,7 +118,7 @@ def rasterization(
             views.append(
                 _View(
                     rasterizer, camera, poses[c], inputs, sh_degree,
-                    None if behind is None else behind[c], render_mode, absgrad,
+                    None if behind is None else behind[c], render_mode,
                 )
             )  # fmt: skip
     drawn = [view.parts() for view in views]
@@ -166,17 +166,19 @@ class _View:
     sh_degree: int | None
     background: Float[Tensor, " D"] | None
     render_mode: str
-    absgrad: bool
 
     def parts(self) -> list[_Part]:
         found = []
         if "RGB" in self.render_mode and self.sh_degree is not None:
             behind = [0.0] * 3 if self.background is None else self.background.tolist()
             rendered = render(
-                over(self.rasterizer, cast(Any, tuple(behind))), self._typed(), (self.sh_degree + 1) ** 2, self.camera,
+                over(self.rasterizer, cast(Any, tuple(behind))),
+                self.inputs,
+                (self.sh_degree + 1) ** 2,
+                self.camera,
                 depth=False,
-            )  # fmt: skip
-            found.append(_Part(rendered, self._typed(), 0.0, 1.0, 3))
+            )
+            found.append(_Part(rendered, self.inputs, 0.0, 1.0, 3))
         elif "RGB" in self.render_mode:
             found += [self._channels(*x) for x in self._threes()]
         if self.render_mode != "RGB":
@@ -213,9 +215,6 @@ class _View:
             image = image + torch.nn.functional.pad(through, (0, image.shape[-1] - through.shape[-1]))
         return image, cast(Tensor, alpha)
 
-    def _typed(self) -> Inputs:
-        return self.inputs._replace(colors=self.inputs.colors.to(self.inputs.means.dtype))  # gsplat takes float16, too
-
     def _threes(self) -> Iterator[tuple[Tensor, Tensor | None, int]]:
         """The channels by threes, the background of each three, and how many of them there are."""
         for first in range(0, self.inputs.colors.shape[-1], 3):
@@ -227,7 +226,6 @@ class _View:
     def _channels(self, colors: Float[Tensor, "N 3"], background: Tensor | None, keeps: int) -> _Part:
         behind = [0.0] * 3 if background is None else [*background.tolist(), *[0.0] * (3 - len(background))]
         low, span = _low_and_span(colors, [behind])
-        colors = colors.to(self.inputs.means.dtype)
         sh0 = ((colors - low) / span - 0.5)[:, None] / SH_C0
         inputs = self.inputs._replace(colors=sh0, rgb_offset=None)
         behind = [(x - low) / span for x in behind]
