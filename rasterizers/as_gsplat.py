@@ -26,6 +26,7 @@ __all__ = ["cameras_of", "rasterization", "rasterizer_of"]
 
 _MODES: Final = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 _FARTHEST: Final = 1e10  # gsplat's default
+_ALPHA_MAX: Final = 0.999  # gsplat's cap on a single contribution; Inria's, and our default, is 0.99
 # The only value of each other argument that this package draws; None for one that is not listed. The others change the speed.
 _SUPPORTED: Final = {
     "camera_model": "pinhole", "with_ut": False, "with_eval3d": False, "rolling_shutter": "GLOBAL", "distributed": False,
@@ -454,4 +455,4 @@ def _require_supported(render_mode: str, rasterize_mode: str, more: Mapping[str,
 def _loaded(name: str, device: str, near: float, kernel: float, antialiased: bool) -> Rasterizer:
     name = rasterizers.fastest(device) if name == "auto" else name
     where = rasterizers.for_device(name, device)
-    return rasterizers.load(name, near=near, kernel=kernel, antialiased=antialiased, **where)
+    return rasterizers.load(name, near=near, kernel=kernel, antialiased=antialiased, alpha_max=_ALPHA_MAX, **where)

@@ -38,6 +38,7 @@ _BINOMIALS: Final = torch.tensor(
     [[math.comb(n, j) for j in range(_MOST_COPIES + 1)] for n in range(_MOST_COPIES + 1)], dtype=torch.float64
 )
 _DENSE: Final = 4.0  # LR px between initial points, up to which their number is a measure of the surface
+_WHOLE: Final = 2**30  # what 1 is, as a whole number: sums of 2²³ Gaussians are exact in float64
 _SHORT_RUN: Final = 750  # the least `stop`, that of 1,500 iterations; shorter runs gain more by density control
 _GATE: Final = 100.0  # slope of the noise's gate σ(100 (dead_opacity - o))
 _STILL: Final = 1e-4  # of the gate: below it, at opacities above 0.1, a Gaussian stays where it is
@@ -154,7 +155,7 @@ class Sampler(Densifier):
         added = max(0, min(self.cap, math.floor((1 + s.growth) * n)) - n)
         if len(dead) + added == 0:
             return None
-        sources = torch.multinomial(opacities * live, len(dead) + added, replacement=True, generator=generator)
+        sources = drawn(opacities * live, len(dead) + added, generator)
         parents = torch.cat((torch.arange(n, device=sources.device), sources[len(dead) :]))
         parents[dead] = sources[: len(dead)]
         copies = torch.bincount(parents, minlength=n)[parents]
@@ -181,6 +182,16 @@ class Sampler(Densifier):
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         self.cap = int(tensors["cap"])
+
+
+def drawn(weights: Float[Tensor, " N"], n: int, generator: torch.Generator) -> Int[Tensor, " n"]:
+    """Rows, each with a probability proportional to its weight in [0, 1], with replacement.
+
+    Unlike those of `torch.multinomial`, the sums are of whole numbers, which no order of addition on a GPU changes.
+    """
+    sums = (weights.double() * _WHOLE).long().cumsum(0)
+    at = torch.rand(n, generator=generator, device=weights.device, dtype=torch.float64) * sums[-1]
+    return torch.searchsorted(sums, at.long(), right=True)
 
 
 def _spacing(field: GaussianField, cameras: Sequence[Camera]) -> float:

@@ -1,11 +1,13 @@
 """HR and extra views that this package draws beside a host's own LR: the same gradients, live and replayed."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import pytest
 import torch
 
 import clear_strategies as cs
+import rasterizers
 from clear_strategies import Conductor
 from clear_strategies.core.view import ExtraView
 from clear_strategies.merging.replays import LIVE
@@ -13,7 +15,7 @@ from clear_strategies.merging.skips import Skips
 from clear_strategies.schedules import Ramp
 from integration import own_drawing
 from rasterizers.recording import running
-from tests.helpers import toy
+from tests.helpers import gsplat_host, toy
 from tests.helpers.backends import needs
 from tests.helpers.gsplat_host import Host, attached, drawn
 from tests.helpers.host_parts import HR_FROM_START
@@ -96,7 +98,7 @@ def trained(
     Args:
         calls: what the host gives its rasterizer besides, one after the other.
     """
-    host = Host(scene, **calls[0])
+    host = Host(scene, rasterization=same_bits(scene), **calls[0])
     strategies = everything() if strategies is None else strategies
     clear = attached(host, scene, Conductor(*strategies, objective=objective, skips=skips), hr_by=hr_by, **settings)
     host.degree = lambda step: 2 if step < 3 else 3
@@ -109,6 +111,12 @@ def trained(
     host.train([names[i % len(names)] for i in range(steps)], between=between)
     clear.remove()
     return {name: p.detach().clone() for name, p in host.splats.items()}, logs, clear
+
+
+def same_bits(scene):
+    """A function for the host's LR with one result: torch's own adds in any order on a GPU."""
+    on_gpu = scene.train[0].lr.image.is_cuda
+    return partial(rasterizers.rasterization, backend="warp") if on_gpu else gsplat_host.rasterization
 
 
 def require_close(found, expected):
@@ -250,7 +258,7 @@ def test_replays_over_densification_resets_evaluation_and_resuming(monkeypatch, 
 
     def run():
         torch.manual_seed(0)
-        host = Host(scene, extent=4.0, strategy=strategies.DefaultStrategy(
+        host = Host(scene, rasterization=same_bits(scene), extent=4.0, strategy=strategies.DefaultStrategy(
             refine_start_iter=2, refine_stop_iter=14, refine_every=6, reset_every=9, grow_grad2d=2e-4, prune_opa=0.02
         ))  # fmt: skip
         clear = begun(host)
@@ -262,7 +270,7 @@ def test_replays_over_densification_resets_evaluation_and_resuming(monkeypatch, 
         host.train(names, between=evaluate)
         logs = [clear.attachment.conductor.work_log]
         clear.remove()
-        resumed = Host(scene, extent=4.0)
+        resumed = Host(scene, rasterization=same_bits(scene), extent=4.0)
         resumed.splats = {name: torch.nn.Parameter(p.detach().clone()) for name, p in host.splats.items()}
         resumed.optimizers = {name: torch.optim.Adam([p], lr=1e-3) for name, p in resumed.splats.items()}
         again = begun(resumed)

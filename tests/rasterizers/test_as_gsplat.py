@@ -69,7 +69,7 @@ def composited(splats, colors, pose, K, background=None, sh_degree=None, antiali
     dx, dy = (p.double()[..., None] - f.means2d[order, i] for i, p in enumerate((x, y)))
     A, B, C = f.conics[order].unbind(-1)
     alpha = opacities[order] * torch.exp(-0.5 * (A * dx * dx + C * dy * dy) - B * dx * dy)
-    alpha = torch.where(alpha >= 1 / 255, alpha.clamp_max(0.99), 0.0)
+    alpha = torch.where(alpha >= 1 / 255, alpha.clamp_max(0.999), 0.0)
     through = torch.cumprod(torch.cat((torch.ones_like(alpha[..., :1]), 1 - alpha), -1), -1)
     weights = through[..., :-1] * alpha
     image = weights @ colors[order] if background is None else weights @ colors[order] + through[..., -1:] * background
