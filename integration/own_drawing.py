@@ -33,6 +33,7 @@ from clear_strategies.merging.replays import (
 from integration.autograd_shot import AutogradShot, HostOutput, Target, every_number, to_parameters
 from rasterizers.autograd import BackwardHook, Drawing
 from rasterizers.interface import Camera, Rasterizer, Recordable, Splats, over
+from rasterizers.recording import unread
 
 _log = logging.getLogger(__name__)
 
@@ -194,7 +195,7 @@ class OwnDrawing:
             if not recorded:
                 return self._compared(given, asked, view, t), {}
             logged = conductor.logs()
-            shown = View(view.name, view.lr, given.photo, background=view.background)
+            shown = View(unread(view.name, "the name of the view"), view.lr, given.photo, background=view.background)
             made = self._compared(given, asked, shown, t)
             return made, {**made[0].losses, **conductor.take_logs(logged)}
 

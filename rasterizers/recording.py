@@ -126,6 +126,50 @@ class _Watch(TorchDispatchMode):  # type: ignore[no-untyped-call]
         return result
 
 
+class Unread:
+    """What recorded work is told but must not read, such as the iteration: its replays would repeat what it decides by it. It can
+    be put into a message.
+    """
+
+    def __init__(self, value: object, what: str) -> None:
+        self._value, self._what = value, what
+
+    @property
+    def __class__(self) -> Any:  # for isinstance, which type checks ask
+        return type(self._value)
+
+    def __str__(self) -> str:
+        return str(self._value)
+
+    __repr__ = __str__
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        self.refuse()
+
+    def refuse(self, *_: Any) -> Any:
+        """In place of every operation."""
+        raise RuntimeError(f"recorded work must not read {self._what}, which is another one in a replay.")
+
+    @classmethod
+    def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        next(x for x in tree_leaves((args, kwargs)) if isinstance(x, cls)).refuse()
+
+
+_OPERATIONS: Final = (
+    "eq ne lt le gt ge add radd sub rsub mul rmul truediv rtruediv floordiv rfloordiv mod rmod pow rpow neg pos abs int float "
+    "index bool hash round trunc floor ceil divmod rdivmod len iter getitem contains"
+)  # fmt: skip
+for _operation in _OPERATIONS.split():
+    setattr(Unread, f"__{_operation}__", Unread.refuse)
+
+
+def unread(value: T, what: str) -> T:
+    """The value; in work that is being recorded an `Unread`."""
+    return value if running() is None else cast(T, Unread(value, what))
+
+
 class _Running(threading.local):
     recording: Recording[Any] | None = None
 

@@ -7,7 +7,7 @@ from functools import lru_cache
 from typing import Any, Final, NamedTuple, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from clear_strategies.core.deferred import Number
@@ -140,6 +140,12 @@ def scale_rows(value: Float[Tensor, "N ..."], weight: float | Float[Tensor, " N"
     if isinstance(weight, Tensor) and weight.dim() == 1:
         weight = weight.to(value).view(-1, *[1] * (value.dim() - 1))
     return value * weight
+
+
+def gathered(rows: Float[Tensor, "N ..."], parents: Int[Tensor, " M"]) -> Float[Tensor, "M ..."]:
+    """Row i is a copy of row parents[i]; in the same memory where there are as many, so that recordings of it hold."""
+    chosen = rows.index_select(0, parents)
+    return rows.copy_(chosen) if len(rows) == len(parents) else chosen
 
 
 def conflict_columns(conflict: Mapping[str, Number]) -> dict[str, Number]:

@@ -28,6 +28,7 @@ from clear_strategies.merging.objective import Losses, Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
 from clear_strategies.strategies.base import ScreenGradients, Strategy, by_class, overrides
 from rasterizers.interface import Color
+from rasterizers.recording import unread
 
 _log = logging.getLogger(__name__)
 
@@ -200,10 +201,10 @@ class Conductor:
         else:
             # Where Î_LR is the area mean of Î_HR, the cotangent of L_LR passes through the same HR render.
             through_mean = images.area_mean_transposed(l_lr.cotangents, view.factor) if reduced else None
-            drawn = Step(t, view, hr.visible, params=params, looked_up=looked_up)
-            g_mean, from_hr = self._backward_hr(hr, drawn, vjp, through_mean)
+            drawn = Step(_told(t), view, hr.visible, params=params, looked_up=looked_up)
+            g_mean, from_hr = self._backward_hr(hr, drawn, t, vjp, through_mean)
             g_lr = g_mean if reduced else g_lr
-        step = Step(t, view, params=params) if from_hr is None else from_hr.step
+        step = Step(_told(t), view, params=params) if from_hr is None else from_hr.step
         with stage("strategies" if stepper is None else stepper.stage):
             score = ordinary = None
             if scored:
@@ -239,8 +240,8 @@ class Conductor:
             params, looked_up: for `Step`.
         """
         apart = apart or self.owner("route") is not None or self.owner("score") is not None
-        step = Step(t, view, hr.visible, params=params, looked_up=looked_up)
-        return self._backward_hr(hr, step, vjp or _vjp, apart=apart)[1]
+        step = Step(_told(t), view, hr.visible, params=params, looked_up=looked_up)
+        return self._backward_hr(hr, step, t, vjp or _vjp, apart=apart)[1]
 
     def extra_views(self, t: int) -> list[ExtraView]:
         """The pictures that the field should match at t besides the view; each gets a step on `extra_loss`."""
@@ -323,7 +324,7 @@ class Conductor:
         """What the strategies add to the merged gradient; empty: nothing.  Eq. 16"""
         total = Grads()
         for s in self.regularizers:
-            g = s.regularize(params, t)
+            g = s.regularize(params, _told(t))
             if g is None:
                 self.work_log.skip("regularize", "no anchor yet")
             else:
@@ -404,6 +405,7 @@ class Conductor:
         self,
         hr: Shot,
         step: Step,
+        t: int,
         vjp: Callable[..., Sequence[Any]],
         lr_cotangents: Tensor | None = None,
         apart: bool = True,
@@ -411,12 +413,12 @@ class Conductor:
         """∇(λ_LR L_LR) where its cotangents [1, H, W, 3] are given, and the gradients of the HR losses."""
         stage = self.work_log.stage
         with stage("losses HR"):
-            sr = step.view.hr.over(self.background(step.t), step.view.background)
+            sr = step.view.hr.over(self.background(t), step.view.background)
             # The memory is kept: an allocator maps tens of megabytes afresh each time, at a page fault for every 4 KB.
             losses = self.objective.hr(hr.image.detach(), sr.image, sr.shown, reuse=self._hr_cotangents)  # Eq. 5
             self._hr_cotangents = losses.cotangents
         require_finite_losses(
-            _where(step.view, step.t), losses.values, {"the SR image": sr.image, "the HR render": hr.image}
+            _where(step.view, t), losses.values, {"the SR image": sr.image, "the HR render": hr.image}
         )
         with stage("backward HR"):  # one pass for all cotangents
             of_hr = losses.cotangents
@@ -440,6 +442,11 @@ def _screen_gradients(lr: Float[Tensor, "N 2"], hr: HrSide[Any], weights: LossWe
 
 def _vjp(shot: Shot, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[Grads]:
     return shot.vjp(cotangents)
+
+
+def _told(t: int) -> int:
+    """The iteration, for a strategy."""
+    return unread(t, "the iteration")
 
 
 def _where(view: View, t: int) -> str:

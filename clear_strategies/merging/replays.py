@@ -1,7 +1,8 @@
 """Work that is recorded by its kind and replayed, in the trainer and in hosts; see `rasterizers.recording`.
 
 Work of a new kind is live first, so that kernels are compiled and caches filled. The next time it is recorded, and then it is
-replayed while the tensors that it reads lie where they lay. Whatever fails in a recording or a replay, all that follows is live.
+replayed while the tensors that it reads lie where they lay. Where they lie elsewhere, it is recorded anew. Whatever fails in a
+recording or a replay, all that follows is live.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ LIVE: Final = "live in place of a replay"
 """The work log's entry for work that was not replayed, by the reason. It has no runs, so that none seem saved."""
 
 _FAILED: Final = "a recording failed"
+_RESTLESS: Final = 20  # changes of memory without a replay between them, where no structure changes so often
 _MOST_KINDS: Final = 8  # a recording keeps the memory of its work
 
 T = TypeVar("T")
@@ -39,7 +41,8 @@ class Kind:
     """What Python decides by in the work: work of one kind launches the same kernels.
 
     Args:
-        addresses: where the tensors lie that it reads in place. When they change, every recording is dropped.
+        addresses: where the tensors lie that it reads in place, and how many rows they have. When this changes, every recording
+            is dropped.
         shapes, facts: whatever else Python looks at.
     """
 
@@ -69,8 +72,12 @@ class Replays:
 
     def __init__(self, device: torch.device, work_log: WorkLog, name: str) -> None:
         self._device, self._work_log, self._name = device, work_log, name
-        self._recorded: dict[Kind, Any] = {}  # None: seen once
+        self._recorded: dict[Kind, Any] = {}  # None: to be recorded
+        self._done: set[tuple[Any, ...]] = (
+            set()
+        )  # what work that was live has in common with such whose tensors lie elsewhere
         self._addresses: tuple[int, ...] = ()
+        self._moves = 0  # changes of these since the last replay
         self._failed = False
 
     def do(self, kind: Kind, t: int, given: Any, *, live: Callable[[], T], record: Callable[[], Recorded[Any, T]]) -> T:
@@ -79,16 +86,25 @@ class Replays:
             return self._live(live, _FAILED)
         if kind.addresses != self._addresses:  # the structure has changed, and with it everything that was recorded
             self._recorded.clear()
-            self._addresses = kind.addresses
+            self._addresses, self._moves = kind.addresses, self._moves + 1
+            if self._moves == _RESTLESS:
+                _log.warning(
+                    "Nothing is replayed, so that on a GPU an iteration takes two to three times as long: in each one, a "
+                    "tensor of the field or of a strategy's state is a new one. Write to Strategy.state in place, by copy_()."
+                )
         if kind not in self._recorded:
             if len(self._recorded) == _MOST_KINDS:
                 return self._live(live, f"more than {_MOST_KINDS} kinds")
             self._recorded[kind] = None
-            with on_side_stream(self._device):  # some caches are of a stream
-                return self._live(live, "the first of its kind")
+            alike = len(kind.addresses), kind.shapes, kind.facts
+            if alike not in self._done or self._moves > 1:  # where nothing lasts, a recording does not pay
+                self._done.add(alike)
+                with on_side_stream(self._device):  # some caches are of a stream
+                    return self._live(live, "the first of its kind")
         try:
             known = self._recorded[kind]
             recorded = record() if known is None else known if known.replay(given) else None
+            self._moves = 0 if recorded is known is not None else self._moves
             reason = "the recorded lists of pairs are too short"  # recorded anew, with space for more
         except Exception as error:
             self._failed, recorded, reason = True, None, _FAILED

@@ -19,7 +19,7 @@ from torch import Tensor
 from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.evidence import Evidence, PatchMaps
-from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, Shot
+from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, Shot, gathered
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, View
 from clear_strategies.kernels import native, reconcile
@@ -161,7 +161,7 @@ class Strategy:
     def on_resize(self, parents: Int[Tensor, " M"]) -> None:
         """After the structure changed: row i of every per-Gaussian tensor now comes from row parents[i]."""
         for name, rows in self.state.items():
-            self.state[name] = rows[parents]
+            self.state[name] = gathered(rows, parents)
 
     def on_fit_end(self) -> None:
         """After the last iteration: release the memory that only training needs."""

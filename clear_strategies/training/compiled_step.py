@@ -12,7 +12,7 @@ device, and so do the numbers made of them (`core.deferred`).
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import Final, Literal
 
 import torch
@@ -100,7 +100,7 @@ class CompiledStep:
         self.conductor, self.optimizer, self.skips = conductor, optimizer, skips
         self._passes = gaussian_pass(optimizer) if passes is None else passes
         self._numbers: Tensor | None = None  # see `_recorded_numbers`
-        self._examined: tuple[int, Sequence[Tensor]] | None = None
+        self._examined: tuple[int, int] | None = None
         self._quiet = False
 
     @property
@@ -213,20 +213,20 @@ class CompiledStep:
     def _above_is_quiet(self, active: int, *, moved: bool) -> bool:
         """Whether bands above the active degree have no momentum.
 
-        Recomputed when a tensor has been replaced (densification, resuming). While the tensors are the same the result holds: a
-        pass that skips the bands leaves them quiet, and momentum does not vanish.
+        Read anew where the moments have been restored. Else the result holds: a pass that skips the bands leaves them quiet,
+        momentum does not vanish, and a change of the structure gathers rows and zeroes some.
 
         Args:
             moved: a strategy gives them a gradient. It is not read, since on a device the host would wait.
         """
-        moments = (self.optimizer.first["shN"], self.optimizer.second["shN"])
+        restored = self.optimizer.restored
         if self._examined is not None and not moved:
             examined_at, same = self._examined
-            known = examined_at <= active if self._quiet else examined_at == active
-            if known and all(a is b for a, b in zip(same, moments, strict=True)):
+            if same == restored and (examined_at <= active if self._quiet else examined_at == active):
                 return self._quiet
+        moments = (self.optimizer.first["shN"], self.optimizer.second["shN"])
         self._quiet = not moved and not any(bool(x[:, active:].any()) for x in moments)
-        self._examined = active, moments
+        self._examined = active, restored
         return self._quiet
 
 

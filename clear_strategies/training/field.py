@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from clear_strategies.core.gradients import ATTRIBUTES, Grads
+from clear_strategies.core.gradients import ATTRIBUTES, Grads, gathered
 from clear_strategies.core.points import PointCloud, spread
 from clear_strategies.core.view import View
 from clear_strategies.kernels import per_gaussian
@@ -121,10 +121,10 @@ class GaussianField(nn.Module):
             self.filter_3d = stds
 
     def take(self, parents: Int[Tensor, " M"], fresh: Bool[Tensor, " M"]) -> None:
-        """Change the structure by one gather: row i becomes a copy of row parents[i]."""
+        """Change the structure by one gather, see `gathered`: row i becomes a copy of row parents[i]."""
         for name in ATTRIBUTES:
-            getattr(self, name).data = getattr(self, name).data.index_select(0, parents)
-        self.filter_3d = self.filter_3d[parents]
+            getattr(self, name).data = gathered(getattr(self, name).data, parents)
+        self.filter_3d = gathered(self.filter_3d, parents)
 
     def constrain(self) -> None:
         """Clamp parameters to where they have a gradient: logits to ±15, log scales to ±20."""

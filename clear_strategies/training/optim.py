@@ -12,7 +12,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from clear_strategies.core.checks import require_number, require_whole
-from clear_strategies.core.gradients import ATTRIBUTES
+from clear_strategies.core.gradients import ATTRIBUTES, gathered
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.schedules import LARGEST_RATE, LogLinear, milestone
 
@@ -99,11 +99,14 @@ class Adam:
 
     Args:
         extent: 3DGS's cameras_extent, world units: scales the positions' learning rate.
+
+    Attributes:
+        restored: how often the moments came from elsewhere, a checkpoint.
     """
 
     def __init__(self, params: Mapping[str, Tensor], rates: LearningRates, extent: float) -> None:
         self.rates, self.extent = rates, extent
-        self.steps = 0
+        self.steps = self.restored = 0
         self.first = {name: torch.zeros_like(p) for name, p in params.items()}
         self.second = {name: torch.zeros_like(p) for name, p in params.items()}
 
@@ -133,7 +136,7 @@ class Adam:
         new = fresh.nonzero()[:, 0]
         for moments in (self.first, self.second):
             for name, rows in moments.items():
-                moments[name] = rows.index_select(0, parents).index_fill_(0, new, 0)
+                moments[name] = gathered(rows, parents).index_fill_(0, new, 0)
 
     def forget(self, name: str) -> None:
         """Zero an attribute's moments, e.g. after an opacity reset."""
@@ -145,7 +148,7 @@ class Adam:
         return {f"{kind}.{name}": rows for kind, table in moments.items() for name, rows in table.items()}
 
     def load_state_dict(self, tensors: Mapping[str, Tensor], steps: int) -> None:
-        self.steps = steps
+        self.steps, self.restored = steps, self.restored + 1
         self.first, self.second = (
             {name: tensors[f"{kind}.{name}"].to(rows.device, copy=True) for name, rows in moments.items()}
             for kind, moments in (("first", self.first), ("second", self.second))

@@ -32,6 +32,7 @@ from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.given import Given, GivenExtra, GivenView, L, Learned, LearnedView
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Rasterizer, Recordable
+from rasterizers.recording import Unread
 from rasterizers.warp_runtime import sent
 
 _log = logging.getLogger(__name__)
@@ -134,7 +135,8 @@ class _Recorded:
             extra = replace(given.extra, photo=photos[0], weight=given.extra.weight.clone())
             return replace(given, extra=extra, background=None)
         lr, hr, *_ = [*photos, given.view.hr]  # where HR is not drawn, its size alone is read
-        view = View(given.view.name, lr, hr, background=given.behind)
+        name = cast(str, Unread(given.view.name, "the name of the view"))
+        view = View(name, lr, hr, background=given.behind)
         looked_up = copied(self._look_up(given.view))
         return replace(given, view=view, gate=copied(given.gate), background=None, looked_up=looked_up)
 

@@ -11,7 +11,7 @@ from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import Grads, to_ndc
 from clear_strategies.core.step import Step
 from clear_strategies.density.adaptive import DensitySettings
-from clear_strategies.kernels.per_gaussian import activate, dispatch
+from clear_strategies.kernels.per_gaussian import activate, dispatch, wander
 from clear_strategies.merging.iteration import HrSide, Update
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
@@ -114,6 +114,21 @@ def test_scores_and_their_sum(by_warp, score_by, hf):
 
 
 @pytest.mark.slow
+def test_the_noise_of_mcmc(by_warp, monkeypatch):
+    monkeypatch.setattr(dispatch.native, "takes", lambda *_: False)  # torch, not C++
+    quats, log_scales, gate, eta = numbers(N, 4) * 10, numbers(N, 3), numbers(N).sigmoid(), numbers(N // 2, 3)
+    quats[0], quats[2] = 0, 1e-25
+    rows = torch.arange(0, N, 2)
+
+    def moved():
+        means = numbers(N, 3)
+        wander(means, quats, log_scales, gate, rows, eta, 3.0)
+        return means
+
+    found, expected = by_warp(moved)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+
+
 def test_the_kernels_compile_for_cuda_on_a_machine_without(ptx_of):
     from clear_strategies.kernels.per_gaussian import warp
 

@@ -54,6 +54,7 @@ def start(
     rises_at: int = 20,
     degree_every: int = 150,
     scores_from: int = 1,
+    reconciles: cs.Strategy | None = None,
     **of_svs: Any,
 ) -> TrainState:
     """A training of everything that `best` is made of, over which λ_HR rises and falls, and with an anchor."""
@@ -64,7 +65,7 @@ def start(
     )
     defaults = {"dropout": Ramp(full=200), "anchor_start": 300, "anchor_weights": {"means": 1.0}}
     svs = cs.SVS(looks=0, anchor_strength=0.01, **(defaults | of_svs))
-    conductor = cs.Conductor(cs.GCO(), cs.P2G(), svs, *more, objective=objective, statistics_from=1)
+    conductor = cs.Conductor(reconciles or cs.GCO(), cs.P2G(), svs, *more, objective=objective, statistics_from=1)
     state = TrainState.start(
         with_depth(scene).to(DEVICE), conductor,
         settings=FitSettings(iterations=iterations, scale_schedule=False, degree_every=degree_every, seed=5),
@@ -232,14 +233,49 @@ def test_kinds_beyond_the_most_are_live_and_counted(monkeypatch):
 
 
 def test_recordings_of_an_earlier_structure_are_dropped():
-    recorded, kept = (
-        SimpleNamespace(replay=lambda _: True, outcome=lambda _: "replayed"),
-        Replays(DEVICE, WorkLog(), ""),
-    )
+    kept, made = Replays(DEVICE, WorkLog(), ""), []
+
+    def recorded():
+        made.append(SimpleNamespace(replay=lambda _: True, outcome=lambda _: "replayed"))
+        return made[-1]
+
     for address in range(2 * replays._MOST_KINDS):
         kind = Kind((address,), (), ())
-        found = [kept.do(kind, 1, None, live=lambda: "live", record=lambda: recorded) for _ in range(3)]
-        assert found == ["live", "replayed", "replayed"]
+        found = [kept.do(kind, 1, None, live=lambda: "live", record=recorded) for _ in range(3)]
+        assert found == ["replayed" if address else "live", "replayed", "replayed"]
+        assert len(made) == address + 1
+
+
+def test_memory_that_is_new_in_each_iteration_is_told_and_not_recorded(caplog):
+    kept = Replays(DEVICE, WorkLog(), "")
+    found = [kept.do(Kind((k,), (), ()), k, None, live=lambda: "live", record=fails) for k in range(30)]
+    assert set(found) == {"live"}
+    assert caplog.text.count("Write to Strategy.state in place") == 1
+
+
+@dataclass(frozen=True)
+class ByTime(cs.Strategy):
+    """Decides by what a recording would keep."""
+
+    reads: str = "t"
+
+    def reconcile(self, products, step):
+        keep = {
+            "t": lambda: 0.5 if step.t > 8 else 1.0, "t in torch": lambda: float((torch.ones(1) * step.t)[0]) / 100,
+            "the name": lambda: 0.5 if step.view.name.endswith("1") else 1.0,
+            "the name as a key": lambda: {view.name: 0.5 for view in SCENE.train}.get(step.view.name, 1.0),
+        }  # fmt: skip
+        return cs.Weights(keep=keep[self.reads]() if self.reads in keep else 1.0)
+
+    def regularize(self, params, t):
+        return cs.Grads({"means": params["means"] / t}) if self.reads == "t of an anchor" else None
+
+
+@pytest.mark.parametrize("reads", ["t", "t in torch", "the name", "the name as a key", "t of an anchor"])
+def test_a_strategy_that_reads_the_iteration_or_the_view_is_live(reads, caplog):
+    replayed = both(lambda: start(reconciles=ByTime(reads), density=False, rises_at=2), 12)
+    assert live_in(replayed)[FAILED] >= 5
+    assert "must not read the" in caplog.text
 
 
 def fails(*_: object) -> None:

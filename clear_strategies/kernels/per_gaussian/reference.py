@@ -142,6 +142,7 @@ def accumulate(
 
 
 @by_cpp
+@by_warp
 def wander(
     means: Float[Tensor, "N 3"],
     quats: Float[Tensor, "N 4"],

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import torch
 import warp as wp
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from clear_strategies.core.evidence import Evidence
@@ -240,6 +240,44 @@ def accumulate(
     visible: Bool[Tensor, " N"], score: Tensor, ordinary: Tensor, totals: tuple[Tensor, Tensor, Tensor], largest: bool
 ) -> None:
     _per_gaussian(_accumulate, len(visible), visible, score, ordinary, largest, *totals)
+
+
+@wp.kernel
+def _wander(
+    quats: wp.array[wp.vec4],
+    log_scales: wp.array[wp.vec3],
+    gate: wp.array[wp.float32],
+    rows: wp.array[wp.int64],
+    eta: wp.array[wp.vec3],
+    typical: wp.array[wp.float32],
+    strength: wp.float32,
+    means: wp.array[wp.vec3],
+) -> None:
+    j = wp.tid()
+    i = wp.int32(rows[j])
+    q = quats[i]
+    largest = wp.max(wp.max(wp.abs(q[0]), wp.abs(q[1])), wp.max(wp.abs(q[2]), wp.abs(q[3])))
+    turn = wp.quat_identity()
+    if largest > 0.0:  # of any length; the zero quaternion is the identity
+        q = q / largest
+        turn = wp.normalize(wp.quat(q[1], q[2], q[3], q[0]))
+    s = log_scales[i]
+    s = wp.vec3(wp.exp(s[0]), wp.exp(s[1]), wp.exp(s[2]))
+    along = wp.cw_mul(wp.cw_mul(s, s), wp.quat_rotate_inv(turn, eta[j]))  # S² Rᵀ η
+    means[i] += strength / wp.exp(typical[0]) * gate[i] * wp.quat_rotate(turn, along)
+
+
+def wander(
+    means: Tensor,
+    quats: Tensor,
+    log_scales: Tensor,
+    gate: Tensor,
+    rows: Int[Tensor, " K"],
+    eta: Tensor,
+    strength: float,
+) -> None:
+    typical = log_scales.amax(-1).median().view(1)
+    _per_gaussian(_wander, len(rows), quats, log_scales, gate, rows, eta, typical, strength, means)
 
 
 def _parts(like: Tensor, width: int) -> Float[Tensor, "blocks width"]:
