@@ -10,9 +10,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from clear_strategies import Conductor
-from clear_strategies.compose import require_each_once
+from clear_strategies.compose import tree
 from clear_strategies.data.view_settings import ViewSettings
-from clear_strategies.errors import SettingError
 from clear_strategies.schedules import scaled
 from clear_strategies.settings import CHANGES_NO_RESULT, build
 from clear_strategies.training.loop import fit
@@ -85,12 +84,14 @@ def test_no_method_has_what_the_baselines_page_says_that_none_has():
 
 
 def test_a_method_is_the_same_whatever_strategies_are_named_before_it():
-    """The decorator of best would change the SR images of srgs, the λ_HR of clear_paper train 3dgs_lr on SR images."""
+    """The decorator of best would change the SR images of srgs, the λ_HR of readings=paper train 3dgs_lr on SR images."""
     assert list(composed("+strategy=clear", "+method=dropgaussian").strategies) == ["svs"]
     assert list(composed("+method=srgs", "+strategy=gco").strategies) == ["gco"]
     assert composed("+strategy=best", "+method=srgs") == composed("+method=srgs")
-    with pytest.raises(SettingError, match=r"\+strategy=clear_paper before it brings /readings/literal"):
-        require_each_once(["+strategy=clear_paper", "+method=3dgs_lr"])
+    for name in options("method"):  # no detail feature: its rates have no effect
+        printed, measured = (tree(composed(f"+method={name}", "skips=none", f"readings={r}")) for r in ("paper", "measured"))
+        rates = {key: measured["optim"][key] for key in ("detail_decay", "detail_steps")}
+        assert {**printed, "optim": {**printed["optim"], **rates}} == measured, name
 
 
 SCENES = {
