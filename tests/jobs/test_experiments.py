@@ -12,6 +12,8 @@ from omegaconf import DictConfig, OmegaConf
 from clear_strategies import Conductor
 from clear_strategies.compose import tree
 from clear_strategies.data.view_settings import ViewSettings
+from clear_strategies.jobs.settings import settings_of
+from clear_strategies.merging.skips import Skips
 from clear_strategies.schedules import scaled
 from clear_strategies.settings import CHANGES_NO_RESULT, build
 from clear_strategies.training.loop import fit
@@ -102,6 +104,7 @@ SCENES = {
 }
 CLEAR = ["gco", "p2g", "svs"]
 ROWS = {
+    "table5": {"baseline": [], "gco": ["gco"], "[gco,p2g]": ["gco", "p2g"], "clear": CLEAR},
     "ablation": {"baseline": [], "gco": ["gco"], "[gco,p2g]": ["gco", "p2g"], "clear": CLEAR},
     "leave_one_out": {"clear": CLEAR, "[p2g,svs]": CLEAR[1:], "[gco,svs]": ["gco", "svs"], "[gco,p2g]": CLEAR[:2]},
 }
@@ -152,8 +155,41 @@ def test_the_evidence_differs_in_what_it_sweeps_alone(experiment):
         pieces(c)
 
 
+METHODS = set(options("method")) - {"srgs_lr", "binocular3dgs_srgs"} | {"[]"}  # those are in no table
+SHOWN = {"3dgs_lr", "srgs", "dropgaussian_srgs", "s2gaussian", "[]"}
+PAPER = {  # scenes, seeds, and the values of what is swept beside these
+    "table1": (8, 3, {"+strategy": {"clear"}, "+method": METHODS}),
+    "table2": (8, 3, {"+strategy": {"clear"}, "+method": METHODS}),
+    "table3": (7, 3, {"+strategy": {"clear"}, "+method": METHODS}),
+    "table4": (8, 1, {"+strategy": {"clear"}, "+method": {"s2gaussian", "[]"}}),
+    "table5": (8, 3, {"+strategy": {*ROWS["table5"]}}),
+    "figure1b": (8, 3, {"+strategy": {"baseline", "clear"}, "data.views.train": set("2369")}),
+    "figure1c": (4, 3, {"+strategy": {"clear"}, "+method": SHOWN}),
+    "figure3": (8, 1, {"+strategy": {"clear"}, "+method": SHOWN}),
+    "figure5": (8, 1, {"+strategy": {*ROWS["table5"]}}),
+}
+
+
+@pytest.mark.parametrize("readings", ["paper", "measured"])
+@pytest.mark.parametrize("experiment", PAPER)
+def test_every_table_and_figure_of_the_paper_is_a_command(experiment, readings):
+    """Each row of the first scene and seed composes into settings, with the readings of what takes part."""
+    scenes, seeds, rows = PAPER[experiment]
+    found, composed_job = jobs(f"experiment={experiment}", f"readings={readings}", "data.root=here")
+    assert {key: {job[key] for job in found} for key in rows} == rows
+    assert len(found) == scenes * seeds * math.prod(map(len, rows.values()))
+    scene = "+scene" if experiment == "figure1c" else "data.scene"
+    for job in (j for j in found if (j[scene], j["fit.seed"]) == (found[0][scene], "0")):
+        c = composed_job(job)
+        settings = settings_of(tree(OmegaConf.masked_copy(c, [key for key in c if key != "hydra"])))
+        assert settings.skips == Skips()  # every iteration, every pixel
+        assert f"readings={readings}" in c.hydra.sweep.subdir
+        if (p2g := settings.strategies.get("p2g")) is not None:
+            assert p2g.score_by == ("evidence" if readings == "paper" else "sum")
+
+
 def test_every_experiment_has_a_test():
-    assert {*SCENES, *ROWS, *EVIDENCE, "smoke"} == set(options("experiment"))
+    assert {*SCENES, *ROWS, *EVIDENCE, *PAPER, "smoke"} == set(options("experiment"))
 
 
 HORNS = ("experiment=llff_x4", "data.root=here", "data.scene=horns")
