@@ -244,6 +244,28 @@ def test_scenes_with_different_data_settings_are_averaged(tmp_path: Path) -> Non
     assert list(averages_of(tmp_path).index) == ["baseline", "gco"]
 
 
+def test_the_papers_numbers_stand_beside_ours(tmp_path: Path) -> None:
+    """Means over scenes of means over seeds, rows of other settings below each other; not for other data or other views."""
+    chosen = {"fern": "scene: fern", "horns": "protocol: llff_x4", "demo": "data: demo"}
+    for k, (scene, seed, psnr) in enumerate((("fern", 0, 19.0), ("fern", 1, 21.0), ("horns", 0, 24.0), ("demo", 0, 50.0))):
+        for more in ([], ["data.views.train=6"]) if k == 0 else ([],):
+            for readings in ("paper", "measured"):
+                settings = ["+strategy=clear", f"data.scene={scene}", f"readings={readings}", *more]
+                folder = make_run(tmp_path / f"{k}{readings}{len(more)}", *settings, seed=seed, psnr=psnr, scene=scene)
+                files.write_text(folder / ".hydra" / "hydra.yaml", f"  runtime:\n    choices:\n      {chosen[scene]}\n")
+    text = report.write(report.collect([tmp_path]), tmp_path)
+    assert "LLFF, beside the paper's numbers" in (tmp_path / "report.html").read_text().replace("&#39;", "'")
+    rows = {row["method"]: row for row in cells(text.partition("LLFF, beside the paper's numbers:")[2])}
+    assert len(rows) == 15  # one of the 14 twice
+    for readings in ("paper", "measured"):
+        row = rows[f"CLEAR, readings={readings}"]
+        assert (row["PSNR (dB)"], row["PSNR (dB), paper"]) == ("22.00", "20.42")
+        assert (row["conflict"], row["conflict, paper"], row["source"]) == ("0.250", "0.162", "Tables 1, 4, 5")
+        assert (row["LPIPS"], row["LPIPS, paper"], row["seconds, paper"]) == ("–", "0.266", "612")
+    assert (rows["RegNeRF"]["PSNR (dB)"], rows["RegNeRF"]["PSNR (dB), paper"]) == ("–", "15.78")
+    assert "Blender, beside" not in text
+
+
 # ---- finished runs are found, named and read; others are left out with a warning
 @pytest.mark.parametrize(
     ("overrides", "facts", "name"),
