@@ -1,6 +1,7 @@
 """The report: its command, its files, its table, its pictures, its rows, and the runs that it finds."""
 
 import csv
+import itertools
 import math
 import os
 import re
@@ -13,14 +14,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from clear_strategies import DataError, files, report
+from clear_strategies.data.photo_files import write_png
 from clear_strategies.outputs.figures import SheetRow, window, write_contact_sheet, write_curves
 from clear_strategies.settings import CHANGES_NO_RESULT
 from tests.helpers.finished_run import averages_of, cells, make_run, rows_of, scores, table_of
 from tests.helpers.image_files import array, holds, read
+from tests.helpers.pages import DOCS, loaded
 
 
 def test_a_report_has_a_table_records_a_page_and_images(tmp_path: Path) -> None:
@@ -264,6 +268,34 @@ def test_the_papers_numbers_stand_beside_ours(tmp_path: Path) -> None:
         assert (row["LPIPS"], row["LPIPS, paper"], row["seconds, paper"]) == ("–", "0.266", "612")
     assert (rows["RegNeRF"]["PSNR (dB)"], rows["RegNeRF"]["PSNR (dB), paper"]) == ("–", "15.78")
     assert "Blender, beside" not in text
+
+
+def test_the_papers_figures_are_drawn_from_a_sweep(tmp_path: Path) -> None:
+    """A point for each number of views, a bar for each method, a line for each rung: means over scenes and seeds."""
+    figures = loaded(DOCS / "figures.py")
+    for k, (scene, views, strategy) in enumerate(itertools.product(("fern", "horns"), (3, 6), ("baseline", "clear"))):
+        share = 0.1 * views + 0.02 * (scene == "horns")
+        settings = [f"+strategy={strategy}", f"data.views.train={views}"]
+        folder = make_run(tmp_path / str(k), *settings, scene=scene, conflict={"gaussian": share})
+        write_png(folder / "views" / "view_lr.png", torch.zeros(6, 8, 3))
+        pd.DataFrame({"t": range(100), "conflict": np.linspace(0, share, 100)}).to_csv(folder / "conflict.csv")
+    runs = report.collect([tmp_path])
+    drawn: dict[str, Any] = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "save", lambda figure, path: drawn.setdefault(path.name, figure))
+        for draw in figures.OF_SWEEPS.values():
+            draw(runs, tmp_path)
+    lines = {name: [line.get_xydata() for line in drawn[name].axes[0].lines] for name in ("figure1b.svg", "figure5.svg")}
+    assert len(lines["figure1b.svg"]) == len(lines["figure5.svg"]) == 2  # baseline and clear
+    for line in lines["figure1b.svg"]:
+        np.testing.assert_allclose(line, [(3, 0.31), (6, 0.61)])
+    for line in lines["figure5.svg"]:
+        assert len(line) == 50
+        np.testing.assert_allclose(line[:, 1], 0.46 * (np.arange(50) * 2 + 0.5) / 99)
+    assert [len(axes.patches) for axes in drawn["figure1c.svg"].axes] == [4, 4, 4]  # two scenes and two methods
+    for name in ("figure3.png", "figure5_views.png"):
+        height, width, _ = read(tmp_path / name).shape
+        assert height > 0 < width
 
 
 # ---- finished runs are found, named and read; others are left out with a warning
