@@ -107,6 +107,9 @@ def conductor(
     chosen = f"+strategy=[{names}]" if "," in names and not names.startswith("[") else f"+strategy={names}"
     config = composed([chosen, *overrides])
     settings: ConductorSettings = build(tree(config, _TRAINERS))
+    for name, s in settings.strategies.items():
+        if not s.shares_gate:
+            raise SettingError(f"strategies.{name}: other trainers render both scales with one mask. Leave out shared=false.")
     return settings.conductor(iterations / REFERENCE_ITERATIONS, _detail(config).of_run(iterations))
 
 

@@ -167,6 +167,7 @@ PAPER = {  # scenes, seeds, and the values of what is swept beside these
     "figure1c": (4, 3, {"+strategy": {"clear"}, "+method": SHOWN}),
     "figure3": (8, 1, {"+strategy": {"clear"}, "+method": SHOWN}),
     "figure5": (8, 1, {"+strategy": {*ROWS["table5"]}}),
+    "claims": (3, 2, {"+strategy": {"clear"}, "+claim": set(options("claim"))}),
 }
 
 
@@ -178,7 +179,7 @@ def test_every_table_and_figure_of_the_paper_is_a_command(experiment, readings):
     found, composed_job = jobs(f"experiment={experiment}", f"readings={readings}", "data.root=here")
     assert {key: {job[key] for job in found} for key in rows} == rows
     assert len(found) == scenes * seeds * math.prod(map(len, rows.values()))
-    scene = "+scene" if experiment == "figure1c" else "data.scene"
+    scene = "+scene" if "+scene" in found[0] else "data.scene"
     first = [job for job in found if (job[scene], job["fit.seed"]) == (found[0][scene], "0")]
     for job in first if readings == "paper" else first[-1:]:
         c = composed_job(job)
