@@ -109,7 +109,9 @@ def conductor(
     settings: ConductorSettings = build(tree(config, _TRAINERS))
     for name, s in settings.strategies.items():
         if not s.shares_gate:
-            raise SettingError(f"strategies.{name}: other trainers render both scales with one mask. Leave out shared=false.")
+            raise SettingError(
+                f"strategies.{name}: other trainers render both scales with one mask. Leave out shared=false."
+            )
     return settings.conductor(iterations / REFERENCE_ITERATIONS, _detail(config).of_run(iterations))
 
 

@@ -211,7 +211,9 @@ def collect_training_time(sweep: Path) -> None:
 def lines_of(runs: Sequence[FinishedRun]) -> dict[FinishedRun, str]:
     """The line of each run in a figure: its name, and the readings where they are not the same for all."""
     readings = {run: next((s for s in run.settings if s.startswith("readings=")), "") for run in runs}
-    return {run: f"{run.name}, {of}" if of and len({*readings.values()}) > 1 else run.name for run, of in readings.items()}
+    return {
+        run: f"{run.name}, {of}" if of and len({*readings.values()}) > 1 else run.name for run, of in readings.items()
+    }
 
 
 def averaged(table: pd.DataFrame, *by: str) -> pd.DataFrame:
@@ -224,12 +226,13 @@ def figure1b(runs: Sequence[FinishedRun], folder: Path) -> None:
     lines = lines_of(runs)
     views = {run: next(s for s in run.settings if s.startswith("data.views.train=")).split("=")[1] for run in runs}
     rows = [
-        {"line": lines[run], "views": int(views[run]), "scene": run.scene, "conflict": run.numbers["conflict"]} for run in runs
+        {"line": lines[run], "views": int(views[run]), "scene": run.scene, "conflict": run.numbers["conflict"]}
+        for run in runs
     ]
     figure, axes = plt.subplots(figsize=(4, 2.6))
     for line, of_line in averaged(pd.DataFrame(rows), "line", "views").groupby("line", sort=False):
-        of_line = of_line.sort_values("views")
-        axes.plot(of_line["views"], of_line["conflict"], marker="o", markersize=4, label=line)
+        points = of_line.sort_values("views")
+        axes.plot(points["views"], points["conflict"], marker="o", markersize=4, label=line)
     axes.set_xlabel("training views")
     axes.set_ylabel("Gaussians in conflict")
     axes.legend(fontsize=7, frameon=False)
@@ -241,13 +244,20 @@ def figure1c(runs: Sequence[FinishedRun], folder: Path) -> None:
     scores = {"psnr": "PSNR, dB", "ssim": "SSIM", "gmsd": "GMSD"}
     lines = lines_of(runs)
     rows = [
-        {"line": lines[run], "data": data_of(run) or run.scene, "scene": run.scene, **{s: run.numbers[s] for s in scores}}
+        {
+            "line": lines[run],
+            "data": data_of(run) or run.scene,
+            "scene": run.scene,
+            **{s: run.numbers[s] for s in scores},
+        }
         for run in runs
     ]
     means = averaged(pd.DataFrame(rows), "line", "data").set_index(["data", "line"])
     figure, all_axes = plt.subplots(1, len(scores), figsize=(9, 2.8))
     for axes, (score, title) in zip(all_axes, scores.items(), strict=True):
-        means[score].unstack(sort=False).plot.bar(ax=axes, rot=0, legend=score == "ssim", xlabel="", ylabel=title, width=0.8)
+        means[score].unstack(sort=False).plot.bar(
+            ax=axes, rot=0, legend=score == "ssim", xlabel="", ylabel=title, width=0.8
+        )
     all_axes[1].legend(fontsize=6, frameon=False, ncols=3, loc="upper center", bbox_to_anchor=(0.5, 1.3))
     save(figure, folder / "figure1c.svg")
 
@@ -278,12 +288,14 @@ def figure5(runs: Sequence[FinishedRun], folder: Path, parts: int = 50) -> None:
     tables = []
     for run, line in lines_of(runs).items():
         conflict = pd.read_csv(run.folder / "conflict.csv")[["t", "conflict"]]
-        part = (conflict["t"] * parts // (conflict["t"].max() + 1) + 0.5) / parts  # scenes may differ in their iterations
+        part = (
+            conflict["t"] * parts // (conflict["t"].max() + 1) + 0.5
+        ) / parts  # scenes may differ in their iterations
         tables.append(conflict.assign(line=line, scene=run.scene, part=part))
     figure, axes = plt.subplots(figsize=(5, 2.8))
     for line, of_line in averaged(pd.concat(tables), "line", "part").groupby("line", sort=False):
-        of_line = of_line.sort_values("part")
-        axes.plot(of_line["part"], of_line["conflict"], label=line)
+        points = of_line.sort_values("part")
+        axes.plot(points["part"], points["conflict"], label=line)
     axes.set_xlabel("part of the training")
     axes.set_ylabel("Gaussians in conflict")
     axes.legend(fontsize=7, frameon=False)

@@ -49,7 +49,9 @@ def beside(runs: Sequence[FinishedRun]) -> dict[str, pd.DataFrame]:
 
 
 def _beside(printed: pd.DataFrame, runs: Sequence[FinishedRun]) -> pd.DataFrame:
-    shared = {scene: in_all([run.settings for run in runs if run.scene == scene]) for scene in {run.scene for run in runs}}
+    shared = {
+        scene: in_all([run.settings for run in runs if run.scene == scene]) for scene in {run.scene for run in runs}
+    }
     records = [
         {"row": _row(run), "label": label("", run.settings, shared[run.scene]), "scene": run.scene, **run.numbers}
         for run in runs
@@ -63,7 +65,9 @@ def _beside(printed: pd.DataFrame, runs: Sequence[FinishedRun]) -> pd.DataFrame:
         ours = table[quantity] if f"{quantity}_paper" in table else pd.Series(float("nan"), table.index)
         paper = table[f"{quantity}_paper"] if f"{quantity}_paper" in table else table[quantity]
         if paper.notna().any():
-            cells |= {name: [_number(v, form) for v in of] for name, of in ((header, ours), (f"{header}, paper", paper))}
+            cells |= {
+                name: [_number(v, form) for v in of] for name, of in ((header, ours), (f"{header}, paper", paper))
+            }
     return pd.DataFrame({**cells, "source": table["source"]})
 
 

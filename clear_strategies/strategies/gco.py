@@ -45,8 +45,8 @@ class GCO(Strategy):
         tolerance: τ_c in [0, 1): cosines down to -τ_c are no conflict.
         weight_min, weight_max: bounds of ω where a conflict is corrected, 0 <= min <= max <= 1.
         groups: the attributes that are compared and corrected, each separately.
-        whole: compare a Gaussian as a whole instead, all groups together. Neither this nor `drop` is the paper's: experiment=claims
-            compares them with it.
+        whole: compare a Gaussian as a whole instead, all groups together. Neither this nor `drop` is the paper's; see
+            experiment=claims.
         drop: leave out a conflicting HR gradient instead of correcting it.
 
     There is no ε: products are in float64, where those of float32 gradients do not vanish, and a zero norm is no conflict (F27).

@@ -103,7 +103,9 @@ class GaussianField(nn.Module):
         """
         active = [self._activate(gate)] * 2 if gate is None or gate.dim() == 1 else list(map(self._activate, gate))
         wanted = [(detail, photo.camera) for detail, photo, on in ((False, view.lr, lr), (True, view.hr, hr)) if on]
-        renderings = rasterizer.render_scales([(active[detail].splats(detail=detail), camera) for detail, camera in wanted])
+        renderings = rasterizer.render_scales(
+            [(active[detail].splats(detail=detail), camera) for detail, camera in wanted]
+        )
         shots = {d: FieldShot(r, active[d], detail=d) for (d, _), r in zip(wanted, renderings, strict=True)}
         return shots.get(False), shots.get(True)
 

@@ -91,7 +91,9 @@ def test_a_method_is_the_same_whatever_strategies_are_named_before_it():
     assert list(composed("+method=srgs", "+strategy=gco").strategies) == ["gco"]
     assert composed("+strategy=best", "+method=srgs") == composed("+method=srgs")
     for name in options("method"):  # no detail feature: its rates have no effect
-        printed, measured = (tree(composed(f"+method={name}", "skips=none", f"readings={r}")) for r in ("paper", "measured"))
+        printed, measured = (
+            tree(composed(f"+method={name}", "skips=none", f"readings={r}")) for r in ("paper", "measured")
+        )
         rates = {key: measured["optim"][key] for key in ("detail_decay", "detail_steps")}
         assert {**printed, "optim": {**printed["optim"], **rates}} == measured, name
 

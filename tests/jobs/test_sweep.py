@@ -119,7 +119,7 @@ def test_a_job_that_submitit_preempts_is_handed_in_again_and_resumed(tmp_path):
     sweep = [*SWEEP, "hydra/launcher=submitit_local", "hydra.sweep.subdir=job", "+strategy=clear", "fit.iterations=900"]
     process = started(*DOOR, *sweep, cwd=tmp_path, said=tmp_path / "said")
     run_folder = tmp_path / "all" / "job"
-    wait_for(lambda: (run_folder / "cameras.json").exists())
+    wait_for((run_folder / "cameras.json").exists)
     (controller,) = (path.name for path in (tmp_path / "all" / ".submitit").iterdir() if path.name.isdecimal())
     (job,) = Path(f"/proc/{controller}/task/{controller}/children").read_text().split()
     os.kill(int(job), signal.SIGUSR2)

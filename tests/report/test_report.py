@@ -251,7 +251,9 @@ def test_scenes_with_different_data_settings_are_averaged(tmp_path: Path) -> Non
 def test_the_papers_numbers_stand_beside_ours(tmp_path: Path) -> None:
     """Means over scenes of means over seeds, rows of other settings below each other; not for other data or other views."""
     chosen = {"fern": "scene: fern", "horns": "protocol: llff_x4", "demo": "data: demo"}
-    for k, (scene, seed, psnr) in enumerate((("fern", 0, 19.0), ("fern", 1, 21.0), ("horns", 0, 24.0), ("demo", 0, 50.0))):
+    for k, (scene, seed, psnr) in enumerate(
+        (("fern", 0, 19.0), ("fern", 1, 21.0), ("horns", 0, 24.0), ("demo", 0, 50.0))
+    ):
         for more in ([], ["data.views.train=6"]) if k == 0 else ([],):
             for readings in ("paper", "measured"):
                 settings = ["+strategy=clear", f"data.scene={scene}", f"readings={readings}", *more]
@@ -285,7 +287,9 @@ def test_the_papers_figures_are_drawn_from_a_sweep(tmp_path: Path) -> None:
         patch.setattr(figures, "save", lambda figure, path: drawn.setdefault(path.name, figure))
         for draw in figures.OF_SWEEPS.values():
             draw(runs, tmp_path)
-    lines = {name: [line.get_xydata() for line in drawn[name].axes[0].lines] for name in ("figure1b.svg", "figure5.svg")}
+    lines = {
+        name: [line.get_xydata() for line in drawn[name].axes[0].lines] for name in ("figure1b.svg", "figure5.svg")
+    }
     assert len(lines["figure1b.svg"]) == len(lines["figure5.svg"]) == 2  # baseline and clear
     for line in lines["figure1b.svg"]:
         np.testing.assert_allclose(line, [(3, 0.31), (6, 0.61)])

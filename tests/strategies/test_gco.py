@@ -62,7 +62,9 @@ def test_what_the_paper_does_not_do_is_there_to_compare_with():
     assert not dropped["scales"].any()
     together = GCO(whole=True).correct(lr, hr, None)  # 9 - 1 > 0
     assert all(torch.equal(together[name], hr[name]) for name in hr)
-    opposed = GCO(whole=True, tolerance=0, weight_min=1, weight_max=1).correct(lr, Grads({n: -g for n, g in hr.items()}), None)
+    opposed = GCO(whole=True, tolerance=0, weight_min=1, weight_max=1).correct(
+        lr, Grads({n: -g for n, g in hr.items()}), None
+    )
     assert sum(float(dot(opposed[name], lr[name])) for name in lr) == pytest.approx(0, abs=1e-6)  # the margin
 
 
