@@ -298,7 +298,7 @@ def figure5(runs: Sequence[FinishedRun], folder: Path, parts: int = 50) -> None:
         axes.plot(points["part"], points["conflict"], label=line)
     axes.set_xlabel("part of the training")
     axes.set_ylabel("Gaussians in conflict")
-    axes.legend(fontsize=7, frameon=False)
+    axes.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
     save(figure, folder / "figure5.svg")
     figure3([run for run in runs if run.seed == runs[0].seed], folder, "figure5_views")
 

@@ -140,8 +140,8 @@ def _job(folder: Path) -> int:
 
 
 def _protocol(folder: Path) -> str | None:
-    chosen = re.search(r"^      (?:protocol|scene): (\w+)$", _hydra(folder), re.MULTILINE)
-    return chosen[1] if chosen else None
+    chosen = dict(re.findall(r"^      (protocol|scene): (\w+)$", _hydra(folder), re.MULTILINE))
+    return chosen.get("scene") or chosen.get("protocol")
 
 
 def _hydra(folder: Path) -> str:

@@ -192,6 +192,14 @@ def test_every_table_and_figure_of_the_paper_is_a_command(experiment, readings):
             assert p2g.score_by == ("evidence" if readings == "paper" else "sum")
 
 
+def test_the_rows_of_a_table_run_on_the_small_scenes_as_well():
+    found, composed_job = jobs("experiment=table5", "protocol=scenes", "data.root=here", "readings=paper")
+    assert {job["+scene"] for job in found} == {"fern", "horns", "lego", "real_room"}
+    assert len(found) == 4 * 3 * 4
+    c = composed_job(found[0])
+    assert (c.data.path, c.fit.iterations, c.optim.geometry_steps, c.skips.hr_every) == ("here/fern", 1500, 0, 1)
+
+
 def test_every_experiment_has_a_test():
     assert {*SCENES, *ROWS, *EVIDENCE, *PAPER, "smoke"} == set(options("experiment"))
 
@@ -229,16 +237,16 @@ def test_a_setting_that_changes_no_result_changes_no_folders_name(rows):
 
 @pytest.mark.slow
 def test_one_command_runs_all_its_report_tells_the_rows_apart_and_a_rerun_trains_nothing(tmp_path: Path):
-    tiny = ["experiment=ablation", "~protocol", "fit.seed=0", *TINY, "fit.iterations=3"]
+    tiny = ["experiment=table5", "readings=paper", "~protocol", "fit.seed=0", *TINY, "fit.iterations=3"]
     for more in (["+strategy=baseline,clear"], ["+method=srgs"], ["+method=srgs", "-v", "fit.video=2"]):
         result = run(*tiny, *more, cwd=tmp_path)
         assert result.returncode == 0, result.stderr
     assert "nothing is trained" in result.stdout + result.stderr  # though more is said and shown
-    (log,) = tmp_path.glob("multirun/ablation/+method=srgs*/run.log")
+    (log,) = tmp_path.glob("multirun/table5/+method=srgs*/run.log")
     assert "strategies named before it take no part" in log.read_text()
-    done = sorted(p.parent.name.split(",")[0] for p in tmp_path.glob("multirun/ablation/*/metrics.json"))
+    done = sorted(p.parent.name.split(",")[0] for p in tmp_path.glob("multirun/table5/*/metrics.json"))
     assert done == ["+method=srgs", "+strategy=baseline", "+strategy=clear"]
-    swept = tmp_path / "multirun" / "ablation"  # a sweep ends with its report
+    swept = tmp_path / "multirun" / "table5"  # a sweep ends with its report
     assert "| srgs " in (swept / "report.md").read_text()
     assert (swept / "report.html").is_file()
     told = run("multirun", "--out", "report", cwd=tmp_path, module="clear_strategies.report")
