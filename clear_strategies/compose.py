@@ -37,7 +37,7 @@ from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.objective import Objective
 from clear_strategies.merging.skips import Skips
 from clear_strategies.schedules import REFERENCE_ITERATIONS, scaled
-from clear_strategies.settings import CHANGES_NO_RESULT, TARGET, build, missing, with_defaults
+from clear_strategies.settings import CHANGES_NO_RESULT, TARGET, build, defaults_of, missing, with_defaults
 from clear_strategies.strategies.base import Strategy
 
 _log = logging.getLogger(__name__)
@@ -105,14 +105,19 @@ def conductor(
         raise SettingError(f"iterations must be at least 1, got {iterations}.")
     names = strategy.strip() if isinstance(strategy, str) else f"[{','.join(strategy)}]"
     chosen = f"+strategy=[{names}]" if "," in names and not names.startswith("[") else f"+strategy={names}"
-    skips = () if any(_key(override) == "skips" for override in overrides) else ("skips=hosts",)
-    config = composed([chosen, *skips, *overrides])
+    config = composed([chosen, *overrides])
     settings: ConductorSettings = build(tree(config, _TRAINERS))
+    for name, s in settings.strategies.items():
+        if not s.shares_gate:
+            raise SettingError(
+                f"strategies.{name}: other trainers render both scales with one mask. Leave out shared=false."
+            )
     return settings.conductor(iterations / REFERENCE_ITERATIONS, _detail(config).of_run(iterations))
 
 
-# Options for runs and hosts, such as readings=literal, set these as well; a host has its own, but for the rates of f_det.
+# Options for runs and hosts, such as readings=paper, set these as well; a host has its own, but for the rates of f_det.
 _TRAINERS: Final = ("optim", "data")
+_READINGS: Final = "readings"
 
 
 def _detail(config: DictConfig) -> DetailRates:
@@ -139,9 +144,9 @@ def tree(config: DictConfig, without: Iterable[str] = ()) -> dict[str, Any]:
         if isinstance(node, dict) and node.get(TARGET) is None:
             raise SettingError(
                 f"strategies.{name}: has settings ({', '.join(node)}), and takes no part. Add it, +strategy={name}, or leave out "
-                "what sets them; readings=literal sets those of p2g and svs."
+                "what sets them."
             )
-    return {key: _expanded(value) for key, value in values.items() if key not in without}
+    return {key: _expanded(value) for key, value in values.items() if key not in (_READINGS, *without)}
 
 
 def _expanded(node: Any) -> Any:
@@ -235,14 +240,11 @@ def _is_itself(value: str) -> bool:
 
 
 def require_each_once(overrides: Iterable[str]) -> None:
-    """Raise a SettingError for a strategy that is named twice, since Hydra merges the two into one silently, and for one before
-    a method that brings more than strategies, which a method does not set aside. Warn of the strategies that it does.
+    """Raise a SettingError for a strategy that is named twice, since Hydra merges the two into one silently. Warn of the
+    strategies that a method sets aside.
     """
-    also_brought: str | None = None
     before = list[str]()
     for override in OverridesParser.create().parse_overrides(list(overrides)):
-        if override.key_or_group == "method" and also_brought is not None:
-            raise SettingError(f"+method={override.value()}: sets strategies aside, and {also_brought}. Leave it out.")
         if override.key_or_group == "method" and before and override.value():
             message = "%s has no effect: %s replaces the strategies before it. What is written behind the method is added to it."
             _log.warning(message, " ".join(before), override.input_line)
@@ -252,9 +254,6 @@ def require_each_once(overrides: Iterable[str]) -> None:
         if value != "baseline":  # no strategy
             before.append(str(override.input_line))
         options = [str(option) for option in (value if isinstance(value, list) else [value])]
-        for option in options:
-            if other_groups := [part for part in _parts(option) if part.startswith("/")]:
-                also_brought = f"+strategy={option} before it brings {', '.join(other_groups)} as well"
         strategies = Counter(strategy for option in options for strategy in _strategies_of(option))
         if twice := next((strategy for strategy, count in strategies.items() if count > 1), None):
             raise SettingError(f"+strategy: must name each strategy once, got {twice} twice in {override.input_line}.")
@@ -262,15 +261,10 @@ def require_each_once(overrides: Iterable[str]) -> None:
 
 def _strategies_of(option: str) -> list[str]:
     """The strategies that an option of conf/strategy consists of, those of the options that it names included."""
-    parts = [part for part in _parts(option) if not part.startswith(("/", "_"))]
-    return [strategy for part in parts for strategy in _strategies_of(part)] or [option]
-
-
-def _parts(option: str) -> list[str]:
-    """The options that an option of conf/strategy names, those of other groups with a `/` in front."""
     file = CONF / "strategy" / f"{option}.yaml"
     content: Any = OmegaConf.to_container(OmegaConf.load(file)) if file.is_file() else {}
-    return [part for part in content.get("defaults", []) if isinstance(part, str)]
+    parts = [part for part in content.get("defaults", []) if isinstance(part, str) and not part.startswith(("/", "_"))]
+    return [strategy for part in parts for strategy in _strategies_of(part)] or [option]
 
 
 def options(group: str) -> dict[str, Mapping[str, Any]]:
@@ -329,10 +323,21 @@ def _one_folder(name: str) -> str:
     return f"{word.encode()[: _LONGEST_NAME - len(digest) - 1].decode(errors='ignore')}_{digest}"
 
 
+def _reading(*, _node_: Any, _root_: Any) -> Any:
+    """`${reading:}` in conf/strategy: what readings= says of this setting, else the default of the class.
+
+    So readings of strategies that take no part have no effect, whatever the order of the options.
+    """
+    _, strategy, *field = _node_._get_full_key(None).split(".")
+    read = OmegaConf.select(_root_, ".".join((_READINGS, strategy, *field)))
+    return defaults_of(_root_.strategies[strategy][TARGET], *field) if read is None else read
+
+
 # `${settings_without_result:more, …}` in conf/: the keys of overrides that do not name a sweep's folders.
 OmegaConf.register_new_resolver(
     "settings_without_result", lambda *more: [*sorted(CHANGES_NO_RESULT), *more], replace=True
 )
 OmegaConf.register_new_resolver("one_folder", _one_folder, replace=True)
+OmegaConf.register_new_resolver("reading", _reading, replace=True)
 Plugins.instance().register(_ConfSource)
 Plugins.instance().register(_ReadConf)

@@ -62,9 +62,14 @@ _NO_OPTION: Final = re.compile(
     r"Could not find '([^']+)/([^'/]+)'\s+Available options in '[^']*':(.*?)Config search path", re.DOTALL
 )
 
+_CHOSEN: Final = re.compile(r"Multiple values for (\S+)\. To override a value use 'override \S+: (\S+)'")
+
 
 def of_hydra(error: Exception) -> str:
     """The message of an error of Hydra's, in one line: of an option that is not there, the nearest one and all others."""
+    if (chosen := _CHOSEN.fullmatch(one_line(error))) is not None:
+        group, name = chosen.groups()
+        return f"+{group}={name}: a choice of this group is there already. Replace it: {group}={name}."
     if (match := _NO_OPTION.search(str(error))) is None:
         return one_line(error)
     group, name, listed = match.groups()

@@ -71,6 +71,11 @@ def with_defaults(node: Any) -> Any:
         return dict(node)
 
 
+def defaults_of(target: str, *field: str) -> Any:
+    """The default that the class or function of a dotted name has for a field, or for an entry of it."""
+    return functools.reduce(lambda node, name: node[name], field, _defaults(_located(target)))
+
+
 def build(node: Any, key: str = "") -> Any:
     """What a node describes: the result of its call, with the nodes inside it built first.
 

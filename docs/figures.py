@@ -2,6 +2,8 @@
 
 python docs/figures.py                     those of the evidence pages, from their CSV files
 python docs/figures.py training_time SWEEP   that of experiment=training_time, its CSV file and its table
+python docs/figures.py figure1b SWEEP …    the paper's figure of that name from your own runs, into the first SWEEP: also figure1c
+                                           (of multirun/table1, table2 and table3, say), figure3 and figure5
 python docs/figures.py demo [OVERRIDE …]   the first tutorial's: trains the demo without strategies and with clear
 python docs/figures.py host                the README's: trains in a gsplat loop, without strategies and with best
 python docs/figures.py notebook            runs docs/tutorial/notebook.ipynb and keeps the outputs of its cells
@@ -16,6 +18,7 @@ import re
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -33,6 +36,13 @@ mpl.rcParams.update(
 )
 
 import matplotlib.pyplot as plt  # noqa: E402 - after the backend was chosen
+import numpy as np  # noqa: E402
+import pandas as pd  # noqa: E402
+
+from clear_strategies.data.photo_files import read_image  # noqa: E402
+from clear_strategies.outputs.figures import SheetRow, write_contact_sheet  # noqa: E402
+from clear_strategies.report.paper import data_of  # noqa: E402
+from clear_strategies.report.runs import FinishedRun, collect  # noqa: E402
 
 DOCS: Final = Path(__file__).resolve().parent
 GREY: Final = "0.6"
@@ -55,8 +65,12 @@ def error(cell: str) -> float:
 
 
 def write(figure: Any, folder: Path, name: str) -> None:
+    save(figure, folder / f"evidence_{name}.svg")
+
+
+def save(figure: Any, path: Path) -> None:
     figure.tight_layout()
-    figure.savefig(folder / f"evidence_{name}.svg", metadata={"Date": None})
+    figure.savefig(path, metadata={"Date": None})
     plt.close(figure)
 
 
@@ -169,10 +183,6 @@ def curve(rows: list[dict[str, str]], scene: str, method: str) -> tuple[list[flo
 
 def collect_training_time(sweep: Path) -> None:
     """Write `training_time.csv` from the runs of experiment=training_time, and print their table."""
-    import pandas as pd
-
-    from clear_strategies.report.runs import collect
-
     tables, stages = [], {}
     for run in collect([sweep]):
         history = pd.read_csv(run.folder / "history.csv")
@@ -196,6 +206,104 @@ def collect_training_time(sweep: Path) -> None:
             took = " + ".join(f"{of_stage:.0f}" for of_stage in stages[scene, method])
             lines.append(f"| {scene} | {method} | {took} | {psnr[-1]:.2f} | {until:.0f}, to {equal:.2f} dB |")
     sys.stdout.write("\n".join(lines) + "\n")
+
+
+def lines_of(runs: Sequence[FinishedRun]) -> dict[FinishedRun, str]:
+    """The line of each run in a figure: its name, and the readings where they are not the same for all."""
+    readings = {run: next((s for s in run.settings if s.startswith("readings=")), "") for run in runs}
+    return {
+        run: f"{run.name}, {of}" if of and len({*readings.values()}) > 1 else run.name for run, of in readings.items()
+    }
+
+
+def averaged(table: pd.DataFrame, *by: str) -> pd.DataFrame:
+    """Means over scenes of the means over seeds."""
+    return table.groupby([*by, "scene"], sort=False).mean().groupby([*by], sort=False).mean().reset_index()
+
+
+def figure1b(runs: Sequence[FinishedRun], folder: Path) -> None:
+    """The share of Gaussians in conflict by the number of training views."""
+    lines = lines_of(runs)
+    views = {run: next(s for s in run.settings if s.startswith("data.views.train=")).split("=")[1] for run in runs}
+    rows = [
+        {"line": lines[run], "views": int(views[run]), "scene": run.scene, "conflict": run.numbers["conflict"]}
+        for run in runs
+    ]
+    figure, axes = plt.subplots(figsize=(4, 2.6))
+    for line, of_line in averaged(pd.DataFrame(rows), "line", "views").groupby("line", sort=False):
+        points = of_line.sort_values("views")
+        axes.plot(points["views"], points["conflict"], marker="o", markersize=4, label=line)
+    axes.set_xlabel("training views")
+    axes.set_ylabel("Gaussians in conflict")
+    axes.legend(fontsize=7, frameon=False)
+    save(figure, folder / "figure1b.svg")
+
+
+def figure1c(runs: Sequence[FinishedRun], folder: Path) -> None:
+    """PSNR, SSIM and GMSD of the methods by data set."""
+    scores = {"psnr": "PSNR, dB", "ssim": "SSIM", "gmsd": "GMSD"}
+    lines = lines_of(runs)
+    rows = [
+        {
+            "line": lines[run],
+            "data": data_of(run) or run.scene,
+            "scene": run.scene,
+            **{s: run.numbers[s] for s in scores},
+        }
+        for run in runs
+    ]
+    means = averaged(pd.DataFrame(rows), "line", "data").set_index(["data", "line"])
+    figure, all_axes = plt.subplots(1, len(scores), figsize=(9, 2.8))
+    for axes, (score, title) in zip(all_axes, scores.items(), strict=True):
+        means[score].unstack(sort=False).plot.bar(
+            ax=axes, rot=0, legend=score == "ssim", xlabel="", ylabel=title, width=0.8
+        )
+    all_axes[1].legend(fontsize=6, frameon=False, ncols=3, loc="upper center", bbox_to_anchor=(0.5, 1.3))
+    save(figure, folder / "figure1c.svg")
+
+
+def figure3(runs: Sequence[FinishedRun], folder: Path, name: str = "figure3") -> None:
+    """A test view of each scene: the LR photo, the picture of every method, the truth, and the part where they differ most."""
+    sheet = []
+    for scene in dict.fromkeys(run.scene for run in runs):
+        of_scene = [run for run in runs if run.scene == scene]
+        views = [{path.stem for path in (run.folder / "renders").glob("*.png")} for run in of_scene]
+        view = sorted(set.intersection(*views))[0]
+        beside = of_scene[0].folder / "views" / view
+        drawn = {line: picture(run.folder / "renders" / f"{view}.png") for run, line in lines_of(of_scene).items()}
+        lr, truth = picture(Path(f"{beside}_lr.png")), picture(Path(f"{beside}_truth.png"))
+        factor = len(truth) // len(lr)
+        images = {"input": lr.repeat(factor, 0).repeat(factor, 1), **drawn, "truth": truth}
+        captions = {line: f"{run.numbers['psnr']:.2f} dB" for run, line in lines_of(of_scene).items()}
+        sheet.append(SheetRow(scene, images, captions, drawn))
+    write_contact_sheet(folder / f"{name}.png", sheet, ", ".join(row.name for row in sheet), "dB: of all test views")
+
+
+def picture(path: Path) -> np.ndarray:
+    return np.asarray(read_image(path))
+
+
+def figure5(runs: Sequence[FinishedRun], folder: Path, parts: int = 50) -> None:
+    """The share of Gaussians in conflict in training, and a test view of each rung."""
+    tables = []
+    for run, line in lines_of(runs).items():
+        conflict = pd.read_csv(run.folder / "conflict.csv")[["t", "conflict"]]
+        part = (
+            conflict["t"] * parts // (conflict["t"].max() + 1) + 0.5
+        ) / parts  # scenes may differ in their iterations
+        tables.append(conflict.assign(line=line, scene=run.scene, part=part))
+    figure, axes = plt.subplots(figsize=(5, 2.8))
+    for line, of_line in averaged(pd.concat(tables), "line", "part").groupby("line", sort=False):
+        points = of_line.sort_values("part")
+        axes.plot(points["part"], points["conflict"], label=line)
+    axes.set_xlabel("part of the training")
+    axes.set_ylabel("Gaussians in conflict")
+    axes.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
+    save(figure, folder / "figure5.svg")
+    figure3([run for run in runs if run.seed == runs[0].seed], folder, "figure5_views")
+
+
+OF_SWEEPS: Final = {draw.__name__: draw for draw in (figure1b, figure1c, figure3, figure5)}
 
 
 def main(folder: Path) -> None:
@@ -307,6 +415,9 @@ if __name__ == "__main__":
         case ["training_time", sweep]:
             collect_training_time(Path(sweep))
             training_time(DOCS / "images")
+        case [name, *sweeps] if name in OF_SWEEPS and sweeps:
+            folders = list(map(Path, sweeps))
+            OF_SWEEPS[name](collect(folders), folders[0])
         case ["demo", *overrides]:
             demo(DOCS / "images", *overrides)
         case ["host"]:

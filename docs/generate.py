@@ -276,6 +276,7 @@ def _built(
     key: str, target: str, leaves: Mapping[str, str], notes: Mapping[str, str]
 ) -> tuple[Section, dict[str, Any]]:
     """The fields of the class or function that a node is built from; and the defaults that are dataclasses themselves."""
+    leaves = {name: value for name, value in leaves.items() if value != "${reading:}"}  # the class's, by default
     module, _, name = target.rpartition(".")
     built = getattr(importlib.import_module(module), name)
     summary, described = (

@@ -49,12 +49,33 @@ def test_names_and_overrides_are_those_of_the_command_line_and_milestones_stretc
         (("gco,best",), "gco twice"),
         (("best,svs",), "svs twice"),
         (("gco", "fit.iterations=3"), r"fit\.iterations: .* A conductor has settings of .*objective"),
-        (("gco", "+readings=literal"), r"strategies.p2g: has settings .*\+strategy=p2g"),
+        (("gco", "+strategies.p2g.floor=0"), r"strategies.p2g: has settings .*\+strategy=p2g"),
+        (("gco", "+readings=paper"), r"\+readings=paper: .*: readings=paper\."),
+        (("gco", "readings=literal"), "readings=literal: there is no such option. There are measured, paper"),
     ],
 )
 def test_what_does_not_exist_is_named(said, named):
     with pytest.raises(SettingError, match=named):
         conductor(*said)
+
+
+def test_readings_stand_beside_any_strategies_and_what_is_set_by_name_wins():
+    """The ladder of the paper's table 5: each rung has the readings of what takes part, and nothing of the others."""
+    whole = tree(composed("+strategy=clear_paper"))
+    assert tree(composed("readings=paper", "+strategy=[gco,p2g,svs]")) == whole
+    assert "readings" not in whole
+    for rung in (["gco", "p2g"], ["gco"], []):
+        values = tree(composed(f"+strategy=[{','.join(rung)}]" if rung else "+strategy=baseline", "readings=paper"))
+        assert values["strategies"] == {name: whole["strategies"][name] for name in rung}
+        assert {key: values[key] for key in ("objective", "skips", "optim")} == {
+            key: whole[key] for key in ("objective", "skips", "optim")
+        }
+    ours, printed = conductor("clear").strategies, conductor("clear", "readings=paper").strategies
+    assert ours != printed == conductor("clear_paper").strategies
+    assert (printed[1].score_by, printed[2].anchor_weights["detail"]) == ("evidence", 0)
+    assert compose_module.composed(["+strategy=clear_paper"]).skips.coarse_until == 0  # where a host's is skips=hosts
+    (svs,) = conductor("svs", "readings=paper", "strategies.svs.anchor_weights.detail=2").strategies
+    assert (svs.anchor_weights["detail"], svs.anchor_weights["means"], svs.looks) == (2, 1, 0)
 
 
 def test_a_hydra_application_keeps_its_own_state():

@@ -61,8 +61,6 @@ def test_commands_are_understood(words, monkeypatch, tmp_path):
         require_parsable("clear_strategies.run", words[1:], monkeypatch)
     elif words[:2] == ["clear-strategies", "train"]:
         require_composable(train.overrides([str(tmp_path), *words[3:]]))
-    elif words[:2] == ["clear-strategies", "settings"]:
-        require_composable(words[2:])
     elif words[:3] == ["python", "-m", "clear_strategies.run"] or words[0] == "clear-strategies":
         require_composable(words[1:] if words[0] == "clear-strategies" else words[3:])
     elif words[:3] == ["python", "-m", "pytest"]:

@@ -121,7 +121,7 @@ class Conductor:
         self.decorated = True
         return prior
 
-    def gate(self, t: int, n: int) -> Float[Tensor, " N"] | None:
+    def gate(self, t: int, n: int) -> Float[Tensor, " N"] | Float[Tensor, "2 N"] | None:
         """zᵗ, before render; None: every Gaussian takes part."""
         z = self._owner["gate"].gate(t, n)
         if z is None and self.owner("gate") is not None:

@@ -3,7 +3,7 @@
 Every folder at or below DIR with a metrics.json is a run. Runs of a scene that differ only in their seed share a row.
 Files:
 
-- report.md, report.csv: the table
+- report.md, report.csv: the table, and the paper's numbers beside ours where the runs are of its data sets
 - report.html: the tables and pictures of all scenes; it needs the pictures beside it, and no network
 - comparison_SCENE.png: one test view of all methods, enlarged where they differ most
 - curves_SCENE.png: what history.csv holds of them, over iterations and over training time
@@ -27,6 +27,7 @@ from clear_strategies.commands import path_of
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.errors import ClearError, DataError
 from clear_strategies.outputs.figures import SheetRow, write_contact_sheet, write_curves
+from clear_strategies.report import paper
 from clear_strategies.report.runs import FinishedRun, collect, history
 from clear_strategies.report.table import compare, layout, markdown, notes
 
@@ -61,6 +62,9 @@ def write(runs: Sequence[FinishedRun], out: Path) -> str:
     """Write the files of a report into `out`; returns the text of report.md."""
     table = compare(runs)
     text = markdown(layout(table), notes(table, runs))
+    papers = {f"{data}, beside the paper's numbers": cells for data, cells in paper.beside(runs).items()}
+    for title, cells in papers.items():
+        text += f"\n{title}:\n\n{markdown(cells, [paper.NOTE])}"
     files.write_text(out / "report.md", text)
     records = table.drop(columns=["average", "run"])
     files.write_text(out / "report.csv", records.to_csv(index=False))
@@ -68,16 +72,17 @@ def write(runs: Sequence[FinishedRun], out: Path) -> str:
     sections: list[dict[str, Any]] = []  # of the page: a scene, or first the average over scenes, which has no pictures
     for scene, name in _file_names(table["scene"]).items():
         rows, pictures = table[table["scene"] == scene], list[str]()
-        cells = {"title": scene, "cells": layout(rows).drop(columns="scene"), "notes": notes(rows, runs)}
+        section = {"title": scene, "cells": layout(rows).drop(columns="scene"), "notes": notes(rows, runs)}
         if rows["average"].any():
-            sections.insert(0, cells)
+            sections.insert(0, section)
             continue
         shown = dict(zip(rows["method"], rows["run"], strict=True))  # of several seeds the first
         if _compare_renders(out / f"comparison_{name}.png", scene, shown):
             pictures.append(f"comparison_{name}.png")
         pictures.append(f"curves_{name}.png")
         write_curves(out / pictures[-1], {method: history(run.folder) for method, run in shown.items()}, scene)
-        sections.append({**cells, "pictures": pictures})
+        sections.append({**section, "pictures": pictures})
+    sections += [{"title": title, "cells": cells, "notes": [paper.NOTE]} for title, cells in papers.items()]
     _write_page(out / "report.html", sections)
     _log.info("report of %d runs: %s (report.html opens in any browser)", len(runs), out)
     return text

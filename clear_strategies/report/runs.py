@@ -35,6 +35,7 @@ class FinishedRun:
         scene: its name, followed by the marks in parentheses.
         marks: that the prior is synthetic, that the scores are of training views, that they are against LR photos.
         name: method or strategies as given on the command line ("clear"), else as they are named in the run ("gco + p2g").
+        protocol: the option of conf/protocol or conf/scene that it is of; None: of neither.
         settings: the other overrides, without the seed and those that change no result.
         numbers: mean scores of the test views, or of the training views where there are no test views; "bicubic", "prior":
             PSNR of these images; conflict, gaussians, seconds. NaN where unknown.
@@ -44,6 +45,7 @@ class FinishedRun:
     scene: str
     marks: str
     name: str
+    protocol: str | None
     settings: tuple[str, ...]
     seed: int
     numbers: Mapping[str, float]
@@ -65,6 +67,7 @@ class FinishedRun:
             scene=content.scene + (f" ({', '.join(marks)})" if marks else ""),
             marks=", ".join(marks),
             name=Chosen(None, content.strategies, overrides).title,
+            protocol=_protocol(folder),
             settings=tuple(filter(_is_setting, overrides)),
             seed=content.seed,
             numbers={
@@ -132,9 +135,18 @@ def _sorted(paths: Iterable[Path]) -> list[Path]:
 
 def _job(folder: Path) -> int:
     """The run's number in its sweep; 0 for a single run, which then sorts by path."""
-    try:
-        content = (folder / _HYDRA / "hydra.yaml").read_text(encoding="utf-8")
-    except (OSError, ValueError):
-        return 0
-    number = re.search(r"^    num: (\d+)$", content, re.MULTILINE)
+    number = re.search(r"^    num: (\d+)$", _hydra(folder), re.MULTILINE)
     return int(number[1]) if number else 0
+
+
+def _protocol(folder: Path) -> str | None:
+    chosen = dict(re.findall(r"^      (protocol|scene): (\w+)$", _hydra(folder), re.MULTILINE))
+    return chosen.get("scene") or chosen.get("protocol")
+
+
+def _hydra(folder: Path) -> str:
+    """What Hydra says of a run; empty where that is unknown."""
+    try:
+        return (folder / _HYDRA / "hydra.yaml").read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return ""

@@ -71,7 +71,7 @@ def notes(table: pd.DataFrame, runs: Sequence[FinishedRun]) -> list[str]:
     if table["average"].any():
         lines.append("Averages are means of the scenes' means; their Δ is paired over scenes and seeds.")
     for scene, of_scene in _by_scene(runs).items():
-        if scene in set(table["scene"]) and (shared := _in_all([run.settings for run in of_scene])):
+        if scene in set(table["scene"]) and (shared := in_all([run.settings for run in of_scene])):
             lines.append(f"All runs of {scene}: `{' '.join(shared)}`.")
     return lines
 
@@ -112,7 +112,7 @@ def _single(runs: Sequence[FinishedRun]) -> list[dict[str, Any]]:
     `key` is name and settings, a line each; `identity`, the key of an average, leaves out the `data` settings that all runs of
     the scene share, which describe the scene.
     """
-    shared = _in_all([run.settings for run in runs])
+    shared = in_all([run.settings for run in runs])
     rows = []
     for run in runs:
         of_all = [s for s in run.settings if s not in shared or not s.lstrip("+~").startswith("data")]
@@ -120,7 +120,7 @@ def _single(runs: Sequence[FinishedRun]) -> list[dict[str, Any]]:
         facts = {
             "scene": run.scene,
             "marks": run.marks,
-            "method": _label(run.name, run.settings, shared),
+            "method": label(run.name, run.settings, shared),
             "seed": run.seed,
         }
         rows.append({**facts, "key": key, "identity": identity, "run": run, **run.numbers})
@@ -132,11 +132,11 @@ def _summary(single: pd.DataFrame) -> pd.DataFrame:
     groups = single.groupby("key", sort=False)
     table = groups[["scene", "method", "run"]].first().assign(average=False, runs=groups.size())
     for _, of_method in groups:
-        label = f"{of_method['scene'].iloc[0]}, {of_method['method'].iloc[0]}"
+        row = f"{of_method['scene'].iloc[0]}, {of_method['method'].iloc[0]}"
         if of_method["seed"].duplicated().any():
-            _log.warning("%s: a row holds several runs with the same seed.", label)
+            _log.warning("%s: a row holds several runs with the same seed.", row)
         if of_method["psnr"].isna().any():
-            _log.warning("%s: runs without a finite PSNR are left out of its mean.", label)
+            _log.warning("%s: runs without a finite PSNR are left out of its mean.", row)
     table["seeds"] = groups["seed"].agg(lambda seeds: ", ".join(map(str, sorted(set(seeds)))))
     for quantity in _QUANTITIES:
         table[quantity], table[f"{quantity}_std"] = groups[quantity].mean(), groups[quantity].std()
@@ -147,15 +147,15 @@ def _summary(single: pd.DataFrame) -> pd.DataFrame:
 def _average(single: pd.DataFrame, title: str) -> pd.DataFrame:
     """A row for each method that all scenes have."""
     scenes = single["scene"].nunique()
-    in_all = single.groupby("identity", sort=False)["scene"].nunique() == scenes
-    if left_out := list(dict.fromkeys(single.loc[~single["identity"].map(in_all), "method"])):
+    complete = single.groupby("identity", sort=False)["scene"].nunique() == scenes
+    if left_out := list(dict.fromkeys(single.loc[~single["identity"].map(complete), "method"])):
         _log.info("%s: left out, because not all scenes have it: %s.", title, "; ".join(left_out))
-    single = single[single["identity"].map(in_all)]
+    single = single[single["identity"].map(complete)]
     means = single.groupby(["identity", "scene"], sort=False)[[*_QUANTITIES]].mean().groupby("identity", sort=False)
     # A quantity that one scene lacks has no average.
     table = means.mean().where(means.count() == scenes).assign(average=True, runs=0, seeds="", scene=title)
-    shared = _in_all([identity.split("\n")[1:] for identity in table.index])
-    table["method"] = [_label(name, settings, shared) for name, *settings in table.index.str.split("\n")]
+    shared = in_all([identity.split("\n")[1:] for identity in table.index])
+    table["method"] = [label(name, settings, shared) for name, *settings in table.index.str.split("\n")]
     return table.join(_differences(single, "identity", table["psnr"])).reset_index(drop=True)
 
 
@@ -176,10 +176,11 @@ def _differences(single: pd.DataFrame, key: str, means: pd.Series[float]) -> pd.
     return table
 
 
-def _in_all(lists: Sequence[Sequence[str]]) -> list[str]:
+def in_all(lists: Sequence[Sequence[str]]) -> list[str]:
     """What every list holds, in the order of the first."""
     return [setting for setting in lists[0] if all(setting in other for other in lists)] if lists else []
 
 
-def _label(name: str, settings: Sequence[str], shared: Sequence[str]) -> str:
+def label(name: str, settings: Sequence[str], shared: Sequence[str]) -> str:
+    """The name of a row: the method's, and the settings that not all of the runs share."""
     return ", ".join((name, *(s for s in settings if s not in shared)))

@@ -86,8 +86,11 @@ class Strategy:
         """
         return None
 
-    def gate(self, t: int, n: int) -> Float[Tensor, " N"] | None:
-        """Before render: which Gaussians take part? z >= 0 multiplies the opacity; None: all of them.  Eq. 15"""
+    def gate(self, t: int, n: int) -> Float[Tensor, " N"] | Float[Tensor, "2 N"] | None:
+        """Before render: which Gaussians take part? z >= 0 multiplies the opacity; None: all of them.  Eq. 15
+
+        Two rows, of LR and of HR, where `shares_gate` is false.
+        """
         return None
 
     def background(self, t: int) -> Color | None:
@@ -180,6 +183,11 @@ class Strategy:
             lambda_hf: the share of the high-frequency loss in it.
         """
         return None
+
+    @property
+    def shares_gate(self) -> bool:
+        """Whether `gate` answers for both scales at once."""
+        return True
 
     def patch_maps(self, view: View) -> PatchMaps | None:
         """The patch evidence that the strategy works with for this view; None: it uses none.  Eq. 9"""

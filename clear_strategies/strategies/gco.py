@@ -45,6 +45,9 @@ class GCO(Strategy):
         tolerance: τ_c in [0, 1): cosines down to -τ_c are no conflict.
         weight_min, weight_max: bounds of ω where a conflict is corrected, 0 <= min <= max <= 1.
         groups: the attributes that are compared and corrected, each separately.
+        whole: compare a Gaussian as a whole instead, all groups together. Neither this nor `drop` is the paper's; see
+            experiment=claims.
+        drop: leave out a conflicting HR gradient instead of correcting it.
 
     There is no ε: products are in float64, where those of float32 gradients do not vanish, and a zero norm is no conflict (F27).
     The opacity group has one dimension: its cosine is ±1, so every disagreement is a full conflict.
@@ -58,6 +61,8 @@ class GCO(Strategy):
     weight_min: float = 0.05
     weight_max: float = 0.75
     groups: Sequence[str] = CONFLICT_GROUPS
+    whole: bool = False
+    drop: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "groups", tuple(self.groups))
@@ -80,8 +85,9 @@ class GCO(Strategy):
     def reconcile(self, products: Products, step: Step | None) -> Weights:
         """ĝ_HR = g_HR - ω (c + τ_c) ‖h‖ / ‖l‖ g_LR where c < -τ_c. Logs what was corrected."""
         p, τ = products, self.tolerance
-        per_norm = times(p.l2, p.h2).clamp_min_(_TINY).rsqrt_()  # 1 / (‖l‖ ‖h‖)
-        c = times(p.dot, per_norm)  # Eq. 6
+        dot, l2, h2 = map(self._together, (p.dot, p.l2, p.h2)) if self.whole else (p.dot, p.l2, p.h2)
+        per_norm = times(l2, h2).clamp_min_(_TINY).rsqrt_()  # 1 / (‖l‖ ‖h‖)
+        c = times(dot, per_norm)  # Eq. 6
         below = c.add_(τ).clamp_max_(0)  # c + τ_c, how far a cosine lies below the margin; 0: no conflict
         below[:, _QUATS] *= _turns_something(p.l2) & _turns_something(p.h2)
         if len(self.groups) < len(CONFLICT_GROUPS):
@@ -90,7 +96,14 @@ class GCO(Strategy):
         q = p.dot.new_zeros(1) if evidence is None else evidence.reliability.double()
         ω = times(below, ((1 - q) / (τ - 1))[:, None]).clamp_(self.weight_min, self.weight_max)  # s (1 - q), Eq. 11
         self._report(p, below, ω, evidence is not None)
-        return Weights(remove=per_norm.mul_(p.h2).mul_(below).mul_(ω))  # ω (c + τ_c) ‖h‖ / ‖l‖, Eq. 7
+        if self.drop:
+            return Weights(keep=(below == 0).double())
+        return Weights(remove=per_norm.mul_(h2).mul_(below).mul_(ω))  # ω (c + τ_c) ‖h‖ / ‖l‖, Eq. 7
+
+    def _together(self, of_groups: Float[Tensor, "N G"]) -> Float[Tensor, "N G"]:
+        """The sum over the groups that are compared, in the place of each."""
+        columns = [CONFLICT_GROUPS.index(group) for group in self.groups]
+        return of_groups[:, columns].sum(1, keepdim=True).repeat(1, of_groups.shape[1])
 
     def _report(self, p: Products, below: Float[Tensor, "N G"], ω: Float[Tensor, "N G"], has_evidence: bool) -> None:
         """Log what was corrected; it is counted where somebody asks for it."""

@@ -45,6 +45,8 @@ class SVS(Strategy):
         anchor_strength: λ_stab >= 0; 0 takes no anchor (densification still stops at t_a); the paper's is 0.01 (F40).
         anchor_weights: W by attribute, >= 0, on raw parameters; positions count in units of the extent of the anchored
             cloud (90th percentile of the distance from its median).
+        shared: both scales lose the same Gaussians; false, which is not the paper's, but for experiment=claims: each its own. The
+            readable pass then takes the place of the compiled one, and other trainers refuse it.
         reduction: "sum" over Gaussians as printed in the paper, or their "mean" (negligible for 1e5 Gaussians).
 
     Raises:
@@ -58,6 +60,7 @@ class SVS(Strategy):
     anchor_strength: float = 0.0
     anchor_weights: Mapping[str, float] = field(default_factory=lambda: dict(ANCHOR_WEIGHTS))
     reduction: Literal["sum", "mean"] = "sum"
+    shared: bool = True
 
     def __post_init__(self) -> None:
         require_whole("looks", self.looks, least=0)
@@ -79,12 +82,17 @@ class SVS(Strategy):
                 self.looks,
             )  # fmt: skip
 
-    def gate(self, t: int, n: int) -> Float[Tensor, " N"] | None:
+    @property
+    def shares_gate(self) -> bool:
+        return self.shared
+
+    def gate(self, t: int, n: int) -> Float[Tensor, " N"] | Float[Tensor, "2 N"] | None:
         """zᵗ: 0 for dropped Gaussians, 1 / (1 - p_t) for the others; a function of (seed, t)."""
         p = self.dropout(t) * self.cache.get("share", 1.0)
         if p == 0:
             return None
-        return dropout_mask(n, p, self.seed, t, self.device)
+        z = dropout_mask(n, p, self.seed, t, self.device)
+        return z if self.shared else torch.stack((z, dropout_mask(n, p, ~self.seed, t, self.device)))
 
     def regularize(self, params: Mapping[str, Tensor], t: int) -> Grads | None:
         """∇ λ_stab Σ_i ‖θ_i - θ_i^a‖²_W, for every Gaussian, seen or not; None before the anchor.

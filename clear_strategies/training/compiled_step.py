@@ -60,6 +60,8 @@ def _why_not(conductor: Conductor, optimizer: Adam, mode: FusedMode) -> Iterator
     for thing, base in ((conductor, Conductor), (optimizer, Adam)):
         if type(thing) is not base:
             yield f"{type(thing).__name__} may compute something else than {base.__name__}"
+    if not all(s.shares_gate for s in conductor.strategies):
+        yield "a mask for each scale makes two activations of the field"
     for name, moments in optimizer.first.items():
         if moments.device.type not in ("cpu", "cuda") or moments.dtype != torch.float32:
             yield f"{name} is {moments.dtype} on {moments.device}, not float32 on the CPU or on CUDA"

@@ -92,15 +92,21 @@ class GaussianField(nn.Module):
         rasterizer: Rasterizer,
         view: View,
         *,
-        gate: Float[Tensor, " N"] | None = None,
+        gate: Float[Tensor, " N"] | Float[Tensor, "2 N"] | None = None,
         lr: bool = True,
         hr: bool = True,
     ) -> tuple[FieldShot | None, FieldShot | None]:
-        """Î_LR without f_det and Î_HR with it, of the same gated geometry; None for a scale that is not wanted.  Eq. 2, 3"""
-        active = self._activate(gate)
+        """Î_LR without f_det and Î_HR with it, of the same gated geometry; None for a scale that is not wanted.  Eq. 2, 3
+
+        Args:
+            gate: of both scales, or a row for LR and one for HR.
+        """
+        active = [self._activate(gate)] * 2 if gate is None or gate.dim() == 1 else list(map(self._activate, gate))
         wanted = [(detail, photo.camera) for detail, photo, on in ((False, view.lr, lr), (True, view.hr, hr)) if on]
-        renderings = rasterizer.render_scales([(active.splats(detail=detail), camera) for detail, camera in wanted])
-        shots = {d: FieldShot(r, active, detail=d) for (d, _), r in zip(wanted, renderings, strict=True)}
+        renderings = rasterizer.render_scales(
+            [(active[detail].splats(detail=detail), camera) for detail, camera in wanted]
+        )
+        shots = {d: FieldShot(r, active[d], detail=d) for (d, _), r in zip(wanted, renderings, strict=True)}
         return shots.get(False), shots.get(True)
 
     def shot(self, rasterizer: Rasterizer, camera: Camera) -> FieldShot:

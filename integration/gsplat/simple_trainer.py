@@ -57,8 +57,7 @@ def install(
 
     Args:
         runner_class: simple_trainer's `Runner`. Its Config stretches the schedules (`max_steps`), and
-            `strategy.refine_stop_iter` is lowered to the step at which a strategy ends densification. With 0, a strategy may
-            densify in place of `DefaultStrategy`.
+            `strategy.refine_stop_iter` is lowered to the step at which a strategy ends densification.
         settings: None: the defaults. changes: fields of `Settings` in place of those, e.g. sr="sr_x4".
         installed: called with every attachment.
 

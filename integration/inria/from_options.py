@@ -28,7 +28,7 @@ def install(gaussians: Any, scene: Any, opt: Any, settings: Settings | None = No
         scene: the Scene with the training cameras.
         opt: the options that the host passed to `training_setup`. `iterations` stretches the schedules,
             `densify_grad_threshold` scales P2G's score, and `densify_until_iter` is lowered to the iteration at which a
-            strategy ends densification. With 0, a strategy may densify in place of the host.
+            strategy ends densification.
         settings: None: the defaults. With points="stereo" the Gaussians are made again by the host's `create_from_pcd` and
             `training_setup`; a checkpoint that is restored later replaces them.
         changes: fields of `Settings` in place of those, e.g. sr="sr_x4".

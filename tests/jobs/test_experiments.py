@@ -10,9 +10,10 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from clear_strategies import Conductor
-from clear_strategies.compose import require_each_once
+from clear_strategies.compose import tree
 from clear_strategies.data.view_settings import ViewSettings
-from clear_strategies.errors import SettingError
+from clear_strategies.jobs.settings import settings_of
+from clear_strategies.merging.skips import Skips
 from clear_strategies.schedules import scaled
 from clear_strategies.settings import CHANGES_NO_RESULT, build
 from clear_strategies.training.loop import fit
@@ -85,12 +86,16 @@ def test_no_method_has_what_the_baselines_page_says_that_none_has():
 
 
 def test_a_method_is_the_same_whatever_strategies_are_named_before_it():
-    """The decorator of best would change the SR images of srgs, the λ_HR of clear_paper train 3dgs_lr on SR images."""
+    """The decorator of best would change the SR images of srgs, the λ_HR of readings=paper train 3dgs_lr on SR images."""
     assert list(composed("+strategy=clear", "+method=dropgaussian").strategies) == ["svs"]
     assert list(composed("+method=srgs", "+strategy=gco").strategies) == ["gco"]
     assert composed("+strategy=best", "+method=srgs") == composed("+method=srgs")
-    with pytest.raises(SettingError, match=r"\+strategy=clear_paper before it brings /readings/literal"):
-        require_each_once(["+strategy=clear_paper", "+method=3dgs_lr"])
+    for name in options("method"):  # no detail feature: its rates have no effect
+        printed, measured = (
+            tree(composed(f"+method={name}", "skips=none", f"readings={r}")) for r in ("paper", "measured")
+        )
+        rates = {key: measured["optim"][key] for key in ("detail_decay", "detail_steps")}
+        assert {**printed, "optim": {**printed["optim"], **rates}} == measured, name
 
 
 SCENES = {
@@ -101,6 +106,7 @@ SCENES = {
 }
 CLEAR = ["gco", "p2g", "svs"]
 ROWS = {
+    "table5": {"baseline": [], "gco": ["gco"], "[gco,p2g]": ["gco", "p2g"], "clear": CLEAR},
     "ablation": {"baseline": [], "gco": ["gco"], "[gco,p2g]": ["gco", "p2g"], "clear": CLEAR},
     "leave_one_out": {"clear": CLEAR, "[p2g,svs]": CLEAR[1:], "[gco,svs]": ["gco", "svs"], "[gco,p2g]": CLEAR[:2]},
 }
@@ -151,8 +157,51 @@ def test_the_evidence_differs_in_what_it_sweeps_alone(experiment):
         pieces(c)
 
 
+METHODS = set(options("method")) - {"srgs_lr", "binocular3dgs_srgs"} | {"[]"}  # those are in no table
+SHOWN = {"3dgs_lr", "srgs", "dropgaussian_srgs", "s2gaussian", "[]"}
+PAPER = {  # scenes, seeds, and the values of what is swept beside these
+    "table1": (8, 3, {"+strategy": {"clear"}, "+method": METHODS}),
+    "table2": (8, 3, {"+strategy": {"clear"}, "+method": METHODS}),
+    "table3": (7, 3, {"+strategy": {"clear"}, "+method": METHODS}),
+    "table4": (8, 1, {"+strategy": {"clear"}, "+method": {"s2gaussian", "[]"}}),
+    "table5": (8, 3, {"+strategy": {*ROWS["table5"]}}),
+    "figure1b": (8, 3, {"+strategy": {"baseline", "clear"}, "data.views.train": set("2369")}),
+    "figure1c": (4, 3, {"+strategy": {"clear"}, "+method": SHOWN}),
+    "figure3": (8, 1, {"+strategy": {"clear"}, "+method": SHOWN}),
+    "figure5": (8, 1, {"+strategy": {*ROWS["table5"]}}),
+    "claims": (3, 2, {"+strategy": {"clear"}, "+claim": set(options("claim"))}),
+}
+
+
+@pytest.mark.parametrize("readings", ["paper", "measured"])
+@pytest.mark.parametrize("experiment", PAPER)
+def test_every_table_and_figure_of_the_paper_is_a_command(experiment, readings):
+    """Each row composes into settings, with the readings of what takes part."""
+    scenes, seeds, rows = PAPER[experiment]
+    found, composed_job = jobs(f"experiment={experiment}", f"readings={readings}", "data.root=here")
+    assert {key: {job[key] for job in found} for key in rows} == rows
+    assert len(found) == scenes * seeds * math.prod(map(len, rows.values()))
+    scene = "+scene" if "+scene" in found[0] else "data.scene"
+    first = [job for job in found if (job[scene], job["fit.seed"]) == (found[0][scene], "0")]
+    for job in first if readings == "paper" else first[-1:]:
+        c = composed_job(job)
+        settings = settings_of(tree(OmegaConf.masked_copy(c, [key for key in c if key != "hydra"])))
+        assert settings.skips == Skips()  # every iteration, every pixel
+        assert f"readings={readings}" in c.hydra.sweep.subdir
+        if (p2g := settings.strategies.get("p2g")) is not None:
+            assert p2g.score_by == ("evidence" if readings == "paper" else "sum")
+
+
+def test_the_rows_of_a_table_run_on_the_small_scenes_as_well():
+    found, composed_job = jobs("experiment=table5", "protocol=scenes", "data.root=here", "readings=paper")
+    assert {job["+scene"] for job in found} == {"fern", "horns", "lego", "real_room"}
+    assert len(found) == 4 * 3 * 4
+    c = composed_job(found[0])
+    assert (c.data.path, c.fit.iterations, c.optim.geometry_steps, c.skips.hr_every) == ("here/fern", 1500, 0, 1)
+
+
 def test_every_experiment_has_a_test():
-    assert {*SCENES, *ROWS, *EVIDENCE, "smoke"} == set(options("experiment"))
+    assert {*SCENES, *ROWS, *EVIDENCE, *PAPER, "smoke"} == set(options("experiment"))
 
 
 HORNS = ("experiment=llff_x4", "data.root=here", "data.scene=horns")
@@ -188,16 +237,16 @@ def test_a_setting_that_changes_no_result_changes_no_folders_name(rows):
 
 @pytest.mark.slow
 def test_one_command_runs_all_its_report_tells_the_rows_apart_and_a_rerun_trains_nothing(tmp_path: Path):
-    tiny = ["experiment=ablation", "~protocol", "fit.seed=0", *TINY, "fit.iterations=3"]
+    tiny = ["experiment=table5", "readings=paper", "~protocol", "fit.seed=0", *TINY, "fit.iterations=3"]
     for more in (["+strategy=baseline,clear"], ["+method=srgs"], ["+method=srgs", "-v", "fit.video=2"]):
         result = run(*tiny, *more, cwd=tmp_path)
         assert result.returncode == 0, result.stderr
     assert "nothing is trained" in result.stdout + result.stderr  # though more is said and shown
-    (log,) = tmp_path.glob("multirun/ablation/+method=srgs*/run.log")
+    (log,) = tmp_path.glob("multirun/table5/+method=srgs*/run.log")
     assert "strategies named before it take no part" in log.read_text()
-    done = sorted(p.parent.name.split(",")[0] for p in tmp_path.glob("multirun/ablation/*/metrics.json"))
+    done = sorted(p.parent.name.split(",")[0] for p in tmp_path.glob("multirun/table5/*/metrics.json"))
     assert done == ["+method=srgs", "+strategy=baseline", "+strategy=clear"]
-    swept = tmp_path / "multirun" / "ablation"  # a sweep ends with its report
+    swept = tmp_path / "multirun" / "table5"  # a sweep ends with its report
     assert "| srgs " in (swept / "report.md").read_text()
     assert (swept / "report.html").is_file()
     told = run("multirun", "--out", "report", cwd=tmp_path, module="clear_strategies.report")

@@ -1,6 +1,7 @@
 """Jobs that can be started again, and sweeps of several processes: what is done stays, what failed is told, all stop."""
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -17,6 +18,7 @@ from clear_strategies.hydra_app import FAILED, SweepCallback
 from clear_strategies.jobs import device
 from clear_strategies.training import checkpoint
 from tests.helpers.command_line import TINY, run, started, stopped_by, wait_for
+from tests.helpers.configs import composed
 from tests.helpers.finished_run import make_run
 
 AUTO = ["fit.resume=auto", *TINY]
@@ -107,7 +109,28 @@ joblib = pytest.mark.skipif(
     find_spec("hydra_plugins") is None or find_spec("hydra_plugins.hydra_joblib_launcher") is None,
     reason="hydra-joblib-launcher is not installed: pip install -e '.[sweeps]'",
 )
-JOBLIB = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+JOBLIB = ["hydra/launcher=cores", "hydra.launcher.n_jobs=2"]
+
+
+@pytest.mark.skipif(find_spec("submitit") is None, reason="pip install hydra-submitit-launcher")
+@pytest.mark.slow
+def test_a_job_that_submitit_preempts_is_handed_in_again_and_resumed(tmp_path):
+    """As Slurm does before a time limit; hydra/launcher=slurm asks for the same, and for a GPU."""
+    sweep = [*SWEEP, "hydra/launcher=submitit_local", "hydra.sweep.subdir=job", "+strategy=clear", "fit.iterations=900"]
+    process = started(*DOOR, *sweep, cwd=tmp_path, said=tmp_path / "said")
+    run_folder = tmp_path / "all" / "job"
+    wait_for((run_folder / "cameras.json").exists)
+    (controller,) = (path.name for path in (tmp_path / "all" / ".submitit").iterdir() if path.name.isdecimal())
+    (job,) = Path(f"/proc/{controller}/task/{controller}/children").read_text().split()
+    os.kill(int(job), signal.SIGUSR2)
+    assert process.wait() == 0, (tmp_path / "said").read_text()
+    log = (run_folder / "run.log").read_text()
+    assert "resumed from" in log
+    assert 1 < int(re.search(r"resumed from .*step_(\d+)", log)[1]) < 900
+    assert (run_folder / "metrics.json").exists()
+    assert (tmp_path / "all" / "report.md").exists()
+    launcher = composed("hydra/launcher=slurm", hydra=True).hydra.launcher
+    assert (launcher.gpus_per_node, launcher.max_num_timeout, launcher.timeout_min) == (1, 20, 240)
 
 
 @joblib

@@ -1,6 +1,7 @@
 """The report: its command, its files, its table, its pictures, its rows, and the runs that it finds."""
 
 import csv
+import itertools
 import math
 import os
 import re
@@ -13,14 +14,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from clear_strategies import DataError, files, report
+from clear_strategies.data.photo_files import write_png
 from clear_strategies.outputs.figures import SheetRow, window, write_contact_sheet, write_curves
 from clear_strategies.settings import CHANGES_NO_RESULT
 from tests.helpers.finished_run import averages_of, cells, make_run, rows_of, scores, table_of
 from tests.helpers.image_files import array, holds, read
+from tests.helpers.pages import DOCS, loaded
 
 
 def test_a_report_has_a_table_records_a_page_and_images(tmp_path: Path) -> None:
@@ -242,6 +246,60 @@ def test_scenes_with_different_data_settings_are_averaged(tmp_path: Path) -> Non
             make_run(tmp_path / f"{scene}{job}", f"+strategy={strategy}", f"data.views.shrink={shrink}", scene=scene)
     make_run(tmp_path / "only_here", "+strategy=gco", "density.threshold=1", "data.views.shrink=2", scene="fern")
     assert list(averages_of(tmp_path).index) == ["baseline", "gco"]
+
+
+def test_the_papers_numbers_stand_beside_ours(tmp_path: Path) -> None:
+    """Means over scenes of means over seeds, rows of other settings below each other; not for other data or other views."""
+    chosen = {"fern": "scene: fern", "horns": "protocol: llff_x4", "demo": "data: demo"}
+    for k, (scene, seed, psnr) in enumerate(
+        (("fern", 0, 19.0), ("fern", 1, 21.0), ("horns", 0, 24.0), ("demo", 0, 50.0))
+    ):
+        for more in ([], ["data.views.train=6"]) if k == 0 else ([],):
+            for readings in ("paper", "measured"):
+                settings = ["+strategy=clear", f"data.scene={scene}", f"readings={readings}", *more]
+                folder = make_run(tmp_path / f"{k}{readings}{len(more)}", *settings, seed=seed, psnr=psnr, scene=scene)
+                files.write_text(folder / ".hydra" / "hydra.yaml", f"  runtime:\n    choices:\n      {chosen[scene]}\n")
+    text = report.write(report.collect([tmp_path]), tmp_path)
+    assert "LLFF, beside the paper's numbers" in (tmp_path / "report.html").read_text().replace("&#39;", "'")
+    rows = {row["method"]: row for row in cells(text.partition("LLFF, beside the paper's numbers:")[2])}
+    assert len(rows) == 15  # one of the 14 twice
+    for readings in ("paper", "measured"):
+        row = rows[f"CLEAR, readings={readings}"]
+        assert (row["PSNR (dB)"], row["PSNR (dB), paper"]) == ("22.00", "20.42")
+        assert (row["conflict"], row["conflict, paper"], row["source"]) == ("0.250", "0.162", "Tables 1, 4, 5")
+        assert (row["LPIPS"], row["LPIPS, paper"], row["seconds, paper"]) == ("–", "0.266", "612")
+    assert (rows["RegNeRF"]["PSNR (dB)"], rows["RegNeRF"]["PSNR (dB), paper"]) == ("–", "15.78")
+    assert "Blender, beside" not in text
+
+
+def test_the_papers_figures_are_drawn_from_a_sweep(tmp_path: Path) -> None:
+    """A point for each number of views, a bar for each method, a line for each rung: means over scenes and seeds."""
+    figures = loaded(DOCS / "figures.py")
+    for k, (scene, views, strategy) in enumerate(itertools.product(("fern", "horns"), (3, 6), ("baseline", "clear"))):
+        share = 0.1 * views + 0.02 * (scene == "horns")
+        settings = [f"+strategy={strategy}", f"data.views.train={views}"]
+        folder = make_run(tmp_path / str(k), *settings, scene=scene, conflict={"gaussian": share})
+        write_png(folder / "views" / "view_lr.png", torch.zeros(6, 8, 3))
+        pd.DataFrame({"t": range(100), "conflict": np.linspace(0, share, 100)}).to_csv(folder / "conflict.csv")
+    runs = report.collect([tmp_path])
+    drawn: dict[str, Any] = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "save", lambda figure, path: drawn.setdefault(path.name, figure))
+        for draw in figures.OF_SWEEPS.values():
+            draw(runs, tmp_path)
+    lines = {
+        name: [line.get_xydata() for line in drawn[name].axes[0].lines] for name in ("figure1b.svg", "figure5.svg")
+    }
+    assert len(lines["figure1b.svg"]) == len(lines["figure5.svg"]) == 2  # baseline and clear
+    for line in lines["figure1b.svg"]:
+        np.testing.assert_allclose(line, [(3, 0.31), (6, 0.61)])
+    for line in lines["figure5.svg"]:
+        assert len(line) == 50
+        np.testing.assert_allclose(line[:, 1], 0.46 * (np.arange(50) * 2 + 0.5) / 99)
+    assert [len(axes.patches) for axes in drawn["figure1c.svg"].axes] == [4, 4, 4]  # two scenes and two methods
+    for name in ("figure3.png", "figure5_views.png"):
+        height, width, _ = read(tmp_path / name).shape
+        assert height > 0 < width
 
 
 # ---- finished runs are found, named and read; others are left out with a warning

@@ -53,6 +53,21 @@ def test_opposite_gradients_are_corrected_up_to_the_upper_bound_and_agreeing_one
     assert read(gco, "omega_at_lower_bound") < 0.9
 
 
+def test_what_the_paper_does_not_do_is_there_to_compare_with():
+    """Of two groups one opposes: dropped, it is left out as a whole; as one Gaussian, both agree."""
+    lr = Grads({"means": torch.tensor([[3.0, 0, 0]]), "scales": torch.tensor([[1.0, 0, 0]])})
+    hr = Grads({"means": torch.tensor([[3.0, 0, 0]]), "scales": torch.tensor([[-1.0, 2, 0]])})
+    dropped = GCO(drop=True).correct(lr, hr, None)
+    assert torch.equal(dropped["means"], hr["means"])
+    assert not dropped["scales"].any()
+    together = GCO(whole=True).correct(lr, hr, None)  # 9 - 1 > 0
+    assert all(torch.equal(together[name], hr[name]) for name in hr)
+    opposed = GCO(whole=True, tolerance=0, weight_min=1, weight_max=1).correct(
+        lr, Grads({n: -g for n, g in hr.items()}), None
+    )
+    assert sum(float(dot(opposed[name], lr[name])) for name in lr) == pytest.approx(0, abs=1e-6)  # the margin
+
+
 @given(seed=st.integers(0, 10_000), tolerance=st.floats(0, 0.9))
 @settings(max_examples=30, deadline=None)
 def test_full_correction_lands_on_the_margin(seed, tolerance):

@@ -6,12 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clear_strategies import SVS, AnchorError
+from clear_strategies.compose import conductor
 from clear_strategies.core.seeds import dropout_mask, generator_at, hashed_generator_at
+from clear_strategies.errors import SettingError
 from clear_strategies.schedules import Ramp
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
 
-# The paper's reading (conf/readings/literal.yaml).
+# The paper's reading (conf/readings/paper.yaml).
 PAPER_WEIGHTS = {
     "means": 1.0, "scales": 1.0, "quats": 1.0, "opacities": 0.1, "sh0": 0.01, "shN": 0.01, "detail": 0.0,
 }  # fmt: skip
@@ -44,6 +46,21 @@ def test_both_scales_lose_the_same_gaussians():
     assert not lr.visible[z == 0].any()
     assert not hr.visible[z == 0].any()
     assert hr.visible[z > 0].any()
+
+
+def test_with_a_mask_for_each_scale_each_loses_its_own_gaussians_and_gradients_are_those_of_its_own_mask():
+    svs, scene = started(looks=0, shared=False), toy.scene()
+    field = GaussianField.from_cloud(scene.cloud)
+    z = svs.gate(10_000, len(field))
+    assert torch.equal(z[0], started(looks=0).gate(10_000, len(field)))
+    assert not torch.equal(z[0], z[1])
+    for k, shot in enumerate(field.render_scales(toy.RASTERIZER, scene.train[0], gate=z)):
+        alone = field.render_scales(toy.RASTERIZER, scene.train[0], gate=z[k])[k]
+        assert torch.equal(shot.image, alone.image)
+        (grads,), (expected,) = (s.vjp(torch.ones(1, *s.image.shape)) for s in (shot, alone))
+        assert all(torch.equal(g, expected[name]) for name, g in grads.items())
+    with pytest.raises(SettingError, match=r"strategies\.svs: other trainers render both scales with one mask"):
+        conductor("svs", "strategies.svs.shared=false")
 
 
 def started(n_views=3, **settings):

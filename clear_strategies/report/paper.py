@@ -1,0 +1,79 @@
+"""The numbers of the paper's tables beside ours, for runs of its data sets.
+
+paper.csv holds them: `ours` is the name of a method or of strategies as a run of this package has it, `source` the table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+import pandas as pd
+
+from clear_strategies.report.runs import FinishedRun
+from clear_strategies.report.table import in_all, label
+
+NUMBERS: Final = Path(__file__).with_name("paper.csv")
+NOTE: Final = (
+    "The columns named paper are the paper's, means over all its scenes at its sizes; ours are means over the scenes that ran. "
+    "A dash: not computed, as LPIPS, or not printed."
+)
+# What a run's protocol or scene (conf/protocol, conf/scene) is a part of.
+_DATA: Final[Mapping[str, str]] = {
+    "llff_x4": "LLFF", "llff_x4_quarter": "LLFF", "fern": "LLFF", "horns": "LLFF", "blender_x4": "Blender",
+    "lego": "Blender", "mip360_x4": "Mip-NeRF 360",
+}  # fmt: skip
+_VIEWS: Final = "data.views.train"  # another number of them is not in the paper's tables
+_COLUMNS: Final = {
+    "psnr": ("PSNR (dB)", ".2f"), "ssim": ("SSIM", ".3f"), "lpips": ("LPIPS", ".3f"), "conflict": ("conflict", ".3f"),
+    "seconds": ("seconds", ",.0f"),
+}  # fmt: skip
+
+
+def data_of(run: FinishedRun) -> str | None:
+    """The data set of the paper that a run is of; None: none, or another number of views."""
+    return None if any(s.startswith(_VIEWS) for s in run.settings) else _DATA.get(run.protocol or "")
+
+
+def beside(runs: Sequence[FinishedRun]) -> dict[str, pd.DataFrame]:
+    """For each of the paper's data sets among the runs: its rows as text, ours beside them; rows of ours that differ in their
+    settings stand below each other.
+    """
+    numbers = pd.read_csv(NUMBERS)
+    return {
+        data: _beside(rows, [run for run in runs if data_of(run) == data])
+        for data, rows in numbers.groupby("data", sort=False)
+        if any(data_of(run) == data and _row(run) in set(rows["ours"]) for run in runs)
+    }
+
+
+def _beside(printed: pd.DataFrame, runs: Sequence[FinishedRun]) -> pd.DataFrame:
+    shared = {
+        scene: in_all([run.settings for run in runs if run.scene == scene]) for scene in {run.scene for run in runs}
+    }
+    records = [
+        {"row": _row(run), "label": label("", run.settings, shared[run.scene]), "scene": run.scene, **run.numbers}
+        for run in runs
+    ]
+    by_scene = pd.DataFrame(records).groupby(["row", "label", "scene"], sort=False).mean(numeric_only=True)
+    means = by_scene.groupby(["row", "label"], sort=False).mean().reset_index()
+    table = printed.merge(means, "left", left_on="ours", right_on="row", suffixes=("_paper", ""))
+    method = table["method"] + table["label"].fillna("")
+    cells = {"method": method}
+    for quantity, (header, form) in _COLUMNS.items():
+        ours = table[quantity] if f"{quantity}_paper" in table else pd.Series(float("nan"), table.index)
+        paper = table[f"{quantity}_paper"] if f"{quantity}_paper" in table else table[quantity]
+        if paper.notna().any():
+            cells |= {
+                name: [_number(v, form) for v in of] for name, of in ((header, ours), (f"{header}, paper", paper))
+            }
+    return pd.DataFrame({**cells, "source": table["source"]})
+
+
+def _row(run: FinishedRun) -> str:
+    return "clear" if run.name == "clear_paper" else run.name
+
+
+def _number(value: float, form: str) -> str:
+    return "–" if pd.isna(value) else f"{value:{form}}"
