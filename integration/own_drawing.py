@@ -33,7 +33,7 @@ from clear_strategies.merging.replays import (
 from integration.autograd_shot import AutogradShot, HostOutput, Target, every_number, to_parameters
 from rasterizers.autograd import BackwardHook, Drawing
 from rasterizers.interface import Camera, Rasterizer, Recordable, Splats, over
-from rasterizers.recording import unread
+from rasterizers.told import name_of_view
 
 _log = logging.getLogger(__name__)
 
@@ -157,6 +157,10 @@ class _Recorded:
         self._own = own.tensors(rasterizer)
         self._work = RecordedWork(given.background.device, work_log, lambda: work(own, True))
 
+    def holds_at(self, t: int) -> bool:
+        """See `Recorded`."""
+        return self._work.holds_at(t)
+
     def replay(self, given: _Given) -> bool:
         """See `Recorded`."""
         write(self._own, given.tensors(self._rasterizer))
@@ -195,7 +199,7 @@ class OwnDrawing:
             if not recorded:
                 return self._compared(given, asked, view, t), {}
             logged = conductor.logs()
-            shown = View(unread(view.name, "the name of the view"), view.lr, given.photo, background=view.background)
+            shown = View(name_of_view(view.name), view.lr, given.photo, background=view.background)
             made = self._compared(given, asked, shown, t)
             return made, {**made[0].losses, **conductor.take_logs(logged)}
 

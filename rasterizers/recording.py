@@ -32,6 +32,7 @@ class Recording(Generic[T]):
 
     Attributes:
         result: what `work` returned. Its tensors receive new values in every replay.
+        guards: conditions on the iteration under which a replay holds, see `rasterizers.told`.
 
     Raises:
         RuntimeError: `work` does what cannot be recorded. Live work can go on: the capture has been ended, and of the part
@@ -42,6 +43,7 @@ class Recording(Generic[T]):
         self._stream = _side_stream(device)
         self._pool = torch.cuda.graph_pool_handle()  # one for all graphs, since they run in order
         self._parts: list[tuple[Callable[[], None], Callable[[], bool]]] = []
+        self.guards: list[Callable[[int], bool]] = []
         self._watch = _Watch(device.type)
         self._graph: Any = None  # which is being captured, and what ends that
         self._ends = ExitStack()
@@ -124,50 +126,6 @@ class _Watch(TorchDispatchMode):  # type: ignore[no-untyped-call]
             self._own |= {x.untyped_storage().data_ptr() for x in tree_leaves(result) if isinstance(x, Tensor)}
         self.keep(tree_leaves((args, kwargs)))
         return result
-
-
-class Unread:
-    """What recorded work is told but must not read, such as the iteration: its replays would repeat what it decides by it. It can
-    be put into a message.
-    """
-
-    def __init__(self, value: object, what: str) -> None:
-        self._value, self._what = value, what
-
-    @property
-    def __class__(self) -> Any:  # for isinstance, which type checks ask
-        return type(self._value)
-
-    def __str__(self) -> str:
-        return str(self._value)
-
-    __repr__ = __str__
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        self.refuse()
-
-    def refuse(self, *_: Any) -> Any:
-        """In place of every operation."""
-        raise RuntimeError(f"recorded work must not read {self._what}, which is another one in a replay.")
-
-    @classmethod
-    def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        next(x for x in tree_leaves((args, kwargs)) if isinstance(x, cls)).refuse()
-
-
-_OPERATIONS: Final = (
-    "eq ne lt le gt ge add radd sub rsub mul rmul truediv rtruediv floordiv rfloordiv mod rmod pow rpow neg pos abs int float "
-    "index bool hash round trunc floor ceil divmod rdivmod len iter getitem contains"
-)  # fmt: skip
-for _operation in _OPERATIONS.split():
-    setattr(Unread, f"__{_operation}__", Unread.refuse)
-
-
-def unread(value: T, what: str) -> T:
-    """The value; in work that is being recorded an `Unread`."""
-    return value if running() is None else cast(T, Unread(value, what))
 
 
 class _Running(threading.local):

@@ -28,7 +28,7 @@ from clear_strategies.merging.objective import Losses, Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
 from clear_strategies.strategies.base import ScreenGradients, Strategy, by_class, overrides
 from rasterizers.interface import Color
-from rasterizers.recording import unread
+from rasterizers.told import iteration
 
 _log = logging.getLogger(__name__)
 
@@ -201,10 +201,10 @@ class Conductor:
         else:
             # Where Î_LR is the area mean of Î_HR, the cotangent of L_LR passes through the same HR render.
             through_mean = images.area_mean_transposed(l_lr.cotangents, view.factor) if reduced else None
-            drawn = Step(_told(t), view, hr.visible, params=params, looked_up=looked_up)
+            drawn = Step(iteration(t), view, hr.visible, params=params, looked_up=looked_up)
             g_mean, from_hr = self._backward_hr(hr, drawn, t, vjp, through_mean)
             g_lr = g_mean if reduced else g_lr
-        step = Step(_told(t), view, params=params) if from_hr is None else from_hr.step
+        step = Step(iteration(t), view, params=params) if from_hr is None else from_hr.step
         with stage("strategies" if stepper is None else stepper.stage):
             score = ordinary = None
             if scored:
@@ -240,7 +240,7 @@ class Conductor:
             params, looked_up: for `Step`.
         """
         apart = apart or self.owner("route") is not None or self.owner("score") is not None
-        step = Step(_told(t), view, hr.visible, params=params, looked_up=looked_up)
+        step = Step(iteration(t), view, hr.visible, params=params, looked_up=looked_up)
         return self._backward_hr(hr, step, t, vjp or _vjp, apart=apart)[1]
 
     def extra_views(self, t: int) -> list[ExtraView]:
@@ -324,7 +324,7 @@ class Conductor:
         """What the strategies add to the merged gradient; empty: nothing.  Eq. 16"""
         total = Grads()
         for s in self.regularizers:
-            g = s.regularize(params, _told(t))
+            g = s.regularize(params, iteration(t))
             if g is None:
                 self.work_log.skip("regularize", "no anchor yet")
             else:
@@ -442,11 +442,6 @@ def _screen_gradients(lr: Float[Tensor, "N 2"], hr: HrSide[Any], weights: LossWe
 
 def _vjp(shot: Shot, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[Grads]:
     return shot.vjp(cotangents)
-
-
-def _told(t: int) -> int:
-    """The iteration, for a strategy."""
-    return unread(t, "the iteration")
 
 
 def _where(view: View, t: int) -> str:

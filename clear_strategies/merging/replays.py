@@ -54,6 +54,10 @@ class Kind:
 class Recorded(Protocol[G_contra, T_co]):
     """A recording of one kind of work."""
 
+    def holds_at(self, t: int) -> bool:
+        """Whether what Python has decided by the iteration, as a strategy may, is the same at t."""
+        ...
+
     def replay(self, given: G_contra) -> bool:
         """Do the work; False where the recording does not hold for it, before anything has changed."""
         ...
@@ -78,6 +82,7 @@ class Replays:
         )  # what work that was live has in common with such whose tensors lie elsewhere
         self._addresses: tuple[int, ...] = ()
         self._moves = 0  # changes of these since the last replay
+        self._turns = 0  # how often a recording did not hold at its iteration
         self._failed = False
 
     def do(self, kind: Kind, t: int, given: Any, *, live: Callable[[], T], record: Callable[[], Recorded[Any, T]]) -> T:
@@ -103,6 +108,10 @@ class Replays:
                     return self._live(live, "the first of its kind")
         try:
             known = self._recorded[kind]
+            if known is not None and not known.holds_at(t):
+                known, self._turns = None, self._turns + 1
+                if self._turns > _MOST_KINDS:
+                    raise RuntimeError("a strategy decides by the iteration, and again and again another way.")
             recorded = record() if known is None else known if known.replay(given) else None
             self._moves = 0 if recorded is known is not None else self._moves
             reason = "the recorded lists of pairs are too short"  # recorded anew, with space for more
@@ -138,6 +147,10 @@ class RecordedWork:
 
         with work_log.noted() as self._skips:
             self._recording = Recording(device, gathered)
+
+    def holds_at(self, t: int) -> bool:
+        """See `Recorded`."""
+        return all(guard(t) for guard in self._recording.guards)
 
     def replay(self) -> bool:
         """See `Recorded`."""

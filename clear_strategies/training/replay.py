@@ -32,7 +32,7 @@ from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.given import Given, GivenExtra, GivenView, L, Learned, LearnedView
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Rasterizer, Recordable
-from rasterizers.recording import Unread
+from rasterizers.told import name_of_view
 from rasterizers.warp_runtime import sent
 
 _log = logging.getLogger(__name__)
@@ -114,6 +114,10 @@ class _Recorded:
         self._write(given)
         self._work = RecordedWork(s.device, s.conductor.work_log, work)
 
+    def holds_at(self, t: int) -> bool:
+        """See `Recorded`."""
+        return self._work.holds_at(t)
+
     def replay(self, given: Given) -> bool:
         """See `Recorded`."""
         self._write(given)
@@ -135,8 +139,7 @@ class _Recorded:
             extra = replace(given.extra, photo=photos[0], weight=given.extra.weight.clone())
             return replace(given, extra=extra, background=None)
         lr, hr, *_ = [*photos, given.view.hr]  # where HR is not drawn, its size alone is read
-        name = cast(str, Unread(given.view.name, "the name of the view"))
-        view = View(name, lr, hr, background=given.behind)
+        view = View(name_of_view(given.view.name), lr, hr, background=given.behind)
         looked_up = copied(self._look_up(given.view))
         return replace(given, view=view, gate=copied(given.gate), background=None, looked_up=looked_up)
 

@@ -1,0 +1,109 @@
+"""What recorded work is told and a replay would be told otherwise: the iteration, and the name of a view.
+
+A replay repeats what Python has decided by them. Decisions by the iteration become guards of the recording, which does not hold
+where one of them would be another one. Anything else that is read of them ends the recording by an error.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from typing import Any, Final, TypeVar, cast
+
+from torch.utils._pytree import tree_leaves
+
+from rasterizers.recording import running
+
+T = TypeVar("T")
+
+
+class Unread:
+    """What recorded work must not read. It can be put into a message.
+
+    Args:
+        what: its name, for the error.
+    """
+
+    def __init__(self, value: Any, what: str) -> None:
+        self._value, self._what = value, what
+
+    @property
+    def __class__(self) -> Any:  # type: ignore[misc]  # for isinstance, which type checks ask
+        return type(self._value)
+
+    def __str__(self) -> str:
+        return str(self._value)
+
+    __repr__ = __str__
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        self._refuse()
+
+    def _refuse(self, *_: Any) -> Any:
+        raise RuntimeError(f"recorded work must not read {self._what}, which is another one in a replay.")
+
+    @classmethod
+    def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        next(x for x in tree_leaves((args, kwargs)) if isinstance(x, cls))._refuse()
+
+
+class Guarded(Unread):
+    """The iteration t, or a number that Python has made of it. Its comparisons have answers, each of which becomes a guard of the
+    recording. It refuses to become a number, which a replay would keep.
+
+    Args:
+        of: the number by t.
+    """
+
+    def __init__(self, value: Any, what: str, of: Callable[[int], Any] = lambda t: t) -> None:
+        super().__init__(value, what)
+        self._of = of
+
+    def _made(self, by: Callable[..., Any], *other: Any) -> Guarded:
+        return Guarded(by(self._value, *other), self._what, lambda t: by(self._of(t), *other))
+
+    def _answered(self, by: Callable[..., bool], *other: Any) -> bool:
+        answer, of = by(self._value, *other), self._of
+        if (recording := running()) is not None:
+            recording.guards.append(lambda t: by(of(t), *other) == answer)
+        return answer
+
+    def __bool__(self) -> bool:
+        return self._answered(bool)
+
+
+def _method(kind: Callable[..., Any], by: Callable[..., Any], *, reflected: bool = False) -> Callable[..., Any]:
+    """A method that Python calls for an operator."""
+
+    def called(self: Guarded, *other: Any) -> Any:
+        if any(isinstance(x, Unread) for x in other):
+            self._refuse()
+        return kind(self, (lambda x, y: by(y, x)) if reflected else by, *other)
+
+    return called
+
+
+_TWO: Final = ("add", "sub", "mul", "truediv", "floordiv", "mod", "pow")
+_ONE: Final = ("neg", "pos", "abs")
+_COMPARED: Final = ("eq", "ne", "lt", "le", "gt", "ge")
+_READ: Final = ("bool", "int", "float", "complex", "index", "hash", "len", "iter", "getitem", "contains")
+for _name in (*_READ, *_COMPARED, *_ONE, *_TWO, *(f"r{name}" for name in _TWO)):
+    setattr(Unread, f"__{_name}__", Unread._refuse)
+for _name in (*_ONE, *_TWO):
+    setattr(Guarded, f"__{_name}__", _method(Guarded._made, getattr(operator, _name)))
+for _name in _TWO:
+    setattr(Guarded, f"__r{_name}__", _method(Guarded._made, getattr(operator, _name), reflected=True))
+for _name in _COMPARED:
+    setattr(Guarded, f"__{_name}__", _method(Guarded._answered, getattr(operator, _name)))
+
+
+def iteration(t: int) -> int:
+    """The iteration, for what may be recorded."""
+    return t if running() is None else cast(int, Guarded(t, "the iteration"))
+
+
+def name_of_view(name: str) -> str:
+    """The name of a view, for recorded work."""
+    return cast(str, Unread(name, "the name of the view"))
