@@ -27,8 +27,8 @@ class Unread:
     def __init__(self, value: Any, what: str) -> None:
         self._value, self._what = value, what
 
-    @property
-    def __class__(self) -> Any:  # type: ignore[misc]  # for isinstance, which type checks ask
+    @property  # type: ignore[misc]  # for isinstance, which type checks ask
+    def __class__(self) -> Any:
         return type(self._value)
 
     def __str__(self) -> str:
