@@ -82,7 +82,7 @@ def test_by_default_the_console_has_the_plan_the_bar_the_result_and_where_to_loo
     result = lines[done + 1 :]
     assert len(plan) <= 15
     assert all(line.startswith(("  ", "warning: ")) for line in plan), quiet.stdout
-    assert result[-1] == "  look next: quiet/contact_sheet.png, or clear-strategies view quiet"
+    assert result[-1] == "  look next: quiet/contact_sheet.jpg, or clear-strategies view quiet"
     assert sum("GMSD, the error of edges" in line for line in result) == 1
     assert not any(detail in quiet.stdout for detail in DETAILS)
     bars = quiet.stderr.splitlines()  # in a file, a line each twentieth, here each iteration

@@ -204,7 +204,7 @@ class _Job:
 
 
 _PREPARED: Final = "views prepared"
-_AFTER: Final = ("evaluate", "maps", "contact sheet and curves", "video")
+_AFTER: Final = ("maps", "evaluate", "video", "pictures")
 
 
 def _parts(scene: Scene, state: TrainState, training: float) -> dict[str, float]:
