@@ -34,6 +34,7 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
+from clear_strategies.core.progress import Progress, duration
 from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.strict_json import Count, Positive, plain_settings, read_object, typed
@@ -156,11 +157,13 @@ def evaluate(
     train = spaced([view for view in scene.train if view.lr.shows_something], MOST_TRAIN)
     kept = {view.name for view in test or spaced(train, TRAIN_RENDERS)}
     with ThreadPoolExecutor(n := threads()) as scorers:
+        done = Progress("scores", "views", len(test) + len(train))
         scored = deque[tuple[Table, str, Future[dict[str, ImageScores]]]]()
 
         def take() -> None:
             table, name, scores = scored.popleft()
             table[name] = scores.result()
+            done(sum(map(len, tables.values())))
 
         for part, view in [*(("test", view) for view in test), *(("train", view) for view in train)]:
             image = render(view).clamp(0, 1)
@@ -223,8 +226,8 @@ def describe(folder: Path, evaluation: Evaluation, seconds: float, parts: Mappin
     folder = _relative(folder)
     rows = [(part, *row) for part in ("test", "train") for row in _rows(part, evaluation)]
     width = max((len(image) for _, image, _ in rows), default=0)
-    told = ", ".join(f"{name} {_duration(part)}" for name, part in parts.items() if part >= 1)
-    lines = [f"done in {_duration(seconds)}{f' ({told})' if told else ''}: {folder}"]
+    told = ", ".join(f"{name} {duration(part)}" for name, part in parts.items() if part >= 1)
+    lines = [f"done in {duration(seconds)}{f' ({told})' if told else ''}: {folder}"]
     lines += [f"  {part:<5}  {image:<{width}}  {numbers}" for part, image, numbers in rows]
     if rows:
         lines.append(_LEGEND)
@@ -244,12 +247,7 @@ def describe_job(number: int, folder: Path, evaluation: Evaluation, seconds: flo
     """One line, of a job among many."""
     means = ((part, mean) for part in ("test", "train") if (mean := evaluation.mean(part)) is not None)
     score = next((f", {part} views {mean.psnr:.2f} dB" for part, mean in means), "")
-    return f"job {number}: done in {_duration(seconds)}{score}: {_relative(folder)}"
-
-
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+    return f"job {number}: done in {duration(seconds)}{score}: {_relative(folder)}"
 
 
 def _relative(folder: Path) -> Path:
