@@ -7,7 +7,8 @@ import os
 import secrets
 import shutil
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -150,3 +151,28 @@ def hold(folder: Path) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+class Beside:
+    """Calls functions, one after the other, in a thread of its own: pictures are drawn and encoded while others are rendered.
+
+    A context. `finish` raises the first error of a call; where it is not reached, what was not begun is left out.
+    """
+
+    def __init__(self) -> None:
+        self._thread, self._calls = ThreadPoolExecutor(1), list[Future[None]]()
+
+    def __call__(self, function: Callable[..., None], *arguments: Any) -> None:
+        """Call it soon. The arguments must not change any more."""
+        self._calls.append(self._thread.submit(function, *arguments))
+
+    def finish(self) -> None:
+        """Wait until all calls have been made."""
+        for call in self._calls:
+            call.result()
+
+    def __enter__(self) -> Beside:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._thread.shutdown(cancel_futures=True)

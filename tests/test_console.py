@@ -75,14 +75,14 @@ def test_by_default_the_console_has_the_plan_the_bar_the_result_and_where_to_loo
     quiet, loud = (run(*tiny, f"hydra.run.dir={name}", *v, cwd=folder) for name, *v in (["quiet"], ["loud", "-v"]))
     assert quiet.returncode == loud.returncode == 0, quiet.stderr + loud.stderr
     lines = [line for line in quiet.stdout.splitlines() if not re.search(r": \d+ of \d+ ", line)]  # on a slow machine
-    assert lines[0].split()[0] == "scene"
+    assert [line.split()[0] for line in lines[:4]] == ["data", "strategies", "iterations", "scene"]
     done = next(i for i, line in enumerate(lines) if line.startswith("done in"))
     assert re.fullmatch(r"done in \d+ s( \(.*\d s\))?: quiet", lines[done])
     plan = lines[:done]
     result = lines[done + 1 :]
     assert len(plan) <= 15
     assert all(line.startswith(("  ", "warning: ")) for line in plan), quiet.stdout
-    assert result[-1] == "  look next: quiet/contact_sheet.png, or clear-strategies view quiet"
+    assert result[-1] == "  look next: quiet/contact_sheet.jpg, or clear-strategies view quiet"
     assert sum("GMSD, the error of edges" in line for line in result) == 1
     assert not any(detail in quiet.stdout for detail in DETAILS)
     bars = quiet.stderr.splitlines()  # in a file, a line each twentieth, here each iteration

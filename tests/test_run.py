@@ -29,7 +29,7 @@ def finished(tmp_path_factory) -> Path:
 
 def test_a_run_leaves_everything_it_promises(finished):
     out = finished / "here"
-    for name in ("metrics.json", "conflict.csv", "timing.csv", "history.csv", "contact_sheet.png", "curves.png"):
+    for name in ("metrics.json", "conflict.csv", "timing.csv", "history.csv", "contact_sheet.jpg", "curves.png"):
         assert (out / name).stat().st_size > 0, name
     metrics = json.loads((out / "metrics.json").read_text())
     assert (metrics["strategies"], metrics["overrides"][0]) == (["gco", "p2g", "svs"], "+strategy=clear")
@@ -43,7 +43,7 @@ def test_a_run_leaves_everything_it_promises(finished):
     assert "skipped" in timing
     stages = [line.split(",")[0] for line in timing.splitlines()[1:]]
     assert stages[:3] == ["capture and poses", "photos and SR images", "initial points"]
-    assert {"maps", "contact sheet and curves"} <= set(stages)
+    assert {"maps", "pictures"} <= set(stages)
     pictures = [len(list(out.glob(kind))) for kind in ("renders/*.png", "views/*_truth.png", "maps/*/corrected.png")]
     assert pictures == [3, 3, 2]
 
@@ -264,7 +264,7 @@ def test_a_run_on_an_ascii_console_writes_into_folders_of_any_letters_and_of_the
     process = started("-c", ascii_console, *arguments, cwd=tmp_path, said=tmp_path / "said")
     assert process.wait() == 0, (tmp_path / "said").read_bytes()
     assert (tmp_path / "home/ü/metrics.json").is_file()
-    assert b"home/\\xfc/contact_sheet.png" in (tmp_path / "said").read_bytes()
+    assert b"home/\\xfc/contact_sheet.jpg" in (tmp_path / "said").read_bytes()
     assert not (tmp_path / "~").exists()
 
 

@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from clear_strategies import files
 from clear_strategies.core.work_log import WorkLog
-from clear_strategies.outputs.figures import save_png
+from clear_strategies.outputs.figures import save
 from clear_strategies.outputs.provenance import provenance
 
 Contender = Callable[[], Mapping[str, float]]
@@ -67,7 +67,7 @@ class Results:
         for name, table in self.tables.items():
             files.write_text(self.out / f"{name}.csv", table.to_csv(index=False, float_format="%.6g"))
         for name, figure in self.figures.items():
-            save_png(figure, self.out / f"{name}.png")
+            save(figure, self.out / f"{name}.png")
         system = collect_env.get_env_info()  # type: ignore[no-untyped-call]
         names = ("os", "gcc_version", "nvidia_gpu_models", "nvidia_driver_version", "cuda_runtime_version")
         machine = provenance(torch=torch.__version__, torch_threads=torch.get_num_threads())

@@ -8,11 +8,12 @@ from typing import Final
 
 _log = logging.getLogger(__name__)
 
+FIRST: Final = 2.0  # seconds until a line: shorter work needs none
 EVERY: Final = 10.0  # seconds between two lines
 
 
 class Progress:
-    """Logs how much is done, at most every `EVERY` seconds.
+    """Logs how much is done and how long the rest takes: first after `FIRST` seconds, then at most every `EVERY` seconds.
 
     Args:
         what: the work. unit: what is counted, in the plural.
@@ -20,10 +21,19 @@ class Progress:
 
     def __init__(self, what: str, unit: str, total: int) -> None:
         self.what, self.unit, self.total = what, unit, total
-        self._logged_at, self._done = time.monotonic(), 0
+        self._began = time.monotonic()
+        self._due, self._done = self._began + FIRST, 0
 
     def __call__(self, done: int) -> None:
-        """Log that `done` of `total` are done, if the last line is old enough and `done` has grown since."""
-        if time.monotonic() - self._logged_at >= EVERY and self._done < done < self.total:
-            _log.info("%s: %d of %d %s", self.what, done, self.total, self.unit)
-            self._logged_at, self._done = time.monotonic(), done
+        """Log that `done` of `total` are done, if a line is due and `done` has grown since the last one."""
+        now = time.monotonic()
+        if now >= self._due and self._done < done < self.total:
+            left = duration((now - self._began) * (self.total - done) / done)
+            _log.info("%s: %d of %d %s, about %s left", self.what, done, self.total, self.unit, left)
+            self._due, self._done = now + EVERY, done
+
+
+def duration(seconds: float) -> str:
+    """As a person says it: "50 s", "7 min 12 s"."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"

@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from clear_strategies.core.points import PointCloud
+from clear_strategies.core.progress import Progress
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.projection import back_project, is_background, sample_colors, seen_pixels
 from rasterizers.interface import Color
@@ -70,7 +71,9 @@ def grid_points(
             photo knows. None: no depth is known.
     """
     added, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
+    done = Progress("depth where stereo finds none", "photos", len(photos))
     for i, photo in enumerate(photos):
+        done(i)
         grid, depth_map = pixel_grid(photo, stride), None if maps is None else maps[i]
         x, y = grid.long().unbind(dim=1)
         wanted = torch.ones(photo.image.shape[:2], dtype=torch.bool) if photo.shown is None else photo.shown.cpu()

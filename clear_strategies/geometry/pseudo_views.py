@@ -7,8 +7,9 @@ wider field: its photo is known, the border around it is not. `clear_strategies.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final, NamedTuple
 
 import torch
@@ -17,14 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo
-from clear_strategies.geometry.projection import (
-    back_project,
-    inside_of,
-    is_background,
-    on_surface,
-    project,
-    sample_colors,
-)
+from clear_strategies.geometry.projection import is_background, projection_matrix
 from rasterizers.interface import Camera, Color
 
 _SOURCES: Final = 4  # the nearest photos that a pseudo view is made of
@@ -42,10 +36,14 @@ class PseudoView:
 
 
 class _Source(NamedTuple):
-    """A photo with depth: its points, and the depth up to which its colours are used, 0 where they are not."""
+    """A photo with depth: its points, and the depth up to which its colours are used, 0 where they are not.
+
+    Points are those of a camera, not of the world, so that float32 holds them wherever the world's origin is. Their coordinates
+    stand in rows: torch then computes with each at once.
+    """
 
     photo: Photo
-    points: Float[Tensor, "N 3"]
+    points: Float[Tensor, "3 N"]
     depth: Float[Tensor, "h w"]
     median: float
 
@@ -60,8 +58,8 @@ def pseudo_views(
     max_pixels: int,
     background: Color,
     seed: int,
-) -> list[PseudoView]:
-    """`count` pseudo views, the training cameras taken in turn; none where fewer than two photos have depth.
+) -> list[Callable[[], PseudoView]]:
+    """Functions that make `count` pseudo views, the training cameras taken in turn; none where fewer than two photos have depth.
 
     Args:
         photos, depths: by the photos' names; on the CPU.
@@ -78,27 +76,25 @@ def pseudo_views(
     if len(sources) < 2:
         return []
     generator = torch.Generator().manual_seed(seed)
-    views = []
+    views = list[Callable[[], PseudoView]]()
     for i in range(count):
         source = sources[i % len(sources)]
         camera = moved_aside(source.photo.camera, source.median, reach, generator)
-        views.append(_warped(camera, sources, tolerance))
+        views.append(partial(_warped, camera, sources, tolerance))
     return views
 
 
-def border_views(photos: Iterable[Photo], *, field: float, max_pixels: int) -> list[PseudoView]:
-    """Each photo, reduced to at most `max_pixels`, as the middle of a picture `field` times as wide and as high."""
-    views = []
-    for photo in (photo.reduced(photo.factor_to(max_pixels)) for photo in photos):
-        c = photo.camera
-        x, y = (round(n * (field - 1) / 2) for n in (c.width, c.height))
-        wide = replace(c, cx=c.cx + x, cy=c.cy + y, width=c.width + 2 * x, height=c.height + 2 * y)
-        known = torch.zeros(wide.height, wide.width, dtype=torch.bool)
-        known[y : y + c.height, x : x + c.width] = True if photo.shown is None else photo.shown
-        image = F.pad(photo.image, (0, 0, x, x, y, y))
-        through = None if photo.transparency is None else F.pad(photo.transparency, (x, x, y, y))
-        views.append(PseudoView(Photo(wide, image, transparency=through), known))
-    return views
+def border_view(photo: Photo, *, field: float, max_pixels: int) -> PseudoView:
+    """The photo, reduced to at most `max_pixels`, as the middle of a picture `field` times as wide and as high."""
+    photo = photo.reduced(photo.factor_to(max_pixels))
+    c = photo.camera
+    x, y = (round(n * (field - 1) / 2) for n in (c.width, c.height))
+    wide = replace(c, cx=c.cx + x, cy=c.cy + y, width=c.width + 2 * x, height=c.height + 2 * y)
+    known = torch.zeros(wide.height, wide.width, dtype=torch.bool)
+    known[y : y + c.height, x : x + c.width] = True if photo.shown is None else photo.shown
+    image = F.pad(photo.image, (0, 0, x, x, y, y))
+    through = None if photo.transparency is None else F.pad(photo.transparency, (x, x, y, y))
+    return PseudoView(Photo(wide, image, transparency=through), known)
 
 
 def cut_out(photos: Iterable[Photo], background: Color) -> bool:
@@ -134,7 +130,7 @@ def beside(camera: Camera, means: Float[Tensor, "N 3"], reach: float, generator:
 def _source(photo: Photo, depth_map: DepthMap, background: Color) -> _Source:
     """Pixels at the border of the background are mixed with it: they give points but no colour."""
     known, depth = depth_map.known, torch.nan_to_num(depth_map.depth)
-    points = back_project(photo.camera, _centres(photo.camera)[known], depth[known].double())
+    points = _behind(photo.camera, depth)[:, known.flatten()]
     mixed = F.max_pool2d(is_background(photo.image, background)[None, None].float(), 3, 1, 1)[0, 0] > 0
     return _Source(photo, points, torch.where(known & ~mixed, depth, 0.0), float(depth[known].median()))
 
@@ -142,39 +138,67 @@ def _source(photo: Photo, depth_map: DepthMap, background: Color) -> _Source:
 def _warped(camera: Camera, sources: Sequence[_Source], tolerance: float) -> PseudoView:
     away = torch.stack([torch.linalg.vector_norm(s.photo.camera.center - camera.center) for s in sources])
     nearest = [sources[i] for i in away.argsort()[:_SOURCES].tolist()]
-    depth = _front(camera, torch.cat([s.points for s in nearest]))
+    depth = _front(camera, nearest)
     known = depth.isfinite()
-    points = back_project(camera, _centres(camera)[known], depth[known])
-    color, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
+    points = _behind(camera, torch.where(known, depth, 1.0))
+    color, weight = torch.zeros_like(points), torch.zeros(points.shape[1])
     for s in nearest:
-        shows, pixels = on_surface(s.photo.camera, s.depth, points, tolerance)
-        w = shows / (s.photo.camera.center - camera.center).square().sum().clamp_min(1e-24)  # the nearest counts most
-        color += w[:, None] * sample_colors(s.photo.image, pixels)
+        shows, colors = _seen(s, camera, points, tolerance)
+        w = shows.float().div_(float((s.photo.camera.center - camera.center).square().sum().clamp_min(1e-24)))
+        color += colors.mul_(w)  # the nearest counts most
         weight += w
-    image = torch.zeros(camera.height, camera.width, 3)
-    image[known] = color / weight.clamp_min(torch.finfo(weight.dtype).tiny)[:, None]
-    known[known.clone()] = weight > 0
+    image = color.div_(weight.clamp_min(torch.finfo(weight.dtype).tiny)).clamp_(0, 1).reshape(3, *known.shape)
+    known &= (weight > 0).reshape(known.shape)
     around = 9 * F.avg_pool2d(known[None, None].float(), 3, 1, 1)[0, 0]
     known &= around >= _NEIGHBOURS - 0.5
-    return PseudoView(Photo(camera, torch.where(known[..., None], image, 0.0).clamp(0, 1)), known)
+    return PseudoView(Photo(camera, torch.where(known, image, 0.0).permute(1, 2, 0).contiguous()), known)
 
 
-def _front(camera: Camera, points: Float[Tensor, "N 3"]) -> Float[Tensor, "h w"]:
-    """The depth of the frontmost point, float64, infinite without one. A point covers 2 × 2 pixels, so surfaces have no holes."""
-    pixels, depth = project(camera, points)
-    front = torch.full((camera.height * camera.width,), torch.inf, dtype=torch.float64)
-    for x in (-0.5, 0.5):
-        for y in (-0.5, 0.5):
-            at = pixels + torch.tensor([x, y])
-            inside = inside_of(camera, at, depth)
-            column, row = at[inside].long().unbind(dim=1)
-            front.scatter_reduce_(0, row * camera.width + column, depth[inside], "amin")
-    return front.reshape(camera.height, camera.width)
+def _front(camera: Camera, sources: Sequence[_Source]) -> Float[Tensor, "h w"]:
+    """The depth of the frontmost point, infinite without one. A point covers 2 × 2 pixels, so that surfaces have no holes."""
+    width, height = camera.width + 1, camera.height + 1
+    outside = height * width
+    front = torch.full((outside + 1,), torch.inf)
+    for s in sources:
+        x, y, depth = _projected(s.points, s.photo.camera, camera)
+        column, row = (
+            x.add_(0.5).floor_(),
+            y.add_(0.5).floor_(),
+        )  # of the lower right of its pixels, after a border of one
+        inside = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        place = torch.where(inside, row.mul_(width).add_(column), outside).long()
+        front.scatter_reduce_(0, place, depth, "amin")
+    front = front[:outside].reshape(height, width)
+    front = torch.minimum(front[:-1], front[1:])
+    return torch.minimum(front[:, :-1], front[:, 1:])
 
 
-def _centres(camera: Camera) -> Float[Tensor, "h w 2"]:
-    row, column = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
-    return torch.stack((column, row), dim=-1).double() + 0.5
+def _seen(
+    source: _Source, camera: Camera, points: Float[Tensor, "3 N"], tolerance: float
+) -> tuple[Bool[Tensor, " N"], Float[Tensor, "3 N"]]:
+    """Whether the photo shows each of the camera's points, at its own depth up to `tolerance`, and the photo's colours there."""
+    own = source.photo.camera
+    x, y, depth = _projected(points, camera, own)
+    inside = (depth > 0) & (x >= 0) & (x < own.width) & (y >= 0) & (y < own.height)
+    place = torch.where(inside, y.floor().mul_(own.width).add_(x.floor()), 0.0).long()
+    grid = torch.view_as_real(torch.complex(x.mul_(2 / own.width).sub_(1), y.mul_(2 / own.height).sub_(1)))
+    image = source.photo.image.permute(2, 0, 1)[None]
+    colors = F.grid_sample(image, grid[None, None], padding_mode="border", align_corners=False)[0, :, 0]
+    return inside & ((source.depth.flatten()[place] / depth - 1).abs() <= tolerance), colors
+
+
+def _projected(points: Float[Tensor, "3 N"], of: Camera, to: Camera) -> tuple[Tensor, Tensor, Tensor]:
+    """(columns, rows, depths) in one camera of another's points; columns and rows have a meaning where depth > 0."""
+    matrix = (projection_matrix(to) @ torch.linalg.inv(of.world_to_camera.double())).float()
+    x, y, depth = torch.addmm(matrix[:, 3:], matrix[:, :3], points)
+    return x.div_(depth), y.div_(depth), depth
+
+
+def _behind(camera: Camera, depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 N"]:
+    """The camera's points at these depths behind all its pixels."""
+    x = (torch.arange(camera.width, dtype=torch.float64) + (0.5 - camera.cx)) / camera.fx
+    y = (torch.arange(camera.height, dtype=torch.float64) + (0.5 - camera.cy)) / camera.fy
+    return torch.stack((x.float() * depth, y.float()[:, None] * depth, depth)).flatten(1)
 
 
 def continued(image: Float[Tensor, "h w 3"], known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:

@@ -107,6 +107,11 @@ class _Job:
             if finished is not None:
                 score = finished.shown.mean.get("ours")
                 return None if score is None else score.psnr
+        # In a sweep the console shows one line per job; the rest is in run.log.
+        level = logging.DEBUG if _in_sweep() else logging.INFO
+        asked, source = settings.fit, settings.data.source
+        choices = plan.describe_choices(self.chosen, self.conductor, source, asked.iterations, asked.seed)
+        _log.log(level, "%s", choices)
         scene = load()
         if few := scene.notes.get(scenes.FEW_PLACED):
             _log.warning("%s.", few)
@@ -119,8 +124,6 @@ class _Job:
         state = self._start(scene, there, drawing)
         self.claim()
         files.sweep(folder)
-        # In a sweep the console shows one line per job; the rest is in run.log.
-        level = logging.DEBUG if _in_sweep() else logging.INFO
         self._announce(scene, state, drawing, f"{threads} ({reason})", level)
         results.remove_earlier(folder, all_files=state.t == 1)
         evaluation, training = self._train(scene, there, state, drawing)
@@ -204,7 +207,7 @@ class _Job:
 
 
 _PREPARED: Final = "views prepared"
-_AFTER: Final = ("evaluate", "maps", "contact sheet and curves", "video")
+_AFTER: Final = ("maps", "evaluate", "video", "pictures")
 
 
 def _parts(scene: Scene, state: TrainState, training: float) -> dict[str, float]:

@@ -56,6 +56,12 @@ class DataSettings:
         if self.path is not None and "root" not in getattr(self.reader, "keywords", {}):
             raise SettingError("path is of no use: this data set is read from no folder. Choose another, data=….")
 
+    @property
+    def source(self) -> str:
+        """The folder that is read; where there is none, what reads, as "demo"."""
+        read = getattr(self.reader, "func", self.reader)
+        return self.path or str(getattr(read, "__module__", type(read).__module__)).rpartition(".")[2]
+
 
 @dataclass(frozen=True, slots=True)
 class AutoPrior:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DPI: Final = 100
+_JPEG_QUALITY: Final = 80  # of 100, with colours at every pixel: within 3 levels of 255 on average
 
 INK, FAINT, RULE = "#222222", "#888888", "#cccccc"
 # Paul Tol's bright scheme, which colour-blind readers can tell apart too.
@@ -73,9 +74,11 @@ def set_title(figure: Figure, title: str) -> None:
     figure.suptitle(title, fontsize=12, color=INK, x=0.01, ha="left", **AS_WRITTEN)
 
 
-def save_png(figure: Figure, path: Path) -> None:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI, pil_kwargs={"compress_level": PNG_LEVEL})
+def save(figure: Figure, path: Path) -> None:
+    """Write the figure as its suffix says: PNG for lines and letters, JPEG for photos, of which it needs a quarter."""
+    buffer, kind = io.BytesIO(), path.suffix[1:]
+    how = {"png": {"compress_level": PNG_LEVEL}, "jpg": {"quality": _JPEG_QUALITY, "subsampling": 0}}[kind]
+    figure.savefig(buffer, format=kind, dpi=DPI, pil_kwargs=how)
     write_bytes(path, buffer.getvalue())
 
 
@@ -113,7 +116,7 @@ def write_curves(path: Path, histories: Mapping[str, pd.DataFrame], title: str) 
         for text in legend.get_texts():
             text.set(**AS_WRITTEN)
     set_title(figure, title)
-    save_png(figure, path)
+    save(figure, path)
 
 
 def _finish(axis: Any) -> None:
@@ -226,7 +229,34 @@ def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: 
         bar.set_label("mean |difference| over RGB", fontsize=8 * larger, color=INK)
         bar.ax.tick_params(labelsize=8 * larger, colors=INK)
         bar.outline.set_visible(False)
-    save_png(figure, path)
+    save(figure, path)
+
+
+def write_tiles(path: Path, tiles: Mapping[str, np.ndarray], title: str, columns: int) -> None:
+    """Draw images side by side in rows of `columns`, each below its name and as large as the largest is on a sheet.
+
+    Args:
+        tiles: RGB [H, W, 3], or numbers in [0, 1], [H, W], which get colours: dark is 0, bright is 1, grey is nan.
+    """
+    from matplotlib import colormaps
+    from matplotlib.figure import Figure
+
+    h, w = (max(image.shape[axis] for image in tiles.values()) for axis in (0, 1))
+    cell_h, cell_w = (round(magnification(h, w) * size) for size in (h, w))
+    heads = ["\n".join(textwrap.fill(line, cell_w // 6) for line in name.splitlines()) for name in tiles]
+    head = (2 + max(name.count("\n") for name in heads)) * _LINE
+    width = _GAP + min(columns, len(tiles)) * (cell_w + _GAP)
+    height = 2 * _LINE + -(-len(tiles) // columns) * (head + cell_h) + _GAP
+    figure, colors = Figure(figsize=(width / DPI, height / DPI), dpi=DPI), colormaps["viridis"].with_extremes(bad=RULE)
+    # No axes: these take matplotlib longer than all the rest.
+    for i, (name, image) in enumerate(zip(heads, tiles.values(), strict=True)):
+        x, top = _GAP + i % columns * (cell_w + _GAP), 2 * _LINE + i // columns * (head + cell_h) + head
+        shown = _resized(image, min(cell_h / image.shape[0], cell_w / image.shape[1]))
+        figure.figimage(shown, x, height - top - len(shown), cmap=colors, vmin=0, vmax=1)
+        middle, above = (x + cell_w / 2) / width, 1 - (top - _LINE / 3) / height
+        figure.text(middle, above, name, fontsize=8.5, ha="center", va="bottom", color=INK, **AS_WRITTEN)
+    figure.text(_GAP / width, 1 - 1.2 * _LINE / height, title, fontsize=12, va="center", color=INK, **AS_WRITTEN)
+    save(figure, path)
 
 
 def _resized(pixels: np.ndarray, times: float) -> np.ndarray:

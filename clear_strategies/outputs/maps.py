@@ -8,7 +8,7 @@ Five maps per view, in [0, 1] at each HR pixel:
 - `conflict`: 1 where g_LR and g_HR of a Gaussian point apart, else 0.  Eq. 6
 
 The last two render the Gaussians over black with that number as their grey. The strategies are copied, so that the run does not
-change. maps.png shows the maps side by side, with the depth that dense stereo found, where it did.
+change. maps.jpg shows the maps side by side, with the depth that dense stereo found, where it did.
 """
 
 from __future__ import annotations
@@ -30,9 +30,11 @@ from clear_strategies import files
 from clear_strategies.core import images
 from clear_strategies.core.evidence import PatchMaps
 from clear_strategies.core.gradients import Grads
+from clear_strategies.core.progress import Progress
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.scene import Scene
+from clear_strategies.files import Beside
 from clear_strategies.geometry.projection import times_seen
 from clear_strategies.kernels import reconcile
 from clear_strategies.merging.conductor import Conductor
@@ -41,7 +43,7 @@ from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.field import FieldShot, GaussianField
 from clear_strategies.viewing.cameras import at_most
-from clear_strategies.viewing.look import DEPTH_COLORS, Painter, depth_range
+from clear_strategies.viewing.look import Painter, depth_range
 from rasterizers.interface import Rasterizer
 
 _log = logging.getLogger(__name__)
@@ -54,7 +56,7 @@ MAPS: Final = {
     "corrected": "corrected\nthe share of the HR gradient that was taken away",
 }
 """The maps, and what they mean."""
-_COLUMNS: Final = 4  # of maps.png
+_COLUMNS: Final = 4  # of maps.jpg
 _NOTE: Final = (
     "reliability, demand, weight: means over pixels; corrected, conflict: means over the Gaussians that the view moves "
     "at both scales"
@@ -75,30 +77,37 @@ _LONGEST_NOTE: Final = 400  # characters below the map
 
 class ViewMaps(NamedTuple):
     """The maps of one training view at HR, in [0, 1], and their means over pixels or Gaussians, by the names in `MAPS`:
-    "corrected" only where a strategy corrects, those of patch evidence only where a strategy has it.
+    "corrected" only where a strategy corrects, those of patch evidence only where a strategy has it; and the render.
     """
 
     maps: Mapping[str, Float[Tensor, "H W"]]
     means: Mapping[str, float]
+    render: Float[Tensor, "H W 3"]
 
 
 def write_maps(
     folder: Path, stems: Mapping[str, str], views: Sequence[View], painter: Painter, conductor: Conductor,
-    rasterizer: Rasterizer, t: int,
-) -> None:  # fmt: skip
-    """Write maps.json and, for each view, a folder of 8-bit grey PNGs (value = 255 × number) and maps.png.
+    rasterizer: Rasterizer, t: int, beside: Beside,
+) -> dict[str, Float[Tensor, "H W 3"]]:  # fmt: skip
+    """Write maps.json and, for each view, a folder of 8-bit grey PNGs (value = 255 × number) and maps.jpg.
 
     Args:
         stems: see `file_stems`.
         views: at least one. The other arguments are those of `view_maps`.
+        beside: does the drawing and encoding.
+
+    Returns:
+        The renders of these views by their names, so that they need not be rendered again.
     """
-    means: dict[str, Mapping[str, float]] = {}
+    means, renders = dict[str, Mapping[str, float]](), dict[str, Tensor]()
+    done = Progress("maps", "views", len(views))
     for view in views:
         view_folder, of_view = folder / stems[view.name], view_maps(painter, conductor, rasterizer, view, t)
-        means[view.name] = of_view.means
+        means[view.name], renders[view.name] = of_view.means, of_view.render
         for name, values in of_view.maps.items():
-            write_png(view_folder / f"{name}.png", values)
-        _write_picture(view_folder / "maps.png", view, of_view)
+            beside(write_png, view_folder / f"{name}.png", values)
+        beside(_write_picture, view_folder / "maps.jpg", view, of_view)
+        done(len(means))
     corrector = conductor.owner("reconcile")
     if corrector is None:
         _log.debug("maps: no strategy of this run corrects, so there is no corrected.png.")
@@ -106,6 +115,7 @@ def write_maps(
     makers = {"corrector": corrector, "evidence": None if evidence is None else evidence[0]}
     named = {part: None if maker is None else type(maker).__name__ for part, maker in makers.items()}
     files.write_json(folder / "maps.json", {"note": _NOTE, **named, "views": means})
+    return renders
 
 
 def view_maps(painter: Painter, conductor: Conductor, rasterizer: Rasterizer, view: View, t: int) -> ViewMaps:
@@ -116,42 +126,29 @@ def view_maps(painter: Painter, conductor: Conductor, rasterizer: Rasterizer, vi
     """
     evidence = _evidence(conductor, view)
     patches = {} if evidence is None else _enlarged(evidence[1], view)
-    numbers, compared = _compare(*_gradients(painter.field, conductor, rasterizer, view, t))
-    drawn = {name: painter.numbers(view.hr.camera, values).clamp(0, 1) for name, values in numbers.items()}
+    lr, hr, corrected, render = _gradients(painter.field, conductor, rasterizer, view, t)
+    numbers, compared = _compare(lr, hr, corrected)
+    columns = [*numbers.values(), *[torch.zeros_like(numbers["conflict"])] * (3 - len(numbers))]
+    pictures = painter.numbers(view.hr.camera, torch.stack(columns, dim=1).float()).clamp(0, 1).cpu().unbind(2)
+    drawn = dict(zip(numbers, pictures, strict=False))
     means = {name: float(patch.mean()) for name, patch in patches.items()}
-    return ViewMaps(patches | drawn, means | {name: float(values[compared].mean()) for name, values in numbers.items()})
+    means |= {name: float(values[compared].mean()) for name, values in numbers.items()}
+    return ViewMaps(patches | drawn, means, render)
 
 
 def _write_picture(path: Path, view: View, found: ViewMaps) -> None:
-    """Draw the LR photo, the SR image, the maps, and the depth and the confidence of stereo side by side; grey is unknown."""
-    panels: list[tuple[str, Tensor, str, tuple[float, float]]] = [
-        ("LR photo\nwhat the camera saw", view.lr.image, "", (0.0, 1.0)),
-        ("SR image\nwhat the prior made of it", view.hr.image, "", (0.0, 1.0)),
-    ]
+    """Draw the LR photo, the SR image, the maps, and the depth and the confidence of stereo side by side."""
+    tiles = {"LR photo\nwhat the camera saw": view.lr.image, "SR image\nwhat the prior made of it": view.hr.image}
     for name in (name for name in MAPS if name in found.maps):
-        title = MAPS[name].replace("\n", f", mean {found.means[name]:.2f}\n")
-        panels.append((title, found.maps[name], "viridis", (0.0, 1.0)))
+        tiles[MAPS[name].replace("\n", f", mean {found.means[name]:.2f}\n")] = found.maps[name]
     if (stereo := view.depth) is not None:
         depth, confidence = (x.where(stereo.known, torch.nan) for x in (stereo.depth, stereo.confidence))
-        title = f"depth by stereo, world units\nknown at {stereo.coverage:.0%}"
-        panels.append((title, depth, DEPTH_COLORS, depth_range(depth)))
-        panels.append(("confidence of the depth", confidence, "viridis", (0.0, 1.0)))
-    columns = min(_COLUMNS, len(panels))
-    rows, height = -(-len(panels) // columns), 4 * view.hr.camera.height / view.hr.camera.width + 0.7
-    from matplotlib import colormaps
-
-    figure, axes = figures.new_figure(rows, columns, 4.5 * columns, rows * height + 0.4)
-    for axis in axes.flat:
-        axis.set_axis_off()
-    for axis, (title, image, colors, span) in zip(axes.flat, panels, strict=False):
-        axis.set_title(title, fontsize=9)
-        pixels = (image.clamp(0, 1) if not colors else image).detach().cpu().numpy()
-        shown = colormaps[colors or "gray"].with_extremes(bad=figures.RULE)
-        drawn = axis.imshow(pixels, cmap=shown, vmin=span[0], vmax=span[1], interpolation="nearest")
-        if colors:
-            figure.colorbar(drawn, ax=axis, shrink=0.8)
-    figures.set_title(figure, f"{view.name}: where the SR image is believed, and where the photo overrules it")
-    figures.save_png(figure, path)
+        near, far = depth_range(depth)
+        title = f"depth by stereo, {near:.3g} (bright) to {far:.3g} (dark) world units\nknown at {stereo.coverage:.0%}"
+        tiles |= {title: (far - depth) / (far - near), "confidence of the depth": confidence}
+    believed = "where the SR image is believed, and where the photo overrules it (0 is dark, 1 is bright)"
+    pixels = {name: image.detach().clamp(0, 1).cpu().numpy() for name, image in tiles.items()}
+    figures.write_tiles(path, pixels, f"{view.name}: {believed}", _COLUMNS)
 
 
 def _evidence(conductor: Conductor, view: View) -> tuple[Strategy, PatchMaps] | None:
@@ -172,8 +169,8 @@ def _enlarged(patches: PatchMaps, view: View) -> dict[str, Tensor]:
 
 def _gradients(
     field: GaussianField, conductor: Conductor, rasterizer: Rasterizer, view: View, t: int
-) -> tuple[Grads, Grads, Grads | None]:
-    """g_LR, g_HR before correction, and g̃_HR where a strategy corrects at t, whatever λ_HR is then."""
+) -> tuple[Grads, Grads, Grads | None, Float[Tensor, "H W 3"]]:
+    """g_LR, g_HR before correction, and g̃_HR where a strategy corrects at t, whatever λ_HR is then; Î_HR on the CPU."""
     objective = replace(conductor.objective, lambda_hr=_ALWAYS_ON)
     aside = Conductor(*copy.deepcopy(conductor.strategies), objective=objective)
     lr, hr = (cast(FieldShot, shot) for shot in field.render_scales(rasterizer, view))  # both scales are asked for
@@ -183,7 +180,7 @@ def _gradients(
     from_hr = aside.hr_gradients(hr, opaque, t)
     g_lr, g_hr = g_lr.without_detail(), from_hr.routed(objective.lambda_hf).without_detail()
     owner = aside.owner("reconcile")
-    return g_lr, g_hr, None if owner is None else owner.correct(g_lr, g_hr, from_hr.step)
+    return g_lr, g_hr, None if owner is None else owner.correct(g_lr, g_hr, from_hr.step), hr.image.detach().cpu()
 
 
 def _compare(lr: Grads, hr: Grads, corrected: Grads | None) -> tuple[dict[str, Tensor], Bool[Tensor, " N"]]:
@@ -209,9 +206,14 @@ def coverage_of(scene: Scene, painter: Painter) -> tuple[Float[Tensor, "N 3"], I
     return points, times_seen(points, [(camera, painter.depth(camera)) for camera in small])
 
 
-def write_coverage(path: Path, scene: Scene, painter: Painter, title: str) -> None:
+def write_coverage(path: Path, scene: Scene, painter: Painter, title: str, beside: Beside) -> None:
     """Draw the points in the colours of how many photos see them, and the cameras; what fewer photos see lies on top."""
-    points, times = coverage_of(scene, painter)
+    beside(_draw_coverage, path, scene, *coverage_of(scene, painter), title)
+
+
+def _draw_coverage(
+    path: Path, scene: Scene, points: Float[Tensor, "N 3"], times: Int[Tensor, " N"], title: str
+) -> None:
     times = times.clamp(max=len(_COLORS) - 1)
     figure, ((axis,),) = figures.new_figure(1, 1, 8, 7)
     poses = torch.stack([view.hr.camera.world_to_camera[:3, :3].double().cpu() for view in scene.train])
@@ -237,7 +239,7 @@ def write_coverage(path: Path, scene: Scene, painter: Painter, title: str) -> No
         )
         axis.text(0, 0, note, fontsize=8, va="bottom", transform=axis.transAxes, **figures.AS_WRITTEN)
     figures.set_title(figure, f"{title}: what the photos see, from above")
-    figures.save_png(figure, path)
+    figures.save(figure, path)
 
 
 def _from_above(poses: Float[Tensor, "C 3 3"]) -> Float[np.ndarray, "3 2"]:

@@ -20,8 +20,9 @@ from __future__ import annotations
 import logging
 import math
 import shlex
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -33,12 +34,13 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
+from clear_strategies.core.progress import Progress, duration
 from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.strict_json import Count, Positive, plain_settings, read_object, typed
 from clear_strategies.outputs.figures import spaced
 from clear_strategies.outputs.image_scores import ImageScores, Truth, mean_scores
-from rasterizers.interface import Camera
+from rasterizers.native import threads
 
 _log = logging.getLogger(__name__)
 
@@ -141,9 +143,10 @@ class Evaluation:
 
 
 def evaluate(
-    scene: Scene, render: Callable[[Camera], Float[Tensor, "H W 3"]], *, down: DownKernel = "bicubic"
+    scene: Scene, render: Callable[[View], Float[Tensor, "H W 3"]], *, down: DownKernel = "bicubic"
 ) -> Evaluation:
-    """Render and score the views, of many training views a sample. Pixels that a mask hides do not count.
+    """Render and score the views, of many training views a sample. Pixels that a mask hides do not count. Views are scored
+    while the next ones are rendered, each by one thread: scikit-image uses one.
 
     Where the HR photo is unknown, D of the render is compared with the LR photo.
     """
@@ -153,14 +156,27 @@ def evaluate(
     test = [view for view in scene.test if view.lr.shows_something]
     train = spaced([view for view in scene.train if view.lr.shows_something], MOST_TRAIN)
     kept = {view.name for view in test or spaced(train, TRAIN_RENDERS)}
-    for part, views in (("test", test), ("train", train)):
-        for view in views:
-            image = render(view.hr.camera).clamp(0, 1)
+    with ThreadPoolExecutor(n := threads()) as scorers:
+        done = Progress("scores", "views", len(test) + len(train))
+        scored = deque[tuple[Table, str, Future[dict[str, ImageScores]]]]()
+
+        def take() -> None:
+            table, name, scores = scored.popleft()
+            table[name] = scores.result()
+            done(sum(map(len, tables.values())))
+
+        for part, view in [*(("test", view) for view in test), *(("train", view) for view in train)]:
+            image = render(view).clamp(0, 1)
             if not bool(image.isfinite().all()):
                 _log.warning("%s: its render is not finite and has no scores.", view.name)
             if view.name in kept:
                 renders[view.name] = image
-            tables[part][view.name] = _scores_of(view, image, down)
+            scored.append((tables[part], view.name, scorers.submit(_scores_of, view, image, down)))
+            if len(scored) > n:  # so that not all renders are held
+                take()
+        while scored:
+            take()
+    for part in tables:
         if "LR" in against[part]:
             _log.debug("%s views: HR is unknown; images reduced by %s were compared with the LR photos.", part, down)
     return Evaluation(tables["test"], tables["train"], against, renders, len(scene.train))
@@ -188,7 +204,7 @@ def _against(views: Sequence[View]) -> str:
 
 
 def _scores_of(view: View, image: Float[Tensor, "H W 3"], down: DownKernel) -> dict[str, ImageScores]:
-    """The scores of the view's images, each in a thread: scikit-image uses one."""
+    """The scores of the view's images."""
     truth, mask, scored = view.truth, view.hr.shown, {"ours": image}
     if truth is None:
         if mask is not None:  # else D would mix what it hides into what is shown
@@ -198,8 +214,7 @@ def _scores_of(view: View, image: Float[Tensor, "H W 3"], down: DownKernel) -> d
     elif not view.hr_is_photo:  # else no SR has a part
         scored |= {"bicubic": images.upsample(view.lr.image, view.factor), "prior": view.hr.image}
     against = Truth(truth, mask)
-    with ThreadPoolExecutor(torch.get_num_threads()) as threads:
-        return dict(zip(scored, threads.map(against.score, scored.values()), strict=True))
+    return {name: against.score(image) for name, image in scored.items()}
 
 
 def describe(folder: Path, evaluation: Evaluation, seconds: float, parts: Mapping[str, float]) -> str:
@@ -211,8 +226,8 @@ def describe(folder: Path, evaluation: Evaluation, seconds: float, parts: Mappin
     folder = _relative(folder)
     rows = [(part, *row) for part in ("test", "train") for row in _rows(part, evaluation)]
     width = max((len(image) for _, image, _ in rows), default=0)
-    told = ", ".join(f"{name} {_duration(part)}" for name, part in parts.items() if part >= 1)
-    lines = [f"done in {_duration(seconds)}{f' ({told})' if told else ''}: {folder}"]
+    told = ", ".join(f"{name} {duration(part)}" for name, part in parts.items() if part >= 1)
+    lines = [f"done in {duration(seconds)}{f' ({told})' if told else ''}: {folder}"]
     lines += [f"  {part:<5}  {image:<{width}}  {numbers}" for part, image, numbers in rows]
     if rows:
         lines.append(_LEGEND)
@@ -224,7 +239,7 @@ def describe(folder: Path, evaluation: Evaluation, seconds: float, parts: Mappin
         lines.append(
             f"  train: {len(evaluation.train)} of the {evaluation.train_views} views, evenly spaced, are scored."
         )
-    look = f"{folder / 'contact_sheet.png'}, or clear-strategies view {shlex.quote(str(folder))}"
+    look = f"{folder / 'contact_sheet.jpg'}, or clear-strategies view {shlex.quote(str(folder))}"
     return "\n".join([*lines, f"  look next: {look}"])
 
 
@@ -232,12 +247,7 @@ def describe_job(number: int, folder: Path, evaluation: Evaluation, seconds: flo
     """One line, of a job among many."""
     means = ((part, mean) for part in ("test", "train") if (mean := evaluation.mean(part)) is not None)
     score = next((f", {part} views {mean.psnr:.2f} dB" for part, mean in means), "")
-    return f"job {number}: done in {_duration(seconds)}{score}: {_relative(folder)}"
-
-
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+    return f"job {number}: done in {duration(seconds)}{score}: {_relative(folder)}"
 
 
 def _relative(folder: Path) -> Path:

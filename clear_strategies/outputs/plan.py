@@ -15,6 +15,7 @@ from typing import Final
 import torch
 
 from clear_strategies.data.scene import Scene
+from clear_strategies.merging.conductor import Conductor
 from clear_strategies.schedules import milestones
 from clear_strategies.training.loop import Progress
 from clear_strategies.training.state import TrainState
@@ -24,7 +25,7 @@ _log = logging.getLogger(__name__)
 # The facts on the console; the others are for `-v` and run.log.
 _SHORT: Final[Sequence[str]] = (
     "scene", "poses", "HR side", "train views", "test views", "not used", "masks", "LR", "HR", "the SR images add",
-    "initial points", "method", "strategies", "rasterizer", "memory", "time", "iterations", "skipped",
+    "initial points", "rasterizer", "memory", "time", "skipped",
 )  # fmt: skip
 _LINES: Final = 20  # in a file, which shows no bar
 _READ_EVERY: Final = 0.25  # seconds; reading the history's numbers waits for the device
@@ -57,25 +58,33 @@ class Chosen:
         return " + ".join(given or self.strategies) or "baseline"
 
 
+def describe_choices(chosen: Chosen, conductor: Conductor, data: str, iterations: int, seed: int) -> str:
+    """The part of the plan that needs no photo: it stands on the console from the first second."""
+    named = zip(chosen.strategies, conductor.strategies, strict=True)
+    none = "none (the paper's baseline)" if chosen.method is None else "none"
+    return _table({
+        "data": data,
+        **({} if chosen.method is None else {"method": f"{chosen.method}; strategies named before it take no part"}),
+        "strategies": ", ".join(f"{name} ({type(s).__name__})" for name, s in named) or none,
+        "iterations": f"{iterations}, seed {seed}",
+    })  # fmt: skip
+
+
 def describe(scene: Scene, state: TrainState, chosen: Chosen, machine: Mapping[str, str]) -> tuple[str, str]:
-    """The plan, a line for each fact: what the console shows, and the details for `-v` and run.log. Strategies without effect
-    give a warning.
+    """The rest of the plan, a line for each fact: what the console shows, and the details for `-v` and run.log. Strategies
+    without effect give a warning.
 
     Args:
         machine: label -> fact: the rasterizer, the threads, the memory.
     """
     settings, conductor = state.settings, state.conductor
     named = list(zip(chosen.strategies, conductor.strategies, strict=True))
-    none = "none (the paper's baseline)" if chosen.method is None else "none"
     on_cuda = state.device.type == "cuda"
     lines = {
         **scene.notes,
-        **({} if chosen.method is None else {"method": f"{chosen.method}; strategies named before it take no part"}),
-        "strategies": ", ".join(f"{name} ({type(s).__name__})" for name, s in named) or none,
         "device": f"cuda, {torch.cuda.get_device_name(state.device)}" if on_cuda else state.device.type,
         **machine,
         "per-Gaussian pass": "readable" if state.compiled_step is None else "compiled",
-        "iterations": f"{settings.iterations}, seed {settings.seed}",
         "milestones": _listed(_marks(state)),
     }
     if iterations := milestones(state.density.settings):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -15,6 +16,8 @@ from torch import Tensor
 from clear_strategies import files
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
+from clear_strategies.core.progress import Progress
+from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.ply import GaussianPly, write_gaussians
 from clear_strategies.data.scene import Scene
@@ -30,9 +33,10 @@ from clear_strategies.training import memory
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.state import TrainState
 from clear_strategies.viewing import cameras
-from clear_strategies.viewing.look import Painter, write_video
+from clear_strategies.viewing.look import Painter, Pixels, write_video
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, Rasterizer
+from rasterizers.native import kernel_threads, threads
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,14 +46,14 @@ _log = logging.getLogger(__name__)
 _METRICS: Final = "metrics.json"
 _COVERAGE: Final = "maps/coverage.png"
 _OF_RUN: Final = (
-    "contact_sheet.png", "curves.png", "history.csv", "conflict.csv", "timing.csv", "point_cloud.ply", "path.mp4",
+    "contact_sheet.jpg", "curves.png", "history.csv", "conflict.csv", "timing.csv", "point_cloud.ply", "path.mp4",
     cameras.FILE, "maps/maps.json", _COVERAGE,
 )  # fmt: skip
 _OF_VIEW: Final = (
     "renders/{}.png", *(f"views/{{}}_{k}.png" for k in ("lr", "prior", "truth")),
-    *(f"maps/{{}}/{name}.png" for name in (*MAPS, "maps")),
+    *(f"maps/{{}}/{name}.png" for name in MAPS), "maps/{}/maps.jpg",
 )  # fmt: skip
-_LONGEST: Final = 960  # px, of the video: a frame takes a fraction of a second, and the file a few MB
+_LONGEST: Final = 640  # px, of the video: `clear-strategies render` makes larger ones
 _SHEET_VIEWS: Final = 4  # test views on the contact sheet and in views/, at most
 _OWN_PHOTO: Final = (
     "LR, SR prior (and bicubic in the tables) show the test view's own photo, which training never sees."
@@ -76,23 +80,32 @@ def write_results(
     field, work_log, settings = state.field, state.conductor.work_log, state.settings
     stems = file_stems(view.name for view in (*scene.train, *scene.test))
     history = pd.DataFrame(list(state.history_as_floats()))
-    with work_log.stage("evaluate"):
-        evaluation = metrics.evaluate(scene, lambda camera: field.render(rasterizer, camera).cpu(), down=down)
-    for name, image in evaluation.renders.items():
-        write_png(folder / "renders" / f"{stems[name]}.png", image)
-    export_ply(folder / "point_cloud.ply", field, antialiased=antialiased)
     synthetic = " · SYNTHETIC prior" * scene.synthetic_prior
     title = f"{scene.name} · {chosen.title} · {state.t - 1} iterations · seed {settings.seed}{synthetic}"
-    with work_log.stage("maps"):
-        if mapped := spaced(state.views, settings.map_views):
-            write_maps(folder / "maps", stems, mapped, painter, state.conductor, rasterizer, state.t - 1)
-            write_coverage(folder / _COVERAGE, scene, painter, title)
-    memory.release()  # the gradients that the maps are made of: several times the field
-    with work_log.stage("contact sheet and curves"):
-        _write_sheet(folder, scene, stems, evaluation, title)
-        write_curves(folder / "curves.png", {chosen.title: history}, title)
-    with work_log.stage("video"):
-        _write_video(folder / "path.mp4", [view.hr.camera for view in scene.train], painter, settings.video)
+    rendered: dict[str, Tensor] = {}
+
+    def render(view: View) -> Tensor:
+        return rendered.pop(view.name) if view.name in rendered else field.render(rasterizer, view.hr.camera).cpu()
+
+    with kernel_threads(threads()), files.Beside() as beside:
+        with work_log.stage("maps"):
+            if mapped := spaced(state.views, settings.map_views):
+                rendered |= write_maps(
+                    folder / "maps", stems, mapped, painter, state.conductor, rasterizer, state.t - 1, beside
+                )
+                write_coverage(folder / _COVERAGE, scene, painter, title, beside)
+        memory.release()  # the gradients that the maps are made of: several times the field
+        with work_log.stage("evaluate"):
+            evaluation = metrics.evaluate(scene, render, down=down)
+        for name, image in evaluation.renders.items():
+            beside(write_png, folder / "renders" / f"{stems[name]}.png", image)
+        beside(_write_sheet, folder, scene, stems, evaluation, title)
+        beside(write_curves, folder / "curves.png", {chosen.title: history}, title)
+        with work_log.stage("video"):
+            _write_video(folder / "path.mp4", [view.hr.camera for view in scene.train], painter, settings.video)
+        export_ply(folder / "point_cloud.ply", field, antialiased=antialiased)
+        with work_log.stage("pictures"):  # those that were not drawn meanwhile
+            beside.finish()
     stages = pd.DataFrame([*scene.work_log.rows(), *_two_stages(state, history), *work_log.rows()])
     _write_tables(folder, history, stages)
     files.write_json(
@@ -161,9 +174,14 @@ def _write_video(path: Path, train: Sequence[Camera], painter: Painter, frames: 
     """Write a loop through the training cameras. Without imageio-ffmpeg, log a message instead."""
     if not frames:
         return
-    along = [cameras.at_most(camera, _LONGEST) for camera in cameras.through(train, frames)]
+    done = Progress("video", "frames", frames)
+
+    def draw(number: int, camera: Camera) -> Pixels:
+        done(number)
+        return images.to_bytes(painter.color(cameras.at_most(camera, _LONGEST)))
+
     try:
-        write_video(path, (images.to_bytes(painter.color(camera)) for camera in along))
+        write_video(path, itertools.starmap(draw, enumerate(cameras.through(train, frames))))
     except SettingError as missing:
         _log.info("no video of the camera path is written: %s", missing)
 
@@ -192,7 +210,7 @@ def _write_sheet(folder: Path, scene: Scene, stems: Mapping[str, str], evaluatio
         given = [name for name in pictures if name != "ours"]  # these differ most where there is most detail
         rows.append(SheetRow(view.name, pixels, captions, given if len(given) > 1 else pictures))
     note = _TRAINED_ON if not scene.test else "" if scene.test[0].hr_is_photo else _OWN_PHOTO
-    write_contact_sheet(folder / "contact_sheet.png", rows, title, note)
+    write_contact_sheet(folder / "contact_sheet.jpg", rows, title, note)
 
 
 def _write_tables(folder: Path, history: pd.DataFrame, stages: pd.DataFrame) -> None:

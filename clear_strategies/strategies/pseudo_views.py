@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import Final
 
 import torch
@@ -20,7 +21,7 @@ import torch
 from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.seeds import generator_at
 from clear_strategies.core.view import DepthMap, ExtraView, Photo, View
-from clear_strategies.geometry.pseudo_views import PseudoView, border_views, continued, cut_out, pseudo_views
+from clear_strategies.geometry.pseudo_views import PseudoView, border_view, continued, cut_out, pseudo_views
 from clear_strategies.strategies.base import Strategy
 from rasterizers.interface import Color
 
@@ -38,7 +39,7 @@ class PseudoViews(Strategy):
 
     Args:
         every: iterations from one pseudo view to the next, at least 1.
-        count: how many pseudo views are made before training, at least 1; fewer, where they would have more than 16 million
+        count: how many different pseudo views there are, at least 1; fewer, where they would have more than 16 million
             pixels together.
         reach: largest distance of a pseudo camera from its photo's, > 0, as a multiple of the photo's median depth.
         weight: of their LR loss, > 0, as a multiple of a photo's, which is λ_LR.
@@ -73,8 +74,8 @@ class PseudoViews(Strategy):
         require_number("border", self.border, least=1)
 
     def on_views(self, views: Sequence[View]) -> None:
-        """Make the pseudo views: a function of the views and the seed. None are made, and a message says why, where they
-        would be of no use.
+        """Choose the pseudo views: a function of the views and the seed. Each is made in the first iteration that shows it.
+        There are none, and a message says why, where they would be of no use.
         """
         if not views:
             _log.warning("PseudoViews has no effect: this training loop does not give its views.")
@@ -89,18 +90,17 @@ class PseudoViews(Strategy):
         aside, borders = self._moved_aside(views, photos), []
         if self.continued > 0 and self.border > 1:
             fit = max(1, math.floor(_TOGETHER / (self._pixels(photos) * self.border**2)))
-            some = list(photos.values())[:: math.ceil(len(photos) / fit)]
-            borders = border_views(some, field=self.border, max_pixels=self.max_pixels)
+            wider = partial(border_view, field=self.border, max_pixels=self.max_pixels)
+            borders = [partial(wider, photo) for photo in list(photos.values())[:: math.ceil(len(photos) / fit)]]
         if not aside:
             left = "only shows the borders of the photos" if borders else "has no effect"
             _log.warning("PseudoViews %s: stereo finds depth in fewer than two of %d photos.", left, len(photos))
         self.cache.update(
-            views=tuple(self._target(view, background) for view in aside),
-            borders=tuple(self._target(view, background) for view in borders),
-            known=sum(float(view.known.float().mean()) for view in aside) / max(1, len(aside)),
+            views=tuple(cache(partial(self._target, make, background)) for make in aside),
+            borders=tuple(cache(partial(self._target, make, background)) for make in borders),
         )
 
-    def _moved_aside(self, views: Sequence[View], photos: dict[str, Photo]) -> list[PseudoView]:
+    def _moved_aside(self, views: Sequence[View], photos: dict[str, Photo]) -> list[Callable[[], PseudoView]]:
         if len(photos) < 2:
             return []
         return pseudo_views(
@@ -118,15 +118,16 @@ class PseudoViews(Strategy):
         """Of the largest photo, reduced to `max_pixels`."""
         return max(p.camera.width * p.camera.height // p.factor_to(self.max_pixels) ** 2 for p in photos.values())
 
-    def _target(self, view: PseudoView, background: Color) -> ExtraView:
+    def _target(self, make: Callable[[], PseudoView], background: Color) -> ExtraView:
+        view = make()
         weight = torch.where(view.known, 1.0, self.continued if bool(view.known.any()) else 0.0) * self.weight
         image = continued(view.photo.image, view.known) if self.continued > 0 else view.photo.image
         return ExtraView(replace(view.photo, image=image), weight, background).to(self.device)
 
     def extra_views(self, t: int) -> Sequence[ExtraView]:
         """One of them every `every` iterations: a function of (seed, t)."""
-        aside: Sequence[ExtraView] = self.cache.get("views", ())
-        borders: Sequence[ExtraView] = self.cache.get("borders", ())
+        aside: Sequence[Callable[[], ExtraView]] = self.cache.get("views", ())
+        borders: Sequence[Callable[[], ExtraView]] = self.cache.get("borders", ())
         if not (aside or borders) or t % self.every:
             return ()
         generator = generator_at(self.seed, t)
@@ -135,7 +136,7 @@ class PseudoViews(Strategy):
             return int(torch.randint(n, (), generator=generator))
 
         choices = borders if borders and not (aside and drawn(_BORDER_SHARE)) else aside
-        return (choices[drawn(len(choices))],)
+        return (choices[drawn(len(choices))](),)
 
     def on_fit_end(self) -> None:
         self.cache["views"] = self.cache["borders"] = ()
@@ -144,9 +145,7 @@ class PseudoViews(Strategy):
         aside, borders = (len(self.cache.get(name, ())) for name in ("views", "borders"))
         if not (aside or borders):
             return None
-        moved = (
-            f"{aside} beside the training cameras, {self.cache['known']:.0%} of their pixels known, " if aside else ""
-        )
+        moved = f"{aside} beside the training cameras, " if aside else ""
         wide = f"{borders} with a field {self.border:g} times as wide, " if borders else ""
         return f"{moved}{wide}one every {self.every} iterations"
 

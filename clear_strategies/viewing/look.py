@@ -59,19 +59,15 @@ class Painter:
         """Mean depth z of what a pixel shows, world units; nan where less than half of it is covered."""
         pose = camera.world_to_camera.to(self.field.means)
         z = (self.field.means.data @ pose[2, :3]) + pose[2, 3]
-        drawn = self._numbers(camera, torch.stack([z, torch.ones_like(z), torch.zeros_like(z)], dim=1))
+        drawn = self.numbers(camera, torch.stack([z, torch.ones_like(z), torch.zeros_like(z)], dim=1))
         z_sum, alpha = drawn[..., 0], drawn[..., 1]
         return torch.where(alpha >= _SOLID, z_sum / alpha.clamp_min(_SOLID), torch.nan).cpu()
 
     @torch.no_grad()
-    def numbers(self, camera: Camera, values: Float[Tensor, " N"]) -> Float[Tensor, "H W"]:
-        """A number >= 0 per Gaussian, blended as colours are; 0 where nothing is."""
-        return self._numbers(camera, values[:, None].expand(-1, 3).to(self.field.means))[..., 0].cpu()
-
-    def _numbers(self, camera: Camera, rgb: Float[Tensor, "N 3"]) -> Float[Tensor, "H W 3"]:
-        """Render the Gaussians with these colours over black."""
+    def numbers(self, camera: Camera, values: Float[Tensor, "N 3"]) -> Float[Tensor, "H W 3"]:
+        """Three numbers >= 0 per Gaussian, blended as colours are; 0 where nothing is. On the device of the field."""
         splats = self.field.baked()
-        painted = replace(splats, sh0=((rgb - 0.5) / SH_C0)[:, None], shN=splats.shN[:, :0], rgb_offset=None)
+        painted = replace(splats, sh0=((values - 0.5) / SH_C0)[:, None], shN=splats.shN[:, :0], rgb_offset=None)
         return self._over_black(painted, camera).image
 
 
@@ -118,7 +114,7 @@ def write_video(path: Path, frames: Iterable[Pixels], *, fps: float = FPS) -> No
     with files.replacing(path.absolute()) as partial:  # ffmpeg takes "a:" at the beginning for a protocol
         writer = imageio_ffmpeg.write_frames(
             str(partial), first.shape[1::-1], fps=fps, codec="libx264", pix_fmt_out="yuv420p", quality=None,
-            output_params=["-vf", _HD, "-crf", _QUALITY, "-preset", "medium", "-movflags", "+faststart"],
+            output_params=["-vf", _HD, "-crf", _QUALITY, "-preset", "veryfast", "-movflags", "+faststart"],
             macro_block_size=2, ffmpeg_log_level="error",
         )  # fmt: skip
         writer.send(None)

@@ -12,7 +12,7 @@ import torch
 
 from clear_strategies import Conductor
 from clear_strategies.core import progress
-from clear_strategies.core.progress import EVERY, Progress
+from clear_strategies.core.progress import EVERY, FIRST, Progress
 from clear_strategies.core.work_log import WorkLog
 
 
@@ -128,7 +128,12 @@ def test_a_line_now_and_then_and_only_where_something_has_happened(monkeypatch, 
     monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
     counter = Progress("features", "photos", 10)
     with caplog.at_level(logging.INFO):
-        for seconds, done in ((0, 1), (EVERY / 2, 2), (EVERY / 2, 3), (EVERY, 3), (1, 4), (EVERY, 5), (EVERY, 10)):
+        for seconds, done in ((0, 1), (FIRST, 2), (EVERY / 2, 3), (EVERY, 3), (1, 4), (EVERY, 4), (70, 5), (EVERY, 10)):
             clock[0] += seconds
             counter(done)
-    assert caplog.messages == ["features: 3 of 10 photos", "features: 4 of 10 photos", "features: 5 of 10 photos"]
+    said = [
+        "2 of 10 photos, about 8 s left",
+        "3 of 10 photos, about 40 s left",
+        "5 of 10 photos, about 1 min 38 s left",
+    ]
+    assert caplog.messages == [f"features: {line}" for line in said]

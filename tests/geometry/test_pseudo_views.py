@@ -8,7 +8,7 @@ from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.projection import back_project, project, sample_colors
-from clear_strategies.geometry.pseudo_views import PseudoView, border_views, continued, moved_aside, pseudo_views
+from clear_strategies.geometry.pseudo_views import PseudoView, border_view, continued, moved_aside, pseudo_views
 from tests.helpers import planes
 
 DEPTH = 4.0
@@ -27,7 +27,7 @@ def views_of(photos: dict[str, Photo], depths: dict[str, DepthMap] | None = None
     if depths is None:
         depths = {name: depth_of(photo) for name, photo in photos.items()}
     chosen = {"count": 6, "reach": 0.2, "tolerance": 0.02, "max_pixels": 10**6, "background": (0.0,) * 3, "seed": 0}
-    return pseudo_views(photos, depths, **{**chosen, **settings})
+    return [make() for make in pseudo_views(photos, depths, **{**chosen, **settings})]
 
 
 @pytest.mark.parametrize("reach", [0.1, 1.2])
@@ -100,7 +100,7 @@ def test_a_depth_that_no_photo_vouches_for_and_pixels_beside_the_background_give
 def test_a_border_view_shows_its_photo_in_the_middle_of_a_wider_field(max_pixels):
     photo = planes.plane_photos(1)[0]
     photo = replace(photo, transparency=torch.rand(photo.image.shape[:2], generator=torch.Generator().manual_seed(0)))
-    (wide,) = border_views([photo], field=1.3, max_pixels=max_pixels)
+    wide = border_view(photo, field=1.3, max_pixels=max_pixels)
     c, (column, row) = wide.photo.camera, (int(wide.known.any(0).sum()), int(wide.known.any(1).sum()))
     assert (c.width, c.height) == (pytest.approx(1.3 * column, abs=2), pytest.approx(1.3 * row, abs=2))
     assert bool(wide.known.sum() == column * row)

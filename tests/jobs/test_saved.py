@@ -84,7 +84,7 @@ def test_a_lone_ply_file_has_an_upright_camera_that_sees_it(saved_run, tmp_path)
     assert not splat.cameras
     (camera,) = splat.poses()
     assert torch.equal(camera.world_to_camera[:3, :3], torch.eye(3, dtype=camera.world_to_camera.dtype))
-    assert float(splat.painter.numbers(camera, torch.ones(len(field))).max()) > 0.2
+    assert float(splat.painter.numbers(camera, torch.ones(len(field), 3)).max()) > 0.2
     points = field.means.data.double() @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     u = points[:, 0] / points[:, 2] * camera.fx + camera.cx
     assert float(((u > 0) & (u < camera.width) & (points[:, 2] > 0)).double().mean()) > 0.8

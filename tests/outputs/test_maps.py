@@ -15,6 +15,7 @@ import rasterizers
 from clear_strategies import GCO, P2G, SVS, Conductor, DepthMap, Grads, Objective, RandomBackground, Strategy, View
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.view_names import file_stems
+from clear_strategies.files import Beside
 from clear_strategies.kernels.reconcile import products
 from clear_strategies.outputs.maps import MAPS, ViewMaps, view_maps, write_maps
 from clear_strategies.schedules import WarmupDecay
@@ -48,7 +49,9 @@ def maps_of(state: TrainState, view: View | None = None, t: int = 1, **settings:
 
 def written(folder: Path, state: TrainState, views: Sequence[View]) -> dict[str, Any]:
     """The content of maps.json."""
-    write_maps(folder, file_stems(view.name for view in views), views, *drawn_by(state), 1)
+    with Beside() as beside:
+        write_maps(folder, file_stems(view.name for view in views), views, *drawn_by(state), 1, beside)
+        beside.finish()
     content: dict[str, Any] = json.loads((folder / "maps.json").read_text())
     return content
 
@@ -161,6 +164,6 @@ def test_views_with_stereo_show_their_depth_and_maps_that_no_strategy_makes_are_
     for view in views:
         assert set(content["views"][view.name]) == {"conflict"}
         assert {path.stem for path in (tmp_path / view.name).iterdir()} == {"conflict", "maps"}
-    found, none, without = (read_image(tmp_path / name / "maps.png") for name in "012")
+    found, none, without = (read_image(tmp_path / name / "maps.jpg") for name in "012")
     assert found.shape == none.shape  # with two panels more than there are without stereo
     assert found.numel() > 1.3 * without.numel()

@@ -123,7 +123,7 @@ def test_the_images_that_ours_is_compared_with_stand_below_it() -> None:
     *_, meanings, note, look_next = text.splitlines()
     assert "GMSD" in meanings
     assert note == f"  {NOTE}."
-    assert look_next == "  look next: run/contact_sheet.png, or clear-strategies view run"
+    assert look_next == "  look next: run/contact_sheet.jpg, or clear-strategies view run"
 
 
 def test_what_is_missing_has_no_row_and_no_note() -> None:

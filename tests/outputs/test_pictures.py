@@ -7,6 +7,7 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
+from clear_strategies.files import Beside
 from clear_strategies.outputs import figures, maps
 from clear_strategies.outputs.figures import SheetRow, magnification, window, write_contact_sheet
 from tests.helpers import wall
@@ -39,7 +40,9 @@ def test_a_point_is_seen_by_the_photos_whose_frame_it_lies_in(monkeypatch: pytes
 
 def test_the_map_has_the_colours_of_its_legend_and_dollars_are_no_mathematics(tmp_path: Path) -> None:
     scene = replace(SCENE, unplaced={"b$1_$.jpg": "12 features: blurred, dark, or without texture"})
-    maps.write_coverage(tmp_path / "coverage.png", scene, wall.painter(), "toy $20_$")
+    with Beside() as beside:
+        maps.write_coverage(tmp_path / "coverage.png", scene, wall.painter(), "toy $20_$", beside)
+        beside.finish()
     drawn = torch.from_numpy(read(tmp_path / "coverage.png").copy()).flatten(0, 1)
     for color in maps._COLORS.values():
         assert int((drawn == torch.tensor(list(bytes.fromhex(color[1:])))).all(1).sum()) > 50

@@ -27,7 +27,9 @@ def started(*strategies: Strategy, **objective: Any) -> TrainState:
 
 
 def lines(state: TrainState, *names: str, method: str | None = None) -> dict[str, str]:
-    found = plan.describe(SCENE, state, plan.Chosen(method, names), {"rasterizer": "torch", "threads": "1"})
+    chosen = plan.Chosen(method, names)
+    found = [plan.describe_choices(chosen, state.conductor, "toy", 6, 0)]
+    found += plan.describe(SCENE, state, chosen, {"rasterizer": "torch", "threads": "1"})
     split = (line.strip().partition("  ") for text in found for line in text.splitlines())
     return {label: words for label, _, words in split}
 

@@ -44,6 +44,19 @@ def test_one_comes_every_nth_iteration_and_the_choice_is_a_function_of_seed_and_
     assert not all(a.shape == b.shape and torch.equal(a, b) for a, b in zip(other, first, strict=True))
 
 
+def test_a_view_is_made_when_it_is_first_shown_and_is_the_same_whichever_were_made_before(monkeypatch):
+    made, shown = [], prepared()
+    target = PseudoViews._target
+    monkeypatch.setattr(PseudoViews, "_target", lambda *of: made.append(1) or target(*of))
+    late = prepared()
+    assert not made
+    last = late.extra_views(40)[0]
+    assert len(made) == 1
+    for t in range(2, 40, 2):
+        shown.extra_views(t)
+    assert torch.equal(last.photo.image, shown.extra_views(40)[0].photo.image)
+
+
 def test_a_quarter_are_training_cameras_with_a_wider_field():
     made = prepared()
     width = SCENE.train[0].lr.camera.width

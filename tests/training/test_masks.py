@@ -12,7 +12,7 @@ from clear_strategies.data.cloud import CloudSettings, initial_points
 from clear_strategies.data.prepare import prepare
 from clear_strategies.data.priors import Bicubic
 from clear_strategies.data.view_settings import ViewSettings
-from clear_strategies.geometry.pseudo_views import border_views
+from clear_strategies.geometry.pseudo_views import border_view
 from clear_strategies.training.evaluation import psnr_of
 from clear_strategies.training.loop import iterate
 from tests.helpers import planes
@@ -89,5 +89,5 @@ def test_hidden_pixels_have_no_depth_give_no_points_and_the_border_continues_ove
         assert not depth.known[20:60, 30:80].any()
         assert depth.known[:, 85:].any()
     photo = replace(planes.photo(), shown=torch.arange(40).expand(40, 40) > 10)
-    (wide,) = border_views([photo], field=1.5, max_pixels=10_000)
+    wide = border_view(photo, field=1.5, max_pixels=10_000)
     assert torch.equal(wide.known[10:50, 10:50], photo.shown)

@@ -61,10 +61,10 @@ def test_depth_is_unknown_where_nothing_is_and_numbers_are_blended_over_black(fi
     picture = colored(depth, *depth_range(depth))
     assert (picture[0, 0] == 204).all()
     painter = Painter(field, make)
-    ones = painter.numbers(CAMERA, torch.ones(len(field)))
+    ones = painter.numbers(CAMERA, torch.ones(len(field), 3))
     assert float(ones.min()) >= 0
     assert float(ones.max()) <= 1 + 1e-6
-    torch.testing.assert_close(painter.numbers(CAMERA, torch.full((len(field),), 0.5)), ones / 2)
+    torch.testing.assert_close(painter.numbers(CAMERA, torch.full((len(field), 3), 0.5)), ones / 2)
 
 
 def numbered(splat):
