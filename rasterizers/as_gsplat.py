@@ -18,7 +18,7 @@ from torch import Tensor
 
 import rasterizers
 from rasterizers.autograd import Inputs, Rendered, in_graph, render, uncompiled
-from rasterizers.geometry import SH_C0
+from rasterizers.geometry import constant_band, depths, low_and_span
 from rasterizers.interface import Camera, Rasterizer, RasterSettings, over
 from rasterizers.reference.projection import footprints
 
@@ -183,8 +183,8 @@ class _View:
         elif "RGB" in self.render_mode:
             found += [self._channels(*x) for x in self._threes()]
         if self.render_mode != "RGB":
-            means, pose = self.inputs.means, self.pose.to(self.inputs.means)
-            z = (means @ pose[2, :3] + pose[2, 3]).clamp_min(0)  # behind the camera nothing is drawn
+            means = self.inputs.means
+            z = depths(means, self.pose.to(means)).clamp_min(0)  # behind the camera nothing is drawn
             found.append(self._channels(torch.stack((z, torch.ones_like(z), torch.zeros_like(z)), 1), None, 2))
         return found
 
@@ -226,9 +226,8 @@ class _View:
 
     def _channels(self, colors: Float[Tensor, "N 3"], background: Tensor | None, keeps: int) -> _Part:
         behind = [0.0] * 3 if background is None else [*background.tolist(), *[0.0] * (3 - len(background))]
-        low, span = _low_and_span(colors, [behind])
-        sh0 = ((colors - low) / span - 0.5)[:, None] / SH_C0
-        inputs = self.inputs._replace(colors=sh0, rgb_offset=None)
+        low, span = low_and_span(colors, behind)
+        inputs = self.inputs._replace(colors=constant_band((colors - low) / span), rgb_offset=None)
         behind = [(x - low) / span for x in behind]
         rendered = render(over(self.rasterizer, cast(Any, tuple(behind))), inputs, 1, self.camera, depth=False)
         return _Part(rendered, inputs, low, span, keeps)
@@ -291,8 +290,7 @@ def _left_in(
     if far_plane >= _FARTHEST and radius_clip <= 0:
         return opacities
     with torch.no_grad():
-        pose = camera.world_to_camera.to(means)
-        keep = means @ pose[2, :3] + pose[2, 3] <= far_plane
+        keep = depths(means, camera.world_to_camera.to(means)) <= far_plane
         if radius_clip > 0:
             f = footprints(means, quats, scales, camera, kernel)
             radii = _extents(opacities, f.deviations, 1 / 255)
@@ -380,16 +378,6 @@ def _like_centres(means2d: Tensor, centres: Sequence[Tensor]) -> list[Tensor]:
 def _stacked(tensors: Sequence[Tensor]) -> Tensor:
     """One tensor of all; a single one is not copied."""
     return tensors[0][None] if len(tensors) == 1 else torch.stack(list(tensors))
-
-
-def _low_and_span(colors: Float[Tensor, "N 3"], backgrounds: Sequence[Sequence[float]]) -> tuple[float, float]:
-    """RGB in any range is drawn as (RGB - low) / span, with colours >= 0 over backgrounds in [0, 1].
-
-    The weights of a pixel's colours and background sum to 1, so the image is low + span times what is drawn.
-    """
-    finite = colors.detach().nan_to_num(0, 0, 0)  # NaN is refused by the rasterizer
-    low = min(0.0, float(finite.min()) if len(finite) else 0.0, *map(min, backgrounds))
-    return low, max(1.0, max(map(max, backgrounds)) - low)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import torch
@@ -33,6 +34,26 @@ def rotation_matrix(quats: Float[Tensor, "M 4"]) -> Float[Tensor, "M 3 3"]:
         ),
         dim=-1,
     ).view(-1, 3, 3)  # fmt: skip
+
+
+def depths(means: Float[Tensor, "N 3"], pose: Float[Tensor, "4 4"]) -> Float[Tensor, " N"]:
+    """Z of the centres along the axis of a camera, by its world-to-camera matrix; world units."""
+    return means @ pose[2, :3] + pose[2, 3]
+
+
+def constant_band(rgb: Float[Tensor, "N 3"]) -> Float[Tensor, "N 1 3"]:
+    """RGB as spherical harmonics."""
+    return ((rgb - 0.5) / SH_C0)[:, None]
+
+
+def low_and_span(colors: Float[Tensor, "N 3"], background: Sequence[float]) -> tuple[float, float]:
+    """RGB in any range is drawn as (RGB - low) / span, with colours >= 0 over a background in [0, 1].
+
+    The weights of a pixel's colours and background sum to 1, so the image is low + span times what is drawn.
+    """
+    finite = colors.detach().nan_to_num(0, 0, 0)  # NaN is refused by the rasterizer
+    low = min(0.0, float(finite.min()) if len(finite) else 0.0, *background)
+    return low, max(1.0, max(background) - low)
 
 
 def spherical_harmonics(directions: Float[Tensor, "M 3"], bands: int) -> Float[Tensor, "M B1"]:

@@ -24,6 +24,7 @@ from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.step import Step
 from clear_strategies.strategies.base import Strategy
+from rasterizers.geometry import depths
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
@@ -98,9 +99,9 @@ class SplatSuRe(Strategy):
             return
         name, camera = step.view.name, step.view.lr.camera  # skips halve the HR side for a part of the run
         pose = self._pose(name, camera).to(params["means"])
-        z = params["means"] @ pose[2, :3] + pose[2, 3]
-        before = self.state.get(name, torch.zeros_like(z))
-        self.state[name] = torch.where(step.visible & (z > 0), camera.fx / z, before)
+        z = depths(params["means"], pose)
+        rates = self.state.setdefault(name, torch.zeros_like(z))
+        rates.copy_(torch.where(step.visible & (z > 0), camera.fx / z, rates))
 
     def _pose(self, name: str, camera: Camera) -> Float[Tensor, "4 4"]:
         """World to camera on the device of the field, cached until the view has another camera."""

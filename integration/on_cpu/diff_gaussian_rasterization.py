@@ -25,7 +25,7 @@ from torch.utils.checkpoint import checkpoint
 
 import rasterizers
 from rasterizers import autograd
-from rasterizers.geometry import SH_C0
+from rasterizers.geometry import constant_band, depths, low_and_span
 from rasterizers.interface import Camera, Rasterizer, Splats, over
 from rasterizers.reference.projection import footprints
 
@@ -103,7 +103,7 @@ class GaussianRasterizer(torch.nn.Module):
 
     def markVisible(self, positions: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:  # noqa: N802 - the name of 3DGS
         """Which positions are far enough before the camera."""
-        return _depths(positions.detach(), self.raster_settings.camera()) > _NEAR
+        return depths(positions.detach(), self.raster_settings.camera().world_to_camera.to(positions)) > _NEAR
 
     def forward(
         self,
@@ -133,25 +133,25 @@ class GaussianRasterizer(torch.nn.Module):
         camera, rasterizer = s.camera(), s.rasterizer()
         shapes = _Shapes(means3D, rotations, scales * s.scale_modifier, opacities[:, 0])
         absgrad = None if s.kernel_size is None else torch.zeros_like(means3D[:, :2], requires_grad=False)
-        low, bands = 0.0, 1  # RGB of any range is drawn as (RGB - low) / (1 - low), which is at least 0
+        low, span, bands, behind = 0.0, 1.0, 1, s.bg.tolist()
         if shs is not None and colors_precomp is None:
             colors, bands = shs, (s.sh_degree + 1) ** 2
         elif colors_precomp is not None and shs is None:
-            low = min(0.0, float(colors_precomp.detach().min())) if len(colors_precomp) else 0.0
-            colors = _constant((colors_precomp - low) / (1 - low))
+            low, span = low_and_span(colors_precomp, behind)
+            colors = constant_band((colors_precomp - low) / span)
         else:
             raise ValueError("exactly one of shs and colors_precomp must be given.")
-        red, green, blue = ((x - low) / (1 - low) for x in s.bg.tolist())
+        red, green, blue = ((x - low) / span for x in behind)
         inputs = autograd.Inputs(*shapes, colors, None)
         rendered = autograd.render(over(rasterizer, (red, green, blue)), inputs, bands, camera, depth=False)
         centres = _InNdc.apply(means2D, rendered.rendering.means2d, absgrad, camera)  # type: ignore[no-untyped-call]
         drawn = autograd.in_graph(rendered, inputs, centres, absgrad=absgrad)
         image = drawn.image.permute(2, 0, 1).contiguous()
-        image = image if low == 0 else low + (1 - low) * image
+        image = image if (low, span) == (0.0, 1.0) else low + span * image
         radii = _radii(drawn.visible, shapes, camera, s.kernel)
         if s.antialiasing is None and s.confidence is None:
             return image, radii
-        z = _depths(means3D, camera)[:, None].clamp_min(_NEAR)
+        z = depths(means3D, camera.world_to_camera.to(means3D))[:, None].clamp_min(_NEAR)
         depth = _sum(rasterizer, camera, shapes, z if s.antialiasing is None else 1 / z)
         return (image, radii, depth) if s.confidence is None else (image, radii, depth, drawn.alpha[None])
 
@@ -161,11 +161,6 @@ class _Shapes(NamedTuple):
     rotations: Tensor
     scales: Tensor
     opacities: Tensor
-
-
-def _constant(rgb: Float[Tensor, "N 3"]) -> Float[Tensor, "N 1 3"]:
-    """RGB as spherical harmonics."""
-    return ((rgb - 0.5) / SH_C0)[:, None]
 
 
 def _sum(
@@ -178,18 +173,13 @@ def _sum(
     """
 
     def drawn(values: Tensor, *shapes: Tensor) -> Tensor:
-        colors = _constant(values.expand(-1, 3))
+        colors = constant_band(values.expand(-1, 3))
         splats = Splats(*_Shapes(*shapes), colors, colors[:, 1:])
         return autograd.draw(rasterizer, splats, camera, colors=colors).image[..., 0][None]
 
     if torch.is_grad_enabled() and any(x.requires_grad for x in shapes):
         return cast(Tensor, checkpoint(drawn, values, *shapes, use_reentrant=True, preserve_rng_state=False))
     return drawn(values, *shapes)
-
-
-def _depths(means: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, " N"]:
-    pose = camera.world_to_camera.to(means)
-    return means @ pose[2, :3] + pose[2, 3]
 
 
 @torch.no_grad()

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from rasterizers.geometry import BLACK, rotation_matrix, spherical_harmonics, tangent_limits
+from rasterizers.geometry import BLACK, depths, rotation_matrix, spherical_harmonics, tangent_limits
 from rasterizers.interface import Camera, RasterSettings, SplatGradients, Splats
 
 # Columns of the table that blending reads, one row per projected Gaussian; the last one is there if depth is drawn.
@@ -180,7 +180,7 @@ def project(splats: Splats, camera: Camera, settings: RasterSettings, *, depth: 
 def _candidates(splats: Splats, camera: Camera, settings: RasterSettings) -> Int[Tensor, " M"]:
     """The Gaussians to project. The conditions say which are kept, because NaN fails each of them."""
     pose = camera.world_to_camera.to(splats.means)
-    depth = splats.means.detach() @ pose[2, :3] + pose[2, 3]
+    depth = depths(splats.means.detach(), pose)
     keep: Tensor = (depth > settings.near) & (splats.opacities.detach() >= settings.alpha_min)
     return torch.nonzero(keep)[:, 0]
 
