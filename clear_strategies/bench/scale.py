@@ -7,7 +7,6 @@ its peak. Photos are those of the demo; of a run of them the processor time coun
 from __future__ import annotations
 
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -24,15 +23,13 @@ import rasterizers
 from clear_strategies.bench import scenes
 from clear_strategies.bench.iteration import TOTAL, Training, view_of
 from clear_strategies.bench.results import Results, interleaved, medians
+from clear_strategies.core.work_log import peak_mib
 from clear_strategies.errors import DataError
 from clear_strategies.merging.objective import Objective
 from clear_strategies.training.loop import kernel_threads
 
 _WIDTH, _GAUSSIANS = 504, 100_000  # where the other size varies
-_MIB: Final = 1024 if sys.platform != "darwin" else 1 << 20  # units of ru_maxrss
-_RUN: Final = (
-    "data.reader.width=128", "data.reader.height=96", "fit.map_views=0", "fit.video=0",
-)  # fmt: skip
+_RUN: Final = ("data.reader.width=128", "data.reader.height=96")
 
 
 def measure(
@@ -50,7 +47,7 @@ def measure(
     sizes += [("pixels", w * w * 3 // 4, _GAUSSIANS, w) for w in sorted(widths)]
     with ProcessPoolExecutor(1, get_context("spawn"), max_tasks_per_child=1) as one:
         rows = [one.submit(_iteration, *size, repeats, torch.get_num_threads()).result() for size in sizes]
-    rows += [_run(n, iterations) for n in sorted(photos)]
+    rows += [row for n in sorted(photos) for row in _run(n, iterations)]
     table = pd.DataFrame(rows, columns=["of", "size", "ms", "mib"])
     steps = np.log(table[["ms", "size"]].astype(float)).groupby(table["of"], sort=False).diff()
     table["exponent"] = steps["ms"] / steps["size"]
@@ -70,16 +67,21 @@ def _iteration(of: str, size: int, gaussians: int, width: int, repeats: int, thr
     training = Training(workload, view_of(workload, rasterizer), rasterizer, Objective())
     with kernel_threads(training.state, rasterizer):
         turns = interleaved({of: training}, repeats, device="cpu", label=workload.name)
-    return of, size, medians(turns).loc[of, TOTAL], resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _MIB
+    return of, size, medians(turns).loc[of, TOTAL], peak_mib()
 
 
-def _run(photos: int, iterations: int) -> tuple[Any, ...]:
+def _run(photos: int, iterations: int) -> list[tuple[Any, ...]]:
+    """A row for the whole run, and one for each of its stages, as timing.csv has them: of these, time is by the clock."""
     with tempfile.TemporaryDirectory() as folder:
         counts = (f"data.reader.views={photos + 1}", f"data.reader.train={photos}", f"fit.iterations={iterations}")
         program = [sys.executable, "-m", "clear_strategies.run", *_RUN, *counts, f"hydra.run.dir={folder}/run"]
         child = subprocess.Popen(program, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # noqa: S603 - this interpreter
         _, status, used = os.wait4(child.pid, 0)
         child.returncode = os.waitstatus_to_exitcode(status)
-    if child.returncode:
-        raise DataError("--photos", str(photos), f"its run ended with code {child.returncode}", " ".join(program[1:-1]))
-    return "photos", photos, 1e3 * (used.ru_utime + used.ru_stime), used.ru_maxrss / _MIB
+        if child.returncode:
+            problem = f"its run ended with code {child.returncode}"
+            raise DataError("--photos", str(photos), problem, " ".join(program[1:-1]))
+        stages = pd.read_csv(f"{folder}/run/timing.csv").query("seconds > 0")
+    peak = int(stages["peak_mib"].max())
+    rows: list[tuple[Any, ...]] = [("photos", photos, 1e3 * (used.ru_utime + used.ru_stime), peak)]
+    return rows + [(s.stage, photos, 1e3 * s.seconds, s.peak_mib) for s in stages.itertuples()]

@@ -6,6 +6,7 @@ read when the log is read or once the device has passed them.
 
 from __future__ import annotations
 
+import sys
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping
@@ -17,15 +18,26 @@ import torch
 from jaxtyping import Shaped
 from torch import Tensor
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
+_MIB: Final = 1024 if sys.platform != "darwin" else 1 << 20  # units of ru_maxrss
 _BATCH: Final = 1024  # pairs of events that are kept before those that the device has passed are read
 
 
 @dataclass(slots=True)
 class Entry:
-    """One stage: how often it ran, for how many seconds in all, and how often each reason kept it from running."""
+    """One stage: how often it ran, for how many seconds in all, and how often each reason kept it from running.
+
+    Args:
+        peak: MiB, see `peak_mib`, at its last end.
+    """
 
     runs: int = 0
     seconds: float = 0.0
+    peak: int = 0
     skipped: dict[str, int] = field(default_factory=dict)
 
 
@@ -83,7 +95,9 @@ class WorkLog:
             self._noted = None
 
     def rows(self) -> list[dict[str, str | int | float]]:
-        """One row per stage: runs, ms per run, seconds, skips, and the seconds that these saved at that rate."""
+        """One row per stage: runs, ms per run, seconds, the process's peak of memory until its end, skips, and the seconds
+        that these saved at that rate. The stage whose peak is above that of those before it needs that memory.
+        """
         table: list[dict[str, str | int | float]] = []
         for name, entry in self.entries.items():
             each = entry.seconds / entry.runs if entry.runs else 0.0
@@ -94,6 +108,7 @@ class WorkLog:
                     "runs": entry.runs,
                     "ms_each": round(each * 1e3, 3),
                     "seconds": round(entry.seconds, 3),
+                    "peak_mib": entry.peak,
                     "skipped": skips,
                     "seconds_saved": round(each * skips, 3),
                     "why": "; ".join(f"{reason} ({count}x)" for reason, count in entry.skipped.items()),
@@ -113,6 +128,7 @@ class WorkLog:
     def _ended(self, name: str, start: Any) -> None:
         entry = self._entries.setdefault(name, Entry())
         entry.runs += 1
+        entry.peak = peak_mib()
         if self.device.type == "cuda":
             self._stamped.append((entry, start, _stamp()))
             if len(self._stamped) >= _BATCH:
@@ -130,6 +146,11 @@ class WorkLog:
             entry, start, end = self._stamped.popleft()
             end.synchronize()
             entry.seconds += start.elapsed_time(end) / 1e3
+
+
+def peak_mib() -> int:
+    """The most main memory that the process has held so far, MiB; 0 where the system does not tell."""
+    return 0 if resource is None else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // _MIB
 
 
 class _Stage:

@@ -14,6 +14,7 @@ import torch
 
 from clear_strategies.core.points import PointCloud
 from rasterizers.interface import BackendUnavailable
+from rasterizers.native import threads
 
 _log = logging.getLogger(__name__)
 
@@ -35,7 +36,7 @@ def without_outliers(cloud: PointCloud, neighbours: int, ratio: float) -> PointC
     from scipy.spatial import cKDTree
 
     points = cloud.means.detach().double().cpu().numpy()
-    measure = np.mean(cKDTree(points).query(points, k=neighbours)[0], axis=1)
+    measure = np.mean(cKDTree(points).query(points, k=neighbours, workers=threads())[0], axis=1)
     apart = measure > 0
     # As in Open3D, coinciding points count in n, although not in the deviation's sum.
     average = measure.sum() / n

@@ -24,7 +24,13 @@ from torch.nn.functional import max_pool2d
 from clear_strategies.core.points import PointCloud
 from clear_strategies.core.progress import Progress
 from clear_strategies.core.view import DepthMap, Photo
-from clear_strategies.geometry.projection import back_project, is_background, sample_colors, seen_pixels
+from clear_strategies.geometry.projection import (
+    back_project,
+    each_photo,
+    is_background,
+    sample_colors,
+    seen_pixels,
+)
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
@@ -70,11 +76,9 @@ def grid_points(
         maps: of each photo; only pixels of unknown depth get a point, unless it floats in front of the depth that another
             photo knows. None: no depth is known.
     """
-    added, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
-    done = Progress("depth where stereo finds none", "photos", len(photos))
-    for i, photo in enumerate(photos):
-        done(i)
-        grid, depth_map = pixel_grid(photo, stride), None if maps is None else maps[i]
+
+    def points_in(i: int) -> tuple[Tensor, Tensor]:
+        photo, grid, depth_map = photos[i], pixel_grid(photos[i], stride), None if maps is None else maps[i]
         x, y = grid.long().unbind(dim=1)
         wanted = torch.ones(photo.image.shape[:2], dtype=torch.bool) if photo.shown is None else photo.shown.cpu()
         if depth_map is not None:
@@ -86,15 +90,21 @@ def grid_points(
             grid, shade = grid[surface], shade[surface]
         inverse_depth = _completed(means, photo, grid, 2 * stride, depth_map) if len(grid) else None
         if inverse_depth is None:
-            continue
+            return torch.zeros(0, 3), torch.zeros(0, 3)
         points = back_project(photo.camera, grid, 1 / inverse_depth)
         kept = torch.ones(len(points), dtype=torch.bool)
         for j, other in enumerate(maps or ()):
             if j != i:
                 inside, row, column, depth = seen_pixels(photos[j].camera, points)
                 kept[inside] &= ~(depth < _NEARER * other.depth.cpu()[row, column].double())  # True where it is unknown
-        added.append(points[kept])
-        colors.append(shade[kept])
+        return points[kept], shade[kept]
+
+    added, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
+    progress = Progress("depth where stereo finds none", "photos", len(photos))
+    for points, shades in each_photo(points_in, len(photos)):
+        added.append(points)
+        colors.append(shades)
+        progress(len(added) - 1)
     return torch.cat(added), torch.cat(colors)
 
 

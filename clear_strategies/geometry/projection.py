@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Final
+from typing import Final, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,9 +13,23 @@ from torch import Tensor
 
 from clear_strategies.core.view import Photo
 from rasterizers.interface import Camera, Color
+from rasterizers.native import kernel_threads, threads
 
+T = TypeVar("T")
+
+_AT_ONCE: Final = 4  # photos that are worked on at the same time, at most
 _BEHIND: Final = 0.03  # a camera sees a point whose depth there exceeds the camera's own by at most this share of it
 _SAME_COLOR: Final = 2 / 255  # largest difference of a background pixel from the background's colour
+
+
+def each_photo(work: Callable[[int], T], count: int) -> Iterator[T]:
+    """work(0), …, work(count - 1) in order, of several photos at once: much of such work, as a path through an image, has no use
+    for a second thread, and torch's threads wait for each other by spinning. No more than `_AT_ONCE`, for the memory.
+    """
+    n = threads()
+    at_once = max(1, min(n, count, _AT_ONCE))
+    with kernel_threads(n // at_once), ThreadPoolExecutor(at_once) as pool:
+        yield from pool.map(work, range(count))
 
 
 def intrinsics(camera: Camera) -> Float[Tensor, "3 3"]:

@@ -17,7 +17,7 @@ from clear_strategies.geometry.dense_stereo.cost import Grey, cost_volume, grey
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.dense_stereo.smoothing import smooth
 from clear_strategies.geometry.dense_stereo.sources import Comparison, comparisons, plane_count
-from clear_strategies.geometry.projection import is_background, seen_pixels
+from clear_strategies.geometry.projection import each_photo, is_background, seen_pixels
 from clear_strategies.geometry.sift import features_of
 from rasterizers.interface import Color
 
@@ -81,16 +81,19 @@ def _estimates(
 ) -> list[Estimate | None]:
     """The depth of each photo at its pixels, from its own plane sweep; None without photos to compare it with."""
     greys = [grey(photo, settings.enlarge, settings.max_pixels) for photo in photos]
+
+    def estimate(i: int) -> Estimate | None:
+        comparison = compared[i]
+        if not (others := [greys[j] for j in comparison.others[: settings.sources]]):
+            return None
+        _log.debug("stereo: photo %d against %s.", i, comparison.others[: settings.sources])
+        return _on_photo(plane_sweep(greys[i], others, comparison, settings), photos[i])
+
     estimates: list[Estimate | None] = []
     progress = Progress("depth by stereo", "photos", len(photos))
-    for i, (photo, comparison) in enumerate(zip(photos, compared, strict=True)):
-        others = [greys[j] for j in comparison.others[: settings.sources]]
-        if not others:
-            estimates.append(None)
-            continue
-        estimates.append(_on_photo(plane_sweep(greys[i], others, comparison, settings), photo))
-        _log.debug("stereo: photo %d against %s.", i, comparison.others[: settings.sources])
-        progress(i + 1)
+    for found in each_photo(estimate, len(photos)):
+        estimates.append(found)
+        progress(len(estimates))
     return estimates
 
 
