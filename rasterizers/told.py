@@ -10,6 +10,7 @@ import operator
 from collections.abc import Callable
 from typing import Any, Final, TypeVar, cast
 
+from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
 from rasterizers.recording import running
@@ -78,7 +79,7 @@ def _method(kind: Callable[..., Any], by: Callable[..., Any], *, reflected: bool
     """A method that Python calls for an operator."""
 
     def called(self: Guarded, *other: Any) -> Any:
-        if any(isinstance(x, Unread) for x in other):
+        if any(isinstance(x, (Unread, Tensor)) for x in other):  # a tensor would keep this number
             self._refuse()
         return kind(self, (lambda x, y: by(y, x)) if reflected else by, *other)
 

@@ -264,7 +264,7 @@ class ByTime(cs.Strategy):
         keep = {
             "a milestone": lambda: 0.5 if t > 8 else 1.0, "periods": lambda: 0.5 if -(-t // 5) >= 2 else 1.0,
             "every second": lambda: 0.5 if t % 2 else 1.0, "a number": lambda: 1 / float(t),
-            "torch": lambda: float((torch.ones(1) * t)[0]) / 100, "a key": lambda: {4: 0.5}.get(t, 1.0),
+            "torch": lambda: float((torch.ones(1) * t)[0]) / 100, "a tensor": lambda: (t > torch.ones(len(products.dot))).double(), "a key": lambda: {4: 0.5}.get(t, 1.0),
             "the name": lambda: 0.5 if name.endswith("1") else 1.0, "the name as a key": lambda: {"view0": 0.5}.get(name, 1.0),
         }  # fmt: skip
         return cs.Weights(keep=keep[self.reads]() if self.reads in keep else 1.0)
@@ -281,7 +281,7 @@ def test_what_a_strategy_decides_by_the_iteration_holds_in_replays_or_they_are_r
 
 
 @pytest.mark.parametrize(
-    "reads", ["every second", "a number", "torch", "a key", "the name", "the name as a key", "an anchor"]
+    "reads", ["every second", "a number", "torch", "a tensor", "a key", "the name", "the name as a key", "an anchor"]
 )
 def test_a_strategy_that_reads_the_iteration_or_the_view_is_live(reads, caplog):
     replayed = both(lambda: start(reconciles=ByTime(reads), density=False, rises_at=2), 16)
