@@ -264,7 +264,8 @@ class ByTime(cs.Strategy):
         keep = {
             "a milestone": lambda: 0.5 if t > 8 else 1.0, "periods": lambda: 0.5 if -(-t // 5) >= 2 else 1.0,
             "every second": lambda: 0.5 if t % 2 else 1.0, "a number": lambda: 1 / float(t),
-            "torch": lambda: float((torch.ones(1) * t)[0]) / 100, "a tensor": lambda: (t > torch.ones(len(products.dot))).double(), "a key": lambda: {4: 0.5}.get(t, 1.0),
+            "torch": lambda: float((torch.ones(1) * t)[0]) / 100, "a key": lambda: {4: 0.5}.get(t, 1.0),
+            "a tensor": lambda: 0.5 + 0.5 * (t > torch.ones(len(products.dot))),
             "the name": lambda: 0.5 if name.endswith("1") else 1.0, "the name as a key": lambda: {"view0": 0.5}.get(name, 1.0),
         }  # fmt: skip
         return cs.Weights(keep=keep[self.reads]() if self.reads in keep else 1.0)
