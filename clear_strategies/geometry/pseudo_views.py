@@ -161,10 +161,8 @@ def _front(camera: Camera, sources: Sequence[_Source]) -> Float[Tensor, "h w"]:
     front = torch.full((outside + 1,), torch.inf)
     for s in sources:
         x, y, depth = _projected(s.points, s.photo.camera, camera)
-        column, row = (
-            x.add_(0.5).floor_(),
-            y.add_(0.5).floor_(),
-        )  # of the lower right of its pixels, after a border of one
+        # Of the lower right one of its pixels, after a border of one.
+        column, row = x.add_(0.5).floor_(), y.add_(0.5).floor_()
         inside = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
         place = torch.where(inside, row.mul_(width).add_(column), outside).long()
         front.scatter_reduce_(0, place, depth, "amin")

@@ -33,9 +33,6 @@ from rasterizers.native import threads
 
 PSNR_CAP: Final = 100.0  # dB, the PSNR of identical images
 _GMSD_C: Final = 170 / 255**2
-_PREWITT: Final = 3.0  # the sum of one side of the filter
-_BLUR: Final = 11  # px, of the box that `_blur` compares with
-_INNER: Final = np.s_[2:-1, 2:-1]
 _LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
 
 
@@ -105,17 +102,9 @@ def _grey(image: Float[Tensor, "H W 3"]) -> np.ndarray:
 
 
 def _blur(grey: np.ndarray) -> float:
-    """How little sharpness is left to lose: 1 - what blurring takes of all edges along an axis, of the blurrier one. It is
-    scikit-image's `blur_effect`, by SciPy's filters in a third of the time.
-    """
-    from scipy.ndimage import sobel, uniform_filter1d
+    from skimage.measure import blur_effect
 
-    of_axes = []
-    for axis in (0, 1):
-        sharp, blurred = (np.abs(sobel(image, axis)) for image in (grey, uniform_filter1d(grey, _BLUR, axis)))
-        taken = np.maximum(sharp - blurred, 0)
-        of_axes.append(1 - taken[_INNER].sum() / max(sharp[_INNER].sum(), np.finfo(float).tiny))
-    return float(max(of_axes))
+    return float(blur_effect(grey))
 
 
 def _gmsd(gx: np.ndarray, gy: np.ndarray, shown: Bool[Tensor, "H W"] | None) -> float:
@@ -126,10 +115,10 @@ def _gmsd(gx: np.ndarray, gy: np.ndarray, shown: Bool[Tensor, "H W"] | None) -> 
 
 def _gradient_at_half_size(image: np.ndarray) -> np.ndarray:
     """Prewitt's gradient magnitude."""
-    from scipy.ndimage import prewitt
+    from skimage.filters import prewitt_h, prewitt_v
 
-    half = _at_half_size(image) / _PREWITT
-    return np.asarray(np.hypot(prewitt(half, 0), prewitt(half, 1)))
+    half = _at_half_size(image)
+    return np.asarray(np.hypot(prewitt_h(half), prewitt_v(half)))
 
 
 def _at_half_size(image: np.ndarray) -> np.ndarray:
