@@ -78,8 +78,11 @@ def test_a_mistake_is_told_with_its_remedy(row: dict[str, str], folder: Path) ->
     ended = command_line.run(*shlex.split(row["command"]), cwd=folder)
     assert ended.returncode == int(row["code"]), ended.stdout + ended.stderr
     told = list(filter(None, (ended.stdout + ended.stderr).splitlines()))
-    # The last but one on a slow machine, the last before a run of photos.
-    progress = r".*: estimating the poses|features of |matching |placing |SR |.*: \d+ of \d+ |clear-strategies \+"
+    # The last but one on a slow machine, the last before a run, and "clear-strategies" before one of photos.
+    progress = (
+        r".*: estimating the poses|features of |matching |placing |SR |.*: \d+ of \d+ |clear-strategies \+"
+        r"|  (data|strategies|iterations)  "
+    )
     error = [line for line in told if not re.match(progress, line)]
     assert 1 <= len(error) <= 3, told
     assert row["message"] in " ".join(error)

@@ -101,7 +101,7 @@ def grid_points(
 
     added, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
     progress = Progress("depth where stereo finds none", "photos", len(photos))
-    for points, shades in each_photo(points_in, len(photos)):
+    for points, shades in each_photo(points_in, photos):
         added.append(points)
         colors.append(shades)
         progress(len(added) - 1)

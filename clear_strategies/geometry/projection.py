@@ -22,11 +22,14 @@ _BEHIND: Final = 0.03  # a camera sees a point whose depth there exceeds the cam
 _SAME_COLOR: Final = 2 / 255  # largest difference of a background pixel from the background's colour
 
 
-def each_photo(work: Callable[[int], T], count: int) -> Iterator[T]:
-    """work(0), …, work(count - 1) in order, of several photos at once: much of such work, as a path through an image, has no use
-    for a second thread, and torch's threads wait for each other by spinning. No more than `_AT_ONCE`, for the memory.
+def each_photo(work: Callable[[int], T], photos: Sequence[Photo]) -> Iterator[T]:
+    """work(0), work(1), … in order, for each photo; on the CPU of several at once: much of such work, as a path through an image,
+    has no use for a second thread, and torch's threads wait for each other by spinning. No more than `_AT_ONCE`, for the memory.
     """
-    n = threads()
+    n, count = threads(), len(photos)
+    if any(photo.image.device.type != "cpu" for photo in photos):
+        yield from map(work, range(count))
+        return
     at_once = max(1, min(n, count, _AT_ONCE))
     with kernel_threads(n // at_once), ThreadPoolExecutor(at_once) as pool:
         yield from pool.map(work, range(count))

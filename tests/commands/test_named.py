@@ -100,7 +100,7 @@ def hydra_undone(monkeypatch) -> Iterator[None]:
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        *((f"{group}=clear", rf"^{group}: .* it is added: \+{group}=") for group in ("strategy", "method", "readings")),
+        *((f"{group}=clear", rf"^{group}: .* it is added: \+{group}=") for group in ("strategy", "method")),
         ("fit.nothing_like_it=1", r"fit\.nothing_like_it: there is no such setting\. clear-strategies --cfg job"),
         (
             "data.path=here",

@@ -91,7 +91,7 @@ def _estimates(
 
     estimates: list[Estimate | None] = []
     progress = Progress("depth by stereo", "photos", len(photos))
-    for found in each_photo(estimate, len(photos)):
+    for found in each_photo(estimate, photos):
         estimates.append(found)
         progress(len(estimates))
     return estimates
