@@ -126,7 +126,10 @@ def test_the_noise_of_mcmc(by_warp, monkeypatch):
         return means
 
     found, expected = by_warp(moved)
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+    size = torch.linalg.vector_norm(expected - numbers(N, 3), dim=1, keepdim=True)
+    assert (
+        float(((found - expected).abs() / (1 + size)).max()) <= 1e-5
+    )  # a small part of a rotated row has the rounding of its largest
 
 
 def test_the_kernels_compile_for_cuda_on_a_machine_without(ptx_of):
