@@ -172,13 +172,8 @@ class _View:
         found = []
         if "RGB" in self.render_mode and self.sh_degree is not None:
             behind = [0.0] * 3 if self.background is None else self.background.tolist()
-            rendered = render(
-                over(self.rasterizer, cast(Any, tuple(behind))),
-                self.inputs,
-                (self.sh_degree + 1) ** 2,
-                self.camera,
-                depth=False,
-            )
+            rasterizer, bands = over(self.rasterizer, cast(Any, tuple(behind))), (self.sh_degree + 1) ** 2
+            rendered = render(rasterizer, self.inputs, bands, self.camera, depth=False)
             found.append(_Part(rendered, self.inputs, 0.0, 1.0, 3))
         elif "RGB" in self.render_mode:
             found += [self._channels(*x) for x in self._threes()]

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
-from typing import Any, Final, TypeVar, cast
+from typing import Any, Final, cast
 
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
 from rasterizers.recording import running
-
-T = TypeVar("T")
 
 
 class Unread:

@@ -15,7 +15,7 @@ from scipy.special import expit
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.errors import DataError
 from clear_strategies.jobs.saved import overview
-from rasterizers.geometry import SH_C0
+from rasterizers.geometry import constant_band
 from rasterizers.interface import Camera, Splats
 
 SETTINGS: Final = {"kernel": 0.3, "near": 0.01, "alpha_max": 0.999, "antialiased": True}
@@ -67,7 +67,7 @@ def surfaces(name: str, n: int, width: int, height: int, *, radius: float, seed:
     shuffled = random.permutation(n)  # a trained field has no order
     parts = [points, quats, scales, expit(random.normal(0.8, 2.2, n)), colors, random.normal(0, 0.02, (n, _BANDS, 3))]
     tensors = [torch.from_numpy(x[shuffled]).float() for x in parts]
-    tensors[4] = ((tensors[4] - 0.5) / SH_C0)[:, None]
+    tensors[4] = constant_band(tensors[4])
     return Workload(name, Splats(*tensors), Camera(_pose(), focal, focal, width / 2, height / 2, width, height))
 
 

@@ -77,9 +77,8 @@ class Replays:
     def __init__(self, device: torch.device, work_log: WorkLog, name: str) -> None:
         self._device, self._work_log, self._name = device, work_log, name
         self._recorded: dict[Kind, Any] = {}  # None: to be recorded
-        self._done: set[tuple[Any, ...]] = (
-            set()
-        )  # what work that was live has in common with such whose tensors lie elsewhere
+        # What work that was live has in common with such whose tensors lie elsewhere.
+        self._done = set[tuple[Any, ...]]()
         self._addresses: tuple[int, ...] = ()
         self._moves = 0  # changes of these since the last replay
         self._turns = 0  # how often a recording did not hold at its iteration

@@ -17,7 +17,7 @@ from clear_strategies.core.points import PointCloud, spread
 from clear_strategies.core.view import View
 from clear_strategies.kernels import per_gaussian
 from clear_strategies.training.mip import NEAR, filter_std
-from rasterizers.geometry import SH_C0
+from rasterizers.geometry import constant_band
 from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats
 
 _INITIAL_OPACITY: Final = 0.1
@@ -70,7 +70,7 @@ class GaussianField(nn.Module):
                 "quats": quats,
                 "scales": _neighbour_distance(means).log()[:, None].expand(n, 3),
                 "opacities": torch.logit(torch.full((n,), _INITIAL_OPACITY)),
-                "sh0": (cloud.colors.float()[:, None] - 0.5) / SH_C0,
+                "sh0": constant_band(cloud.colors.float()),
                 "shN": torch.zeros(n, (max_degree + 1) ** 2 - 1, 3),
                 "detail": torch.zeros(n, 3),
             }

@@ -16,7 +16,7 @@ from torch import Tensor
 from clear_strategies import files
 from clear_strategies.errors import SettingError
 from clear_strategies.training.field import GaussianField
-from rasterizers.geometry import SH_C0
+from rasterizers.geometry import constant_band, depths
 from rasterizers.interface import Camera, Rasterizer
 
 _SOLID: Final = 0.5  # a pixel has a depth where the Gaussians cover at least this share of it
@@ -57,8 +57,8 @@ class Painter:
     @torch.no_grad()
     def depth(self, camera: Camera) -> Float[Tensor, "H W"]:
         """Mean depth z of what a pixel shows, world units; nan where less than half of it is covered."""
-        pose = camera.world_to_camera.to(self.field.means)
-        z = (self.field.means.data @ pose[2, :3]) + pose[2, 3]
+        means = self.field.means.data
+        z = depths(means, camera.world_to_camera.to(means))
         drawn = self.numbers(camera, torch.stack([z, torch.ones_like(z), torch.zeros_like(z)], dim=1))
         z_sum, alpha = drawn[..., 0], drawn[..., 1]
         return torch.where(alpha >= _SOLID, z_sum / alpha.clamp_min(_SOLID), torch.nan).cpu()
@@ -67,7 +67,7 @@ class Painter:
     def numbers(self, camera: Camera, values: Float[Tensor, "N 3"]) -> Float[Tensor, "H W 3"]:
         """Three numbers >= 0 per Gaussian, blended as colours are; 0 where nothing is. On the device of the field."""
         splats = self.field.baked()
-        painted = replace(splats, sh0=((values - 0.5) / SH_C0)[:, None], shN=splats.shN[:, :0], rgb_offset=None)
+        painted = replace(splats, sh0=constant_band(values), shN=splats.shN[:, :0], rgb_offset=None)
         return self._over_black(painted, camera).image
 
 
