@@ -120,7 +120,9 @@ def test_an_iteration_is_measured_with_and_without_hr():
     assert math.isnan(table.loc["backward HR", "lr_only_ms"])
 
 
-def test_growth_has_an_exponent_for_each_step_and_none_across_what_grows():
+def test_growth_has_an_exponent_for_each_step_and_none_across_what_grows(monkeypatch):
+    for name, size in {"_WIDTH": 96, "_GAUSSIANS": 100}.items():
+        monkeypatch.setattr(scale, name, size)
     table = measured(scale, gaussians=[200, 100], widths=[96], photos=[], iterations=1, repeats=1).tables["scale"]
     assert list(table["size"]) == [100, 200, 96 * 72]
     assert [math.isnan(p) for p in table["exponent"]] == [True, False, True]
