@@ -41,8 +41,9 @@ def compare(runs: Sequence[FinishedRun]) -> pd.DataFrame:
     tables = [_summary(rows) for _, rows in single.groupby("scene", sort=False)]
     # Scores against LR photos, or of training views, are not averaged with others.
     for marks, alike in single.groupby("marks", sort=False):
-        if (count := alike["scene"].nunique()) > 1:
-            tables.append(_average(alike, f"average of {count} scenes" + (f" ({marks})" if marks else "")))
+        title = f"average of {alike['scene'].nunique()} scenes" + (f" ({marks})" if marks else "")
+        if alike["scene"].nunique() > 1 and len(comparable := _of_all_scenes(alike, title)):
+            tables.append(_average(comparable, title))
     return pd.concat(tables, ignore_index=True).astype({"psnr_delta_pairs": "Int64"})
 
 
@@ -144,13 +145,18 @@ def _summary(single: pd.DataFrame) -> pd.DataFrame:
     return table.join(_differences(single, "key", table["psnr"])).reset_index(drop=True)
 
 
-def _average(single: pd.DataFrame, title: str) -> pd.DataFrame:
-    """A row for each method that all scenes have."""
-    scenes = single["scene"].nunique()
-    complete = single.groupby("identity", sort=False)["scene"].nunique() == scenes
-    if left_out := list(dict.fromkeys(single.loc[~single["identity"].map(complete), "method"])):
+def _of_all_scenes(single: pd.DataFrame, title: str) -> pd.DataFrame:
+    """The runs of the methods that all scenes have."""
+    scenes = single.groupby("identity", sort=False)["scene"].nunique()
+    complete = single["identity"].map(scenes == single["scene"].nunique())
+    if left_out := list(dict.fromkeys(single.loc[~complete, "method"])):
         _log.info("%s: left out, because not all scenes have it: %s.", title, "; ".join(left_out))
-    single = single[single["identity"].map(complete)]
+    return single[complete]
+
+
+def _average(single: pd.DataFrame, title: str) -> pd.DataFrame:
+    """A row for each method, each of which all scenes have."""
+    scenes = single["scene"].nunique()
     means = single.groupby(["identity", "scene"], sort=False)[[*_QUANTITIES]].mean().groupby("identity", sort=False)
     # A quantity that one scene lacks has no average.
     table = means.mean().where(means.count() == scenes).assign(average=True, runs=0, seeds="", scene=title)

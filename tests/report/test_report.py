@@ -248,6 +248,12 @@ def test_scenes_with_different_data_settings_are_averaged(tmp_path: Path) -> Non
     assert list(averages_of(tmp_path).index) == ["baseline", "gco"]
 
 
+def test_scenes_that_share_no_method_have_no_average(tmp_path: Path) -> None:
+    for scene, strategy in (("fern", "baseline"), ("horns", "gco")):
+        make_run(tmp_path / scene, f"+strategy={strategy}", scene=scene)
+    assert [line["scene"] for line in cells(table_of(tmp_path))] == ["fern", "horns"]
+
+
 def test_the_papers_numbers_stand_beside_ours(tmp_path: Path) -> None:
     """Means over scenes of means over seeds, rows of other settings below each other; not for other data or other views."""
     chosen = {"fern": "scene: fern", "horns": "protocol: llff_x4", "demo": "data: demo"}
