@@ -76,15 +76,15 @@ def rasterization(
             centres along the camera's axis, the last channel, and has gradients.
         packed: `info` is that of the visible Gaussians of each camera, one after the other. gsplat's default is True, and here
             False, since on a CPU its ellipses take half as long as the image.
-        absgrad: after `backward()`, `info["means2d"].absgrad` is the sum over pixels of absolute gradients. Those of channels that
-            are not drawn together are summed apart.
+        absgrad: after `backward()`, `info["means2d"].absgrad` is the sum over pixels of absolute gradients. Those of channels
+            that are not drawn together are summed apart.
         more: gsplat's other arguments. Those that change only how it computes have no effect.
         backend: a name of `rasterizers.load`.
         rgb_offset: added to the colours before their clamp at 0, with `sh_degree` only; gsplat has no such argument.
 
     Returns:
-        images, alphas, and `info`: `means2d` [*B, C, N, 2] (`retain_grad` works); `radii` [*B, C, N, 2] in pixels, `depths`, `conics`
-        and `opacities` of the visible, 0 of others, made when they are asked for; and `width`, `height`, `n_cameras`,
+        images, alphas, and `info`: `means2d` [*B, C, N, 2] (`retain_grad` works); `radii` [*B, C, N, 2] in pixels, `depths`,
+        `conics` and `opacities` of the visible, 0 of others, made when they are asked for; and `width`, `height`, `n_cameras`,
         `n_batches`, `tile_size`. Packed, of M visible Gaussians: `means2d` [M, 2], `gaussian_ids`,
         `camera_ids` and `batch_ids` [M], and in the graph of what they depend on, `depths` [M], `conics` [M, 3] and `opacities`
         [M], times the factor of `rasterize_mode="antialiased"`; `radii` [M, 2] in pixels.

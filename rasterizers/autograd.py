@@ -48,8 +48,8 @@ class Drawn(NamedTuple):
     """An image, and its depth if `draw` had `depth=True`, in the autograd graph of their splats.
 
     Args:
-        depth: the expected depth, see `rasterizers.interface.Rendering.depth`. A loss may depend on it where the rasterizer has the
-            trait `depth_gradient`.
+        depth: the expected depth, see `rasterizers.interface.Rendering.depth`. A loss may depend on it where the rasterizer has
+            the trait `depth_gradient`.
         means2d: projected centres, pixels. After `backward()` its `.grad` is the screen gradient in 1/pixel; the gradient
             of the positions does not pass through it.
     """
@@ -129,8 +129,8 @@ def draw(
 ) -> Drawn:
     """Draw the splats. Gradients flow from the image, its alpha and its depth to the splats' tensors and the pose.
 
-    Without the trait `depth_gradient`, depth has none, and a loss of alpha draws the splats a second time, over another background,
-    and takes a second backward pass.
+    Without the trait `depth_gradient`, depth has none, and a loss of alpha draws the splats a second time, over another
+    background, and takes a second backward pass.
 
     Args:
         means2d: a tensor that receives the projected centres and whose `.grad` will be the screen gradient; None makes one.

@@ -119,8 +119,8 @@ def of_accumulated(
         drawn = getattr(rendering, name)
         if cotangent is not None and (drawn is None or cotangent.dim() != 3 or cotangent.shape[1:] != drawn.shape):
             raise ValueError(
-                f"the cotangents of {name} must be [K, {', '.join(map(str, rendering.alpha.shape))}] and it must have been drawn, "
-                f"got {tuple(cotangent.shape)} of a rendering {'without' if drawn is None else 'with'} {name}."
+                f"cotangents of {name} must be [K, {', '.join(map(str, rendering.alpha.shape))}] of a rendering that has it, "
+                f"got {tuple(cotangent.shape)} of one {'without; draw with depth=True' if drawn is None else 'with it'}."
             )
     like = rendering.alpha
     alpha = None if alpha is None else alpha.detach().to(like)

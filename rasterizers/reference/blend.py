@@ -104,8 +104,8 @@ def blend_vjp(
     *,
     absgrad: bool = False,
 ) -> tuple[Float[Tensor, "K M1 W"], Float[Tensor, "K M1 2"] | None]:
-    """Gradient of Σ v·image + v_α·(1 - T_end) with respect to the table, back to front, and the sums of its absolute values by the
-    centre.
+    """Gradient of Σ v·image + v_α·(1 - T_end) with respect to the table, back to front, and the sums of its absolute values by
+    the centre.
 
     With s_i = c_i·v and `behind` = Σ_{j>i} T_j α_j s_j + T_end (background·v - v_α):  ∂/∂α_i = T_i s_i - behind / (1 - α_i).
 

@@ -143,7 +143,7 @@ def test_a_loss_of_the_image_has_the_gradient_of_the_vjp(depth):
 def test_losses_of_depth_and_of_gradients_and_splats_changed_in_place_are_refused_rather_than_left_out():
     drawn = autograd.draw(WithoutDepthGradient(), leaves(scene(60)), camera(40, 30), depth=True)
     with pytest.raises(
-        NotImplementedError, match="the loss depends on a rendered depth, which has no gradient in WithoutDepthGradient"
+        NotImplementedError, match="the loss depends on a rendered depth, which has no gradient in Without"
     ):
         (drawn.image.sum() + drawn.depth.sum()).backward()
     splats = leaves(scene(60))
