@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,21 +26,23 @@ class _Ahead(threading.local):
     wanted: Camera | None = None
     kept: tuple[tuple[Any, ...], Rendering, Splats] | None = None
 
-    def draw(self, rasterizer: Rasterizer, splats: Splats, camera: Camera) -> Rendering:
+    def draw(self, rasterizer: Rasterizer, splats: Splats, camera: Camera, depth: bool) -> Rendering:
         """The image, from `kept` where it lies there."""
-        if self.kept is not None and self.kept[0] == _shown(rasterizer, splats, camera):
+        if self.kept is not None and self.kept[0] == _shown(rasterizer, splats, camera, depth):
             rendering, self.kept = self.kept[1], None
             return rendering
+        drawing = functools.partial(rasterizer, depth=True) if depth else rasterizer
         wanted = self.wanted
         if wanted is None or camera.world_to_camera.tolist() != wanted.world_to_camera.tolist():
-            return rasterizer(splats, camera)
+            return drawing(splats, camera)
         self.wanted = None
         plain = replace(splats, rgb_offset=None)
         if splats.rgb_offset is None and _grid(camera) == _grid(wanted):  # it is this one
-            return rasterizer(splats, camera)
+            return drawing(splats, camera)
         other = replace(wanted, world_to_camera=camera.world_to_camera)  # by the same tensor, as a backend sees at once
-        ahead, rendering = rasterizer.render_scales([(plain, other), (splats, camera)])
-        self.kept = _shown(rasterizer, plain, other), ahead, plain
+        together = functools.partial(rasterizer.render_scales, depth=[True] * 2) if depth else rasterizer.render_scales
+        ahead, rendering = together([(plain, other), (splats, camera)])
+        self.kept = _shown(rasterizer, plain, other, depth), ahead, plain
         return rendering
 
 
@@ -50,11 +53,11 @@ def _grid(camera: Camera) -> tuple[float, ...]:
     return camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
 
 
-def _shown(rasterizer: Rasterizer, splats: Splats, camera: Camera) -> tuple[Any, ...]:
+def _shown(rasterizer: Rasterizer, splats: Splats, camera: Camera, depth: bool) -> tuple[Any, ...]:
     """What an image shows: equal for equal images, as long as the tensors are alive."""
     tensors = (getattr(splats, field.name) for field in fields(Splats))
     memory = [None if x is None else (x.data_ptr(), x.shape, x.stride(), x._version) for x in tensors]
-    return rasterizer, memory, _grid(camera), camera.world_to_camera.tolist()
+    return rasterizer, memory, _grid(camera), camera.world_to_camera.tolist(), depth
 
 
 @contextmanager
@@ -72,6 +75,6 @@ def drawing_ahead(viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width:
         _ahead.wanted = _ahead.kept = None
 
 
-def draw_or_take(rasterizer: Rasterizer, splats: Splats, camera: Camera) -> Rendering:
+def draw_or_take(rasterizer: Rasterizer, splats: Splats, camera: Camera, *, depth: bool) -> Rendering:
     """The image, or the same that was drawn ahead."""
-    return _ahead.draw(rasterizer, splats, camera)
+    return _ahead.draw(rasterizer, splats, camera, depth)

@@ -1,13 +1,14 @@
 """`rasterization` with the signature of gsplat's, for a loop that was written for gsplat: on a CPU, or on CUDA in its place.
 
 A picture is drawn three channels at a time. The first three are the spherical harmonics, or the first of the colours; every other
-channel is a number of each Gaussian, as the depth of its centre is and the 1 whose picture is alpha.
+channel is a number of each Gaussian. Depth is drawn with the first three, or, by a backend without the trait `depth_gradient`, as
+two more channels: the depth of the centre, and the 1 whose picture is alpha.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Final, cast
@@ -19,7 +20,8 @@ from torch import Tensor
 import rasterizers
 from rasterizers.autograd import Inputs, Rendered, in_graph, render, uncompiled
 from rasterizers.geometry import constant_band, depths, low_and_span
-from rasterizers.interface import Camera, Rasterizer, RasterSettings, over
+from rasterizers.interface import Camera, Rasterizer, RasterSettings, WithRadii, over
+from rasterizers.native import empty_for
 from rasterizers.reference.projection import footprints
 
 __all__ = ["cameras_of", "rasterization", "rasterizer_of"]
@@ -27,6 +29,7 @@ __all__ = ["cameras_of", "rasterization", "rasterizer_of"]
 _MODES: Final = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 _FARTHEST: Final = 1e10  # gsplat's default
 _ALPHA_MAX: Final = 0.999  # gsplat's cap on a single contribution; Inria's, and our default, is 0.99
+_REACH: Final = 3.33  # standard deviations: gsplat's bound of a Gaussian's box
 # The only value of each other argument that this package draws; None for one that is not listed. The others change the speed.
 _SUPPORTED: Final = {
     "camera_model": "pinhole", "with_ut": False, "with_eval3d": False, "rolling_shutter": "GLOBAL", "distributed": False,
@@ -73,16 +76,16 @@ def rasterization(
             centres along the camera's axis, the last channel, and has gradients.
         packed: `info` is that of the visible Gaussians of each camera, one after the other. gsplat's default is True, and here
             False, since on a CPU its ellipses take half as long as the image.
-        absgrad: after `backward()`, `info["means2d"].absgrad` is the sum over pixels of absolute gradients. Those of the colours
-            and of depth or further channels are summed apart.
+        absgrad: after `backward()`, `info["means2d"].absgrad` is the sum over pixels of absolute gradients. Those of channels
+            that are not drawn together are summed apart.
         more: gsplat's other arguments. Those that change only how it computes have no effect.
         backend: a name of `rasterizers.load`.
         rgb_offset: added to the colours before their clamp at 0, with `sh_degree` only; gsplat has no such argument.
 
     Returns:
-        images, alphas, and `info`: `means2d` [*B, C, N, 2] (`retain_grad` works), `radii` [*B, C, N, 2] (1 for the visible, 0 for
-        the others), `depths`, `conics` and `opacities` of the visible, 0 of others, made when they are asked for, and `width`,
-        `height`, `n_cameras`, `n_batches`, `tile_size`. Packed, of M visible Gaussians: `means2d` [M, 2], `gaussian_ids`,
+        images, alphas, and `info`: `means2d` [*B, C, N, 2] (`retain_grad` works); `radii` [*B, C, N, 2] in pixels, `depths`,
+        `conics` and `opacities` of the visible, 0 of others, made when they are asked for; and `width`, `height`, `n_cameras`,
+        `n_batches`, `tile_size`. Packed, of M visible Gaussians: `means2d` [M, 2], `gaussian_ids`,
         `camera_ids` and `batch_ids` [M], and in the graph of what they depend on, `depths` [M], `conics` [M, 3] and `opacities`
         [M], times the factor of `rasterize_mode="antialiased"`; `radii` [M, 2] in pixels.
 
@@ -169,16 +172,20 @@ class _View:
     render_mode: str
 
     def parts(self) -> list[_Part]:
-        found = []
+        found: list[_Part] = []
+        means, wants_depth = self.inputs.means, self.render_mode != "RGB"
+        depth = wants_depth and self.rasterizer.traits.depth_gradient  # with the first of the parts
         if "RGB" in self.render_mode and self.sh_degree is not None:
             behind = [0.0] * 3 if self.background is None else self.background.tolist()
             rasterizer, bands = over(self.rasterizer, cast(Any, tuple(behind))), (self.sh_degree + 1) ** 2
-            rendered = render(rasterizer, self.inputs, bands, self.camera, depth=False)
+            rendered = render(rasterizer, self.inputs, bands, self.camera, depth=depth)
             found.append(_Part(rendered, self.inputs, 0.0, 1.0, 3))
         elif "RGB" in self.render_mode:
-            found += [self._channels(*x) for x in self._threes()]
-        if self.render_mode != "RGB":
-            means = self.inputs.means
+            for three in self._threes():
+                found.append(self._channels(*three, depth=depth and not found))
+        elif depth:
+            found.append(self._channels(torch.zeros_like(means), None, 0, depth=True))
+        if wants_depth and not depth:
             z = depths(means, self.pose.to(means)).clamp_min(0)  # behind the camera nothing is drawn
             found.append(self._channels(torch.stack((z, torch.ones_like(z), torch.zeros_like(z)), 1), None, 2))
         return found
@@ -189,15 +196,17 @@ class _View:
         """The picture, and its alpha."""
         pictures = []
         alpha: Tensor | None = None
+        depth: Tensor | None = None
         for part in parts:
             drawn = in_graph(part.rendered, part.inputs, means2d, rows, pose=self.pose, absgrad=absgrad)
-            alpha = drawn.alpha if alpha is None else alpha
+            alpha, depth = (drawn.alpha, drawn.depth) if alpha is None else (alpha, depth)
             image = drawn.image if (part.low, part.span) == (0.0, 1.0) else part.low + part.span * drawn.image
             pictures.append(image if part.keeps == 3 else image[..., : part.keeps])
         if self.render_mode != "RGB":
-            last = pictures.pop()
-            depth, alpha = last[..., :1], last[..., 1]  # with exact gradients
-            pictures.append(depth / alpha[..., None].clamp_min(1e-10) if "ED" in self.render_mode else depth)
+            if depth is None:
+                accumulated, alpha = pictures.pop().unbind(-1)  # with exact gradients
+                depth = accumulated / alpha.clamp_min(1e-10)
+            pictures.append((depth if "ED" in self.render_mode else depth * cast(Tensor, alpha))[..., None])
         image = pictures[0] if len(pictures) == 1 else torch.cat(pictures, -1)
         if (
             self.background is not None
@@ -219,12 +228,14 @@ class _View:
             keeps = three.shape[1]
             yield torch.nn.functional.pad(three, (0, 3 - keeps)), behind, keeps
 
-    def _channels(self, colors: Float[Tensor, "N 3"], background: Tensor | None, keeps: int) -> _Part:
+    def _channels(
+        self, colors: Float[Tensor, "N 3"], background: Tensor | None, keeps: int, *, depth: bool = False
+    ) -> _Part:
         behind = [0.0] * 3 if background is None else [*background.tolist(), *[0.0] * (3 - len(background))]
         low, span = low_and_span(colors, behind)
         inputs = self.inputs._replace(colors=constant_band((colors - low) / span), rgb_offset=None)
         behind = [(x - low) / span for x in behind]
-        rendered = render(over(self.rasterizer, cast(Any, tuple(behind))), inputs, 1, self.camera, depth=False)
+        rendered = render(over(self.rasterizer, cast(Any, tuple(behind))), inputs, 1, self.camera, depth=depth)
         return _Part(rendered, inputs, low, span, keeps)
 
 
@@ -297,20 +308,28 @@ def _extents(
     opacities: Float[Tensor, " M"], deviations: Float[Tensor, "M 2"], alpha_min: float
 ) -> Float[Tensor, "M 2"]:
     """Half the box in which alpha may reach alpha_min, whole px."""
-    return ((2 * (opacities / alpha_min).log()).clamp_min(0).sqrt()[:, None] * deviations).ceil().clamp_min(1)
+    reach = (2 * (opacities / alpha_min).log()).clamp_min(0).sqrt().clamp_max(_REACH)
+    return (reach[:, None] * deviations).ceil().clamp_min(1)
 
 
 class _Info(dict[str, Any]):
-    """Gsplat's `info`. What a loop seldom reads is made when it is asked for."""
+    """Gsplat's `info`. What not every loop reads is made when it is asked for.
 
-    def __init__(self, values: Mapping[str, Any], ellipses: Any) -> None:
+    Args:
+        later: what makes each of these values, and others besides.
+    """
+
+    def __init__(self, values: Mapping[str, Any], later: Mapping[str, Callable[[], dict[str, Any]]]) -> None:
         super().__init__(values)
-        self._ellipses = ellipses
+        self._later = later
+
+    def __contains__(self, name: object) -> bool:
+        return super().__contains__(name) or name in self._later
 
     def __missing__(self, name: str) -> Any:
-        if name not in ("depths", "conics", "opacities"):
+        if name not in self._later:
             raise KeyError(name)
-        self.update(self._ellipses())
+        self.update(self._later[name]())
         return self[name]
 
 
@@ -321,11 +340,13 @@ def _info(
     means2d = _stacked([rendering.means2d for rendering, *_ in each])
     means2d = means2d.clone() if len(each) == 1 else means2d
     means2d = means2d.view(*lead, *means2d.shape[1:]).requires_grad_()
-    visible = _stacked([rendering.visible for rendering, *_ in each])
-    radii = visible.view(*lead, -1).int()[..., None].expand(*(-1,) * (len(lead) + 1), 2)
+
+    def radii() -> dict[str, Tensor]:
+        found = _stacked([cast(WithRadii, rendering).radii for rendering, *_ in each])
+        return {"radii": found.view(*lead, *found.shape[1:])}
 
     def ellipses() -> dict[str, Tensor]:
-        found: dict[str, list[Tensor]] = {"depths": [], "conics": [], "opacities": []}
+        found: dict[str, list[Tensor]] = {"depths": [], "conics": [], "opacities": [], "radii": []}
         for rendered, view in zip(each, views, strict=True):
             rows = rendered.rendering.visible.nonzero()[:, 0]
             for name, values in _columns(rendered, view.inputs, rows).items():
@@ -335,8 +356,11 @@ def _info(
         return {name: torch.stack(x).view(*lead, *x[0].shape) for name, x in found.items()}
 
     flat = means2d.view(len(each), *means2d.shape[len(lead) :])
-    values = {"means2d": means2d, "radii": radii, "gaussian_ids": None, "camera_ids": None, "batch_ids": None}
-    return _Info(values, ellipses), flat.unbind(), [None] * len(each)
+    values = {"means2d": means2d, "gaussian_ids": None, "camera_ids": None, "batch_ids": None}
+    later = dict.fromkeys(("radii", "depths", "conics", "opacities"), ellipses)
+    if all(rasterizer.traits.radii for _, rasterizer, *_ in each):
+        later["radii"] = radii
+    return _Info(values, later), flat.unbind(), [None] * len(each)
 
 
 def _packed_info(
@@ -372,7 +396,20 @@ def _like_centres(means2d: Tensor, centres: Sequence[Tensor]) -> list[Tensor]:
 
 def _stacked(tensors: Sequence[Tensor]) -> Tensor:
     """One tensor of all; a single one is not copied."""
-    return tensors[0][None] if len(tensors) == 1 else torch.stack(list(tensors))
+    stacked: Tensor = tensors[0][None] if len(tensors) == 1 else _Stack.apply(*tensors)  # type: ignore[no-untyped-call]
+    return stacked
+
+
+class _Stack(torch.autograd.Function):
+    """`torch.stack`, to memory that is used again: fresh pages of eight images cost a tenth of drawing them."""
+
+    @staticmethod
+    def forward(ctx: Any, *tensors: Tensor) -> Tensor:
+        return torch.stack(tensors, out=empty_for((len(tensors), *tensors[0].shape), tensors[0]))
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
+        return gradient.unbind()
 
 
 @dataclass(frozen=True, slots=True)

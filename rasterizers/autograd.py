@@ -21,7 +21,8 @@ from torch.autograd.function import once_differentiable
 
 from rasterizers.ahead import draw_or_take
 from rasterizers.checks import require_absgrad, require_depth
-from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, WithAbsgrad, over
+from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, over
+from rasterizers.native import empty_for
 from rasterizers.pose import pose_gradient
 
 __all__ = ["BackwardHook", "Drawing", "Drawn", "TakeColours", "draw", "outer", "recorded", "uncompiled"]
@@ -47,7 +48,8 @@ class Drawn(NamedTuple):
     """An image, and its depth if `draw` had `depth=True`, in the autograd graph of their splats.
 
     Args:
-        depth: the expected depth, see `rasterizers.interface.Rendering.depth`. A loss must not depend on it.
+        depth: the expected depth, see `rasterizers.interface.Rendering.depth`. A loss may depend on it where the rasterizer has
+            the trait `depth_gradient`.
         means2d: projected centres, pixels. After `backward()` its `.grad` is the screen gradient in 1/pixel; the gradient
             of the positions does not pass through it.
     """
@@ -125,9 +127,10 @@ def draw(
     depth: bool = False,
     colors: Float[Tensor, "N K 3"] | None = None,
 ) -> Drawn:
-    """Draw the splats. Gradients flow from the image and its alpha to the splats' tensors and the pose; depth has none.
+    """Draw the splats. Gradients flow from the image, its alpha and its depth to the splats' tensors and the pose.
 
-    A loss of alpha draws the splats a second time, over another background, and takes a second backward pass.
+    Without the trait `depth_gradient`, depth has none, and a loss of alpha draws the splats a second time, over another
+    background, and takes a second backward pass.
 
     Args:
         means2d: a tensor that receives the projected centres and whose `.grad` will be the screen gradient; None makes one.
@@ -136,7 +139,7 @@ def draw(
 
     Raises:
         ValueError: the rasterizer lacks the trait `depth` that `depth=True` needs.
-        NotImplementedError: in `backward`, if the loss depends on the depth.
+        NotImplementedError: in `backward`, if the loss depends on the depth and the rasterizer lacks `depth_gradient`.
         RuntimeError: in `backward`, if the loss depends on these gradients, e.g. by a gradient penalty.
     """
     if colors is None:
@@ -180,7 +183,7 @@ def render(rasterizer: Rasterizer, inputs: Inputs, bands: int, camera: Camera, *
         require_depth(rasterizer)
     splats = inputs.splats(bands)
     with torch.no_grad():
-        rendering = rasterizer(splats, camera, depth=True) if depth else draw_or_take(rasterizer, splats, camera)
+        rendering = draw_or_take(rasterizer, splats, camera, depth=depth)
     return Rendered(rendering, rasterizer, camera, bands)
 
 
@@ -229,17 +232,20 @@ class _Draw(torch.autograd.Function):
     @staticmethod
     @once_differentiable  # a second derivative would silently be 0
     def backward(ctx: Any, d_image: Tensor | None, d_alpha: Tensor | None, _: None, d_depth: Tensor | None) -> Any:
-        if d_depth is not None and bool(d_depth.any()):  # silence would leave out a part of the loss
+        rendering, rasterizer, camera, bands = ctx.rendered
+        besides = {"alpha": d_alpha, "depth": d_depth}
+        besides = {name: v[None] for name, v in besides.items() if v is not None and bool(v.any())}
+        whole = rasterizer.traits.depth_gradient
+        if "depth" in besides and not whole:  # silence would leave out a part of the loss
             raise NotImplementedError(
-                "the loss depends on a rendered depth, which has no gradient in this package; detach it, or draw with "
-                "gsplat's own rasterization on a GPU."
+                f"the loss depends on a rendered depth, which has no gradient in {type(rasterizer).__name__} (its "
+                "traits.depth_gradient is False); detach it, draw with cpp or torch, or let rasterizers.rasterization draw it."
             )
         take_colours = ctx.hook.reached()
-        rendering, rasterizer, camera, bands = ctx.rendered
         inputs = Inputs(*ctx.saved_tensors)  # raises if one was changed in place since it was drawn
         if d_image is None:
             d_image = torch.zeros_like(rendering.image)
-        if d_alpha is None or not bool(d_alpha.any()):
+        if whole or d_alpha is None or not besides:
             drawn = [(rendering, d_image)]
         else:
             # With C the colour and T = 1 - alpha, I(b) = C + T b. The difference of two backgrounds has the gradient of T.
@@ -249,10 +255,11 @@ class _Draw(torch.autograd.Function):
             d_red[..., 0] = d_alpha / (other[0] - b[0])
             over_other = over(rasterizer, other)(inputs.splats(bands), camera)
             drawn = [(rendering, d_image + d_red), (over_other, -d_red)]
-        if ctx.absgrad is None:
-            each = [image.vjp(cotangent[None]) for image, cotangent in drawn]
-        else:
-            each = [cast(WithAbsgrad, image).vjp(cotangent[None], absgrad=True) for image, cotangent in drawn]
+        more: dict[str, Any] = besides if whole else {}
+        if ctx.absgrad is not None:
+            more = more | {"absgrad": True}
+        each = [cast(Any, image).vjp(cotangent[None], **more) for image, cotangent in drawn]
+        if ctx.absgrad is not None:
             total = sum(g.absgrad[0] for g in each)
             ctx.absgrad.add_(total if ctx.rows is None else total[ctx.rows])
         names = ("screen", "means", "quats", "scales", "opacities", "rgb")
@@ -275,7 +282,7 @@ class _Draw(torch.autograd.Function):
 
 def outer(rgb: Float[Tensor, "N 3"], basis: Float[Tensor, "N B1"], bands: int) -> Float[Tensor, "N K 3"]:
     """The gradient of the colours from its factors, Y ⊗ ∇rgb, for as many bands; those that were not drawn have gradient 0."""
-    drawn = basis[..., None] * rgb[:, None]
+    drawn = torch.mul(basis[..., None], rgb[:, None], out=empty_for((*basis.shape, 3), basis))
     return drawn if bands == basis.shape[1] else torch.nn.functional.pad(drawn, (0, 0, 0, bands - basis.shape[1]))
 
 

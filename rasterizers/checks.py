@@ -107,6 +107,30 @@ def require_cotangents(cotangents: Tensor, image: Tensor) -> None:
         raise ValueError(f"cotangents must be [K, {height}, {width}, 3], got {tuple(cotangents.shape)}.")
 
 
+def of_accumulated(
+    rendering: Rendering, alpha: Float[Tensor, "K H W"] | None, depth: Float[Tensor, "K H W"] | None
+) -> tuple[Float[Tensor, "K H W"] | None, Float[Tensor, "K H W"] | None]:
+    """The cotangents of alpha A and of the accumulated depth D = A E from those of A and of the expected depth E = D / A.
+
+    Raises:
+        ValueError: the rendering has no depth, or a cotangent is not [K, H, W].
+    """
+    for name, cotangent in (("alpha", alpha), ("depth", depth)):
+        drawn = getattr(rendering, name)
+        if cotangent is not None and (drawn is None or cotangent.dim() != 3 or cotangent.shape[1:] != drawn.shape):
+            raise ValueError(
+                f"cotangents of {name} must be [K, {', '.join(map(str, rendering.alpha.shape))}] of a rendering that has it, "
+                f"got {tuple(cotangent.shape)} of one {'without; draw with depth=True' if drawn is None else 'with it'}."
+            )
+    like = rendering.alpha
+    alpha = None if alpha is None else alpha.detach().to(like)
+    if depth is None or rendering.depth is None:
+        return alpha, None
+    d_D = torch.where(like > 0, depth.detach().to(like) / like, 0.0)
+    d_A = -rendering.depth * d_D
+    return d_A if alpha is None else d_A + alpha, d_D
+
+
 def require_depth(rasterizer: Rasterizer) -> None:
     """Raise a ValueError for a rasterizer that draws no depth."""
     if not rasterizer.traits.depth:

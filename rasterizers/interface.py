@@ -22,7 +22,7 @@ from itertools import chain
 from typing import Final, Protocol, cast, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
@@ -206,7 +206,7 @@ class Rendering(Protocol):
 
         E = Σ wᵢ zᵢ / Σ wᵢ with the blending weights wᵢ = Tᵢ αᵢ and the depths zᵢ of the centres along the camera's axis: "ED"
         in gsplat's terms, the accumulated depth "D" divided by alpha. It is 0 where nothing is drawn. Where alpha is small it
-        is that of a few faint Gaussians. It has no gradient.
+        is that of a few faint Gaussians. `WithDepthGradient` has its gradient.
         """
         ...
 
@@ -238,6 +238,9 @@ class Traits:
         native_threads: it computes on the threads of `rasterizers.native`, not on torch's.
         depth: it draws expected depth. Without this trait nobody passes the argument `depth`, so its methods may lack it.
         absgrad: its renderings are `WithAbsgrad`.
+        depth_gradient: its renderings are `WithDepthGradient`. Without this trait alpha's gradient takes a second image, and
+            depth has none.
+        radii: its renderings are `WithRadii`.
     """
 
     devices: frozenset[str]
@@ -245,6 +248,8 @@ class Traits:
     native_threads: bool = False
     depth: bool = False
     absgrad: bool = False
+    depth_gradient: bool = False
+    radii: bool = False
 
 
 class WithAbsgrad(Protocol):
@@ -252,6 +257,36 @@ class WithAbsgrad(Protocol):
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"], *, absgrad: bool = False) -> SplatGradients:
         """See `Rendering.vjp`; with `SplatGradients.absgrad`."""
+        ...
+
+
+class WithDepthGradient(Protocol):
+    """A rendering of a backend with the trait `depth_gradient`."""
+
+    def vjp(
+        self,
+        cotangents: Float[Tensor, "K H W 3"],
+        *,
+        alpha: Float[Tensor, "K H W"] | None = None,
+        depth: Float[Tensor, "K H W"] | None = None,
+    ) -> SplatGradients:
+        """See `Rendering.vjp`; the same K losses have these gradients of `Rendering.alpha` and of `Rendering.depth`; None: 0.
+
+        Raises:
+            ValueError: `depth` is given for a rendering that was drawn without it.
+        """
+        ...
+
+
+class WithRadii(Protocol):
+    """A rendering of a backend with the trait `radii`."""
+
+    @property
+    def radii(self) -> Int[Tensor, "N 2"]:
+        """Half the box of each Gaussian, px, rounded up; 0 for those that are not visible.
+
+        As in gsplat it reaches to where alpha falls below `alpha_min`, at most 3.33 standard deviations.
+        """
         ...
 
 

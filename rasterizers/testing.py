@@ -14,7 +14,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final, cast
 
 import torch
 from torch import Tensor
@@ -50,14 +50,21 @@ def check_rasterizer(make: Make) -> None:
 
 
 def check_gradients_are_finite_differences(make: Make) -> None:
-    """The VJP agrees with finite differences along random directions, for every attribute."""
+    """The VJP agrees with finite differences along random directions, for every attribute.
+
+    With the trait `depth_gradient` the loss is one of alpha and depth, too.
+    """
     rasterizer = make(background=(0.2, 0.5, 0.9), **_SMOOTH)
     dtype = _widest(rasterizer)
     splats, camera = scene(24, dtype=dtype, seed=1), _camera(40, 30)
     g = torch.Generator().manual_seed(2)
-    rendering = rasterizer(splats, camera)
+    whole = rasterizer.traits.depth_gradient
+    draw = _drawing(rasterizer, whole)
+    rendering = draw(splats, camera)
     v = _cotangents(rendering, 1, g)
-    gradients = rendering.vjp(v)
+    # Where little is drawn, depth is far from linear.
+    besides = {name: v[..., c] * rendering.alpha for c, name in enumerate(("alpha", "depth")) if whole}
+    gradients = cast(Any, rendering).vjp(v, **besides)
     step, tolerance = (1e-6, 1e-4) if dtype == torch.float64 else (1e-2, 2e-2)
     for name in _ATTRIBUTES:
         value, gradient = getattr(splats, name), gradient_of(gradients, name)[0]
@@ -67,8 +74,12 @@ def check_gradients_are_finite_differences(make: Make) -> None:
                 direction = direction * value * 0.3
             direction = direction / torch.linalg.vector_norm(direction)
             moved = [replace(splats, **{name: value + s * step * direction}) for s in (1, -1)]
-            ends = [rasterizer(m, camera).image for m in moved]
-            numeric = float(((ends[0] - ends[1]) * v[0]).sum()) / (2 * step)
+            ends = [draw(m, camera) for m in moved]
+            change = sum(
+                float(((getattr(ends[0], of) - getattr(ends[1], of)) * w[0]).sum())
+                for of, w in {"image": v, **besides}.items()
+            )
+            numeric = change / (2 * step)
             analytic = float((gradient * direction).sum())
             scale = max(abs(numeric), float(gradient.abs().max()) * 1e-2, 1e-9)
             require(

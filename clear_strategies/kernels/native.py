@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from types import ModuleType
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.utils.dlpack import from_dlpack
 
 from rasterizers.interface import BackendUnavailable
-from rasterizers.native import load_kernels
+from rasterizers.native import empty, load_kernels
 
 
 def available() -> bool:
@@ -27,13 +25,6 @@ def available() -> bool:
 def module() -> ModuleType:
     """The compiled module for this processor's instruction set; a BackendUnavailable where there is none."""
     return load_kernels("clear_strategies.kernels")
-
-
-def empty(shape: Sequence[int], dtype: torch.dtype = torch.float32) -> Tensor:
-    """Not initialized, in the CPU's memory that another such tensor has left: fresh pages cost more than filling them."""
-    numbers = math.prod(shape) * dtype.itemsize // torch.float32.itemsize
-    x: Tensor = from_dlpack(load_kernels("rasterizers.cpp").Frame.empty((numbers,)))
-    return x.view(dtype).view(*shape)
 
 
 def empty_like(x: Tensor) -> Tensor:

@@ -15,11 +15,11 @@ from itertools import chain
 from typing import Final
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils.dlpack import from_dlpack
 
-from rasterizers.checks import Backend, packed_rows, require_cotangents, require_finite, require_splats
+from rasterizers.checks import Backend, of_accumulated, packed_rows, require_cotangents, require_finite, require_splats
 from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradients, Splats, Traits
 from rasterizers.native import load_kernels, threads
 
@@ -29,6 +29,8 @@ _TRAITS: Final = Traits(
     native_threads=True,
     depth=True,
     absgrad=True,
+    depth_gradient=True,
+    radii=True,
 )
 _LONGEST_SIDE: Final = 32 << 15  # px: bins of 32 px are numbered in 16 bits
 
@@ -137,14 +139,29 @@ class CppRendering:
         self.visible: Bool[Tensor, " N"] = frame.visible[grid]
         frame.native.draw(grid, self.image, self.alpha, self.depth, frame.threads)
 
-    def vjp(self, cotangents: Float[Tensor, "K H W 3"], *, absgrad: bool = False) -> SplatGradients:
-        """One pass for up to three cotangents, with absolute gradients for one; see `Rendering.vjp`."""
+    @property
+    def radii(self) -> Int[Tensor, "N 2"]:
+        """See `WithRadii`."""
+        out = torch.empty(len(self.visible), 2, dtype=torch.int32, device="cpu")
+        self._frame.native.radii(self._grid, out, self._frame.threads)
+        return out
+
+    def vjp(
+        self,
+        cotangents: Float[Tensor, "K H W 3"],
+        *,
+        absgrad: bool = False,
+        alpha: Float[Tensor, "K H W"] | None = None,
+        depth: Float[Tensor, "K H W"] | None = None,
+    ) -> SplatGradients:
+        """One pass for up to three cotangents, with depth or absolute gradients for one; see `WithDepthGradient`."""
         require_cotangents(cotangents, self.image)
+        v_alpha, v_depth = (None if x is None else x.contiguous() for x in of_accumulated(self, alpha, depth))
         k, n, frame = len(cotangents), len(self.visible), self._frame
         means, quats, scales, screen, rgb = (frame.empty(k, n, width) for width in (3, 4, 3, 2, 3))
         opacities, absolute = frame.empty(k, n), frame.empty(k, n, 2) if absgrad else None
         frame.native.vjp(
-            self._grid, cotangents.detach().to(self.image).contiguous(), *frame.shared,
+            self._grid, cotangents.detach().to(self.image).contiguous(), v_alpha, v_depth, *frame.shared,
             means, quats, scales, opacities, screen, rgb, absolute, frame.threads,
         )  # fmt: skip
         return SplatGradients(means, quats, scales, opacities, screen, rgb, frame.basis(), absolute)

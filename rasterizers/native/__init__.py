@@ -1,4 +1,4 @@
-"""Loading of the compiled module for this processor's instruction set, and the number of threads of its kernels.
+"""Loading of the compiled module for this processor's instruction set, the number of threads of its kernels, and their memory.
 
 `src/` holds the C++ headers that both packages (`rasterizers.cpp` and `clear_strategies.kernels`) include.
 """
@@ -8,8 +8,9 @@ from __future__ import annotations
 import hashlib
 import importlib
 import logging
+import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -17,6 +18,8 @@ from types import ModuleType
 from typing import Final
 
 import torch
+from torch import Tensor
+from torch.utils.dlpack import from_dlpack
 
 from rasterizers.interface import BackendUnavailable, OutdatedKernels
 
@@ -97,3 +100,18 @@ def load_kernels(package: str, isa: str | None = None) -> ModuleType:
         _log.debug("%s: kernels for %s.", package, name)
         return module
     raise BackendUnavailable(f"{package} was not compiled for {requested}; unset {source}.")
+
+
+def empty(shape: Sequence[int], dtype: torch.dtype = torch.float32) -> Tensor:
+    """Not initialized, in the CPU's memory that another such tensor has left: fresh pages cost more than filling them."""
+    numbers = math.prod(shape) * dtype.itemsize // torch.float32.itemsize
+    x: Tensor = from_dlpack(load_kernels("rasterizers.cpp").Frame.empty((numbers,)))
+    return x.view(dtype).view(*shape)
+
+
+def empty_for(shape: Sequence[int], like: Tensor) -> Tensor:
+    """Not initialized, of this one's type and on its device; on a CPU by `empty` where the kernels were compiled."""
+    try:
+        return empty(shape, like.dtype) if like.device.type == "cpu" else like.new_empty(shape)
+    except BackendUnavailable:
+        return like.new_empty(shape)

@@ -99,22 +99,27 @@ def blend_vjp(
     passes: list[Pass],
     grid: TileGrid,
     settings: RasterSettings,
-    cotangents: Float[Tensor, "K T P 3"],
+    cotangents: Float[Tensor, "K T P C"],
+    alpha: Float[Tensor, "K T P"] | None,
     *,
     absgrad: bool = False,
 ) -> tuple[Float[Tensor, "K M1 W"], Float[Tensor, "K M1 2"] | None]:
-    """Gradient of Σ cotangent·image with respect to the table, back to front, and the sums of its absolute values by the centre.
+    """Gradient of Σ v·image + v_α·(1 - T_end) with respect to the table, back to front, and the sums of its absolute values by
+    the centre.
 
-    With s_i = c_i·v and `behind` = Σ_{j>i} T_j α_j s_j + T_end background·v:  ∂/∂α_i = T_i s_i - behind / (1 - α_i).
-    That of the column of depths is 0.
+    With s_i = c_i·v and `behind` = Σ_{j>i} T_j α_j s_j + T_end (background·v - v_α):  ∂/∂α_i = T_i s_i - behind / (1 - α_i).
+
+    Args:
+        cotangents: v; a fourth channel is that of the accumulated depth Σ T_i α_i z_i. alpha: v_α, or None: 0.
     """
-    background = table.new_tensor(settings.background)
+    channels = slice(RGB.start, RGB.start + cotangents.shape[-1])
+    background = table.new_tensor((*settings.background, 0.0)[: cotangents.shape[-1]])
     monomials = _monomials(grid.tile, table)
     gradients = table.new_zeros(len(cotangents), *table.shape)
     absolute = table.new_zeros(len(cotangents), len(table), 2) if absgrad else None
     for batch in passes:
         v = cotangents[:, batch.tiles]
-        behind = batch.end * (v @ background)
+        behind = batch.end * (v @ background if alpha is None else v @ background - alpha[:, batch.tiles])
         for pairs, through in reversed(batch.slabs):
             slab = _composite(table[pairs], batch.tiles, grid, settings, through)
             weights = slab.weights
@@ -124,7 +129,7 @@ def blend_vjp(
                 sensitivity *= slab.kept
             one_minus_alpha = 1 - slab.alpha
             for k, v_k in enumerate(v):
-                s = slab.rows[..., RGB] @ v_k.transpose(1, 2)
+                s = slab.rows[..., channels] @ v_k.transpose(1, 2)
                 blended = weights * s
                 tail = blended.flip(1).cumsum(1).flip(1)  # includes i itself
                 d_alpha = slab.before * s - (tail - blended + behind[k][:, None]) / one_minus_alpha

@@ -66,13 +66,15 @@ class Projection:
         self, table_gradients: Float[Tensor, "K M1 W"], absgrad: Float[Tensor, "K M1 2"] | None = None
     ) -> SplatGradients:
         """The splats' gradients from those of the table."""
-        outputs = (self.means2d, self.conics, self.opacities, self.rgb)
+        outputs = (self.means2d, self.conics, self.opacities, self.rgb, self.depths)
         inputs = (*self.leaves, self.raw_rgb)
         by_cotangent = []
         for g in table_gradients[:, : self.rows.shape[0]]:
-            parts = (g[:, MEAN], g[:, CONIC], g[:, OPACITY], g[:, RGB])
-            cotangents = [part.reshape(x.shape) for part, x in zip(parts, outputs, strict=True)]
-            gradients = torch.autograd.grad(outputs, inputs, cotangents, retain_graph=True, materialize_grads=True)
+            parts = [g[:, columns] for columns in (MEAN, CONIC, OPACITY, RGB, DEPTH)][: 5 if self.draws_depth else 4]
+            cotangents = [part.reshape(x.shape) for part, x in zip(parts, outputs, strict=False)]
+            gradients = torch.autograd.grad(
+                outputs[: len(parts)], inputs, cotangents, retain_graph=True, materialize_grads=True
+            )
             by_cotangent.append([*gradients, g[:, MEAN]])
         means, quats, scales, opacities, rgb, screen = (
             torch.stack([self.scatter(g) for g in attribute]) for attribute in zip(*by_cotangent, strict=True)

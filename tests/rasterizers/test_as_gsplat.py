@@ -171,13 +171,18 @@ def test_in_float32_values_and_gradients_are_those_of_float64(backend):
 ABSOLUTE = [*BACKENDS, pytest.param("warp", marks=needs("warp"), id="warp")]
 
 
-@pytest.mark.parametrize("backend", ABSOLUTE)
-@pytest.mark.parametrize("packed", [True, False])
-def test_absolute_gradients_are_summed_over_pixels(backend, packed):
+@pytest.mark.parametrize(
+    ("backend", "packed", "mode"),
+    [
+        *[pytest.param(*x.values, packed, "RGB", marks=x.marks) for x in ABSOLUTE for packed in (True, False)],
+        *[pytest.param(*x.values, False, "RGB+ED", marks=x.marks) for x in BACKENDS],  # Warp sums those of depth apart
+    ],
+)
+def test_absolute_gradients_are_summed_over_pixels(backend, packed, mode):
     """Each pixel's gradient of the centres, one backward pass for each."""
     dtype = torch.float32 if backend == "warp" else torch.float64
     splats, colors, (viewmats, Ks) = gaussians(dtype=dtype), colours(False, 3, dtype=dtype), cameras(dtype=dtype)
-    call = {"sh_degree": 3, "packed": packed, "backend": backend}
+    call = {"sh_degree": 3, "packed": packed, "backend": backend, "render_mode": mode}
     image, _, info = rasterization(*splats.values(), colors, viewmats, Ks, WIDTH, HEIGHT, absgrad=True, **call)
     weights = torch.randn(image.shape, dtype=dtype, generator=torch.Generator().manual_seed(5))
     (image * weights).sum().backward(retain_graph=True)
@@ -189,6 +194,34 @@ def test_absolute_gradients_are_summed_over_pixels(backend, packed):
         total += of_pixel.abs()
     assert total.abs().max() > 0
     assert torch.allclose(found, total, rtol=1e-4, atol=1e-5 * float(total.max()))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("packed", [True, False])
+@pytest.mark.parametrize("antialiased", [True, False])
+def test_radii_are_gsplats_pixels_as_far_as_the_opacity_lets_them_reach(backend, packed, antialiased):
+    torch_impl = pytest.importorskip("gsplat.cuda._torch_impl")
+    splats, colors, (viewmats, Ks) = gaussians(), colours(False, None), cameras()
+    splats["opacities"] = torch.linspace(0.003, 1.5, N, dtype=torch.float64)  # above 1 under inverted dropout
+    splats["scales"] = splats["scales"] * torch.logspace(-2, 0, N, dtype=torch.float64)[:, None]
+    mode = "antialiased" if antialiased else "classic"
+    _, _, info = rasterization(
+        *splats.values(), colors, viewmats, Ks, WIDTH, HEIGHT, packed=packed, rasterize_mode=mode, backend=backend
+    )
+    covariances, _ = torch_impl._quat_scale_to_covar_preci(splats["quats"], splats["scales"], True, False)
+    _, _, _, conics, compensations = torch_impl._fully_fused_projection(
+        splats["means"], covariances, viewmats, Ks, WIDTH, HEIGHT, calc_compensations=True
+    )
+    blurred = torch.linalg.inv(conics[..., [0, 1, 1, 2]].unflatten(-1, (2, 2)))
+    opacities = splats["opacities"] * (compensations if antialiased else 1)
+    reach = (
+        (2 * (255 * opacities).log()).clamp(0, 3.33**2).sqrt()
+    )  # as gsplat's kernel; its torch function always takes 3.33
+    expected = (reach[..., None] * blurred.diagonal(dim1=-2, dim2=-1).sqrt()).ceil().int()
+    assert "radii" in info  # as gsplat's strategies ask before they read it
+    ids = (info["camera_ids"], info["gaussian_ids"]) if packed else (info["radii"] > 0).all(-1).nonzero(as_tuple=True)
+    assert CAMERAS * N > len(ids[0]) > N
+    assert torch.equal(info["radii"] if packed else info["radii"][ids], expected[ids])
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

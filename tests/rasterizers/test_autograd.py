@@ -18,6 +18,12 @@ from rasterizers.testing import pixels_of, scene
 from tests.helpers.backends import camera
 
 
+class WithoutDepthGradient(ReferenceRasterizer):
+    @property
+    def traits(self):
+        return replace(super().traits, depth_gradient=False)
+
+
 def leaves(splats: Splats) -> Splats:
     return Splats(**{f.name: getattr(splats, f.name).clone().requires_grad_() for f in fields(Splats)})
 
@@ -135,8 +141,10 @@ def test_a_loss_of_the_image_has_the_gradient_of_the_vjp(depth):
 
 
 def test_losses_of_depth_and_of_gradients_and_splats_changed_in_place_are_refused_rather_than_left_out():
-    drawn = autograd.draw(ReferenceRasterizer(), leaves(scene(60)), camera(40, 30), depth=True)
-    with pytest.raises(NotImplementedError, match="the loss depends on a rendered depth, which has no gradient"):
+    drawn = autograd.draw(WithoutDepthGradient(), leaves(scene(60)), camera(40, 30), depth=True)
+    with pytest.raises(
+        NotImplementedError, match="the loss depends on a rendered depth, which has no gradient in Without"
+    ):
         (drawn.image.sum() + drawn.depth.sum()).backward()
     splats = leaves(scene(60))
     image = autograd.draw(ReferenceRasterizer(), splats, camera(40, 30)).image
@@ -162,14 +170,15 @@ def test_the_stand_in_for_gsplats_rasterization_has_our_rasterizers_gradients():
     require_gradients(splats, info["means2d"].grad[0], expected.vjp(v))
 
 
+@pytest.mark.parametrize("backend", [ReferenceRasterizer, WithoutDepthGradient])
 @pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (0.9, 0.2, 0.4)])
-def test_a_loss_of_alpha_has_the_gradient_of_another_background(background):
+def test_a_loss_of_alpha_has_the_gradient_of_another_background(backend, background):
     """C + (1 - alpha) b over black is what a rasterizer draws over b."""
     b, view = torch.tensor(background, dtype=torch.float64), camera(40, 30)
     v = torch.randn(30, 40, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     composed, drawn_over = (leaves(scene(60, dtype=torch.float64)) for _ in range(2))
     for over in (background, (0.3, 0.3, 0.3)):
-        rasterizer = ReferenceRasterizer(background=over)
+        rasterizer = backend(background=over)
         shot = autograd.draw(rasterizer, composed, view)
         image = shot.image + (1 - shot.alpha)[..., None] * (b - torch.tensor(over, dtype=torch.float64))
         (image * v).sum().backward()

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 import rasterizers
-from clear_strategies import kernels
 from clear_strategies.jobs import exit_codes
+from clear_strategies.kernels import native as strategies_native
 from rasterizers import BackendUnavailable, Camera, native
 from rasterizers.cpp import CppRasterizer
 from rasterizers.interface import OutdatedKernels
@@ -109,7 +109,7 @@ def test_kernels_of_other_sources_are_refused_and_nothing_takes_their_place(stat
         else:
             monkeypatch.setattr(module, "sources", stated)
     native.load_kernels.cache_clear()
-    for load in (cpp, kernels.native.available, rasterizers.fastest):
+    for load in (cpp, strategies_native.available, rasterizers.fastest):
         with pytest.raises(OutdatedKernels, match=r"from other sources .* Install again: pip install") as refused:
             load()
         assert exit_codes.describe(refused.value) == (2, str(refused.value))

@@ -49,7 +49,7 @@ class Flat:
 
     @property
     def traits(self) -> Traits:
-        return replace(self.inner.traits, depth=False)
+        return replace(self.inner.traits, depth=False, depth_gradient=False)
 
     def __call__(self, splats, camera):
         return self.inner(splats, camera)

@@ -14,7 +14,7 @@ from clear_strategies.core.gradients import CONFLICT_GROUPS
 from clear_strategies.kernels import native
 from clear_strategies.kernels.gaussian_step import Attribute, StepSettings
 from clear_strategies.kernels.reconcile.tables import addresses, weight_tables
-from rasterizers.native import threads
+from rasterizers.native import empty, threads
 
 
 class CppGaussianStep:
@@ -43,7 +43,7 @@ class CppGaussianStep:
         self._n = len(lr["basis"])
 
     def products(self) -> Products:
-        table = native.empty((3, len(CONFLICT_GROUPS), self._n), torch.float64)
+        table = empty((3, len(CONFLICT_GROUPS), self._n), torch.float64)
         return Products(CONFLICT_GROUPS, *(x.T for x in table), *self._passes.products(table.data_ptr(), threads()))
 
     def dense(self, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor]) -> None:

@@ -19,7 +19,7 @@ from clear_strategies.kernels.reconcile.tables import (
     row_width,
     weight_tables,
 )
-from rasterizers.native import threads
+from rasterizers.native import empty, threads
 
 _GROUPS: Final = {name: k for k, name in enumerate((*CONFLICT_GROUPS, "detail"))}
 
@@ -29,7 +29,7 @@ def products(lr: Grads, hr: Grads, names: Sequence[str]) -> Products:
     lr, hr = contiguous(lr), contiguous(hr)
     n = len(next(iter(lr.tensors.values())))
     rows = [_rows(name, row_width(name, lr, hr), n, lr.get(name), hr.get(name)) for name in names]
-    table = native.empty((3, len(CONFLICT_GROUPS), n), torch.float64)
+    table = empty((3, len(CONFLICT_GROUPS), n), torch.float64)
     kernels: Any = native.module()
     counts = kernels.products(n, rows, _factors(lr, n), _factors(hr, n), table.data_ptr(), threads())
     return Products(names, *(x.T for x in table), *counts)

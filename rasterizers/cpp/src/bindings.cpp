@@ -118,8 +118,16 @@ void bind_frame(nb::module_& m) {
              self.draw(i, pixels, cover, expected, threads);
            },
            nb::arg("grid"), tensor("image"), tensor("alpha"), tensor("depth").none(), nb::arg("threads"))
+      .def("radii",
+           [](const F& self, int i, Write<std::int32_t, -1, 2> out, int threads) {
+             std::int32_t* radii = out.data();
+             nb::gil_scoped_release release;
+             self.radii(i, radii, threads);
+           },
+           nb::arg("grid"), tensor("out"), nb::arg("threads"))
       .def("vjp",
-           [](F& self, int i, Read<T, -1, -1, -1, 3> cotangents, Read<T, -1, 3> means, Read<T, -1, 4> quats,
+           [](F& self, int i, Read<T, -1, -1, -1, 3> image, std::optional<Read<T, -1, -1, -1>> alpha,
+              std::optional<Read<T, -1, -1, -1>> depth, Read<T, -1, 3> means, Read<T, -1, 4> quats,
               Read<T, -1, 3> scales, Read<T, -1, 1, 3> sh0, Rows<T> shN, Write<T, -1, -1, 3> d_means,
               Write<T, -1, -1, 4> d_quats, Write<T, -1, -1, 3> d_scales, Write<T, -1, -1> d_opacities,
               Write<T, -1, -1, 2> d_screen, Write<T, -1, -1, 3> d_rgb, std::optional<Write<T, -1, -1, 2>> d_absgrad,
@@ -127,14 +135,15 @@ void bind_frame(nb::module_& m) {
              Splats<T> splats = splats_of<T>(means, quats, scales, sh0, shN);
              Gradients<T> out{d_means.data(),  d_quats.data(), d_scales.data(), d_opacities.data(),
                               d_screen.data(), d_rgb.data(),   d_absgrad ? d_absgrad->data() : nullptr};
-             const int K = int(cotangents.shape(0));
-             const T* v = cotangents.data();
+             const int K = int(image.shape(0));
+             const Cotangents<T> v{image.data(), alpha ? alpha->data() : nullptr, depth ? depth->data() : nullptr};
              nb::gil_scoped_release release;
              self.vjp(i, K, v, splats, out, threads);
            },
-           nb::arg("grid"), tensor("cotangents"), tensor("means"), tensor("quats"), tensor("scales"), tensor("sh0"),
-           tensor("shN"), tensor("d_means"), tensor("d_quats"), tensor("d_scales"), tensor("d_opacities"),
-           tensor("d_screen"), tensor("d_rgb"), tensor("d_absgrad").none(), nb::arg("threads"))
+           nb::arg("grid"), tensor("image"), tensor("alpha").none(), tensor("depth").none(), tensor("means"),
+           tensor("quats"), tensor("scales"), tensor("sh0"), tensor("shN"), tensor("d_means"), tensor("d_quats"),
+           tensor("d_scales"), tensor("d_opacities"), tensor("d_screen"), tensor("d_rgb"), tensor("d_absgrad").none(),
+           nb::arg("threads"))
       .def("basis", [](F& self, Read<T, -1, 3> means, Read<T, -1, 4> quats, Read<T, -1, 3> scales,
                        Read<T, -1, 1, 3> sh0, Rows<T> shN, Write<T, -1, -1> out, int threads) {
         Splats<T> splats = splats_of<T>(means, quats, scales, sh0, shN);

@@ -4,8 +4,8 @@
 //
 // A Gaussian with α_i < α_min is skipped; a pixel ends before the Gaussian that would take its T below transmittance_min.
 //
-// C is the number of channels that are drawn: kColour, or kColourAndDepth with expected depth, E = Σ T_i α_i z_i / Σ T_i α_i.
-// Cotangents are those of the colour.
+// C is the number of channels that are drawn: kColour, or kColourAndDepth with expected depth, E = Σ T_i α_i z_i / Σ T_i α_i. In the
+// VJP it is that of the cotangents, of which the fourth is that of Σ T_i α_i z_i.
 #pragma once
 
 #include <climits>
@@ -133,9 +133,9 @@ void blend_block(const Segment<T>& segment, int block, const Settings<T>& s, Blo
 }
 
 // Sums over a block's pixels for the Gaussians of its bin.
-template <class T, int K, bool Absolute>
+template <class T, int K, int C, bool Absolute>
 struct BlockSums {
-  using Sums = PairSums<T, K, Absolute>;
+  using Sums = PairSums<T, K, C, Absolute>;
   static constexpr int kRows = kLanes;  // Gaussians are collected until every lane has one
   T q[K][kRows][kLanes], weight[kRows][kLanes];
   T offset_x[kRows], offset_y[kRows];  // from the Gaussian's centre to the block's
@@ -143,7 +143,7 @@ struct BlockSums {
   int place[kRows];
 
   // Not inlined: two copies beside the loop over Gaussians would exceed the instruction cache.
-  __attribute__((noinline)) void flush(int count, const T (&cotangent)[K][kColour][kLanes], Sums* sums) {
+  __attribute__((noinline)) void flush(int count, const T (&cotangent)[K][C][kLanes], Sums* sums) {
     if constexpr (kByQuads)
       for (int i = 0; i < count; ++i) add_by_quads(i, cotangent, sums);
     else if (count)
@@ -155,7 +155,7 @@ struct BlockSums {
   static constexpr bool kByQuads = sizeof(T) == 4 && Lanes<T>::registers > 1;
 
   // A sum over pixels is the sum of a register's quads, four sums at a time.
-  CLEAR_INLINE void add_by_quads(int row, const T (&cotangent)[K][kColour][kLanes], Sums* sums) const {
+  CLEAR_INLINE void add_by_quads(int row, const T (&cotangent)[K][C][kLanes], Sums* sums) const {
     using L = Lanes<T>;
     using Register = typename L::Register;
     constexpr int n = L::registers;
@@ -173,14 +173,14 @@ struct BlockSums {
       for (int i = 1; i < n; ++i) m += v.r[i], my += along.r[i], myy += along.r[i] * dy.r[i];
       const Register x = dx.r[0], mx = m * x;  // every register holds whole rows of pixels
       out[0] = m, out[1] = mx, out[2] = my, out[3] = mx * x, out[4] = my * x, out[5] = myy;
-      for (int c = 0; c < kColour; ++c) {
+      for (int c = 0; c < C; ++c) {
         const L parts = L::load(cotangent[k][c]);
-        out[6 + c] = w.r[0] * parts.r[0];
-        for (int i = 1; i < n; ++i) out[6 + c] += w.r[i] * parts.r[i];
+        Register& sum = out[Sums::of_channel(c)] = w.r[0] * parts.r[0];
+        for (int i = 1; i < n; ++i) sum += w.r[i] * parts.r[i];
       }
       if constexpr (Absolute) {
-        const L A = conic[0][row], B = conic[1][row], C = conic[2][row];
-        const L each[2] = {absolute(v * (A * dx + B * dy)), absolute(v * (B * dx + C * dy))};
+        const L xx = conic[0][row], xy = conic[1][row], yy = conic[2][row];
+        const L each[2] = {absolute(v * (xx * dx + xy * dy)), absolute(v * (xy * dx + yy * dy))};
         for (int c = 0; c < 2; ++c) {
           out[6 + kColour + c] = each[c].r[0];
           for (int i = 1; i < n; ++i) out[6 + kColour + c] += each[c].r[i];
@@ -196,7 +196,7 @@ struct BlockSums {
   }
 
   // Transposed, a lane is a Gaussian; a sum over pixels is then fifteen additions for sixteen Gaussians.
-  CLEAR_INLINE void add_by_transposes(int count, const T (&cotangent)[K][kColour][kLanes], Sums* sums) {
+  CLEAR_INLINE void add_by_transposes(int count, const T (&cotangent)[K][C][kLanes], Sums* sums) {
     using L = Lanes<T>;
     for (int i = count; i < kRows; ++i) {
       L(T(0)).store(weight[i]);
@@ -215,18 +215,18 @@ struct BlockSums {
       for (int i = 0; i < kRows; ++i) v[i] = L::load(q[k][i]);
       transpose(v);
       moments(v, ox, oy, out);
-      L channels[kColour];
+      L channels[C];
       for (L& channel : channels) channel = T(0);
       for (int p = 0; p < kLanes; ++p)
-        for (int c = 0; c < kColour; ++c) channels[c] += w[p] * L(cotangent[k][c][p]);
-      for (int c = 0; c < kColour; ++c) out[6 + c] = channels[c];
+        for (int c = 0; c < C; ++c) channels[c] += w[p] * L(cotangent[k][c][p]);
+      for (int c = 0; c < C; ++c) out[Sums::of_channel(c)] = channels[c];
       if constexpr (Absolute) {
-        const L A = L::load(conic[0]), B = L::load(conic[1]), C = L::load(conic[2]);
+        const L xx = L::load(conic[0]), xy = L::load(conic[1]), yy = L::load(conic[2]);
         out[6 + kColour] = out[7 + kColour] = L(T(0));
         for (int p = 0; p < kLanes; ++p) {
           const L dx = ox + L(T(p % kBlock) - T(1.5)), dy = oy + L(T(p / kBlock) - T(1.5));
-          out[6 + kColour] += absolute(v[p] * (A * dx + B * dy));
-          out[7 + kColour] += absolute(v[p] * (B * dx + C * dy));
+          out[6 + kColour] += absolute(v[p] * (xx * dx + xy * dy));
+          out[7 + kColour] += absolute(v[p] * (xy * dx + yy * dy));
         }
       }
     }
@@ -271,7 +271,7 @@ struct BlockSums {
 };
 
 // What a block passes from segment to segment in the backward pass: T in front of the visited Gaussians, and for each
-// cotangent what lies behind, Σ_{j>i} T_j α_j (c_j·v) + T_end background·v.
+// cotangent what lies behind, Σ_{j>i} T_j α_j (c_j·v) + T_end (background·v - v_α), with v_α that of alpha = 1 - T_end.
 template <class T, int K>
 struct BlockBack {
   T transmittance[kLanes], behind[K][kLanes];
@@ -279,9 +279,9 @@ struct BlockBack {
 
 //   ∂I·v/∂α_i = T_i (c_i·v) - behind / (1 - α_i)
 // Where α is capped, the image does not depend on the ellipse.
-template <class T, int K, bool Absolute>
+template <class T, int K, int C, bool Absolute>
 void blend_block_vjp(const Segment<T>& segment, int block, const Settings<T>& s, const BlockEnd<T>& end,
-                     const T (&cotangent)[K][kColour][kLanes], BlockBack<T, K>& back, PairSums<T, K, Absolute>* sums) {
+                     const T (&cotangent)[K][C][kLanes], BlockBack<T, K>& back, PairSums<T, K, C, Absolute>* sums) {
   using L = Lanes<T>;
   const PixelCentres<T> pixel(block);
   const L alpha_min = s.alpha_min, alpha_max = s.alpha_max, one = T(1);
@@ -302,12 +302,12 @@ void blend_block_vjp(const Segment<T>& segment, int block, const Settings<T>& s,
   if (last < segment.count) n = int(std::lower_bound(list, list + n, last) - list);
   if (!n) return;
 
-  L through = L::load(back.transmittance), v[K][kColour], behind[K];
+  L through = L::load(back.transmittance), v[K][C], behind[K];
   for (int k = 0; k < K; ++k) {
     behind[k] = L::load(back.behind[k]);
-    for (int c = 0; c < kColour; ++c) v[k][c] = L::load(cotangent[k][c]);
+    for (int c = 0; c < C; ++c) v[k][c] = L::load(cotangent[k][c]);
   }
-  BlockSums<T, K, Absolute> collected;
+  BlockSums<T, K, C, Absolute> collected;
   int count = 0;
   const Ellipse<T>* ellipses = segment.ellipses.data();
   for (int i = n - 1; i >= 0; --i) {
@@ -324,7 +324,8 @@ void blend_block_vjp(const Segment<T>& segment, int block, const Settings<T>& s,
     const Mask<T> moves = kept & (free <= alpha_max);
     weight.store(collected.weight[count]);
     for (int k = 0; k < K; ++k) {
-      const L light = v[k][0] * L(e.r) + v[k][1] * L(e.g) + v[k][2] * L(e.b);
+      L light = v[k][0] * L(e.r) + v[k][1] * L(e.g) + v[k][2] * L(e.b);
+      if constexpr (C == kColourAndDepth) light += v[k][kColour] * L(e.z);
       const L d_alpha = through * light - behind[k] * over;
       where(moves, alpha * d_alpha).store(collected.q[k][count]);
       behind[k] += weight * light;

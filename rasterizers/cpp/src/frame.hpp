@@ -61,23 +61,45 @@ class Frame {
     }
   }
 
-  // The gradients [K, n, …] for K cotangents [K, height, width, 3].
-  void vjp(int i, int K, const T* cotangents, const Splats<T>& splats, const Gradients<T>& out, int threads) {
+  // The gradients [K, n, …] for K cotangents.
+  void vjp(int i, int K, const Cotangents<T>& v, const Splats<T>& splats, const Gradients<T>& out, int threads) {
     View& view = views_.at(i);
-    const std::int64_t image = std::int64_t(view.target.grid.width) * view.target.grid.height * kColour;
+    const std::int64_t pixels = std::int64_t(view.target.grid.width) * view.target.grid.height;
     for (int k = 0; k < K;) {
-      const int now = out.absgrad ? 1 : std::min(kMostCotangents, K - k);
+      const int now = v.depth || out.absgrad ? 1 : std::min(kMostCotangents, K - k);
       const std::int64_t at = k * n_;
       Gradients<T> part{out.means + 3 * at,  out.quats + 4 * at, out.scales + 3 * at, out.opacities + at,
                         out.screen + 2 * at, out.rgb + 3 * at,   out.absgrad ? out.absgrad + 2 * at : nullptr};
-      if (out.absgrad) vjp_of<1, true>(view, cotangents + k * image, splats, part, threads);
-      else if (now == 1) vjp_of<1>(view, cotangents + k * image, splats, part, threads);
+      const Cotangents<T> these{v.image + k * pixels * kColour, v.alpha ? v.alpha + k * pixels : nullptr,
+                                v.depth ? v.depth + k * pixels : nullptr};
+      if (v.depth && out.absgrad) vjp_of<1, kColourAndDepth, true>(view, these, splats, part, threads);
+      else if (v.depth) vjp_of<1, kColourAndDepth>(view, these, splats, part, threads);
+      else if (out.absgrad) vjp_of<1, kColour, true>(view, these, splats, part, threads);
+      else if (now == 1) vjp_of<1>(view, these, splats, part, threads);
       if constexpr (kMostCotangents > 1) {
-        if (now == 2) vjp_of<2>(view, cotangents + k * image, splats, part, threads);
-        if (now == 3) vjp_of<3>(view, cotangents + k * image, splats, part, threads);
+        if (now == 2) vjp_of<2>(view, these, splats, part, threads);
+        if (now == 3) vjp_of<3>(view, these, splats, part, threads);
       }
       k += now;
     }
+  }
+
+  // Half the box of every Gaussian that the grid draws, [n, 2], in whole pixels; zeros for the others. It reaches to where alpha falls
+  // below alpha_min, at most 3.33 standard deviations, as gsplat's.
+  void radii(int i, std::int32_t* out, int threads) const {
+    const Target<T>& target = views_.at(i).target;
+    Pool::instance().run(threads, drawn_.chunks(), [&](std::int64_t chunk) {
+      const std::int64_t first = chunk * kChunk;
+      std::fill(out + 2 * first, out + 2 * std::min(n_, first + kChunk), 0);
+      for (const std::uint32_t* number = drawn_.begin(chunk); number < drawn_.end(chunk); ++number) {
+        if (!target.ranges[*number].count()) continue;
+        const Ellipse<T>& e = target.ellipses[*number];
+        const T power = std::max((e.peak - settings_.log2_alpha_min) * (2 / kLog2E<T>), T(0));
+        const T reach = std::min(std::sqrt(power), T(3.33)) / std::sqrt(e.reach * (2 / kLog2E<T>));  // of `half`, which has a margin
+        const T half[2] = {e.half_x * reach, e.half_y * reach};
+        for (int c = 0; c < 2; ++c) out[2 * std::int64_t(*number) + c] = std::int32_t(std::ceil(std::clamp(half[c], T(1), T(1e9))));
+      }
+    });
   }
 
   // Y of every Gaussian that some grid draws, [n, bands + 1]; zeros for the others.
@@ -206,9 +228,9 @@ class Frame {
             view.ends.data() + place * kBlocks};
   }
 
-  template <int K, bool Absolute = false>
-  void vjp_of(View& view, const T* cotangents, const Splats<T>& splats, const Gradients<T>& out, int threads) {
-    using Sums = PairSums<T, K, Absolute>;
+  template <int K, int C = kColour, bool Absolute = false>
+  void vjp_of(View& view, const Cotangents<T>& cotangents, const Splats<T>& splats, const Gradients<T>& out, int threads) {
+    using Sums = PairSums<T, K, C, Absolute>;
     const std::vector<Band> bands = bands_of(view, kBytesPerPair + sizeof(Sums));
     const bool whole = bands.size() == 1;
     Buffer<Sums> pair_sums, splat_sums;  // by pair; by Gaussian, when there are several bands
@@ -220,14 +242,14 @@ class Frame {
       if (view.bins.band != band) list(view, band, threads);
       pair_sums.reserve_lost(view.bins.pairs.size());
       Pool::instance().run(threads, band.bins(),
-                           [&](std::int64_t bin) { blend_vjp_bin<T, K, Absolute>(job(view, bin), cotangents, pair_sums.data()); });
+                           [&](std::int64_t bin) { blend_vjp_bin<T, K, C, Absolute>(job(view, bin), cotangents, pair_sums.data()); });
       view.bins.has_masks = true;
       if (whole) break;
       Pool::instance().run(threads, chunks_of(n_),
                            [&](std::int64_t chunk) { add_band(view, chunk, pair_sums.data(), splat_sums.data()); });
     }
     Pool::instance().run(threads, chunks_of(n_), [&](std::int64_t chunk) {
-      vjp_of_chunk<K, Absolute>(view, splats, chunk, whole, (whole ? pair_sums : splat_sums).data(), out);
+      vjp_of_chunk<K, C, Absolute>(view, splats, chunk, whole, (whole ? pair_sums : splat_sums).data(), out);
     });
   }
 
@@ -251,9 +273,10 @@ class Frame {
   }
 
   // The gradients of a chunk's Gaussians from `sums`, by pair where one band is the whole image, else by Gaussian.
-  template <int K, bool Absolute>
+  template <int K, int C, bool Absolute>
   void vjp_of_chunk(const View& view, const Splats<T>& splats, std::int64_t chunk, bool whole,
-                    const PairSums<T, K, Absolute>* sums, const Gradients<T>& out) {
+                    const PairSums<T, K, C, Absolute>* sums, const Gradients<T>& out) {
+    using Sums = PairSums<T, K, C, Absolute>;
     constexpr std::int64_t ahead = 6 * kLanes;
     const std::int64_t first = chunk * kChunk, end = std::min(n_, first + kChunk);
     auto touched = [&](std::int64_t i) {
@@ -272,7 +295,7 @@ class Frame {
     const std::int64_t known = sparse ? count : count + ahead;
     for (std::int64_t at = 0; at < count; at += kLanes) {
       const Group group(numbers + at, count - at);
-      Lanes<T> rows[PairSums<T, K, Absolute>::kRows][kLanes];
+      Lanes<T> rows[Sums::kRows][kLanes];
       fetch_rows(splats, view.target, slopes_, numbers + std::min(known, at + 2 * kLanes),
                  numbers + std::min(known, at + 3 * kLanes));
       if (whole) {
@@ -287,6 +310,7 @@ class Frame {
       std::uint32_t bits = 0;
       for (int i = 0; i < group.count; ++i) bits |= std::uint32_t(sparse || touched(group.rows[i])) << i;
       project_vjp_group(pose_, settings_, splats, view.target, slopes_, group, K, rows[0], bits, out);
+      if constexpr (C == kColourAndDepth) depth_vjp_group(pose_, group, rows[0][Sums::of_channel(kColour)], bits, out.means);
     }
   }
 

@@ -71,24 +71,34 @@ void draw_bin(const BinJob<T>& job, T* image, T* alpha, T* depth) {
 }
 
 // The state of a bin's blocks in the backward pass.
-template <class T, int K>
+template <class T, int K, int C>
 struct BinVjp {
   BlockBack<T, K> back[kBlocks];
-  T cotangent[kBlocks][K][kColour][kLanes];
+  T cotangent[kBlocks][K][C][kLanes];
 };
 
-template <class T, int K>
-void start_vjp(const BinJob<T>& job, const T* cotangents, BinVjp<T, K>& out) {
+template <class T, int K, int C>
+void start_vjp(const BinJob<T>& job, const Cotangents<T>& cotangents, BinVjp<T, K, C>& out) {
   using L = Lanes<T>;
-  const std::int64_t image = std::int64_t(job.grid.width) * job.grid.height * kColour;
+  const int width = job.grid.width, height = job.grid.height;
+  const std::int64_t pixels = std::int64_t(width) * height;
   each_bit(job.inside, [&](int b) {
+    const int X = job.block_x(b), Y = job.block_y(b);
     const L through = L::load(job.ends[b].transmittance);
     through.store(out.back[b].transmittance);
     for (int k = 0; k < K; ++k) {
-      L v[kColour], light = T(0);
-      load_block<kColour>(cotangents + k * image, job.grid.width, job.grid.height, job.block_x(b), job.block_y(b), v);
+      L v[kColour], one[1], light = T(0);
+      load_block<kColour>(cotangents.image + k * pixels * kColour, width, height, X, Y, v);
       for (int c = 0; c < kColour; ++c) light += v[c] * L(job.settings.background[c]);
       for (int c = 0; c < kColour; ++c) v[c].store(out.cotangent[b][k][c]);
+      if constexpr (C == kColourAndDepth) {
+        load_block<1>(cotangents.depth + k * pixels, width, height, X, Y, one);
+        one[0].store(out.cotangent[b][k][kColour]);
+      }
+      if (cotangents.alpha) {
+        load_block<1>(cotangents.alpha + k * pixels, width, height, X, Y, one);
+        light -= one[0];
+      }
       (through * light).store(out.back[b].behind[k]);
     }
   });
@@ -96,22 +106,22 @@ void start_vjp(const BinJob<T>& job, const T* cotangents, BinVjp<T, K>& out) {
 
 // Prefetches a bin's cotangents, whose rows lie far apart in memory, while its Gaussians are gathered.
 template <class T, int K>
-CLEAR_INLINE void fetch_cotangents(const BinJob<T>& job, const T* cotangents) {
+CLEAR_INLINE void fetch_cotangents(const BinJob<T>& job, const T* images) {
   const std::int64_t image = std::int64_t(job.grid.width) * job.grid.height * kColour;
   for (int k = 0; k < K; ++k)
     for (int y = job.y * kBin; y < std::min(job.grid.height, (job.y + 1) * kBin); ++y)
       for (int x = 0; x < kColour * kBin; x += kLanes)
-        __builtin_prefetch(cotangents + k * image + (std::int64_t(y) * job.grid.width + job.x * kBin) * kColour + x);
+        __builtin_prefetch(images + k * image + (std::int64_t(y) * job.grid.width + job.x * kBin) * kColour + x);
 }
 
 // The backward pass of a bin, back to front. Writes the sums of all its pairs.
-template <class T, int K, bool Absolute>
-void blend_vjp_bin(const BinJob<T>& job, const T* cotangents, PairSums<T, K, Absolute>* pair_sums) {
+template <class T, int K, int C, bool Absolute>
+void blend_vjp_bin(const BinJob<T>& job, const Cotangents<T>& cotangents, PairSums<T, K, C, Absolute>* pair_sums) {
   const std::int64_t n = job.pairs();
   if (!n) return;
-  static thread_local BinVjp<T, K> scratch;
-  BinVjp<T, K>& mine = scratch;
-  fetch_cotangents<T, K>(job, cotangents);
+  static thread_local BinVjp<T, K, C> scratch;
+  BinVjp<T, K, C>& mine = scratch;
+  fetch_cotangents<T, K>(job, cotangents.image);
   std::int64_t end = 0;  // no pixel blended a pair from here on, and their segments may not have been listed
   each_bit(job.inside, [&](int b) {
     for (std::int32_t e : job.ends[b].ended) end = std::max<std::int64_t>(end, std::min<std::int64_t>(e, n));
@@ -119,14 +129,14 @@ void blend_vjp_bin(const BinJob<T>& job, const T* cotangents, PairSums<T, K, Abs
   bool started = false;
   for (std::int64_t first = (n - 1) / kSegment * kSegment; first >= 0; first -= kSegment) {
     const std::int64_t count = std::min<std::int64_t>(kSegment, n - first);
-    PairSums<T, K, Absolute>* sums = pair_sums + job.bins.starts[job.bin] + first;
+    PairSums<T, K, C, Absolute>* sums = pair_sums + job.bins.starts[job.bin] + first;
     std::memset(static_cast<void*>(sums), 0, sizeof *sums * count);
     if (first >= end) continue;
     Segment<T>& part = thread_segment<T>();
     gather(job.ellipses, job.bins, job.bin, first, job.inside, part);
     if (!std::exchange(started, true)) start_vjp(job, cotangents, mine);
     each_bit(job.inside, [&](int b) {
-      if (part.lengths[b]) blend_block_vjp<T, K, Absolute>(part, b, job.settings, job.ends[b], mine.cotangent[b], mine.back[b], sums);
+      if (part.lengths[b]) blend_block_vjp<T, K, C, Absolute>(part, b, job.settings, job.ends[b], mine.cotangent[b], mine.back[b], sums);
     });
   }
 }

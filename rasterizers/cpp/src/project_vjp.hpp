@@ -103,4 +103,14 @@ void project_vjp_group(const Pose& pose, const Settings<T>& s, const Splats<T>& 
   }
 }
 
+// Adds the gradients of the depths, in the group's `touched` lanes, to those of the centres.
+template <class T>
+void depth_vjp_group(const Pose& pose, const Group& group, const Lanes<T>& d_depth, std::uint32_t touched, T* d_means) {
+  Lanes<T> mean[3];
+  load_rows<3>(d_means, group, mean);
+  for (int axis = 0; axis < 3; ++axis)
+    mean[axis] += where(Mask<T>::from_bits(touched), Lanes<T>(T(pose.R[6 + axis])) * d_depth);
+  store_rows<3>(d_means, group, mean);
+}
+
 }  // namespace clear

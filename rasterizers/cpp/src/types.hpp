@@ -90,13 +90,22 @@ enum Field { kU, kV, kA, kB, kC, kPeak, kReach, kHalfX, kHalfY, kRed, kGreen, kB
 
 inline constexpr int kColour = 3, kColourAndDepth = 4;  // channels that are blended
 
+// The gradients of K images [K, height, width, 3], and of their alpha and accumulated depth Σ T_i α_i z_i [K, height, width], which
+// may be null.
+template <class T>
+struct Cotangents {
+  const T *image, *alpha, *depth;
+};
+
 // Sums over the pixels of a (Gaussian, bin) pair, for each of K cotangents: q = ∂L/∂(log alpha), q's moments about the centre
-// x, y, xx, xy, yy, and ∂L/∂(r, g, b); with absolute gradients also Σ|∂L/∂u|. Packed, because they are written, read and
-// transposed by sixteen.
-template <class T, int K, bool Absolute = false>
+// x, y, xx, xy, yy, and ∂L/∂(r, g, b); with absolute gradients also Σ|∂L/∂u|; with depth, last, ∂L/∂z. Packed, because they are
+// written, read and transposed by sixteen.
+template <class T, int K, int C = kColour, bool Absolute = false>
 struct alignas(kLanes * sizeof(T)) PairSums {
-  static constexpr int kWidth = 6 + kColour + (Absolute ? 2 : 0), kRows = (K * kWidth + kLanes - 1) / kLanes;
+  static constexpr int kWidth = 6 + C + (Absolute ? 2 : 0), kRows = (K * kWidth + kLanes - 1) / kLanes;
   T numbers[kRows * kLanes];
+
+  static constexpr int of_channel(int c) { return c < kColour ? 6 + c : kWidth - 1; }
 };
 
 }  // namespace clear
