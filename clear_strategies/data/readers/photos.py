@@ -77,7 +77,7 @@ def read(
         cache: folder of the poses; None: ~/.cache/clear-strategies/sfm, or $CLEAR_CACHE/sfm. Not in the photos' folder.
         max_side: features are extracted from photos reduced to this many pixels.
         max_features: of a photo, those of the coarsest scales; the time of matching grows with its square.
-        precise: features that follow a surface's tilt (affine shape): more photos are placed, in about TWICE the time;
+        precise: features that follow a surface's tilt (affine shape): more photos are placed, in about twice the time;
             "auto": for up to 30 photos.
         least_placed: the least share of the photos whose poses must be found.
         threads: of COLMAP; -1: all. With more than one, the poses' last digits may change from run to run.
