@@ -76,9 +76,9 @@ def read(
         root: the folder; or one whose photos lie in its subfolder `images`, or in the only folder below it that holds any.
         cache: folder of the poses; None: ~/.cache/clear-strategies/sfm, or $CLEAR_CACHE/sfm. Not in the photos' folder.
         max_side: features are extracted from photos reduced to this many pixels.
-        max_features: of a photo, those of the coarsest scales; memory and time of matching grow with its square.
-        precise: features that follow a surface's tilt (affine shape, domain-size pooling), matched once more along the
-            epipolar lines: more photos are placed, in about six times the time; "auto": for up to 30 photos.
+        max_features: of a photo, those of the coarsest scales; the time of matching grows with its square.
+        precise: features that follow a surface's tilt (affine shape): more photos are placed, in about twice the time;
+            "auto": for up to 30 photos.
         least_placed: the least share of the photos whose poses must be found.
         threads: of COLMAP; -1: all. With more than one, the poses' last digits may change from run to run.
         seed: of COLMAP's random samples.
@@ -179,7 +179,7 @@ def _once_each(paths: Sequence[Path]) -> list[Path]:
 
 
 def _key(paths: Sequence[Path], *settings: int) -> str:
-    digest = hashlib.sha256(repr(("upright copies, points of two views, guided, reasons in words", *settings)).encode())
+    digest = hashlib.sha256(repr(("upright copies, points of two views, affine, reasons in words", *settings)).encode())
     for path in paths:
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:24]

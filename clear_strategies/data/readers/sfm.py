@@ -24,6 +24,7 @@ from PIL import Image as Picture
 
 from clear_strategies import files
 from clear_strategies.core.images import to_bytes
+from clear_strategies.core.progress import Progress
 from clear_strategies.data.capture import MORE_PHOTOS, NO_PARALLAX, STEP_ASIDE
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.errors import DataError
@@ -42,8 +43,8 @@ _NEARLY_ALL: Final = 0.9  # of the pairs
 _TURN: Final = 0.03  # entries by which a map between two photos may differ from a turn's, as distortion makes it
 _LISTED: Final = 3  # photos without a pose in the warning, at most
 _DIAGONAL_35MM: Final = math.hypot(36, 24)  # mm
-_DISTANCES: Final = 4  # bytes of each pair of features that are compared
-_MEMORY: Final = 4 << 30  # bytes that all threads together may take in matching
+_PER_THREAD: Final = 2  # photos whose features are found between two looks at the progress
+_BLOCK: Final = 20  # photos that are matched between two looks: COLMAP indexes their features anew for each block
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,17 +56,6 @@ class SfmSettings:
     precise: bool
     threads: int
     seed: int
-
-    @property
-    def matchers(self) -> int:
-        """Threads that match at the same time: as many as fit into `_MEMORY`."""
-        asked = self.threads if self.threads > 0 else os.cpu_count() or 1
-        return max(1, min(asked, _MEMORY // self.memory))
-
-    @property
-    def memory(self) -> int:
-        """Bytes that a thread takes to match two photos: every feature is compared with every other, once more if `precise`."""
-        return (3 if self.precise else 2) * _DISTANCES * self.max_features**2
 
 
 def reconstruct(root: Path, photos: Mapping[Path, float | None], folder: Path, settings: SfmSettings) -> None:
@@ -132,22 +122,25 @@ def _map(pycolmap: Any, photos: Mapping[Path, float | None], work: Path, setting
         extraction = pycolmap.FeatureExtractionOptions()
         extraction.num_threads, extraction.use_gpu = settings.threads, False
         extraction.sift.max_num_features = settings.max_features
-        extraction.sift.estimate_affine_shape = extraction.sift.domain_size_pooling = settings.precise
+        extraction.sift.estimate_affine_shape = settings.precise
         _log.info("features of %d photos.", count)
+        progress = Progress("features", "photos", count)
+        at_once = _PER_THREAD * (settings.threads if settings.threads > 0 else os.cpu_count() or 1)
         for (width, height, focal), names in groups.items():
             reader = pycolmap.ImageReaderOptions()
             if focal is not None:
                 reader.camera_params = f"{focal},{width / 2},{height / 2},0"  # of SIMPLE_RADIAL, its default
-            pycolmap.extract_features(
-                database, copies, image_names=names, camera_mode=pycolmap.CameraMode.SINGLE,
-                reader_options=reader, extraction_options=extraction, device=pycolmap.Device.cpu,
-            )  # fmt: skip
+            for first in range(0, len(names), at_once):
+                some = names[first : first + at_once]
+                pycolmap.extract_features(
+                    database, copies, image_names=some, camera_mode=pycolmap.CameraMode.SINGLE,
+                    reader_options=reader, extraction_options=extraction, device=pycolmap.Device.cpu,
+                )  # fmt: skip
+                with pycolmap.Database.open(database) as opened:
+                    reader.existing_camera_id = opened.read_image_with_name(some[0]).camera_id
+                    progress(opened.num_images())
         _keep_coarsest(pycolmap, database, settings.max_features)
-        matching = pycolmap.FeatureMatchingOptions()
-        matching.num_threads, matching.use_gpu = settings.matchers, False
-        matching.guided_matching = settings.precise
-        _log.info("matching %d pairs of photos.", count * (count - 1) // 2)
-        pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
+        _match(pycolmap, database, [name for names in groups.values() for name in names], settings.threads)
         mapping = pycolmap.IncrementalPipelineOptions()
         mapping.num_threads, mapping.random_seed = settings.threads, settings.seed
         # COLMAP's thresholds are for hundreds of photos. Of ten photos around a table these place six where those place four.
@@ -157,10 +150,32 @@ def _map(pycolmap: Any, photos: Mapping[Path, float | None], work: Path, setting
         mapping.triangulation.ignore_two_view_tracks = False
         _require_parallax(pycolmap, database, next(iter(photos)).parent)
         _log.info("placing the photos.")
-        models = pycolmap.incremental_mapping(database, copies, work, options=mapping)
+        progress, placed = Progress("placing", "photos", count), itertools.count(3)  # after the first two
+        models = pycolmap.incremental_mapping(
+            database, copies, work, options=mapping, next_image_callback=lambda: progress(next(placed))
+        )
     finally:
         pycolmap.logging.minloglevel = level
     return list(models.values())
+
+
+def _match(pycolmap: Any, database: Path, copies: Sequence[str], threads: int) -> None:
+    """Match and verify all pairs of copies, block by block."""
+    options, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
+    options.num_threads, options.use_gpu = threads, False
+    pairing.match_list_path = database.with_name("pairs.txt")
+    blocks = [copies[first : first + _BLOCK] for first in range(0, len(copies), _BLOCK)]
+    total, done = math.comb(len(copies), 2), 0
+    _log.info("matching %d pairs of photos.", total)
+    progress = Progress("matching", "pairs of photos", total)
+    for one, other in itertools.combinations_with_replacement(blocks, 2):
+        pairs = list(itertools.combinations(one, 2) if one is other else itertools.product(one, other))
+        pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in pairs))
+        pycolmap.match_image_pairs(
+            database, matching_options=options, pairing_options=pairing, device=pycolmap.Device.cpu
+        )
+        done += len(pairs)
+        progress(done)
 
 
 def _require_parallax(pycolmap: Any, database: Path, root: Path) -> None:
@@ -199,7 +214,7 @@ def _require_parallax(pycolmap: Any, database: Path, root: Path) -> None:
 def _keep_coarsest(pycolmap: Any, database: Path, most: int) -> None:
     """Leave each photo at most that many features, those of the coarsest scales, which COLMAP writes first.
 
-    COLMAP's own limit is soft: of photos of 12 megapixels it left 21,609 features for 8192, and the memory of matching grows with
+    COLMAP's own limit is soft: of photos of 12 megapixels it left 21,609 features for 8192, and the time of matching grows with
     their square.
     """
     kind = pycolmap.FeatureExtractorType.SIFT

@@ -19,7 +19,7 @@ from rasterizers.interface import Camera
 from rasterizers.native import threads
 
 _VARIANCE_FLOOR: Final = 1e-5  # of grey in [0, 1]: windows with less contrast than noise correlate with nothing
-_BLOCK: Final = 1 << 19  # pixels times planes that are compared at once: they stay in a processor's cache
+_BLOCK: Final = 1 << 19  # pixels times planes that are compared at once
 _ENLARGED: Final = 64_000  # the most pixels of an enlarged photo
 
 
@@ -74,6 +74,12 @@ def cost_volume(
     volume = photo.image.new_empty(height, width, len(inverse_depths))
     reference = _Windows(photo.image.contiguous(), window)
     swept = [_Swept(photo, other) for other in others]
+    if native.runs(photo.image):
+        native.module().cost_volume(
+            reference.image, reference.mean, reference.deviation, [(s.rotated, s.shift, s.image) for s in swept],
+            inverse_depths, window, _VARIANCE_FLOOR, volume, threads(),
+        )  # fmt: skip
+        return volume
     at_once = max(1, _BLOCK // (height * width))
     for first in range(0, len(inverse_depths), at_once):
         planes = slice(first, first + at_once)
@@ -100,8 +106,8 @@ class _Windows:
 
     def __init__(self, image: Float[Tensor, "H W"], window: int) -> None:
         self.image, self.window = image, window
-        self.mean, variance = _moments(image[None], window)
-        self.deviation = (variance.clamp_min(0) + _VARIANCE_FLOOR).sqrt()
+        mean, variance = _moments(image[None], window)
+        self.mean, self.deviation = mean[0], _deviation(variance[0])
 
 
 class _Swept:
@@ -130,20 +136,15 @@ class _Swept:
 
 def _cost(reference: _Windows, other: _Swept, inverse_depths: Float[Tensor, " P"]) -> Float[Tensor, "P H W"]:
     """From the covariance with the windows of the other photo drawn through each plane, 0 where it does not see them."""
-    image, window = reference.image, reference.window
-    if native.runs(image):
-        covariance, variance = image.new_empty(2, len(inverse_depths), *image.shape)
-        native.module().sweep(
-            image, reference.mean[0], other.rotated, other.shift, other.image, inverse_depths, window,
-            covariance, variance, threads(),
-        )  # fmt: skip
-    else:
-        drawn, seen = other.through(inverse_depths)
-        mean, variance = _moments(drawn, window)
-        covariance = torch.where(seen, box_mean(image * drawn, window) - reference.mean * mean, 0.0)
-    deviation = variance.clamp_min_(0).add_(_VARIANCE_FLOOR).sqrt_()
-    cost: Tensor = (1 - covariance.div_(deviation.mul_(reference.deviation))).div_(2)
-    return cost
+    drawn, seen = other.through(inverse_depths)
+    mean, variance = _moments(drawn, reference.window)
+    covariance = box_mean(reference.image * drawn, reference.window) - reference.mean * mean
+    correlation = torch.where(seen, covariance, 0.0) / (_deviation(variance) * reference.deviation)
+    return (1 - correlation) / 2
+
+
+def _deviation(variance: Tensor) -> Tensor:
+    return (variance.clamp_min(0) + _VARIANCE_FLOOR).sqrt()
 
 
 def _moments(images: Float[Tensor, "P H W"], window: int) -> tuple[Float[Tensor, "P H W"], Float[Tensor, "P H W"]]:

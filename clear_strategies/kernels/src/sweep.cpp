@@ -5,12 +5,14 @@
 #include <cmath>
 #include <vector>
 
+#include "block.hpp"
 #include "pool.hpp"
 
 namespace clear {
 namespace {
 
-constexpr int kBand = 32;  // rows of a task; what it draws stays in the L2 cache
+constexpr int kBand = 32;   // rows of a task; what it draws stays in the L2 cache
+constexpr int kPlanes = 8;  // that are written at once: half a cache line of the volume
 
 // a · b + c, rounded once where the processor has FMA, as in torch's grid_sample.
 inline float multiply_add(float a, float b, float c) {
@@ -28,13 +30,13 @@ inline float pixel(float at, int size) {
 }
 
 // A row of the other photo, drawn through a plane, and how far from its middle each pixel lies: inside it, less than 1.
-void draw(const Sweep& s, float inverse_depth, int row, float* __restrict drawn, float* __restrict reach) {
+void draw(const Sweep& s, const Swept& o, float inverse_depth, int row, float* __restrict drawn, float* __restrict reach) {
   const std::ptrdiff_t plane = std::ptrdiff_t(s.height) * s.width;
-  const float *X = s.rotated + std::ptrdiff_t(row) * s.width, *Y = X + plane, *Z = Y + plane;
-  const float dx = s.shift[0] * inverse_depth, dy = s.shift[1] * inverse_depth, dz = s.shift[2] * inverse_depth;
-  const int width = s.other_width, height = s.other_height, n = s.width;
+  const float *X = o.rotated + std::ptrdiff_t(row) * s.width, *Y = X + plane, *Z = Y + plane;
+  const float dx = o.shift[0] * inverse_depth, dy = o.shift[1] * inverse_depth, dz = o.shift[2] * inverse_depth;
+  const int width = o.width, height = o.height, n = s.width;
   const float half_width = float(width) / 2.0f, half_height = float(height) / 2.0f;
-  const float* __restrict other = s.other;
+  const float* __restrict other = o.image;
 #pragma GCC ivdep
   for (int i = 0; i < n; ++i) {
     const float z = Z[i] + dz, u = (X[i] + dx) / (z * half_width) - 1.0f, v = (Y[i] + dy) / (z * half_height) - 1.0f;
@@ -48,56 +50,92 @@ void draw(const Sweep& s, float inverse_depth, int row, float* __restrict drawn,
   }
 }
 
-// The mean over the windows along a row: `sums` are those down its columns, with `radius` free numbers at both sides.
-void mean_along(float* __restrict sums, int width, int window, float* __restrict means) {
-  const int radius = window / 2;
-  std::fill(sums, sums + radius, sums[radius]);
-  std::fill(sums + radius + width, sums + 2 * radius + width, sums[radius + width - 1]);
-  const float share = float(1.0 / (window * window));
-  std::copy_n(sums, width, means);
-  for (int k = 1; k < window; ++k)
-    for (int i = 0; i < width; ++i) means[i] += sums[i + k];
-  for (int i = 0; i < width; ++i) means[i] *= share;
+// A thread's memory for a band of rows. Rows are whole blocks of lanes; what lies beyond the width is never written to the volume.
+struct Band {
+  Band(const Sweep& s, int most)
+      : radius(s.window / 2), row((s.width + kLanes - 1) / kLanes * kLanes), border(row + 2 * radius), size(kBand * row),
+        drawn(std::size_t(kBand + 2 * radius) * row), reaches(drawn.size()), sums(3 * border), lowest(std::size_t(most) * size),
+        means(std::size_t(kPlanes) * size) {}
+
+  int radius, row, border, size;
+  std::vector<float> drawn, reaches;  // [the rows of the band and its border, row]
+  std::vector<float> sums;            // of b, b² and a b down the columns of the windows of a row [3, border]
+  std::vector<float> lowest, means;   // of one plane [most, kBand, row], and of those that are written at once
+};
+
+// The windows of row y: sums down their columns, with the columns at both ends repeated.
+void add_columns(const Sweep& s, int y, const float* drawn, Band& t) {
+  float *b = t.sums.data() + t.radius, *bb = b + t.border, *ab = bb + t.border;
+  for (int i = 0; i < s.width; i += kLanes) {
+    Floats B = 0.0f, BB = 0.0f, AB = 0.0f;
+    for (int k = 0; k < s.window; ++k) {
+      const float* image = s.image + std::ptrdiff_t(std::clamp(y - t.radius + k, 0, s.height - 1)) * s.width + i;
+      const Floats one = Floats::load(drawn + k * t.row + i), product = load_some(image, std::min(kLanes, s.width - i)) * one;
+      B += one, BB += one * one, AB += product;
+    }
+    B.store(b + i), BB.store(bb + i), AB.store(ab + i);
+  }
+  for (float* line : {b, bb, ab}) {
+    std::fill_n(line - t.radius, t.radius, line[0]);
+    std::fill_n(line + s.width, t.radius, line[s.width - 1]);
+  }
 }
 
-void sweep_band(const Sweep& s, float inverse_depth, int first, int last, float* __restrict covariances,
-                float* __restrict variances) {
-  const int radius = s.window / 2, rows = last - first + 2 * radius, W = s.width, padded = W + 2 * radius;
-  static thread_local std::vector<float> memory;
-  memory.resize(std::size_t(2 * rows) * W + 3 * padded + 3 * W);
-  float *drawn = memory.data(), *reaches = drawn + rows * W, *d = reaches + rows * W, *dd = d + padded, *ad = dd + padded;
-  float *mean = ad + padded, *square = mean + W, *product = square + W;
-  auto clamped = [&](int row) { return std::clamp(row, 0, s.height - 1); };
-  for (int k = 0; k < rows; ++k) draw(s, inverse_depth, clamped(first - radius + k), drawn + k * W, reaches + k * W);
+// The mean over the windows of lanes i …, from the sums down their columns.
+CLEAR_INLINE Floats window_mean(const float* sums, int i, int window) {
+  Floats sum = Floats::load(sums + i);
+  for (int k = 1; k < window; ++k) sum += Floats::load(sums + i + k);
+  return sum * float(1.0 / (window * window));
+}
+
+// The costs of one plane against one other photo, sorted in among the lowest of the `before` photos before it.
+void compare(const Sweep& s, const Swept& o, float inverse_depth, int first, int last, int before, int most, Band& t) {
+  for (int k = 0; k < last - first + 2 * t.radius; ++k)
+    draw(s, o, inverse_depth, std::clamp(first - t.radius + k, 0, s.height - 1), &t.drawn[k * t.row], &t.reaches[k * t.row]);
   for (int y = first; y < last; ++y) {
-    for (int k = 0; k < s.window; ++k) {
-      const float* __restrict b = drawn + (y - first + k) * W;
-      const float* __restrict a = s.image + std::ptrdiff_t(clamped(y - radius + k)) * W;
-      float *__restrict d_ = d + radius, *__restrict dd_ = dd + radius, *__restrict ad_ = ad + radius;
-      if (k == 0)
-        for (int i = 0; i < W; ++i) d_[i] = b[i], dd_[i] = b[i] * b[i], ad_[i] = a[i] * b[i];
-      else
-        for (int i = 0; i < W; ++i) d_[i] += b[i], dd_[i] += b[i] * b[i], ad_[i] += a[i] * b[i];
-    }
-    mean_along(d, W, s.window, mean), mean_along(dd, W, s.window, square), mean_along(ad, W, s.window, product);
-    const std::ptrdiff_t at = std::ptrdiff_t(y) * W;
-    const float *reach = reaches + (y - first + radius) * W, *m = s.mean + at;
-    for (int i = 0; i < W; ++i) {
-      const float covariance = product[i] - m[i] * mean[i];
-      variances[at + i] = square[i] - mean[i] * mean[i];
-      covariances[at + i] = reach[i] < 1.0f ? covariance : 0.0f;
+    add_columns(s, y, &t.drawn[(y - first) * t.row], t);
+    const float *b = t.sums.data(), *bb = b + t.border, *ab = bb + t.border, *reach = &t.reaches[(y - first + t.radius) * t.row];
+    for (int i = 0; i < s.width; i += kLanes) {
+      const int count = std::min(kLanes, s.width - i);
+      const std::ptrdiff_t at = std::ptrdiff_t(y) * s.width + i;
+      const Floats mean = window_mean(b, i, s.window), variance = window_mean(bb, i, s.window) - mean * mean;
+      const Floats covariance = window_mean(ab, i, s.window) - load_some(s.mean + at, count) * mean;
+      const Floats deviation = root(maximum(variance, Floats(0.0f)) + s.floor) * load_some(s.deviation + at, count);
+      Floats cost = (1.0f - where(Floats::load(reach + i) < 1.0f, covariance) / deviation) * 0.5f;
+      float* lowest = &t.lowest[(y - first) * t.row + i];
+      for (int k = 0; k < std::min(before, most); ++k, lowest += t.size) {
+        const Floats kept = Floats::load(lowest);
+        minimum(kept, cost).store(lowest), cost = maximum(kept, cost);
+      }
+      if (before < most) cost.store(lowest);
     }
   }
 }
 
 }  // namespace
 
-void sweep(const Sweep& s, const float* inverse_depths, int planes, float* covariances, float* variances, int threads) {
-  const std::int64_t bands = (s.height + kBand - 1) / kBand, plane = std::int64_t(s.height) * s.width;
-  Pool::instance().run(threads, planes * bands, [&](std::int64_t task) {
-    const int p = int(task / bands), first = int(task % bands) * kBand;
-    sweep_band(s, inverse_depths[p], first, std::min(first + kBand, s.height), covariances + p * plane,
-               variances + p * plane);
+void cost_volume(const Sweep& s, const float* inverse_depths, int planes, float* volume, int threads) {
+  const int others = int(s.others.size()), most = (others + 1) / 2;
+  Pool::instance().run(threads, (s.height + kBand - 1) / kBand, [&](std::int64_t task) {
+    const int first = int(task) * kBand, last = std::min(first + kBand, s.height);
+    Band t(s, most);
+    for (int p = 0; p < planes; p += kPlanes) {
+      const int count = std::min(kPlanes, planes - p);
+      for (int q = 0; q < count; ++q) {
+        for (int k = 0; k < others; ++k) compare(s, s.others[k], inverse_depths[p + q], first, last, k, most, t);
+        for (int i = 0; i < t.size; i += kLanes) {
+          Floats sum = Floats::load(&t.lowest[i]);
+          for (int k = 1; k < most; ++k) sum += Floats::load(&t.lowest[k * t.size + i]);
+          (sum / Floats(float(most))).store(&t.means[q * t.size + i]);
+        }
+      }
+      for (int y = first; y < last; ++y) {
+        float* to = volume + std::ptrdiff_t(y) * s.width * planes + p;
+        const float* from = &t.means[(y - first) * t.row];
+        for (int i = 0; i < s.width; ++i, to += planes)
+          for (int q = 0; q < count; ++q) to[q] = from[q * t.size + i];
+      }
+    }
   });
 }
 

@@ -201,11 +201,11 @@ def test_the_better_half_of_the_photos_decides_and_the_true_plane_costs_next_to_
 
 @pytest.mark.parametrize("window", [3, 7])
 def test_the_compiled_sweep_is_the_readable_one(window: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    first, second = (Grey(p.camera, p.image.mean(2)) for p in plane_photos(2, 77, 71))
-    planes = torch.tensor([1 / 8, 1 / 4.1, 1 / 3, 3.0])
-    compiled = cost_volume(first, [second], planes, window)
+    first, *others = (Grey(p.camera, p.image.mean(2)) for p in plane_photos(4, 77, 71))
+    planes = torch.tensor([1 / 8, 1 / 4.1, 1 / 3, 3.0, *torch.linspace(0.1, 0.5, 6)])
+    compiled = cost_volume(first, others, planes, window)
     monkeypatch.setattr(cost.native, "available", lambda: False)
-    difference = (cost_volume(first, [second], planes, window) - compiled).abs()
+    difference = (cost_volume(first, others, planes, window) - compiled).abs()
     assert difference.median() < 1e-6
     assert difference.max() < 0.01  # where there is next to no contrast
 
