@@ -19,7 +19,7 @@ from torch import Tensor
 
 import rasterizers
 from rasterizers.autograd import Inputs, Rendered, in_graph, render, uncompiled
-from rasterizers.geometry import constant_band, depths, low_and_span
+from rasterizers.geometry import REACH, constant_band, depths, low_and_span
 from rasterizers.interface import Camera, Rasterizer, RasterSettings, WithRadii, over
 from rasterizers.native import empty_for
 from rasterizers.reference.projection import footprints
@@ -29,7 +29,6 @@ __all__ = ["cameras_of", "rasterization", "rasterizer_of"]
 _MODES: Final = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 _FARTHEST: Final = 1e10  # gsplat's default
 _ALPHA_MAX: Final = 0.999  # gsplat's cap on a single contribution; Inria's, and our default, is 0.99
-_REACH: Final = 3.33  # standard deviations: gsplat's bound of a Gaussian's box
 # The only value of each other argument that this package draws; None for one that is not listed. The others change the speed.
 _SUPPORTED: Final = {
     "camera_model": "pinhole", "with_ut": False, "with_eval3d": False, "rolling_shutter": "GLOBAL", "distributed": False,
@@ -308,7 +307,7 @@ def _extents(
     opacities: Float[Tensor, " M"], deviations: Float[Tensor, "M 2"], alpha_min: float
 ) -> Float[Tensor, "M 2"]:
     """Half the box in which alpha may reach alpha_min, whole px."""
-    reach = (2 * (opacities / alpha_min).log()).clamp_min(0).sqrt().clamp_max(_REACH)
+    reach = (2 * (opacities / alpha_min).log()).clamp_min(0).sqrt().clamp_max(REACH)
     return (reach[:, None] * deviations).ceil().clamp_min(1)
 
 
@@ -325,6 +324,12 @@ class _Info(dict[str, Any]):
 
     def __contains__(self, name: object) -> bool:
         return super().__contains__(name) or name in self._later
+
+    def get(self, name: str, default: Any = None) -> Any:
+        try:
+            return self[name]
+        except KeyError:
+            return default
 
     def __missing__(self, name: str) -> Any:
         if name not in self._later:

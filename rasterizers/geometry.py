@@ -17,6 +17,9 @@ SH_C0: Final = 0.28209479177387814
 BLACK: Final = 1e-6
 """A colour of 0 may come out this much below 0 by rounding. It is drawn as 0, but has a gradient, or it could never learn."""
 
+REACH: Final = 3.33
+"""Standard deviations, at most, from the centre of a Gaussian to the side of its box. gsplat's."""
+
 
 def rotation_matrix(quats: Float[Tensor, "M 4"]) -> Float[Tensor, "M 3 3"]:
     """Rotation matrices of quaternions (wxyz, any norm); the zero quaternion gives the identity and zero gradient."""

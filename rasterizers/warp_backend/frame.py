@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 
 import torch
 import warp as wp
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rasterizers.checks import packed_rows, require_cotangents, require_finite, require_splats
@@ -29,7 +29,7 @@ from rasterizers.warp_backend import types
 from rasterizers.warp_backend.bins import find_tiles, list_pairs
 from rasterizers.warp_backend.blend import blend, blend_pieces, blend_vjp
 from rasterizers.warp_backend.colour import basis
-from rasterizers.warp_backend.project import fold, project, project_vjp
+from rasterizers.warp_backend.project import fold, project, project_vjp, radii
 from rasterizers.warp_backend.settings import PAIR_BYTES, SUMS_BYTES, TILE, WarpSettings, mebibytes, padded
 from rasterizers.warp_runtime import launch, on_device, on_stream, sort_pairs
 
@@ -245,6 +245,18 @@ class WarpRendering:
     def depth(self) -> Float[Tensor, "H W"] | None:
         self._resolve()
         return self._depth
+
+    @property
+    def radii(self) -> Int[Tensor, "N 2"]:
+        """See `WithRadii`."""
+        frame, view = self._frame, self._view
+        out = frame.empty(frame.n, 2, dtype=torch.int32)
+        with on_stream(frame.like.device):
+            frame.launch(
+                radii, frame.n, frame.pose, view.grid, frame.cuts, frame.means, frame.quats, frame.scales, view.opacities,
+                view.visible, out,
+            )  # fmt: skip
+        return out
 
     def _resolve(self) -> None:
         frame = self._frame

@@ -28,6 +28,7 @@ from rasterizers.warp_backend.types import (
 wp.set_module_options({"enable_backward": False})
 
 BLACK = wp.constant(geometry.BLACK)
+REACH = wp.constant(geometry.REACH)
 HUGE = wp.constant(1e30)  # such an ellipse, of 1e-15 px, covers no pixel centre, and the square would overflow
 
 
@@ -139,6 +140,32 @@ def project(
                     all_finite = all_finite and finite(ellipse.rgb)
     if not all_finite:
         flags[0] = wp.int64(1)
+
+
+@wp.kernel
+def radii(
+    poses: wp.array[Pose],
+    grids: wp.array[Grid],
+    cuts: Cuts,
+    means: wp.array[wp.vec3],
+    quats: wp.array[wp.vec4],
+    scales: wp.array[wp.vec3],
+    opacities: wp.array[wp.float32],
+    visible: wp.array[wp.bool],
+    out: wp.array2d[wp.int32],
+) -> None:
+    """One thread per Gaussian; see `WithRadii`."""
+    i = wp.tid()
+    out[i, 0] = 0
+    out[i, 1] = 0
+    if not visible[i]:
+        return
+    pose, grid = poses[0], grids[0]
+    f = footprint_of(geometry_of(pose, grid, centre_of(pose, means[i]), quats[i], scales[i]), grid, cuts)
+    power = 2.0 * wp.log(opacities[i] * f.compensation / cuts.alpha_min)
+    reach = wp.min(wp.sqrt(wp.max(power, 0.0)), REACH) * f.size
+    out[i, 0] = wp.int32(wp.clamp(wp.ceil(reach * wp.sqrt(f.a + f.kernel)), 1.0, 1e9))
+    out[i, 1] = wp.int32(wp.clamp(wp.ceil(reach * wp.sqrt(f.c + f.kernel)), 1.0, 1e9))
 
 
 @wp.func

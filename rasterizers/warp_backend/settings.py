@@ -26,7 +26,7 @@ SUMS_BYTES: Final = 36  # a pair's nine sums for one cotangent
 
 
 _TRAITS: Final = {
-    device: Traits(devices=frozenset({device}), dtypes=frozenset({torch.float32}), depth=True, absgrad=True)
+    device: Traits(devices=frozenset({device}), dtypes=frozenset({torch.float32}), depth=True, absgrad=True, radii=True)
     for device in ("cpu", "cuda")
 }
 

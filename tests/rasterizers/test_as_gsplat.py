@@ -224,6 +224,20 @@ def test_radii_are_gsplats_pixels_as_far_as_the_opacity_lets_them_reach(backend,
     assert torch.equal(info["radii"] if packed else info["radii"][ids], expected[ids])
 
 
+@needs("warp")
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_radii_of_warp_are_those_of_the_reference_as_float32_rounds_them(mode):
+    splats, (viewmats, Ks) = {name: x.float() for name, x in gaussians().items()}, cameras()
+    call = *splats.values(), colours(False, None).float(), viewmats.float(), Ks.float(), WIDTH, HEIGHT
+    of = {name: rasterization(*call, rasterize_mode=mode, backend=name)[2] for name in ("torch", "warp")}
+    assert of["warp"].get("radii") is of["warp"]["radii"]
+    found, expected = (info["radii"] for info in of.values())
+    assert found.dtype == torch.int32
+    assert torch.equal(found > 0, expected > 0)
+    assert float((found != expected).float().mean()) < 0.01
+    assert int((found - expected).abs().max()) <= 1 < int(expected.max())
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_what_lies_too_far_or_is_too_small_is_left_out(backend):
     splats, colors, (viewmats, Ks) = gaussians(), colours(False, None), cameras()
