@@ -382,5 +382,6 @@ def compare(loop, p, expected):
         if g is not None:
             is_drawn = name in PARAMETERS and (name != "opacities" or loop.opacities != "detached")
             assert not (is_drawn and x.grad.requires_grad), f"{name}: .grad has a graph, of LR alone"
+            g = g.detach()
             error, size = float((x.grad.detach().double() - g).abs().max()), float(g.abs().max())
             assert error <= 2e-3 * size + 1e-12, f"{name}: {error:.3g} of {size:.3g}"

@@ -32,7 +32,7 @@ from tests.helpers.short_run import SCENE, tensors, with_depth
 from tests.training.test_resume import without_time
 
 pytestmark = needs("warp")
-ROUND = 50  # iterations between changes of the structure
+ROUND = 25  # iterations between changes of the structure
 FIRST = "the first of its kind"
 FAILED = "a recording failed"
 
@@ -48,11 +48,11 @@ DEVICE = torch.device("cpu")
 
 def start(
     *more: cs.Strategy,
-    iterations: int = 500,
+    iterations: int = 250,
     density: bool = True,
     scene: Scene = SCENE,
     rises_at: int = 20,
-    degree_every: int = 150,
+    degree_every: int = 75,
     scores_from: int = 1,
     reconciles: cs.Strategy | None = None,
     **of_svs: Any,
@@ -61,19 +61,19 @@ def start(
     from clear_strategies.kernels.gaussian_step.warp import WarpGaussianStep
 
     objective = cs.Objective(
-        lambda_hr=WarmupDecay(final=0.1, start=rises_at, full=60, decay_from=400, end=500), kernels="warp"
+        lambda_hr=WarmupDecay(final=0.1, start=rises_at, full=60, decay_from=200, end=250), kernels="warp"
     )
-    defaults = {"dropout": Ramp(full=200), "anchor_start": 300, "anchor_weights": {"means": 1.0}}
+    defaults = {"dropout": Ramp(full=100), "anchor_start": 150, "anchor_weights": {"means": 1.0}}
     svs = cs.SVS(looks=0, anchor_strength=0.01, **(defaults | of_svs))
     conductor = cs.Conductor(reconciles or cs.GCO(), cs.P2G(), svs, *more, objective=objective, statistics_from=1)
     state = TrainState.start(
         with_depth(scene).to(DEVICE), conductor,
         settings=FitSettings(iterations=iterations, scale_schedule=False, degree_every=degree_every, seed=5),
         density=DensitySettings(
-            start=1, stop=300 if density else 2, statistics_from=scores_from, every=ROUND, reset_every=120, threshold=1e-5,
+            start=1, stop=150 if density else 2, statistics_from=scores_from, every=ROUND, reset_every=60, threshold=1e-5,
             max_gaussians=80,
         ),
-        rates=LearningRates(means=LogLinear(end=500), detail_decay=0.01, cool_from=450, end=500),
+        rates=LearningRates(means=LogLinear(end=250), detail_decay=0.01, cool_from=225, end=250),
         mip=MipFilter(every=15, last=1),
     )  # fmt: skip
     state.compiled_step = CompiledStep(conductor, state.optimizer, passes=WarpGaussianStep)
@@ -120,13 +120,13 @@ def live_in(state: TrainState) -> dict[str, int]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("moves", ["density", "mcmc"])
-def test_five_hundred_replayed_iterations_have_the_bits_of_live_ones(moves):
+def test_a_whole_training_of_replays_has_the_bits_of_a_live_one(moves):
     def best():
         more = [cs.PseudoViews(count=8, reach=0.1), cs.FadingOpacity(rate=0.002), cs.RandomBackground(until=1_350)]
-        return start(*more, *([MCMC(start=50, stop=300, every=ROUND, per_point=3.0)] if moves == "mcmc" else []))
+        return start(*more, *([MCMC(start=ROUND, stop=150, every=ROUND, per_point=3.0)] if moves == "mcmc" else []))
 
-    replayed = both(best, 500)
-    assert replays_of(replayed) > 600  # of 500 views and 250 extra views
+    replayed = both(best, 250)
+    assert replays_of(replayed) > 300  # of 250 views and 125 extra views
     assert len(replayed.field) > 12
     assert live_in(replayed).keys() <= {FIRST, "the recorded lists of pairs are too short"}
 
