@@ -8,7 +8,7 @@ two more channels: the depth of the centre, and the 1 whose picture is alpha.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, ItemsView, Iterator, KeysView, Mapping, Sequence, ValuesView
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Final, cast
@@ -312,7 +312,7 @@ def _extents(
 
 
 class _Info(dict[str, Any]):
-    """Gsplat's `info`. What not every loop reads is made when it is asked for.
+    """Gsplat's `info`. What not every loop reads is made when it is asked for, also by what goes through all of it.
 
     Args:
         later: what makes each of these values, and others besides.
@@ -334,8 +334,26 @@ class _Info(dict[str, Any]):
     def __missing__(self, name: str) -> Any:
         if name not in self._later:
             raise KeyError(name)
-        self.update(self._later[name]())
+        for made, value in self._later[name]().items():
+            self.setdefault(made, value)  # what the loop has written stays
         return self[name]
+
+    def _whole(self) -> dict[str, Any]:
+        for name in self._later:
+            self.get(name)
+        return dict(super().items())
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._whole())
+
+    def keys(self) -> KeysView[str]:  # type: ignore[override]
+        return self._whole().keys()
+
+    def values(self) -> ValuesView[Any]:  # type: ignore[override]
+        return self._whole().values()
+
+    def items(self) -> ItemsView[str, Any]:  # type: ignore[override]
+        return self._whole().items()
 
 
 def _info(

@@ -230,7 +230,7 @@ def test_radii_of_warp_are_those_of_the_reference_as_float32_rounds_them(mode):
     splats, (viewmats, Ks) = {name: x.float() for name, x in gaussians().items()}, cameras()
     call = *splats.values(), colours(False, None).float(), viewmats.float(), Ks.float(), WIDTH, HEIGHT
     of = {name: rasterization(*call, rasterize_mode=mode, backend=name)[2] for name in ("torch", "warp")}
-    assert of["warp"].get("radii") is of["warp"]["radii"]
+    assert {**of["warp"]}["radii"] is dict(of["warp"].items())["radii"] is of["warp"].get("radii")
     found, expected = (info["radii"] for info in of.values())
     assert found.dtype == torch.int32
     assert torch.equal(found > 0, expected > 0)
