@@ -33,6 +33,12 @@ HUGE = wp.constant(1e30)  # such an ellipse, of 1e-15 px, covers no pixel centre
 
 
 @wp.func
+def half_box(f: Footprint, reach: wp.float32) -> wp.vec2:
+    """Of the box that reaches so many standard deviations from the centre, px."""
+    return reach * f.size * wp.vec2(wp.sqrt(f.a + f.kernel), wp.sqrt(f.c + f.kernel))
+
+
+@wp.func
 def ellipse_at(u: wp.float64, v: wp.float64, f: Footprint, opacity: wp.float32, cuts: Cuts) -> Ellipse:
     whole_u, whole_v = wp.round(u), wp.round(v)
     ellipse = Ellipse()
@@ -43,8 +49,7 @@ def ellipse_at(u: wp.float64, v: wp.float64, f: Footprint, opacity: wp.float32, 
     ellipse.C = 0.5 * f.yy
     ellipse.opacity = opacity * f.compensation
     ellipse.reach = wp.log(wp.max(ellipse.opacity, 1e-30) / cuts.alpha_min) * 1.001 + 1e-3
-    extent = wp.sqrt(2.0 * wp.max(ellipse.reach, 0.0)) * f.size
-    ellipse.half = extent * wp.vec2(wp.sqrt(f.a + f.kernel), wp.sqrt(f.c + f.kernel))
+    ellipse.half = half_box(f, wp.sqrt(2.0 * wp.max(ellipse.reach, 0.0)))
     return ellipse
 
 
@@ -163,9 +168,9 @@ def radii(
     pose, grid = poses[0], grids[0]
     f = footprint_of(geometry_of(pose, grid, centre_of(pose, means[i]), quats[i], scales[i]), grid, cuts)
     power = 2.0 * wp.log(opacities[i] * f.compensation / cuts.alpha_min)
-    reach = wp.min(wp.sqrt(wp.max(power, 0.0)), REACH) * f.size
-    out[i, 0] = wp.int32(wp.clamp(wp.ceil(reach * wp.sqrt(f.a + f.kernel)), 1.0, 1e9))
-    out[i, 1] = wp.int32(wp.clamp(wp.ceil(reach * wp.sqrt(f.c + f.kernel)), 1.0, 1e9))
+    half = half_box(f, wp.min(wp.sqrt(wp.max(power, 0.0)), REACH))
+    for c in range(2):
+        out[i, c] = wp.int32(wp.clamp(wp.ceil(half[c]), 1.0, 1e9))
 
 
 @wp.func
