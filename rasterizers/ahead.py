@@ -12,6 +12,7 @@ from typing import Any, Final
 from jaxtyping import Float
 from torch import Tensor
 
+from rasterizers.checks import drawing
 from rasterizers.interface import Camera, Rasterizer, Rendering, Splats
 
 
@@ -31,14 +32,13 @@ class _Ahead(threading.local):
         if self.kept is not None and self.kept[0] == _shown(rasterizer, splats, camera, depth):
             rendering, self.kept = self.kept[1], None
             return rendering
-        drawing = functools.partial(rasterizer, depth=True) if depth else rasterizer
         wanted = self.wanted
         if wanted is None or camera.world_to_camera.tolist() != wanted.world_to_camera.tolist():
-            return drawing(splats, camera)
+            return drawing(rasterizer, depth)(splats, camera)
         self.wanted = None
         plain = replace(splats, rgb_offset=None)
         if splats.rgb_offset is None and _grid(camera) == _grid(wanted):  # it is this one
-            return drawing(splats, camera)
+            return drawing(rasterizer, depth)(splats, camera)
         other = replace(wanted, world_to_camera=camera.world_to_camera)  # by the same tensor, as a backend sees at once
         together = functools.partial(rasterizer.render_scales, depth=[True] * 2) if depth else rasterizer.render_scales
         ahead, rendering = together([(plain, other), (splats, camera)])

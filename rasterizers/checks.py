@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from itertools import pairwise
 from typing import Final
@@ -150,3 +151,8 @@ def require_absgrad(rasterizer: Rasterizer) -> None:
 def packed_rows(sh: Float[Tensor, "N B 3"]) -> Float[Tensor, "N B 3"]:
     """The tensor with contiguous rows. A view of the active bands has gaps between its rows, and is returned as it is."""
     return sh if sh.numel() == 0 or sh.stride()[1:] == (3, 1) else sh.contiguous()
+
+
+def drawing(rasterizer: Rasterizer, depth: bool) -> Callable[..., Rendering]:
+    """The rasterizer, called with `depth=True` if depth is True: without the trait it may not have the argument."""
+    return functools.partial(rasterizer, depth=True) if depth else rasterizer
