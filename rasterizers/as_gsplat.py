@@ -315,7 +315,7 @@ class _Info(dict[str, Any]):
     """Gsplat's `info`. What not every loop reads is made when it is asked for, also by what goes through all of it.
 
     Args:
-        later: what makes each of these values, and others besides.
+        later: what makes each of these values.
     """
 
     def __init__(self, values: Mapping[str, Any], later: Mapping[str, Callable[[], dict[str, Any]]]) -> None:
@@ -334,8 +334,10 @@ class _Info(dict[str, Any]):
     def __missing__(self, name: str) -> Any:
         if name not in self._later:
             raise KeyError(name)
-        for made, value in self._later[name]().items():
-            self.setdefault(made, value)  # what the loop has written stays
+        make = self._later[name]
+        for made, value in make().items():
+            if self._later[made] is make:
+                self.setdefault(made, value)  # what the loop has written stays
         return self[name]
 
     def _whole(self) -> dict[str, Any]:

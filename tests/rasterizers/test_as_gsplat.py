@@ -214,9 +214,8 @@ def test_radii_are_gsplats_pixels_as_far_as_the_opacity_lets_them_reach(backend,
     )
     blurred = torch.linalg.inv(conics[..., [0, 1, 1, 2]].unflatten(-1, (2, 2)))
     opacities = splats["opacities"] * (compensations if antialiased else 1)
-    reach = (
-        (2 * (255 * opacities).log()).clamp(0, 3.33**2).sqrt()
-    )  # as gsplat's kernel; its torch function always takes 3.33
+    # As gsplat's kernel; its torch function always takes 3.33.
+    reach = (2 * (255 * opacities).log()).clamp(0, 3.33**2).sqrt()
     expected = (reach[..., None] * blurred.diagonal(dim1=-2, dim2=-1).sqrt()).ceil().int()
     assert "radii" in info  # as gsplat's strategies ask before they read it
     ids = (info["camera_ids"], info["gaussian_ids"]) if packed else (info["radii"] > 0).all(-1).nonzero(as_tuple=True)
