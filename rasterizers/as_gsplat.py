@@ -340,22 +340,23 @@ class _Info(dict[str, Any]):
                 self.setdefault(made, value)  # what the loop has written stays
         return self[name]
 
-    def _whole(self) -> dict[str, Any]:
-        for name in self._later:
-            self.get(name)
-        return dict(super().items())
-
     def __iter__(self) -> Iterator[str]:
-        return iter(self._whole())
+        return iter(dict.fromkeys((*super().__iter__(), *self._later)))  # names make nothing: a type checker asks for one
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
 
     def keys(self) -> KeysView[str]:  # type: ignore[override]
-        return self._whole().keys()
+        return KeysView(self)
 
     def values(self) -> ValuesView[Any]:  # type: ignore[override]
-        return self._whole().values()
+        return ValuesView(self)
 
     def items(self) -> ItemsView[str, Any]:  # type: ignore[override]
-        return self._whole().items()
+        return ItemsView(self)
+
+    def copy(self) -> dict[str, Any]:
+        return dict(self)
 
 
 def _info(

@@ -223,13 +223,24 @@ def test_radii_are_gsplats_pixels_as_far_as_the_opacity_lets_them_reach(backend,
     assert torch.equal(info["radii"] if packed else info["radii"][ids], expected[ids])
 
 
+def test_names_of_info_make_nothing_and_what_reads_it_as_a_dictionary_has_the_whole():
+    splats, (viewmats, Ks) = gaussians(), cameras()
+    _, _, info = rasterization(*splats.values(), colours(False, None), viewmats, Ks, WIDTH, HEIGHT, packed=False)
+    assert len(info) == len(list(info)) == len(set(info)) and {"means2d", "radii", "conics"} <= info.keys()
+    assert not any(dict.__contains__(info, name) for name in ("radii", "conics", "depths"))
+    info["conics"] = None  # a loop's own
+    for whole in ({**info}, dict(info), dict(info.items()), info.copy(), {} | info):
+        assert whole.keys() == info.keys()
+        assert whole["radii"] is info["radii"] and whole["depths"] is info["depths"] and whole["conics"] is None
+    assert info.get("nothing") is None and "nothing" not in info
+
+
 @needs("warp")
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 def test_radii_of_warp_are_those_of_the_reference_as_float32_rounds_them(mode):
     splats, (viewmats, Ks) = {name: x.float() for name, x in gaussians().items()}, cameras()
     call = *splats.values(), colours(False, None).float(), viewmats.float(), Ks.float(), WIDTH, HEIGHT
     of = {name: rasterization(*call, rasterize_mode=mode, backend=name)[2] for name in ("torch", "warp")}
-    assert {**of["warp"]}["radii"] is dict(of["warp"].items())["radii"] is of["warp"].get("radii")
     found, expected = (info["radii"] for info in of.values())
     assert found.dtype == torch.int32
     assert torch.equal(found > 0, expected > 0)
