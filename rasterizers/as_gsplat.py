@@ -341,7 +341,9 @@ class _Info(dict[str, Any]):
         return self[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(dict.fromkeys((*super().__iter__(), *self._later)))  # names make nothing: a type checker asks for one
+        return iter(
+            dict.fromkeys((*super().__iter__(), *self._later))
+        )  # names make nothing: a type checker asks for one
 
     def __len__(self) -> int:
         return sum(1 for _ in self)

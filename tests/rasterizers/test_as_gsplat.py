@@ -226,13 +226,17 @@ def test_radii_are_gsplats_pixels_as_far_as_the_opacity_lets_them_reach(backend,
 def test_names_of_info_make_nothing_and_what_reads_it_as_a_dictionary_has_the_whole():
     splats, (viewmats, Ks) = gaussians(), cameras()
     _, _, info = rasterization(*splats.values(), colours(False, None), viewmats, Ks, WIDTH, HEIGHT, packed=False)
-    assert len(info) == len(list(info)) == len(set(info)) and {"means2d", "radii", "conics"} <= info.keys()
+    assert len(info) == len(list(info)) == len(set(info))
+    assert {"means2d", "radii", "conics"} <= info.keys()
     assert not any(dict.__contains__(info, name) for name in ("radii", "conics", "depths"))
     info["conics"] = None  # a loop's own
     for whole in ({**info}, dict(info), dict(info.items()), info.copy(), {} | info):
         assert whole.keys() == info.keys()
-        assert whole["radii"] is info["radii"] and whole["depths"] is info["depths"] and whole["conics"] is None
-    assert info.get("nothing") is None and "nothing" not in info
+        assert whole["radii"] is info["radii"]
+        assert whole["depths"] is info["depths"]
+        assert whole["conics"] is None
+    assert info.get("nothing") is None
+    assert "nothing" not in info
 
 
 @needs("warp")
