@@ -77,7 +77,10 @@ class SkipPolicy:
         elif s.coarse_until > 0:
             phrases.append(f"HR at half its size until iteration {s.coarse_until}")
         if s.hr_every > 1 and s.coarse_until > 0:
-            phrases.append(f"HR in one of {s.hr_every} iterations until iteration {s.coarse_until}")
+            phrases.append(
+                f"HR in one of {s.hr_every} iterations until iteration {s.coarse_until}, and in each whose scores "
+                "densification reads"
+            )
         if in_host or s.plateau_gain == 0:
             return phrases
         if s.plateau_window == 0:

@@ -68,7 +68,7 @@ def test_a_skip_that_cannot_act_is_a_warning_and_not_in_the_plan(caplog):
     view, skips = toy.scene().train[0], Skips(coarse_until=10, plateau_gain=0.01)
     half, rest, window = SkipPolicy(replace(skips, hr_every=2)).descriptions([view])
     assert half == "HR at half its size until iteration 10"
-    assert rest == "HR in one of 2 iterations until iteration 10"
+    assert rest == "HR in one of 2 iterations until iteration 10, and in each whose scores densification reads"
     assert "by less than 1.0% in 500 iterations" in window
     assert not caplog.records
     odd = replace(view, hr=view.hr.reduced(4))  # by a factor of 1
