@@ -27,7 +27,7 @@ _COMPARED: Final = ("means", *_COPIED)
 _GROUPS: Final = {"means": "xyz", "quats": "rotation", "sh0": "f_dc"}
 """The parameter groups of 3DGS that hold the parameters `_COMPARED`."""
 _HASH_FACTOR: Final = 0x2545F4914F6CDD1D
-_DISTANCES: Final = 1 << 24  # at once: 64 MB; FSGS appends 100,000 Gaussians of one colour
+_DISTANCES: Final = 1 << 24  # at once, 64 MB: FSGS appends very many Gaussians of one colour
 
 
 @dataclass(frozen=True, slots=True, eq=False)
