@@ -27,6 +27,7 @@ _COMPARED: Final = ("means", *_COPIED)
 _GROUPS: Final = {"means": "xyz", "quats": "rotation", "sh0": "f_dc"}
 """The parameter groups of 3DGS that hold the parameters `_COMPARED`."""
 _HASH_FACTOR: Final = 0x2545F4914F6CDD1D
+_DISTANCES: Final = 1 << 24  # at once, 64 MB: FSGS appends very many Gaussians of one colour
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,8 +157,9 @@ def _nearest_copied(before: Mapping[str, Tensor], rows: Mapping[str, Tensor]) ->
     for first in sorted(set(begin[ambiguous].tolist())):
         children = (ambiguous & (begin == first)).nonzero()[:, 0]
         candidates = order[first : int(end[children[0]])]
-        distances = torch.cdist(rows["means"][children], before["means"][candidates])
-        parents[children] = candidates[distances.argmin(1)]
+        means = before["means"][candidates]
+        for some in children.split(max(1, _DISTANCES // len(candidates))):
+            parents[some] = candidates[torch.cdist(rows["means"][some], means).argmin(1)]
     return parents
 
 

@@ -1,6 +1,7 @@
 """Run an unchanged trainer where there is no GPU: `python -m integration.on_cpu [--strategies best …] train.py -s data`.
 
-The trainer is one that draws with gsplat, or a 3DGS-style one, which has a module `gaussian_renderer`.
+The trainer is one that draws with gsplat, as nerfstudio's splatfacto does, or a 3DGS-style one, which has a module
+`gaussian_renderer`.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import logging
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
@@ -50,6 +52,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.strategies is None:
         _require_strategies(parser, options)
+    elif _is_of_nerfstudio(options.script):
+        parser.error(
+            "--strategies has no effect on nerfstudio's scripts, whose method clear-splatfacto has the strategies. Use, e.g.: "
+            f"{options.script} clear-splatfacto --pipeline.model.strategies {options.strategies} …"
+        )
     return launcher.run(options, lambda: prepared(options.script, options.rest))
 
 
@@ -75,6 +82,13 @@ def prepared(script: Path, arguments: Sequence[str] = ()) -> launcher.Host:
         gsplat_functions.replace()
     _log.info("CUDA means the CPU here; images are drawn by rasterizer=%s.", rasterizers.fastest("cpu"))
     return GSPLAT if renderer is None else INRIA
+
+
+def _is_of_nerfstudio(script: Path) -> bool:
+    return (
+        script.is_file()
+        and re.search(rb"^\s*(from|import) nerfstudio\b", script.read_bytes(), re.MULTILINE) is not None
+    )
 
 
 def _knn(renderer: Path | None) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import resource
 import sys
 import threading
@@ -25,8 +26,10 @@ _TENSORS: Final = ("BoolTensor", "ByteTensor", "DoubleTensor", "FloatTensor", "H
 def replace() -> None:
     """From here on CUDA means the CPU, in this process and in those that it forks.
 
-    `torch.cuda.is_available()` stays false, and what is not replaced raises torch's own errors.
+    `torch.cuda.is_available()` stays false, and what is not replaced raises torch's own errors. `torch.compile` compiles nothing
+    unless the environment says so: it takes longer than the small functions that trainers compile, and needs a C++ compiler.
     """
+    os.environ.setdefault("TORCHDYNAMO_DISABLE", "1")
     _CudaIsTheCpu().__enter__()  # type: ignore[no-untyped-call]
     _replace(threading.Thread, "start", _started_with_it)
     if "fork" in multiprocessing.get_all_start_methods():  # a process that is started anew has none of this

@@ -28,7 +28,7 @@ def replace() -> None:
     everything: Any = (gsplat, rendering, distributed, relocation_of, ops, wrapper)
     in_torch = importlib.import_module("gsplat.cuda._torch_impl")
     for name, ours in {
-        "rasterization": _rasterization(rendering.rasterization),
+        "rasterization": rasterization_like(rendering.rasterization, one_radius=_version(gsplat) < (1, 5)),
         "quat_scale_to_covar_preci": in_torch._quat_scale_to_covar_preci,
         "_make_lazy_cuda_func": function,
         "cli": lambda train, config, verbose=False: train(0, 0, 1, config),
@@ -38,14 +38,25 @@ def replace() -> None:
                 setattr(module, name, ours)
 
 
-def _rasterization(theirs: Callable[..., Any]) -> Callable[..., Any]:
-    """Ours, for calls in gsplat's order and with its default of `packed`."""
+def _version(gsplat: Any) -> tuple[int, ...]:
+    return tuple(int(part) for part in gsplat.__version__.split(".")[:2])
+
+
+def rasterization_like(theirs: Callable[..., Any], *, one_radius: bool) -> Callable[..., Any]:
+    """Ours, for calls in gsplat's order and with its default of `packed`.
+
+    Args:
+        one_radius: `info["radii"]` has one number for each Gaussian, as before gsplat 1.5.
+    """
     signature = inspect.signature(theirs)
 
     @functools.wraps(theirs)
     def rasterization(*args: Any, **kwargs: Any) -> Any:
         call = {"packed": signature.parameters["packed"].default} | signature.bind(*args, **kwargs).arguments
-        return rasterizers.rasterization(**call)
+        images, alphas, info = rasterizers.rasterization(**call)
+        if one_radius:
+            info["radii"] = info["radii"].amax(-1)
+        return images, alphas, info
 
     return rasterization
 
@@ -89,4 +100,8 @@ def _adam(
     param[rows] -= lr * mean[rows] / (square[rows].sqrt() + eps)
 
 
-_FUNCTIONS: Final[dict[str, Callable[..., Any]]] = {"relocation": _relocation, "adam": _adam}
+_FUNCTIONS: Final[dict[str, Callable[..., Any]]] = {
+    "relocation": _relocation,
+    "compute_relocation": _relocation,  # its name before gsplat 1.5
+    "adam": _adam,
+}

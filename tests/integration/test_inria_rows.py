@@ -135,6 +135,16 @@ def test_clones_splits_and_pruned_gaussians_are_found_by_colour_and_place():
     assert find_change(gaussians(1.0), empty).parents.tolist() == []
 
 
+def test_many_gaussians_of_one_colour_need_no_memory_for_all_their_distances(monkeypatch):
+    x = [float(i) for i in range(40)]
+    before, after = gaussians(*x, colours=(7.0,) * 40), gaussians(*x, *(i + 0.2 for i in x), colours=(7.0,) * 80)
+    sizes, cdist = [], torch.cdist
+    monkeypatch.setattr("integration.inria.rows._DISTANCES", 120)
+    monkeypatch.setattr(torch, "cdist", lambda a, b: sizes.append(len(a) * len(b)) or cdist(a, b))
+    assert find_change(before, after).parents.tolist() == [*range(40), *range(40)]
+    assert max(sizes) <= 120
+
+
 # ---- a proxy of a host's model: opacities and colours are changed once, however the host's getters call each other
 class Model:
     """Getters as in Mip-Splatting, where one calls another."""
