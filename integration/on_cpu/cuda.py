@@ -63,8 +63,10 @@ def _on_cpu(x: Any) -> Any:
 
 class _CudaIsTheCpu(TorchFunctionMode):
     def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if function in (torch.Tensor.cuda, torch.Tensor.pin_memory):
+        if function is torch.Tensor.pin_memory:
             return args[0]
+        if function is torch.Tensor.cuda:
+            return _without_gaps(args[0])
         named = {name: _on_cpu(x) for name, x in (kwargs or {}).items() if name != "pin_memory"}
         if isinstance(named.get("device"), int):
             named["device"] = _CPU
@@ -72,7 +74,14 @@ class _CudaIsTheCpu(TorchFunctionMode):
             args = (args[0], _CPU, *args[2:])
         if function is torch.device and args and _on_cpu(args[0]) != args[0]:
             return _CPU  # without an index, as the device of the tensors
-        return function(*map(_on_cpu, args), **named)
+        result = function(*map(_on_cpu, args), **named)
+        moved = function is torch.Tensor.to and any(isinstance(x, str | torch.device) for x in (*args, *named.values()))
+        return _without_gaps(result) if moved else result
+
+
+def _without_gaps(x: torch.Tensor) -> torch.Tensor:
+    """The tensor, as another device gets it: rows with gaps between them are copied. Adam(fused=True) does not see gaps here."""
+    return x if torch.empty_like(x).stride() == x.stride() else x.contiguous()
 
 
 def _started_with_it(start: Callable[[threading.Thread], None]) -> Callable[[threading.Thread], None]:
