@@ -360,6 +360,9 @@ class _Info(dict[str, Any]):
     def copy(self) -> dict[str, Any]:
         return dict(self)
 
+    def __or__(self, other: dict[str, Any]) -> dict[str, Any]:  # type: ignore[override]
+        return self.copy() | other
+
 
 def _info(
     each: Sequence[Rendered], views: Sequence[_View], lead: tuple[int, ...]

@@ -230,7 +230,7 @@ def test_names_of_info_make_nothing_and_what_reads_it_as_a_dictionary_has_the_wh
     assert {"means2d", "radii", "conics"} <= info.keys()
     assert not any(dict.__contains__(info, name) for name in ("radii", "conics", "depths"))
     info["conics"] = None  # a loop's own
-    for whole in ({**info}, dict(info), dict(info.items()), info.copy(), {} | info):
+    for whole in ({**info}, dict(info), dict(info.items()), info.copy(), {} | info, info | {}):
         assert whole.keys() == info.keys()
         assert whole["radii"] is info["radii"]
         assert whole["depths"] is info["depths"]
