@@ -8,7 +8,7 @@ two more channels: the depth of the centre, and the 1 whose picture is alpha.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, ItemsView, Iterator, KeysView, Mapping, Sequence, ValuesView
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Final, cast
@@ -315,7 +315,7 @@ class _Info(dict[str, Any]):
     """Gsplat's `info`. What not every loop reads is made when it is asked for, also by what goes through all of it.
 
     Args:
-        later: what makes each of these values.
+        later: what makes each of these values, and no other.
     """
 
     def __init__(self, values: Mapping[str, Any], later: Mapping[str, Callable[[], dict[str, Any]]]) -> None:
@@ -325,37 +325,21 @@ class _Info(dict[str, Any]):
     def __contains__(self, name: object) -> bool:
         return super().__contains__(name) or name in self._later
 
-    def get(self, name: str, default: Any = None) -> Any:
-        try:
-            return self[name]
-        except KeyError:
-            return default
-
     def __missing__(self, name: str) -> Any:
         if name not in self._later:
             raise KeyError(name)
-        make = self._later[name]
-        for made, value in make().items():
-            if self._later[made] is make:
-                self.setdefault(made, value)  # what the loop has written stays
+        for made, value in self._later[name]().items():
+            self.setdefault(made, value)  # what the loop has written stays
         return self[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(
-            dict.fromkeys((*super().__iter__(), *self._later))
-        )  # names make nothing: a type checker asks for one
+        # Names make nothing: a type checker asks for one.
+        return iter(dict.fromkeys((*super().__iter__(), *self._later)))
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
 
-    def keys(self) -> KeysView[str]:  # type: ignore[override]
-        return KeysView(self)
-
-    def values(self) -> ValuesView[Any]:  # type: ignore[override]
-        return ValuesView(self)
-
-    def items(self) -> ItemsView[str, Any]:  # type: ignore[override]
-        return ItemsView(self)
+    get, keys, values, items = Mapping.get, Mapping.keys, Mapping.values, Mapping.items  # type: ignore[assignment]
 
     def copy(self) -> dict[str, Any]:
         return dict(self)
@@ -377,7 +361,7 @@ def _info(
         return {"radii": found.view(*lead, *found.shape[1:])}
 
     def ellipses() -> dict[str, Tensor]:
-        found: dict[str, list[Tensor]] = {"depths": [], "conics": [], "opacities": [], "radii": []}
+        found: dict[str, list[Tensor]] = {name: [] for name in of_ellipses}
         for rendered, view in zip(each, views, strict=True):
             rows = rendered.rendering.visible.nonzero()[:, 0]
             for name, values in _columns(rendered, view.inputs, rows).items():
@@ -388,9 +372,9 @@ def _info(
 
     flat = means2d.view(len(each), *means2d.shape[len(lead) :])
     values = {"means2d": means2d, "gaussian_ids": None, "camera_ids": None, "batch_ids": None}
-    later = dict.fromkeys(("radii", "depths", "conics", "opacities"), ellipses)
-    if all(rasterizer.traits.radii for _, rasterizer, *_ in each):
-        later["radii"] = radii
+    own_radii = all(rasterizer.traits.radii for _, rasterizer, *_ in each)
+    of_ellipses = ("depths", "conics", "opacities", *(() if own_radii else ("radii",)))
+    later = {"radii": radii, **dict.fromkeys(of_ellipses, ellipses)}
     return _Info(values, later), flat.unbind(), [None] * len(each)
 
 
