@@ -41,7 +41,8 @@ def compare(runs: Sequence[FinishedRun]) -> pd.DataFrame:
     tables = [_summary(rows) for _, rows in single.groupby("scene", sort=False)]
     # Scores against LR photos, or of training views, are not averaged with others.
     for marks, alike in single.groupby("marks", sort=False):
-        title = f"average of {(count := alike['scene'].nunique())} scenes" + (f" ({marks})" if marks else "")
+        count = alike["scene"].nunique()
+        title = f"average of {count} scenes" + (f" ({marks})" if marks else "")
         if count > 1 and len(comparable := _of_all_scenes(alike, title)):
             tables.append(_average(comparable, title))
     return pd.concat(tables, ignore_index=True).astype({"psnr_delta_pairs": "Int64"})
