@@ -27,13 +27,6 @@ def module() -> ModuleType:
     return load_kernels("clear_strategies.kernels")
 
 
-def empty_like(x: Tensor) -> Tensor:
-    """Contiguous, of this shape and type, not initialized; in recycled memory where the kernels take it."""
-    if x.device.type == "cpu" and x.dtype == torch.float32 and available():
-        return empty(x.shape)
-    return torch.empty_like(x, memory_format=torch.contiguous_format)
-
-
 def times(a: Float[Tensor, "N G"], b: Tensor) -> Float[Tensor, "N G"]:
     """A · b, with a's type and layout; in recycled memory where the kernels are there."""
     if a.device.type != "cpu" or not available():

@@ -20,7 +20,7 @@ from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, View
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import StrategyConflict
-from clear_strategies.kernels import native, per_gaussian, reconcile
+from clear_strategies.kernels import per_gaussian, reconcile
 from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.iteration import HrSide, LossWeights, Merged, Stepper, Update, require_finite_parts
@@ -28,6 +28,7 @@ from clear_strategies.merging.objective import Losses, Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
 from clear_strategies.strategies.base import ScreenGradients, Strategy, by_class, overrides
 from rasterizers.interface import Color
+from rasterizers.native import empty_for
 from rasterizers.told import iteration
 
 _log = logging.getLogger(__name__)
@@ -110,6 +111,7 @@ class Conductor:
 
     def on_fit_end(self) -> None:
         """Once, after the last iteration."""
+        self._hr_cotangents = None
         for s in self.strategies:
             s.on_fit_end()
 
@@ -290,7 +292,7 @@ class Conductor:
         λ, plus = self.objective.lambda_hr(t), self.regularized(params, t)
         if out is None:
             known = [name for name in params if name in plus or reconcile.has(g_lr, name) or reconcile.has(g_hr, name)]
-            out = {name: native.empty_like(params[name]) for name in known}
+            out = {name: empty_for(params[name].shape, params[name]) for name in known}
         conflict: Mapping[str, Number] = {}
         weights = Weights()
         if λ > 0 and reconcile.common_groups(g_lr, g_hr):

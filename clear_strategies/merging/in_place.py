@@ -12,8 +12,8 @@ from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import Colour, Grads
 from clear_strategies.core.step import Step
-from clear_strategies.kernels import native
 from clear_strategies.merging.conductor import Conductor
+from rasterizers.native import empty_for
 
 _HALF: Final = (torch.float16, torch.bfloat16)  # merged in float32; float64 is not
 
@@ -60,7 +60,8 @@ def merge_in_place(
             g = g * (1 / scale)
         if g is not None:
             g_lr[name] = g
-        out[name] = g if g is not None and g.is_contiguous() else native.empty_like(_widened(p.detach()))
+        here = _widened(p.detach())
+        out[name] = g if g is not None and g.is_contiguous() else empty_for(here.shape, here)
     high = Grads() if g_hr is None else Grads({name: _widened(g) for name, g in g_hr.items()}, colour=g_hr.colour)
     values = {name: p.detach() for name, p in trained.items()}
     merged = conductor.merge_routed(values, g_lr, high, step, t, out)

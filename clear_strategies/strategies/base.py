@@ -22,8 +22,9 @@ from clear_strategies.core.evidence import Evidence, PatchMaps
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, Shot, gathered
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, View
-from clear_strategies.kernels import native, reconcile
+from clear_strategies.kernels import reconcile
 from rasterizers.interface import Color
+from rasterizers.native import empty_for
 
 _DEVICE, _SEED = "device", "seed"  # in the cache
 
@@ -134,7 +135,7 @@ class Strategy:
         if not lr or not hr:
             return hr
         products = reconcile.products(lr, hr)
-        out = {name: native.empty_like(g) for name, g in hr.items() if name in CONFLICT_GROUPS}
+        out = {name: empty_for(g.shape, g) for name, g in hr.items() if name in CONFLICT_GROUPS}
         reconcile.apply(out, lr, hr, self.reconcile(products, step), keeps_lr=False)
         return Grads({**hr, **out})
 

@@ -21,9 +21,9 @@ from clear_strategies.core.points import spread
 from clear_strategies.core.seeds import dropout_mask
 from clear_strategies.core.step import Step
 from clear_strategies.errors import AnchorError
-from clear_strategies.kernels import native
 from clear_strategies.schedules import Ramp, milestone
 from clear_strategies.strategies.base import Strategy
+from rasterizers.native import empty_for
 
 _log = logging.getLogger(__name__)
 
@@ -108,7 +108,7 @@ class SVS(Strategy):
         pull = Grads()
         for name in self.state.keys() & params.keys():
             unit = self._extent() ** 2 if name == "means" else 1.0
-            difference = torch.sub(params[name], self.state[name], out=native.empty_like(params[name]))
+            difference = torch.sub(params[name], self.state[name], out=empty_for(params[name].shape, params[name]))
             pull[name] = difference.mul_(strength * self.anchor_weights[name] / unit)  # Eq. 16
         return pull
 

@@ -30,6 +30,7 @@ from clear_strategies.merging.iteration import HrSide, LossWeights
 from clear_strategies.training.field import LOG_SCALE_LIMIT, LOGIT_LIMIT, Activation, FieldShot
 from clear_strategies.training.optim import BETA1, BETA2, Adam
 from rasterizers.interface import BackendUnavailable
+from rasterizers.native import empty_for
 from rasterizers.recording import running
 from rasterizers.warp_runtime import require_warp
 
@@ -239,7 +240,7 @@ def _table(g: Grads) -> dict[str, Tensor]:
 
 def _dense(gaussians: kernel.GaussianStep, params: Mapping[str, Tensor]) -> tuple[Grads, Grads]:
     """g_LR and g^HR with every number, for strategies that override `correct`."""
-    both = [Grads({name: native.empty_like(params[name]) for name in CONFLICT_GROUPS}) for _ in range(2)]
+    both = [Grads({name: empty_for(params[name].shape, params[name]) for name in CONFLICT_GROUPS}) for _ in range(2)]
     gaussians.dense(*both)
     return both[0], both[1]
 

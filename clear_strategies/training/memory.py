@@ -13,6 +13,7 @@ import torch
 
 from clear_strategies.errors import SettingError
 from clear_strategies.training.state import TrainState
+from rasterizers import native
 
 _log = logging.getLogger(__name__)
 
@@ -45,8 +46,9 @@ def require(state: TrainState, limit: int | None) -> str:
 
 
 def release() -> None:
-    """Give the system what has been freed, which the C library keeps: loading and training leave hundreds of MiB."""
+    """Give the system what has been freed, which the kernels and the C library keep: after training up to a GiB."""
     gc.collect()
+    native.release()
     if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:  # glibc
         trim(0)
 

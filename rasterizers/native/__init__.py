@@ -11,7 +11,7 @@ import logging
 import math
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -110,8 +110,14 @@ def empty(shape: Sequence[int], dtype: torch.dtype = torch.float32) -> Tensor:
 
 
 def empty_for(shape: Sequence[int], like: Tensor) -> Tensor:
-    """Not initialized, of this one's type and on its device; on a CPU by `empty` where the kernels were compiled."""
-    try:
-        return empty(shape, like.dtype) if like.device.type == "cpu" else like.new_empty(shape)
-    except BackendUnavailable:
-        return like.new_empty(shape)
+    """Not initialized, contiguous, of this one's type and on its device; by `empty` where the kernels take such tensors."""
+    if like.device.type == "cpu" and like.dtype in (torch.float32, torch.float64):
+        with suppress(BackendUnavailable):
+            return empty(shape, like.dtype)
+    return like.new_empty(shape)
+
+
+def release() -> None:
+    """Give the system the memory that `empty` and the frames keep for their next use: as much as an iteration needs."""
+    with suppress(BackendUnavailable):
+        load_kernels("rasterizers.cpp").Frame.release()

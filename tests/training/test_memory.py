@@ -5,7 +5,9 @@ import logging
 import pytest
 
 from clear_strategies.errors import SettingError
+from clear_strategies.kernels import native
 from clear_strategies.training import memory
+from rasterizers.native import empty
 from tests.helpers.short_run import start
 
 MIB = 1 << 20
@@ -43,3 +45,16 @@ def test_the_estimate_holds_the_parameters_and_their_moments_and_the_system_tell
     assert least < each * 1024 * n < 10 * least
     assert memory.system_bytes("/proc/self/status", "VmRSS") > 0
     assert memory.system_bytes("/proc/nothing", "VmRSS") is None
+
+
+@pytest.mark.skipif(not native.available(), reason="the compiled kernels were not built")
+def test_what_the_kernels_keep_for_their_next_use_is_given_back():
+    def resident() -> int:
+        return memory.system_bytes("/proc/self/status", "VmRSS")
+
+    memory.release()
+    before = resident()
+    empty((100, MIB // 4)).fill_(1.0)
+    assert resident() - before > 90 * MIB  # kept
+    memory.release()
+    assert resident() - before < 10 * MIB

@@ -23,6 +23,7 @@ from clear_strategies.kernels import native
 from clear_strategies.kernels.reconcile import reference
 from clear_strategies.kernels.reconcile.tables import WIDEST, common_groups, has
 from rasterizers.interface import BackendUnavailable
+from rasterizers.native import empty_for
 from rasterizers.warp_runtime import require_warp
 
 __all__ = ["apply", "common_groups", "dense", "has", "products"]
@@ -66,7 +67,7 @@ def dense(g: Grads, like: Mapping[str, Tensor]) -> Grads:
     """The same with every number of the spherical harmonics, in the shapes of `like` and for its attributes alone."""
     out = {name: g[name].reshape(x.shape) for name, x in like.items() if name in g}
     if g.colour is not None:
-        bands = {name: native.empty_like(like[name]) for name in ("sh0", "shN") if name in like}
+        bands = {name: empty_for(like[name].shape, like[name]) for name in ("sh0", "shN") if name in like}
         apply(bands, Grads(), g, Weights(), keeps_lr=False)
         out |= bands
     return Grads(out, screen=g.screen)

@@ -109,6 +109,7 @@ void bind_frame(nb::module_& m) {
            tensor("means"), tensor("quats"), tensor("scales"), tensor("sh0"), tensor("shN"), nb::arg("grids"),
            tensor("opacities"), tensor("offsets"), tensor("means2d"), tensor("visible"), nb::arg("threads"))
       .def_static("empty", &empty<T>, nb::rv_policy::reference)
+      .def_static("release", [] { Recycler::instance().release(); })
       .def("pairs", &F::pairs)
       .def("draw",
            [](F& self, int i, Write<T, -1, -1, 3> image, Write<T, -1, -1> alpha, std::optional<Write<T, -1, -1>> depth,

@@ -74,6 +74,12 @@ class Recycler {
     }
   }
 
+  // Frees the blocks that no buffer has.
+  void release() noexcept {
+    std::lock_guard<std::mutex> lock(mutex_);
+    while (!kept_.empty()) std::free(removed(kept_.size() - 1).data);
+  }
+
   // Bytes kept for later requests.
   std::size_t held() {
     std::lock_guard<std::mutex> lock(mutex_);
