@@ -6,11 +6,13 @@ EXIF share a camera, whose estimate starts at that focal length.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import logging
 import math
 import os
 import signal
+import statistics
 import tempfile
 import threading
 from collections.abc import Mapping, Sequence, Set
@@ -37,14 +39,20 @@ MODEL: Final = "cameras.bin"
 UNPLACED: Final = "unplaced.json"
 """A file in the model's folder: why the pose is unknown, for each photo without one, by its name."""
 _DATABASE: Final = "database.db"
+_COPIES: Final = "copies"
 _FEW_FEATURES: Final = 200  # a photo with fewer shows too little
 _MATCHED: Final = 50  # features in common, from which a pair's relation is trusted
 _NEARLY_ALL: Final = 0.9  # of the pairs
 _TURN: Final = 0.03  # entries by which a map between two photos may differ from a turn's, as distortion makes it
 _LISTED: Final = 3  # photos without a pose in the warning, at most
 _DIAGONAL_35MM: Final = math.hypot(36, 24)  # mm
+_LARGE: Final = 1_200_000  # px of a copy, above which its own scale has features enough
+_ENOUGH: Final = 0.25  # of the features that a photo may have
 _PER_THREAD: Final = 2  # photos whose features are found between two looks at the progress
 _BLOCK: Final = 20  # photos that are matched between two looks: COLMAP indexes their features anew for each block
+
+_Groups = dict[tuple[int, int, float | None], list[str]]
+"""The names of copies by width, height and focal length (pixels of the copy, or None)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,33 +120,20 @@ def require_placed(root: Path, placed: int, count: int, least: float = 0.0) -> N
 
 def _map(pycolmap: Any, photos: Mapping[Path, float | None], work: Path, settings: SfmSettings) -> list[Any]:
     """The models that COLMAP's incremental pipeline finds: features, matching of all pairs, mapping."""
-    copies, database, count = work / "copies", work / _DATABASE, len(photos)
+    copies, database, count = work / _COPIES, work / _DATABASE, len(photos)
     level = pycolmap.logging.minloglevel
     # COLMAP's progress is hundreds of lines, and its errors are raised.
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     try:
         pycolmap.set_random_seed(settings.seed)
         groups = _write_copies(photos, copies, settings.max_side)
-        extraction = pycolmap.FeatureExtractionOptions()
-        extraction.num_threads, extraction.use_gpu = settings.threads, False
-        extraction.sift.max_num_features = settings.max_features
-        extraction.sift.estimate_affine_shape = settings.precise
-        _log.info("features of %d photos.", count)
-        progress = Progress("features", "photos", count)
-        at_once = _PER_THREAD * (settings.threads if settings.threads > 0 else os.cpu_count() or 1)
-        for (width, height, focal), names in groups.items():
-            reader = pycolmap.ImageReaderOptions()
-            if focal is not None:
-                reader.camera_params = f"{focal},{width / 2},{height / 2},0"  # of SIMPLE_RADIAL, its default
-            for first in range(0, len(names), at_once):
-                some = names[first : first + at_once]
-                pycolmap.extract_features(
-                    database, copies, image_names=some, camera_mode=pycolmap.CameraMode.SINGLE,
-                    reader_options=reader, extraction_options=extraction, device=pycolmap.Device.cpu,
-                )  # fmt: skip
-                with pycolmap.Database.open(database) as opened:
-                    reader.existing_camera_id = opened.read_image_with_name(some[0]).camera_id
-                    progress(opened.num_images())
+        find = functools.partial(_find_features, pycolmap, database, groups, settings)
+        if min(width * height for width, height, _ in groups) <= _LARGE:
+            find(octave=-1)
+        elif (found := find(octave=0)) < _ENOUGH * settings.max_features:
+            _log.info("only %d features in half of the photos: they are found again, in photos enlarged twice.", found)
+            database.unlink()
+            find(octave=-1)
         _keep_coarsest(pycolmap, database, settings.max_features)
         _match(pycolmap, database, [name for names in groups.values() for name in names], settings.threads)
         mapping = pycolmap.IncrementalPipelineOptions()
@@ -157,6 +152,37 @@ def _map(pycolmap: Any, photos: Mapping[Path, float | None], work: Path, setting
     finally:
         pycolmap.logging.minloglevel = level
     return list(models.values())
+
+
+def _find_features(pycolmap: Any, database: Path, groups: _Groups, settings: SfmSettings, *, octave: int) -> int:
+    """Find the features of all copies; returns how many a copy has, the median.
+
+    Args:
+        octave: of the finest scale: 0, that of the copies; -1, that of copies enlarged twice.
+    """
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.num_threads, extraction.use_gpu = settings.threads, False
+    extraction.sift.first_octave, extraction.sift.max_num_features = octave, settings.max_features
+    extraction.sift.estimate_affine_shape = settings.precise
+    count = sum(map(len, groups.values()))
+    _log.info("features of %d photos.", count)
+    progress = Progress("features", "photos", count)
+    at_once = _PER_THREAD * (settings.threads if settings.threads > 0 else os.cpu_count() or 1)
+    for (width, height, focal), names in groups.items():
+        reader = pycolmap.ImageReaderOptions()
+        if focal is not None:
+            reader.camera_params = f"{focal},{width / 2},{height / 2},0"  # of SIMPLE_RADIAL, its default
+        for first in range(0, len(names), at_once):
+            some = names[first : first + at_once]
+            pycolmap.extract_features(
+                database, database.with_name(_COPIES), image_names=some, camera_mode=pycolmap.CameraMode.SINGLE,
+                reader_options=reader, extraction_options=extraction, device=pycolmap.Device.cpu,
+            )  # fmt: skip
+            with pycolmap.Database.open(database) as opened:
+                reader.existing_camera_id = opened.read_image_with_name(some[0]).camera_id
+                progress(opened.num_images())
+    with pycolmap.Database.open(database) as opened:
+        return int(statistics.median(opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()))
 
 
 def _match(pycolmap: Any, database: Path, copies: Sequence[str], threads: int) -> None:
@@ -233,12 +259,10 @@ def _keep_coarsest(pycolmap: Any, database: Path, most: int) -> None:
             opened.write_descriptors(number, pycolmap.FeatureDescriptors(kind, descriptors))
 
 
-def _write_copies(
-    photos: Mapping[Path, float | None], folder: Path, max_side: int
-) -> dict[tuple[int, int, float | None], list[str]]:
+def _write_copies(photos: Mapping[Path, float | None], folder: Path, max_side: int) -> _Groups:
     """Copies for COLMAP; their names by width, height and focal length (pixels of the copy, or None)."""
     folder.mkdir()
-    groups: dict[tuple[int, int, float | None], list[str]] = {}
+    groups: _Groups = {}
     for i, (path, focal_35mm) in enumerate(photos.items()):
         image = read_image(path, turn=True)
         height, width = image.shape[:2]

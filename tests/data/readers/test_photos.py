@@ -1,6 +1,7 @@
 """Photos without poses: structure from motion finds the true cameras, up to a similarity, and caches them."""
 
 import errno
+import logging
 import os
 import signal
 import subprocess
@@ -22,8 +23,13 @@ pycolmap = pytest.importorskip("pycolmap")
 
 
 @pytest.mark.slow
-def test_poses_are_those_of_the_ground_truth(shared_data, tmp_path, monkeypatch):
-    """Five views of fountain-P11 at 384x256: rotations within 1 degree, centres within 2 % of their largest offset."""
+@pytest.mark.parametrize("large", [False, True])
+def test_poses_are_those_of_the_ground_truth(shared_data, tmp_path, monkeypatch, caplog, large: bool):
+    """Five views of fountain-P11 at 384x256: rotations within 1 degree, centres within 2 % of their largest offset. Where such
+    photos count as large, too few features are found at their own size, and they are enlarged after all.
+    """
+    if large:
+        monkeypatch.setattr(sfm, "_LARGE", 0)
     folder = tmp_path / "photos"
     folder.mkdir()
     truth = colmap.read(shared_data / "strecha_fountain").frames[2:7]
@@ -31,7 +37,9 @@ def test_poses_are_those_of_the_ground_truth(shared_data, tmp_path, monkeypatch)
         with Image.open(shared_data / "strecha_fountain/images" / frame.name) as image:
             image.resize((384, 256), Image.Resampling.LANCZOS).save(folder / frame.name, quality=97)
     Image.new("RGB", (384, 256), (90, 90, 90)).save(folder / "z_flat.png")
-    capture = photos.read(folder, tmp_path / "cache", threads=1)
+    with caplog.at_level(logging.INFO):
+        capture = photos.read(folder, tmp_path / "cache", threads=1)
+    assert ("they are found again, in photos enlarged twice" in caplog.text) == large
     assert [frame.name for frame in capture.frames] == [frame.name for frame in truth]
     assert "estimated by pycolmap from all 6 photos, 5 could be placed" in capture.notes["poses"]
     assert capture.unplaced == {"z_flat.png": "0 features: blurred, dark, or without texture"}
@@ -166,6 +174,18 @@ def test_poses_that_another_run_has_estimated_meanwhile_are_kept(tmp_path, estim
 
     estimate(slower)
     assert [(p.name, p.read_text()) for p in tmp_path.glob("poses*/*")] == [("cameras.bin", "of the other run")]
+
+
+def test_the_features_of_a_large_photo_begin_at_its_own_scale(tmp_path: Path) -> None:
+    blobs = np.random.default_rng(0).integers(0, 255, (80, 107), np.uint8)
+    (tmp_path / "copies").mkdir()
+    for number in range(2):
+        picture = Image.fromarray(blobs).resize((320, 240), Image.Resampling.BICUBIC)
+        picture.convert("RGB").save(tmp_path / "copies" / sfm.copy_name(number))
+    groups = {(320, 240, None): [sfm.copy_name(0), sfm.copy_name(1)]}
+    settings = SfmSettings(max_side=1600, max_features=8192, precise=False, threads=1, seed=0)
+    found = [sfm._find_features(pycolmap, tmp_path / f"{o}.db", groups, settings, octave=o) for o in (0, -1)]
+    assert 100 < found[0] < found[1]
 
 
 def test_no_photo_has_more_features_than_asked_for(tmp_path: Path) -> None:
