@@ -131,7 +131,9 @@ def _map(pycolmap: Any, photos: Mapping[Path, float | None], work: Path, setting
         if min(width * height for width, height, _ in groups) <= _LARGE:
             find(octave=-1)
         elif (found := find(octave=0)) < _ENOUGH * settings.max_features:
-            _log.info("only %d features in half of the photos: they are found again, in photos enlarged twice.", found)
+            _log.info(
+                "half of the photos have %d features or fewer: they are found again, in photos enlarged twice.", found
+            )
             database.unlink()
             find(octave=-1)
         _keep_coarsest(pycolmap, database, settings.max_features)
