@@ -420,7 +420,7 @@ class _Stack(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *tensors: Tensor) -> Tensor:
-        return torch.stack(tensors, out=empty_for((len(tensors), *tensors[0].shape), tensors[0]))
+        return torch.stack(tensors, out=empty_for(tensors[0], (len(tensors), *tensors[0].shape)))
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:

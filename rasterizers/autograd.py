@@ -282,7 +282,7 @@ class _Draw(torch.autograd.Function):
 
 def outer(rgb: Float[Tensor, "N 3"], basis: Float[Tensor, "N B1"], bands: int) -> Float[Tensor, "N K 3"]:
     """The gradient of the colours from its factors, Y ⊗ ∇rgb, for as many bands; those that were not drawn have gradient 0."""
-    drawn = torch.mul(basis[..., None], rgb[:, None], out=empty_for((*basis.shape, 3), basis))
+    drawn = torch.mul(basis[..., None], rgb[:, None], out=empty_for(basis, (*basis.shape, 3)))
     return drawn if bands == basis.shape[1] else torch.nn.functional.pad(drawn, (0, 0, 0, bands - basis.shape[1]))
 
 

@@ -292,7 +292,7 @@ class Conductor:
         λ, plus = self.objective.lambda_hr(t), self.regularized(params, t)
         if out is None:
             known = [name for name in params if name in plus or reconcile.has(g_lr, name) or reconcile.has(g_hr, name)]
-            out = {name: empty_for(params[name].shape, params[name]) for name in known}
+            out = {name: empty_for(params[name]) for name in known}
         conflict: Mapping[str, Number] = {}
         weights = Weights()
         if λ > 0 and reconcile.common_groups(g_lr, g_hr):

@@ -60,8 +60,7 @@ def merge_in_place(
             g = g * (1 / scale)
         if g is not None:
             g_lr[name] = g
-        here = _widened(p.detach())
-        out[name] = g if g is not None and g.is_contiguous() else empty_for(here.shape, here)
+        out[name] = g if g is not None and g.is_contiguous() else empty_for(_widened(p.detach()))
     high = Grads() if g_hr is None else Grads({name: _widened(g) for name, g in g_hr.items()}, colour=g_hr.colour)
     values = {name: p.detach() for name, p in trained.items()}
     merged = conductor.merge_routed(values, g_lr, high, step, t, out)

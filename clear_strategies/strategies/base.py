@@ -135,7 +135,7 @@ class Strategy:
         if not lr or not hr:
             return hr
         products = reconcile.products(lr, hr)
-        out = {name: empty_for(g.shape, g) for name, g in hr.items() if name in CONFLICT_GROUPS}
+        out = {name: empty_for(g) for name, g in hr.items() if name in CONFLICT_GROUPS}
         reconcile.apply(out, lr, hr, self.reconcile(products, step), keeps_lr=False)
         return Grads({**hr, **out})
 

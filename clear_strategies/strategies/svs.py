@@ -108,7 +108,7 @@ class SVS(Strategy):
         pull = Grads()
         for name in self.state.keys() & params.keys():
             unit = self._extent() ** 2 if name == "means" else 1.0
-            difference = torch.sub(params[name], self.state[name], out=empty_for(params[name].shape, params[name]))
+            difference = torch.sub(params[name], self.state[name], out=empty_for(params[name]))
             pull[name] = difference.mul_(strength * self.anchor_weights[name] / unit)  # Eq. 16
         return pull
 

@@ -240,7 +240,7 @@ def _table(g: Grads) -> dict[str, Tensor]:
 
 def _dense(gaussians: kernel.GaussianStep, params: Mapping[str, Tensor]) -> tuple[Grads, Grads]:
     """g_LR and g^HR with every number, for strategies that override `correct`."""
-    both = [Grads({name: empty_for(params[name].shape, params[name]) for name in CONFLICT_GROUPS}) for _ in range(2)]
+    both = [Grads({name: empty_for(params[name]) for name in CONFLICT_GROUPS}) for _ in range(2)]
     gaussians.dense(*both)
     return both[0], both[1]
 

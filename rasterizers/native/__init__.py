@@ -109,8 +109,13 @@ def empty(shape: Sequence[int], dtype: torch.dtype = torch.float32) -> Tensor:
     return x.view(dtype).view(*shape)
 
 
-def empty_for(shape: Sequence[int], like: Tensor) -> Tensor:
-    """Not initialized, contiguous, of this one's type and on its device; by `empty` where the kernels take such tensors."""
+def empty_for(like: Tensor, shape: Sequence[int] | None = None) -> Tensor:
+    """Not initialized, contiguous, of this one's type and on its device; by `empty` where the kernels take such tensors.
+
+    Args:
+        shape: None: that of `like`.
+    """
+    shape = like.shape if shape is None else shape
     if like.device.type == "cpu" and like.dtype in (torch.float32, torch.float64):
         with suppress(BackendUnavailable):
             return empty(shape, like.dtype)

@@ -262,7 +262,7 @@ def _keep_coarsest(pycolmap: Any, database: Path, most: int) -> None:
 
 
 def _write_copies(photos: Mapping[Path, float | None], folder: Path, max_side: int) -> _Groups:
-    """Copies for COLMAP; their names by width, height and focal length (pixels of the copy, or None)."""
+    """Write copies for COLMAP, no larger than `max_side`."""
     folder.mkdir()
     groups: _Groups = {}
     for i, (path, focal_35mm) in enumerate(photos.items()):

@@ -67,7 +67,7 @@ def dense(g: Grads, like: Mapping[str, Tensor]) -> Grads:
     """The same with every number of the spherical harmonics, in the shapes of `like` and for its attributes alone."""
     out = {name: g[name].reshape(x.shape) for name, x in like.items() if name in g}
     if g.colour is not None:
-        bands = {name: empty_for(like[name].shape, like[name]) for name in ("sh0", "shN") if name in like}
+        bands = {name: empty_for(like[name]) for name in ("sh0", "shN") if name in like}
         apply(bands, Grads(), g, Weights(), keeps_lr=False)
         out |= bands
     return Grads(out, screen=g.screen)
