@@ -27,6 +27,7 @@ def by_warp(request, monkeypatch, blocks_of):
     from clear_strategies.kernels.per_gaussian import warp
 
     def both(function):
+        monkeypatch.setattr(dispatch.native, "takes", lambda *_: False)  # not C++
         expected = function()
         monkeypatch.setattr(dispatch, "DEVICES", {"cpu"})
         if request.param > 1:
@@ -114,8 +115,7 @@ def test_scores_and_their_sum(by_warp, score_by, hf):
 
 
 @pytest.mark.slow
-def test_the_noise_of_mcmc(by_warp, monkeypatch):
-    monkeypatch.setattr(dispatch.native, "takes", lambda *_: False)  # torch, not C++
+def test_the_noise_of_mcmc(by_warp):
     quats, log_scales, gate, eta = numbers(N, 4) * 10, numbers(N, 3), numbers(N).sigmoid(), numbers(N // 2, 3)
     quats[0], quats[2] = 0, 1e-25
     rows = torch.arange(0, N, 2)
@@ -144,6 +144,7 @@ def test_other_tensors_take_torch(monkeypatch):
     from clear_strategies.kernels.per_gaussian import warp
 
     monkeypatch.setattr(warp, "activate", lambda *_: "Warp's")
+    monkeypatch.setattr(dispatch.native, "takes", lambda *_: False)  # not C++
     x = [torch.zeros(1, 3), torch.zeros(1), torch.zeros(1)]
     assert activate(*x, None) != "Warp's"
     monkeypatch.setattr(dispatch, "DEVICES", {"cpu"})

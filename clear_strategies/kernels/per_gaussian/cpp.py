@@ -8,7 +8,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.kernels import native
-from rasterizers.native import threads
+from rasterizers.native import empty, threads
+
+
+def activate(
+    log_scales: Float[Tensor, "N 3"], logits: Float[Tensor, " N"], filters: Float[Tensor, " N"], gate: Tensor | None
+) -> tuple[Tensor, ...]:
+    rows, columns = empty((2, len(logits), 3)), empty((4, len(logits)))
+    gate = None if gate is None else gate.to(logits)
+    native.module().activate(log_scales, logits, filters, gate, rows, columns, threads())
+    return *rows, *columns
 
 
 def nearest_depths(means: Float[Tensor, "N 3"], cameras: Float[Tensor, "V 20"], near: float) -> Float[Tensor, " N"]:

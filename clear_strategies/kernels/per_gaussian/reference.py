@@ -12,6 +12,7 @@ from clear_strategies.kernels.per_gaussian.dispatch import by_cpp, by_warp
 from rasterizers.geometry import rotation_matrix
 
 
+@by_cpp
 @by_warp
 def activate(
     log_scales: Float[Tensor, "N 3"],

@@ -3,6 +3,7 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include "activate.hpp"
 #include "bind_losses.hpp"
 #include "bind_reconcile.hpp"
 #include "bind_step.hpp"
@@ -19,6 +20,7 @@ NB_MODULE(CLEAR_MODULE, m) {
   m.attr("isa") = CLEAR_NAME;
   m.attr("sources") = CLEAR_SOURCES;
   m.def("instruction_sets", &clear::instruction_sets);
+  clear::bind_activate(m);
   clear::bind_losses(m);
   clear::bind_reconcile(m);
   clear::bind_step(m);
