@@ -138,6 +138,12 @@ class Density(Densifier):
             return False
         return self.white_background if t == s.start else s.reset_every > 0 and t % s.reset_every == 0
 
+    def settled(self, t: int) -> bool:
+        return t >= self.settings.stop
+
+    def gather(self, parents: Int[Tensor, " M"]) -> None:
+        self.score, self.ordinary, self.count = (x[parents] for x in (self.score, self.ordinary, self.count))
+
     def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
         if due := self.due(t):
             resized(self.restructure(field, optimizer, t))

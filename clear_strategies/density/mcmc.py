@@ -127,6 +127,9 @@ class Sampler(Densifier):
         s = self.settings
         return s.start < t < s.stop and t % s.every == 0
 
+    def settled(self, t: int) -> bool:
+        return t >= self.settings.stop
+
     def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
         if t >= self.settings.stop:
             return False

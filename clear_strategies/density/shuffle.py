@@ -60,6 +60,9 @@ class ShuffleSplit(Density):
     def second_stage(self) -> int:
         return self.settings.split_at + 1
 
+    def settled(self, t: int) -> bool:
+        return self.is_split
+
     def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
         if self.is_split:
             return False

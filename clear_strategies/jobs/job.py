@@ -147,6 +147,7 @@ class _Job:
         state = TrainState.start(
             there, self.conductor, settings=scaled(settings.fit, stretch), density=scaled(settings.density, stretch),
             rates=rates, mip=scaled(settings.mip, stretch), near=drawing.rules.near,
+            alpha_min=drawing.rules.alpha_min,
         )  # fmt: skip
         resume.resume(state, scene, settings.fit.resume, self.folder, self.compared)
         return state

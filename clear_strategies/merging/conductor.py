@@ -333,6 +333,10 @@ class Conductor:
                 total = Grads(g) if not total else total + g
         return total
 
+    def pulls(self, params: Mapping[str, Tensor], t: int) -> bool:
+        """Whether a strategy adds a gradient of its own, which moves Gaussians that no view draws."""
+        return any(s.regularize(params, t) is not None for s in self.regularizers)
+
     def scores(
         self, screen_lr: Float[Tensor, "N 2"], hr: HrSide[Any] | None, weights: LossWeights
     ) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:

@@ -12,6 +12,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
 from clear_strategies.core import deferred
 from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.deferred import Number
@@ -25,6 +29,7 @@ PLATEAU_LOSS: Final = "loss_views"
 """The column of the history by which a plateau is found: the mean loss of training views, every Gaussian drawn."""
 
 _REDUCED: Final = 2  # the coarse SR image has half the size of the fine one
+_GATED: Final = 0.5  # an opacity is drawn up to twice as high where up to half of the Gaussians are dropped
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +46,8 @@ class Skips:
         plateau_window: iterations between two measurements.
         plateau_from: iteration of the earliest measurement.
         plateau_to: iteration from which every run trains: the learning rates fall, and HR is at full size.
+        undrawn: once the structure has settled, Gaussians too faint to be drawn in any view are removed where they are at least
+            this share of all, and where no strategy pulls parameters; 0: never.
     """
 
     coarse_until: int = milestone(0)
@@ -49,9 +56,11 @@ class Skips:
     plateau_window: int = milestone(500)
     plateau_from: int = milestone(5_000)
     plateau_to: int = milestone(8_000)
+    undrawn: float = 0.0
 
     def __post_init__(self) -> None:
-        require_number("plateau_gain", self.plateau_gain, below=1)
+        for name in ("plateau_gain", "undrawn"):
+            require_number(name, getattr(self, name), below=1)
         require_whole("coarse_until", self.coarse_until, least=0)
         require_whole("hr_every", self.hr_every, least=1)
 
@@ -81,13 +90,15 @@ class SkipPolicy:
                 f"HR in one of {s.hr_every} iterations until iteration {s.coarse_until}, and in each whose scores "
                 "densification reads"
             )
-        if in_host or s.plateau_gain == 0:
+        if in_host:
             return phrases
-        if s.plateau_window == 0:
+        if s.undrawn > 0:
+            phrases.append("Gaussians too faint to be drawn, once the structure has settled")
+        if s.plateau_gain > 0 and s.plateau_window == 0:
             _log.warning(
                 "skips.plateau_gain has no effect: in this short run plateau_window is less than one iteration."
             )
-        else:
+        elif s.plateau_gain > 0:
             phrases.append(
                 f"all iterations up to {s.plateau_to}, once the loss of the training views falls by less than "
                 f"{s.plateau_gain:.1%} in {s.plateau_window} iterations"
@@ -118,6 +129,21 @@ class SkipPolicy:
             return True
         work_log.skip("render LR", "HR at half its size is as large (skips.coarse_until)")
         return False
+
+    def drawn(self, opacities: Float[Tensor, " N"], alpha_min: float, work_log: WorkLog) -> Int[Tensor, " M"] | None:
+        """The rows of the Gaussians that some view may draw; None where (nearly) all may.
+
+        Args:
+            opacities: as rendered. alpha_min: of the rasterizer, see `RasterSettings`.
+        """
+        if self.skips.undrawn == 0:
+            return None
+        rows = torch.nonzero(opacities >= _GATED * alpha_min)[:, 0]
+        faint = len(opacities) - len(rows)
+        if faint < max(1, self.skips.undrawn * len(opacities)) or not len(rows):
+            return None
+        work_log.skip("Gaussians", "too faint to be drawn (skips.undrawn)", faint)
+        return rows
 
     def measured(self, t: int) -> bool:
         """Whether the training views are drawn whole after iteration t, to find a plateau."""

@@ -48,6 +48,13 @@ class Densifier:
         """
         raise NotImplementedError
 
+    def settled(self, t: int) -> bool:
+        """Whether the structure does not change after t."""
+        return False
+
+    def gather(self, parents: Int[Tensor, " M"]) -> None:
+        """Follow a change of structure that is not its own: row i of what it keeps per Gaussian comes from row parents[i]."""
+
     def reset_due(self, t: int) -> bool:
         """Whether opacities are lowered at t; renders right after that do not show how good the field is."""
         return False

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import torch
 from jaxtyping import Int
@@ -27,8 +27,11 @@ from clear_strategies.training.history import History
 from clear_strategies.training.mip import NEAR, MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
 from clear_strategies.training.settings import FitSettings
+from rasterizers.interface import RasterSettings
 
 _log = logging.getLogger(__name__)
+
+_ALPHA_MIN: Final = RasterSettings().alpha_min
 
 
 @dataclass(slots=True)
@@ -37,7 +40,7 @@ class TrainState:
 
     Args:
         t: the iteration to come, from 1.
-        near: the near plane of the rasterizer, world units.
+        near, alpha_min: of the rasterizer, see `RasterSettings`.
         history: one row per iteration; read it by `history_as_floats`, since on a device its numbers are deferred.
         replays: where iterations are replayed (`fit.replay`); no checkpoint needs them.
     """
@@ -50,6 +53,7 @@ class TrainState:
     mip: MipFilter
     views: tuple[View, ...]
     near: float = NEAR
+    alpha_min: float = _ALPHA_MIN
     t: int = 1
     history: History = field(default_factory=History)
     compiled_step: CompiledStep | None = None
@@ -66,13 +70,14 @@ class TrainState:
         rates: LearningRates,
         mip: MipFilter,
         near: float = NEAR,
+        alpha_min: float = _ALPHA_MIN,
     ) -> TrainState:
         """The state before the first iteration, on the device of the scene's views.
 
         Args:
             settings, density, rates, mip: with milestones already scaled to this run.
             density: replaced where a strategy brings a densifier.
-            near: of the rasterizer that draws.
+            near, alpha_min: of the rasterizer that draws.
         """
         device = scene.device
         theta = GaussianField.from_cloud(scene.cloud, max_degree=settings.max_degree).to(device)
@@ -86,7 +91,7 @@ class TrainState:
             )
         optimizer = Adam(theta.raw(), rates, extent)
         conductor.on_fit_start(len(scene.train), settings.seed, device, scene.train)
-        state = cls(theta, conductor, optimizer, densifier, settings, mip, scene.train, near)
+        state = cls(theta, conductor, optimizer, densifier, settings, mip, scene.train, near, alpha_min)
         state.compiled_step = compiled_step_for(conductor, optimizer, settings.fused)
         state.refilter()
         return state
@@ -127,6 +132,24 @@ class TrainState:
     def refilter(self) -> None:
         cameras = [(v.hr if self.mip.cameras == "hr" else v.lr).camera for v in self.views]
         self.field.update_filter(cameras, self.mip.variance, self.near)
+
+    def remove_undrawn(self) -> bool:
+        """Once the structure has settled, remove the Gaussians that no view draws, see `Skips.undrawn`; returns whether there
+        were any. Nothing would bring them back: their gradient is 0.
+        """
+        conductor = self.conductor
+        if not self.density.settled(self.t) or conductor.pulls(self.field.raw(), self.t):
+            return False
+        drawn = conductor.skips.drawn(self.field.filtered_opacities(), self.alpha_min, conductor.work_log)
+        if drawn is None:
+            return False
+        n = len(self.field)
+        _log.debug("t=%d: %d too faint to be drawn: %d -> %d Gaussians.", self.t, n - len(drawn), n, len(drawn))
+        for per_gaussian in (self.field, self.optimizer):
+            per_gaussian.take(drawn, torch.zeros_like(drawn, dtype=torch.bool))
+        self.density.gather(drawn)
+        self.resized(drawn)
+        return True
 
     def resized(self, parents: Int[Tensor, " M"]) -> None:
         """Gather what strategies keep per Gaussian, and recompute the filter, after a change of structure: row i comes from row

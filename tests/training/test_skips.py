@@ -2,6 +2,7 @@
 
 import weakref
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -153,3 +154,62 @@ def test_one_render_serves_both_scales_while_they_have_one_size():
     fit(state, toy.scene(), toy.RASTERIZER)
     skipped = state.conductor.work_log.entries["render LR"].skipped
     assert skipped == {"HR at half its size is as large (skips.coarse_until)": 11}  # not at t = 1, where λ_HR = 0
+
+
+def faint(state, share: float):
+    """Lower the opacity of so many Gaussians below what a view draws; returns the others' rows."""
+    n = len(state.field)
+    rows = torch.randperm(n, generator=torch.Generator().manual_seed(1))[: round(share * n)]
+    state.field.opacities.data[rows] = -6.3  # 0.0018, less than half of 1/255
+    return torch.tensor([i for i in range(n) if i not in rows])
+
+
+def settled(*names: str, undrawn: float = 0.05):
+    state = start(names, more=[] if "svs" in names else [SVS(Ramp(0.2, "constant"), looks=0)])
+    state.conductor.skips = SkipPolicy(Skips(undrawn=undrawn))
+    for _ in range(13):
+        iterate(state, toy.RASTERIZER)
+    assert state.density.settled(state.t)
+    assert state.filter_due()
+    return state
+
+
+def test_gaussians_that_no_view_draws_are_removed_and_the_pictures_stay():
+    state = settled("gco", "p2g")
+    kept, before, n = faint(state, 0.4), state.field.baked(), len(state.field)
+    density = state.density.state_dict()
+    views = [view.hr.camera for view in state.views]
+    pictures = [state.field.render(toy.RASTERIZER, camera) for camera in views]
+    moments = {name: x[kept] for name, x in state.optimizer.first.items()}
+    assert state.remove_undrawn()
+    assert state.conductor.work_log.entries["Gaussians"].skipped == {
+        "too faint to be drawn (skips.undrawn)": n - len(kept)
+    }
+    for camera, picture in zip(views, pictures, strict=True):
+        assert torch.equal(state.field.render(toy.RASTERIZER, camera), picture)
+    assert torch.equal(state.field.baked().means, before.means[kept])
+    assert all(torch.equal(state.optimizer.first[name], x) for name, x in moments.items())
+    assert all(torch.equal(x, density[name][kept]) for name, x in state.density.state_dict().items())
+    assert not state.remove_undrawn()  # all are drawn
+    saved, resumed = state.checkpoint({}), settled("gco", "p2g")
+    resumed.restore(saved, Path("its checkpoint"))
+    for s in (state, resumed):
+        while not s.ended:
+            iterate(s, toy.RASTERIZER)
+    assert len(state.field) == len(kept)
+    for name, x in state.checkpoint({}).tensors.items():
+        assert torch.equal(x, resumed.checkpoint({}).tensors[name]), name
+
+
+def test_they_stay_while_the_structure_changes_or_where_they_may_return():
+    early = start(("gco",))
+    early.conductor.skips = SkipPolicy(Skips(undrawn=0.05))
+    anchored, few, off = settled("svs"), settled("gco", undrawn=0.5), settled("gco", undrawn=0.0)
+    assert anchored.conductor.pulls(anchored.field.raw(), anchored.t)
+    for state in (early, anchored, few, off):
+        faint(state, 0.4)
+        assert not state.remove_undrawn()
+        assert "Gaussians" not in state.conductor.work_log.entries
+    faint(off, 1.0)
+    off.conductor.skips = SkipPolicy(Skips(undrawn=0.05))
+    assert not off.remove_undrawn()  # something has to be left
