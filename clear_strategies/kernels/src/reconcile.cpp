@@ -3,6 +3,7 @@
 
 #include "chunks.hpp"
 #include "pool.hpp"
+#include "sh_rows.hpp"
 
 namespace clear {
 namespace {
@@ -15,20 +16,6 @@ CLEAR_INLINE const float* block_of(const float* rows, std::int64_t i, int count,
   std::fill_n(copy, kLanes * width, 0.0f);
   if (rows) std::copy_n(rows + i * width, count * width, copy);
   return copy;
-}
-
-// Sixteen rows of shN's Y ⊗ ∇rgb, from the same rows of its factors.
-CLEAR_INLINE void expand(const float* rgb_rows, const float* basis, int bases, int width, const RowPlan& plan, int count, float* to) {
-  if (count < kLanes) std::fill_n(to, kLanes * width, 0.0f);
-  float colour[4 * kLanes] = {};  // padded, because reads are sixteen wide
-  std::copy_n(rgb_rows, 3 * count, colour);
-  for (int k = 0; k < count; ++k, to += width) {
-    Floats Y = load_some(basis + bases * k, bases), rgb = Floats::load(colour + 3 * k);
-    float few[kLanes];  // of a row of less than sixteen numbers
-    float* row = width < kLanes ? few : to;
-    for (int v = 0; v < plan.sixteens; ++v) (pick(Y, plan.band[v]) * pick(rgb, plan.channel[v])).store(row + plan.offset[v]);
-    if (width < kLanes) std::copy_n(few, width, to);
-  }
 }
 
 CLEAR_INLINE Products products_of_rows(const float* l, const float* h, int width) {
@@ -120,7 +107,7 @@ class Passes {
   // Sixteen longer rows: where they lie, or a copy of them.
   static const float* read(const Rows& a, const RowPlan& plan, const float* rows, const Colour& colour, std::int64_t i, int count, float* copy) {
     if (a.first_band != 1 || !colour.rgb) return block_of(rows, i, count, a.width, copy);
-    expand(colour.rgb + 3 * i, colour.basis + colour.bases * i, colour.bases, a.width, plan, count, copy);
+    expand(colour.rgb + 3 * i, colour.basis + colour.bases * i, colour.bases, plan, count, kLanes, copy);
     if (rows)
       for (int j = 0; j < count * a.width; ++j) copy[j] += rows[i * a.width + j];
     return copy;
@@ -161,7 +148,7 @@ class Passes {
       for (int c = 0; c < 3; ++c) l[c] += h[c] * Floats(λ);
       alignas(64) float rgb[3 * kLanes];
       join_rows(rgb, l);
-      expand(rgb, g.lr.basis + g.lr.bases * i, g.lr.bases, a.width, plan, count, merged);
+      expand(rgb, g.lr.basis + g.lr.bases * i, g.lr.bases, plan, count, kLanes, merged);
       return write(a, merged, i, count, finite);
     }
     Sixteen b;

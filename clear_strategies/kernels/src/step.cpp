@@ -7,6 +7,7 @@
 
 #include "chunks.hpp"
 #include "pool.hpp"
+#include "sh_rows.hpp"
 
 namespace clear {
 namespace {
@@ -45,23 +46,12 @@ class ChunkDense {
   const RowPlan plan;
 
   void write(const RawGradients& raw, const SplatGradient& of, const DenseRows& to, std::int64_t i, int count) const {
-    columns(raw.means, to.of[kMeans], i, count), columns(raw.sh0, to.of[kSh0], i, count);
-    columns(raw.opacities, to.of[kOpacities], i, count), columns(raw.scales, to.of[kScales], i, count);
-    columns(raw.quats, to.of[kQuats], i, count);
-    float colour[4 * kLanes] = {}, row[3 * kLanes];
-    join_rows(colour, raw.rgb);
-    for (int k = 0; k < count && plan.width; ++k) {
-      Floats Y = basis_row(of, g.bases, i + k), rgb = Floats::load(colour + 3 * k);
-      for (int v = 0; v < plan.sixteens; ++v) (pick(Y, plan.band[v]) * pick(rgb, plan.channel[v])).store(row + plan.offset[v]);
-      std::copy_n(row, plan.width, to.of[kShN] + (i + k) * plan.width);
-    }
-  }
-
-  template <int D>
-  static CLEAR_INLINE void columns(const Floats (&values)[D], float* to, std::int64_t i, int count) {
-    float numbers[D * kLanes];
-    join_rows(numbers, values);
-    std::copy_n(numbers, D * count, to + D * i);
+    store_columns(to.of[kMeans] + 3 * i, count, raw.means), store_columns(to.of[kSh0] + 3 * i, count, raw.sh0);
+    store_columns(to.of[kOpacities] + i, count, raw.opacities), store_columns(to.of[kScales] + 3 * i, count, raw.scales);
+    store_columns(to.of[kQuats] + 4 * i, count, raw.quats);
+    float rgb[3 * kLanes];
+    join_rows(rgb, raw.rgb);
+    expand(rgb, of.basis + g.bases * i, g.bases, plan, count, count, to.of[kShN] + i * plan.width);
   }
 };
 
@@ -165,10 +155,10 @@ class ChunkStep {
       fetch_next(s.shN, i + k, i + k + 1);
       if (!(moving >> k & 1)) continue;
       Floats Y = basis_row(g.lr, g.bases, i + k), rgb = Floats::load(merged.lr + 3 * k), gradient[3] = {0.0f, 0.0f, 0.0f};
-      for (int v = 0; v < plan.sixteens; ++v) gradient[v] = pick(Y, plan.band[v]) * pick(rgb, plan.channel[v]);
+      for (int v = 0; v < plan.sixteens; ++v) gradient[v] = outer(Y, rgb, plan, v);
       if (two) {
         Y = basis_row(g.base, g.bases, i + k), rgb = Floats::load(merged.hr + 3 * k);
-        for (int v = 0; v < plan.sixteens; ++v) gradient[v] += pick(Y, plan.band[v]) * pick(rgb, plan.channel[v]);
+        for (int v = 0; v < plan.sixteens; ++v) gradient[v] += outer(Y, rgb, plan, v);
       }
       step_row(i + k, gradient);
     }
