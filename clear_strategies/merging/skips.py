@@ -130,7 +130,7 @@ class SkipPolicy:
         work_log.skip("render LR", "HR at half its size is as large (skips.coarse_until)")
         return False
 
-    def drawn(self, opacities: Float[Tensor, " N"], alpha_min: float, work_log: WorkLog) -> Int[Tensor, " M"] | None:
+    def drawn(self, opacities: Float[Tensor, " N"], alpha_min: float) -> Int[Tensor, " M"] | None:
         """The rows of the Gaussians that some view may draw; None where (nearly) all may.
 
         Args:
@@ -142,7 +142,6 @@ class SkipPolicy:
         faint = len(opacities) - len(rows)
         if faint < max(1, self.skips.undrawn * len(opacities)) or not len(rows):
             return None
-        work_log.skip("Gaussians", "too faint to be drawn (skips.undrawn)", faint)
         return rows
 
     def measured(self, t: int) -> bool:

@@ -137,13 +137,13 @@ class TrainState:
         """Once the structure has settled, remove the Gaussians that no view draws, see `Skips.undrawn`; returns whether there
         were any. Nothing would bring them back: their gradient is 0.
         """
-        conductor = self.conductor
-        if not self.density.settled(self.t) or conductor.pulls(self.field.raw(), self.t):
+        if not self.density.settled(self.t):
             return False
-        drawn = conductor.skips.drawn(self.field.filtered_opacities(), self.alpha_min, conductor.work_log)
-        if drawn is None:
+        conductor, n = self.conductor, len(self.field)
+        drawn = conductor.skips.drawn(self.field.filtered_opacities(), self.alpha_min)
+        if drawn is None or conductor.pulls(self.field.raw(), self.t):
             return False
-        n = len(self.field)
+        conductor.work_log.skip("Gaussians", "too faint to be drawn (skips.undrawn)", n - len(drawn))
         _log.debug("t=%d: %d too faint to be drawn: %d -> %d Gaussians.", self.t, n - len(drawn), n, len(drawn))
         for per_gaussian in (self.field, self.optimizer):
             per_gaussian.take(drawn, torch.zeros_like(drawn, dtype=torch.bool))
