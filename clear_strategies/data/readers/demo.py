@@ -7,10 +7,12 @@ and is ray-cast with anti-aliasing from exact poses. The capture brings its own 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, lru_cache, partial
+from functools import cache, lru_cache, partial, wraps
 from pathlib import Path
-from typing import Final
+from threading import RLock
+from typing import Final, ParamSpec, TypeVar
 
 import numpy as np
 import torch
@@ -30,6 +32,8 @@ _BAND: Final = 16  # image rows cast at once, few enough for the CPU's caches
 _FIELD_OF_VIEW: Final = math.radians(58)
 _ARC: Final = 0.75  # the cameras' largest offset to the left and right, world units
 _TARGET: Final = np.array([0.0, 0.15, 5.0])
+P = ParamSpec("P")
+T = TypeVar("T")
 Array = np.ndarray
 Vector = tuple[float, float, float]
 _FLOOR: Final = 1.35  # y; y points down
@@ -40,6 +44,18 @@ _LAMP_REACH: Final = 8.5  # distance at which its light is halved
 _AMBIENT: Final = 0.3
 _EXPOSURE: Final = 1.9
 _LIGHT_TEXEL: Final = 0.08  # of the baked light, world units
+
+
+def once(function: Callable[P, T]) -> Callable[P, T]:
+    """As `cache`. Of threads that ask for the same at once, as those do that read the photos, one computes it."""
+    cached, lock = cache(function), RLock()
+
+    @wraps(function)
+    def waited(*args: P.args, **kwargs: P.kwargs) -> T:
+        with lock:
+            return cached(*args, **kwargs)  # type: ignore[arg-type]  # they are hashable
+
+    return waited
 
 
 def read(*, width: int = 256, height: int = 192, views: int = 12, train: int = 3) -> Capture:
@@ -309,7 +325,7 @@ class Texture:
         return np.asarray(upper * (1 - fy) + lower * fy)
 
 
-@cache
+@once
 def photograph(name: str) -> Texture:
     """A photograph that scikit-image ships, RGB in [0, 1]."""
     import skimage
@@ -337,7 +353,7 @@ def f32(values: Array | tuple[float, ...]) -> Float[Array, "*shape"]:
     return np.asarray(values, np.float32)
 
 
-@cache
+@once
 def room() -> tuple[Surface, ...]:
     """A yard: pictures on the wall and leaning before it, a box, and balls on the ground."""
     brick = Finish("brick", (1.12, 0.80, 0.66), repeat=(2.0, 3.0), shift=(0.1, 0.35))
@@ -406,7 +422,7 @@ def _turned(angle: float) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
     return np.array([c, 0, s]), np.array([-s, 0, c])
 
 
-@cache
+@once
 def light_on(surface: Surface) -> Texture:
     """The light of the lamp and the sky on a surface, with soft shadows. It does not depend on the view, so it is baked."""
     width, height = (max(math.ceil(side / _LIGHT_TEXEL), 4) for side in surface.extent)
