@@ -15,8 +15,11 @@ class Host:
     """A trainer that is not ours."""
 
     def __init__(self, scene):
-        self.field = GaussianField.from_cloud(scene.cloud)
+        self.field, g = GaussianField.from_cloud(scene.cloud), torch.Generator().manual_seed(0)
         self.field.degree = 3
+        # The rotation of a ball has no gradient but for rounding.
+        for rows in (self.field.scales.data, self.field.quats.data):
+            rows.add_(torch.randn(rows.shape, generator=g), alpha=0.5)
         self.params = {name: value.clone().requires_grad_() for name, value in self.field.raw().items()}
 
     def render(self, camera, z=None, detail=True):
