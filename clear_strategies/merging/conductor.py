@@ -247,9 +247,11 @@ class Conductor:
 
     def extra_views(self, t: int) -> list[ExtraView]:
         """The pictures that the field should match at t besides the view; each gets a step on `extra_loss`."""
-        if self.objective.lambda_lr == 0:
+        showing = [s for s in self.strategies if overrides(s, "extra_views")]
+        if self.objective.lambda_lr == 0 or not showing:
             return []
-        return [extra for s in self.strategies for extra in s.extra_views(t)]
+        with self.work_log.stage("pictures of extra views"):  # a pseudo view is made when it is first asked for
+            return [extra for s in showing for extra in s.extra_views(t)]
 
     def extra_loss(self, image: Float[Tensor, "h w 3"], extra: ExtraView, t: int) -> Losses:
         """The LR loss of a render of `extra`, weighted by pixel: its value and its cotangent [1, h, w, 3].  Eq. 4
