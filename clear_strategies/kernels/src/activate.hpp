@@ -44,8 +44,8 @@ inline void activate(const RawColumns& raw, const ActivatedColumns& to, int thre
       }
       const Floats sigmoid = Floats(1.0f) / (Floats(1.0f) + exponential(-load_some(raw.opacities + i, count)));
       const Floats factor = raw.gate ? coefficient * load_some(raw.gate + i, count) : coefficient;
-      store_columns(to.scales + 3 * i, count, s);
-      store_columns(to.filtered + 3 * i, count, filtered);
+      store_rows(to.scales, i, count, s);
+      store_rows(to.filtered, i, count, filtered);
       store_some(to.sigmoid + i, sigmoid, count);
       store_some(to.coefficient + i, coefficient, count);
       store_some(to.factor + i, factor, count);

@@ -1,7 +1,6 @@
 // Loads sixteen Gaussians from rows in memory into lanes, and arithmetic that only the trainer's kernels need.
 #pragma once
 
-#include <algorithm>
 #include <cstdint>
 #include <initializer_list>
 
@@ -23,15 +22,6 @@ CLEAR_INLINE void load_columns(const float* rows, int count, Floats (&columns)[D
   for (int i = 0; i < count; ++i)
     for (int d = 0; d < D; ++d) a[d][i] = rows[std::int64_t(i) * stride + d];
   for (int d = 0; d < D; ++d) columns[d] = Floats::load(a[d]);
-}
-
-// rows[i · D + d] = columns[d] lane i for the first `count` rows.
-template <int D>
-CLEAR_INLINE void store_columns(float* rows, int count, const Floats (&columns)[D]) {
-  if (count == kLanes) return join_rows(rows, columns);
-  float joined[D * kLanes];
-  join_rows(joined, columns);
-  std::copy(joined, joined + D * count, rows);
 }
 
 template <class T>

@@ -46,9 +46,9 @@ class ChunkDense {
   const RowPlan plan;
 
   void write(const RawGradients& raw, const SplatGradient& of, const DenseRows& to, std::int64_t i, int count) const {
-    store_columns(to.of[kMeans] + 3 * i, count, raw.means), store_columns(to.of[kSh0] + 3 * i, count, raw.sh0);
-    store_columns(to.of[kOpacities] + i, count, raw.opacities), store_columns(to.of[kScales] + 3 * i, count, raw.scales);
-    store_columns(to.of[kQuats] + 4 * i, count, raw.quats);
+    store_rows(to.of[kMeans], i, count, raw.means), store_rows(to.of[kSh0], i, count, raw.sh0);
+    store_rows(to.of[kOpacities], i, count, raw.opacities), store_rows(to.of[kScales], i, count, raw.scales);
+    store_rows(to.of[kQuats], i, count, raw.quats);
     float rgb[3 * kLanes];
     join_rows(rgb, raw.rgb);
     expand(rgb, of.basis + g.bases * i, g.bases, plan, count, count, to.of[kShN] + i * plan.width);

@@ -21,14 +21,6 @@ CLEAR_INLINE void load_rows(const T* tensor, std::int64_t row, int count, Lanes<
   split_rows(p, columns);
 }
 
-template <int C, class T>
-CLEAR_INLINE void store_rows(T* tensor, std::int64_t row, int count, const Lanes<T> (&columns)[C]) {
-  T joined[C * kLanes];
-  T* p = count == kLanes ? tensor + row * C : joined;
-  join_rows(p, columns);
-  if (count < kLanes) std::memcpy(tensor + row * C, joined, sizeof(T) * C * count);
-}
-
 template <class T>
 CLEAR_INLINE Lanes<T> load_row(const T* tensor, std::int64_t row, int count) {
   Lanes<T> columns[1];

@@ -318,6 +318,15 @@ CLEAR_INLINE void join_rows(T* rows, const Lanes<T> (&columns)[D]) {
   }
 }
 
+// Columns to the `count` (1 … 16) rows from `row` on of a contiguous [n, C] tensor.
+template <int C, class T>
+CLEAR_INLINE void store_rows(T* tensor, std::int64_t row, int count, const Lanes<T> (&columns)[C]) {
+  T joined[C * kLanes];
+  T* p = count == kLanes ? tensor + row * C : joined;
+  join_rows(p, columns);
+  if (count < kLanes) std::memcpy(tensor + row * C, joined, sizeof(T) * C * count);
+}
+
 // Converts sixteen rows of D numbers, four each at p, p + stride, p + 2 stride and p + 3 stride, to D columns of sixteen.
 template <int D>
 CLEAR_INLINE void split_rows(const float* p, std::ptrdiff_t stride, Lanes<float> (&columns)[D]) {
