@@ -146,8 +146,7 @@ class _Job:
         rates = scaled(settings.optim, stretch).of_run(settings.fit.iterations)
         state = TrainState.start(
             there, self.conductor, settings=scaled(settings.fit, stretch), density=scaled(settings.density, stretch),
-            rates=rates, mip=scaled(settings.mip, stretch), near=drawing.rules.near,
-            alpha_min=drawing.rules.alpha_min,
+            rates=rates, mip=scaled(settings.mip, stretch), rules=drawing.rules,
         )  # fmt: skip
         resume.resume(state, scene, settings.fit.resume, self.folder, self.compared)
         return state

@@ -57,7 +57,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     with stage("density and filter"):
         # clone · split · prune = parents[M]
         restructured = conductor.may_densify(t) and s.density.step(θ, s.optimizer, t, s.resized)
-        if s.filter_due() and not restructured and not s.remove_undrawn():  # which refilter
+        if s.filter_due() and not restructured and not s.remove_undrawn():  # each recomputes the filter
             s.refilter()
     s.history.append(_row(s) | learned.row | extra)
     if s.conductor.skips.measured(t) and not (restructured or s.reset_due(t)):

@@ -24,14 +24,14 @@ from clear_strategies.training.densifier import Densifier, DensifierSettings, ca
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.given import Replayer
 from clear_strategies.training.history import History
-from clear_strategies.training.mip import NEAR, MipFilter
+from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
 from clear_strategies.training.settings import FitSettings
 from rasterizers.interface import RasterSettings
 
 _log = logging.getLogger(__name__)
 
-_ALPHA_MIN: Final = RasterSettings().alpha_min
+_RULES: Final = RasterSettings()
 
 
 @dataclass(slots=True)
@@ -40,7 +40,7 @@ class TrainState:
 
     Args:
         t: the iteration to come, from 1.
-        near, alpha_min: of the rasterizer, see `RasterSettings`.
+        rules: by which the rasterizer draws.
         history: one row per iteration; read it by `history_as_floats`, since on a device its numbers are deferred.
         replays: where iterations are replayed (`fit.replay`); no checkpoint needs them.
     """
@@ -52,8 +52,7 @@ class TrainState:
     settings: FitSettings
     mip: MipFilter
     views: tuple[View, ...]
-    near: float = NEAR
-    alpha_min: float = _ALPHA_MIN
+    rules: RasterSettings = _RULES
     t: int = 1
     history: History = field(default_factory=History)
     compiled_step: CompiledStep | None = None
@@ -69,15 +68,14 @@ class TrainState:
         density: DensifierSettings,
         rates: LearningRates,
         mip: MipFilter,
-        near: float = NEAR,
-        alpha_min: float = _ALPHA_MIN,
+        rules: RasterSettings = _RULES,
     ) -> TrainState:
         """The state before the first iteration, on the device of the scene's views.
 
         Args:
             settings, density, rates, mip: with milestones already scaled to this run.
             density: replaced where a strategy brings a densifier.
-            near, alpha_min: of the rasterizer that draws.
+            rules: of the rasterizer that draws.
         """
         device = scene.device
         theta = GaussianField.from_cloud(scene.cloud, max_degree=settings.max_degree).to(device)
@@ -91,7 +89,7 @@ class TrainState:
             )
         optimizer = Adam(theta.raw(), rates, extent)
         conductor.on_fit_start(len(scene.train), settings.seed, device, scene.train)
-        state = cls(theta, conductor, optimizer, densifier, settings, mip, scene.train, near, alpha_min)
+        state = cls(theta, conductor, optimizer, densifier, settings, mip, scene.train, rules)
         state.compiled_step = compiled_step_for(conductor, optimizer, settings.fused)
         state.refilter()
         return state
@@ -131,7 +129,7 @@ class TrainState:
 
     def refilter(self) -> None:
         cameras = [(v.hr if self.mip.cameras == "hr" else v.lr).camera for v in self.views]
-        self.field.update_filter(cameras, self.mip.variance, self.near)
+        self.field.update_filter(cameras, self.mip.variance, self.rules.near)
 
     def remove_undrawn(self) -> bool:
         """Once the structure has settled, remove the Gaussians that no view draws, see `Skips.undrawn`; returns whether there
@@ -140,7 +138,7 @@ class TrainState:
         if not self.density.settled(self.t):
             return False
         conductor, n = self.conductor, len(self.field)
-        drawn = conductor.skips.drawn(self.field.filtered_opacities(), self.alpha_min)
+        drawn = conductor.skips.drawn(self.field.filtered_opacities(), self.rules.alpha_min)
         if drawn is None or conductor.pulls(self.field.raw(), self.t):
             return False
         conductor.work_log.skip("Gaussians", "too faint to be drawn (skips.undrawn)", n - len(drawn))

@@ -20,6 +20,7 @@ from clear_strategies.training.optim import LearningRates
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from rasterizers import Camera, Splats
+from rasterizers.interface import RasterSettings
 
 FACTOR = 4
 RASTERIZER = rasterizers.load("torch")
@@ -130,5 +131,5 @@ def started(
     return TrainState.start(
         of or scene(), Conductor(*strategies, objective=objective or Objective(kernels="torch")),
         settings=FitSettings(**{"iterations": 10, "probe_every": 0, "max_degree": 1, "fused": "off", **settings}),
-        density=DensitySettings(), rates=LearningRates(), mip=MipFilter(), near=near,
+        density=DensitySettings(), rates=LearningRates(), mip=MipFilter(), rules=RasterSettings(near=near),
     )  # fmt: skip
