@@ -156,6 +156,7 @@ class Browser:
         )
         viewer.render_tab_state.viewer_res = 64
         self.camera()
+        self.after_step(next(self.steps))  # a run that has trained, even if viser lists the browser by now
         self.train_until(viewer.server.get_clients)
         (client,) = viewer.server.get_clients().values()
         client.scene.set_background_image = lambda image, **_: self.pictures.append(image)
@@ -293,6 +294,7 @@ def test_a_picture_that_nerfview_stops_is_drawn_again_and_is_no_error(browser, m
 
 def test_a_training_goes_on_where_a_browser_leaves_while_it_is_updated(browser, monkeypatch, caplog):
     viewer = browser.viewer
+    viewer.render_tab_state.num_train_rays_per_sec = 1  # a second an iteration: each of the steps below is due for a picture
     with monkeypatch.context() as patched:
         patched.setattr(viewer, "_renderers", {"gone": None})  # viser still lists the browser
         for step in (10**6, 2 * 10**6):
