@@ -46,6 +46,7 @@ from integration.densification import ScoreScaler, write_score
 from integration.extra_steps import ExtraSteps
 from integration.own_drawing import Drawable, OwnDrawing, RenderAt
 from integration.pending import BackwardPass, Pending, current_pass
+from integration.replayed_merge import ReplayedMerge
 from integration.views import enlarged_mask, require_unique
 from rasterizers.autograd import TakeColours
 from rasterizers.interface import Color
@@ -117,11 +118,12 @@ class Attachment:
         self._detail_gradients = 0
         self._pending: Pending | None = None  # the last rendering
         self._pass: BackwardPass | None = None  # the last one that has reached a rendering
-        self._merge_in_place: Callable[..., Mapping[str, deferred.Number]] = partial(merge_in_place, conductor)
+        self._merge_in_place: Callable[..., Mapping[str, deferred.Number]] = partial(
+            merge_in_place, conductor, merge=ReplayedMerge(conductor, params()["means"].device)
+        )
         self._step: Step | None = None  # of the rendering, until `after_step`
         self._extra = ExtraSteps(params)
         self._logged: dict[str, deferred.Number] = {}
-        self._replayed: Mapping[str, deferred.Number] = {}  # what the strategies have logged in the replay of HR
         self._own_drawing = OwnDrawing(conductor, params()["means"].device)
         self._hooks: list[Any] = []
         self._hooked: list[torch.optim.Optimizer] = []
@@ -142,7 +144,6 @@ class Attachment:
         if z is not None:
             z = z.to(means)
         hr = routed = None
-        self._replayed = {}
         if self._wants_hr(t):
             self.counts["HR renders"] += 1
             view = conductor.skips.view(view, t)
@@ -169,9 +170,8 @@ class Attachment:
         merges = conductor.objective.lambda_hr(t) > 0
         fine = None if mask is None else enlarged_mask(mask.to(params["means"]), view.factor)[..., None]
         if isinstance(drawn, Drawable):
-            work = self._own_drawing.hr(drawn, view, t, fine)
-            self._replayed = work.numbers
-            return work.hr, work.routed if merges else None
+            hr, routed = self._own_drawing.hr(drawn, view, t, fine)
+            return hr, routed if merges else None
         shot = drawn.shot
         if len(shot.drawings) > 1:
             self._count_parts(len(shot.drawings))
@@ -433,7 +433,7 @@ class Attachment:
                 self.counts["scores written"] += 1
         λ = self.conductor.objective.lambda_hr(self.t)
         losses = {} if hr is None else hr.losses
-        self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **self._replayed, **conflict_columns(conflict)}
+        self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **conflict_columns(conflict)}
         if self.counts["merges"] % _LOGGED_EVERY == 0:
             now = self.log
             losses_now = ", ".join(f"L_{name} {now[name]:.4f}" for name in losses) or "no HR"

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final, TypeGuard
+from typing import Any, TypeGuard
 
 import torch
 from jaxtyping import Float
@@ -23,6 +23,7 @@ from clear_strategies.core.work_log import WorkLog
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide
 from clear_strategies.merging.replays import (
+    RECORDING,
     Kind,
     RecordedWork,
     Replays,
@@ -36,8 +37,6 @@ from rasterizers.interface import Camera, Rasterizer, Recordable, Splats, over
 from rasterizers.told import name_of_view
 
 _log = logging.getLogger(__name__)
-
-_RECORDING: Final = {"cuda"}  # devices
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,20 +134,6 @@ _Work = Callable[[_Given, bool], tuple[Any, dict[str, Number]]]
 """Work on what is given, and whether it is being recorded. It returns what it makes, and its numbers where it is."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HrWork:
-    """What HR gives in an iteration.
-
-    Args:
-        hr: see `HrSide`. routed: the same of the raw parameters.
-        numbers: the losses, and what the strategies have logged, of a replay; empty where the work was live.
-    """
-
-    hr: HrSide[Grads]
-    routed: Grads
-    numbers: Mapping[str, Number]
-
-
 class _Recorded:
     """The recording of one kind of work, and the tensors from which it reads what it is given."""
 
@@ -181,15 +166,19 @@ class OwnDrawing:
     def __init__(self, conductor: Conductor, device: torch.device) -> None:
         self._conductor = conductor
         self._replays: Replays | None = None
-        if device.type in _RECORDING:
+        if device.type in RECORDING:
             self._replays = Replays(device, conductor.work_log, "the replay of HR")
             if (reason := next(why_strategies_are_not_recorded(conductor), None)) is not None:
                 self._replays = None
                 _log.info("HR is not replayed: %s.", reason)
 
     @torch.no_grad()
-    def hr(self, asked: Drawable, view: View, t: int, mask: Float[Tensor, "H W 1"] | None) -> HrWork:
-        """Draw the view at HR, compare it with the SR image, and route the gradients."""
+    def hr(
+        self, asked: Drawable, view: View, t: int, mask: Float[Tensor, "H W 1"] | None
+    ) -> tuple[HrSide[Grads], Grads]:
+        """Draw the view at HR, compare it with the SR image, and route the gradients. Returns what HR gives, and g^HR of the raw
+        parameters.
+        """
         conductor = self._conductor
         photo = view.hr.over(conductor.background(t), view.background)
         known = None if self._replays is None else conductor.looked_up(view)
@@ -203,13 +192,14 @@ class OwnDrawing:
             made = self._compared(given, asked, shown, t)
             return made, {**made[0].losses, **conductor.take_logs(logged)}
 
-        (hr, g), numbers = self._done(asked, given, t, ("hr", view.factor), work)
+        (hr, g), replayed = self._done(asked, given, t, ("hr", view.factor), work)
         params = {name: p.detach() for name, p in asked.params.items()}
+        conductor.log_replayed(replayed)
         hr = replace(hr, step=replace(hr.step, t=t, view=view, params=params))
         routed = to_parameters(g, asked.drawn, asked.params)
         if "detail" in g:
             routed["detail"] = g["detail"]
-        return HrWork(hr, routed, numbers)
+        return hr, routed
 
     @torch.no_grad()
     def extra_view(self, asked: Drawable, extra: ExtraView, t: int) -> Grads:

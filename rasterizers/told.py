@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
-from typing import Any, Final, cast
+from typing import Any, Final, TypeVar, cast
 
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
 from rasterizers.recording import running
+
+R = TypeVar("R")
 
 
 class Unread:
@@ -60,6 +62,10 @@ class Guarded(Unread):
         super().__init__(value, what)
         self._of = of
 
+    def at(self, t: int | None) -> Any:
+        """The number at another iteration; None: at this one."""
+        return self._value if t is None else self._of(t)
+
     def _made(self, by: Callable[..., Any], *other: Any) -> Guarded:
         return Guarded(by(self._value, *other), self._what, lambda t: by(self._of(t), *other))
 
@@ -103,6 +109,11 @@ def iteration(t: int) -> int:
     return t if running() is None else cast(int, Guarded(t, "the iteration"))
 
 
+def unread(value: R, what: str) -> R:
+    """A value that recorded work must not read, `what` for the error."""
+    return cast(R, Unread(value, what))
+
+
 def name_of_view(name: str) -> str:
     """The name of a view, for recorded work."""
-    return cast(str, Unread(name, "the name of the view"))
+    return unread(name, "the name of the view")

@@ -75,6 +75,7 @@ class Conductor:
         self.sr: Any = None
         self.work_log = WorkLog()
         self._hr_cotangents: Tensor | None = None
+        self._replayed: dict[str, Number] = {}  # see `log_replayed`
         self._owner = dict.fromkeys(_ONE_ANSWER, Strategy())  # its hooks hold where no strategy overrides them
         for hook in _ONE_ANSWER:
             hooks = [hook, *_ALSO_BY.get(hook, ())]
@@ -283,21 +284,23 @@ class Conductor:
 
     def merge_routed(
         self, params: Mapping[str, Tensor], g_lr: Grads, g_hr: Grads, step: Step | None, t: int,
-        out: Mapping[str, Tensor] | None = None,
+        out: Mapping[str, Tensor] | None = None, lambda_hr: Float[Tensor, " 1"] | None = None,
     ) -> Merged:  # fmt: skip
         """The merge after routing.
 
         Args:
             g_hr: g^HR of Eq. 13, and m λ_HF ∇L_HF of f_det; empty without HR. step: the iteration, with the evidence.
             out: receives the merged gradient, by attribute, contiguous; None: new tensors, for what has a gradient.
+            lambda_hr: λ_HR(t) > 0, of a recording.
         """
-        λ, plus = self.objective.lambda_hr(t), self.regularized(params, t)
+        λ = self.objective.lambda_hr(t) if lambda_hr is None else lambda_hr
+        plus = self.regularized(params, t)
         if out is None:
             known = [name for name in params if name in plus or reconcile.has(g_lr, name) or reconcile.has(g_hr, name)]
             out = {name: empty_for(params[name]) for name in known}
         conflict: Mapping[str, Number] = {}
         weights = Weights()
-        if λ > 0 and reconcile.common_groups(g_lr, g_hr):
+        if (lambda_hr is not None or λ > 0) and reconcile.common_groups(g_lr, g_hr):
             products = reconcile.products(g_lr, g_hr)
             conflict = products.conflict()  # before correction
             answer = self.reconciled(products, step, lambda: (dense(g_lr, out), dense(g_hr.without_detail(), out)))
@@ -394,7 +397,7 @@ class Conductor:
 
     def logs(self) -> dict[str, Number]:
         """The scalars that the strategies logged in the last iteration."""
-        return {name: x() if callable(x) else x for s in self.strategies for name, x in s.logs.items()}
+        return {name: x() if callable(x) else x for s in self.strategies for name, x in s.logs.items()} | self._replayed
 
     def take_logs(self, known: Mapping[str, Number]) -> dict[str, Number]:
         """The scalars that were logged besides the known ones, and which are then logged no more."""
@@ -406,8 +409,13 @@ class Conductor:
 
     def forget_logs(self) -> None:
         """Before an iteration: what the strategies log from now on belongs to it."""
+        self._replayed.clear()
         for s in self.strategies:
             s.logs.clear()
+
+    def log_replayed(self, numbers: Mapping[str, Number]) -> None:
+        """Scalars of this iteration from a replay, in which no strategy is called."""
+        self._replayed.update(numbers)
 
     def _backward_hr(
         self,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Final
 
 import torch
@@ -13,6 +13,7 @@ from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import Colour, Grads
 from clear_strategies.core.step import Step
 from clear_strategies.merging.conductor import Conductor
+from clear_strategies.merging.iteration import Merged
 from rasterizers.native import empty_for
 
 _HALF: Final = (torch.float16, torch.bfloat16)  # merged in float32; float64 is not
@@ -29,6 +30,7 @@ def merge_in_place(
     lr_colour: Colour | None = None,
     scale: float = 1.0,
     must_be_finite: bool = True,
+    merge: Callable[..., Merged] | None = None,
 ) -> Mapping[str, Number]:
     """Turn `.grad` of the parameters, before + scale · ∇(λ_LR L_LR), into before + scale · the merged gradient.
 
@@ -39,6 +41,7 @@ def merge_in_place(
         before: `.grad` as it was when the backward pass began, by name, where it was there.
         lr_colour: what `.grad` of sh0 and shN lacks of this pass.
         scale: of the loss: an AMP gradient scaler's, or 1 / the number of accumulated passes.
+        merge: in place of `Conductor.merge_routed`.
 
     Returns:
         The conflict ratios by group, before correction; {} without HR.
@@ -63,7 +66,7 @@ def merge_in_place(
         out[name] = g if g is not None and g.is_contiguous() else empty_for(_widened(p.detach()))
     high = Grads() if g_hr is None else Grads({name: _widened(g) for name, g in g_hr.items()}, colour=g_hr.colour)
     values = {name: p.detach() for name, p in trained.items()}
-    merged = conductor.merge_routed(values, g_lr, high, step, t, out)
+    merged = (merge or conductor.merge_routed)(values, g_lr, high, step, t, out)
     if must_be_finite and not isinstance(merged.finite, Tensor) and not merged.finite:
         require_finite(f"t={t}: the merged gradient", merged.grads)
     for name, p in trained.items():

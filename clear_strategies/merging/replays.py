@@ -21,8 +21,12 @@ from clear_strategies.core.work_log import WorkLog
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.strategies.base import describes, overrides
 from rasterizers.recording import Recording, on_side_stream
+from rasterizers.told import Guarded
 
 _log = logging.getLogger(__name__)
+
+RECORDING: Final = {"cuda"}
+"""The kinds of devices whose work can be recorded."""
 
 LIVE: Final = "live in place of a replay"
 """The work log's entry for work that was not replayed, by the reason. It has no runs, so that none seem saved."""
@@ -138,17 +142,21 @@ class RecordedWork:
         self, device: torch.device, work_log: WorkLog, work: Callable[[], tuple[Any, Mapping[str, Number]]]
     ) -> None:
         self._work_log = work_log
+        self._of_t: dict[str, Any] = {}  # numbers that Python has made of the iteration
+        self._t: int | None = None  # of the replay; None: of the recording
 
         def gathered() -> tuple[Any, Tensor, Callable[[Tensor], dict[str, Number]]]:
             made, row = work()
+            self._of_t = {name: x for name, x in row.items() if isinstance(x, Guarded)}
             counts = {f"skip {k}": count for k, (*_, count) in enumerate(self._skips) if isinstance(count, Tensor)}
-            return made, *deferred.gathered({**row, **counts})
+            return made, *deferred.gathered({name: x for name, x in row.items() if name not in self._of_t} | counts)
 
         with work_log.noted() as self._skips:
             self._recording = Recording(device, gathered)
 
     def holds_at(self, t: int) -> bool:
         """See `Recorded`."""
+        self._t = t
         return all(guard(t) for guard in self._recording.guards)
 
     def replay(self) -> bool:
@@ -159,7 +167,7 @@ class RecordedWork:
     def outcome(self) -> tuple[Any, dict[str, Number]]:
         """What the work has made, whose tensors the next replay overwrites, and its numbers, copied."""
         made, numbers, row_of = self._recording.result
-        row = row_of(numbers.clone())
+        row: dict[str, Number] = row_of(numbers.clone()) | {name: x.at(self._t) for name, x in self._of_t.items()}
         for k, (name, reason, count) in enumerate(self._skips):
             counted = row.pop(f"skip {k}", None)
             on_device = isinstance(counted, deferred.Element)

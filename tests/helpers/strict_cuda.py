@@ -18,6 +18,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_leaves, tree_map
 
+from rasterizers.interface import BackendUnavailable
 from tests.helpers.cuda_rules import CHECKS, RULES, Act, State
 
 Pool = dict[int, torch.Tensor]
@@ -197,11 +198,13 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     """A scope in which torch, Warp and this package take the CPU for a CUDA device."""
     import warp as wp
 
+    import rasterizers.native
     from clear_strategies.core import deferred
-    from clear_strategies.kernels import native
+    from clear_strategies.kernels import native, reconcile
     from clear_strategies.kernels.per_gaussian import dispatch
+    from clear_strategies.kernels.reconcile import warp as warp_merge
     from clear_strategies.training import replay
-    from integration import own_drawing
+    from integration import own_drawing, replayed_merge
     from rasterizers import recording, warp_runtime
     from rasterizers.warp_backend import frame, settings
 
@@ -240,6 +243,9 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         cuda.ask("allocate", by_warp=True)
         return allocate(*args, **kwargs)
 
+    def on_no_cpu(*_: Any) -> Any:
+        raise BackendUnavailable("this memory is the CPU's")
+
     patches: dict[Any, dict[str, Any]] = {
         torch.cuda: {
             "CUDAGraph": partial(Graph, cuda), "stream": cuda.using, "current_stream": lambda device: cuda.current,
@@ -255,7 +261,9 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         deferred: {"is_immediate": lambda x: False},
         native: {"available": lambda: False},
         dispatch: {"DEVICES": {"cpu"}},
-        own_drawing: {"_RECORDING": {"cpu"}},
+        **{m: {"RECORDING": {"cpu"}} for m in (own_drawing, replayed_merge)},
+        reconcile: {"_for_device": lambda device: warp_merge},
+        rasterizers.native: {"empty": on_no_cpu},
         frame: {"DEFERRED_COUNTS": {"cpu": True}},
         **{m: {"sent": lambda numbers, device: numbers.pin_memory()} for m in (warp_runtime, settings, replay)},
     }  # fmt: skip

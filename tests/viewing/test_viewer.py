@@ -294,7 +294,7 @@ def test_a_picture_that_nerfview_stops_is_drawn_again_and_is_no_error(browser, m
 
 def test_a_training_goes_on_where_a_browser_leaves_while_it_is_updated(browser, monkeypatch, caplog):
     viewer = browser.viewer
-    viewer.render_tab_state.num_train_rays_per_sec = 1  # a second an iteration: each of the steps below is due for a picture
+    viewer.render_tab_state.num_train_rays_per_sec = 1  # a second an iteration: a picture is due at each step below
     with monkeypatch.context() as patched:
         patched.setattr(viewer, "_renderers", {"gone": None})  # viser still lists the browser
         for step in (10**6, 2 * 10**6):

@@ -14,6 +14,7 @@ from functools import cache
 from types import ModuleType
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.conflicts import Products, Weights
@@ -45,13 +46,14 @@ def products(lr: Grads, hr: Grads) -> Products:
 
 
 def apply(
-    out: Mapping[str, Tensor], lr: Grads, hr: Grads, weights: Weights, *, lambda_hr: float = 1.0, plus: Grads | None = None,
-    keeps_lr: bool = True,
+    out: Mapping[str, Tensor], lr: Grads, hr: Grads, weights: Weights, *, lambda_hr: float | Float[Tensor, " 1"] = 1.0,
+    plus: Grads | None = None, keeps_lr: bool = True,
 ) -> Number:  # fmt: skip
     """Write the merged gradient of these attributes; f_det takes part with keep 1.
 
     Args:
         out: contiguous, [N, …]; it may hold the tensors of `lr`. An attribute that no gradient has becomes 0.
+        lambda_hr: a tensor of the type of `out` where a recording reads it, see `rasterizers.recording`.
         keeps_lr: False: keep · g_HR - remove · g_LR alone.
 
     Returns:

@@ -36,7 +36,13 @@ def products(lr: Grads, hr: Grads, names: Sequence[str]) -> Products:
 
 
 def apply(
-    out: Mapping[str, Tensor], lr: Grads, hr: Grads, weights: Weights, lambda_hr: float, plus: Grads, keeps_lr: bool
+    out: Mapping[str, Tensor],
+    lr: Grads,
+    hr: Grads,
+    weights: Weights,
+    lambda_hr: float | Tensor,
+    plus: Grads,
+    keeps_lr: bool,
 ) -> Number:
     """See `kernels.reconcile.apply`."""
     lr, hr, plus, n = contiguous(lr), contiguous(hr), contiguous(plus), len(next(iter(out.values())))
@@ -46,7 +52,7 @@ def apply(
     tables = weight_tables(weights, n, torch.device("cpu"))
     kernels: Any = native.module()
     finite: bool = kernels.apply(
-        n, rows, _factors(lr, n), _factors(hr, n), addresses(tables), lambda_hr, keeps_lr, threads()
+        n, rows, _factors(lr, n), _factors(hr, n), addresses(tables), float(lambda_hr), keeps_lr, threads()
     )
     return finite
 

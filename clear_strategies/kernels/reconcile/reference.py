@@ -30,7 +30,13 @@ def products(lr: Grads, hr: Grads, names: Sequence[str]) -> Products:
 
 
 def apply(
-    out: Mapping[str, Tensor], lr: Grads, hr: Grads, weights: Weights, lambda_hr: float, plus: Grads, keeps_lr: bool
+    out: Mapping[str, Tensor],
+    lr: Grads,
+    hr: Grads,
+    weights: Weights,
+    lambda_hr: float | Tensor,
+    plus: Grads,
+    keeps_lr: bool,
 ) -> Number:
     """See `kernels.reconcile.apply`."""
     first = next(iter(out.values()))

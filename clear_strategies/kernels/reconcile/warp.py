@@ -136,13 +136,14 @@ def compare(
 
 @wp.func
 def write(
-    a: Rows, i: wp.int32, d: wp.int32, keep: wp.float64, remove: wp.float64, o: Options, finite: wp.array[wp.int32]
-) -> None:
+    a: Rows, i: wp.int32, d: wp.int32, keep: wp.float64, remove: wp.float64, o: Options, lambda_hr: wp.float32,
+    finite: wp.array[wp.int32],
+) -> None:  # fmt: skip
     at = i * a.width + d
     g_lr = low(a, i, d, o)
     total = reconciled(high(a, i, d, o), g_lr, keep, remove)  # Eq. 7
     if o.keeps_lr:
-        total = g_lr + total * o.lambda_hr  # Eq. 8
+        total = g_lr + total * lambda_hr  # Eq. 8
     if (a.has & 4) != 0:
         total += a.plus[at]
     if not wp.isfinite(total):
@@ -152,43 +153,46 @@ def write(
 
 @wp.func
 def write_group(
-    a: Rows, i: wp.int32, d: wp.int32, group: wp.int32, w: Weights, o: Options, finite: wp.array[wp.int32]
-) -> None:
-    write(a, i, d, weight(w.keep, group, i), weight(w.remove, group, i), o, finite)
+    a: Rows, i: wp.int32, d: wp.int32, group: wp.int32, w: Weights, o: Options, lambda_hr: wp.float32,
+    finite: wp.array[wp.int32],
+) -> None:  # fmt: skip
+    write(a, i, d, weight(w.keep, group, i), weight(w.remove, group, i), o, lambda_hr, finite)
 
 
 @wp.kernel
 def combine(
     means: Rows, quats: Rows, scales: Rows, opacities: Rows, sh0: Rows, shN: Rows, detail: Rows, o: Options, w: Weights,
-    finite: wp.array[wp.int32],
+    changing: wp.array[wp.float32], finite: wp.array[wp.int32],
 ) -> None:  # fmt: skip
     """Thread (i, j) writes the j-th number of Gaussian i, over the attributes side by side."""
     i, j = wp.tid()
-    d = j
+    d, lambda_hr = j, wp.float32(o.lambda_hr)
+    if changing.shape[0] > 0:  # of a recording
+        lambda_hr = wp.float32(changing[0])
     if d < shN.width:
-        write_group(shN, i, d, SHN, w, o, finite)
+        write_group(shN, i, d, SHN, w, o, lambda_hr, finite)
         return
     d -= shN.width
     if d < means.width:
-        write_group(means, i, d, MEANS, w, o, finite)
+        write_group(means, i, d, MEANS, w, o, lambda_hr, finite)
         return
     d -= means.width
     if d < quats.width:
-        write_group(quats, i, d, QUATS, w, o, finite)
+        write_group(quats, i, d, QUATS, w, o, lambda_hr, finite)
         return
     d -= quats.width
     if d < scales.width:
-        write_group(scales, i, d, SCALES, w, o, finite)
+        write_group(scales, i, d, SCALES, w, o, lambda_hr, finite)
         return
     d -= scales.width
     if d < opacities.width:
-        write_group(opacities, i, d, OPACITIES, w, o, finite)
+        write_group(opacities, i, d, OPACITIES, w, o, lambda_hr, finite)
         return
     d -= opacities.width
     if d < sh0.width:
-        write_group(sh0, i, d, SH0, w, o, finite)
+        write_group(sh0, i, d, SH0, w, o, lambda_hr, finite)
         return
-    write(detail, i, d - sh0.width, wp.float64(1.0), wp.float64(0.0), o, finite)
+    write(detail, i, d - sh0.width, wp.float64(1.0), wp.float64(0.0), o, lambda_hr, finite)
 
 
 def products(lr: Grads, hr: Grads, names: Sequence[str]) -> conflicts.Products:
@@ -210,7 +214,7 @@ def apply(
     lr: Grads,
     hr: Grads,
     weights: conflicts.Weights,
-    lambda_hr: float,
+    lambda_hr: float | Tensor,
     plus: Grads,
     keeps_lr: bool,
 ) -> Number:
@@ -221,8 +225,10 @@ def apply(
         _rows(name, out[name].shape[1:].numel() if name in out else 0, lr, hr, plus, out.get(name)) for name in _ORDER
     ]
     tables, finite = weight_tables(weights, n, device), like.new_ones(1, dtype=torch.int32)
+    changing = lambda_hr if isinstance(lambda_hr, Tensor) else None
+    options = _options(n, lr, hr, 0.0 if isinstance(lambda_hr, Tensor) else lambda_hr, keeps_lr)
     with on_stream(device):
-        combined = *rows, _options(n, lr, hr, lambda_hr, keeps_lr), weights_of(tables), finite
+        combined = *rows, options, weights_of(tables), changing, finite
         launch(combine, [n, sum(row.width for row in rows)], combined, device, block=_LANES[device.type])
     return scalar(finite[0])
 

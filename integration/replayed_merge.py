@@ -1,0 +1,143 @@
+"""The merge of a host's gradients, on CUDA recorded and replayed: of the kernels that it launches, 22 are GCO's.
+
+A host has other gradients in each step, so a recording reads copies of them, and its result is copied to where the host has its
+own. The parameters, and what the strategies store, it reads in place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Final
+
+import torch
+from torch import Tensor
+
+from clear_strategies.core.deferred import Number
+from clear_strategies.core.evidence import Evidence
+from clear_strategies.core.gradients import Colour, Grads
+from clear_strategies.core.step import Step
+from clear_strategies.merging.conductor import Conductor
+from clear_strategies.merging.iteration import Merged
+from clear_strategies.merging.replays import RECORDING, Kind, RecordedWork, Replays, copied, write
+from rasterizers.told import iteration, unread
+
+_FINITE: Final = "finite"
+_CONFLICT: Final = "conflict of "
+"""Keys of a replay's numbers, before a group's name; all others were logged by strategies."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Given:
+    """The arguments of `Conductor.merge_routed` where HR takes part."""
+
+    params: Mapping[str, Tensor]
+    lr: Grads
+    hr: Grads
+    step: Step
+    out: Mapping[str, Tensor]
+
+    @property
+    def tensors(self) -> dict[str, Tensor | None]:
+        """Those that a recording has copies of, by a name for each."""
+        found = dict[str, Tensor | None](visible=self.step.visible)
+        for side, g in {"lr": self.lr, "hr": self.hr}.items():
+            found |= {f"{side} {name}": x for name, x in g.items()}
+            if g.colour is not None:
+                found |= {f"{side} {name}": x for name, x in g.colour._asdict().items()}
+        if (e := self.step.evidence) is not None:
+            found |= {"reliability": e.reliability, "demand": e.demand, "sums": e.sums}
+        return found
+
+    def copied(self) -> _Given:
+        """The same with copies. They do not tell the view of the iteration, which is another one in a replay."""
+        step, e = self.step, self.step.evidence
+        own = replace(
+            step, view=unread(step.view, "the view"), visible=copied(step.visible), looked_up=None,
+            evidence=None if e is None else Evidence(e.reliability.clone(), e.demand.clone(), copied(e.sums)),
+        )  # fmt: skip
+        return _Given(self.params, _copied(self.lr), _copied(self.hr), own, self.out)
+
+
+class _Recorded:
+    """The recording of one kind of merge, and the tensors from which it reads what it is given."""
+
+    def __init__(self, conductor: Conductor, given: _Given) -> None:
+        own, first = given.copied(), next(iter(given.out.values()))
+        self._own, self._lambda_hr = [*own.tensors.values()], conductor.objective.lambda_hr
+        self._λ, self._λ_now = first.new_empty(1), -1.0  # on the device
+
+        def work() -> tuple[list[Tensor], dict[str, Number]]:
+            logged, step = conductor.logs(), replace(own.step, t=iteration(given.step.t))
+            out = {name: torch.empty_like(x, memory_format=torch.contiguous_format) for name, x in given.out.items()}
+            merged = conductor.merge_routed(own.params, own.lr, own.hr, step, given.step.t, out, self._λ)
+            conflict = {f"{_CONFLICT}{group}": share for group, share in merged.conflict.items()}
+            return [*out.values()], {_FINITE: merged.finite, **conflict, **conductor.take_logs(logged)}
+
+        self._write(given)
+        self._work = RecordedWork(first.device, conductor.work_log, work)
+
+    def holds_at(self, t: int) -> bool:
+        """See `Recorded`."""
+        return self._work.holds_at(t)
+
+    def replay(self, given: _Given) -> bool:
+        """See `Recorded`."""
+        self._write(given)
+        return self._work.replay()
+
+    def outcome(self, given: _Given) -> tuple[Merged, dict[str, Number]]:
+        """See `Recorded`. What the strategies have logged is the second."""
+        made, row = self._work.outcome()
+        write([*given.out.values()], made)
+        conflict = {group.removeprefix(_CONFLICT): row.pop(group) for group in [*row] if group.startswith(_CONFLICT)}
+        return Merged(Grads(given.out), conflict, row.pop(_FINITE)), row
+
+    def _write(self, given: _Given) -> None:
+        write(self._own, [*given.tensors.values()])
+        if (λ := self._lambda_hr(given.step.t)) != self._λ_now:
+            self._λ_now = λ
+            self._λ.fill_(λ)
+
+
+class ReplayedMerge:
+    """Called as `Conductor.merge_routed` with all its arguments.
+
+    Args:
+        device: of the Gaussians. On CUDA a merge in which HR takes part is recorded and replayed.
+    """
+
+    def __init__(self, conductor: Conductor, device: torch.device) -> None:
+        self._conductor = conductor
+        self._replays: Replays | None = None
+        if device.type in RECORDING:
+            self._replays = Replays(device, conductor.work_log, "the replay of the merge")
+
+    def __call__(
+        self, params: Mapping[str, Tensor], g_lr: Grads, g_hr: Grads, step: Step | None, t: int, out: Mapping[str, Tensor]
+    ) -> Merged:  # fmt: skip
+        """See `Conductor.merge_routed`."""
+        conductor = self._conductor
+
+        def live() -> tuple[Merged, dict[str, Number]]:
+            return conductor.merge_routed(params, g_lr, g_hr, step, t, out), {}
+
+        if self._replays is None or step is None or not g_hr.tensors or conductor.objective.lambda_hr(t) == 0:
+            return live()[0]
+        given = _Given(params, g_lr, g_hr, step, out)
+        merged, logged = self._replays.do(
+            self._kind(given), t, given, live=live, record=lambda: _Recorded(conductor, given)
+        )
+        conductor.log_replayed(logged)
+        return merged
+
+    def _kind(self, given: _Given) -> Kind:
+        read = *given.params.values(), *given.step.params.values(), *self._conductor.state_dict().values()
+        addresses = [x.data_ptr() for x in read if x.dim() > 0]
+        shapes = [(name, None if x is None else x.shape) for name, x in given.tensors.items()]
+        return Kind((len(next(iter(given.out.values()))), *addresses), tuple(shapes), tuple(given.out))
+
+
+def _copied(g: Grads) -> Grads:
+    colour = None if g.colour is None else Colour(*(x.clone() for x in g.colour))
+    return Grads({name: x.clone() for name, x in g.items()}, colour=colour)
