@@ -186,7 +186,7 @@ class CompiledStep:
             )
             for name, p in params.items()
         }  # fmt: skip
-        all_bands, active = params["shN"].shape[1], _table(g_lr)["basis"].shape[1] - 1
+        all_bands, active = params["shN"].shape[1], _basis(g_lr).shape[1] - 1
         quiet = self.skips and self._above_is_quiet(active, moved="shN" in plus or "shN" in given)
         bands = active if quiet else all_bands
         settings = self._settings(t, bias2, self.skips, 3 * bands, numbers)
@@ -203,9 +203,10 @@ class CompiledStep:
         activation = {
             "scales": a.scales, "filtered": a.filtered, "filter": a.filter_3d, "sigmoid": a.sigmoid,
             "factor": a.factor.contiguous(), "route": m.float().contiguous() if isinstance(m, Tensor) else None,
+            "basis": _basis(g_lr, None if hr is None else hr.base),
         }  # fmt: skip
-        base, hf = (None, None) if hr is None else (_table(hr.base), None if hr.hf is None else _table(hr.hf))
-        return self._passes(activation, _table(g_lr), base, hf, self.conductor.objective.lambda_hf)
+        base, hf = (None, None) if hr is None else (hr.base.tensors, None if hr.hf is None else hr.hf.tensors)
+        return self._passes(activation, g_lr.tensors, base, hf, self.conductor.objective.lambda_hf)
 
     def _settings(
         self, t: int, bias2: float, skips: bool = False, width: int = 0, changing: Tensor | None = None
@@ -233,9 +234,14 @@ class CompiledStep:
         return self._quiet
 
 
-def _table(g: Grads) -> dict[str, Tensor]:
-    """A gradient as the passes take it."""
-    return {**g, **g.colour._asdict()} if g.colour is not None else {**g}
+def _basis(g_lr: Grads, g_hr: Grads | None = None) -> Float[Tensor, "N B1"]:
+    """Y of a view, which both scales see from one place. Some rasterizers leave it out where a scale draws nothing."""
+    low, high = (None if g is None else g.colour for g in (g_lr, g_hr))
+    if low is None:
+        raise ValueError("the gradient of the colours must be given by its factors.")
+    if high is None or high.basis is low.basis:
+        return low.basis
+    return torch.where((low.rgb != 0).any(1, keepdim=True), low.basis, high.basis)
 
 
 def _dense(gaussians: kernel.GaussianStep, params: Mapping[str, Tensor]) -> tuple[Grads, Grads]:

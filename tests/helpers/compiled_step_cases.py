@@ -104,7 +104,7 @@ def case(n=1000, degree=3, kind="random", seed=0, bands=15, gate=False, evidence
         def rowed(*shape):
             return normal(k, n, *shape) * rows.view(1, n, *[1] * len(shape))
 
-        return SplatGradients(rowed(3), rowed(4), rowed(3), rowed(), rowed(2), rowed(3), basis.clone())
+        return SplatGradients(rowed(3), rowed(4), rowed(3), rowed(), rowed(2), rowed(3), basis)
 
     lr, hr = gradients(1), gradients(2)
     if kind in ("opposite", "parallel"):

@@ -277,10 +277,10 @@ def test_the_same_bits_for_any_number_of_threads(passes):
         assert all(torch.equal(a.nan_to_num(), b.nan_to_num()) for a, b in zip(state, states[0][0], strict=True))
 
 
-def test_bases_of_both_scales_may_differ(passes):
+def test_a_rasterizer_may_have_the_basis_of_what_a_scale_draws_alone(passes):
     for make in (GCO, Signed):
-        c = case(64)
-        c.hr = replace(c.hr, basis=c.hr.basis * 1.5 + 0.1)
+        c = case(64, kind="sparse")
+        c.lr, c.hr = (replace(g, basis=g.basis * (g.rgb != 0).any(2).any(0)[:, None]) for g in (c.lr, c.hr))
         expected, conflict, found, found_conflict = both_ways(passes, c, *conductors(make))
         assert_same_gradient(c, expected, found)
         assert as_floats(conflict) == as_floats(found_conflict)
@@ -289,9 +289,9 @@ def test_bases_of_both_scales_may_differ(passes):
 def test_wrong_tensors_are_refused_at_the_border(passes):
     c = case(8)
     shot, g, _ = c.factors(1)
-    lr, a = {**g, **g.colour._asdict()}, shot.activation
+    lr, a = {**g.tensors}, shot.activation
     drawn = {"scales": a.scales, "filtered": a.filtered, "filter": a.filter_3d, "sigmoid": a.sigmoid}
-    drawn |= {"factor": a.factor, "route": None}
+    drawn |= {"factor": a.factor, "route": None, "basis": g.colour.basis}
     for wrong, error, message in (
         (lr["means"].double(), TypeError, r"means must be a contiguous float32 tensor (in the CPU's memory|on cuda:0)"),
         (lr["means"].T.contiguous().T, TypeError, "means must be a contiguous float32 tensor"),
@@ -300,7 +300,7 @@ def test_wrong_tensors_are_refused_at_the_border(passes):
         with pytest.raises(error, match=message):
             passes(drawn, lr | {"means": wrong}, None, None, 0.2)
     with pytest.raises(KeyError, match="means"):
-        passes(drawn, {"basis": lr["basis"]}, None, None, 0.2)
+        passes(drawn, {}, None, None, 0.2)
     with pytest.raises(ValueError, match="hf needs base"):
         passes(drawn, lr, None, lr, 0.2)
 

@@ -21,9 +21,8 @@ class CppGaussianStep:
     """The gradients of one view's losses, as the rasterizer returns them, and the pass over them.
 
     Args:
-        activation: scales, filtered [N, 3], filter, sigmoid, factor [N], and route: m [N], None: 1.
-        lr, base, hf: means, quats, scales, opacities, rgb and the basis Y [N, bases], for one cotangent each; base and hf
-            may be None.
+        activation: scales, filtered [N, 3], filter, sigmoid, factor [N], the basis Y [N, bases], and route: m [N], None: 1.
+        lr, base, hf: means, quats, scales, opacities and rgb, for one cotangent each; base and hf may be None.
 
     Raises:
         BackendUnavailable: the kernels were not compiled.
@@ -32,15 +31,15 @@ class CppGaussianStep:
 
     def __init__(
         self,
-        activation: Mapping[str, Tensor | None],
+        activation: Mapping[str, Any],
         lr: Mapping[str, Tensor],
         base: Mapping[str, Tensor] | None,
         hf: Mapping[str, Tensor] | None,
         lambda_hf: float,
     ) -> None:
         kernels: Any = native.module()
-        self._passes = kernels.GaussianStep(dict(activation), lr, base, hf, lr["basis"].shape[1], lambda_hf)
-        self._n = len(lr["basis"])
+        self._n, bases = activation["basis"].shape
+        self._passes = kernels.GaussianStep(dict(activation), lr, base, hf, bases, lambda_hf)
 
     def products(self) -> Products:
         table = empty((3, len(CONFLICT_GROUPS), self._n), torch.float64)

@@ -17,6 +17,7 @@ class GaussianStep {
     g_.activation = {tensors_.rows<const float>(activation, "scales", n, 3), tensors_.rows<const float>(activation, "filtered", n, 3),
                      tensors_.rows<const float>(activation, "filter", n, 1), tensors_.rows<const float>(activation, "sigmoid", n, 1),
                      tensors_.rows<const float>(activation, "factor", n, 1)};
+    g_.basis = tensors_.rows<const float>(activation, "basis", n, bases);
     g_.route = tensors_.rows<const float>(activation, "route", n, 1, true);
     g_.lr = gradient(lr);
     if (!base.is_none()) g_.base = gradient(nb::cast<nb::dict>(base));
@@ -82,7 +83,7 @@ class GaussianStep {
     std::int64_t n = g_.n;
     return {tensors_.rows<const float>(t, "means", n, 3), tensors_.rows<const float>(t, "quats", n, 4),
             tensors_.rows<const float>(t, "scales", n, 3), tensors_.rows<const float>(t, "opacities", n, 1),
-            tensors_.rows<const float>(t, "rgb", n, 3), tensors_.rows<const float>(t, "basis", n, g_.bases)};
+            tensors_.rows<const float>(t, "rgb", n, 3)};
   }
 
   Attribute parameter(Tensors& tensors, const nb::dict& t) const {

@@ -5,10 +5,9 @@
 
 namespace clear {
 
-// One cotangent's rasterizers.interface.SplatGradients, row-major; the colour gradient as its factors rgb and basis.
+// One cotangent's rasterizers.interface.SplatGradients, row-major; rgb is the factor beside Y of the colour gradient.
 struct SplatGradient {
   const float *means = nullptr, *quats = nullptr, *scales = nullptr, *opacities = nullptr, *rgb = nullptr;
-  const float* basis = nullptr;  // Y [N, bases]
   explicit operator bool() const { return means != nullptr; }
 };
 
@@ -20,6 +19,7 @@ struct Activation {
 struct Gradients {
   std::int64_t n;
   int bases;                     // columns of Y: 1 + active higher bands
+  const float* basis;            // Y [N, bases]
   SplatGradient lr, base, hf;    // base and hf may be absent
   Activation activation;
   const float* route;            // m_i, or null for 1
@@ -65,39 +65,15 @@ CLEAR_INLINE void activation_vjp(const SplatGradient& g, const Activated& a, con
   out.opacities[0] = d_opacity * a.factor * a.sigmoid * a.slope;
 }
 
-CLEAR_INLINE Floats first_band(const SplatGradient& g, int bases, std::int64_t i, int count) {
-  Floats Y0[1];
-  load_columns(g.basis + bases * i, count, Y0, bases);
-  return Y0[0];
-}
-
-// The higher bands of sixteen bases, one Gaussian per lane.
-CLEAR_INLINE void load_bands(const float* basis, int bases, std::int64_t i, int count, Floats (&bands)[kLanes]) {
+// ‖Y‖² over the higher bands of sixteen Gaussians, for ⟨Y ⊗ a, Y ⊗ b⟩ = ‖Y‖² ⟨a, b⟩.
+CLEAR_INLINE Doubles higher_bands2(const float* basis, int bases, std::int64_t i, int count) {
+  Doubles total = 0.0;
+  if (bases == 1) return total;
+  Floats bands[kLanes];
   for (int row = 0; row < kLanes; ++row) bands[row] = row < count ? load_some(basis + bases * (i + row), bases) : Floats(0.0f);
   transpose(bands);
-}
-
-// ⟨Y_a, Y_b⟩ over the higher bands, for ⟨Y_a ⊗ a, Y_b ⊗ b⟩ = ⟨Y_a, Y_b⟩ ⟨a, b⟩.
-struct BasisProducts {
-  Doubles lr2 = 0.0, hr2 = 0.0, cross = 0.0;
-};
-
-CLEAR_INLINE BasisProducts basis_products(const float* lr, const float* hr, int bases, std::int64_t i, int count) {
-  BasisProducts out;
-  if (bases == 1) return out;
-  Floats l[kLanes], h[kLanes];
-  load_bands(lr, bases, i, count, l);
-  if (hr == lr) {
-    for (int k = 1; k < bases; ++k) out.lr2 += widen(l[k]) * widen(l[k]);
-    out.hr2 = out.cross = out.lr2;
-    return out;
-  }
-  load_bands(hr, bases, i, count, h);
-  for (int k = 1; k < bases; ++k) {
-    Doubles a = widen(l[k]), b = widen(h[k]);
-    out.lr2 += a * a, out.hr2 += b * b, out.cross += a * b;
-  }
-  return out;
+  for (int k = 1; k < bases; ++k) total += widen(bands[k]) * widen(bands[k]);
+  return total;
 }
 
 // g^HR = g_base + λ_HF m g_HF, multiplied in the same order as the conductor does.
@@ -115,13 +91,13 @@ struct Block {
 CLEAR_INLINE void load(const Gradients& g, std::int64_t i, int count, Block& b) {
   Activated a;
   load(g.activation, i, count, a);
-  Floats Y0 = first_band(g.lr, g.bases, i, count);
-  activation_vjp(g.lr, a, Y0, i, count, b.lr);
+  Floats Y0[1];
+  load_columns(g.basis + g.bases * i, count, Y0, g.bases);
+  activation_vjp(g.lr, a, Y0[0], i, count, b.lr);
   if (!g.base) return;
-  if (g.base.basis != g.lr.basis) Y0 = first_band(g.base, g.bases, i, count);
-  activation_vjp(g.base, a, Y0, i, count, b.hr);
+  activation_vjp(g.base, a, Y0[0], i, count, b.hr);
   if (!g.hf) return;
-  activation_vjp(g.hf, a, Y0, i, count, b.hf);
+  activation_vjp(g.hf, a, Y0[0], i, count, b.hf);
   b.m = g.route ? load_some(g.route + i, count) : Floats(1.0f);
   route(b.hr.means, b.hf.means, b.m, g.lambda_hf);
   route(b.hr.quats, b.hf.quats, b.m, g.lambda_hf);
@@ -140,8 +116,7 @@ CLEAR_INLINE void fetch(const Gradients& g, std::int64_t i) {
     fetch_rows(loss->means, i, 3), fetch_rows(loss->quats, i, 4), fetch_rows(loss->scales, i, 3);
     fetch_rows(loss->opacities, i, 1), fetch_rows(loss->rgb, i, 3);
   }
-  fetch_rows(g.lr.basis, i, g.bases);
-  if (g.base.basis != g.lr.basis) fetch_rows(g.base.basis, i, g.bases);
+  fetch_rows(g.basis, i, g.bases);
 }
 
 }  // namespace clear

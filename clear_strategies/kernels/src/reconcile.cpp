@@ -121,7 +121,7 @@ class Passes {
       Floats l[3], h[3];
       load_factors(i, count, l, h);
       clear::Products rgb = clear::products(l, h);
-      Doubles Y2 = basis_products(g.lr.basis, g.lr.basis, g.lr.bases, i, count).lr2;
+      Doubles Y2 = higher_bands2(g.lr.basis, g.lr.bases, i, count);
       return {Y2 * rgb.dot, Y2 * rgb.l2, Y2 * rgb.h2};
     }
     Sixteen b;

@@ -12,19 +12,15 @@
 namespace clear {
 namespace {
 
-CLEAR_INLINE Floats basis_row(const SplatGradient& g, int bases, std::int64_t row) {
-  return load_some(g.basis + bases * row, bases);
-}
-
 CLEAR_INLINE void group_products(const Gradients& g, const Block& b, std::int64_t i, int count, Products (&p)[kGroups]) {
   p[kMeans] = products(b.lr.means, b.hr.means);
   p[kSh0] = products(b.lr.sh0, b.hr.sh0);
   p[kOpacities] = products(b.lr.opacities, b.hr.opacities);
   p[kScales] = products(b.lr.scales, b.hr.scales);
   p[kQuats] = products(b.lr.quats, b.hr.quats);
-  BasisProducts Y = basis_products(g.lr.basis, g.base.basis, g.bases, i, count);
+  Doubles Y2 = higher_bands2(g.basis, g.bases, i, count);
   Products rgb = products(b.lr.rgb, b.hr.rgb);
-  p[kShN] = {Y.cross * rgb.dot, Y.lr2 * rgb.l2, Y.hr2 * rgb.h2};
+  p[kShN] = {Y2 * rgb.dot, Y2 * rgb.l2, Y2 * rgb.h2};
 }
 
 // The rows of a chunk of Gaussians in dense form.
@@ -36,7 +32,7 @@ class ChunkDense {
     each_sixteen(g.n, number, [&](std::int64_t i, int count) {
       Block b;
       load(g, i, count, b);
-      write(b.lr, g.lr, lr, i, count), write(b.hr, g.base, hr, i, count);
+      write(b.lr, lr, i, count), write(b.hr, hr, i, count);
     });
   }
 
@@ -45,13 +41,13 @@ class ChunkDense {
   const DenseRows &lr, &hr;
   const RowPlan plan;
 
-  void write(const RawGradients& raw, const SplatGradient& of, const DenseRows& to, std::int64_t i, int count) const {
+  void write(const RawGradients& raw, const DenseRows& to, std::int64_t i, int count) const {
     store_rows(to.of[kMeans], i, count, raw.means), store_rows(to.of[kSh0], i, count, raw.sh0);
     store_rows(to.of[kOpacities], i, count, raw.opacities), store_rows(to.of[kScales], i, count, raw.scales);
     store_rows(to.of[kQuats], i, count, raw.quats);
     float rgb[3 * kLanes];
     join_rows(rgb, raw.rgb);
-    expand(rgb, of.basis + g.bases * i, g.bases, plan, count, count, to.of[kShN] + i * plan.width);
+    expand(rgb, g.basis + g.bases * i, g.bases, plan, count, count, to.of[kShN] + i * plan.width);
   }
 };
 
@@ -80,12 +76,12 @@ class ChunkStep {
     std::uint32_t still = s.skips ? still_rows(b, i, rows) : 0;
     std::uint32_t moving = rows & ~still;
     if (moving) {  // still rows beside a moving one step too, which leaves them unchanged
-      Merged merged = merge(b, i, count);
+      if (g.base && s.lambda_hr > 0) merge(b, i, count);
       step_columns(s.means, b.lr.means, i, count), step_columns(s.quats, b.lr.quats, i, count);
       step_columns(s.scales, b.lr.scales, i, count), step_columns(s.opacities, b.lr.opacities, i, count);
       step_columns(s.sh0, b.lr.sh0, i, count);
       step_detail(b, i, count);
-      step_rows(merged, i, count, moving);
+      step_rows(b, i, count, moving);
       return __builtin_popcount(still);
     }
     for (int k = 0; k < count; ++k) rest_row(s.scales, i + k), rest_row(s.opacities, i + k), rest_row(s.detail, i + k);
@@ -93,33 +89,12 @@ class ChunkStep {
     return __builtin_popcount(still);
   }
 
-  // The merged colours of sixteen Gaussians, of which shN's gradient is Y_LR ⊗ lr + Y_HR ⊗ hr; padded, because reads are sixteen wide.
-  struct Merged {
-    float lr[4 * kLanes] = {}, hr[4 * kLanes] = {};
-  };
-
-  // g_LR becomes g_LR + λ_HR ĝ_HR, and is that of shN as colours.
-  CLEAR_INLINE Merged merge(Block& b, std::int64_t i, int count) const {
-    Merged out;
-    if (g.base && s.lambda_hr > 0) {
-      add(kMeans, b.lr.means, b.hr.means, i, count), add(kSh0, b.lr.sh0, b.hr.sh0, i, count);
-      add(kOpacities, b.lr.opacities, b.hr.opacities, i, count), add(kScales, b.lr.scales, b.hr.scales, i, count);
-      add(kQuats, b.lr.quats, b.hr.quats, i, count);
-      if (one_basis()) {
-        add(kShN, b.lr.rgb, b.hr.rgb, i, count);
-      } else {  // l - λ remove l, and λ keep h
-        Floats none[3] = {0.0f, 0.0f, 0.0f};
-        Floats kept[3] = {b.hr.rgb[0], b.hr.rgb[1], b.hr.rgb[2]}, removed[3] = {0.0f, 0.0f, 0.0f};
-        reconcile(w, kShN, removed, b.lr.rgb, i, count), reconcile(w, kShN, kept, none, i, count);
-        for (int d = 0; d < 3; ++d) b.lr.rgb[d] += removed[d] * Floats(s.lambda_hr), kept[d] *= Floats(s.lambda_hr);
-        join_rows(out.hr, kept);
-      }
-    }
-    join_rows(out.lr, b.lr.rgb);
-    return out;
+  // g_LR becomes g_LR + λ_HR ĝ_HR, and is that of shN as the colours beside Y.
+  CLEAR_INLINE void merge(Block& b, std::int64_t i, int count) const {
+    add(kMeans, b.lr.means, b.hr.means, i, count), add(kSh0, b.lr.sh0, b.hr.sh0, i, count);
+    add(kOpacities, b.lr.opacities, b.hr.opacities, i, count), add(kScales, b.lr.scales, b.hr.scales, i, count);
+    add(kQuats, b.lr.quats, b.hr.quats, i, count), add(kShN, b.lr.rgb, b.hr.rgb, i, count);
   }
-
-  bool one_basis() const { return g.lr.basis == g.base.basis; }
 
   template <int D>
   CLEAR_INLINE void add(Group group, Floats (&l)[D], Floats (&h)[D], std::int64_t i, int count) const {
@@ -148,18 +123,15 @@ class ChunkStep {
     step_columns(s.detail, routed, i, count);
   }
 
-  void step_rows(const Merged& merged, std::int64_t i, int count, std::uint32_t moving) const {
+  void step_rows(const Block& b, std::int64_t i, int count, std::uint32_t moving) const {
     if (!s.width) return;
-    bool two = g.base && !one_basis();
+    float colours[4 * kLanes] = {};  // padded, because reads are sixteen wide
+    join_rows(colours, b.lr.rgb);
     for (int k = 0; k < count; ++k) {
       fetch_next(s.shN, i + k, i + k + 1);
       if (!(moving >> k & 1)) continue;
-      Floats Y = basis_row(g.lr, g.bases, i + k), rgb = Floats::load(merged.lr + 3 * k), gradient[3] = {0.0f, 0.0f, 0.0f};
+      Floats Y = load_some(g.basis + g.bases * (i + k), g.bases), rgb = Floats::load(colours + 3 * k), gradient[3] = {0.0f, 0.0f, 0.0f};
       for (int v = 0; v < plan.sixteens; ++v) gradient[v] = outer(Y, rgb, plan, v);
-      if (two) {
-        Y = basis_row(g.base, g.bases, i + k), rgb = Floats::load(merged.hr + 3 * k);
-        for (int v = 0; v < plan.sixteens; ++v) gradient[v] += outer(Y, rgb, plan, v);
-      }
       step_row(i + k, gradient);
     }
   }

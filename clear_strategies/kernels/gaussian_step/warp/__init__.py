@@ -47,13 +47,13 @@ class WarpGaussianStep:
 
     def __init__(
         self,
-        activation: Mapping[str, Tensor | None],
+        activation: Mapping[str, Any],
         lr: Mapping[str, Tensor],
         base: Mapping[str, Tensor] | None,
         hf: Mapping[str, Tensor] | None,
         lambda_hf: float,
     ) -> None:
-        self._like = lr["basis"]
+        self._like = activation["basis"]
         self._n, self._bases = self._like.shape
         if not 1 <= self._bases <= 16:
             raise ValueError(f"the basis must have 1 to 16 columns, got {self._bases}.")
@@ -62,14 +62,13 @@ class WarpGaussianStep:
         if base is None and hf is not None:
             raise ValueError("hf needs base, got None.")
         self._kept = (activation, lr, base, hf)  # kept alive while kernels may read them
-        self._has_base, self._hr_basis = base is not None, (lr if base is None else base)["basis"]
-        self._one_basis = self._hr_basis.data_ptr() == lr["basis"].data_ptr()
+        self._has_base = base is not None
         view = struct(
-            raw_gradients.View, {}, n=self._n, bases=self._bases, one_basis=self._one_basis, lambda_hf=lambda_hf,
+            raw_gradients.View, {}, n=self._n, bases=self._bases, lambda_hf=lambda_hf,
             has_base=self._has_base, has_hf=hf is not None, routed=activation["route"] is not None,
         )  # fmt: skip
-        inputs = {"scales": 3, "filtered": 3, "filter": 1, "sigmoid": 1, "factor": 1, "route": 1}
-        widths = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "rgb": 3, "basis": self._bases}
+        inputs = {"scales": 3, "filtered": 3, "filter": 1, "sigmoid": 1, "factor": 1, "basis": self._bases, "route": 1}
+        widths = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "rgb": 3}
         self._gradients = (
             self._rows(raw_gradients.Activation, activation, inputs, optional=("route",)),
             self._rows(raw_gradients.Gradient, lr, widths),
@@ -105,7 +104,7 @@ class WarpGaussianStep:
             raise ValueError(
                 f"width must be a multiple of 3 from {least}, the active bands, to {most}, a row of shN; got {settings.width}."
             )
-        colours = self._like.new_empty(1 if self._one_basis else 2, self._n, 3)
+        colours = self._like.new_empty(self._n, 3)
         moving = self._like.new_empty(self._n, dtype=torch.bool)
         device, lanes, adam_step = self._like.device, self._lanes, settings.changing
         blocks = -(-self._n // lanes)
@@ -119,7 +118,7 @@ class WarpGaussianStep:
         step = (
             *self._gradients, weights_of(tables), options, adam_step, *parameters, bands, colours, moving, stills,
         )  # fmt: skip
-        of_bands = self._gradients[-1], self._like, self._hr_basis, colours, moving, adam_step, bands
+        of_bands = self._like, colours, moving, adam_step, bands
         with on_stream(device):
             launch(passes.step, [blocks], step, device, block=lanes, together=True)
             launch(passes.step_bands, [self._n, settings.width], of_bands, device, block=lanes)

@@ -18,7 +18,7 @@ from clear_strategies.kernels.gaussian_step.warp.raw_gradients import (
     Gradient,
     RawGradient,
     View,
-    basis_products,
+    higher_bands2,
     load,
     route_of,
     size,
@@ -66,7 +66,7 @@ def products4(low: wp.vec4, high: wp.vec4) -> wp.vec3d:
 
 @wp.func
 def group_products(
-    low: RawGradient, high: RawGradient, lr: Gradient, base: Gradient, view: View, i: wp.int32
+    low: RawGradient, high: RawGradient, activation: Activation, bases: wp.int32, i: wp.int32
 ) -> Products:
     a, b = wp.float64(low.opacity), wp.float64(high.opacity)
     means, sh0, scales = (
@@ -74,7 +74,7 @@ def group_products(
         products3(low.sh0, high.sh0),
         products3(low.scales, high.scales),
     )
-    shN = wp.cw_mul(basis_products(lr, base, view, i), products3(low.rgb, high.rgb))
+    shN = higher_bands2(activation, bases, i) * products3(low.rgb, high.rgb)
     opacities, quats = wp.vec3d(a * b, a * a, b * b), products4(low.quats, high.quats)
     p = Products()
     p.dot = Six(means[0], sh0[0], shN[0], opacities[0], scales[0], quats[0])
@@ -105,7 +105,7 @@ def compare(
     i, tally = block * wp.block_dim() + lane, Counts()
     if i < view.n:
         g_lr, g_hr, _ = load(activation, lr, base, hf, view, i)
-        products = group_products(g_lr, g_hr, lr, base, view, i)
+        products = group_products(g_lr, g_hr, activation, view.bases, i)
         store(products, table, i)
         tally = counted(products)
     wp.tile_store(counts, wp.tile_sum(wp.tile(tally, preserve_type=True)), offset=(block,))
@@ -147,8 +147,8 @@ def write_dense(
 ) -> None:  # fmt: skip
     i = wp.tid()
     g_lr, g_hr, _ = load(activation, lr, base, hf, view, i)
-    write_rows(g_lr, lr.basis, view.bases, i, to_lr)
-    write_rows(g_hr, base.basis, view.bases, i, to_hr)
+    write_rows(g_lr, activation.basis, view.bases, i, to_lr)
+    write_rows(g_hr, activation.basis, view.bases, i, to_hr)
 
 
 @wp.kernel
@@ -168,14 +168,11 @@ def step(
     sh0: Attribute,
     detail: Attribute,
     shN: Attribute,
-    colours: wp.array3d[wp.float32],
+    colours: wp.array2d[wp.float32],
     moving: wp.array[wp.bool],
     stills: wp.array[wp.int32],
 ) -> None:
-    """One thread per Gaussian: steps everything but shN, for which it writes the merged colour to `colours`.
-
-    If LR and HR have different bases, there are two colours, one for each.
-    """
+    """One thread per Gaussian: steps everything but shN, for which it writes the merged colour to `colours`."""
     block, lane = wp.tid()
     adam = adams[0]
     at = block * wp.block_dim() + lane
@@ -196,9 +193,7 @@ def step(
     d_sh0 = merged3(g_lr.sh0, g_hr.sh0, w, SH0, i, λ)
     # f_det gets only the routed gradient of L_HF, uncorrected
     d_detail = g_hf.rgb * route_of(activation, view, i) * view.lambda_hf * adam.lambda_hr
-    rgb_lr, rgb_hr = merged3(g_lr.rgb, g_hr.rgb, w, SHN, i, λ), wp.vec3()
-    if not view.one_basis:
-        rgb_lr, rgb_hr = merged3(g_lr.rgb, wp.vec3(), w, SHN, i, λ), merged3(wp.vec3(), g_hr.rgb, w, SHN, i, λ)
+    d_rgb = merged3(g_lr.rgb, g_hr.rgb, w, SHN, i, λ)
 
     count = wp.int32(0)
     if still and at < view.n:
@@ -209,9 +204,7 @@ def step(
 
     moving[i] = moves
     for channel in range(3):
-        colours[0, i, channel] = rgb_lr[channel]
-        if not view.one_basis:
-            colours[1, i, channel] = rgb_hr[channel]
+        colours[i, channel] = d_rgb[channel]
     for d in range(3):
         step_number(adam, means, adam.rates.means, 3 * i + d, d_means[d], moves)
         step_number(adam, scales, adam.rates.scales, 3 * i + d, d_scales[d], moves)
@@ -224,10 +217,8 @@ def step(
 
 @wp.kernel
 def step_bands(
-    view: View,
-    lr_basis: wp.array2d[wp.float32],
-    hr_basis: wp.array2d[wp.float32],
-    colours: wp.array3d[wp.float32],
+    basis: wp.array2d[wp.float32],
+    colours: wp.array2d[wp.float32],
     moving: wp.array[wp.bool],
     adams: wp.array[AdamStep],
     shN: Attribute,
@@ -238,8 +229,6 @@ def step_bands(
         return
     adam, band, channel = adams[0], 1 + j / 3, j % 3
     gradient = wp.float32(0.0)
-    if band < view.bases:
-        gradient = lr_basis[i, band] * colours[0, i, channel]
-        if view.has_base and not view.one_basis:
-            gradient += hr_basis[i, band] * colours[1, i, channel]
+    if band < basis.shape[1]:
+        gradient = basis[i, band] * colours[i, channel]
     step_number(adam, shN, adam.rates.shN, shN.width * i + j, gradient, True)

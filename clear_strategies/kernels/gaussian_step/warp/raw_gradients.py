@@ -7,25 +7,25 @@ import warp as wp
 
 @wp.struct
 class Gradient:
-    """One cotangent's rasterizers.interface.SplatGradients, row-major; the colour gradient as its factors rgb and basis."""
+    """One cotangent's rasterizers.interface.SplatGradients, row-major; rgb is the factor beside Y of the colour gradient."""
 
     means: wp.array[wp.float32]
     quats: wp.array[wp.float32]
     scales: wp.array[wp.float32]
     opacities: wp.array[wp.float32]
     rgb: wp.array[wp.float32]
-    basis: wp.array[wp.float32]
 
 
 @wp.struct
 class Activation:
-    """The inputs of the activations' VJP (training.field.Activation), and m unless it is 1."""
+    """The inputs of the activations' VJP (training.field.Activation), Y, and m unless it is 1."""
 
     scales: wp.array[wp.float32]
     filtered: wp.array[wp.float32]
     filter: wp.array[wp.float32]
     sigmoid: wp.array[wp.float32]
     factor: wp.array[wp.float32]
+    basis: wp.array[wp.float32]
     route: wp.array[wp.float32]
 
 
@@ -35,7 +35,6 @@ class View:
 
     n: wp.int32
     bases: wp.int32  # columns of Y: 1 + active higher bands
-    one_basis: wp.bool  # LR and HR have the same Y
     has_base: wp.bool
     has_hf: wp.bool
     routed: wp.bool
@@ -78,7 +77,7 @@ def activation_vjp(g: Gradient, a: Activation, bases: wp.int32, i: wp.int32) -> 
     out.scales = along + d_opacity * (factor * sigmoid) * share
     out.opacity = d_opacity * factor * sigmoid * (1.0 - sigmoid)
     out.rgb = row3(g.rgb, i)
-    out.sh0 = g.basis[bases * i] * out.rgb
+    out.sh0 = a.basis[bases * i] * out.rgb
     return out
 
 
@@ -119,16 +118,13 @@ def load(
 
 
 @wp.func
-def basis_products(lr: Gradient, base: Gradient, view: View, i: wp.int32) -> wp.vec3d:
-    """⟨Y_LR, Y_HR⟩, ‖Y_LR‖², ‖Y_HR‖² over the higher bands, for ⟨Y_a ⊗ a, Y_b ⊗ b⟩ = ⟨Y_a, Y_b⟩ ⟨a, b⟩."""
-    out = wp.vec3d()
-    for k in range(1, view.bases):
-        low = wp.float64(lr.basis[view.bases * i + k])
-        high = low
-        if not view.one_basis:
-            high = wp.float64(base.basis[view.bases * i + k])
-        out += wp.vec3d(low * high, low * low, high * high)
-    return out
+def higher_bands2(a: Activation, bases: wp.int32, i: wp.int32) -> wp.float64:
+    """‖Y‖² over the higher bands, for ⟨Y ⊗ a, Y ⊗ b⟩ = ‖Y‖² ⟨a, b⟩."""
+    total = wp.float64(0.0)
+    for k in range(1, bases):
+        y = wp.float64(a.basis[bases * i + k])
+        total += y * y
+    return total
 
 
 @wp.func
