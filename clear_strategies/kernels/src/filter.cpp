@@ -5,16 +5,15 @@
 #include <limits>
 
 #include "block.hpp"
+#include "chunks.hpp"
 #include "pool.hpp"
 
 namespace clear {
 
 void nearest_depths(const float* means, std::int64_t n, const float* cameras, std::int64_t count, float near, float* depths,
                     int threads) {
-  constexpr std::int64_t chunk = 1024;  // Gaussians per task
-  Pool::instance().run(threads, (n + chunk - 1) / chunk, [&](std::int64_t number) {
-    for (std::int64_t i = number * chunk, end = std::min(n, i + chunk); i < end; i += kLanes) {
-      int lanes = int(std::min<std::int64_t>(kLanes, end - i));
+  Pool::instance().run(threads, chunks(n), [&](std::int64_t number) {
+    each_sixteen(n, number, [&](std::int64_t i, int lanes) CLEAR_LAMBDA {
       Floats p[3], nearest = std::numeric_limits<float>::infinity();
       load_columns(means + 3 * i, lanes, p);
       for (const float* c = cameras; c < cameras + count * kCameraNumbers; c += kCameraNumbers) {
@@ -28,10 +27,8 @@ void nearest_depths(const float* means, std::int64_t n, const float* cameras, st
         auto inside = (u >= Floats(c[16])) & (u <= Floats(c[17])) & (v >= Floats(c[18])) & (v <= Floats(c[19]));
         nearest = select(nearer & inside, z, nearest);
       }
-      float values[kLanes];
-      nearest.store(values);
-      std::copy(values, values + lanes, depths + i);
-    }
+      store_some(depths + i, nearest, lanes);
+    });
   });
 }
 

@@ -7,6 +7,8 @@
 #include <vector>
 
 #include "block.hpp"
+#include "chunks.hpp"
+#include "exponential.hpp"
 #include "pool.hpp"
 
 namespace clear {
@@ -61,10 +63,8 @@ void sixteen(const Field& field, const std::int64_t* rows, const float* eta, int
   normalize(q);
   rotate(q, noise, true, local);
   for (int d = 0; d < 3; ++d) {
-    float squares[kLanes];
-    s[d].store(squares);
-    for (float& x : squares) x = std::exp(x) * std::exp(x);
-    local[d] *= Floats::load(squares);  // S² Rᵀ η
+    const Floats size = exponential(s[d]);
+    local[d] *= size * size;  // S² Rᵀ η
   }
   rotate(q, local, false, moved);
   for (int d = 0; d < 3; ++d) {
@@ -77,12 +77,10 @@ void sixteen(const Field& field, const std::int64_t* rows, const float* eta, int
 }  // namespace
 
 void wander(const Field& field, const std::int64_t* rows, const float* eta, std::int64_t count, float strength, int threads) {
-  constexpr std::int64_t chunk = 1024;  // Gaussians per task
   if (count == 0) return;
   const float share = strength / std::exp(median_of_largest(field.scales, field.n));
-  Pool::instance().run(threads, (count + chunk - 1) / chunk, [&](std::int64_t number) {
-    for (std::int64_t k = number * chunk, end = std::min(count, k + chunk); k < end; k += kLanes)
-      sixteen(field, rows + k, eta + 3 * k, int(std::min<std::int64_t>(kLanes, end - k)), share);
+  Pool::instance().run(threads, chunks(count), [&](std::int64_t number) {
+    each_sixteen(count, number, [&](std::int64_t k, int lanes) { sixteen(field, rows + k, eta + 3 * k, lanes, share); });
   });
 }
 
