@@ -37,7 +37,15 @@ from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.objective import Objective
 from clear_strategies.merging.skips import Skips
 from clear_strategies.schedules import REFERENCE_ITERATIONS, scaled
-from clear_strategies.settings import CHANGES_NO_RESULT, TARGET, build, defaults_of, missing, with_defaults
+from clear_strategies.settings import (
+    CHANGES_NO_RESULT,
+    TARGET,
+    build,
+    defaults_of,
+    has_parameter,
+    missing,
+    with_defaults,
+)
 from clear_strategies.strategies.base import Strategy
 
 _log = logging.getLogger(__name__)
@@ -208,7 +216,10 @@ def not_composed(error: Exception, overrides: Sequence[str], config: str) -> Set
         )
     known = settings()
     remedy = "clear-strategies --cfg job prints all of them."
-    if near := difflib.get_close_matches(key, flat(known), 1, 0.8):
+    parent, _, name = key.rpartition(".")
+    if has_parameter(str(flat(known).get(f"{parent}.{TARGET}")), name):  # of the user's own class, named by an override
+        remedy = f"Its class has it; a plus adds it: +{key}=…."
+    elif near := difflib.get_close_matches(key, [name for name in flat(known) if not name.endswith(TARGET)], 1, 0.8):
         remedy = f"Did you mean {near[0]}?"
     elif known and config == "conductor":
         remedy = f"A conductor has settings of {', '.join(known)}."

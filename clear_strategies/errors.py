@@ -37,6 +37,10 @@ class StrategyConflict(ClearError, TypeError):
     """Two strategies answer a question that only one may answer."""
 
 
+class AnswerError(ClearError, TypeError):
+    """A strategy answers a hook with what that hook must not give. The message names both, the rule, and what was found."""
+
+
 class DivergedError(ClearError, FloatingPointError):
     """A number is NaN or infinite. The message names the tensor, the Gaussian, the view and the iteration."""
 

@@ -14,6 +14,7 @@ import importlib
 import inspect
 import math
 import re
+import traceback
 import types
 import typing
 import warnings
@@ -99,16 +100,25 @@ def build(node: Any, key: str = "") -> Any:
     return node
 
 
-def missing(key: str) -> SettingError:
-    """The error for a setting that has no default."""
-    return SettingError(f"{key}: is needed and missing. Add {key}=….")
+def missing(key: str, *, known: bool = True) -> SettingError:
+    """The error for a setting that has no default.
+
+    Args:
+        known: the configuration has the key; else Hydra adds it by a plus.
+    """
+    return SettingError(f"{key}: is needed and missing. Add {'' if known else '+'}{key}=….")
 
 
 def _called(node: Mapping[str, Any], key: str) -> Any:
     target = node[TARGET]
     try:
         function = _located(target)
-    except (ImportError, AttributeError) as error:
+    except Exception as error:  # whatever a module does when it is imported
+        if place := _place_in_module(error):
+            cause = f"{place}: {type(error).__name__}: {one_line(error)}"
+            raise SettingError(f"{key}: {target} cannot be imported: {cause}. Correct that file.") from error
+        if not isinstance(error, ImportError | AttributeError):
+            raise
         of_this_package = str(target).startswith(("clear_strategies.", "rasterizers."))
         remedy = "pip install 'clear-strategies[train]'" if of_this_package else "Correct its dotted name"
         raise SettingError(f"{key}: {target} cannot be imported ({one_line(error)}). {remedy}.") from error
@@ -125,13 +135,20 @@ def _called(node: Mapping[str, Any], key: str) -> Any:
         return partial
     needed = {name for name, p in parameters.items() if p.default is _EMPTY and p.kind not in _VARIADIC}
     if absent := sorted(needed - set(arguments)):
-        raise missing(_joined(key, absent[0]))
+        raise missing(_joined(key, absent[0]), known=False)
     try:
         return partial()
     except DataError:
         raise
     except (ValueError, BackendUnavailable) as error:
         raise SettingError(_with_key(one_line(error), key, parameters)) from error
+
+
+def _place_in_module(error: Exception) -> str:
+    """File and line of the module that raises while it is imported; empty where the module is not there."""
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if "importlib" not in frame.filename]
+    last = frames[-1]
+    return "" if last.filename == __file__ else f"{last.filename}:{last.lineno}"
 
 
 def _with_key(message: str, key: str, parameters: Mapping[str, Any]) -> str:
@@ -148,13 +165,23 @@ def _with_key(message: str, key: str, parameters: Mapping[str, Any]) -> str:
 
 def _located(target: Any) -> Callable[..., Any]:
     """The class or function of a dotted name; an ImportError or AttributeError where it is not there."""
+    module, _, name = str(target).rpartition(".")
+    if not module or module.startswith("."):
+        raise ImportError("it is no dotted name")
+    function = getattr(importlib.import_module(module), name)
     try:
-        module, _, name = str(target).rpartition(".")
-        function = getattr(importlib.import_module(module), name)
         inspect.signature(function)
-    except (ValueError, TypeError) as error:  # no name, no function, or one that is built in
+    except (ValueError, TypeError) as error:  # no function, or one that is built in
         raise ImportError(f"it is no class or function whose parameters are known: {one_line(error)}") from error
     return typing.cast("Callable[..., Any]", function)
+
+
+def has_parameter(target: str, name: str) -> bool:
+    """Whether the class or function of a dotted name can be imported and takes this."""
+    try:
+        return name in _parameters(_located(target))
+    except Exception:  # whatever a module does when it is imported: `build` tells
+        return False
 
 
 def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields
 from multiprocessing.reduction import ForkingPickler
 from typing import Any, Final
 
@@ -18,9 +18,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from clear_strategies.core import images
+from clear_strategies.core import deferred, images
 from clear_strategies.core.gradients import ATTRIBUTES, Grads
 from clear_strategies.core.view import Photo, View
+from clear_strategies.errors import AnswerError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Update
 from clear_strategies.merging.objective import Objective
@@ -46,14 +47,19 @@ def check_strategy(make: Make) -> None:
         ContractError: the first promise that does not hold.
     """
     for check in CHECKS:
-        check(make)
+        try:
+            check(make)
+        except AnswerError as error:
+            raise ContractError(str(error)) from error
 
 
 def check_is_frozen_settings(make: Make) -> None:
     """A frozen dataclass with a repr that names its settings, and milestones that can be stretched."""
     strategy = make()
     require(isinstance(strategy, Strategy), f"{type(strategy).__name__} is no Strategy")
-    require(is_dataclass(strategy), "a strategy is a dataclass of settings")
+    name = type(strategy).__name__
+    require("__dataclass_fields__" in vars(type(strategy)), f"write @dataclass(frozen=True) above class {name}")
+    require(hasattr(strategy, "state"), f"{name} has no state: its __init__ must be that of the dataclass")
     settings = [f.name for f in fields(strategy) if f.init]
     if settings:
         try:
@@ -83,26 +89,21 @@ def check_gradients_are_left_alone(make: Make) -> None:
 
 
 def check_answers_have_their_shapes(make: Make) -> None:
-    """One number per Gaussian from gate and score, a colour from background, the merge's attributes and shapes, all finite."""
+    """Answers of the types and shapes that the conductor takes, gates and routes >= 0, evidence in [0, 1], finite gradients."""
     conductor = _conductor(make)
     lr, hr, view, params = _situation(1)
     for t in range(1, _STEPS):
-        z = conductor.gate(t, _N)
-        require(z is None or (z.shape == (_N,) and bool((z >= 0).all())), "gate() must give [N] numbers >= 0, or None")
-        color = conductor.background(t)
-        require(
-            color is None or (len(color) == 3 and all(0 <= c <= 1 for c in color)),
-            f"background() must give three numbers in [0, 1], or None, got {color}",
-        )
+        z, _ = conductor.gate(t, _N), conductor.background(t)
+        require(z is None or bool((z >= 0).all()), "gate() must give numbers >= 0")
         update = conductor.update(params, lr, hr, view, t)
-        shape = None if update.score is None else tuple(update.score.shape)
-        require(shape == (_N,), f"score() gave {shape} for {_N} Gaussians")
         for name, gradient in _grads(update).items():
-            require(gradient.shape == params[name].shape, f"the gradient of {name} has shape {tuple(gradient.shape)}")
             require(bool(gradient.isfinite().all()), f"the gradient of {name} is not finite")
         if update.evidence is not None:
             for q in (update.evidence.reliability, update.evidence.demand):
                 require(bool(((q >= 0) & (q <= 1)).all()), "evidence must lie in [0, 1]")
+        if (router := conductor.owner("route")) is not None:
+            require(bool((torch.as_tensor(router.route(update.step)) >= 0).all()), "route() must give numbers >= 0")
+        deferred.read([*update.logs.values()])
         conductor.after_step(params, update.step)
 
 

@@ -31,6 +31,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from clear_strategies.core import deferred
+from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import Grads, conflict_columns
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, View
@@ -219,7 +220,10 @@ class Attachment:
         self._hooked = distinct
         self._stepped.clear()
         self._hooks = [
-            *(o.register_step_pre_hook(lambda o, *_: self._before_step(o)) for o in distinct),
+            *(
+                o.register_step_pre_hook(lambda o, given, named: self._before_step(o, *given, *named.values()))
+                for o in distinct
+            ),
             *(o.register_step_post_hook(lambda o, *_: self._step_on_extra_views(o)) for o in distinct),
         ]
 
@@ -229,7 +233,7 @@ class Attachment:
             self._resize(len(self.params()["means"]))  # the host may have densified since it rendered
         return {
             "t": self.t, "passes": self._passes, "strategies": self.conductor.state_dict(),
-            "view": None if self._step is None else self._step.view.name,
+            "view": None if self._step is None else self._step.view.name, "step": _rows_of(self._step),
             "score": None if self._scaler is None else self._scaler.state_dict(),
         }  # fmt: skip
 
@@ -239,8 +243,10 @@ class Attachment:
         self.conductor.load_state_dict(state["strategies"])
         self._restart_parents()
         self._n = len(self.params()["means"])
-        if (view := self._views.get(state.get("view") or "")) is not None:
-            self._step = Step(self.t, view)
+        if (view := self._views.get(state.get("view") or "")) is not None:  # its `after_step` is still to come
+            rows = {name: x.to(self.params()["means"].device) for name, x in state.get("step", {}).items()}
+            evidence = Evidence(rows["reliability"], rows["demand"]) if "demand" in rows else None
+            self._step = Step(self.t, view, rows.get("visible"), evidence)
         if self._scaler is not None and state.get("score") is not None:
             self._scaler.load_state_dict(state["score"])
 
@@ -261,10 +267,19 @@ class Attachment:
         self.conductor.on_fit_end()
         self._farewell()
 
-    def _before_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Refuse a first step in which no strategy takes part, and tell of a later one."""
+    def _before_step(self, optimizer: torch.optim.Optimizer, *given: Any) -> None:
+        """Refuse a first step in which no strategy takes part, and tell of a later one.
+
+        Args:
+            given: what `step` was called with.
+        """
         if self._extra.stepping:
             return
+        if any(callable(x) for x in given):
+            raise HostError(
+                "the host gives its optimizer a closure, which renders inside of step(), but the gradients are merged before. "
+                "Render and call loss.backward(), then step() without a closure."
+            )
         if current_pass() >= 0 and self._pending is not None and self._pending.output is not None:
             raise HostError(
                 "the host steps inside of its backward pass, where the gradients of the views are not merged yet. Step after "
@@ -340,6 +355,8 @@ class Attachment:
         parents = self._poll_parents()
         if parents is None and n == self._n:
             return
+        if parents is not None and len(parents) != n:
+            raise HostError(f"the host says of {len(parents):,} Gaussians which they come from, but has {n:,}.")
         state = ", ".join(self.conductor.state_dict())
         if parents is not None and (unknown := int((parents < 0).sum())):
             if state:
@@ -461,6 +478,14 @@ class Attachment:
                 "f_det has no effect: none of its first %d gradients was stepped on. Step the optimizer of the parameter detail: "
                 "attach adds it to the optimizers that it is given, and one that is made anew must hold it, too.", _PATIENCE,
             )  # fmt: skip
+
+
+def _rows_of(step: Step | None) -> dict[str, Tensor]:
+    """What a step holds per Gaussian, for a checkpoint."""
+    if step is None:
+        return {}
+    e, visible = step.evidence, {} if step.visible is None else {"visible": step.visible}
+    return visible | ({} if e is None else {"reliability": e.reliability, "demand": e.demand})
 
 
 def _require_supported(conductor: Conductor, accumulation: int) -> None:

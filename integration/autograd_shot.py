@@ -200,6 +200,18 @@ def _trained(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name: p for name, p in params.items() if p.requires_grad and name != "detail"}
 
 
+def leaves_of(x: Tensor) -> list[Tensor]:
+    """The leaves that a tensor depends on."""
+    found, seen, nodes = list[Tensor](), set[Any](), [x.grad_fn]
+    while nodes:
+        if (node := nodes.pop()) is None or node in seen:
+            continue
+        seen.add(node)
+        found += [leaf] if (leaf := getattr(node, "variable", None)) is not None else []
+        nodes += [before for before, _ in node.next_functions]
+    return found
+
+
 Target = Literal["lr", "hr"] | Camera
 """What a host draws: the view of this iteration at one of its sizes, or what a camera without a photo sees."""
 

@@ -6,7 +6,7 @@ that must stay as it is, see attachment.py.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -18,7 +18,7 @@ from clear_strategies.core.gradients import Grads, Shot
 from clear_strategies.core.view import ExtraView, View
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Update
-from integration.autograd_shot import AutogradShot
+from integration.autograd_shot import AutogradShot, leaves_of
 from integration.densification import ScoreScaler, score_for_host
 
 
@@ -33,16 +33,22 @@ def joint_loss(
 ) -> tuple[Float[Tensor, ""], Update]:
     """λ_LR L_LR + λ_HR (L_base + λ_HF L_HF), whose gradient is the conductor's merged gradient, and what was decided.
 
+    What else the LR rendering depends on (exposure, poses, an offset of the colours) gets the gradient of λ_LR L_LR.
+
     Args:
-        params: the leaves that the host optimizes, by gsplat's names (and "detail", if the host has it).
+        params: the leaves of the Gaussians that the host optimizes, by gsplat's names (and "detail", if the host has it).
         lr, hr: the renderings of this view at both scales, e.g. `AutogradShot`. t: the iteration, from 1.
         scaler: for hosts with a densifier; `backward()` then also writes the score where the densifier reads the screen
             gradient.
 
     Returns:
         The loss, and the `Update`: the step for `Conductor.after_step`, densification scores, conflict ratios.
+
+    Raises:
+        ValueError: `params` and the renderings do not name the same parameters, or one has no row for each Gaussian.
     """
     values = {name: p.detach() for name, p in params.items()}
+    _require_rows(values)
     update = conductor.update(values, lr, hr, view, t)
     objective, λ = conductor.objective, conductor.objective.lambda_hr(t)
     losses = update.losses
@@ -50,10 +56,14 @@ def joint_loss(
         losses.get("base", 0.0) + objective.lambda_hf * losses.get("hf", 0.0)
     )
     merged = update.grads or Grads()
-    trained = {name: p for name, p in params.items() if name in merged}
-    gradients = [merged[name].to(p) for name, p in trained.items()]
+    if lost := [name for name, p in params.items() if p.requires_grad and name not in merged and name != "detail"]:
+        raise ValueError(
+            f"the renderings must name their parameters as params does; they have no gradient of {', '.join(lost)}."
+        )
+    trained = [(p, merged[name].to(p)) for name, p in params.items() if name in merged]
+    leaves, gradients = zip(*trained, *_others(conductor, params, lr, view, t), strict=True)
 
-    loss: Tensor = _GivenGradients.apply(value, gradients, *trained.values())  # type: ignore[no-untyped-call]
+    loss: Tensor = _GivenGradients.apply(value, gradients, *leaves)  # type: ignore[no-untyped-call]
     if scaler is not None and isinstance(lr, AutogradShot):
         slot, (own, ordinary) = lr.gradient_slot, (update.score, update.ordinary)
         score = None if own is None or ordinary is None else score_for_host(slot, own, ordinary, lr.visible, scaler)
@@ -79,11 +89,34 @@ def extra_loss(conductor: Conductor, image: Float[Tensor, "h w 3"], extra: Extra
     return loss
 
 
+def _require_rows(params: Mapping[str, Tensor]) -> None:
+    n = len(params["means"])
+    for name, p in params.items():
+        if p.shape[:1] != (n,):
+            raise ValueError(
+                f"params[{name!r}] must have a row for each of the {n:,} Gaussians, got {[*p.shape]}. Leave it out: what else "
+                "the rendering depends on gets the gradient of LR."
+            )
+
+
+def _others(
+    conductor: Conductor, params: Mapping[str, Tensor], lr: Shot, view: View, t: int
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """The leaves that the LR rendering depends on besides `params`, each with the gradient of λ_LR L_LR."""
+    slot = lr.gradient_slot.tensor if isinstance(lr, AutogradShot) else lr.means2d
+    known = {id(slot), *map(id, params.values())}
+    if leaves := [leaf for leaf in leaves_of(lr.image) if id(leaf) not in known]:
+        photo = view.lr.over(conductor.background(t), view.background)
+        (cotangent,) = conductor.objective.lr(lr.image.detach(), photo.image, photo.shown).cotangents
+        found = torch.autograd.grad(lr.image, leaves, cotangent, retain_graph=True, allow_unused=True)
+        yield from ((leaf, g) for leaf, g in zip(leaves, found, strict=True) if g is not None)
+
+
 class _GivenGradients(torch.autograd.Function):
     """A scalar whose gradients are given; scaling the loss scales them."""
 
     @staticmethod
-    def forward(ctx: Any, value: Scalar, gradients: list[Tensor], *params: Tensor) -> Tensor:
+    def forward(ctx: Any, value: Scalar, gradients: Sequence[Tensor], *params: Tensor) -> Tensor:
         ctx.gradients = gradients
         return torch.as_tensor(value, dtype=params[0].dtype, device=params[0].device)
 

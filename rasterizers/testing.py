@@ -166,7 +166,9 @@ def check_equal_depths_have_an_order(make: Make) -> None:
 
 
 def check_agrees_with_the_reference(make: Make, *, depth: bool = False) -> None:
-    """Image and gradients agree with the reference in float64, at the default cut-offs, for SH degrees 0 to 3."""
+    """Image, alpha, projected centres and gradients agree with the reference in float64, at the default cut-offs, for SH degrees
+    0 to 3.
+    """
     rasterizer = make()
     for bands in (0, 3, 8, 15):
         splats, camera = scene(300, bands=bands), _camera(65, 47)
@@ -176,6 +178,15 @@ def check_agrees_with_the_reference(make: Make, *, depth: bool = False) -> None:
         error = (pixels_of(found).double() - pixels_of(exact)).abs() / magnitude(exact)
         require(float((error <= 5e-6).double().mean()) >= 0.999, f"{bands} bands: more than 0.1 % of values are off")
         require(float(error.max()) <= 8e-3, f"{bands} bands: a value is off by {float(error.max()):.2g}")
+        off = float((found.alpha.double() - exact.alpha).abs().max())
+        require(off <= 8e-3, f"{bands} bands: alpha is off by {off:.2g}")
+        seen = found.visible & exact.visible
+        require(
+            int(seen.sum()) >= 0.9 * int(exact.visible.sum()),
+            f"{bands} bands: Gaussians that are drawn are not visible",
+        )
+        off = float((found.means2d.double() - exact.means2d)[seen].abs().max())
+        require(off <= 1e-2, f"{bands} bands: a projected centre, means2d, is off by {off:.2g} pixels")
         v = _cotangents(exact, 1, torch.Generator().manual_seed(6))
         gradients, expected = found.vjp(v.to(dtype)), exact.vjp(v)
         for name in (*_ATTRIBUTES, "screen"):

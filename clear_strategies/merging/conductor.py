@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final, TypeVar
 
 import torch
@@ -26,6 +27,7 @@ from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.iteration import HrSide, LossWeights, Merged, Stepper, Update, require_finite_parts
 from clear_strategies.merging.objective import Losses, Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
+from clear_strategies.strategies import answers
 from clear_strategies.strategies.base import ScreenGradients, Strategy, by_class, overrides
 from rasterizers.interface import Color
 from rasterizers.native import empty_for
@@ -105,6 +107,7 @@ class Conductor:
         self.work_log.device = torch.device(device)
         for s in self.strategies:
             s.on_fit_start(n_views, seed)
+            answers.require_started(s, seed)
             s.to(device)
             if overrides(s, "on_views"):
                 with self.work_log.stage("views prepared"):
@@ -127,6 +130,7 @@ class Conductor:
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | Float[Tensor, "2 N"] | None:
         """zᵗ, before render; None: every Gaussian takes part."""
         z = self._owner["gate"].gate(t, n)
+        answers.require_gate(self._owner["gate"], z, n)
         if z is None and self.owner("gate") is not None:
             self.work_log.skip("gate", "no Gaussian is dropped at this rate")
         return z
@@ -137,7 +141,9 @@ class Conductor:
 
     def background(self, t: int) -> Color | None:
         """The colour behind every rendering of iteration t; None: the scene's own."""
-        return self._owner["background"].background(t)
+        color = self._owner["background"].background(t)
+        answers.require_background(self._owner["background"], color)
+        return color
 
     def wants_hr(self, t: int) -> bool:
         """Whether the HR render has any use at t: λ_HR > 0, Î_LR is made of it, or a densification score needs it."""
@@ -191,6 +197,7 @@ class Conductor:
         self.forget_logs()
         with stage("losses LR"):
             low, photo = rendered.image.detach(), view.lr.over(self.background(t), view.background)
+            _require_size(view, "HR" if reduced else "LR", low, view.hr.image if reduced else photo.image)
             l_lr = o.lr(images.area_mean(low, view.factor) if reduced else low, photo.image, photo.shown)  # Eq. 4
         where = _where(view, t)
         require_finite_losses(where, l_lr.values, {"the LR photo": photo.image, "the LR render": low})
@@ -214,12 +221,12 @@ class Conductor:
                 weights = (o if stepper is None else stepper).weights(t)
                 screen_lr = screen_in_ndc(g_lr, _size(rendered.image))
                 score, ordinary = self.scores(screen_lr, from_hr, weights)  # S^dens   Eq. 14
+            require_finite_parts(where, g_lr, from_hr)
             if stepper is None:
                 merged = self.merge(params, g_lr, from_hr, t)
                 require_finite(f"{where}: the merged gradient", merged.grads)
                 grads, conflict = merged.grads, merged.conflict
             else:
-                require_finite_parts(where, g_lr, from_hr)
                 grads, conflict = None, stepper.step(params, rendered, g_lr, from_hr, t)
         losses = {} if from_hr is None else from_hr.losses
         return Update(step, grads, score, ordinary, conflict, {**l_lr.values, **losses}, self.logs())
@@ -279,12 +286,12 @@ class Conductor:
         """
         g_lr = g_lr.without_detail()
         if hr is None:
-            return self.merge_routed(params, g_lr, Grads(), None, t)
-        return self.merge_routed(params, g_lr, hr.routed(self.objective.lambda_hf), hr.step, t)
+            return self.merge_routed(params, g_lr, Grads(), None, t, finite=True)
+        return self.merge_routed(params, g_lr, hr.routed(self.objective.lambda_hf), hr.step, t, finite=True)
 
     def merge_routed(
         self, params: Mapping[str, Tensor], g_lr: Grads, g_hr: Grads, step: Step | None, t: int,
-        out: Mapping[str, Tensor] | None = None, lambda_hr: Float[Tensor, " 1"] | None = None,
+        out: Mapping[str, Tensor] | None = None, lambda_hr: Float[Tensor, " 1"] | None = None, finite: bool = False,
     ) -> Merged:  # fmt: skip
         """The merge after routing.
 
@@ -292,9 +299,10 @@ class Conductor:
             g_hr: g^HR of Eq. 13, and m λ_HF ∇L_HF of f_det; empty without HR. step: the iteration, with the evidence.
             out: receives the merged gradient, by attribute, contiguous; None: new tensors, for what has a gradient.
             lambda_hr: λ_HR(t) > 0, of a recording.
+            finite: look at the numbers that strategies answer, too.
         """
         λ = self.objective.lambda_hr(t) if lambda_hr is None else lambda_hr
-        plus = self.regularized(params, t)
+        plus = self.regularized(params, t, finite=finite)
         if out is None:
             known = [name for name in params if name in plus or reconcile.has(g_lr, name) or reconcile.has(g_hr, name)]
             out = {name: empty_for(params[name]) for name in known}
@@ -303,39 +311,48 @@ class Conductor:
         if (lambda_hr is not None or λ > 0) and reconcile.common_groups(g_lr, g_hr):
             products = reconcile.products(g_lr, g_hr)
             conflict = products.conflict()  # before correction
-            answer = self.reconciled(products, step, lambda: (dense(g_lr, out), dense(g_hr.without_detail(), out)))
+            both = partial(_both, g_lr, g_hr.without_detail(), out)
+            answer = self.reconciled(products, step, both, finite=finite)
             if isinstance(answer, Weights):
                 weights = answer  # ĝ^HR           Eq. 6, 7, 11
             else:
                 g_hr = Grads({**answer, **{name: g for name, g in g_hr.items() if name == "detail"}})
-        finite = reconcile.apply(out, g_lr, g_hr, weights, lambda_hr=λ, plus=plus)  # Eq. 8, 16
-        return Merged(Grads(out), conflict, finite)
+        is_finite = reconcile.apply(out, g_lr, g_hr, weights, lambda_hr=λ, plus=plus)  # Eq. 8, 16
+        return Merged(Grads(out), conflict, is_finite)
 
     def reconciled(
-        self, products: Products, step: Step | None, both: Callable[[], tuple[Grads, Grads]]
+        self, products: Products, step: Step | None, both: Callable[[], tuple[Grads, Grads]], *, finite: bool = False
     ) -> Weights | Grads:  # fmt: skip
         """How the strategies reconcile g_HR with g_LR: the weights of `reconcile`, or ĝ_HR where one overrides `correct`.
 
         Args:
             both: g_LR and g^HR with every number, which only `correct` needs.
+            finite: look at the numbers, too.
+
+        Raises:
+            AnswerError: the answer is none that the hook may give.
         """
         s = self._owner["reconcile"]
         if overrides(s, "correct"):
-            return s.correct(*both(), step)
+            g_lr, g_hr = both()
+            return answers.corrected(s, s.correct(g_lr, g_hr, step), g_hr, finite=finite)
         weights = s.reconcile(products, step)
-        if not isinstance(weights, Weights):
-            raise TypeError(f"{type(s).__name__}.reconcile must return Weights(keep, remove), got {weights!r:.80}.")
+        answers.require_weights(s, weights, *products.dot.shape, finite=finite)
         return weights
 
-    def regularized(self, params: Mapping[str, Tensor], t: int) -> Grads:
-        """What the strategies add to the merged gradient; empty: nothing.  Eq. 16"""
+    def regularized(self, params: Mapping[str, Tensor], t: int, *, finite: bool = False) -> Grads:
+        """What the strategies add to the merged gradient; empty: nothing.  Eq. 16
+
+        Args:
+            finite: look at the numbers, too.
+        """
         total = Grads()
         for s in self.regularizers:
-            g = s.regularize(params, iteration(t))
+            g = answers.regularized(s, s.regularize(params, iteration(t)), params, finite=finite)
             if g is None:
                 self.work_log.skip("regularize", "no anchor yet")
             else:
-                total = Grads(g) if not total else total + g
+                total = g if not total else total + g
         return total
 
     def pulls(self, params: Mapping[str, Tensor], t: int) -> bool:
@@ -355,12 +372,14 @@ class Conductor:
             return ordinary, ordinary
         screen = _screen_gradients(screen_lr, hr, weights)
         score = self._owner["score"].score(hr.step, screen)
+        answers.require_score(self._owner["score"], score, len(screen_lr))
         return screen.ordinary if score is None else score, screen.ordinary
 
     def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
         """After the optimizer steps of an iteration."""
         for s in self.strategies:
             s.after_step(params, step)
+            answers.require_state(s, params)
 
     def may_densify(self, t: int) -> bool:
         return all(s.may_densify(t) for s in self.strategies)
@@ -430,6 +449,7 @@ class Conductor:
         stage = self.work_log.stage
         with stage("losses HR"):
             sr = step.view.hr.over(self.background(t), step.view.background)
+            _require_size(step.view, "HR", hr.image, sr.image)
             # The memory is kept: an allocator maps tens of megabytes afresh each time, at a page fault for every 4 KB.
             losses = self.objective.hr(hr.image.detach(), sr.image, sr.shown, reuse=self._hr_cotangents)  # Eq. 5
             self._hr_cotangents = losses.cotangents
@@ -445,9 +465,11 @@ class Conductor:
         g_lr = None if lr_cotangents is None else gradients.pop(0)
         base, hf = gradients if len(gradients) > 1 else (gradients[0], None)
         with stage("evidence"):
-            evidence = self._owner["observe"].observe(step, hr)  # q, a, w        Eq. 9, 10
+            n, evidence = len(hr.visible), self._owner["observe"].observe(step, hr)  # q, a, w        Eq. 9, 10
+            answers.require_evidence(self._owner["observe"], evidence, n)
             step = replace(step, evidence=evidence)
             m = 1.0 if hf is None else self._owner["route"].route(step)  # m              Eq. 12
+            answers.require_route(self._owner["route"], m, n)
         return g_lr, HrSide(base, hf, _size(hr.image), step, m, losses.values)
 
 
@@ -456,8 +478,21 @@ def _screen_gradients(lr: Float[Tensor, "N 2"], hr: HrSide[Any], weights: LossWe
     return ScreenGradients(lr, *per_gaussian.screens(lr, screen_of(hr.base), hf, hr.size, weights))
 
 
+def _both(g_lr: Grads, g_hr: Grads, like: Mapping[str, Tensor]) -> tuple[Grads, Grads]:
+    return dense(g_lr, like), dense(g_hr, like)
+
+
 def _vjp(shot: Shot, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[Grads]:
     return shot.vjp(cotangents)
+
+
+def _require_size(view: View, scale: str, render: Tensor, image: Tensor) -> None:
+    if render.shape != image.shape:
+        (h, w, *_), (height, width, *_) = render.shape, image.shape
+        rule = f"must have the {width}x{height} pixels of its {scale} image"
+        raise ValueError(
+            f"view {view.name}: the {scale} rendering {rule}, got {w}x{h}. Draw it by view.{scale.lower()}.camera."
+        )
 
 
 def _where(view: View, t: int) -> str:

@@ -40,6 +40,7 @@ from clear_strategies.kernels import reconcile
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.outputs import figures
 from clear_strategies.schedules import WarmupDecay
+from clear_strategies.strategies import answers
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.field import FieldShot, GaussianField
 from clear_strategies.viewing.cameras import at_most
@@ -177,10 +178,12 @@ def _gradients(
     (g_lr,) = lr.vjp(objective.lr(lr.image.detach(), view.lr.image, view.lr.shown).cotangents)
     # The field is drawn over the scene's own background, whichever one a strategy would choose.
     opaque = replace(view, hr=replace(view.hr, transparency=None))
-    from_hr = aside.hr_gradients(hr, opaque, t)
+    from_hr = aside.hr_gradients(hr, opaque, t, params={name: p.detach() for name, p in field.raw().items()})
     g_lr, g_hr = g_lr.without_detail(), from_hr.routed(objective.lambda_hf).without_detail()
-    owner = aside.owner("reconcile")
-    return g_lr, g_hr, None if owner is None else owner.correct(g_lr, g_hr, from_hr.step), hr.image.detach().cpu()
+    if (owner := aside.owner("reconcile")) is None:
+        return g_lr, g_hr, None, hr.image.detach().cpu()
+    answer = answers.corrected(owner, owner.correct(g_lr, g_hr, from_hr.step), g_hr, finite=False)
+    return g_lr, g_hr, answer, hr.image.detach().cpu()
 
 
 def _compare(lr: Grads, hr: Grads, corrected: Grads | None) -> tuple[dict[str, Tensor], Bool[Tensor, " N"]]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -22,7 +22,7 @@ from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.ply import GaussianPly, write_gaussians
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.view_names import file_stems
-from clear_strategies.errors import DataError, SettingError
+from clear_strategies.errors import DataError, SettingError, one_line
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.figures import SheetRow, spaced, write_contact_sheet, write_curves
 from clear_strategies.outputs.maps import MAPS, write_coverage, write_maps
@@ -90,9 +90,10 @@ def write_results(
     with kernel_threads(threads()), files.Beside() as beside:
         with work_log.stage("maps"):
             if mapped := spaced(state.views, settings.map_views):
-                rendered |= write_maps(
-                    folder / "maps", stems, mapped, painter, state.conductor, rasterizer, state.t - 1, beside
-                )
+                with _without_it("maps"):  # their makers are strategies, anyone's
+                    rendered |= write_maps(
+                        folder / "maps", stems, mapped, painter, state.conductor, rasterizer, state.t - 1, beside
+                    )
                 write_coverage(folder / _COVERAGE, scene, painter, title, beside)
         memory.release()  # the gradients that the maps are made of: several times the field
         with work_log.stage("evaluate"):
@@ -117,6 +118,15 @@ def write_results(
         ),
     )  # fmt: skip
     return evaluation
+
+
+@contextmanager
+def _without_it(what: str) -> Iterator[None]:
+    """A scope whose error is one line of the log: a run is not lost by it."""
+    try:
+        yield
+    except Exception as error:
+        _log.warning("%s: left out, %s: %s", what, type(error).__name__, one_line(error))
 
 
 def export_ply(path: Path, field: GaussianField, *, antialiased: bool = True, degree: int = 3) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import torch
 from jaxtyping import Float, Int
@@ -27,6 +27,7 @@ from rasterizers.interface import Color
 from rasterizers.native import empty_for
 
 _DEVICE, _SEED = "device", "seed"  # in the cache
+_OWN_NAMES: Final = {"state", "cache", "logs", "device", "seed"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +60,13 @@ class Strategy:
     state: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
     cache: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
     logs: dict[str, Number | Callable[[], Number]] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if taken := _OWN_NAMES & inspect.get_annotations(cls).keys():
+            raise TypeError(
+                f"{cls.__name__}: a setting must not be called {min(taken)}, which every strategy has already."
+            )
 
     # ---- hooks: the trainer or the host calls them in this order ----------------------------------------------------
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Final, Literal
 
 import torch
@@ -123,12 +124,13 @@ class CompiledStep:
         if hr is not None and λ > 0:
             products = gaussians.products()
             conflict = products.conflict()  # before correction
-            answer = self.conductor.reconciled(products, hr.step, lambda: _dense(gaussians, params))
+            both = partial(_dense, gaussians, params)
+            answer = self.conductor.reconciled(products, hr.step, both, finite=True)
             if isinstance(answer, Weights):
                 weights = answer  # ĝ^HR           Eq. 6, 7, 11
             else:
                 weights, given = Weights(keep=0.0), answer
-        plus = self.conductor.regularized(params, t)
+        plus = self.conductor.regularized(params, t, finite=True)
         decays = (hr is not None and hr.hf is not None) or "detail" in plus
         self._apply(gaussians, params, g_lr, t, weights, given, plus, decays=decays)
         return conflict

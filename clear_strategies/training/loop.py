@@ -22,7 +22,7 @@ from clear_strategies.core.seeds import generator_at
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.data.priors import Bicubic, network_of
 from clear_strategies.data.scene import Scene
-from clear_strategies.errors import DivergedError
+from clear_strategies.errors import AnswerError, DivergedError
 from clear_strategies.merging.iteration import Update, require_finite_parts
 from clear_strategies.merging.skips import PLATEAU_LOSS
 from clear_strategies.strategies.sr_stage import SRStage
@@ -59,7 +59,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
         restructured = conductor.may_densify(t) and s.density.step(θ, s.optimizer, t, s.resized)
         if s.filter_due() and not restructured and not s.remove_undrawn():  # each recomputes the filter
             s.refilter()
-    s.history.append(_row(s) | learned.row | extra)
+    s.history.append(_with_logs(_row(s), learned.row) | extra)
     if s.conductor.skips.measured(t) and not (restructured or s.reset_due(t)):
         with stage("training views drawn whole"):
             s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)
@@ -95,7 +95,7 @@ def learn(s: TrainState, rasterizer: Rasterizer, given: GivenView) -> LearnedVie
     photo = view.lr.over(given.background, view.background)
     row: dict[str, Number] = {"psnr_train_lr": psnr_of(low, photo.image, photo.shown)}
     row |= {f"loss_{name}": value for name, value in u.losses.items()}
-    return LearnedView(row | conflict_columns(u.conflict) | dict(u.logs), u)
+    return LearnedView(_with_logs(row | conflict_columns(u.conflict), u.logs), u)
 
 
 def view_at(s: TrainState) -> View:
@@ -166,6 +166,15 @@ def learn_extra(s: TrainState, rasterizer: Rasterizer, given: GivenExtra) -> Lea
     return Learned({EXTRA_LOSS: losses.values["lr"]})
 
 
+def _with_logs(row: dict[str, Number], logs: Mapping[str, Number]) -> dict[str, Number]:
+    """A row of the history with what strategies have logged."""
+    if taken := row.keys() & logs.keys():
+        raise AnswerError(
+            f"a strategy logs {min(taken)!r}, a column that the history has already. Give it another name."
+        )
+    return row | dict(logs)
+
+
 def _row(s: TrainState) -> dict[str, Number]:
     return {
         "t": float(s.t),
@@ -204,6 +213,7 @@ def fit(
     Raises:
         Interrupted: after a signal, once the step is done and saved.
         DivergedError: a loss, a gradient or a parameter became NaN or infinite; the state before that step is saved.
+        AnswerError: a strategy answers a hook with what that hook must not give; as above.
     """
     settings = state.settings
 
@@ -220,9 +230,11 @@ def fit(
             done = state.t
             try:
                 iterate(state, rasterizer)
-            except DivergedError as error:
+            except (DivergedError, AnswerError) as error:
                 saved = save()
                 where = "" if saved is None else f" The state before that step is {saved}."
+                if isinstance(error, AnswerError):
+                    raise AnswerError(f"t={done}: {error}{where}") from error
                 raise DivergedError(f"{error}{where} Check that view's photos, or lower the learning rates.") from error
             ended = state.ended
             state.history[-1].update(clock.read())

@@ -173,6 +173,22 @@ def test_a_resumed_loop_takes_the_anchor_as_if_it_had_not_stopped(stopped_at):
     assert set(resumed.conductor.state_dict()) == set(whole.conductor.state_dict()) != set()
 
 
+def test_a_resumed_loop_tells_strategies_what_its_last_step_has_seen():
+    def told(state=None):
+        _, clear, render = gsplat_host.started(SplatSuRe(), P2G())
+        if state is not None:
+            clear.attachment.load_state_dict(state)
+        render(1).mean().backward()  # `after_step` of the step before comes first
+        return clear.attachment
+
+    first = told()
+    whole, resumed = copy.deepcopy(first.state_dict()), told(first.state_dict())
+    assert whole["step"].keys() == {"visible", "reliability", "demand"}
+    ((name, rates),) = resumed.conductor.state_dict().items()
+    assert name == f"SplatSuRe.{whole['view']}"
+    assert rates.any()
+
+
 def test_a_loop_goes_back_to_a_checkpoint_with_another_number_of_gaussians():
     recorder = toy.Recorder()
     host, clear, render = gsplat_host.started(recorder, SplatSuRe())

@@ -66,6 +66,14 @@ def test_extra_views_are_stepped_on_by_optimizers_that_are_made_anew_and_it_is_t
     assert caplog.text.count("put new ones in the same dictionary") == 1
 
 
+def test_a_step_with_a_closure_is_refused():
+    _, clear, render = started()
+    optimizer = torch.optim.LBFGS([clear.params()["means"]])
+    clear.attachment.hook([optimizer])
+    with pytest.raises(HostError, match="the host gives its optimizer a closure"):
+        optimizer.step(lambda: render().mean())
+
+
 def test_f_det_is_a_group_of_the_only_optimizer_unless_a_scheduler_counts_the_groups():
     scene = toy.scene(20)
     for scheduled in (False, True):

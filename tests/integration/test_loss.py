@@ -79,3 +79,66 @@ def test_an_extra_view_is_learned_from_in_a_step_of_its_own():
             losses.append(float(loss))
     assert len(losses) == 24
     assert losses[-1] < 0.8 * losses[0]
+
+
+def test_what_else_the_rendering_depends_on_gets_the_gradient_of_lr():
+    scene = toy.scene(20)
+    host, view, conductor = Host(scene), scene.train[0], Conductor(GCO(), objective=HR_FROM_START)
+    exposure, offset = torch.eye(3).requires_grad_(), torch.zeros(1, 1, 3, requires_grad=True)
+
+    def render(camera):
+        p = host.params | {"sh0": host.params["sh0"] + offset}
+        splats = Splats(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"])
+        shot = autograd.draw(toy.RASTERIZER, splats, camera)
+        return AutogradShot(shot.image @ exposure, shot.means2d, shot.visible, host.params)
+
+    lr, hr = render(view.lr.camera), render(view.hr.camera)
+    (3 * joint_loss(conductor, host.params, lr, hr, view, 5)[0]).backward()
+    (cotangent,) = conductor.objective.lr(lr.image.detach(), view.lr.image, None).cotangents
+    for leaf, expected in zip(
+        (exposure, offset), torch.autograd.grad(lr.image, (exposure, offset), cotangent), strict=True
+    ):
+        assert expected.abs().max() > 1e-4
+        torch.testing.assert_close(leaf.grad, 3 * expected)
+
+
+def test_parameters_without_a_row_for_each_gaussian_or_of_other_names_are_refused():
+    scene = toy.scene(20)
+    host, view, conductor = Host(scene), scene.train[0], Conductor(objective=HR_FROM_START)
+    lr, hr = host.render(view.lr.camera), host.render(view.hr.camera)
+    with pytest.raises(
+        ValueError, match=r"params\['pose'\] must have a row for each of the 20 Gaussians, got \[1, 6\]"
+    ):
+        joint_loss(conductor, host.params | {"pose": torch.zeros(1, 6)}, lr, hr, view, 5)
+    renamed = {("xyz" if name == "scales" else name): p for name, p in host.params.items()}
+    with pytest.raises(ValueError, match="they have no gradient of xyz"):
+        joint_loss(conductor, renamed, lr, hr, view, 5)
+
+
+def test_a_parameter_of_another_name_is_summed():
+    scene = toy.scene(20)
+    host, view, conductor = Host(scene), scene.train[0], Conductor(GCO(), objective=HR_FROM_START)
+    host.params["tint"] = torch.zeros(20, 3, requires_grad=True)
+
+    def render(camera):
+        p = host.params
+        offset = p["detail"] + p["tint"]
+        splats = Splats(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"], offset)
+        shot = autograd.draw(toy.RASTERIZER, splats, camera)
+        return AutogradShot(shot.image, shot.means2d, shot.visible, p)
+
+    lr, hr = render(view.lr.camera), render(view.hr.camera)
+    joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
+    (g_lr,) = lr.vjp(conductor.objective.lr(lr.image.detach(), view.lr.image, None).cotangents)
+    base, hf = hr.vjp(conductor.objective.hr(hr.image.detach(), view.hr.image, None).cotangents)
+    torch.testing.assert_close(host.params["tint"].grad, g_lr["tint"] + base["tint"] + 0.2 * hf["tint"])
+
+
+def test_a_rendering_of_another_size_is_refused():
+    scene = toy.scene(20)
+    host, view = Host(scene), scene.train[0]
+    small = host.render(view.lr.camera)
+    with pytest.raises(
+        ValueError, match="view view0: the HR rendering must have the 96x64 pixels of its HR image, got 24x16"
+    ):
+        joint_loss(Conductor(objective=HR_FROM_START), host.params, small, small, view, 5)

@@ -5,6 +5,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from clear_strategies import GCO, P2G, SVS
+from clear_strategies.core import deferred
 from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.optim import Adam, LearningRates
 from rasterizers.interface import BackendUnavailable
@@ -75,7 +76,8 @@ class Synchronisations(TorchDispatchMode):
         return func(*args, **kwargs)
 
 
-def test_the_host_does_not_wait_for_the_device(warp_step):
+def test_the_host_does_not_wait_for_the_device(warp_step, monkeypatch):
+    monkeypatch.setattr(deferred, "is_immediate", lambda x: False)
     c, step = started(warp_step)
     factors = c.factors(1)
     step.step(c.fields[1].raw(), *factors, T)  # reads what changes only with the number of Gaussians

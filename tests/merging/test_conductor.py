@@ -7,7 +7,20 @@ import torch
 from torch import Tensor
 
 import clear_strategies
-from clear_strategies import GCO, P2G, SVS, Conductor, Grads, Objective, Photo, Strategy, StrategyConflict
+from clear_strategies import (
+    GCO,
+    P2G,
+    SVS,
+    Conductor,
+    Evidence,
+    Grads,
+    Objective,
+    Photo,
+    Strategy,
+    StrategyConflict,
+    Weights,
+)  # fmt: skip
+from clear_strategies.errors import AnswerError
 from clear_strategies.kernels.losses import reference
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.testing import CHECKS, ContractError, check_strategy
@@ -74,6 +87,74 @@ class Secretive(Strategy):
 def test_the_contract_can_fail(make, message):
     with pytest.raises(ContractError, match=message):
         check_strategy(make)
+
+
+def answering(hook, answer, **facts):
+    """A strategy with this answer, a value or a function of the hook's arguments."""
+
+    def answered(self, *arguments):
+        return answer(*arguments) if callable(answer) else answer
+
+    return dataclass(frozen=True)(type("Mine", (Strategy,), {hook: answered, **facts}))
+
+
+def nan_of_first(rows):
+    return rows.index_fill(0, torch.tensor([3]), torch.nan)
+
+
+ANSWERS = {
+    "gate [N]": ("gate", lambda t, n: torch.ones(n + 1), "must give a tensor \\[30\\] or None, got a tensor \\[31\\]"),
+    "gate": ("gate", 0.5, "must give a tensor .* or None, got 0.5"),
+    "background": ("background", torch.zeros(3), "must give three numbers in \\[0, 1\\] or None"),
+    "observe": ("observe", (1.0, 2.0), "must give an Evidence or None, got \\(1.0, 2.0\\)"),
+    "evidence [N]": ("observe", lambda step, hr: Evidence(torch.ones(5), torch.ones(5)), "reliability is a tensor \\[30\\]"),
+    "route": ("route", torch.tensor(0.5), "must give a number or a tensor \\[30\\], got a tensor \\[\\]"),
+    "reconcile": ("reconcile", {"keep": 1.0}, "must give Weights\\(keep, remove\\), got {'keep': 1.0}"),
+    "keep": ("reconcile", Weights(keep=None), "keep is a number or a tensor \\[30\\] or \\[30, 6\\], got None"),
+    "keep NaN": (
+        "reconcile", lambda p, step: Weights(keep=nan_of_first(p.dot[:, 0])),
+        "must give finite numbers, but keep is not finite for 1 Gaussians, first Gaussian 3",
+    ),
+    "correct": ("correct", None, "must give Grads, or a mapping from attributes to tensors, got None"),
+    "correct, weights": ("correct", Weights(), "must give Grads, or a mapping"),
+    "correct, names": ("correct", lambda lr, hr, step: {"mean": hr["means"]}, "must give attributes of g_HR, .*, got 'mean'"),
+    "correct, rows": (
+        "correct", lambda lr, hr, step: {"means": hr["means"][:5]}, "must give means as a tensor \\[30, 3\\], got .* \\[5, 3\\]"
+    ),
+    "regularize": ("regularize", torch.ones(30), "must give Grads, or a mapping"),
+    "regularize, names": ("regularize", lambda p, t: {"scale": p["scales"]}, "must give attributes of the parameters"),
+    "regularize, rows": ("regularize", lambda p, t: {"scales": p["scales"].T}, "must give scales as a tensor \\[30, 3\\]"),
+    "regularize, NaN": ("regularize", lambda p, t: {"means": nan_of_first(p["means"])}, "must give finite numbers, but means"),
+    "score": ("score", 1.0, "must give a tensor \\[30\\] or None, got 1.0"),
+    "score NaN": ("score", lambda step, screen: nan_of_first(screen.ordinary), "must give finite numbers, but S"),
+    "start": ("on_fit_start", None, "must call super\\(\\).on_fit_start"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("answer", ANSWERS)
+def test_an_answer_that_a_hook_must_not_give_is_refused_by_the_name_of_both(answer):
+    hook, given, message = ANSWERS[answer]
+    with pytest.raises(ContractError, match=f"^Mine.{hook}\\(\\) .*{message}"):
+        check_strategy(answering(hook, given))
+
+
+def test_state_of_other_rows_and_settings_of_taken_names_are_refused():
+    class Short(Strategy):
+        def after_step(self, params, step):
+            self.state["seen"] = torch.zeros(5)
+
+    with pytest.raises(AnswerError, match=r"Short.state\['seen'\] must have a row for each Gaussian, 30, got \[5\]"):
+        Conductor(Short()).after_step({"means": torch.zeros(30, 3)}, toy.step())
+    with pytest.raises(TypeError, match="a setting must not be called seed"):
+        type("Mine", (Strategy,), {"__annotations__": {"seed": int}})
+
+
+def test_a_plain_mapping_is_an_answer_of_correct_and_of_regularize():
+    made = [answering("correct", lambda lr, hr, step: {name: g * 0.5 for name, g in hr.items()}),
+            answering("regularize", lambda params, t: {"means": 0.1 * params["means"]})]  # fmt: skip
+    for make in made:
+        for check in CHECKS[:-1]:  # the last needs a class of a module
+            check(make)
 
 
 def field_and_view(dtype=torch.float64, degree=1):

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -114,6 +114,19 @@ def test_corrected_is_the_share_of_the_hr_gradient_that_was_taken_away_over_blac
     found = maps_of(state, background=(1.0, 1.0, 1.0))
     assert found.means["corrected"] == pytest.approx(0.5, rel=1e-6)
     assert 0 < float(found.maps["corrected"].max()) < 0.4
+
+
+@dataclass(frozen=True)
+class ByOpacity(Strategy):
+    """Reads the parameters, and answers by a plain mapping."""
+
+    def correct(self, lr, hr, step):
+        return {name: g * step.params["opacities"].sigmoid().view(-1, *[1] * (g.dim() - 1)) for name, g in hr.items()}
+
+
+def test_maps_ask_a_strategy_as_training_does() -> None:
+    means = maps_of(trained(ByOpacity())).means
+    assert 0.1 < means["corrected"] < 0.99
 
 
 def test_maps_show_what_a_strategy_corrects_at_the_end_of_the_run() -> None:

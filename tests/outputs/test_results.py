@@ -83,6 +83,16 @@ def test_without_test_views_training_views_are_shown_and_what_cannot_be_written_
     assert not names(tmp_path) & {"maps/", "path.mp4"}
 
 
+def test_a_strategy_that_fails_in_the_maps_loses_them_and_nothing_else(tmp_path, state, monkeypatch, caplog):
+    def fails(*_: object) -> None:
+        raise ZeroDivisionError("of a\nstrategy")
+
+    monkeypatch.setattr(results, "write_maps", fails)
+    write(tmp_path, state, map_views=1)
+    assert {"metrics.json", "point_cloud.ply", "contact_sheet.jpg"} <= names(tmp_path)
+    assert "maps: left out, ZeroDivisionError: of a strategy" in caplog.text
+
+
 TWINS = {
     ("left/0000.png", "right/0000.png"): {"left_0000", "right_0000"},
     ("0000.jpg", "0000.png"): {"0000.jpg", "0000.png"},

@@ -24,6 +24,26 @@ def test_a_rasterizer_that_ignores_the_background_fails_the_checks():
         check_rasterizer(lambda **settings: ReferenceRasterizer(**{**settings, "background": (0.0, 0.0, 0.0)}))
 
 
+@pytest.mark.parametrize("name", ["means2d", "alpha"])
+def test_the_contract_looks_at_centres_and_alpha(name):
+    check = next(check for check in CHECKS if check.__name__ == "check_agrees_with_the_reference")
+
+    class Turned:
+        def __init__(self, rendering):
+            self._rendering = rendering
+
+        def __getattr__(self, other):
+            found = getattr(self._rendering, other)
+            return found.flip(1) if other == name else found
+
+    class Other(ReferenceRasterizer):
+        def __call__(self, *given, **settings):
+            return Turned(super().__call__(*given, **settings))
+
+    with pytest.raises(ContractError, match=f"{name}.* is off by"):
+        check(Other)
+
+
 def odd_camera(focal=40.0) -> Camera:
     """The centre of pixel (10, 10) looks straight ahead."""
     return Camera(torch.eye(4), focal, focal, 10.5, 10.5, 21, 21)

@@ -60,7 +60,8 @@ def apply(
 def _rows(name: str, width: int, n: int, *tensors: Tensor | None) -> tuple[int, ...]:
     """An attribute as the kernel takes it: addresses of lr, hr, plus and out, width, group, first band."""
     at = [_address(name, x, n, width) for x in tensors]
-    return (*at, *[0] * (4 - len(at)), width, _GROUPS[name], FIRST_BANDS.get(name, -1))
+    group = _GROUPS.get(name, _GROUPS["detail"])  # others are summed, too
+    return (*at, *[0] * (4 - len(at)), width, group, FIRST_BANDS.get(name, -1))
 
 
 def _factors(g: Grads, n: int) -> tuple[int, int, int]:

@@ -1,0 +1,127 @@
+"""What the answers of strategies must be. Each check names the strategy, the hook, the rule, and what was found.
+
+Types and shapes are looked at, and the numbers where `finite` asks for it, but not on a device, since the host would wait.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NoReturn
+
+from torch import Tensor
+
+from clear_strategies.core import deferred
+from clear_strategies.core.conflicts import Weights
+from clear_strategies.core.evidence import Evidence
+from clear_strategies.core.finite import is_finite, rows_not_finite
+from clear_strategies.core.gradients import Grads
+from clear_strategies.errors import AnswerError
+from clear_strategies.strategies.base import Strategy
+
+
+def require_started(s: Strategy, seed: int) -> None:
+    if s.cache.get("seed") != seed:
+        raise AnswerError(f"{_named(s, 'on_fit_start')} must call super().on_fit_start(n_views, seed).")
+
+
+def require_state(s: Strategy, params: Mapping[str, Tensor]) -> None:
+    n = {len(p) for p in params.values()}
+    for name, rows in s.state.items():
+        if n and rows.shape[:1] != (*n,):
+            raise AnswerError(
+                f"{type(s).__name__}.state[{name!r}] must have a row for each Gaussian, {min(n)}, got {[*rows.shape]}. Other "
+                "things belong in cache."
+            )
+
+
+def require_gate(s: Strategy, z: Any, n: int) -> None:
+    shape = (n,) if s.shares_gate else (2, n)
+    if z is not None and not (isinstance(z, Tensor) and z.shape == shape):
+        scales = "" if s.shares_gate else ", a row for LR and one for HR,"
+        _refuse(s, "gate", f"a tensor {[*shape]}{scales} or None", z)
+
+
+def require_background(s: Strategy, color: Any) -> None:
+    if color is not None and not (
+        isinstance(color, tuple | list)
+        and len(color) == 3
+        and all(isinstance(x, int | float) and 0 <= x <= 1 for x in color)
+    ):
+        _refuse(s, "background", "three numbers in [0, 1] or None", color)
+
+
+def require_evidence(s: Strategy, e: Any, n: int) -> None:
+    if e is None:
+        return
+    if not isinstance(e, Evidence):
+        _refuse(s, "observe", "an Evidence or None", e)
+    for name in ("reliability", "demand"):
+        if not _is_rows(getattr(e, name), n):
+            _refuse(s, "observe", f"an Evidence whose {name} is a tensor [{n}]", getattr(e, name))
+
+
+def require_route(s: Strategy, m: Any, n: int) -> None:
+    if not (isinstance(m, int | float) or _is_rows(m, n)):
+        _refuse(s, "route", f"a number or a tensor [{n}]", m)
+
+
+def require_weights(s: Strategy, weights: Any, n: int, groups: int, *, finite: bool) -> None:
+    if not isinstance(weights, Weights):
+        _refuse(s, "reconcile", "Weights(keep, remove)", weights)
+    for name, w in weights._asdict().items():
+        if not (isinstance(w, int | float) or (isinstance(w, Tensor) and w.shape in ((), (n,), (n, groups)))):
+            _refuse(s, "reconcile", f"Weights whose {name} is a number or a tensor [{n}] or [{n}, {groups}]", w)
+    if finite:
+        _require_finite(s, "reconcile", weights._asdict())
+
+
+def corrected(s: Strategy, answer: Any, g_hr: Mapping[str, Tensor], *, finite: bool) -> Grads:
+    """The answer of `correct`: attributes of g_HR; those that it leaves out are 0."""
+    return _rows_like(s, "correct", answer, g_hr, "of g_HR", finite)
+
+
+def regularized(s: Strategy, answer: Any, params: Mapping[str, Tensor], *, finite: bool) -> Grads | None:
+    """The answer of `regularize`."""
+    return None if answer is None else _rows_like(s, "regularize", answer, params, "of the parameters", finite)
+
+
+def require_score(s: Strategy, score: Any, n: int) -> None:
+    """Its numbers, too: a Gaussian whose score is NaN never grows."""
+    if score is not None and not _is_rows(score, n):
+        _refuse(s, "score", f"a tensor [{n}] or None", score)
+    _require_finite(s, "score", {"S": score})
+
+
+def _require_finite(s: Strategy, hook: str, numbers: Mapping[str, Any]) -> None:
+    for name, x in numbers.items():
+        if isinstance(x, Tensor) and deferred.is_immediate(x) and not is_finite(x):
+            found = rows_not_finite(x) if x.dim() else f"is {float(x)}"
+            raise AnswerError(f"{_named(s, hook)} must give finite numbers, but {name} {found}.")
+
+
+def _is_rows(x: Any, n: int) -> bool:
+    return isinstance(x, Tensor) and x.shape == (n,)
+
+
+def _rows_like(
+    s: Strategy, hook: str, answer: Any, like: Mapping[str, Tensor], whose: str, finite: bool
+) -> Grads:  # fmt: skip
+    if not isinstance(answer, Mapping):
+        _refuse(s, hook, "Grads, or a mapping from attributes to tensors", answer)
+    for name, x in answer.items():
+        if name not in like:
+            _refuse(s, hook, f"attributes {whose}, {', '.join(like)}", name)
+        if not (isinstance(x, Tensor) and x.shape == like[name].shape):
+            _refuse(s, hook, f"{name} as a tensor {[*like[name].shape]}", x)
+    if finite:
+        _require_finite(s, hook, answer)
+    return answer if isinstance(answer, Grads) else Grads(answer)
+
+
+def _named(s: Strategy, hook: str) -> str:
+    return f"{type(s).__name__}.{hook}()"
+
+
+def _refuse(s: Strategy, hook: str, rule: str, found: Any) -> NoReturn:
+    shown = f"a tensor {[*found.shape]}" if isinstance(found, Tensor) else f"{found!r:.80}"
+    raise AnswerError(f"{_named(s, hook)} must give {rule}, got {shown}.")
