@@ -23,7 +23,7 @@ from clear_strategies.data.lenses import rigid_inverse
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.strict_json import Number, typed
 from clear_strategies.data.view_settings import resized
-from clear_strategies.errors import DataError, SettingError
+from clear_strategies.errors import DataError
 from rasterizers.interface import Camera, Color
 
 FILE: Final = "cameras.json"
@@ -109,10 +109,6 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     The path goes from each camera to the nearest that is left, and passes at most `_MOST_KEYS` of them. A single camera sways
     to both sides. All frames have the first camera's lens and size.
     """
-    if not cameras:
-        raise SettingError("a camera path needs at least one camera.")
-    if frames < 1:
-        raise SettingError(f"a camera path needs at least 1 frame, got {frames}.")
     from scipy.interpolate import CubicSpline
     from scipy.spatial.transform import Rotation, RotationSpline
 

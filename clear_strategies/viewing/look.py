@@ -92,10 +92,10 @@ def write_video(path: Path, frames: Iterable[Pixels], *, fps: float = FPS) -> No
     """Write the frames into an MP4 file while they come; the file takes its name when it is whole.
 
     Args:
-        frames: all of one size, with an even height and width.
+        frames: at least one, all of one size, with an even height and width.
 
     Raises:
-        SettingError: imageio-ffmpeg or its program is missing, the file is no .mp4, or there is no frame.
+        SettingError: imageio-ffmpeg or its program is missing.
     """
     try:
         import imageio_ffmpeg
@@ -106,11 +106,8 @@ def write_video(path: Path, frames: Iterable[Pixels], *, fps: float = FPS) -> No
     except RuntimeError as error:
         problem = "videos need ffmpeg, and that of imageio-ffmpeg does not run here: install ffmpeg."
         raise SettingError(problem) from error
-    if path.suffix != ".mp4":
-        raise SettingError(f"{path}: a video must be .mp4. Choose this suffix.")
     coming = iter(frames)
-    if (first := next(coming, None)) is None:
-        raise SettingError("a video needs at least 1 frame.")
+    first = next(coming)
     with files.replacing(path.absolute()) as partial:  # ffmpeg takes "a:" at the beginning for a protocol
         writer = imageio_ffmpeg.write_frames(
             str(partial), first.shape[1::-1], fps=fps, codec="libx264", pix_fmt_out="yuv420p", quality=None,
