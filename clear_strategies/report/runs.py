@@ -85,14 +85,14 @@ def collect(folders: Iterable[Path]) -> list[FinishedRun]:
     Unfinished and damaged runs are logged and left out.
     """
     folders = list(folders)
-    folders += [link for folder in folders for link in _sorted(folder.glob("*")) if link.is_symlink() and link.is_dir()]
+    folders += [link for folder in folders for link in sorted(folder.glob("*")) if link.is_symlink() and link.is_dir()]
     finished: dict[Path, None] = {}
     for folder in folders:
-        in_folder = _sorted(path.parent for path in folder.rglob("metrics.json"))
+        in_folder = sorted(path.parent for path in folder.rglob("metrics.json"))
         sweeps = [run.parent for run in in_folder]
         in_order = sorted(in_folder, key=lambda run: (sweeps.index(run.parent), _job(run), in_folder.index(run)))
         finished |= dict.fromkeys(run.resolve() for run in in_order)
-    for unfinished in _sorted(path.parent for folder in folders for path in folder.rglob(_HYDRA)):
+    for unfinished in sorted({path.parent for folder in folders for path in folder.rglob(_HYDRA)}):
         if unfinished.resolve() not in finished:
             _log.warning("%s: left out, it has no metrics.json: the run did not finish.", unfinished)
     runs = []
@@ -121,16 +121,6 @@ def _is_setting(override: str) -> bool:
     key = override.partition("=")[0]
     named_elsewhere = override.startswith((_SEED, _METHOD, _STRATEGY)) or _PATH.fullmatch(key)
     return not (named_elsewhere or key.startswith("hydra") or key in CHANGES_NO_RESULT)
-
-
-def _sorted(paths: Iterable[Path]) -> list[Path]:
-    """Sort by path, numbers by value: the folders of a sweep are 0, 1, … 10."""
-
-    def key(path: Path) -> list[tuple[int, int, str]]:
-        words = re.split(r"(\d+)", str(path))
-        return [(1, int(word), "") if word.isdecimal() else (0, 0, word) for word in words]
-
-    return sorted(set(paths), key=key)
 
 
 def _job(folder: Path) -> int:
