@@ -16,7 +16,7 @@ from PIL import Image
 from clear_strategies.commands.train import detect
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.photo_files import read_image
-from clear_strategies.data.readers import colmap, photos
+from clear_strategies.data.readers import photos
 from clear_strategies.data.view_names import ViewFiles, matching
 from clear_strategies.errors import DataError
 from tests.helpers import captures
@@ -178,14 +178,6 @@ def test_a_ply_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
     root = captures.nerfstudio(tmp_path)
     captures.edit(root / "transforms.json", lambda value: value.update(ply_file_path="points.ply"))
     assert READERS["nerfstudio"](root).points.means.tolist() == [[1, 2, 3]]
-
-
-def test_photos_in_several_folders_are_not_chosen_from(tmp_path: Path) -> None:
-    root = captures.colmap_bin(tmp_path)
-    (root / "images").rename(root / "cam1")
-    captures.write_photos(root / "more" / "cam2")
-    with pytest.raises(DataError, match=r"but cam1 holds 3, more/cam2 holds 3: name the folder of photos: data.reader"):
-        colmap.read(root)
 
 
 @pytest.mark.parametrize("kind", ["colmap_txt", "blender", "nerfstudio"])
@@ -355,21 +347,12 @@ def beside_each_other(folder: Path, *names: str) -> None:
         (folder / name).write_bytes(b"never opened")
 
 
-# What lies in the folder, and what the message says of it.
+# What lies in the folder, and what the message says of it; tests/mistakes.csv has more.
 NO_PHOTOS: dict[str, tuple[tuple[str, ...], str]] = {
-    "several folders of photos": (
-        ("cam1/0.jpg", "cam1/1.jpg", "cam2/0.jpg"),
-        "but cam1 holds 2, cam2 holds 1: give one of",
-    ),
-    "raw photos": (
-        ("IMG_1.CR2", "IMG_2.CR2", "notes.txt"),
-        r"but raw photos \(2\): IMG_1.CR2, IMG_2.CR2: develop them",
-    ),
     "raw photos on a card": (("DCIM/100CANON/IMG_1.CR3",), r"but raw photos \(1\): IMG_1.CR3: develop them"),
     "an archive": (("my photos.zip",), "unpack them, and give the folder: unzip 'my photos.zip' -d FOLDER"),
     "a video": (("clip.MOV",), "ffmpeg -i VIDEO -vf thumbnail=15"),
     "another format": (("a.avif", "b.avif", "c.bmp"), "save them as PNG or JPEG: mogrify -format png a.avif"),
-    "nothing": ((), r"holds no image \(.png, .*\): check the path"),
     "what a Mac leaves of raw photos": (("._IMG_1.CR2",), "check the path"),
 }
 
@@ -383,11 +366,10 @@ def test_where_there_is_no_photo_the_message_says_what_there_is_and_what_makes_p
         read()
 
 
-# A file in place of a folder, and what the message says.
+# A file in place of a folder, and what the message says; tests/mistakes.csv has more.
 FILES = {
-    "photos.zip": "unpack them, and give the folder: unzip photos.zip", "photos.tar.gz": "or tar -xf photos.tar.gz",
-    "a.PNG": "give the folder of all photos: clear-strategies train ", "scene.ply": "clear-strategies view scene.ply shows",
-    "a.nef": "develop them", "clip.mp4": "ffmpeg -i VIDEO", "cameras.txt": "give the folder of the photos or of the capture",
+    "photos.tar.gz": "or tar -xf photos.tar.gz", "a.PNG": "give the folder of all photos: clear-strategies train ",
+    "a.nef": "develop them", "cameras.txt": "give the folder of the photos or of the capture",
 }  # fmt: skip
 
 

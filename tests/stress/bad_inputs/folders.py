@@ -1,7 +1,6 @@
 """Folders where a data set, a run or its lock should be, and is not, or is something else."""
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,12 +17,6 @@ from tests.stress.bad_inputs import BadInput, at
 def _held_twice(folder: Path) -> None:
     with hold(folder), hold(folder):
         pass
-
-
-def _photos_renamed(folder: Path) -> None:
-    GOOD["colmap"](folder)
-    (folder / "images").rename(folder / "photos")
-    shutil.copytree(folder / "photos", folder / "more")
 
 
 def _photos_gone(folder: Path) -> None:
@@ -46,10 +39,6 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     **{f"{kind} at a path that is absent": (at("none", read), "none") for kind, read in READERS.items()},
     **{f"{kind} at a path that is a file": (at("file", read, b"no folder"), "file") for kind, read in READERS.items()},
     **{f"{kind} in an empty folder": (read, ": ") for kind, read in READERS.items()},
-    "photos in a folder of another name": (
-        at("", colmap.read, _photos_renamed),
-        "has none of .*, but more holds 3, photos holds 3",
-    ),
     "no photo of the model is there": (
         at("", colmap.read, _photos_gone),
         "none of 3 is in .*images, such as a.png; it holds nothing",
