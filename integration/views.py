@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies.core.checks import refuse, require_whole
+from clear_strategies.core.finite import is_finite
 from clear_strategies.core.points import MAX_POINTS, PointCloud
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.priors.interface import super_resolved
@@ -131,7 +133,16 @@ def view(
     Raises:
         DataError: photo, mask, pose or K has another shape, or is no array of numbers; the SR image is not `factor` times as
             large as the photo; an image is not in [0, 1] but for a network's overshoot.
+        SettingError: sr cannot be called, or factor is no whole number of at least 1.
     """
+    require_whole("factor", factor, least=1)
+    if not callable(sr):
+        refuse(
+            "sr",
+            "must be a function or a prior",
+            sr,
+            "of a folder of SR images, clear_strategies.data.priors.Images(folder)",
+        )
     given = {"image": image, "world_to_camera": world_to_camera, "K": K}
     tensors = {field: _tensor(name, field, value) for field, value in given.items()}
     return HostPhoto(name, **tensors, mask=None if mask is None else _tensor(name, "mask", mask)).view(sr, factor)
@@ -149,8 +160,11 @@ def _tensor(name: str, field: str, value: object) -> Tensor:
 
 
 def _require_range(name: str, what: str, values: Tensor) -> None:
+    if not is_finite(values):
+        bad = int((~torch.isfinite(values)).sum())
+        raise DataError(name, what, f"has {bad:,} numbers that are not finite", "give numbers in [0, 1]")
     low, high = float(values.min()), float(values.max())
-    if not (low >= -_OVERSHOOT and high <= 1 + _OVERSHOOT):  # nan too
+    if not (low >= -_OVERSHOOT and high <= 1 + _OVERSHOOT):
         problem = f"must lie in [0, 1], has values from {low:.3g} to {high:.3g}"
         raise DataError(name, what, problem, "divide 8-bit values by 255")
 

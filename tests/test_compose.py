@@ -17,6 +17,9 @@ from clear_strategies.training.settings import FitSettings
 from tests.helpers.configs import composed, options
 
 
+MINE = "tests.merging.test_conductor.Halve"
+
+
 def names(c):
     return [type(s).__name__ for s in c.strategies]
 
@@ -42,6 +45,10 @@ def test_names_and_overrides_are_those_of_the_command_line_and_milestones_stretc
     [
         (("nope",), "strategy=nope: there is no such option"),
         (("gco", "strategies.gco.tau=1"), "strategies.gco.tau: there is no such setting"),
+        (
+            ("baseline", f"+strategies.x._target_={MINE}", "strategies.x.share=1"),
+            r"strategies.x.share: there is no such setting. Its class has it; a plus adds it: \+strategies.x.share=",
+        ),
         (("best", "strategies.gco.tolerence=1"), r"tolerence: there .* Did you mean strategies\.gco\.tolerance\?"),
         (("gco", "strategies.gco.tolerance=2"), "tolerance: must lie in"),
         (("gco,gco",), "gco twice"),

@@ -79,7 +79,7 @@ REFUSED = {
     "share: must be a number, got True": {"share": True},
     "share: must be a finite number, got nan": {"share": float("nan")},
     "share: must be a finite number, got inf": {"share": float("inf")},
-    "share: is needed and missing. Add it.share=….": {},
+    "share: is needed and missing. Add +it.share=….": {},
     "share: is needed and missing. Add it.share": {"share": "???"},
     "shape: tests.test_settings.Outer has no such setting. Did you mean it.share?": {"share": 1, "shape": 1},
     "zzz: tests.test_settings.Outer has no such setting. There is share, inner": {"share": 1, "zzz": 1},

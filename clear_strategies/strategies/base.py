@@ -22,6 +22,7 @@ from clear_strategies.core.evidence import Evidence, PatchMaps
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, Shot, gathered
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, View
+from clear_strategies.errors import AnswerError
 from clear_strategies.kernels import reconcile
 from rasterizers.interface import Color
 from rasterizers.native import empty_for
@@ -214,6 +215,10 @@ class Strategy:
         """Log a scalar of this iteration, or what computes it where it is asked for before the next one: a host asks for it in
         every hundredth. A 0-dim tensor on a device is read later, see `core.deferred`.
         """
+        if isinstance(value, Tensor) and value.dim() > 0:
+            raise AnswerError(
+                f"{type(self).__name__}.log({name!r}, …) takes one number, got a tensor {[*value.shape]}."
+            )
         self.logs[name] = value
 
     def to(self, device: torch.device | str) -> None:

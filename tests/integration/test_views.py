@@ -12,7 +12,7 @@ from clear_strategies.core import images
 from clear_strategies.core.points import PointCloud
 from clear_strategies.data.photo_files import read_image, write_png
 from clear_strategies.data.priors import Images
-from clear_strategies.errors import DataError
+from clear_strategies.errors import DataError, SettingError
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.training.field import GaussianField
 from integration.examples.demo import load_demo, splats_with_optimizers
@@ -96,6 +96,9 @@ def test_what_is_no_photo_with_a_camera_is_refused_with_the_rule(name):
     ("wrong", "message"),
     [
         ({"image": 255 * PHOTO.image}, r"image: must lie in \[0, 1\]"),
+        ({"image": PHOTO.image / 0}, r"image: has 1,152 numbers that are not finite"),
+        ({"factor": 2.5}, "factor: must be a whole number of at least 1, got 2.5"),
+        ({"sr": "sr_x4"}, "sr: must be a function or a prior, got 'sr_x4': of a folder"),
         ({"image": PHOTO.image.permute(2, 0, 1)}, r"image: must have shape \[h, w, 3\], got \(3, 16, 24\)"),
         ({"K": torch.eye(4)}, r"K: must have shape \[3, 3\], got \(4, 4\)"),
         ({"mask": torch.ones(16, 24, 1)}, r"mask: must have shape \(16, 24\), got \(16, 24, 1\)"),
@@ -103,7 +106,7 @@ def test_what_is_no_photo_with_a_camera_is_refused_with_the_rule(name):
     ],
 )
 def test_a_photo_mask_or_K_of_another_shape_or_range_is_refused(wrong, message):
-    with pytest.raises(DataError, match=message):
+    with pytest.raises((DataError, SettingError), match=message):
         of_host(**wrong)
 
 
