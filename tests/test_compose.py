@@ -16,7 +16,6 @@ from clear_strategies.merging.detail import DetailRates
 from clear_strategies.training.settings import FitSettings
 from tests.helpers.configs import composed, options
 
-
 MINE = "tests.merging.test_conductor.Halve"
 
 
