@@ -217,7 +217,12 @@ def not_composed(error: Exception, overrides: Sequence[str], config: str) -> Set
     known = settings()
     remedy = "clear-strategies --cfg job prints all of them."
     parent, _, name = key.rpartition(".")
-    if has_parameter(str(flat(known).get(f"{parent}.{TARGET}")), name):  # of the user's own class, named by an override
+    beside = {".".join(k.split(".")[: key.count(".") + 1]) for k in flat(known) if k.startswith(f"{parent}.")}
+    if f"~{key}" in overrides and beside:
+        remedy = f"There are {', '.join(sorted(beside))}."
+    elif has_parameter(
+        str(flat(known).get(f"{parent}.{TARGET}")), name
+    ):  # of the user's own class, named by an override
         remedy = f"Its class has it; a plus adds it: +{key}=…."
     elif near := difflib.get_close_matches(key, [name for name in flat(known) if not name.endswith(TARGET)], 1, 0.8):
         remedy = f"Did you mean {near[0]}?"

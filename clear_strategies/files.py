@@ -44,6 +44,9 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         yield partial
         partial.replace(path)
+    except OSError as error:
+        error.filename = error.filename or str(path)  # a write to a full disk names no file
+        raise
     finally:
         partial.unlink(missing_ok=True)  # exists only after an exception or Ctrl-C
 

@@ -43,6 +43,12 @@ _FLAGS: Final = (
 )  # fmt: skip
 
 
+_WITH_VALUE: Final = {
+    "--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd",
+}  # fmt: skip
+_WRITTEN: Final = "A setting is written name=value, and clear-strategies --cfg job prints all of them."
+
+
 def main(overrides: Sequence[str] | None = None) -> None:
     """Hydra's command line, and `-v`.
 
@@ -51,7 +57,7 @@ def main(overrides: Sequence[str] | None = None) -> None:
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     arguments = sys.argv[1:] if overrides is None else overrides
-    _require_known_flags(arguments)
+    arguments = _flags_last(arguments)
     if completed := re.match(
         r"(\S+ )train \S+ (.*)", os.environ.get("COMP_LINE", "")
     ):  # settings behind `train PHOTOS`
@@ -86,13 +92,24 @@ def readable(word: str) -> str:
     return f"{key}={quoted(value)}" if "," in value and os.path.exists(value) else word  # noqa: PTH110 - as `is_file`
 
 
-def _require_known_flags(arguments: Sequence[str]) -> None:
-    """Raise a SettingError for an unknown flag; Hydra's own message names none of our commands."""
-    for word in arguments:
+def _flags_last(arguments: Sequence[str]) -> list[str]:
+    """The settings, then the flags: Hydra refuses settings on both sides of a flag.
+
+    Raises:
+        SettingError: there is no such flag, or a word is neither flag nor setting. Hydra's messages name none of our commands.
+    """
+    settings, flags, words = list[str](), list[str](), iter(arguments)
+    for word in words:
         flag = word.partition("=")[0]
         if flag.startswith("--") and flag != "--verbose" and not any(known.startswith(flag) for known in _FLAGS):
-            remedy = "A setting is written name=value, and clear-strategies --cfg job prints all of them."
-            raise SettingError(f"{flag}: there is no such flag. {remedy}")
+            raise SettingError(f"{flag}: there is no such flag. {_WRITTEN}")
+        if word.startswith("-"):
+            flags += [word, next(words, "")] if word in _WITH_VALUE else [word]
+        elif "=" in word or word.startswith("~"):
+            settings.append(word)
+        else:
+            raise SettingError(f"{word}: is no setting. {_WRITTEN}")
+    return [*settings, *filter(None, flags)]
 
 
 def job(config: DictConfig) -> float | None:

@@ -100,7 +100,7 @@ def test_resuming_through_the_door_gives_the_same_field(finished):
 
 
 def test_a_sweep_goes_on_after_a_bad_job(tmp_path):
-    result = run("-m", "strategies.gco.tolerance=0.1,7", "+strategy=gco", *TINY, "fit.iterations=3", cwd=tmp_path)
+    result = run("+strategy=gco", "-m", "strategies.gco.tolerance=0.1,7", *TINY, "fit.iterations=3", cwd=tmp_path)
     said = result.stdout + result.stderr
     assert result.returncode == 2
     assert "strategies.gco.tolerance: must lie in [0, 1), got 7" in said

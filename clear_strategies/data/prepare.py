@@ -276,17 +276,17 @@ def scene_notes(
 ) -> dict[str, str]:
     """The notes of a scene, in the order of the plan; `photo`: the camera of the first training photo, as the capture has it."""
     sample, sr = train[0], views.photos_are != "both"
+    others = " and other sizes" if len({size_of(view.lr.camera) for view in train}) > 1 else ""
     network, unused = network_of(prior) if sr else None, len(capture.frames) - len(train) - len(test)
-    all_trained = "none: all are trained on (data.views.test_every=8 keeps every 8th for testing)"
+    none = f"none{'' if unused else ': all are trained on'} (data.views.test_every=8 keeps every 8th for testing)"
     return {
         "scene": f"{capture.name}, {len(capture.frames)} photos",
         **capture.notes,
-        "train views": _names(train),
-        "test views": _names(test) if test else all_trained,
-        **({"not used": f"{unused} photos, by data.views"} if unused and not test else {}),
+        "train views": _names(train) + (f"; {unused} photos are not used (data.views)" if unused else ""),
+        "test views": _names(test) if test else none,
         "sizes": f"photos of {size_of(photo)}, shrink {views.shrink}, {views.sizes} to whole pixels at both scales",
-        "LR": f"{size_of(sample.lr.camera)}, {_lr_source(views)}",
-        "HR": f"{size_of(sample.hr.camera)} (x{views.sr_scale}), {'SR images: ' if sr else ''}{sample.sr_source}",
+        "LR": f"{size_of(sample.lr.camera)}{others}, {_lr_source(views)}",
+        "HR": f"{size_of(sample.hr.camera)}{others} (x{views.sr_scale}), {'SR images: ' if sr else ''}{sample.sr_source}",
         **_masks(train),
         **exposure,
         **_back_projection(train, views.downsample),
@@ -311,7 +311,8 @@ def _names(views: Sequence[View]) -> str:
 
 def _lr_source(views: ViewSettings) -> str:
     if views.photos_are == "lr":
-        return "the photos themselves; HR is unknown"
+        reduced = "themselves" if views.shrink == 1 else f"reduced {views.shrink} times"
+        return f"the photos {reduced}; HR is unknown"
     if views.lr_folder is not None:
         return f"read from {views.lr_folder} (D is taken to be {views.downsample})"
     by = "" if views.downsample == "area" else "PIL "

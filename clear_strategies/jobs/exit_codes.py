@@ -15,7 +15,8 @@ from clear_strategies.errors import ClearError, SettingError, of_hydra, one_line
 
 _NO_MEMORY: Final = "can't allocate memory"  # of torch's allocator on the CPU
 _LESS_MEMORY: Final = (
-    "Lower density.max_gaussians or raise data.views.shrink; rasterizer.memory bounds the rasterizer's lists."
+    "Lower density.max_gaussians or raise data.views.shrink; rasterizer.memory bounds the rasterizer's lists. "
+    "Of clear-strategies render: lower --width."
 )
 
 _FULL: Final = (errno.ENOSPC, errno.EDQUOT)

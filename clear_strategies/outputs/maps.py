@@ -210,8 +210,14 @@ def coverage_of(scene: Scene, painter: Painter) -> tuple[Float[Tensor, "N 3"], I
 
 
 def write_coverage(path: Path, scene: Scene, painter: Painter, title: str, beside: Beside) -> None:
-    """Draw the points in the colours of how many photos see them, and the cameras; what fewer photos see lies on top."""
-    beside(_draw_coverage, path, scene, *coverage_of(scene, painter), title)
+    """Draw the points in the colours of how many photos see them, and the cameras; what fewer photos see lies on top. Nothing
+    where no Gaussian is a surface yet.
+    """
+    points, times = coverage_of(scene, painter)
+    if len(points):
+        beside(_draw_coverage, path, scene, points, times, title)
+    else:
+        _log.info("%s: left out, no Gaussian is more opaque than %g.", path.name, _SOLID)
 
 
 def _draw_coverage(
@@ -225,10 +231,10 @@ def _draw_coverage(
     flat, centers, ahead = (x.numpy() @ plane for x in (points.double(), places, poses[:, 2]))
     for seen, (name, color) in reversed([*enumerate(_COLORS.items())]):
         those = (times == seen).numpy()
-        share = those.mean() if len(those) else 0
-        axis.scatter(*flat[those].T, s=4, marker="s", color=color, linewidths=0, label=f"seen by {name}: {share:.0%}")
+        label = f"seen by {name}: {those.mean():.0%}"
+        axis.scatter(*flat[those].T, s=4, marker="s", color=color, linewidths=0, label=label)
     axis.quiver(*centers.T, *ahead.T, color=figures.INK, angles="xy", scale=18, width=0.005)
-    inner = np.quantile(flat, (_CROP, 1 - _CROP), axis=0) if len(flat) else centers
+    inner = np.quantile(flat, (_CROP, 1 - _CROP), axis=0)
     shown = np.concatenate([inner, centers])
     margin = max(0.06 * float(np.ptp(inner, axis=0).max()), 1e-6)
     low, high = shown.min(0) - margin, shown.max(0) + margin

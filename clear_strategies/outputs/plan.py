@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import math
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,11 +25,15 @@ _log = logging.getLogger(__name__)
 
 # The facts on the console; the others are for `-v` and run.log.
 _SHORT: Final[Sequence[str]] = (
-    "scene", "poses", "HR side", "train views", "test views", "not used", "masks", "LR", "HR", "the SR images add",
+    "scene", "poses", "HR side", "train views", "test views", "masks", "LR", "HR", "the SR images add",
     "initial points", "rasterizer", "memory", "time", "skipped",
 )  # fmt: skip
 _LINES: Final = 20  # in a file, which shows no bar
 _READ_EVERY: Final = 0.25  # seconds; reading the history's numbers waits for the device
+
+
+OF_STRATEGY: Final = re.compile(r"strategies\.(\w+)(?:\._target_)?")
+"""The key of an override that adds a strategy, or leaves one out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,15 +52,19 @@ class Chosen:
 
     @property
     def title(self) -> str:
-        """The names on the command line, as "best"; where there are none, those of the strategies."""
-        given = [self.method] if self.method else []
+        """The names on the command line, as "best" or "best - p2g"; where there are none, those of the strategies."""
+        given, left_out = [self.method] if self.method else [], list[str]()
         for override in self.overrides or ():
-            key, _, value = override.lstrip("+").partition("=")
+            key, _, value = override.lstrip("+~").partition("=")
             if key == "method" and value != "[]":  # replaces the strategies before it
                 given = [value]
-            elif key == "strategy":
-                given.append(value.strip("[]").replace(",", " + "))
-        return " + ".join(given or self.strategies) or "baseline"
+            elif key == "strategy":  # without a plus, it replaces the choice before it
+                given = [*(given if override.startswith("+") else []), value.strip("[]").replace(",", " + ")]
+            elif (name := OF_STRATEGY.fullmatch(key)) is not None:
+                (left_out if override.startswith("~") else given).append(name[1])
+        if not given:
+            return " + ".join(self.strategies) or "baseline"
+        return " - ".join([" + ".join(given), *left_out])
 
 
 def describe_choices(chosen: Chosen, conductor: Conductor, data: str, iterations: int, seed: int) -> str:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import math
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -14,8 +14,9 @@ import pandas as pd
 
 from clear_strategies.errors import DataError
 from clear_strategies.outputs import metrics
-from clear_strategies.outputs.plan import Chosen
+from clear_strategies.outputs.plan import OF_STRATEGY, Chosen
 from clear_strategies.settings import CHANGES_NO_RESULT
+from clear_strategies.viewing.cameras import FILE as CAMERAS
 
 _log = logging.getLogger(__name__)
 
@@ -23,6 +24,7 @@ _HYDRA: Final = ".hydra"
 _SEED: Final = "fit.seed="
 # The overrides that name a run; the others are its settings.
 _METHOD, _STRATEGY = "method=", "strategy="
+_DATA: Final = ("data.path", "data.root")  # keys of a run's configuration
 # Where the photos lie: the scene has a name.
 _PATH: Final = re.compile(r"scene|data\.root|data\.(reader\.)?path")
 
@@ -32,13 +34,14 @@ class FinishedRun:
     """A finished run.
 
     Args:
-        scene: its name, followed by the marks in parentheses.
+        scene: its name, followed by the marks in parentheses. See `_told_apart`.
         marks: that the prior is synthetic, that the scores are of training views, that they are against LR photos.
         name: method or strategies as given on the command line ("clear"), else as they are named in the run ("gco + p2g").
         protocol: the option of conf/protocol or conf/scene that it is of; None: of neither.
         settings: the other overrides, without the seed and those that change no result.
         numbers: mean scores of the test views, or of the training views where there are no test views; "bicubic", "prior":
             PSNR of these images; conflict, gaussians, seconds. NaN where unknown.
+        views: whose scores they are. data: where the photos lay.
     """
 
     folder: Path
@@ -49,6 +52,8 @@ class FinishedRun:
     settings: tuple[str, ...]
     seed: int
     numbers: Mapping[str, float]
+    views: tuple[str, ...]
+    data: str
 
     @classmethod
     def read(cls, folder: Path) -> FinishedRun:
@@ -77,6 +82,8 @@ class FinishedRun:
                 "gaussians": content.gaussians,
                 "seconds": content.seconds,
             },
+            views=tuple(sorted(part.views)),
+            data=str(next((content.config[key] for key in _DATA if content.config.get(key)), "")),
         )
 
 
@@ -104,7 +111,36 @@ def collect(folders: Iterable[Path]) -> list[FinishedRun]:
     if not runs:
         names = ", ".join(map(str, folders))
         raise DataError(names, "runs", "there is no finished run here", "give the folder of a run or of a sweep")
-    return runs
+    return _told_apart(runs)
+
+
+def _told_apart(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
+    """The runs with other names for scenes of one name that are not the same: of other photos, or scored on other views."""
+
+    def photos(run: FinishedRun) -> str:
+        """Where they lay; runs that have the same cameras have the same."""
+        cameras, alike = _text(run.folder / CAMERAS), (other for other in runs if other.scene == run.scene)
+        return next(o.data for o in alike if o.data == run.data or _text(o.folder / CAMERAS) == cameras)
+
+    apart = []
+    for run in runs:
+        alike = [other for other in runs if other.scene == run.scene]
+        scene = run.scene
+        if len(places := {photos(other) for other in alike}) > 1:
+            scene = f"{scene} of {_shortest(photos(run), places)}"
+        if len({other.views for other in alike if photos(other) == photos(run)}) > 1:
+            scene = f"{scene}, {len(run.views)} views: {', '.join(run.views[:3])}{', …' if len(run.views) > 3 else ''}"
+        apart.append(replace(run, scene=scene))
+    for scene in dict.fromkeys(run.scene for run, other in zip(runs, apart, strict=True) if run.scene != other.scene):
+        _log.warning("%s: runs of other photos, or scored on other views, are not compared.", scene)
+    return apart
+
+
+def _shortest(path: str, others: Collection[str]) -> str:
+    """The end of a path that tells it from the others."""
+    parts = Path(path).parts
+    ends = ("/".join(parts[-k:]) for k in range(2, len(parts)))
+    return next((end for end in ends if sum(other.endswith(end) for other in others) == 1), path)
 
 
 def history(folder: Path) -> pd.DataFrame:
@@ -116,10 +152,16 @@ def history(folder: Path) -> pd.DataFrame:
         return pd.DataFrame()
 
 
+def _text(path: Path) -> str:
+    return path.read_text(encoding="utf-8") if path.is_file() else str(path)
+
+
 def _is_setting(override: str) -> bool:
     override = override.lstrip("+~")
     key = override.partition("=")[0]
-    named_elsewhere = override.startswith((_SEED, _METHOD, _STRATEGY)) or _PATH.fullmatch(key)
+    named_elsewhere = (
+        override.startswith((_SEED, _METHOD, _STRATEGY)) or _PATH.fullmatch(key) or OF_STRATEGY.fullmatch(key)
+    )
     return not (named_elsewhere or key.startswith("hydra") or key in CHANGES_NO_RESULT)
 
 

@@ -220,11 +220,13 @@ def fit(
     def save() -> Path | None:
         if checkpoints is None:
             return None
-        return checkpoint.save(checkpoints, state.checkpoint(config or {}), keep=settings.keep)
+        with state.conductor.work_log.stage("checkpoints"):
+            return checkpoint.save(checkpoints, state.checkpoint(config or {}), keep=settings.keep)
 
     if settings.replay or (settings.replay is None and state.device.type == "cuda"):
         state.replays = replays_for(state, rasterizer)
     clock = Clock(state.history_as_floats()[-1] if state.history else {})
+    before = state.t - 1
     with deferred_signals() as pending, kernel_threads(state, rasterizer):
         while not state.ended:
             done = state.t
@@ -238,15 +240,23 @@ def fit(
                 raise DivergedError(f"{error}{where} Check that view's photos, or lower the learning rates.") from error
             ended = state.ended
             state.history[-1].update(clock.read())
-            if settings.probe_every and (done % settings.probe_every == 0 or ended):
+            if settings.probe_every and (_passed(settings.probe_every, before, done) or ended):
                 with clock.paused():
                     evaluate(state, scene, rasterizer, done)
             if progress is not None:
                 progress(state)
             if pending:
                 raise Interrupted(foremost(pending), f"before iteration {state.t}", save())
-            if settings.checkpoint_every and done % settings.checkpoint_every == 0 and not ended:
+            if settings.checkpoint_every and _passed(settings.checkpoint_every, before, done) and not ended:
                 save()
-    save()
+            before = done
+        saved = save()
+        if pending:
+            raise Interrupted(foremost(pending), "after the last iteration", saved)
     state.history_as_floats()
     return state
+
+
+def _passed(every: int, before: int, t: int) -> bool:
+    """Whether a multiple of `every` lies in (before, t]: skips may jump over it."""
+    return t // every > before // every

@@ -114,6 +114,8 @@ def hydra_undone(monkeypatch) -> Iterator[None]:
         ),
         ("fit.iteration=1", r"fit\.iteration: there is no such setting\. Did you mean fit\.iterations\?"),
         ("--multrun", r"--multrun: there is no such flag\. A setting is written name=value"),
+        ("fit.iterations", r"fit.iterations: is no setting\. A setting is written name=value"),
+        ("~strategies.foo", r"strategies.foo: there is no such setting\."),
     ],
 )
 def test_a_wrong_override_is_refused_with_what_was_meant(word, message):

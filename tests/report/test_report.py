@@ -149,7 +149,7 @@ def test_runs_that_differ_in_their_seed_share_a_row(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "setting", ["prior=onnx", "strategies.gco.tolerance=0.1", "~strategies.p2g", "data.cloud.path=dense.ply"]
+    "setting", ["prior=onnx", "strategies.gco.tolerance=0.1", "~strategies.p2g.patch", "data.cloud.path=dense.ply"]
 )
 def test_runs_that_differ_in_a_setting_have_rows_that_name_it(tmp_path: Path, setting: str) -> None:
     make_run(tmp_path / "0", "+strategy=clear", "data=llff")
@@ -317,8 +317,11 @@ def test_the_papers_figures_are_drawn_from_a_sweep(tmp_path: Path) -> None:
         (["+strategy=clear_paper"], {"strategies": ["gco", "p2g", "svs"]}, "clear_paper"),
         ([], {"strategies": ["mine", "svs"]}, "mine + svs"),
         (["+strategy=clear", "+method=srgs"], {}, "srgs"),
+        (["+strategy=best", "strategy=clear"], {}, "clear"),
+        (["+strategy=best", "~strategies.p2g", "~strategies.mcmc"], {}, "best - p2g - mcmc"),
+        (["+strategies.veto._target_=your.Veto"], {}, "veto"),
     ],
-    ids=["none", "list", "preset", "without overrides", "a method replaces"],
+    ids=["none", "list", "preset", "without overrides", "a method", "a choice", "left out", "one's own"],
 )
 def test_a_run_is_named_by_its_strategies_as_given_on_the_command_line(tmp_path, overrides, facts, name):
     folder = make_run(tmp_path, *overrides, **facts, **({} if overrides else {"overrides": None}))
@@ -336,6 +339,22 @@ def test_runs_of_a_sweep_are_in_the_order_of_their_jobs_and_linked_ones_count_on
     (runs / "latest").symlink_to(ours)
     (runs / "sweep").symlink_to(make_run(tmp_path / "disk" / "sweep" / "0", "+strategy=clear").parent)
     assert [run.name for run in report.collect([runs, ours, runs / ".." / "runs" / "ours"])] == ["gco", "clear"]
+
+
+def test_scenes_of_one_name_with_other_photos_or_other_views_are_no_one_scene(tmp_path, caplog):
+    def made(folder: str, path: str, cameras: str, **facts: Any) -> None:
+        run = make_run(tmp_path / folder, "+strategy=clear", scene="photos", config={"data.path": path}, **facts)
+        files.write_text(run / "cameras.json", cameras)
+
+    made("a", "/x/one/photos", "[1]")
+    made("b", "/moved/photos", "[1]")  # the same photos
+    made("c", "/x/two/photos", "[2]")
+    test = {"against": "HR photos", "views": {"other.png": {"ours": scores(3.0)}}, "mean": {"ours": scores(3.0)}}
+    made("d", "/x/two/photos", "[2]", test=test)
+    scenes = [run.scene for run in report.collect([tmp_path])]
+    assert scenes[0] == scenes[1] == "photos of one/photos"
+    assert scenes[2:] == ["photos of two/photos, 1 views: view.png", "photos of two/photos, 1 views: other.png"]
+    assert "photos: runs of other photos, or scored on other views, are not compared" in caplog.text
 
 
 def test_damaged_and_unfinished_runs_are_left_out_with_a_warning(tmp_path, caplog):

@@ -3,6 +3,7 @@
 import json
 import logging
 import math
+import signal
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from clear_strategies.training import checkpoint
 from clear_strategies.training.clock import WALL
 from clear_strategies.training.loop import fit, iterate
 from clear_strategies.training.settings import FitSettings
+from clear_strategies.training.signals import Interrupted
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
 from tests.helpers.short_run import ITERATIONS, SCENE, start, tensors
@@ -74,6 +76,36 @@ def _assert_that_everything_happened(state: TrainState, names: tuple[str, ...], 
         assert any(row.get("corrected", 0) > 0 for row in state.history)
     if "p2g" in names:
         assert any(row.get("mean_q", 0) > 0 for row in state.history)
+
+
+def test_a_signal_during_the_last_save_ends_a_run_that_is_saved_to_its_end(tmp_path, monkeypatch):
+    save = checkpoint.save
+
+    def interrupted(*given, **named):
+        signal.raise_signal(signal.SIGTERM)
+        return save(*given, **named)
+
+    monkeypatch.setattr(checkpoint, "save", interrupted)
+    state = start(())
+    state.settings = FitSettings(iterations=3, scale_schedule=False, probe_every=0, checkpoint_every=0)
+    with pytest.raises(Interrupted, match="stopped by SIGTERM after the last iteration") as ended:
+        fit(state, SCENE, toy.RASTERIZER, checkpoints=tmp_path)
+    assert "step_0000004" in str(ended.value)
+    assert checkpoint.load(checkpoint.saved(tmp_path)[-1]).t == 4
+
+
+def test_checkpoints_come_where_skips_jump_over_their_iteration(tmp_path, monkeypatch):
+    state = start(())
+    state.settings = FitSettings(iterations=12, scale_schedule=False, probe_every=0, checkpoint_every=4)
+    advance = TrainState.advance
+
+    def jumping(s):
+        advance(s)
+        s.t += 3 * (s.t == 7)  # from 6 to 10, over 8
+
+    monkeypatch.setattr(TrainState, "advance", jumping)
+    fit(state, SCENE, toy.RASTERIZER, checkpoints=tmp_path)
+    assert [path.stem for path in checkpoint.saved(tmp_path)] == ["step_0000005", "step_0000011", "step_0000013"]
 
 
 def test_the_same_seed_is_the_same_run_and_after_a_reset_of_opacities_nobody_looks_at_test_views():
