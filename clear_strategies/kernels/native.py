@@ -40,11 +40,6 @@ def runs(x: Tensor) -> bool:
     return x.device.type == "cpu" and x.dtype == torch.float32 and available()
 
 
-def takes(*tensors: Tensor) -> bool:
-    """Whether the kernels run on these tensors as they lie in memory."""
-    return all(runs(x) and x.is_contiguous() for x in tensors)
-
-
 def all_finite(tensors: Collection[Tensor]) -> bool:
     """Whether every number is known to be finite, in one call; False where the kernels do not take all of the tensors."""
-    return takes(*tensors) and bool(module().all_finite([*tensors]))
+    return all(runs(x) and x.is_contiguous() for x in tensors) and bool(module().all_finite([*tensors]))

@@ -9,7 +9,7 @@ import torch
 from torch._subclasses import FakeTensor, FakeTensorMode
 
 from clear_strategies.kernels import losses, native
-from clear_strategies.kernels.losses import reference, warp
+from clear_strategies.kernels.losses import reference
 from clear_strategies.kernels.losses.images import image_pair
 from clear_strategies.merging.objective import Objective
 from rasterizers.interface import BackendUnavailable
@@ -294,10 +294,10 @@ def test_the_objective_gives_its_losses_in_order():
 def missing(monkeypatch):
     """No Warp here."""
     monkeypatch.setitem(sys.modules, "warp", None)  # makes its import fail
-    for cached in (runs_warp, warp.require):
+    for cached in (runs_warp, losses._warp):
         cached.cache_clear()
     yield
-    for cached in (runs_warp, warp.require):
+    for cached in (runs_warp, losses._warp):
         cached.cache_clear()
 
 

@@ -27,7 +27,7 @@ def by_warp(request, monkeypatch, blocks_of):
     from clear_strategies.kernels.per_gaussian import warp
 
     def both(function):
-        monkeypatch.setattr(dispatch.native, "takes", lambda *_: False)  # not C++
+        monkeypatch.setattr(dispatch.native, "available", lambda: False)  # not C++
         expected = function()
         monkeypatch.setattr(dispatch, "DEVICES", {"cpu"})
         if request.param > 1:
@@ -144,7 +144,7 @@ def test_other_tensors_take_torch(monkeypatch):
     from clear_strategies.kernels.per_gaussian import warp
 
     monkeypatch.setattr(warp, "activate", lambda *_: "Warp's")
-    monkeypatch.setattr(dispatch.native, "takes", lambda *_: False)  # not C++
+    monkeypatch.setattr(dispatch.native, "available", lambda: False)  # not C++
     x = [torch.zeros(1, 3), torch.zeros(1), torch.zeros(1)]
     assert activate(*x, None) != "Warp's"
     monkeypatch.setattr(dispatch, "DEVICES", {"cpu"})

@@ -18,10 +18,10 @@ from torch import Tensor
 
 from clear_strategies.errors import SettingError
 from clear_strategies.kernels import native
-from clear_strategies.kernels.losses import cpp, reference, warp
+from clear_strategies.kernels.losses import cpp, reference
 from clear_strategies.kernels.losses.images import DEVICES, image_pair, supported
 from clear_strategies.kernels.losses.reference import LossAndGradient
-from rasterizers.warp_runtime import runs_warp
+from rasterizers.warp_runtime import require_warp, runs_warp
 
 __all__ = ["Choice", "LossAndGradient", "haar_l1", "photometric", "require", "running_on", "ssim"]
 
@@ -53,7 +53,7 @@ def require(kernels: Choice) -> None:
     if kernels == "cpp":
         native.module()
     if kernels == "warp":
-        warp.require("cpu")
+        _warp("cpu")
 
 
 def photometric(
@@ -118,7 +118,15 @@ def _fastest(x: Tensor, y: Tensor) -> Choice:
 
 
 def _compiled(kernels: Choice, x: Tensor) -> ModuleType:
-    return cpp if kernels == "cpp" else warp.loaded(x.device.type)
+    return cpp if kernels == "cpp" else _warp(x.device.type)
+
+
+@cache
+def _warp(device: str) -> ModuleType:
+    require_warp("kernels=warp", device, "kernels=torch runs here")
+    from clear_strategies.kernels.losses.warp import launches
+
+    return launches
 
 
 @cache

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from functools import wraps
-from typing import Any, Final, ParamSpec, TypeVar
+from types import ModuleType
+from typing import Final, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
@@ -20,35 +21,26 @@ DEVICES: Final = {"cuda"}
 """Where Warp's kernels are used; tests add the CPU."""
 
 
-def by_cpp(function: Callable[P, T]) -> Callable[P, T]:
-    """C++ computes it where it takes the tensors among the arguments as they lie."""
-    compiled: Callable[P, T] = getattr(cpp, function.__name__)
+def compiled(function: Callable[P, T]) -> Callable[P, T]:
+    """C++ or Warp computes it where they have a function of that name, and take the tensors among the arguments."""
 
     @wraps(function)
     def chosen(*args: P.args, **kwargs: P.kwargs) -> T:
-        given = _tensors(args)
-        takes = native.takes(*filter(torch.is_floating_point, given)) and all(x.is_contiguous() for x in given)
-        return (compiled if takes else function)(*args, **kwargs)
+        kernels = _kernels([x for x in args if isinstance(x, Tensor)])
+        fastest: Callable[P, T] = getattr(kernels, function.__name__, function)
+        return fastest(*args, **kwargs)
 
     return chosen
 
 
-def by_warp(function: Callable[P, T]) -> Callable[P, T]:
-    """Warp computes it where it takes the tensors among the arguments: float32 on CUDA, with Warp installed."""
-
-    @wraps(function)
-    def chosen(*args: P.args, **kwargs: P.kwargs) -> T:
-        given = _tensors(args)
-        takes = all(x.device.type in DEVICES and (x.dtype == torch.float32 or not x.is_floating_point()) for x in given)
-        if not takes or not runs_warp(given[0].device.type):
-            return function(*args, **kwargs)
+def _kernels(given: Sequence[Tensor]) -> ModuleType | None:
+    """C++ for contiguous tensors on a CPU, Warp on CUDA, both for float32; None: torch."""
+    if any(x.is_floating_point() and x.dtype != torch.float32 for x in given):
+        return None
+    if native.available() and all(x.device.type == "cpu" and x.is_contiguous() for x in given):
+        return cpp
+    if all(x.device.type in DEVICES for x in given) and runs_warp(given[0].device.type):
         from clear_strategies.kernels.per_gaussian import warp
 
-        compiled: Callable[P, T] = getattr(warp, function.__name__)
-        return compiled(*args, **kwargs)
-
-    return chosen
-
-
-def _tensors(arguments: Iterable[Any]) -> list[Tensor]:
-    return [x for x in arguments if isinstance(x, Tensor)]
+        return warp
+    return None

@@ -1,4 +1,4 @@
-"""What each function computes, in torch; its decorator names the kernels that take its place."""
+"""What each function computes, in torch; kernels of the same name in `cpp` and `warp` take its place."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ from torch import Tensor
 
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import screen_norm, to_ndc
-from clear_strategies.kernels.per_gaussian.dispatch import by_cpp, by_warp
+from clear_strategies.kernels.per_gaussian.dispatch import compiled
 from rasterizers.geometry import rotation_matrix
 
 
-@by_cpp
-@by_warp
+@compiled
 def activate(
     log_scales: Float[Tensor, "N 3"],
     logits: Float[Tensor, " N"],
@@ -36,7 +35,7 @@ def activate(
     return scales, filtered, sigmoid, coefficient, factor, factor * sigmoid
 
 
-@by_cpp
+@compiled
 def nearest_depths(means: Float[Tensor, "N 3"], cameras: Float[Tensor, "V 20"], near: float) -> Float[Tensor, " N"]:
     """The smallest depth beyond `near` among the cameras that see each centre; infinite where none does.
 
@@ -53,7 +52,7 @@ def nearest_depths(means: Float[Tensor, "N 3"], cameras: Float[Tensor, "V 20"], 
     return z_min
 
 
-@by_cpp
+@compiled
 def lift(
     patch_maps: Float[Tensor, "C ph pw"], centers: Float[Tensor, "N 2"], visible: Bool[Tensor, " N"], patch: float
 ) -> Float[Tensor, "C N"]:
@@ -71,7 +70,7 @@ def lift(
     return patch_maps.flatten(1).index_select(1, row * width + column) * visible
 
 
-@by_warp
+@compiled
 def evidence(
     maps: Float[Tensor, "2 ph pw"], centers: Float[Tensor, "N 2"], visible: Bool[Tensor, " N"], patch: float
 ) -> Evidence:
@@ -79,7 +78,7 @@ def evidence(
     return Evidence(*lift(maps, centers, visible, patch))
 
 
-@by_warp
+@compiled
 def route(e: Evidence, visible: Bool[Tensor, " N"], floor: float, normalize: bool) -> Float[Tensor, " N"]:
     """m_i, over its mean where `normalize`; undefined for invisible Gaussians.  Eq. 12"""
     m = floor + (1 - floor) * e.weight
@@ -89,7 +88,7 @@ def route(e: Evidence, visible: Bool[Tensor, " N"], floor: float, normalize: boo
     return m / mean.clamp_min(torch.finfo(m.dtype).tiny)
 
 
-@by_warp
+@compiled
 def screens(
     lr: Float[Tensor, "N 2"],
     base: Float[Tensor, "N 2"],
@@ -111,7 +110,7 @@ def screens(
     return base, hf, screen_norm(total)
 
 
-@by_warp
+@compiled
 def evidence_score(
     e: Evidence, hf: Float[Tensor, "N 2"], ordinary: Float[Tensor, " N"], joined: bool
 ) -> Float[Tensor, " N"]:
@@ -120,7 +119,7 @@ def evidence_score(
     return ordinary + S * (ordinary.mean() / S.mean().clamp_min(torch.finfo(S.dtype).tiny)) if joined else S
 
 
-@by_warp
+@compiled
 def accumulate(
     visible: Bool[Tensor, " N"],
     score: Float[Tensor, " N"],
@@ -142,8 +141,7 @@ def accumulate(
     totals[2].add_(seen)
 
 
-@by_cpp
-@by_warp
+@compiled
 def wander(
     means: Float[Tensor, "N 3"],
     quats: Float[Tensor, "N 4"],

@@ -10,7 +10,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache
 from types import ModuleType
 
 import torch
@@ -21,11 +20,10 @@ from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads
 from clear_strategies.kernels import native
-from clear_strategies.kernels.reconcile import reference
+from clear_strategies.kernels.reconcile import cpp, reference
 from clear_strategies.kernels.reconcile.tables import WIDEST, common_groups, has
-from rasterizers.interface import BackendUnavailable
 from rasterizers.native import empty_for
-from rasterizers.warp_runtime import require_warp
+from rasterizers.warp_runtime import runs_warp
 
 __all__ = ["apply", "common_groups", "dense", "has", "products"]
 
@@ -82,19 +80,11 @@ def _chosen(*tensors: Tensor) -> ModuleType:
     return _for_device(first.device.type)
 
 
-@cache
 def _for_device(device: str) -> ModuleType:
-    try:
-        if device == "cpu":
-            native.module()
-            from clear_strategies.kernels.reconcile import cpp
+    if device == "cpu" and native.available():
+        return cpp
+    if device == "cuda" and runs_warp(device):
+        from clear_strategies.kernels.reconcile import warp
 
-            return cpp
-        if device == "cuda":
-            require_warp("the compiled merge", device, "torch merges in its place")
-            from clear_strategies.kernels.reconcile import warp
-
-            return warp
-    except BackendUnavailable:
-        pass
+        return warp
     return reference
