@@ -65,21 +65,9 @@ class GivenExtra:
         return self.extra.background
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Learned:
-    """What an iteration made of an extra view: columns of the history."""
-
-    row: dict[str, Number]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LearnedView(Learned):
-    """What an iteration made of its view."""
-
-    update: Update
-
-
 Given = GivenView | GivenExtra
+Learned = tuple[Update | None, dict[str, Number]]
+"""What the iteration decided, None of an extra view, and columns of the history."""
 L = TypeVar("L", bound=Learned)
 
 

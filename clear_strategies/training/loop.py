@@ -29,7 +29,7 @@ from clear_strategies.strategies.sr_stage import SRStage
 from clear_strategies.training import checkpoint
 from clear_strategies.training.clock import Clock
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
-from clear_strategies.training.given import Given, GivenExtra, GivenView, L, Learned, LearnedView
+from clear_strategies.training.given import Given, GivenExtra, GivenView, L
 from clear_strategies.training.replay import replays_for
 from clear_strategies.training.signals import Interrupted, deferred_signals, foremost
 from clear_strategies.training.state import TrainState
@@ -49,8 +49,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     hr_due = conductor.wants_hr(t) and (needs_hr or not conductor.skips.leaves_out_hr(t, conductor.work_log))
     scales = {"lr": conductor.wants_lr and conductor.skips.lr_due(view, hr_due, conductor.work_log), "hr": hr_due}
     z, background = conductor.gate(t, len(θ)), conductor.background(t)  # zᵗ             Eq. 15       SVS
-    learned = _learned(s, rasterizer, GivenView(t, view, scales, z, background), learn)
-    u = learned.update
+    u, row = _learned(s, rasterizer, GivenView(t, view, scales, z, background), learn)
     begin_sr_stage(s, over(rasterizer, background))
     extra = extra_steps(s, rasterizer, conductor.extra_views(t), background)
     conductor.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS
@@ -59,7 +58,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
         restructured = conductor.may_densify(t) and s.density.step(θ, s.optimizer, t, s.resized)
         if s.filter_due() and not restructured and not s.remove_undrawn():  # each recomputes the filter
             s.refilter()
-    s.history.append(_with_logs(_row(s), learned.row) | extra)
+    s.history.append(_with_logs(_row(s), row) | extra)
     if s.conductor.skips.measured(t) and not (restructured or s.reset_due(t)):
         with stage("training views drawn whole"):
             s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)
@@ -72,7 +71,7 @@ def _learned(s: TrainState, rasterizer: Rasterizer, given: Given, learn: Callabl
     return learn(s, rasterizer, given) if s.replays is None else s.replays.learn(given, learn)
 
 
-def learn(s: TrainState, rasterizer: Rasterizer, given: GivenView) -> LearnedView:
+def learn(s: TrainState, rasterizer: Rasterizer, given: GivenView) -> tuple[Update, dict[str, Number]]:
     """What an iteration does with its view: render, compare, step on the merged gradient, and accumulate statistics.
 
     It can be recorded where `Replays` say so: then nothing here reads a number from the device.
@@ -95,7 +94,7 @@ def learn(s: TrainState, rasterizer: Rasterizer, given: GivenView) -> LearnedVie
     photo = view.lr.over(given.background, view.background)
     row: dict[str, Number] = {"psnr_train_lr": psnr_of(low, photo.image, photo.shown)}
     row |= {f"loss_{name}": value for name, value in u.losses.items()}
-    return LearnedView(_with_logs(row | conflict_columns(u.conflict), u.logs), u)
+    return u, _with_logs(row | conflict_columns(u.conflict), u.logs)
 
 
 def view_at(s: TrainState) -> View:
@@ -143,12 +142,12 @@ def extra_steps(
     row: dict[str, Number] = {}
     for extra in extra_views:
         steps = s.optimizer.steps
-        row |= _learned(s, rasterizer, GivenExtra(s.t, extra, background), learn_extra).row
+        row |= _learned(s, rasterizer, GivenExtra(s.t, extra, background), learn_extra)[1]
         s.optimizer.steps = steps  # the learning rates follow the iteration
     return row
 
 
-def learn_extra(s: TrainState, rasterizer: Rasterizer, given: GivenExtra) -> Learned:
+def learn_extra(s: TrainState, rasterizer: Rasterizer, given: GivenExtra) -> tuple[None, dict[str, Number]]:
     """What an iteration does with an extra view. It can be recorded as `learn`."""
     θ, extra, where = s.field, given.extra, f"t={given.t}, an extra view"
     with s.conductor.work_log.stage("extra views"):
@@ -163,7 +162,7 @@ def learn_extra(s: TrainState, rasterizer: Rasterizer, given: GivenExtra) -> Lea
             require_finite(f"{where}: the gradient", grads)
             s.optimizer.step(θ.raw(), grads)
             θ.constrain()
-    return Learned({EXTRA_LOSS: losses.values["lr"]})
+    return None, {EXTRA_LOSS: losses.values["lr"]}
 
 
 def _with_logs(row: dict[str, Number], logs: Mapping[str, Number]) -> dict[str, Number]:

@@ -12,12 +12,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from clear_strategies.core.deferred import Number
 from clear_strategies.core.view import Photo, View
 from clear_strategies.kernels import losses
 from clear_strategies.merging.replays import (
@@ -29,7 +28,7 @@ from clear_strategies.merging.replays import (
     write,
 )
 from clear_strategies.training.compiled_step import CompiledStep
-from clear_strategies.training.given import Given, GivenExtra, GivenView, L, Learned, LearnedView
+from clear_strategies.training.given import Given, GivenExtra, GivenView, L, Learned
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Rasterizer, Recordable
 from rasterizers.told import name_of_view
@@ -106,13 +105,8 @@ class _Recorded:
         own, self._background = self._copied(given), s.field.means.new_empty(1, 3)
         drawn_by = rasterizer if given.background is None else rasterizer.over_changing(self._background)
         self._own = self._read_of(own)
-
-        def work() -> tuple[Learned, dict[str, Number]]:
-            learned = learn(s, drawn_by, own)
-            return learned, learned.row
-
         self._write(given)
-        self._work = RecordedWork(s.device, s.conductor.work_log, work)
+        self._work = RecordedWork(s.device, s.conductor.work_log, lambda: learn(s, drawn_by, own))
 
     def holds_at(self, t: int) -> bool:
         """See `Recorded`."""
@@ -125,11 +119,10 @@ class _Recorded:
 
     def outcome(self, given: Given) -> Any:
         """See `Recorded`."""
-        learned, row = self._work.outcome()
-        if isinstance(given, GivenExtra):
-            return Learned(row)
-        update = cast(LearnedView, learned).update
-        return LearnedView(row, replace(update, step=replace(update.step, t=given.t, view=given.view)))
+        update, row = self._work.outcome()
+        if isinstance(given, GivenView):
+            update = replace(update, step=replace(update.step, t=given.t, view=given.view))
+        return update, row
 
     def _copied(self, given: Given) -> Given:
         """The same with tensors and cameras of its own, and photos that no background shows through."""
