@@ -63,7 +63,7 @@ def joint_loss(
     trained = [(p, merged[name].to(p)) for name, p in params.items() if name in merged]
     leaves, gradients = zip(*trained, *_others(conductor, params, lr, view, t), strict=True)
 
-    loss: Tensor = _GivenGradients.apply(value, gradients, *leaves)  # type: ignore[no-untyped-call]
+    loss = with_gradients(value, gradients, *leaves)
     if scaler is not None and isinstance(lr, AutogradShot):
         slot, (own, ordinary) = lr.gradient_slot, (update.score, update.ordinary)
         score = None if own is None or ordinary is None else score_for_host(slot, own, ordinary, lr.visible, scaler)
@@ -84,9 +84,13 @@ def extra_loss(conductor: Conductor, image: Float[Tensor, "h w 3"], extra: Extra
         image: rendered by the camera of `extra`, without a gate and without f_det.
     """
     losses = conductor.extra_loss(image, extra, t)
-    value = conductor.objective.lambda_lr * losses.values["lr"]
-    loss: Tensor = _GivenGradients.apply(value, [losses.cotangents[0]], image)  # type: ignore[no-untyped-call]
-    return loss
+    return with_gradients(conductor.objective.lambda_lr * losses.values["lr"], [losses.cotangents[0]], image)
+
+
+def with_gradients(value: Scalar, gradients: Sequence[Tensor], *tensors: Tensor) -> Float[Tensor, ""]:
+    """A scalar with these gradients with respect to these tensors; scaling it scales them."""
+    scalar: Tensor = _GivenGradients.apply(value, gradients, *tensors)  # type: ignore[no-untyped-call]
+    return scalar
 
 
 def _require_rows(params: Mapping[str, Tensor]) -> None:
@@ -113,13 +117,11 @@ def _others(
 
 
 class _GivenGradients(torch.autograd.Function):
-    """A scalar whose gradients are given; scaling the loss scales them."""
-
     @staticmethod
-    def forward(ctx: Any, value: Scalar, gradients: Sequence[Tensor], *params: Tensor) -> Tensor:
+    def forward(ctx: Any, value: Scalar, gradients: Sequence[Tensor], *tensors: Tensor) -> Tensor:
         ctx.gradients = gradients
-        return torch.as_tensor(value, dtype=params[0].dtype, device=params[0].device)
+        return torch.as_tensor(value, dtype=tensors[0].dtype, device=tensors[0].device)
 
     @staticmethod
-    def backward(ctx: Any, *loss_scale: Tensor) -> Any:
-        return None, None, *(g * loss_scale[0] for g in ctx.gradients)
+    def backward(ctx: Any, scale: Tensor) -> Any:
+        return None, None, *(g * scale for g in ctx.gradients)

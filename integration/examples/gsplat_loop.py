@@ -21,6 +21,7 @@ from clear_strategies.geometry import stereo
 from clear_strategies.kernels import losses
 from integration.examples.demo import Demo, Render, load_demo, splats_with_optimizers
 from integration.gsplat import attach  # +
+from integration.loss import with_gradients
 from integration.views import view  # +
 from rasterizers import native
 from rasterizers.as_gsplat import rasterization as cpu_rasterization
@@ -65,8 +66,9 @@ def train(iterations: int, strategies: str | None, seed: int = 0) -> tuple[Demo,
         _, target, viewmat, K = photos[step % len(photos)]
         image, info = render(viewmat, K, target.shape[1], target.shape[0])
         strategy.step_pre_backward(splats, optimizers, state, step, info)
-        loss = Photometric.apply(image, target)  # type: ignore[no-untyped-call]
-        loss.backward()
+        value, gradient = losses.photometric(image.detach(), target, 0.2)  # 0.8 L1 + 0.2 (1 - SSIM), the loss of 3DGS
+        loss = with_gradients(value, [gradient], image)
+        loss.backward()  # type: ignore[no-untyped-call]
         for optimizer in optimizers.values():
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
@@ -74,20 +76,6 @@ def train(iterations: int, strategies: str | None, seed: int = 0) -> tuple[Demo,
         if (step + 1) % max(1, iterations // 5) == 0:
             logging.info("step %d: loss %.4f, %d Gaussians", step + 1, float(loss.detach()), len(splats["means"]))
     return demo, lambda *camera: render(*camera)[0]
-
-
-class Photometric(torch.autograd.Function):
-    """0.8 L1 + 0.2 (1 - SSIM), the loss of 3DGS."""
-
-    @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor) -> Tensor:
-        loss = losses.photometric(image.detach().contiguous(), target, 0.2)
-        ctx.gradient = loss.gradient
-        return image.new_tensor(float(loss.value))
-
-    @staticmethod
-    def backward(ctx: Any, scale: Tensor) -> tuple[Tensor, None]:
-        return ctx.gradient * scale, None
 
 
 if __name__ == "__main__":

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.kernels.losses import ssim
+from integration.loss import with_gradients
 
 _REACH: Final = 5  # of a window, beside its pixel
 
@@ -27,17 +28,8 @@ def fused_ssim(
     """
     if padding not in ("same", "valid"):
         raise ValueError(f"padding must be 'same' or 'valid', got {padding!r}.")
-    return _MeanSsim.apply(img1, img2, _REACH if padding == "valid" else 0)  # type: ignore[no-untyped-call, no-any-return]
-
-
-class _MeanSsim(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, first: Tensor, second: Tensor, inset: int) -> Tensor:
-        pairs = zip(first.permute(0, 2, 3, 1), second.permute(0, 2, 3, 1), strict=True)
-        values, gradients = zip(*(ssim(x, y, inset) for x, y in pairs), strict=True)
-        ctx.save_for_backward(torch.stack(gradients).permute(0, 3, 1, 2) / len(values))
-        return torch.stack(values).mean()
-
-    @staticmethod
-    def backward(ctx: Any, cotangent: Tensor) -> Any:
-        return cotangent * ctx.saved_tensors[0], None, None
+    inset = _REACH if padding == "valid" else 0
+    pairs = zip(*(images.detach().permute(0, 2, 3, 1) for images in (img1, img2)), strict=True)
+    values, gradients = zip(*(ssim(x, y, inset) for x, y in pairs), strict=True)
+    gradient = torch.stack(gradients).permute(0, 3, 1, 2) / len(values)
+    return with_gradients(torch.stack(values).mean(), [gradient], img1)
