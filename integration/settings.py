@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
+from clear_strategies.core.checks import require_choice
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.schedules import REFERENCE_ITERATIONS
-from integration.views import Points, SuperResolve, sr_source, wants_stereo
+from integration.views import Points, SuperResolve, sr_source
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,11 +41,11 @@ class Settings:
     hr_by: str = "auto"
 
     def __post_init__(self) -> None:
-        wants_stereo(self.points)
+        require_choice("points", self.points, get_args(Points))
 
     @property
     def from_stereo(self) -> bool:
-        return wants_stereo(self.points)
+        return self.points == "stereo"
 
     def conductor(self, iterations: int = REFERENCE_ITERATIONS) -> Conductor:
         """The strategies, with milestones for a training of so many iterations.

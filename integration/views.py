@@ -233,22 +233,6 @@ def no_stereo(problem: str) -> HostError:
     return HostError(f"points=stereo: {problem}. {remedy}")
 
 
-def wants_stereo(points: str) -> bool:
-    """Whether the Gaussians start from stereo, and not from the host's own points.
-
-    Args:
-        points: "own" or "stereo".
-
-    Raises:
-        SettingError: it is neither.
-    """
-    if points not in ("own", "stereo"):
-        raise SettingError(
-            f"points: must be own (the host's) or stereo (dense stereo between its training photos), got {points!r}."
-        )
-    return points == "stereo"
-
-
 def stereo_points(photos: Sequence[HostPhoto]) -> PointCloud:
     """Dense stereo between a host's training photos; one line of the log sums them up.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -28,13 +28,14 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from clear_strategies.console import show_in_host
+from clear_strategies.core.checks import require_choice
 from clear_strategies.errors import SettingError
 from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
 from integration.gsplat import Attached, attach
 from integration.nerfstudio.data import photos_of, prior, seed_with_stereo, views_from_datamanager
 from integration.replacing import replaced_attribute
-from integration.views import save_photos, wants_stereo
+from integration.views import Points, save_photos
 
 NAMES: Final = {"sh0": "features_dc", "shN": "features_rest"}
 """gsplat's parameter name -> splatfacto's, where they differ."""
@@ -53,7 +54,7 @@ class ClearDatamanagerConfig(FullImageDatamanagerConfig):  # type: ignore[misc]
     """own: the data set's points; stereo: dense stereo between the training photos"""
 
     def __post_init__(self) -> None:
-        wants_stereo(self.points)
+        require_choice("points", self.points, get_args(Points))
 
 
 class ClearDatamanager(FullImageDatamanager):  # type: ignore[misc]
@@ -63,7 +64,7 @@ class ClearDatamanager(FullImageDatamanager):  # type: ignore[misc]
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        if wants_stereo(self.config.points) and self.test_mode == "val":  # otherwise a checkpoint has the Gaussians
+        if self.config.points == "stereo" and self.test_mode == "val":  # otherwise a checkpoint has the Gaussians
             show_in_host()
             seed_with_stereo(self)
 
