@@ -165,7 +165,7 @@ class Attachment:
 
     def _hr_side(
         self, view: View, t: int, z: Tensor | None, render_at: RenderAt, params: Mapping[str, Tensor]
-    ) -> tuple[HrSide[Grads], Grads | None]:
+    ) -> tuple[HrSide, Grads | None]:
         """The gradients of HR, and the same of the raw parameters where HR takes part in the merge."""
         conductor, mask, drawn = self.conductor, self._masks.get(view.name), render_at("hr", z, view)
         merges = conductor.objective.lambda_hr(t) > 0

@@ -132,7 +132,7 @@ class AutogradShot:
             results.append(Grads(values, screen=slot.per_gaussian(screen, len(self.visible))))
         return results
 
-    def routed(self, hr: HrSide[Grads], lambda_hf: float) -> Grads:
+    def routed(self, hr: HrSide, lambda_hf: float) -> Grads:
         """g^HR of the raw parameters, and the gradient of f_det.  Eq. 12, 13"""
         g = self._raw(hr.routed(lambda_hf))
         detail = Grads() if hr.hf is None else self._detail(hr.hf) * (hr.m * lambda_hf)

@@ -173,9 +173,7 @@ class OwnDrawing:
                 _log.info("HR is not replayed: %s.", reason)
 
     @torch.no_grad()
-    def hr(
-        self, asked: Drawable, view: View, t: int, mask: Float[Tensor, "H W 1"] | None
-    ) -> tuple[HrSide[Grads], Grads]:
+    def hr(self, asked: Drawable, view: View, t: int, mask: Float[Tensor, "H W 1"] | None) -> tuple[HrSide, Grads]:
         """Draw the view at HR, compare it with the SR image, and route the gradients. Returns what HR gives, and g^HR of the raw
         parameters.
         """
@@ -184,7 +182,7 @@ class OwnDrawing:
         known = None if self._replays is None else conductor.looked_up(view)
         given = _Given(asked.tensors, asked.background, asked.camera, photo, known, mask)
 
-        def work(given: _Given, recorded: bool) -> tuple[tuple[HrSide[Grads], Grads], dict[str, Number]]:
+        def work(given: _Given, recorded: bool) -> tuple[tuple[HrSide, Grads], dict[str, Number]]:
             if not recorded:
                 return self._compared(given, asked, view, t), {}
             logged = conductor.logs()
@@ -218,7 +216,7 @@ class OwnDrawing:
         found = every_number(to_parameters(g, asked.drawn, asked.params), asked.params)
         return Grads({name: x.clone() for name, x in found.items()})  # some are those that the next replay overwrites
 
-    def _compared(self, given: _Given, asked: Drawable, view: View, t: int) -> tuple[HrSide[Grads], Grads]:
+    def _compared(self, given: _Given, asked: Drawable, view: View, t: int) -> tuple[HrSide, Grads]:
         """The HR side, and g^HR of what was drawn, with f_det's.  Eq. 9, 10, 12, 13"""
         λ_hf = self._conductor.objective.lambda_hf
         shot = given.shot(asked)

@@ -78,7 +78,7 @@ class Pending:
     nth: int
     view: str
     output: HostOutput | None
-    hr: HrSide[Grads] | None
+    hr: HrSide | None
     routed: Grads | None
     screen: dict[int, Tensor] = field(default_factory=dict)
     merged: set[str] = field(default_factory=set)

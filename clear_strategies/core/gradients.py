@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import Any, Final, NamedTuple, Protocol, runtime_checkable
+from typing import Final, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -164,17 +164,11 @@ def _half(size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Fl
     return torch.cat([torch.full((1,), pixels / 2, dtype=dtype, device=device) for pixels in size])
 
 
-def screen_of(g: Any) -> Float[Tensor, "N 2"]:
-    """`g.screen`, which must be there; `g` is a `Grads`, or what a stepper has in its place."""
-    screen: Tensor | None = g.screen
-    if screen is None:
+def screen_of(g: Grads) -> Float[Tensor, "N 2"]:
+    """`g.screen`, which must be there."""
+    if g.screen is None:
         raise ValueError("a Shot's vjp() must set .screen on every Grads it returns.")
-    return screen
-
-
-def screen_in_ndc(g: Any, size: tuple[int, int]) -> Float[Tensor, "N 2"]:
-    """`g.screen` in NDC."""
-    return to_ndc(screen_of(g), size)
+    return g.screen
 
 
 def screen_norm(screen: Float[Tensor, "N 2"]) -> Float[Tensor, " N"]:

@@ -16,7 +16,7 @@ from clear_strategies.core import images
 from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import require_finite, require_finite_losses
-from clear_strategies.core.gradients import Grads, Shot, screen_in_ndc, screen_norm, screen_of
+from clear_strategies.core.gradients import Grads, Shot, screen_norm, screen_of, to_ndc
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, View
 from clear_strategies.core.work_log import WorkLog
@@ -167,7 +167,7 @@ class Conductor:
         hr: Shot | None,
         view: View,
         t: int,
-        stepper: Stepper[Any] | None = None,
+        stepper: Stepper | None = None,
         *,
         scored: bool = True,
         looked_up: Tensor | None = None,
@@ -186,7 +186,7 @@ class Conductor:
             DivergedError: a loss or a gradient is not finite; neither `params` nor the optimizer have changed.
         """
         o, stage = self.objective, self.work_log.stage
-        vjp: Callable[..., Sequence[Any]] = _vjp if stepper is None else stepper.vjp
+        vjp: Callable[..., Sequence[Grads]] = _vjp if stepper is None else stepper.vjp
         reduced = not self.wants_lr or (lr is None and view.factor == 1)
         rendered = hr if reduced else lr
         if rendered is None:
@@ -202,7 +202,7 @@ class Conductor:
         where = _where(view, t)
         require_finite_losses(where, l_lr.values, {"the LR photo": photo.image, "the LR render": low})
         g_lr: Any = None
-        from_hr: HrSide[Any] | None = None
+        from_hr: HrSide | None = None
         if not reduced:
             with stage("backward LR"):
                 (g_lr,) = vjp(rendered, l_lr.cotangents)
@@ -219,7 +219,7 @@ class Conductor:
             score = ordinary = None
             if scored:
                 weights = (o if stepper is None else stepper).weights(t)
-                screen_lr = screen_in_ndc(g_lr, _size(rendered.image))
+                screen_lr = to_ndc(screen_of(g_lr), _size(rendered.image))
                 score, ordinary = self.scores(screen_lr, from_hr, weights)  # S^dens   Eq. 14
             require_finite_parts(where, g_lr, from_hr)
             if stepper is None:
@@ -236,12 +236,12 @@ class Conductor:
         hr: Shot,
         view: View,
         t: int,
-        vjp: Callable[[Any, Tensor], Sequence[Any]] | None = None,
+        vjp: Callable[[Any, Tensor], Sequence[Grads]] | None = None,
         *,
         apart: bool = True,
         params: Mapping[str, Tensor] = _UNKNOWN,
         looked_up: Tensor | None = None,
-    ) -> HrSide[Any]:
+    ) -> HrSide:
         """Compare Î_HR with the SR image, backpropagate both losses in one pass, and ask for the evidence.
 
         Args:
@@ -278,7 +278,7 @@ class Conductor:
         require_finite_losses(f"t={t}, an extra view", loss.values, {"its picture": target, "the render": image})
         return loss._replace(cotangents=loss.cotangents * weight)
 
-    def merge(self, params: Mapping[str, Tensor], g_lr: Grads, hr: HrSide[Grads] | None, t: int) -> Merged:
+    def merge(self, params: Mapping[str, Tensor], g_lr: Grads, hr: HrSide | None, t: int) -> Merged:
         """The merge: g_LR + λ_HR ĝ_HR + λ∇L_stab.
 
         Args:
@@ -360,7 +360,7 @@ class Conductor:
         return any(s.regularize(params, t) is not None for s in self.regularizers)
 
     def scores(
-        self, screen_lr: Float[Tensor, "N 2"], hr: HrSide[Any] | None, weights: LossWeights
+        self, screen_lr: Float[Tensor, "N 2"], hr: HrSide | None, weights: LossWeights
     ) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
         """The densification score of the strategies, and the ordinary ‖∇_u L‖ that holds without them.
 
@@ -441,10 +441,10 @@ class Conductor:
         hr: Shot,
         step: Step,
         t: int,
-        vjp: Callable[..., Sequence[Any]],
+        vjp: Callable[..., Sequence[Grads]],
         lr_cotangents: Tensor | None = None,
         apart: bool = True,
-    ) -> tuple[Any | None, HrSide[Any]]:
+    ) -> tuple[Grads | None, HrSide]:
         """∇(λ_LR L_LR) where its cotangents [1, H, W, 3] are given, and the gradients of the HR losses."""
         stage = self.work_log.stage
         with stage("losses HR"):
@@ -473,7 +473,7 @@ class Conductor:
         return g_lr, HrSide(base, hf, _size(hr.image), step, m, losses.values)
 
 
-def _screen_gradients(lr: Float[Tensor, "N 2"], hr: HrSide[Any], weights: LossWeights) -> ScreenGradients:
+def _screen_gradients(lr: Float[Tensor, "N 2"], hr: HrSide, weights: LossWeights) -> ScreenGradients:
     hf = None if hr.hf is None else screen_of(hr.hf)
     return ScreenGradients(lr, *per_gaussian.screens(lr, screen_of(hr.base), hf, hr.size, weights))
 

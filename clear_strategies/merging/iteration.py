@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -17,14 +17,12 @@ from clear_strategies.core.gradients import Grads
 from clear_strategies.core.step import Step
 from clear_strategies.kernels import native
 
-G = TypeVar("G", bound=Grads)
-
 LossWeights = tuple[float, float] | Tensor
 """λ_HR(t) and λ_HR(t) λ_HF: two numbers, or a tensor of them on the device, [2]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HrSide(Generic[G]):
+class HrSide:
     """What the HR render of one view gives: its gradients, the evidence, and the routing weights.
 
     Args:
@@ -34,8 +32,8 @@ class HrSide(Generic[G]):
         losses: L_base and L_HF by name.
     """
 
-    base: G
-    hf: G | None
+    base: Grads
+    hf: Grads | None
     size: tuple[int, int]
     step: Step
     m: float | Float[Tensor, " N"] = 1.0
@@ -91,7 +89,7 @@ class Update:
 
 
 @runtime_checkable
-class Stepper(Protocol[G]):
+class Stepper(Protocol):
     """Merges and steps in one pass: the same arithmetic as `Conductor.merge` and the optimizer, with no gradient left."""
 
     @property
@@ -99,12 +97,12 @@ class Stepper(Protocol[G]):
         """The stage of the work log that the pass is timed as."""
         ...
 
-    def vjp(self, shot: Any, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[G]:
-        """One gradient per cotangent, in the form that `step` takes."""
+    def vjp(self, shot: Any, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[Grads]:
+        """One gradient per cotangent."""
         ...
 
     def step(
-        self, params: Mapping[str, Tensor], shot: Any, g_lr: G, hr: HrSide[G] | None, t: int
+        self, params: Mapping[str, Tensor], shot: Any, g_lr: Grads, hr: HrSide | None, t: int
     ) -> Mapping[str, Number]:  # fmt: skip
         """Merge, and step `params` and the optimizer's moments in place; returns the conflict ratios by group.
 
@@ -117,12 +115,8 @@ class Stepper(Protocol[G]):
         """As `Objective.weights`."""
         ...
 
-    def step_extra(self, params: Mapping[str, Tensor], shot: Any, g_lr: G, t: int) -> None:
-        """Step on the gradient of an extra view alone; nothing is regularized."""
-        ...
 
-
-def require_finite_parts(where: str, g_lr: Grads, hr: HrSide[Any] | None) -> None:
+def require_finite_parts(where: str, g_lr: Grads, hr: HrSide | None) -> None:
     """Check what a `Stepper` merges: the gradients, and the weights of the strategies; those on a device are not read."""
     if g_lr.screen is None or not deferred.is_immediate(g_lr.screen):
         return

@@ -116,7 +116,7 @@ class CompiledStep:
         return gradients_of(shot.gradients(cotangents))
 
     def step(
-        self, params: Mapping[str, Tensor], shot: FieldShot, g_lr: Grads, hr: HrSide[Grads] | None, t: int
+        self, params: Mapping[str, Tensor], shot: FieldShot, g_lr: Grads, hr: HrSide | None, t: int
     ) -> Mapping[str, Number]:
         """Step `params` and the optimizer's moments in place; returns the conflict ratios by group."""
         gaussians, λ = self._gaussians(shot.activation, g_lr, hr), self.conductor.objective.lambda_hr(t)
@@ -199,7 +199,7 @@ class CompiledStep:
         if bands < all_bands:
             skip("SH bands in the optimizer", "above the active degree", all_bands - bands)
 
-    def _gaussians(self, a: Activation, g_lr: Grads, hr: HrSide[Grads] | None) -> kernel.GaussianStep:
+    def _gaussians(self, a: Activation, g_lr: Grads, hr: HrSide | None) -> kernel.GaussianStep:
         """The passes over the gradients of one view."""
         m = None if hr is None else hr.m
         activation = {
