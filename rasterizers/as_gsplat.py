@@ -8,6 +8,7 @@ two more channels: the depth of the centre, and the 1 whose picture is alpha.
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -33,7 +34,7 @@ _ALPHA_MAX: Final = 0.999  # gsplat's cap on a single contribution; Inria's, and
 _SUPPORTED: Final = {
     "camera_model": "pinhole", "with_ut": False, "with_eval3d": False, "rolling_shutter": "GLOBAL", "distributed": False,
 }  # fmt: skip
-_WITHOUT_EFFECT: Final = {"sparse_grad", "tile_size", "channel_chunk", "segmented"}
+_WITHOUT_EFFECT: Final = {"channel_chunk", "segmented"}
 
 
 @uncompiled
@@ -267,11 +268,7 @@ def rasterizer_of(arguments: Mapping[str, Any], backend: str) -> Rasterizer:
     return _loaded(backend, means.device.type, near, eps2d, mode == "antialiased")
 
 
-_TAKEN: Final = {
-    "means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height", "near_plane", "far_plane",
-    "radius_clip", "eps2d", "sh_degree", "packed", "backgrounds", "render_mode", "absgrad", "rasterize_mode", "backend",
-    "rgb_offset",
-}  # fmt: skip
+_TAKEN: Final = inspect.signature(rasterization).parameters
 
 
 def cameras_of(viewmats: Float[Tensor, "C 4 4"], Ks: Float[Tensor, "C 3 3"], width: int, height: int) -> list[Camera]:
