@@ -251,18 +251,10 @@ def describes(strategy: Strategy, fact: str) -> bool:
     cls = type(strategy)
     stated_by = next(base for base in cls.__mro__ if fact in vars(base))
     return stated_by is not Strategy and all(
-        getattr(cls, name) is method for name, method in _methods(stated_by).items()
+        getattr(cls, name) is method
+        for name, method in inspect.getmembers(stated_by, inspect.isfunction)
+        if not name.startswith("__") or name == "__post_init__"  # others are the dataclass decorator's
     )
-
-
-def _methods(cls: type) -> dict[str, Any]:
-    """A class's own and inherited functions, except those that the dataclass decorator generates."""
-    return {
-        name: getattr(cls, name)
-        for base in cls.__mro__
-        for name, value in vars(base).items()
-        if inspect.isfunction(value) and not (name.startswith("__") and name != "__post_init__")
-    }
 
 
 def by_class(strategies: Sequence[Strategy]) -> dict[str, Strategy]:
