@@ -7,12 +7,11 @@ and is ray-cast with anti-aliasing from exact poses. The capture brings its own 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, lru_cache, partial, wraps
+from functools import cache, lru_cache, partial
 from pathlib import Path
-from threading import RLock
-from typing import Final, ParamSpec, TypeVar
+from threading import Lock
+from typing import Final
 
 import numpy as np
 import torch
@@ -32,8 +31,6 @@ _BAND: Final = 16  # image rows cast at once, few enough for the CPU's caches
 _FIELD_OF_VIEW: Final = math.radians(58)
 _ARC: Final = 0.75  # the cameras' largest offset to the left and right, world units
 _TARGET: Final = np.array([0.0, 0.15, 5.0])
-P = ParamSpec("P")
-T = TypeVar("T")
 Array = np.ndarray
 Vector = tuple[float, float, float]
 _FLOOR: Final = 1.35  # y; y points down
@@ -44,18 +41,7 @@ _LAMP_REACH: Final = 8.5  # distance at which its light is halved
 _AMBIENT: Final = 0.3
 _EXPOSURE: Final = 1.9
 _LIGHT_TEXEL: Final = 0.08  # of the baked light, world units
-
-
-def once(function: Callable[P, T]) -> Callable[P, T]:
-    """As `cache`. Of threads that ask for the same at once, as those do that read the photos, one computes it."""
-    cached, lock = cache(function), RLock()
-
-    @wraps(function)
-    def waited(*args: P.args, **kwargs: P.kwargs) -> T:
-        with lock:
-            return cached(*args, **kwargs)  # type: ignore[arg-type]  # they are hashable
-
-    return waited
+_PREPARING: Final = Lock()
 
 
 def read(*, width: int = 256, height: int = 192, views: int = 12, train: int = 3) -> Capture:
@@ -87,6 +73,10 @@ def read(*, width: int = 256, height: int = 192, views: int = 12, train: int = 3
 
 def render(camera: Camera) -> Float[Tensor, "H W 3"]:
     """Ray-cast with 4 × 4 rays a pixel and prefiltered textures; 8-bit values, as a photo would have."""
+    with _PREPARING:  # of threads that read the photos at once, one makes what all need
+        for surface in room():
+            photograph(surface.finish.texture)
+            light_on(surface)
     bands = []
     for first in range(0, camera.height, _BAND):
         rays = Rays.through(camera, first, min(first + _BAND, camera.height), _RAYS)
@@ -325,7 +315,7 @@ class Texture:
         return np.asarray(upper * (1 - fy) + lower * fy)
 
 
-@once
+@cache
 def photograph(name: str) -> Texture:
     """A photograph that scikit-image ships, RGB in [0, 1]."""
     import skimage
@@ -353,7 +343,7 @@ def f32(values: Array | tuple[float, ...]) -> Float[Array, "*shape"]:
     return np.asarray(values, np.float32)
 
 
-@once
+@cache
 def room() -> tuple[Surface, ...]:
     """A yard: pictures on the wall and leaning before it, a box, and balls on the ground."""
     brick = Finish("brick", (1.12, 0.80, 0.66), repeat=(2.0, 3.0), shift=(0.1, 0.35))
@@ -422,7 +412,7 @@ def _turned(angle: float) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
     return np.array([c, 0, s]), np.array([-s, 0, c])
 
 
-@once
+@cache
 def light_on(surface: Surface) -> Texture:
     """The light of the lamp and the sky on a surface, with soft shadows. It does not depend on the view, so it is baked."""
     width, height = (max(math.ceil(side / _LIGHT_TEXEL), 4) for side in surface.extent)
