@@ -13,6 +13,7 @@ import os
 import re
 import signal
 import sys
+from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -170,8 +171,12 @@ class SweepCallback(Callback):
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         folder = Path(config.hydra.sweep.dir)
         _report(folder)
-        if failed := sorted(note.read_text(encoding="utf-8").strip() for note in folder.rglob(FAILED)):
-            _log.error("%d job(s) failed: %s", len(failed), " | ".join(failed))
+        if failed := [note.read_text(encoding="utf-8").strip().partition(": ") for note in folder.rglob(FAILED)]:
+            by_message = defaultdict[str, list[int]](list)
+            for job, _, message in failed:
+                by_message[message].append(int(job.removeprefix("job ")))
+            listed = (f"job {', '.join(map(str, sorted(jobs)))}: {message}" for message, jobs in by_message.items())
+            _log.error("%d job(s) failed: %s", len(failed), " | ".join(listed))
             sys.exit(exit_codes.UNUSABLE)
 
 

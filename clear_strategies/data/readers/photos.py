@@ -39,6 +39,7 @@ _HEAD: Final = 1 << 16  # bytes of a file that tell what it is
 _LOOKED_INTO: Final = 50  # files of a kind, at most
 _CONVERT: Final = "ns-process-data {0} --data {{root}}{1} --output-dir converted"
 _HERE: Final = "put the model into {root}/sparse/0"
+_ABOVE: Final = "clear-strategies train {root}/.."
 # Poses of other tools that no reader reads: where they lie, what such a file contains, whose they are, what makes use of them.
 _OTHERS: Final = (
     ("*.json", b'"frames"', "transforms.json", "clear-strategies train {file}"),
@@ -50,6 +51,8 @@ _OTHERS: Final = (
     ("metadata*", b'"poses"', "Record3D", _CONVERT.format("record3d", "")),
     ("poses_bounds.npy", b"NUMPY", "LLFF", "put the COLMAP model that they were made from into {root}/sparse/0"),
     *((f"{place}cameras.[bt]*", b"", "COLMAP", _HERE) for place in ("*/", "*/*/", "*/*/*/")),
+    *((f"../{place}cameras.[bt]*", b"", "COLMAP", _ABOVE) for place in ("sparse/", "sparse/0/")),
+    ("../transforms.json", b'"frames"', "transforms.json", _ABOVE),
 )
 
 

@@ -125,12 +125,14 @@ BESIDE: dict[str, tuple[str, str, str]] = {
     "Polycam's keyframes": ("cameras/1.json", '{"t_00": 1.0}', "ns-process-data polycam"),
     "LLFF": ("poses_bounds.npy", "\x93NUMPY", "sparse/0"),
     "COLMAP's undistorter": ("dense/sparse/cameras.bin", "", "sparse/0"),
+    "COLMAP's, beside the photos": ("../sparse/0/cameras.bin", "", "/.."),
+    "nerfstudio's, beside the photos": ("../transforms.json", '{"frames": []}', "/.."),
 }
 
 
 @pytest.mark.parametrize("what", BESIDE)
 def test_poses_that_are_not_read_are_told_before_new_ones_are_estimated(what, tmp_path, monkeypatch, caplog):
-    name, text, remedy = BESIDE[what]
+    (name, text, remedy), tmp_path = BESIDE[what], tmp_path / "capture"
     tiny.write_photos(tmp_path / "images")
     (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / name).write_text(text, encoding="latin-1")
