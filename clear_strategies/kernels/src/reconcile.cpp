@@ -55,6 +55,7 @@ class Passes {
   Conflicts products(std::int64_t number, const ProductTable& to) const {
     Conflicts found;
     each_sixteen(g.n, number, [&](std::int64_t i, int count) {
+      fetch(i + kLanes);
       clear::Products p[kGroups];
       for (std::size_t k = 0; k < g.attributes.size(); ++k) {
         const Rows& a = g.attributes[k];
@@ -81,6 +82,12 @@ class Passes {
   const TwoGradients& g;
   std::vector<RowPlan> plans;
   bool one_basis;  // of both gradients of the colours
+
+  // Prefetches what `products` reads of sixteen Gaussians.
+  CLEAR_INLINE void fetch(std::int64_t i) const {
+    for (const Rows& a : g.attributes) fetch_rows(a.lr, i, a.width), fetch_rows(a.hr, i, a.width);
+    for (const Colour* c : {&g.lr, &g.hr}) fetch_rows(c->rgb, i, 3), fetch_rows(c->rgb ? c->basis : nullptr, i, c->bases);
+  }
 
   static bool has(const Rows& a, const float* rows, const Colour& colour) { return rows || (a.first_band >= 0 && colour.rgb); }
 
