@@ -171,12 +171,13 @@ class SweepCallback(Callback):
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         folder = Path(config.hydra.sweep.dir)
         _report(folder)
-        if failed := [note.read_text(encoding="utf-8").strip().partition(": ") for note in folder.rglob(FAILED)]:
-            by_message = defaultdict[str, list[int]](list)
-            for job, _, message in failed:
-                by_message[message].append(int(job.removeprefix("job ")))
-            listed = (f"job {', '.join(map(str, sorted(jobs)))}: {message}" for message, jobs in by_message.items())
-            _log.error("%d job(s) failed: %s", len(failed), " | ".join(listed))
+        failed = defaultdict[str, list[int]](list)
+        for note in folder.rglob(FAILED):
+            job, message = note.read_text(encoding="utf-8").strip().split(": ", 1)
+            failed[message].append(int(job.removeprefix("job ")))
+        if failed:
+            listed = (f"job {', '.join(map(str, sorted(jobs)))}: {message}" for message, jobs in failed.items())
+            _log.error("%d job(s) failed: %s", sum(map(len, failed.values())), " | ".join(listed))
             sys.exit(exit_codes.UNUSABLE)
 
 

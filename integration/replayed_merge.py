@@ -1,7 +1,7 @@
 """The merge of a host's gradients, on CUDA recorded and replayed: of the kernels that it launches, 22 are GCO's.
 
 A host has other gradients in each step, so a recording reads copies of them, and its result is copied to where the host has its
-own. The parameters, and what the strategies store, it reads in place.
+own. The parameters, and what strategies that reconcile or regularize store, it reads in place.
 """
 
 from __future__ import annotations
@@ -132,8 +132,9 @@ class ReplayedMerge:
         return merged
 
     def _kind(self, given: _Given) -> Kind:
-        read = *given.params.values(), *given.step.params.values(), *self._conductor.state_dict().values()
-        addresses = [x.data_ptr() for x in read if x.dim() > 0]
+        asked = self._conductor.owner("reconcile"), *self._conductor.regularizers
+        stored = [rows for s in asked if s is not None for rows in s.state.values()]
+        addresses = [x.data_ptr() for x in (*given.params.values(), *given.step.params.values(), *stored)]
         shapes = [(name, None if x is None else x.shape) for name, x in given.tensors.items()]
         return Kind((len(next(iter(given.out.values()))), *addresses), tuple(shapes), tuple(given.out))
 

@@ -6,6 +6,7 @@ Types and shapes are looked at, and the numbers where `finite` asks for it, but 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from numbers import Real
 from typing import Any, NoReturn
 
 from torch import Tensor
@@ -45,7 +46,7 @@ def require_background(s: Strategy, color: Any) -> None:
     if color is not None and not (
         isinstance(color, tuple | list)
         and len(color) == 3
-        and all(isinstance(x, int | float) and 0 <= x <= 1 for x in color)
+        and all(isinstance(x, Real) and 0 <= float(x) <= 1 for x in color)
     ):
         _refuse(s, "background", "three numbers in [0, 1] or None", color)
 
@@ -61,7 +62,7 @@ def require_evidence(s: Strategy, e: Any, n: int) -> None:
 
 
 def require_route(s: Strategy, m: Any, n: int) -> None:
-    if not (isinstance(m, int | float) or _is_rows(m, n)):
+    if not (isinstance(m, Real) or _is_rows(m, n)):
         _refuse(s, "route", f"a number or a tensor [{n}]", m)
 
 
@@ -69,7 +70,7 @@ def require_weights(s: Strategy, weights: Any, n: int, groups: int, *, finite: b
     if not isinstance(weights, Weights):
         _refuse(s, "reconcile", "Weights(keep, remove)", weights)
     for name, w in weights._asdict().items():
-        if not (isinstance(w, int | float) or (isinstance(w, Tensor) and w.shape in ((), (n,), (n, groups)))):
+        if not (isinstance(w, Real) or (isinstance(w, Tensor) and w.shape in ((), (n,), (n, groups)))):
             _refuse(s, "reconcile", f"Weights whose {name} is a number or a tensor [{n}] or [{n}, {groups}]", w)
     if finite:
         _require_finite(s, "reconcile", weights._asdict())
