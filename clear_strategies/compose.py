@@ -194,6 +194,9 @@ def composed(overrides: list[str], config: str = "conductor") -> DictConfig:
         GlobalHydra.instance().hydra = before
 
 
+_SWEEPS: Final = re.compile(r"\+?(experiment=|strategy=[^\[]*,)")  # overrides by which strategies come later
+
+
 def not_composed(error: Exception, overrides: Sequence[str], config: str) -> SettingError:
     """The error for overrides that Hydra cannot compose; where there is no such setting, it names the most similar one."""
     if (unknown := re.match(r"Could not (?:override|delete from config\.) '([^']+)'", str(error))) is None:
@@ -218,7 +221,12 @@ def not_composed(error: Exception, overrides: Sequence[str], config: str) -> Set
     remedy = "clear-strategies --cfg job prints all of them."
     parent, _, name = key.rpartition(".")
     beside = {".".join(k.split(".")[: key.count(".") + 1]) for k in flat(known) if k.startswith(f"{parent}.")}
-    if f"~{key}" in overrides and beside:
+    if key.startswith("strategies.") and any(_SWEEPS.match(o) for o in overrides):
+        remedy = (
+            "Hydra composes a sweep first without what is swept, here the strategies. Sweep this setting, too "
+            f"({key}=a,b), or name the strategies that remain (+strategy=[gco,svs])."
+        )
+    elif f"~{key}" in overrides and beside:
         remedy = f"There are {', '.join(sorted(beside))}."
     elif has_parameter(
         str(flat(known).get(f"{parent}.{TARGET}")), name

@@ -183,18 +183,20 @@ def curve(rows: list[dict[str, str]], scene: str, method: str) -> tuple[list[flo
 
 def collect_training_time(sweep: Path) -> None:
     """Write `training_time.csv` from the runs of experiment=training_time, and print their table."""
-    tables, stages = [], {}
-    for run in collect([sweep]):
+    tables, stages, runs_of_sweep = [], {}, collect([sweep])
+    names, seeds = lines_of(runs_of_sweep), {run.seed for run in runs_of_sweep}
+    for run in runs_of_sweep:
+        name = f"{names[run]}, seed {run.seed}" if len(seeds) > 1 else names[run]
         history = pd.read_csv(run.folder / "history.csv")
         probed = history.dropna(subset="psnr_test")
         seconds, psnr = probed["processor_seconds"].round(1), probed["psnr_test"].round(3)
         tables.append(
-            pd.DataFrame({"scene": run.scene, "method": run.name, "processor seconds": seconds, "PSNR (dB)": psnr})
+            pd.DataFrame({"scene": run.scene, "method": name, "processor seconds": seconds, "PSNR (dB)": psnr})
         )
         runs = pd.read_csv(run.folder / "timing.csv").set_index("stage")["runs"]
         whole = history["processor_seconds"].iloc[-1]
         first = history[history["t"] <= runs.get("first stage", 0)]["processor_seconds"].max()
-        stages[run.scene, run.name] = [whole] if pd.isna(first) else [first, whole - first]
+        stages[run.scene, name] = [whole] if pd.isna(first) else [first, whole - first]
     pd.concat(tables).to_csv(DOCS / "data" / "evidence" / "training_time.csv", index=False)
     rows = table("training_time")
     lines = ["| scene | method | processor seconds | PSNR (dB) | seconds to equal PSNR |", "|---|---|---|---|---|"]

@@ -137,7 +137,7 @@ class Attachment:
 
     def render_view(self, view: View, render_at: RenderAt) -> Any:
         """Render a training view at both scales; returns what the host's render function returns at LR."""
-        self._finish_previous_step()
+        self._finish_step()  # where not every optimizer has stepped, or the structure has changed since
         conductor, t, params = self.conductor, self.t, {name: p.detach() for name, p in self.params().items()}
         means = params["means"]
         conductor.forget_logs()
@@ -212,7 +212,9 @@ class Attachment:
 
     def hook(self, optimizers: Sequence[torch.optim.Optimizer]) -> None:
         """Hook the steps of the optimizers that the host now has, and no longer those of earlier ones."""
-        distinct = list({id(o): o for o in optimizers}.values())  # one optimizer may have several parameters
+        distinct = list(
+            {id(o): o for o in optimizers if isinstance(o, torch.optim.Optimizer)}.values()
+        )  # others have no hooks
         if list(map(id, distinct)) == list(map(id, self._hooked)):
             return
         for hook in self._hooks:
@@ -224,7 +226,7 @@ class Attachment:
                 o.register_step_pre_hook(lambda o, given, named: self._before_step(o, *given, *named.values()))
                 for o in distinct
             ),
-            *(o.register_step_post_hook(lambda o, *_: self._step_on_extra_views(o)) for o in distinct),
+            *(o.register_step_post_hook(lambda o, *_: self._after_step_of(o)) for o in distinct),
         ]
 
     def state_dict(self) -> dict[str, Any]:
@@ -336,17 +338,24 @@ class Attachment:
             "Take the gradients by loss.backward(), not by torch.autograd.grad, of a loss of that rendering.",
         )
 
-    def _step_on_extra_views(self, optimizer: torch.optim.Optimizer) -> None:
-        if not self._extra.stepping and (steps := self._extra.step(optimizer)):
+    def _after_step_of(self, optimizer: torch.optim.Optimizer) -> None:
+        """Step on extra views; and once all optimizers have stepped, let the strategies do so: what the loop computes of the
+        parameters from then on, before it renders, is of what they have left.
+        """
+        if self._extra.stepping:
+            return
+        if steps := self._extra.step(optimizer):
             self.counts["extra views"] += steps
+        if len(self._stepped) == len(self._hooked):
+            self._finish_step()
 
-    def _finish_previous_step(self) -> None:
+    def _finish_step(self) -> None:
         """Call `on_resize` and `after_step`, now that the host has stepped and perhaps densified."""
         params = self.params()
         self._resize(len(params["means"]))
         if self._passes >= self.accumulation:
             if self._step is not None:
-                self.conductor.after_step({name: p.detach() for name, p in params.items()}, self._step)
+                self.conductor.after_step({name: _to_change(p) for name, p in params.items()}, self._step)
             self.t += 1
             self._passes = 0
 
@@ -426,6 +435,8 @@ class Attachment:
                 p.grad = p.grad.detach()
         scale = (self._loss_scale() if self._loss_scale is not None else 1.0) / self.accumulation
         detail = done.params.get("detail") if first else None
+        if detail is not None and not detail.requires_grad:
+            detail = None
         if detail is not None:
             params["detail"] = detail
             if detail.grad is not None:  # what the host has given it stays
@@ -478,6 +489,11 @@ class Attachment:
                 "f_det has no effect: none of its first %d gradients was stepped on. Step the optimizer of the parameter detail: "
                 "attach adds it to the optimizers that it is given, and one that is made anew must hold it, too.", _PATIENCE,
             )  # fmt: skip
+
+
+def _to_change(p: Tensor) -> Tensor:
+    """What a strategy may change in place: a copy, where the host has frozen the parameter."""
+    return p.detach() if p.requires_grad else p.detach().clone()
 
 
 def _rows_of(step: Step | None) -> dict[str, Tensor]:

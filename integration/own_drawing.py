@@ -34,6 +34,7 @@ from clear_strategies.merging.replays import (
 from integration.autograd_shot import AutogradShot, HostOutput, Target, every_number, to_parameters
 from rasterizers.autograd import BackwardHook, Drawing
 from rasterizers.interface import Camera, Rasterizer, Recordable, Splats, over
+from rasterizers.modes import in_full_precision
 from rasterizers.told import name_of_view
 
 _log = logging.getLogger(__name__)
@@ -172,6 +173,7 @@ class OwnDrawing:
                 self._replays = None
                 _log.info("HR is not replayed: %s.", reason)
 
+    @in_full_precision
     @torch.no_grad()
     def hr(self, asked: Drawable, view: View, t: int, mask: Float[Tensor, "H W 1"] | None) -> tuple[HrSide, Grads]:
         """Draw the view at HR, compare it with the SR image, and route the gradients. Returns what HR gives, and g^HR of the raw
@@ -199,6 +201,7 @@ class OwnDrawing:
             routed["detail"] = g["detail"]
         return hr, routed
 
+    @in_full_precision
     @torch.no_grad()
     def extra_view(self, asked: Drawable, extra: ExtraView, t: int) -> Grads:
         """The gradient of `Conductor.extra_loss`, a number for each of the raw parameters."""

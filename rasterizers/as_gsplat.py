@@ -19,9 +19,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 import rasterizers
-from rasterizers.autograd import Inputs, Rendered, in_graph, render, uncompiled
+from rasterizers.autograd import Inputs, Rendered, in_graph, render
 from rasterizers.geometry import REACH, constant_band, depths, low_and_span
 from rasterizers.interface import Camera, Rasterizer, RasterSettings, WithRadii, over
+from rasterizers.modes import in_full_precision, uncompiled
 from rasterizers.native import empty_for
 from rasterizers.reference.projection import footprints
 
@@ -38,6 +39,7 @@ _WITHOUT_EFFECT: Final = {"channel_chunk", "segmented"}
 
 
 @uncompiled
+@in_full_precision
 def rasterization(
     means: Float[Tensor, "*B N 3"],
     quats: Float[Tensor, "*B N 4"],
@@ -71,6 +73,7 @@ def rasterization(
         means, quats, scales, opacities: of batches of scenes, or of one.
         colors: with `sh_degree`, the active degree, spherical harmonics [*B, N, K, 3]; without it D channels [*B, N, D] in any
             range. Either may be of each camera, [*B, C, N, …].
+        backgrounds: behind the image; with `sh_degree` each is a colour in [0, 1].
         near_plane, far_plane: Gaussians beyond them are left out, and those whose radius is at most `radius_clip` px.
         render_mode: "RGB", "D" (accumulated depth), "ED" (expected depth), or both: "RGB+D", "RGB+ED". Depth is that of the
             centres along the camera's axis, the last channel, and has gradients.
@@ -84,10 +87,10 @@ def rasterization(
 
     Returns:
         images, alphas, and `info`: `means2d` [*B, C, N, 2] (`retain_grad` works); `radii` [*B, C, N, 2] in pixels, `depths`,
-        `conics` and `opacities` of the visible, 0 of others, made when they are asked for; and `width`, `height`, `n_cameras`,
-        `n_batches`, `tile_size`. Packed, of M visible Gaussians: `means2d` [M, 2], `gaussian_ids`,
-        `camera_ids` and `batch_ids` [M], and in the graph of what they depend on, `depths` [M], `conics` [M, 3] and `opacities`
-        [M], times the factor of `rasterize_mode="antialiased"`; `radii` [M, 2] in pixels.
+        `conics` and `opacities` of the visible, 0 of others, made when they are asked for, of the parameters as they are then;
+        and `width`, `height`, `n_cameras`, `n_batches`, `tile_size`. Packed, of M visible Gaussians: `means2d` [M, 2],
+        `gaussian_ids`, `camera_ids` and `batch_ids` [M], and in the graph of what they depend on, `depths` [M], `conics` [M, 3]
+        and `opacities` [M], times the factor of `rasterize_mode="antialiased"`; `radii` [M, 2] in pixels.
 
         Gradients reach everything that is given but `Ks`. That of `viewmats` is exact along rigid motions.
 
@@ -389,6 +392,7 @@ def _packed_info(
     return info, torch.split(info["means2d"], [len(i) for i in rows]), rows
 
 
+@in_full_precision
 def _columns(rendered: Rendered, splats: Inputs, rows: Int[Tensor, " M"]) -> dict[str, Tensor]:
     """What gsplat says of the visible Gaussians."""
     settings = cast(RasterSettings, rendered.rasterizer)  # `over` has checked it

@@ -6,7 +6,6 @@ backward pass handles one cotangent; `Rendering.vjp` handles several, and `recor
 
 from __future__ import annotations
 
-import functools
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -22,26 +21,14 @@ from torch.autograd.function import once_differentiable
 from rasterizers.ahead import draw_or_take
 from rasterizers.checks import require_absgrad, require_depth
 from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, over
+from rasterizers.modes import in_full_precision, uncompiled
 from rasterizers.native import empty_for
 from rasterizers.pose import pose_gradient
 
-__all__ = ["BackwardHook", "Drawing", "Drawn", "TakeColours", "draw", "outer", "recorded", "uncompiled"]
+__all__ = ["BackwardHook", "Drawing", "Drawn", "TakeColours", "draw", "outer", "recorded"]
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
-
-
-def uncompiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """The function, which `torch.compile` leaves as it is where compiled code calls it: the kernels take memory, not traces."""
-
-    @functools.wraps(function)
-    def called(*args: _P.args, **kwargs: _P.kwargs) -> _R:
-        if torch.compiler.is_compiling():
-            apart: Callable[_P, _R] = torch.compiler.disable(function)  # type: ignore[no-untyped-call]
-            return apart(*args, **kwargs)  # made here, since at import it would take a second
-        return function(*args, **kwargs)
-
-    return called
 
 
 class Drawn(NamedTuple):
@@ -118,6 +105,7 @@ def recorded() -> Iterator[list[Drawing]]:
 
 
 @uncompiled
+@in_full_precision
 def draw(
     rasterizer: Rasterizer,
     splats: Splats,
@@ -230,6 +218,7 @@ class _Draw(torch.autograd.Function):
         return rendering.image.data, rendering.alpha.data, visible, depth
 
     @staticmethod
+    @in_full_precision
     @once_differentiable  # a second derivative would silently be 0
     def backward(ctx: Any, d_image: Tensor | None, d_alpha: Tensor | None, _: None, d_depth: Tensor | None) -> Any:
         rendering, rasterizer, camera, bands = ctx.rendered

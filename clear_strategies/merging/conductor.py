@@ -30,6 +30,7 @@ from clear_strategies.merging.skips import SkipPolicy, Skips
 from clear_strategies.strategies import answers
 from clear_strategies.strategies.base import ScreenGradients, Strategy, by_class, overrides
 from rasterizers.interface import Color
+from rasterizers.modes import in_full_precision
 from rasterizers.native import empty_for
 from rasterizers.told import iteration
 
@@ -160,6 +161,7 @@ class Conductor:
         """Whether the LR render has any use; else Î_LR is the area mean of Î_HR."""
         return self.objective.draws_lr
 
+    @in_full_precision
     def update(
         self,
         params: Mapping[str, Tensor],
@@ -231,6 +233,7 @@ class Conductor:
         losses = {} if from_hr is None else from_hr.losses
         return Update(step, grads, score, ordinary, conflict, {**l_lr.values, **losses}, self.logs())
 
+    @in_full_precision
     def hr_gradients(
         self,
         hr: Shot,
@@ -261,6 +264,7 @@ class Conductor:
         with self.work_log.stage("pictures of extra views"):  # a pseudo view is made when it is first asked for
             return [extra for s in showing for extra in s.extra_views(t)]
 
+    @in_full_precision
     def extra_loss(self, image: Float[Tensor, "h w 3"], extra: ExtraView, t: int) -> Losses:
         """The LR loss of a render of `extra`, weighted by pixel: its value and its cotangent [1, h, w, 3].  Eq. 4
 

@@ -29,9 +29,10 @@ from integration.own_drawing import Drawable
 from integration.replacing import replace_everywhere
 from rasterizers.ahead import drawing_ahead
 from rasterizers.as_gsplat import cameras_of, rasterizer_of
-from rasterizers.autograd import recorded, uncompiled
+from rasterizers.autograd import recorded
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import BackendUnavailable, Camera, Rasterizer
+from rasterizers.modes import uncompiled
 
 _log = logging.getLogger(__name__)
 

@@ -25,8 +25,9 @@ from integration.inria.model_proxy import Overrides, host_output, proxy
 from integration.inria.rows import CarriedRows
 from integration.replacing import replace_everywhere, replace_methods, replaced_attribute
 from integration.views import SuperResolve, sr_source
-from rasterizers.autograd import recorded, uncompiled
+from rasterizers.autograd import recorded
 from rasterizers.interface import Camera
+from rasterizers.modes import uncompiled
 
 _log = logging.getLogger(__name__)
 
@@ -148,6 +149,7 @@ class Attached:
                 self._warn_of_what_was_not_read(overrides, output)
                 return output
 
+            self.detail.forget_gradient()
             return self.attachment.render_view(view, render_at)
 
         return wrapped

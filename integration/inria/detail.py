@@ -53,6 +53,10 @@ class DetailFeature:
         self._adam.step()
         self._adam.zero_grad(set_to_none=True)
 
+    def forget_gradient(self) -> None:
+        """Before a rendering: the host's `zero_grad`, of a step that it has left out, does not reach this Adam."""
+        self._adam.zero_grad(set_to_none=True)
+
     def state_dict(self) -> dict[str, Any]:
         """f_det and the moments of its Adam, for the host's checkpoint."""
         return {"value": self.value.detach().clone(), "adam": self._adam.state_dict()}

@@ -1,12 +1,13 @@
 """A host's optimizers and gradient scaler: f_det and the extra views follow them, and a step without the strategies is told."""
 
 import functools
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
 import torch
 
-from clear_strategies import GCO, P2G, SVS, Conductor
+from clear_strategies import GCO, P2G, SVS, Conductor, FadingOpacity
 from clear_strategies.compose import conductor as composed_conductor
 from clear_strategies.errors import SettingError
 from clear_strategies.merging.detail import DetailRates
@@ -235,3 +236,54 @@ def test_a_loop_that_ends_before_hr_takes_part_is_told(caplog):
     attached(Host(scene), scene, composed_conductor("gco", iterations=120), iterations=120)
     assert "HR takes part from step 7 on" in caplog.text
     assert "the loop has" not in caplog.text
+
+
+@pytest.mark.parametrize("activation", [torch.nn.functional.softplus, torch.sigmoid])
+def test_what_a_loop_computes_before_it_renders_is_of_what_strategies_have_left(activation):
+    """A regularizer, or an activation: `after_step` comes with the step, not with the next rendering."""
+    host, clear, _ = started(FadingOpacity(rate=0.1))
+    p, seen = host.splats, []
+    for _ in range(3):
+        opacities = activation(p["opacities"]).clamp(max=0.99)
+        regularizer = p["opacities"].square().mean()
+        seen.append(p["opacities"].detach().clone())
+        camera = host.photos["view0"].camera
+        image = gsplat_host.drawn(
+            lambda m, q, s, _, *more, o=opacities, **call: host.rasterization(m, q, s, o, *more, **call), p, camera
+        )[0]
+        (image.mean() + 0 * regularizer).backward()
+        faded = p["opacities"].detach().clone()
+        for optimizer in host.optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad()
+        assert torch.equal(seen[-1], faded)
+        assert float((p["opacities"] - faded).max()) < -0.05  # a tenth of the opacity, and Adam's step
+    assert clear.attachment.t == 4
+    clear.remove()
+
+
+def test_frozen_parameters_stay_as_they_are():
+    host, clear, render = started(FadingOpacity(rate=0.1), GCO())
+    for name in ("opacities", "detail"):
+        host.splats[name].requires_grad_(False)
+    before = {name: host.splats[name].detach().clone() for name in ("opacities", "detail")}
+    for i in range(3):
+        render(i).mean().backward()
+        for optimizer in host.optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad()
+    assert not [name for name, x in before.items() if not torch.equal(x, host.splats[name])]
+    clear.remove()
+
+
+def test_gradients_in_autocast_are_those_outside_of_it():
+    def merged(context):
+        host, clear, render = started(GCO(), P2G())
+        with context:
+            render().mean().backward()
+        clear.remove()
+        return {name: p.grad for name, p in host.splats.items() if p.grad is not None}
+
+    expected, found = merged(nullcontext()), merged(torch.autocast("cpu", torch.bfloat16))
+    for name, g in expected.items():
+        torch.testing.assert_close(found[name], g, rtol=1e-5, atol=1e-9)

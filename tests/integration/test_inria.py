@@ -178,6 +178,17 @@ def test_dropped_gaussians_are_not_visible(indices, inria_host, inria_attached):
     assert torch.equal((package["radii"] > 0).nonzero()[:, 0], visible)
 
 
+def test_a_step_that_the_host_leaves_out_leaves_no_gradient_of_f_det(inria_host, inria_attached):
+    clear, gaussians, scene = inria_attached()
+    render, found = clear.wrap(inria_host.render), []
+    for _ in range(3):
+        render(scene.cameras[0], gaussians, None, None)["render"].mean().backward()
+        found.append(clear.detail.value.grad.clone())
+        gaussians.optimizer.zero_grad()  # as a guard against NaN does
+    assert found[0].any()
+    assert torch.equal(found[2], found[0])
+
+
 def test_without_hr_no_sr_images_are_needed(inria_host, inria_capture):
     dropped = Conductor(SVS(dropout=Ramp(maximum=0.2, shape="constant")), objective=WITHOUT_HR)
     opt = options(inria_host, inria_capture, iterations=3)

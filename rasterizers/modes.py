@@ -1,0 +1,42 @@
+"""Modes of torch that a loop may be in, and this package's code must not: `torch.compile` and `torch.autocast`."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import ParamSpec, TypeVar
+
+import torch
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+def in_full_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """The function with torch's autocast off, whose products of matrices would be in half precision."""
+
+    @functools.wraps(function)
+    def called(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        cast = [device for device in ("cpu", "cuda") if torch.is_autocast_enabled(device)]
+        if not cast:
+            return function(*args, **kwargs)
+        with ExitStack() as exact:
+            for device in cast:
+                exact.enter_context(torch.autocast(device, enabled=False))
+            return function(*args, **kwargs)
+
+    return called
+
+
+def uncompiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """The function, which `torch.compile` leaves as it is where compiled code calls it: the kernels take memory, not traces."""
+
+    @functools.wraps(function)
+    def called(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        if torch.compiler.is_compiling():
+            apart: Callable[_P, _R] = torch.compiler.disable(function)  # type: ignore[no-untyped-call]
+            return apart(*args, **kwargs)  # made here, since at import it would take a second
+        return function(*args, **kwargs)
+
+    return called
