@@ -124,7 +124,7 @@ class Attachment:
         )
         self._step: Step | None = None  # of the rendering, until `after_step`
         self._extra = ExtraSteps(params)
-        self._logged: dict[str, deferred.Number] = {}
+        self._logged: dict[str, deferred.Number | Callable[[], deferred.Number]] = {}
         self._own_drawing = OwnDrawing(conductor, params()["means"].device)
         self._hooks: list[Any] = []
         self._hooked: list[torch.optim.Optimizer] = []
@@ -258,8 +258,8 @@ class Attachment:
 
     @property
     def log(self) -> dict[str, float]:
-        """Scalars of the last iteration. On a device, reading them waits for the device."""
-        return deferred.resolve([self._logged | self.conductor.logs()])[0]
+        """Scalars of the last iteration that was merged. On a device, reading them waits for the device."""
+        return deferred.resolve([{name: x() if callable(x) else x for name, x in self._logged.items()}])[0]
 
     def remove(self) -> None:
         """Stop: the host's renderings pass through, and the gradients of one that is still pending stay unmerged."""
@@ -340,13 +340,15 @@ class Attachment:
 
     def _after_step_of(self, optimizer: torch.optim.Optimizer) -> None:
         """Step on extra views; and once all optimizers have stepped, let the strategies do so: what the loop computes of the
-        parameters from then on, before it renders, is of what they have left.
+        parameters from then on, before it renders, is of what they have left. In the iteration in which densification ends they
+        wait for the next rendering, since a host may densify in it, and an anchor is taken after that.
         """
         if self._extra.stepping:
             return
         if steps := self._extra.step(optimizer):
             self.counts["extra views"] += steps
-        if len(self._stepped) == len(self._hooked):
+        may_densify = self.conductor.may_densify
+        if len(self._stepped) == len(self._hooked) and may_densify(self.t) == may_densify(max(1, self.t - 1)):
             self._finish_step()
 
     def _finish_step(self) -> None:
@@ -461,7 +463,8 @@ class Attachment:
                 self.counts["scores written"] += 1
         λ = self.conductor.objective.lambda_hr(self.t)
         losses = {} if hr is None else hr.losses
-        self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **conflict_columns(conflict)}
+        shares = conflict_columns(conflict)
+        self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **shares, **self.conductor.uncounted_logs()}
         if self.counts["merges"] % _LOGGED_EVERY == 0:
             now = self.log
             losses_now = ", ".join(f"L_{name} {now[name]:.4f}" for name in losses) or "no HR"
@@ -492,8 +495,10 @@ class Attachment:
 
 
 def _to_change(p: Tensor) -> Tensor:
-    """What a strategy may change in place: a copy, where the host has frozen the parameter."""
-    return p.detach() if p.requires_grad else p.detach().clone()
+    """What a strategy may change in place: a copy, where the host has frozen the parameter. What a loop has computed of it before
+    it renders stays valid for autograd.
+    """
+    return p.data if p.requires_grad else p.detach().clone()
 
 
 def _rows_of(step: Step | None) -> dict[str, Tensor]:

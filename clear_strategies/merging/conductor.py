@@ -420,7 +420,11 @@ class Conductor:
 
     def logs(self) -> dict[str, Number]:
         """The scalars that the strategies logged in the last iteration."""
-        return {name: x() if callable(x) else x for s in self.strategies for name, x in s.logs.items()} | self._replayed
+        return {name: x() if callable(x) else x for name, x in self.uncounted_logs().items()}
+
+    def uncounted_logs(self) -> dict[str, Number | Callable[[], Number]]:
+        """The same as the strategies logged them: some are what computes the scalar."""
+        return {name: x for s in self.strategies for name, x in s.logs.items()} | self._replayed
 
     def take_logs(self, known: Mapping[str, Number]) -> dict[str, Number]:
         """The scalars that were logged besides the known ones, and which are then logged no more."""
