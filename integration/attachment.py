@@ -8,7 +8,8 @@ One training iteration:
    parameter becomes the merged gradient. If a strategy has a densification score, the tensor that the densifier reads
    holds it; otherwise the densifier's statistic stays the host's own.
 3. Gradient clipping, unscaling, the optimizer step and densification are the host's, in any order.
-4. After the host's optimizer has stepped, it steps once more on the gradient of each extra view.
+4. After the host's optimizer has stepped, it steps once more on the gradient of each extra view. Once all optimizers have
+   stepped, the strategies do what they do after a step.
 
 The merge runs at the end of `backward()`, not in an optimizer hook. Gradient clipping therefore sees the merged gradient,
 optimizers other than `torch.optim.Optimizer` work, and so do hosts that densify before the step (3DGS) as well as hosts
