@@ -23,11 +23,11 @@ from clear_strategies.core.work_log import WorkLog
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide
 from clear_strategies.merging.replays import (
-    RECORDING,
     Kind,
+    Recorded,
     RecordedWork,
-    Replays,
     copied,
+    replays_on,
     why_strategies_are_not_recorded,
     write,
 )
@@ -135,7 +135,7 @@ _Work = Callable[[_Given, bool], tuple[Any, dict[str, Number]]]
 """Work on what is given, and whether it is being recorded. It returns what it makes, and its numbers where it is."""
 
 
-class _Recorded:
+class _Recorded(Recorded[_Given, tuple[Any, dict[str, Number]]]):
     """The recording of one kind of work, and the tensors from which it reads what it is given."""
 
     def __init__(self, work_log: WorkLog, rasterizer: Recordable, given: _Given, work: _Work) -> None:
@@ -143,14 +143,8 @@ class _Recorded:
         self._own = own.tensors(rasterizer)
         self._work = RecordedWork(given.background.device, work_log, lambda: work(own, True))
 
-    def holds_at(self, t: int) -> bool:
-        """See `Recorded`."""
-        return self._work.holds_at(t)
-
-    def replay(self, given: _Given) -> bool:
-        """See `Recorded`."""
+    def _write(self, given: _Given) -> None:
         write(self._own, given.tensors(self._rasterizer))
-        return self._work.replay()
 
     def outcome(self, _: _Given) -> tuple[Any, dict[str, Number]]:
         """See `Recorded`."""
@@ -166,12 +160,10 @@ class OwnDrawing:
 
     def __init__(self, conductor: Conductor, device: torch.device) -> None:
         self._conductor = conductor
-        self._replays: Replays | None = None
-        if device.type in RECORDING:
-            self._replays = Replays(device, conductor.work_log, "the replay of HR")
-            if (reason := next(why_strategies_are_not_recorded(conductor), None)) is not None:
-                self._replays = None
-                _log.info("HR is not replayed: %s.", reason)
+        self._replays = replays_on(device, conductor.work_log, "the replay of HR")
+        if self._replays is not None and (reason := next(why_strategies_are_not_recorded(conductor), None)) is not None:
+            self._replays = None
+            _log.info("HR is not replayed: %s.", reason)
 
     @in_full_precision
     @torch.no_grad()

@@ -19,7 +19,7 @@ from clear_strategies.core.gradients import Colour, Grads
 from clear_strategies.core.step import Step
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Merged
-from clear_strategies.merging.replays import RECORDING, Kind, RecordedWork, Replays, copied, write
+from clear_strategies.merging.replays import Kind, Recorded, RecordedWork, copied, replays_on, write
 from rasterizers.told import iteration, unread
 
 _FINITE: Final = "finite"
@@ -59,7 +59,7 @@ class _Given:
         return _Given(self.params, _copied(self.lr), _copied(self.hr), own, self.out)
 
 
-class _Recorded:
+class _Recorded(Recorded[_Given, tuple[Merged, dict[str, Number]]]):
     """The recording of one kind of merge, and the tensors from which it reads what it is given."""
 
     def __init__(self, conductor: Conductor, given: _Given) -> None:
@@ -76,15 +76,6 @@ class _Recorded:
 
         self._write(given)
         self._work = RecordedWork(first.device, conductor.work_log, work)
-
-    def holds_at(self, t: int) -> bool:
-        """See `Recorded`."""
-        return self._work.holds_at(t)
-
-    def replay(self, given: _Given) -> bool:
-        """See `Recorded`."""
-        self._write(given)
-        return self._work.replay()
 
     def outcome(self, given: _Given) -> tuple[Merged, dict[str, Number]]:
         """See `Recorded`. What the strategies have logged is the second."""
@@ -109,9 +100,7 @@ class ReplayedMerge:
 
     def __init__(self, conductor: Conductor, device: torch.device) -> None:
         self._conductor = conductor
-        self._replays: Replays | None = None
-        if device.type in RECORDING:
-            self._replays = Replays(device, conductor.work_log, "the replay of the merge")
+        self._replays = replays_on(device, conductor.work_log, "the replay of the merge")
 
     def __call__(
         self, params: Mapping[str, Tensor], g_lr: Grads, g_hr: Grads, step: Step | None, t: int, out: Mapping[str, Tensor]

@@ -8,9 +8,10 @@ recording or a replay, all that follows is live.
 from __future__ import annotations
 
 import logging
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -25,8 +26,8 @@ from rasterizers.told import Guarded
 
 _log = logging.getLogger(__name__)
 
-RECORDING: Final = {"cuda"}
-"""The kinds of devices whose work can be recorded."""
+DEVICES: Final = {"cuda"}
+"""The kinds of devices whose work can be recorded; tests add the CPU."""
 
 LIVE: Final = "live in place of a replay"
 """The work log's entry for work that was not replayed, by the reason. It has no runs, so that none seem saved."""
@@ -36,8 +37,7 @@ _RESTLESS: Final = 20  # changes of memory without a replay between them, where 
 _MOST_KINDS: Final = 8  # a recording keeps the memory of its work
 
 T = TypeVar("T")
-G_contra = TypeVar("G_contra", contravariant=True)
-T_co = TypeVar("T_co", covariant=True)
+G = TypeVar("G")
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,20 +55,27 @@ class Kind:
     facts: tuple[Any, ...]
 
 
-class Recorded(Protocol[G_contra, T_co]):
-    """A recording of one kind of work."""
+class Recorded(ABC, Generic[G, T]):
+    """A recording of one kind of work, which reads what it is given from tensors of its own."""
+
+    _work: RecordedWork
 
     def holds_at(self, t: int) -> bool:
         """Whether what Python has decided by the iteration, as a strategy may, is the same at t."""
-        ...
+        return self._work.holds_at(t)
 
-    def replay(self, given: G_contra) -> bool:
+    def replay(self, given: G) -> bool:
         """Do the work; False where the recording does not hold for it, before anything has changed."""
-        ...
+        self._write(given)
+        return self._work.replay()
 
-    def outcome(self, given: G_contra) -> T_co:
+    @abstractmethod
+    def _write(self, given: G) -> None:
+        """Write what the work is given to where the recorded one reads it."""
+
+    @abstractmethod
+    def outcome(self, given: G) -> T:
         """What the work has made."""
-        ...
 
 
 class Replays:
@@ -173,6 +180,11 @@ class RecordedWork:
             on_device = isinstance(counted, deferred.Element)
             self._work_log.skip(name, reason, counted.vector[counted.k].long() if on_device else count)  # type: ignore[union-attr]
         return made, row
+
+
+def replays_on(device: torch.device, work_log: WorkLog, name: str) -> Replays | None:
+    """`Replays`; None where work on the device cannot be recorded."""
+    return Replays(device, work_log, name) if device.type in DEVICES else None
 
 
 def why_strategies_are_not_recorded(conductor: Conductor) -> Iterator[str]:

@@ -21,6 +21,7 @@ from clear_strategies.core.view import Photo, View
 from clear_strategies.kernels import losses
 from clear_strategies.merging.replays import (
     Kind,
+    Recorded,
     RecordedWork,
     Replays,
     copied,
@@ -94,7 +95,7 @@ class IterationReplays:
         return Kind((len(s.field), *addresses), tuple(shapes), tuple(facts))
 
 
-class _Recorded:
+class _Recorded(Recorded[Given, Any]):
     """The recording of one kind of iteration, and the tensors from which it reads what it is given."""
 
     def __init__(
@@ -107,15 +108,6 @@ class _Recorded:
         self._own = self._read_of(own)
         self._write(given)
         self._work = RecordedWork(s.device, s.conductor.work_log, lambda: learn(s, drawn_by, own))
-
-    def holds_at(self, t: int) -> bool:
-        """See `Recorded`."""
-        return self._work.holds_at(t)
-
-    def replay(self, given: Given) -> bool:
-        """See `Recorded`."""
-        self._write(given)
-        return self._work.replay()
 
     def outcome(self, given: Given) -> Any:
         """See `Recorded`."""

@@ -203,8 +203,8 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     from clear_strategies.kernels import native, reconcile
     from clear_strategies.kernels.per_gaussian import dispatch
     from clear_strategies.kernels.reconcile import warp as warp_merge
+    from clear_strategies.merging import replays
     from clear_strategies.training import replay
-    from integration import own_drawing, replayed_merge
     from rasterizers import recording, warp_runtime
     from rasterizers.warp_backend import frame, settings
 
@@ -261,7 +261,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         deferred: {"is_immediate": lambda x: False},
         native: {"available": lambda: False},
         dispatch: {"DEVICES": {"cpu"}},
-        **{m: {"RECORDING": {"cpu"}} for m in (own_drawing, replayed_merge)},
+        replays: {"DEVICES": {"cpu"}},
         reconcile: {"_for_device": lambda device: warp_merge},
         rasterizers.native: {"empty": on_no_cpu},
         frame: {"DEFERRED_COUNTS": {"cpu": True}},

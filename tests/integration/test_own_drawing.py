@@ -10,10 +10,11 @@ import clear_strategies as cs
 import rasterizers
 from clear_strategies import Conductor
 from clear_strategies.core.view import ExtraView
+from clear_strategies.merging import replays
 from clear_strategies.merging.replays import LIVE
 from clear_strategies.merging.skips import Skips
 from clear_strategies.schedules import Ramp, WarmupDecay
-from integration import own_drawing, replayed_merge
+from integration import own_drawing
 from rasterizers.recording import running
 from tests.helpers import gsplat_host, toy
 from tests.helpers.backends import needs
@@ -209,8 +210,7 @@ def both(monkeypatch, **settings):
     """The replayed training, after a comparison with the live one: the same bits."""
     settings.setdefault("objective", WARP)
     replayed = trained("warp", **settings)
-    for module in (own_drawing, replayed_merge):
-        monkeypatch.setattr(module, "RECORDING", set())
+    monkeypatch.setattr(replays, "DEVICES", set())
     live = trained("warp", **settings)
     assert not [name for name, x in live[0].items() if not torch.equal(x, replayed[0][name])]
     assert replayed[1] == live[1]
@@ -304,8 +304,7 @@ def test_replays_over_densification_resets_evaluation_and_resuming(monkeypatch, 
         return {name: p.detach() for name, p in resumed.splats.items()}, logs
 
     replayed, logs = run()
-    for module in (own_drawing, replayed_merge):
-        monkeypatch.setattr(module, "RECORDING", set())
+    monkeypatch.setattr(replays, "DEVICES", set())
     live, _ = run()
     assert len(live["means"]) not in (40, 0)
     assert not [name for name, x in live.items() if not torch.equal(x, replayed[name])]
