@@ -116,19 +116,19 @@ def collect(folders: Iterable[Path]) -> list[FinishedRun]:
 
 def _told_apart(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
     """The runs with other names for scenes of one name that are not the same: of other photos, or scored on other views."""
-
-    def photos(run: FinishedRun) -> str:
-        """Where they lay; runs that have the same cameras have the same."""
-        cameras, alike = _text(run.folder / CAMERAS), (other for other in runs if other.scene == run.scene)
-        return next(o.data for o in alike if o.data == run.data or _text(o.folder / CAMERAS) == cameras)
-
+    cameras = {run: _text(run.folder / CAMERAS) for run in runs}
+    alike = {run: [other for other in runs if other.scene == run.scene] for run in runs}
+    # Where the photos lay; runs that have the same cameras have the same.
+    photos = {
+        run: next(other.data for other in of if other.data == run.data or cameras[other] == cameras[run])
+        for run, of in alike.items()
+    }
     apart = []
-    for run in runs:
-        alike = [other for other in runs if other.scene == run.scene]
+    for run, of in alike.items():
         scene = run.scene
-        if len(places := {photos(other) for other in alike}) > 1:
-            scene = f"{scene} of {_shortest(photos(run), places)}"
-        if len({other.views for other in alike if photos(other) == photos(run)}) > 1:
+        if len(places := {photos[other] for other in of}) > 1:
+            scene = f"{scene} of {_shortest(photos[run], places)}"
+        if len({other.views for other in of if photos[other] == photos[run]}) > 1:
             scene = f"{scene}, {len(run.views)} views: {', '.join(run.views[:3])}{', …' if len(run.views) > 3 else ''}"
         apart.append(replace(run, scene=scene))
     for scene in dict.fromkeys(run.scene for run, other in zip(runs, apart, strict=True) if run.scene != other.scene):
