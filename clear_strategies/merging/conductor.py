@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, Final, TypeVar
 
 import torch
@@ -315,8 +314,9 @@ class Conductor:
         if (lambda_hr is not None or λ > 0) and reconcile.common_groups(g_lr, g_hr):
             products = reconcile.products(g_lr, g_hr)
             conflict = products.conflict()  # before correction
-            both = partial(_both, g_lr, g_hr.without_detail(), out)
-            answer = self.reconciled(products, step, both, finite=finite)
+            answer = self.reconciled(
+                products, step, lambda: (dense(g_lr, out), dense(g_hr.without_detail(), out)), finite=finite
+            )
             if isinstance(answer, Weights):
                 weights = answer  # ĝ^HR           Eq. 6, 7, 11
             else:
@@ -484,10 +484,6 @@ class Conductor:
 def _screen_gradients(lr: Float[Tensor, "N 2"], hr: HrSide, weights: LossWeights) -> ScreenGradients:
     hf = None if hr.hf is None else screen_of(hr.hf)
     return ScreenGradients(lr, *per_gaussian.screens(lr, screen_of(hr.base), hf, hr.size, weights))
-
-
-def _both(g_lr: Grads, g_hr: Grads, like: Mapping[str, Tensor]) -> tuple[Grads, Grads]:
-    return dense(g_lr, like), dense(g_hr, like)
 
 
 def _vjp(shot: Shot, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[Grads]:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
 from typing import Final, Literal
 
 import torch
@@ -124,8 +123,7 @@ class CompiledStep:
         if hr is not None and λ > 0:
             products = gaussians.products()
             conflict = products.conflict()  # before correction
-            both = partial(_dense, gaussians, params)
-            answer = self.conductor.reconciled(products, hr.step, both, finite=True)
+            answer = self.conductor.reconciled(products, hr.step, lambda: _dense(gaussians, params), finite=True)
             if isinstance(answer, Weights):
                 weights = answer  # ĝ^HR           Eq. 6, 7, 11
             else:
