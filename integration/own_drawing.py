@@ -22,19 +22,12 @@ from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide
-from clear_strategies.merging.replays import (
-    Kind,
-    Recorded,
-    RecordedWork,
-    copied,
-    replays_on,
-    why_strategies_are_not_recorded,
-    write,
-)
+from clear_strategies.merging.replays import RecordedWork, replays_on, why_strategies_are_not_recorded
 from integration.autograd_shot import AutogradShot, HostOutput, Target, every_number, to_parameters
 from rasterizers.autograd import BackwardHook, Drawing
 from rasterizers.interface import Camera, Rasterizer, Recordable, Splats, over
 from rasterizers.modes import in_full_precision
+from rasterizers.replays import Kind, Recorded, copied, write
 from rasterizers.told import name_of_view
 
 _log = logging.getLogger(__name__)
@@ -137,6 +130,8 @@ _Work = Callable[[_Given, bool], tuple[Any, dict[str, Number]]]
 
 class _Recorded(Recorded[_Given, tuple[Any, dict[str, Number]]]):
     """The recording of one kind of work, and the tensors from which it reads what it is given."""
+
+    _work: RecordedWork
 
     def __init__(self, work_log: WorkLog, rasterizer: Recordable, given: _Given, work: _Work) -> None:
         own, self._rasterizer = given.copied(), rasterizer

@@ -19,7 +19,8 @@ from clear_strategies.core.gradients import Colour, Grads
 from clear_strategies.core.step import Step
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Merged
-from clear_strategies.merging.replays import Kind, Recorded, RecordedWork, copied, replays_on, write
+from clear_strategies.merging.replays import RecordedWork, replays_on
+from rasterizers.replays import Kind, Recorded, copied, write
 from rasterizers.told import iteration, unread
 
 _FINITE: Final = "finite"
@@ -61,6 +62,8 @@ class _Given:
 
 class _Recorded(Recorded[_Given, tuple[Merged, dict[str, Number]]]):
     """The recording of one kind of merge, and the tensors from which it reads what it is given."""
+
+    _work: RecordedWork
 
     def __init__(self, conductor: Conductor, given: _Given) -> None:
         own, first = given.copied(), next(iter(given.out.values()))

@@ -74,6 +74,10 @@ class Recording(Generic[T]):
         """Note a launch that torch does not see, which reads and writes these tensors."""
         self._watch.keep(tensors)
 
+    def holds_at(self, t: int) -> bool:
+        """Whether what Python has decided by the iteration is the same at t."""
+        return all(guard(t) for guard in self.guards)
+
     def replay(self) -> bool:
         """Do the work again; False: it ended at a `pause` where what was recorded does not hold."""
         for work, holds in self._parts:

@@ -1,7 +1,7 @@
 """Iterations that are recorded and replayed: on a GPU, an iteration takes the host longer than the kernels.
 
 What an iteration does with its view (render, losses, gradients, merge and step, statistics), and with an extra view, is
-recorded once for each kind of iteration, see `merging.replays`, and done again while the tensors of the field lie where they
+recorded once for each kind of iteration, see `rasterizers.replays`, and done again while the tensors of the field lie where they
 lay. Before a replay, what the iteration is given is copied to where the recorded one read it: photo, SR image, what P2G looks
 up, cameras, dropout mask, background, and the numbers of the optimizer's step. All else is live: what strategies and densifier
 do after the step, and every iteration that cannot be replayed. A replay has the bits of the live iteration.
@@ -12,6 +12,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -19,19 +20,12 @@ from torch import Tensor
 
 from clear_strategies.core.view import Photo, View
 from clear_strategies.kernels import losses
-from clear_strategies.merging.replays import (
-    Kind,
-    Recorded,
-    RecordedWork,
-    Replays,
-    copied,
-    why_strategies_are_not_recorded,
-    write,
-)
+from clear_strategies.merging.replays import LIVE, RecordedWork, why_strategies_are_not_recorded
 from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.given import Given, GivenExtra, GivenView, L, Learned
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Rasterizer, Recordable
+from rasterizers.replays import Kind, Recorded, Replays, copied, write
 from rasterizers.told import name_of_view
 from rasterizers.warp_runtime import sent
 
@@ -65,7 +59,7 @@ class IterationReplays:
 
     def __init__(self, s: TrainState, rasterizer: Recordable, compiled_step: CompiledStep) -> None:
         self._state, self._rasterizer, self._count = s, rasterizer, compiled_step.count
-        self._replays = Replays(s.device, s.conductor.work_log, "fit.replay")
+        self._replays = Replays(s.device, "fit.replay", partial(s.conductor.work_log.skip, LIVE))
 
     def learn(self, given: Given, learn: Callable[..., L]) -> L:
         """See `given.Replayer`."""
@@ -97,6 +91,8 @@ class IterationReplays:
 
 class _Recorded(Recorded[Given, Any]):
     """The recording of one kind of iteration, and the tensors from which it reads what it is given."""
+
+    _work: RecordedWork
 
     def __init__(
         self, s: TrainState, rasterizer: Recordable, given: Given, count: Callable[[int], None], learn: Callable[..., Learned]

@@ -203,9 +203,8 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     from clear_strategies.kernels import native, reconcile
     from clear_strategies.kernels.per_gaussian import dispatch
     from clear_strategies.kernels.reconcile import warp as warp_merge
-    from clear_strategies.merging import replays
     from clear_strategies.training import replay
-    from rasterizers import recording, warp_runtime
+    from rasterizers import recording, replays, warp_runtime
     from rasterizers.warp_backend import frame, settings
 
     cuda = StrictCuda()
@@ -243,6 +242,10 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         cuda.ask("allocate", by_warp=True)
         return allocate(*args, **kwargs)
 
+    def sends(numbers: Any, device: Any) -> Any:
+        cuda.ask("pin")
+        return numbers
+
     def on_no_cpu(*_: Any) -> Any:
         raise BackendUnavailable("this memory is the CPU's")
 
@@ -265,7 +268,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         reconcile: {"_for_device": lambda device: warp_merge},
         rasterizers.native: {"empty": on_no_cpu},
         frame: {"DEFERRED_COUNTS": {"cpu": True}},
-        **{m: {"sent": lambda numbers, device: numbers.pin_memory()} for m in (warp_runtime, settings, replay)},
+        **{m: {"sent": sends} for m in (warp_runtime, settings, replay)},
     }  # fmt: skip
     for owner, values in patches.items():
         for name, value in values.items():

@@ -10,11 +10,11 @@ import clear_strategies as cs
 import rasterizers
 from clear_strategies import Conductor
 from clear_strategies.core.view import ExtraView
-from clear_strategies.merging import replays
 from clear_strategies.merging.replays import LIVE
 from clear_strategies.merging.skips import Skips
 from clear_strategies.schedules import Ramp, WarmupDecay
 from integration import own_drawing
+from rasterizers import replays
 from rasterizers.recording import running
 from tests.helpers import gsplat_host, toy
 from tests.helpers.backends import needs

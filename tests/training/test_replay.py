@@ -12,12 +12,10 @@ import torch
 import clear_strategies as cs
 import rasterizers
 from clear_strategies.core.view import ExtraView, View
-from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.density.mcmc import MCMC
-from clear_strategies.merging import replays
-from clear_strategies.merging.replays import LIVE, Kind, Replays
+from clear_strategies.merging.replays import LIVE
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
 from clear_strategies.training import checkpoint, loop
 from clear_strategies.training.compiled_step import CompiledStep
@@ -26,7 +24,9 @@ from clear_strategies.training.optim import LearningRates
 from clear_strategies.training.replay import replays_for
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
-from rasterizers.recording import running
+from rasterizers import replays
+from rasterizers.recording import Recording, running
+from rasterizers.replays import Kind, Replays
 from tests.helpers.backends import needs
 from tests.helpers.short_run import SCENE, tensors, with_depth
 from tests.training.test_resume import without_time
@@ -233,7 +233,7 @@ def test_kinds_beyond_the_most_are_live_and_counted(monkeypatch):
 
 
 def test_recordings_of_an_earlier_structure_are_dropped():
-    kept, made = Replays(DEVICE, WorkLog(), ""), []
+    kept, made = Replays(DEVICE, ""), []
 
     def recorded():
         made.append(SimpleNamespace(holds_at=lambda t: True, replay=lambda _: True, outcome=lambda _: "replayed"))
@@ -247,7 +247,7 @@ def test_recordings_of_an_earlier_structure_are_dropped():
 
 
 def test_memory_that_is_new_in_each_iteration_is_told_and_not_recorded(caplog):
-    kept = Replays(DEVICE, WorkLog(), "")
+    kept = Replays(DEVICE, "")
     found = [kept.do(Kind((k,), (), ()), k, None, live=lambda: "live", record=fails) for k in range(30)]
     assert set(found) == {"live"}
     assert caplog.text.count("Write to Strategy.state in place") == 1
@@ -321,7 +321,7 @@ def test_what_cannot_be_recorded_is_live_from_then_on_and_one_line_says_why(faul
 
 def test_where_a_replay_fails_iterations_are_live_from_then_on(monkeypatch, caplog):
     live, other = (trained(start(density=False), replayed=r, until=5) for r in (False, True))
-    monkeypatch.setattr(replays.Recording, "replay", fails)
+    monkeypatch.setattr(Recording, "replay", fails)
     require_same(trained(other, replayed=True, until=8), trained(live, replayed=False, until=8))
     assert (replays_of(other), live_in(other)) == (3, {FIRST: 2, FAILED: 3})
     require_one_line(caplog, 6)

@@ -1,0 +1,159 @@
+"""Work on CUDA that is recorded by its kind and replayed; see `rasterizers.recording`.
+
+Work of a new kind is live first, so that kernels are compiled and caches filled. The next time it is recorded, and then it is
+replayed while the tensors that it reads lie where they lay. Where they lie elsewhere, it is recorded anew. Whatever fails in a
+recording or a replay, all that follows is live.
+"""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Generic, Protocol, TypeVar
+
+import torch
+from torch import Tensor
+
+from rasterizers.recording import on_side_stream
+
+_log = logging.getLogger(__name__)
+
+DEVICES: Final = {"cuda"}
+"""The kinds of devices whose work can be recorded; tests add the CPU."""
+
+_FAILED: Final = "a recording failed"
+_RESTLESS: Final = 20  # changes of memory without a replay between them, where no structure changes so often
+_MOST_KINDS: Final = 8  # a recording keeps the memory of its work
+
+T = TypeVar("T")
+G = TypeVar("G")
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What Python decides by in the work: work of one kind launches the same kernels.
+
+    Args:
+        addresses: where the tensors lie that it reads in place, and how many rows they have. When this changes, every recording
+            is dropped.
+        shapes, facts: whatever else Python looks at.
+    """
+
+    addresses: tuple[int, ...]
+    shapes: tuple[Any, ...]
+    facts: tuple[Any, ...]
+
+
+def can_record(device: torch.device) -> bool:
+    """Whether work on the device can be recorded."""
+    return device.type in DEVICES
+
+
+class Work(Protocol):
+    """A `Recording`, or what has one."""
+
+    def holds_at(self, t: int) -> bool: ...
+
+    def replay(self) -> bool: ...
+
+
+class Recorded(ABC, Generic[G, T]):
+    """A recording of one kind of work, which reads what it is given from tensors of its own."""
+
+    _work: Work
+
+    def holds_at(self, t: int) -> bool:
+        """Whether what Python has decided by the iteration, as a strategy may, is the same at t."""
+        return self._work.holds_at(t)
+
+    def replay(self, given: G) -> bool:
+        """Do the work; False where the recording does not hold for it, before anything has changed."""
+        self._write(given)
+        return self._work.replay()
+
+    @abstractmethod
+    def _write(self, given: G) -> None:
+        """Write what the work is given to where the recorded one reads it."""
+
+    @abstractmethod
+    def outcome(self, given: G) -> T:
+        """What the work has made."""
+
+
+class Replays:
+    """The recordings of one training, or of the drawings of one thread.
+
+    Args:
+        name: of what ends where a recording fails, for the log.
+        count: is told the reason whenever work is live.
+    """
+
+    def __init__(self, device: torch.device, name: str, count: Callable[[str], None] = lambda reason: None) -> None:
+        self._device, self._name, self._count = device, name, count
+        self._recorded: dict[Kind, Any] = {}  # None: to be recorded
+        # What work that was live has in common with such whose tensors lie elsewhere.
+        self._done = set[tuple[Any, ...]]()
+        self._addresses: tuple[int, ...] = ()
+        self._moves = 0  # changes of these since the last replay
+        self._turns = 0  # how often a recording did not hold at its iteration
+        self._failed = False
+
+    def do(self, kind: Kind, t: int, given: Any, *, live: Callable[[], T], record: Callable[[], Recorded[Any, T]]) -> T:
+        """Do the work: by a replay, while it is recorded, or live."""
+        if self._failed:
+            return self._live(live, _FAILED)
+        if kind.addresses != self._addresses:  # the structure has changed, and with it everything that was recorded
+            self._recorded.clear()
+            self._addresses, self._moves = kind.addresses, self._moves + 1
+            if self._moves == _RESTLESS:
+                _log.warning(
+                    "Nothing is replayed, so that on a GPU an iteration takes two to three times as long: in each one, a "
+                    "tensor of the field or of a strategy's state is a new one. Write to Strategy.state in place, by copy_()."
+                )
+        if kind not in self._recorded:
+            if len(self._recorded) == _MOST_KINDS:
+                return self._live(live, f"more than {_MOST_KINDS} kinds")
+            self._recorded[kind] = None
+            alike = len(kind.addresses), kind.shapes, kind.facts
+            if alike not in self._done or self._moves > 1:  # where nothing lasts, a recording does not pay
+                self._done.add(alike)
+                with on_side_stream(self._device):  # some caches are of a stream
+                    return self._live(live, "the first of its kind")
+        try:
+            known = self._recorded[kind]
+            if known is not None and not known.holds_at(t):
+                known, self._turns = None, self._turns + 1
+                if self._turns > _MOST_KINDS:
+                    raise RuntimeError("a strategy decides by the iteration, and again and again another way.")
+            recorded = record() if known is None else known if known.replay(given) else None
+            self._moves = 0 if recorded is known is not None else self._moves
+            reason = "the recorded lists of pairs are too short"  # recorded anew, with space for more
+        except Exception as error:
+            self._failed, recorded, reason = True, None, _FAILED
+            self._recorded.clear()
+            cause = f"{type(error).__name__}: {error}".partition("\n")[0]
+            _log.warning("%s ends at t=%d, and iterations are live from now on: %s", self._name, t, cause)
+        self._recorded[kind] = recorded
+        return self._live(live, reason) if recorded is None else recorded.outcome(given)
+
+    def _live(self, live: Callable[[], T], reason: str) -> T:
+        self._count(reason)
+        return live()
+
+
+def copied(x: Tensor | None) -> Tensor | None:
+    return None if x is None else x.clone()
+
+
+def write(own: Sequence[Tensor | None], given: Sequence[Tensor | None]) -> None:
+    """Write what work is given to where the recorded one reads it: tensors of one layout by one kernel."""
+    pairs = [(x, y) for x, y in zip(own, given, strict=True) if x is not None and y is not None]
+    alike = [(x, y) for x, y in pairs if x.dtype == y.dtype == torch.float32 and x.stride() == y.stride()]
+    together = {id(x) for x, _ in alike}
+    if alike:
+        torch._foreach_copy_([x for x, _ in alike], [y for _, y in alike])
+    for x, y in pairs:
+        if id(x) not in together:
+            x.copy_(y)
