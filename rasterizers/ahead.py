@@ -75,6 +75,10 @@ def drawing_ahead(viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width:
         _ahead.wanted = _ahead.kept = None
 
 
+def is_drawing_ahead() -> bool:
+    return _ahead.wanted is not None or _ahead.kept is not None
+
+
 def draw_or_take(rasterizer: Rasterizer, splats: Splats, camera: Camera, *, depth: bool) -> Rendering:
     """The image, or the same that was drawn ahead."""
     return _ahead.draw(rasterizer, splats, camera, depth)

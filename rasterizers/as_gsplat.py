@@ -65,6 +65,7 @@ def rasterization(
     *,
     backend: str = "auto",
     rgb_offset: Float[Tensor, "*B N 3"] | None = None,
+    replay: bool = True,
     **more: Any,
 ) -> tuple[Float[Tensor, "*B C H W X"], Float[Tensor, "*B C H W 1"], dict[str, Any]]:
     """Draw Gaussians as gsplat's `rasterization` does, by a backend of this package: pinhole cameras, any number of channels.
@@ -84,6 +85,8 @@ def rasterization(
         more: gsplat's other arguments. Those that change only how it computes have no effect.
         backend: a name of `rasterizers.load`.
         rgb_offset: added to the colours before their clamp at 0, with `sh_degree` only; gsplat has no such argument.
+        replay: on CUDA with Warp, replay the kernels of drawings with gradients in place of launching each of them. The bits are
+            the same, but with `absgrad` nothing is replayed.
 
     Returns:
         images, alphas, and `info`: `means2d` [*B, C, N, 2] (`retain_grad` works); `radii` [*B, C, N, 2] in pixels, `depths`,
@@ -99,6 +102,7 @@ def rasterization(
     """
     _require_supported(render_mode, rasterize_mode, more)
     batch, cameras = means.shape[:-2], viewmats.shape[-3]
+    replays = replay and not absgrad and torch.is_grad_enabled()
     n_scenes = batch.numel()
     shape = _Shape(batch, means.shape[-2], cameras, sh_degree, "RGB" in render_mode)
     shape.require(quats, scales, opacities, colors, viewmats, Ks, backgrounds, rgb_offset)
@@ -125,7 +129,7 @@ def rasterization(
             views.append(
                 _View(
                     rasterizer, camera, poses[c], inputs, sh_degree,
-                    None if behind is None else behind[c], render_mode,
+                    None if behind is None else behind[c], render_mode, replays,
                 )
             )  # fmt: skip
     drawn = [view.parts() for view in views]
@@ -173,6 +177,7 @@ class _View:
     sh_degree: int | None
     background: Float[Tensor, " D"] | None
     render_mode: str
+    replays: bool
 
     def parts(self) -> list[_Part]:
         found: list[_Part] = []
@@ -181,7 +186,7 @@ class _View:
         if "RGB" in self.render_mode and self.sh_degree is not None:
             behind = [0.0] * 3 if self.background is None else self.background.tolist()
             rasterizer, bands = over(self.rasterizer, cast(Any, tuple(behind))), (self.sh_degree + 1) ** 2
-            rendered = render(rasterizer, self.inputs, bands, self.camera, depth=depth)
+            rendered = render(rasterizer, self.inputs, bands, self.camera, depth=depth, replays=self.replays)
             found.append(_Part(rendered, self.inputs, 0.0, 1.0, 3))
         elif "RGB" in self.render_mode:
             for three in self._threes():
@@ -238,7 +243,8 @@ class _View:
         low, span = low_and_span(colors, behind)
         inputs = self.inputs._replace(colors=constant_band((colors - low) / span), rgb_offset=None)
         behind = [(x - low) / span for x in behind]
-        rendered = render(over(self.rasterizer, cast(Any, tuple(behind))), inputs, 1, self.camera, depth=depth)
+        rasterizer = over(self.rasterizer, cast(Any, tuple(behind)))
+        rendered = render(rasterizer, inputs, 1, self.camera, depth=depth, replays=self.replays)
         return _Part(rendered, inputs, low, span, keeps)
 
 

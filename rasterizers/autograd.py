@@ -18,7 +18,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rasterizers.ahead import draw_or_take
+from rasterizers import replayed
+from rasterizers.ahead import draw_or_take, is_drawing_ahead
 from rasterizers.checks import require_absgrad, require_depth
 from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, over
 from rasterizers.modes import in_full_precision, uncompiled
@@ -166,12 +167,22 @@ class Rendered(NamedTuple):
     bands: int  # of the colours
 
 
-def render(rasterizer: Rasterizer, inputs: Inputs, bands: int, camera: Camera, *, depth: bool) -> Rendered:
+def render(
+    rasterizer: Rasterizer, inputs: Inputs, bands: int, camera: Camera, *, depth: bool, replays: bool = False
+) -> Rendered:
+    """Draw.
+
+    Args:
+        replays: the drawing may be a replay, and a backward pass follows.
+    """
     if depth:
         require_depth(rasterizer)
     splats = inputs.splats(bands)
     with torch.no_grad():
-        rendering = draw_or_take(rasterizer, splats, camera, depth=depth)
+        if replays and not is_drawing_ahead():
+            rendering = replayed.draw(rasterizer, splats, inputs.colors.detach()[:, :bands], camera, depth=depth)
+        else:
+            rendering = draw_or_take(rasterizer, splats, camera, depth=depth)
     return Rendered(rendering, rasterizer, camera, bands)
 
 

@@ -204,7 +204,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     from clear_strategies.kernels.per_gaussian import dispatch
     from clear_strategies.kernels.reconcile import warp as warp_merge
     from clear_strategies.training import replay
-    from rasterizers import recording, replays, warp_runtime
+    from rasterizers import recording, replayed, replays, warp_runtime
     from rasterizers.warp_backend import frame, settings
 
     cuda = StrictCuda()
@@ -265,10 +265,11 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         native: {"available": lambda: False},
         dispatch: {"DEVICES": {"cpu"}},
         replays: {"DEVICES": {"cpu"}},
+        replayed: {"_threads": replayed._Threads()},
         reconcile: {"_for_device": lambda device: warp_merge},
         rasterizers.native: {"empty": on_no_cpu},
         frame: {"DEFERRED_COUNTS": {"cpu": True}},
-        **{m: {"sent": sends} for m in (warp_runtime, settings, replay)},
+        **{m: {"sent": sends} for m in (warp_runtime, settings, replay, replayed)},
     }  # fmt: skip
     for owner, values in patches.items():
         for name, value in values.items():

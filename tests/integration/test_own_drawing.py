@@ -16,7 +16,7 @@ from clear_strategies.schedules import Ramp, WarmupDecay
 from integration import own_drawing
 from rasterizers import replays
 from rasterizers.recording import running
-from tests.helpers import gsplat_host, toy
+from tests.helpers import toy
 from tests.helpers.backends import needs
 from tests.helpers.gsplat_host import Host, attached, drawn
 from tests.helpers.host_parts import HR_FROM_START
@@ -106,14 +106,15 @@ def transparent(scene):
 
 
 def trained(
-    hr_by, *, steps=6, strategies=None, scene=SCENE, objective=HR_FROM_START, skips=None, calls=({},), **settings
+    hr_by, *, lr_by="torch", steps=6, strategies=None, scene=SCENE, objective=HR_FROM_START, skips=None, calls=({},),
+    **settings
 ):  # fmt: skip
     """The host's parameters, the log of each step, and the attachment.
 
     Args:
         calls: what the host gives its rasterizer besides, one after the other.
     """
-    host = Host(scene, rasterization=same_bits(scene), **calls[0])
+    host = Host(scene, rasterization=drawn_by(lr_by), **calls[0])
     strategies = everything() if strategies is None else strategies
     clear = attached(host, scene, Conductor(*strategies, objective=objective, skips=skips), hr_by=hr_by, **settings)
     host.degree = lambda step: 2 if step < 3 else 3
@@ -129,10 +130,9 @@ def trained(
     return {name: p.detach().clone() for name, p in host.splats.items()}, logs, clear
 
 
-def same_bits(scene):
-    """A function for the host's LR with one result: torch's own adds in any order on a GPU."""
-    on_gpu = scene.train[0].lr.image.is_cuda
-    return partial(rasterizers.rasterization, backend="warp") if on_gpu else gsplat_host.rasterization
+def drawn_by(backend):
+    """A function for the host's LR. Warp has one result on a GPU; torch adds in any order there."""
+    return partial(rasterizers.rasterization, backend=backend)
 
 
 def require_close(found, expected):
@@ -208,7 +208,7 @@ def scene(recorded_on):
 
 def both(monkeypatch, **settings):
     """The replayed training, after a comparison with the live one: the same bits."""
-    settings.setdefault("objective", WARP)
+    settings = {"objective": WARP, "lr_by": "warp", **settings}
     replayed = trained("warp", **settings)
     monkeypatch.setattr(replays, "DEVICES", set())
     live = trained("warp", **settings)
@@ -281,7 +281,7 @@ def test_replays_over_densification_resets_evaluation_and_resuming(monkeypatch, 
 
     def run():
         torch.manual_seed(0)
-        host = Host(scene, rasterization=same_bits(scene), extent=4.0, strategy=strategies.DefaultStrategy(
+        host = Host(scene, rasterization=drawn_by("warp"), extent=4.0, strategy=strategies.DefaultStrategy(
             refine_start_iter=2, refine_stop_iter=14, refine_every=6, reset_every=9, grow_grad2d=2e-4, prune_opa=0.02
         ))  # fmt: skip
         clear = begun(host)
@@ -293,7 +293,7 @@ def test_replays_over_densification_resets_evaluation_and_resuming(monkeypatch, 
         host.train(names, between=evaluate)
         logs = [clear.attachment.conductor.work_log]
         clear.remove()
-        resumed = Host(scene, rasterization=same_bits(scene), extent=4.0)
+        resumed = Host(scene, rasterization=drawn_by("warp"), extent=4.0)
         resumed.splats = {name: torch.nn.Parameter(p.detach().clone()) for name, p in host.splats.items()}
         resumed.optimizers = {name: torch.optim.Adam([p], lr=1e-3) for name, p in resumed.splats.items()}
         again = begun(resumed)
