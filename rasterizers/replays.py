@@ -109,8 +109,10 @@ class Replays:
             self._addresses, self._moves = kind.addresses, self._moves + 1
             if self._moves == _RESTLESS:
                 _log.warning(
-                    "Nothing is replayed, so that on a GPU an iteration takes two to three times as long: in each one, a "
-                    "tensor of the field or of a strategy's state is a new one. Write to Strategy.state in place, by copy_()."
+                    "%s: nothing is replayed, so that on a GPU an iteration takes two to three times as long. In each one, the "
+                    "number of Gaussians is another one, or a tensor of the field or of a strategy's state is a new one. Write "
+                    "to Strategy.state in place, by copy_().",
+                    self._name,
                 )
         if kind not in self._recorded:
             if len(self._recorded) == _MOST_KINDS:
