@@ -62,7 +62,7 @@ def pseudo_views(
     """Functions that make `count` pseudo views, the training cameras taken in turn; none where fewer than two photos have depth.
 
     Args:
-        photos, depths: by the photos' names; on the CPU.
+        photos, depths: by the photos' names, on one device, where the pseudo views are made.
         reach: largest distance of a pseudo camera from its photo's, as a multiple of the photo's median depth.
         tolerance: relative difference of depth up to which a photo shows a point.
         max_pixels: larger photos are reduced by a whole factor first.
@@ -90,7 +90,7 @@ def border_view(photo: Photo, *, field: float, max_pixels: int) -> PseudoView:
     c = photo.camera
     x, y = (round(n * (field - 1) / 2) for n in (c.width, c.height))
     wide = replace(c, cx=c.cx + x, cy=c.cy + y, width=c.width + 2 * x, height=c.height + 2 * y)
-    known = torch.zeros(wide.height, wide.width, dtype=torch.bool)
+    known = torch.zeros(wide.height, wide.width, dtype=torch.bool, device=photo.image.device)
     known[y : y + c.height, x : x + c.width] = True if photo.shown is None else photo.shown
     image = F.pad(photo.image, (0, 0, x, x, y, y))
     through = None if photo.transparency is None else F.pad(photo.transparency, (x, x, y, y))
@@ -141,7 +141,7 @@ def _warped(camera: Camera, sources: Sequence[_Source], tolerance: float) -> Pse
     depth = _front(camera, nearest)
     known = depth.isfinite()
     points = _behind(camera, torch.where(known, depth, 1.0))
-    color, weight = torch.zeros_like(points), torch.zeros(points.shape[1])
+    color, weight = torch.zeros_like(points), points.new_zeros(points.shape[1])
     for s in nearest:
         shows, colors = _seen(s, camera, points, tolerance)
         w = shows.float().div_(float((s.photo.camera.center - camera.center).square().sum().clamp_min(1e-24)))
@@ -158,7 +158,7 @@ def _front(camera: Camera, sources: Sequence[_Source]) -> Float[Tensor, "h w"]:
     """The depth of the frontmost point, infinite without one. A point covers 2 × 2 pixels, so that surfaces have no holes."""
     width, height = camera.width + 1, camera.height + 1
     outside = height * width
-    front = torch.full((outside + 1,), torch.inf)
+    front = sources[0].depth.new_full((outside + 1,), torch.inf)
     for s in sources:
         x, y, depth = _projected(s.points, s.photo.camera, camera)
         # Of the lower right one of its pixels, after a border of one.
@@ -187,15 +187,16 @@ def _seen(
 
 def _projected(points: Float[Tensor, "3 N"], of: Camera, to: Camera) -> tuple[Tensor, Tensor, Tensor]:
     """(columns, rows, depths) in one camera of another's points; columns and rows have a meaning where depth > 0."""
-    matrix = (projection_matrix(to) @ torch.linalg.inv(of.world_to_camera.double())).float()
+    matrix = (projection_matrix(to) @ torch.linalg.inv(of.world_to_camera.double())).to(points)
     x, y, depth = torch.addmm(matrix[:, 3:], matrix[:, :3], points)
     return x.div_(depth), y.div_(depth), depth
 
 
 def _behind(camera: Camera, depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 N"]:
     """The camera's points at these depths behind all its pixels."""
-    x = (torch.arange(camera.width, dtype=torch.float64) + (0.5 - camera.cx)) / camera.fx
-    y = (torch.arange(camera.height, dtype=torch.float64) + (0.5 - camera.cy)) / camera.fy
+    numbers = partial(torch.arange, dtype=torch.float64, device=depth.device)
+    x = (numbers(camera.width) + (0.5 - camera.cx)) / camera.fx
+    y = (numbers(camera.height) + (0.5 - camera.cy)) / camera.fy
     return torch.stack((x.float() * depth, y.float()[:, None] * depth, depth)).flatten(1)
 
 

@@ -80,7 +80,7 @@ class PseudoViews(Strategy):
         if not views:
             _log.warning("PseudoViews has no effect: this training loop does not give its views.")
             return
-        photos = {view.name: view.depth_photo.to("cpu") for view in views}
+        photos = {view.name: view.depth_photo.to(self.device) for view in views}
         background = views[0].background
         if cut_out(photos.values(), background):
             _log.info(
@@ -105,7 +105,7 @@ class PseudoViews(Strategy):
             return []
         return pseudo_views(
             photos,
-            _depths(views, photos),
+            {name: depth.to(self.device) for name, depth in _depths(views).items()},
             count=max(1, min(self.count, _TOGETHER // self._pixels(photos))),
             reach=self.reach,
             tolerance=self.tolerance,
@@ -122,7 +122,7 @@ class PseudoViews(Strategy):
         view = make()
         weight = torch.where(view.known, 1.0, self.continued if bool(view.known.any()) else 0.0) * self.weight
         image = continued(view.photo.image, view.known) if self.continued > 0 else view.photo.image
-        return ExtraView(replace(view.photo, image=image), weight, background).to(self.device)
+        return ExtraView(replace(view.photo, image=image), weight, background)
 
     def extra_views(self, t: int) -> Sequence[ExtraView]:
         """One of them every `every` iterations: a function of (seed, t)."""
@@ -153,11 +153,12 @@ class PseudoViews(Strategy):
         return "it is the LR loss that pseudo views are trained by, and lambda_lr is 0" if lambda_lr == 0 else None
 
 
-def _depths(views: Sequence[View], photos: dict[str, Photo]) -> dict[str, DepthMap]:
-    """The depth of each photo, on the CPU: that of its view, or where no view has any, that of stereo."""
-    known = {view.name: view.depth.to("cpu") for view in views if view.depth is not None}
+def _depths(views: Sequence[View]) -> dict[str, DepthMap]:
+    """The depth of each photo: that of its view, or where no view has any, that of stereo."""
+    known = {view.name: view.depth for view in views if view.depth is not None}
     if known:
         return known
     from clear_strategies.geometry import depth_maps
 
-    return dict(zip(photos, depth_maps(list(photos.values()), background=views[0].background), strict=True))
+    photos = [view.depth_photo.to("cpu") for view in views]
+    return {view.name: m for view, m in zip(views, depth_maps(photos, background=views[0].background), strict=True)}

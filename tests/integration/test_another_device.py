@@ -25,6 +25,7 @@ pytestmark = pytest.mark.skipif(
 def test_public_functions_take_photos_of_another_device_and_cameras_stay_on_the_cpu():
     code = """
 import torch
+from clear_strategies import PseudoViews, View
 from clear_strategies.compose import conductor
 from clear_strategies.geometry import depth_maps, exposure_gains
 from integration.examples.demo import load_demo
@@ -45,10 +46,21 @@ with Elsewhere():
     photos = [view(name, *photo, sr=enlarged).lr for name, *photo in zip(demo.names, demo.images, demo.viewmats, demo.Ks)]
     maps = depth_maps(photos, torch.rand(5, 3, device=NAME) + 2)
     print(exposure_gains(photos, maps).device)
+
+    def pseudo_views(device):
+        made = PseudoViews(count=3, reach=0.1)
+        made.on_fit_start(3, 0)
+        made.to(device)
+        made.on_views([View(str(i), photo.to(device), photo.to(device)) for i, photo in enumerate(photos)])
+        return [made.extra_views(t)[0] for t in range(2, 20, 2)]
+
+    for here, there in zip(pseudo_views("cpu"), pseudo_views(NAME), strict=True):
+        assert torch.equal(here.photo.image, there.photo.image.cpu()) and torch.equal(here.weight, there.weight.cpu())
+    print(there.photo.image.device)
 """
     ran = run(["-c", code])
     assert ran.returncode == 0, ran.stderr
-    assert ran.stdout.split() == ["elsewhere:0", "elsewhere:0", "cpu", "elsewhere:0", "elsewhere:0"]
+    assert ran.stdout.split() == ["elsewhere:0", "elsewhere:0", "cpu", "elsewhere:0", "elsewhere:0", "elsewhere:0"]
 
 
 @pytest.mark.slow
