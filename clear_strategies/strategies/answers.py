@@ -26,7 +26,7 @@ def require_started(s: Strategy, seed: int) -> None:
 
 
 def require_state(s: Strategy, params: Mapping[str, Tensor]) -> None:
-    n = {len(p) for p in params.values()}
+    n = {len(p) for p in params.values()} if s.state else set()
     for name, rows in s.state.items():
         if n and rows.shape[:1] != (*n,):
             raise AnswerError(
