@@ -111,7 +111,7 @@ def conductor(
     """
     if iterations < 1:
         raise SettingError(f"iterations must be at least 1, got {iterations}.")
-    names = strategy.strip() if isinstance(strategy, str) else f"[{','.join(strategy)}]"
+    names = strategy.strip() if isinstance(strategy, str) else f"[{','.join(map(str, strategy))}]"
     chosen = f"+strategy=[{names}]" if "," in names and not names.startswith("[") else f"+strategy={names}"
     config = composed([chosen, *overrides])
     settings: ConductorSettings = build(tree(config, _TRAINERS))
@@ -264,8 +264,8 @@ def _is_itself(value: str) -> bool:
 
 
 def require_each_once(overrides: Iterable[str]) -> None:
-    """Raise a SettingError for a strategy that is named twice, since Hydra merges the two into one silently. Warn of the
-    strategies that a method sets aside.
+    """Raise a SettingError for a strategy that is named twice, since Hydra merges the two into one silently, and for what is no
+    name. Warn of the strategies that a method sets aside.
     """
     before = list[str]()
     for override in OverridesParser.create().parse_overrides(list(overrides)):
@@ -277,7 +277,11 @@ def require_each_once(overrides: Iterable[str]) -> None:
         value = override.value()
         if value != "baseline":  # no strategy
             before.append(str(override.input_line))
-        options = [str(option) for option in (value if isinstance(value, list) else [value])]
+        named = value if isinstance(value, list) else [value]
+        options = [option for option in named if isinstance(option, str)]
+        if len(options) < len(named):  # else Hydra raises errors of Python's
+            rule = f"+strategy: must be a name or a list of names, got {override.input_line}"
+            raise SettingError(f"{rule}. Write +strategy=gco or +strategy=[gco,svs].")
         strategies = Counter(strategy for option in options for strategy in _strategies_of(option))
         if twice := next((strategy for strategy, count in strategies.items() if count > 1), None):
             raise SettingError(f"+strategy: must name each strategy once, got {twice} twice in {override.input_line}.")
