@@ -114,7 +114,6 @@ def train(photos: str | Path | None = None, *settings: str, folder: str | Path |
     name = "demo" if photos is None else path_of(str(photos)).resolve().stem
     now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S-%f")
     into = path_of(str(folder)) if folder is not None else Path("outputs") / name / now
-    into.mkdir(parents=True, exist_ok=True)
     threads = torch.get_num_threads()
     try:
         with console.logged(into / "run.log") as claim:

@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 import clear_strategies
 from clear_strategies.compose import CONF, tree
-from clear_strategies.errors import DataError
+from clear_strategies.errors import DataError, SettingError
 from clear_strategies.jobs import job, resume
 from clear_strategies.jobs import scene as scenes
 from clear_strategies.training.loop import iterate
@@ -168,6 +168,13 @@ def test_a_command_that_is_refused_leaves_no_empty_folder_and_default_folders_di
     assert not list((tmp_path / "outputs/demo").iterdir())
     for pattern in (composed_hydra("run"), composed_hydra("sweep")):
         assert "%f" in pattern
+
+
+def test_a_run_from_python_that_is_refused_leaves_no_folder(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SettingError, match=r"fit\.iterations: must be"):
+        clear_strategies.train(None, "fit.iterations=0")
+    assert not list(tmp_path.iterdir())
 
 
 def composed_hydra(kind: str) -> str:
