@@ -68,9 +68,19 @@ _NO_OPTION: Final = re.compile(
 
 _CHOSEN: Final = re.compile(r"Multiple values for (\S+)\. To override a value use 'override \S+: (\S+)'")
 
+_LAUNCHER: Final = re.compile(
+    r"Could not (?:load|find) 'hydra/launcher/((joblib|submitit|ray)(?:_local|_slurm|_aws)?)'"
+)
+"""A launcher that a package `hydra-NAME-launcher` brings."""
+
 
 def of_hydra(error: Exception) -> str:
-    """The message of an error of Hydra's, in one line: of an option that is not there, the nearest one and all others."""
+    """The message of an error of Hydra's, in one line: of an option that is not there, the nearest one and all others, or the
+    package that brings it.
+    """
+    if (launcher := _LAUNCHER.search(str(error))) is not None:
+        name, package = launcher.groups()
+        return f"hydra/launcher: {name} is not installed: pip install hydra-{package}-launcher."
     if (chosen := _CHOSEN.fullmatch(one_line(error))) is not None:
         group, name = chosen.groups()
         return f"+{group}={name}: a choice of this group is there already. Replace it: {group}={name}."

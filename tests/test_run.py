@@ -7,6 +7,7 @@ import resource
 import signal
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -181,6 +182,17 @@ def test_ctrl_c_while_data_is_prepared_is_one_line(tmp_path):
     process.send_signal(signal.SIGINT)
     assert process.wait() == 130, said.read_text()
     assert said.read_text().endswith("\nreading\nstopped by SIGINT before training began. Nothing was saved.\n")
+
+
+@pytest.mark.parametrize(
+    ("chosen", "package"), [("slurm", "submitit"), ("ray_gpus", "ray"), ("submitit_local", "submitit")]
+)
+def test_a_launcher_that_is_not_installed_names_its_package(chosen, package, tmp_path):
+    if find_spec("hydra_plugins") and find_spec(f"hydra_plugins.hydra_{package}_launcher"):
+        pytest.skip("it is installed")
+    ended = run("-m", "+strategy=clear,gco", f"hydra/launcher={chosen}", cwd=tmp_path)
+    assert ended.returncode == 2, ended.stdout
+    assert ended.stderr.endswith(f"is not installed: pip install hydra-{package}-launcher.\n")
 
 
 ENDINGS = {
