@@ -36,7 +36,7 @@ from clear_strategies.training.signals import STOPS
 _log = logging.getLogger(__name__)
 
 FAILED: Final = "failed.txt"
-"""In the folder of a sweep's job: why it failed."""
+"""In the folder of a sweep's job: why it failed; beside the folder, behind its name, where that holds a finished run."""
 _VERBOSE: Final = "fit.verbose=true"
 _FLAGS: Final = (
     "--help", "--hydra-help", "--cfg", "--resolve", "--package", "--run", "--multirun", "--shell-completion",
@@ -149,7 +149,9 @@ def _end(error: BaseException, ending: exit_codes.Ending, folder: Path, *, resum
         return
     _log.log(logging.INFO if code > exit_codes.SIGNALS else logging.ERROR, "%s", message)  # a stop is no error
     if in_sweep and code == exit_codes.UNUSABLE:
-        files.write_text(folder / FAILED, f"job {hydra_config.job.num}: {message}\n")
+        finished = (folder / "metrics.json").exists()  # its folder stays as it is
+        note = folder.with_name(f"{folder.name}_{FAILED}") if finished else folder / FAILED
+        files.write_text(note, f"job {hydra_config.job.num}: {message}\n")
         return
     with suppress(OSError):
         folder.rmdir()  # where nothing was written
@@ -165,14 +167,14 @@ class SweepCallback(Callback):
         for stop in STOPS:  # as Ctrl-C; else joblib's workers would go on without us
             if signal.getsignal(stop) is not signal.SIG_IGN:
                 signal.signal(stop, signal.default_int_handler)
-        for note in Path(config.hydra.sweep.dir).rglob(FAILED):  # of an earlier sweep
+        for note in Path(config.hydra.sweep.dir).rglob(f"*{FAILED}"):  # of an earlier sweep
             note.unlink()
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         folder = Path(config.hydra.sweep.dir)
         _report(folder)
         failed = defaultdict[str, list[int]](list)
-        for note in folder.rglob(FAILED):
+        for note in folder.rglob(f"*{FAILED}"):
             job, message = note.read_text(encoding="utf-8").strip().split(": ", 1)
             failed[message].append(int(job.removeprefix("job ")))
         if failed:

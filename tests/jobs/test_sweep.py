@@ -50,6 +50,17 @@ def test_a_finished_run_is_not_trained_again_and_one_of_another_configuration_is
     assert "this is not the configuration that wrote it" in other.stdout + other.stderr
 
 
+def test_a_sweeps_job_that_is_refused_leaves_the_folder_of_a_finished_run_as_it_is(whole):
+    def state() -> dict[Path, int]:
+        return {p: p.stat().st_mtime_ns for p in whole.rglob("*") if p.is_file()}
+
+    before, sweep = state(), ["-m", "hydra.sweep.dir=.", "hydra.sweep.subdir=here", *AUTO]
+    result = run("+strategy=clear", *sweep, "fit.iterations=-1", cwd=whole.parent)
+    assert (result.returncode, "1 job(s) failed: job 0: " in result.stdout) == (2, True), result.stdout
+    assert state() == before
+    assert whole.with_name(f"here_{FAILED}").read_text().startswith("job 0: fit.iterations: must be")
+
+
 @pytest.mark.slow
 def test_a_killed_run_goes_on_from_the_newest_whole_checkpoint_and_ends_the_same(whole, tmp_path):
     """SIGKILL, then a damaged newest checkpoint: the one before it is taken; seconds and counts go on."""
