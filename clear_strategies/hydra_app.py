@@ -31,6 +31,7 @@ from clear_strategies import console, files
 from clear_strategies.compose import CONF, not_composed, quoted, require_each_once
 from clear_strategies.errors import ClearError, SettingError
 from clear_strategies.jobs import exit_codes
+from clear_strategies.settings import missing
 from clear_strategies.training.signals import STOPS
 
 _log = logging.getLogger(__name__)
@@ -164,6 +165,10 @@ class SweepCallback(Callback):
     """Runs at the beginning and end of a sweep, in the process that was started; jobs may run in other processes."""
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        given = [override.lstrip("+").partition("=")[0] for override in config.hydra.overrides.task]
+        if OmegaConf.is_missing(config.data, "root") and "data.root" not in given:  # no job's own settings name it
+            _log.error("%s", missing("data.root"))  # of an error that a callback raises Hydra makes a warning
+            sys.exit(exit_codes.UNUSABLE)
         for stop in STOPS:  # as Ctrl-C; else joblib's workers would go on without us
             if signal.getsignal(stop) is not signal.SIG_IGN:
                 signal.signal(stop, signal.default_int_handler)

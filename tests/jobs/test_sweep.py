@@ -61,6 +61,13 @@ def test_a_sweeps_job_that_is_refused_leaves_the_folder_of_a_finished_run_as_it_
     assert whole.with_name(f"here_{FAILED}").read_text().startswith("job 0: fit.iterations: must be")
 
 
+def test_an_experiment_without_the_folder_of_its_scenes_is_refused_once_before_any_job_starts(tmp_path):
+    result = run("experiment=llff_x4", cwd=tmp_path)
+    assert result.returncode == 2
+    assert result.stdout + result.stderr == "error: data.root: is needed and missing. Add data.root=….\n"
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.slow
 def test_a_killed_run_goes_on_from_the_newest_whole_checkpoint_and_ends_the_same(whole, tmp_path):
     """SIGKILL, then a damaged newest checkpoint: the one before it is taken; seconds and counts go on."""
@@ -183,7 +190,10 @@ def test_a_clusters_announcement_saves_before_its_handler_acts(tmp_path):
 
 def test_failed_jobs_are_told_where_the_report_cannot_be_written(tmp_path, caplog, monkeypatch):
     monkeypatch.setattr(signal, "signal", lambda *_: None)  # of this process
-    callback, config = SweepCallback(), OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}})
+    callback, config = (
+        SweepCallback(),
+        OmegaConf.create({"data": {}, "hydra": {"sweep": {"dir": str(tmp_path)}, "overrides": {"task": []}}}),
+    )
     make_run(tmp_path / "0")
     (tmp_path / "0" / FAILED).write_text("job 0: of an earlier sweep")
     callback.on_multirun_start(config)
