@@ -46,6 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("folders", nargs="+", type=path_of, metavar="DIR", help="a run's folder, or a folder of runs")
     parser.add_argument("--out", type=path_of, metavar="FOLDER", help="where the report goes (default: the first DIR)")
     console.steady()
+    logging.captureWarnings(True)  # as `run.main`: matplotlib has one for each letter that its font lacks
     options = parser.parse_args(arguments)
     console.show()
     out = options.out or options.folders[0]

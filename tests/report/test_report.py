@@ -70,7 +70,7 @@ def test_runs_without_images_or_history_are_still_in_the_table(tmp_path, caplog)
 
 
 def test_the_command_prints_the_table_on_an_ascii_terminal_and_does_not_import_hydra(tmp_path: Path) -> None:
-    make_run(tmp_path / "0", "+strategy=gco")
+    make_run(tmp_path / "0", "+strategy=gco", scene="庭院")  # letters that matplotlib's font lacks, too
     code = (
         "import sys; from clear_strategies import report; code = report.main([sys.argv[1]]); "
         "sys.exit(9 if {'hydra', 'matplotlib.pyplot'} & set(sys.modules) else code)"
@@ -79,7 +79,7 @@ def test_the_command_prints_the_table_on_an_ascii_terminal_and_does_not_import_h
     command = [sys.executable, "-c", code, str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert (done.returncode, done.stderr.count("\n")) == (0, 1)
-    assert "| demo  | gco" in done.stdout
+    assert r"| \u5ead\u9662    | gco" in done.stdout
 
 
 def test_without_runs_the_command_logs_one_line_and_exits_with_2(tmp_path, caplog, capsys):
