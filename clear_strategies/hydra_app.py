@@ -32,7 +32,7 @@ from clear_strategies.compose import CONF, not_composed, quoted, require_each_on
 from clear_strategies.errors import ClearError, SettingError
 from clear_strategies.jobs import exit_codes
 from clear_strategies.settings import missing
-from clear_strategies.training.signals import STOPS
+from clear_strategies.training.signals import STOPS, stop
 
 _log = logging.getLogger(__name__)
 
@@ -68,6 +68,9 @@ def main(overrides: Sequence[str] | None = None) -> None:
     gc.freeze()  # what has been imported stays: collections need not look through torch's objects, which takes 0.1 s
     sys.argv[1:] = [_VERBOSE if a in ("-v", "--verbose") else readable(a) for a in arguments]  # Hydra reads them there
     exit_codes.require("train")
+    for signum in STOPS:  # else the system ends us at once, and joblib's workers go on without us
+        if signal.getsignal(signum) is not signal.SIG_IGN:
+            signal.signal(signum, stop)
     try:
         hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(job)()
     except ConfigCompositionException as error:
@@ -169,9 +172,6 @@ class SweepCallback(Callback):
         if OmegaConf.is_missing(config.data, "root") and "data.root" not in given:  # no job's own settings name it
             _log.error("%s", missing("data.root"))  # of an error that a callback raises Hydra makes a warning
             sys.exit(exit_codes.UNUSABLE)
-        for stop in STOPS:  # as Ctrl-C; else joblib's workers would go on without us
-            if signal.getsignal(stop) is not signal.SIG_IGN:
-                signal.signal(stop, signal.default_int_handler)
         for note in Path(config.hydra.sweep.dir).rglob(f"*{FAILED}"):  # of an earlier sweep
             note.unlink()
 

@@ -170,7 +170,8 @@ def test_the_exit_codes_of_a_whole_process(tmp_path):
     assert (unwritable.returncode, said.count("\n"), "/proc/run" in said) == (3, 1, True), said
 
 
-def test_ctrl_c_while_data_is_prepared_is_one_line(tmp_path):
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_data_is_prepared_is_one_line(stop, tmp_path):
     (tmp_path / "slow.py").write_text(
         "import time\n\n\ndef read():\n    print('reading', flush=True)\n    time.sleep(99)\n"
     )
@@ -179,9 +180,9 @@ def test_ctrl_c_while_data_is_prepared_is_one_line(tmp_path):
     said = tmp_path / "said"
     process = started("-m", "clear_strategies.run", *slow, cwd=tmp_path, said=said)
     wait_for(lambda: said.read_text().endswith("reading\n"))
-    process.send_signal(signal.SIGINT)
-    assert process.wait() == 130, said.read_text()
-    assert said.read_text().endswith("\nreading\nstopped by SIGINT before training began. Nothing was saved.\n")
+    process.send_signal(stop)
+    assert process.wait() == 128 + stop, said.read_text()
+    assert said.read_text().endswith(f"\nreading\nstopped by {stop.name} before training began. Nothing was saved.\n")
 
 
 @pytest.mark.parametrize(
@@ -197,6 +198,7 @@ def test_a_launcher_that_is_not_installed_names_its_package(chosen, package, tmp
 
 ENDINGS = {
     KeyboardInterrupt(): (130, "stopped by SIGINT."),  # a job says what it has saved
+    KeyboardInterrupt(signal.SIGTERM): (143, "stopped by SIGTERM."),
     OSError(errno.ENOSPC, "No space", "x"): (3, "x: No space. Free space, or write elsewhere (hydra.run.dir=FOLDER"),
     OSError(errno.EROFS, "Read-only", "x"): (
         3,

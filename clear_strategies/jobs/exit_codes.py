@@ -7,11 +7,11 @@
 from __future__ import annotations
 
 import errno
-import signal
 from importlib.util import find_spec
 from typing import Final, NamedTuple
 
 from clear_strategies.errors import ClearError, SettingError, of_hydra, one_line
+from clear_strategies.training.signals import signal_of
 
 _NO_MEMORY: Final = "can't allocate memory"  # of torch's allocator on the CPU
 _LESS_MEMORY: Final = (
@@ -46,7 +46,8 @@ def describe(error: BaseException) -> Ending | None:
     if isinstance(error, ClearError):
         return Ending(error.exit_code, one_line(error))
     if isinstance(error, KeyboardInterrupt):
-        return Ending(SIGNALS + signal.SIGINT, "stopped by SIGINT.")  # a job says what it has saved
+        signum = signal_of(error)
+        return Ending(SIGNALS + signum, f"stopped by {signum.name}.")  # a job says what it has saved
     if isinstance(error, _library_errors()):
         return Ending(UNUSABLE, of_hydra(error))  # before OSError: Hydra's error for an option that is not there is one
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY in str(error)):

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Final
+from typing import Final, NoReturn
 
 from clear_strategies.errors import ClearError
 
@@ -84,13 +84,23 @@ def deferred_signals() -> Iterator[list[int]]:
             signal.signal(s, handler)
 
 
+def stop(signum: int, _frame: FrameType | None) -> NoReturn:
+    """The handler of `STOPS` where no step defers them: as Python's own of Ctrl-C, but it tells the signal."""
+    raise KeyboardInterrupt(signum)
+
+
+def signal_of(error: KeyboardInterrupt) -> signal.Signals:
+    """The signal that `stop` tells; Python's own handler is that of SIGINT."""
+    return signal.Signals(error.args[0] if error.args else signal.SIGINT)
+
+
 @contextmanager
 def interrupted(when: str, saved: Callable[[], Path | None] = lambda: None) -> Iterator[None]:
-    """Ctrl-C where no step defers it becomes `Interrupted`, with the checkpoint that is the newest then."""
+    """A signal where no step defers it becomes `Interrupted`, with the checkpoint that is the newest then."""
     try:
         yield
     except KeyboardInterrupt as error:
-        raise Interrupted(signal.SIGINT, when, saved()) from error
+        raise Interrupted(signal_of(error), when, saved()) from error
 
 
 def foremost(pending: list[int]) -> int:

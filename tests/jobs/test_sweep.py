@@ -188,8 +188,7 @@ def test_a_clusters_announcement_saves_before_its_handler_acts(tmp_path):
     assert process.wait() == 91, (tmp_path / "said").read_text()
 
 
-def test_failed_jobs_are_told_where_the_report_cannot_be_written(tmp_path, caplog, monkeypatch):
-    monkeypatch.setattr(signal, "signal", lambda *_: None)  # of this process
+def test_failed_jobs_are_told_where_the_report_cannot_be_written(tmp_path, caplog):
     callback, config = (
         SweepCallback(),
         OmegaConf.create({"data": {}, "hydra": {"sweep": {"dir": str(tmp_path)}, "overrides": {"task": []}}}),
