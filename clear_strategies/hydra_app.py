@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import multiprocessing
 import os
 import re
 import signal
@@ -17,6 +18,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import FrameType
 from typing import Any, Final
 
 import hydra
@@ -32,7 +34,7 @@ from clear_strategies.compose import CONF, not_composed, quoted, require_each_on
 from clear_strategies.errors import ClearError, SettingError
 from clear_strategies.jobs import exit_codes
 from clear_strategies.settings import missing
-from clear_strategies.training.signals import STOPS, stop
+from clear_strategies.training import signals
 
 _log = logging.getLogger(__name__)
 
@@ -68,14 +70,16 @@ def main(overrides: Sequence[str] | None = None) -> None:
     gc.freeze()  # what has been imported stays: collections need not look through torch's objects, which takes 0.1 s
     sys.argv[1:] = [_VERBOSE if a in ("-v", "--verbose") else readable(a) for a in arguments]  # Hydra reads them there
     exit_codes.require("train")
-    for signum in STOPS:  # else the system ends us at once, and joblib's workers go on without us
-        if signal.getsignal(signum) is not signal.SIG_IGN:
-            signal.signal(signum, stop)
+    signals.handle(signals.stop)  # else the system ends us at once, and joblib's workers go on without us
     try:
         hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(job)()
     except ConfigCompositionException as error:
         overrides = [word for word in sys.argv[1:] if not word.startswith(("-", "hydra."))]
         raise not_composed(error, overrides, "config") from error
+    except Exception as error:
+        if not _stopped:
+            raise
+        raise KeyboardInterrupt(_stopped[0]) from error  # a process of joblib's had not begun, and was ended
 
 
 def readable(word: str) -> str:
@@ -117,8 +121,55 @@ def _flags_last(arguments: Sequence[str]) -> list[str]:
     return [*settings, *filter(None, flags)]
 
 
+_stopped: Final = list[int]()
+"""The signals by which a sweep of several processes was stopped: in the process that was started, and in each of the others."""
+
+
 def job(config: DictConfig) -> float | None:
-    """One job of Hydra's. Returns what `jobs.job.run` does; in a sweep also None for a job that failed or is left to another."""
+    """One job of Hydra's. Returns what `jobs.job.run` does; in a sweep also None for a job that failed, was stopped, or is left
+    to another.
+    """
+    if not _in_worker():
+        return _job(config)
+    signals.handle(_end_job)
+    try:
+        return None if _stopped else _job(config)
+    finally:
+        signals.handle(_note)
+        with suppress(OSError):
+            Path(HydraConfig.get().runtime.output_dir).rmdir()  # where nothing was written
+
+
+def _in_worker() -> bool:
+    """Whether this is a process of joblib's, which ends all others at once where one of them ends or has an error."""
+    return HydraConfig.get().mode == RunMode.MULTIRUN and multiprocessing.parent_process() is not None
+
+
+def _note(signum: int, _frame: FrameType | None) -> None:
+    """The handler of joblib's processes between two jobs."""
+    _stopped.append(signum)
+
+
+def _end_job(signum: int, frame: FrameType | None) -> None:
+    """The handler of joblib's processes in a job, where no step defers signals: only the first ends the job, which saves."""
+    if not _stopped and not signals.asked():
+        _note(signum, frame)
+        signals.stop(signum, frame)
+
+
+def _stop_workers(signum: int, frame: FrameType | None) -> None:
+    """The handler of a sweep: joblib's processes save their runs, and begin no other; a second signal acts at once."""
+    if not (workers := multiprocessing.active_children()):
+        signals.stop(signum, frame)
+    _stopped.append(signum)
+    for twice in signals.TWICE:
+        signal.signal(twice, signals.stop)
+    for worker in workers:
+        with suppress(ProcessLookupError):
+            os.kill(worker.pid, signum)  # type: ignore[arg-type]
+
+
+def _job(config: DictConfig) -> float | None:
     logging.captureWarnings(True)  # as `run.main`, which a launcher's processes do not pass
     hydra_config = HydraConfig.get()
     folder, overrides = Path(hydra_config.runtime.output_dir), list(hydra_config.overrides.task)
@@ -159,8 +210,11 @@ def _end(error: BaseException, ending: exit_codes.Ending, folder: Path, *, resum
         return
     with suppress(OSError):
         folder.rmdir()  # where nothing was written
-    if code > exit_codes.SIGNALS and code - exit_codes.SIGNALS not in STOPS:
+    if code > exit_codes.SIGNALS and code - exit_codes.SIGNALS not in signals.STOPS:
         signal.raise_signal(code - exit_codes.SIGNALS)  # all is saved: now the launcher's handler may resubmit the job
+    if code > exit_codes.SIGNALS and _in_worker():
+        _stopped.append(code - exit_codes.SIGNALS)
+        return
     sys.exit(code)
 
 
@@ -172,10 +226,13 @@ class SweepCallback(Callback):
         if OmegaConf.is_missing(config.data, "root") and "data.root" not in given:  # no job's own settings name it
             _log.error("%s", missing("data.root"))  # of an error that a callback raises Hydra makes a warning
             sys.exit(exit_codes.UNUSABLE)
+        signals.handle(_stop_workers)
         for note in Path(config.hydra.sweep.dir).rglob(f"*{FAILED}"):  # of an earlier sweep
             note.unlink()
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        if _stopped:
+            sys.exit(exit_codes.SIGNALS + _stopped[0])
         folder = Path(config.hydra.sweep.dir)
         _report(folder)
         failed = defaultdict[str, list[int]](list)

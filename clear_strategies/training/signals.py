@@ -33,10 +33,10 @@ class Interrupted(ClearError):
         return 128 + self.signum
 
 
-_TWICE: Final = (signal.SIGINT, signal.SIGTERM)  # a second one acts at once
+TWICE: Final = (signal.SIGINT, signal.SIGTERM)  # a second one acts at once
 # The terminal was closed, or its connection lost: the system sends several of them.
 _HANGUPS: Final = tuple(getattr(signal, name) for name in ("SIGHUP",) if hasattr(signal, name))
-STOPS: Final = (*_TWICE, *_HANGUPS)
+STOPS: Final = (*TWICE, *_HANGUPS)
 """Signals that end a run, which saves before."""
 # A cluster announces the end of a job with these, if the job's launcher has set a handler.
 _ANNOUNCEMENTS: Final = tuple(getattr(signal, name) for name in ("SIGUSR1", "SIGUSR2") if hasattr(signal, name))
@@ -63,15 +63,15 @@ def deferred_signals() -> Iterator[list[int]]:
 
     def note(signum: int, _frame: FrameType | None) -> None:
         pending.append(signum)
-        again = " Once more to leave at once." if signum in _TWICE else ""
+        again = " Once more to leave at once." if signum in TWICE else ""
         _log.warning("%s: finishing this step, then saving.%s", signal.Signals(signum).name, again)
-        for s in _TWICE:
+        for s in TWICE:
             signal.signal(s, before[s])
 
     handled = [s for s in _ANNOUNCEMENTS if callable(signal.getsignal(s))]
     handled += [s for s in _HANGUPS if signal.getsignal(s) is not signal.SIG_IGN]
     try:
-        before = {s: signal.signal(s, note) for s in (*_TWICE, *handled)}
+        before = {s: signal.signal(s, note) for s in (*TWICE, *handled)}
     except ValueError:  # not the main thread, which alone may set handlers
         yield pending
         return
@@ -82,6 +82,13 @@ def deferred_signals() -> Iterator[list[int]]:
         _collected.pop()
         for s, handler in before.items():
             signal.signal(s, handler)
+
+
+def handle(handler: Callable[[int, FrameType | None], object]) -> None:
+    """Set a handler of `STOPS`; SIGHUP stays ignored where it is."""
+    for signum in STOPS:
+        if signal.getsignal(signum) is not signal.SIG_IGN:
+            signal.signal(signum, handler)
 
 
 def stop(signum: int, _frame: FrameType | None) -> NoReturn:

@@ -154,12 +154,14 @@ def test_a_job_that_submitit_preempts_is_handed_in_again_and_resumed(tmp_path):
 @joblib
 @pytest.mark.slow
 @pytest.mark.parametrize("stop", [signal.SIGTERM, signal.SIGHUP])
-def test_a_stopped_joblib_sweep_leaves_no_worker(stop, tmp_path):
-    sweep = [*SWEEP, *JOBLIB, "+strategy=baseline,gco", "fit.iterations=100_000"]
+def test_a_stopped_joblib_sweep_saves_its_running_jobs_begins_no_other_and_leaves_no_worker(stop, tmp_path):
+    sweep = [*SWEEP, *JOBLIB, "+strategy=baseline,gco,p2g", "fit.iterations=100_000", "fit.checkpoint_every=0"]
     process = started(*DOOR, *sweep, cwd=tmp_path, said=tmp_path / "said", session=True)
     wait_for(lambda: all((tmp_path / "all" / job / "cameras.json").exists() for job in ("0", "1")))
     process.send_signal(stop)
-    assert process.wait() == 130, (tmp_path / "said").read_text()
+    assert process.wait() == 128 + stop, (tmp_path / "said").read_text()
+    saved = [bool(checkpoint.saved(tmp_path / "all" / job / "checkpoints")) for job in ("0", "1")]
+    assert (saved, (tmp_path / "all" / "2").exists()) == ([True, True], False)
 
     def gone() -> bool:
         try:
