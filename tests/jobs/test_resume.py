@@ -8,6 +8,7 @@ from pathlib import Path
 import hydra
 import pytest
 from omegaconf import OmegaConf
+from PIL import Image, ImageOps
 
 import clear_strategies
 from clear_strategies.compose import CONF, tree
@@ -101,6 +102,16 @@ def test_a_run_goes_on_where_its_data_moved_and_not_on_other_data(there: str, tm
     train_on(here.rename(tmp_path / "moved"), folder, "fit.resume=auto")
     assert ("resumed from" if there == "checkpoint" else "nothing is trained") in caplog.text
     assert (folder / "metrics.json").is_file()
+
+
+def test_a_run_does_not_go_on_with_a_photo_whose_content_has_changed(tmp_path: Path) -> None:
+    photos, folder = captures.demo_on_disk(tmp_path / "photos"), tmp_path / "run"
+    train_on(photos, folder)
+    (photo,) = photos.rglob("0.png")
+    with Image.open(photo) as image:
+        ImageOps.mirror(image).save(photo)
+    with pytest.raises(DataError, match=r"run: photos: 1 of 4 have another content than in this run, such as 0\.png: "):
+        train_on(photos, tmp_path / "other", f"fit.resume={folder}")
 
 
 def test_that_few_photos_have_a_pose_is_said_first_and_last(tmp_path: Path, monkeypatch, caplog) -> None:
