@@ -53,7 +53,7 @@ def test_names_and_overrides_are_those_of_the_command_line_and_milestones_stretc
         (("gco,gco",), "gco twice"),
         (("gco,clear",), "gco twice"),
         ((["gco", "[svs]"],), r"must be a name or a list of names, got \+strategy=\[gco,\[svs\]\]. Write "),
-        ((["gco", 1],), r"must be a name or a list of names, got \+strategy=\[gco,1\]"),
+        (("[gco,1]",), r"must be a name or a list of names, got \+strategy=\[gco,1\]"),
         (("gco,best",), "gco twice"),
         (("best,svs",), "svs twice"),
         (("gco", "fit.iterations=3"), r"fit\.iterations: .* A conductor has settings of .*objective"),

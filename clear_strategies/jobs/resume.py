@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import msgspec
 import torch
+from torch import Tensor
 
 from clear_strategies.compose import flat
 from clear_strategies.data.scene import Scene
@@ -19,7 +20,7 @@ from clear_strategies.outputs.metrics import Metrics
 from clear_strategies.settings import CHANGES_NO_RESULT
 from clear_strategies.training import checkpoint
 from clear_strategies.training.checkpoint import CHECKPOINTS, Checkpoint
-from clear_strategies.training.state import TrainState
+from clear_strategies.training.state import PHOTOS, TrainState, colours
 from clear_strategies.viewing.cameras import FILE as CAMERAS
 from clear_strategies.viewing.cameras import read_cameras
 from rasterizers.interface import Camera
@@ -38,6 +39,7 @@ _FILES: Final = ("path", "lr_folder")
 _HELD: Final = " holds"
 _ROUNDED: Final = 1e-6  # of a position, as float32 has it
 _SAME: Final = 1e-3  # of a camera's focal length, and of the distances between the cameras
+_SAME_COLOUR: Final = 5e-4  # more than other machines round or decode differently
 
 
 def comparable(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -125,6 +127,7 @@ def restore(state: TrainState, scene: Scene, saved: Checkpoint, source: Path, co
     """Continue from a checkpoint of the same configuration, on the same photos and poses."""
     _require_same(source, saved.config, config)
     _require_same_cameras(source, scene)
+    _require_same_photos(source, saved, scene)
     state.restore(saved, source)
     _log.info("resumed from %s: %d iterations are done.", source, saved.t - 1)
     if saved.device != state.device.type:
@@ -166,3 +169,15 @@ def _require_same_cameras(source: Path, scene: Scene) -> None:
     if changed := sorted((then.keys() ^ now.keys()) | {name for name in both if not same(then[name], now[name])}):
         problem = f"{len(changed)} of {len(now)} photos have another name, size or pose than in this run, such as {changed[0]}"
         raise DataError(source, "data", problem, "give the same data, at whatever path, or start a new run")
+
+
+def _require_same_photos(source: Path, saved: Checkpoint, scene: Scene) -> None:
+    """Refuse training photos with another content; checkpoints of earlier versions do not have it."""
+    now = {name: (saved.tensors.get(f"{PHOTOS}/{name}", x), x) for name, x in colours(scene.train).items()}
+    if changed := [name for name, (a, b) in now.items() if not _same_colours(a, b)]:
+        problem = f"{len(changed)} of {len(now)} have another content than in this run, such as {changed[0]}"
+        raise DataError(source, "photos", problem, "give the photos of this run, or start a new run")
+
+
+def _same_colours(a: Tensor, b: Tensor) -> bool:
+    return a.shape == b.shape and float((a.double() - b.double()).abs().max()) <= _SAME_COLOUR

@@ -33,8 +33,14 @@ from rasterizers.interface import RasterSettings
 _log = logging.getLogger(__name__)
 
 _RULES: Final = RasterSettings()
-_CELLS: Final = 16  # a side, of the mean colours by which a checkpoint knows a photo
-_SAME: Final = 5e-4  # of such a colour: more than other machines round or decode differently
+PHOTOS: Final = "photos"
+"""What a checkpoint's tensors of `colours` begin with."""
+_CELLS: Final = 16  # a side
+
+
+def colours(views: Sequence[View]) -> dict[str, Tensor]:
+    """The mean colours of each LR photo in a grid, by its name: a checkpoint knows the photo by them."""
+    return {view.name: adaptive_avg_pool2d(view.lr.image.permute(2, 0, 1), _CELLS).cpu() for view in views}
 
 
 @dataclass(slots=True)
@@ -176,7 +182,7 @@ class TrainState:
             ("optimizer", self.optimizer.state_dict()),
             ("density", self.density.state_dict()),
             ("strategies", self.conductor.state_dict()),
-            ("photos", self._photos()),
+            (PHOTOS, colours(self.views)),
         ):
             tensors |= {f"{prefix}/{name}": value for name, value in table.items()}
         facts = {"optimizer_steps": float(self.optimizer.steps), "degree": float(self.field.degree)}
@@ -189,7 +195,6 @@ class TrainState:
         for name, value in saved.tensors.items():
             prefix, _, rest = name.partition("/")
             tables.setdefault(prefix, {})[rest] = value
-        self._require_same_photos(tables.get("photos", {}), source)
         try:
             parameters, device = tables["field"], self.device
             self._require_rows(tables, saved)
@@ -205,18 +210,6 @@ class TrainState:
             ) from error
         self.t = saved.t
         self.history = History(dict(row) for row in saved.history)
-
-    def _photos(self) -> dict[str, Tensor]:
-        """The mean colours of each training photo in a grid of `_CELLS`, by its name."""
-        return {v.name: adaptive_avg_pool2d(v.lr.image.permute(2, 0, 1), _CELLS).cpu() for v in self.views}
-
-    def _require_same_photos(self, then: Mapping[str, Tensor], source: Path) -> None:
-        """Refuse photos with another content; checkpoints of earlier versions do not have it."""
-        now = self._photos()
-        both = [(name, then[name].double(), x.double()) for name, x in now.items() if name in then]
-        if changed := [name for name, a, b in both if a.shape != b.shape or float((a - b).abs().max()) > _SAME]:
-            problem = f"{len(changed)} of {len(now)} have another content than in this run, such as {min(changed)}"
-            raise DataError(source, "photos", problem, "give the photos of this run, or start a new run")
 
     def _require_rows(self, tables: Mapping[str, Mapping[str, Tensor]], saved: Checkpoint) -> None:
         """Check that all restored tensors have a row for each Gaussian, and the width and type that this run has."""

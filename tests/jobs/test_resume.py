@@ -114,6 +114,21 @@ def test_a_run_does_not_go_on_with_a_photo_whose_content_has_changed(tmp_path: P
         train_on(photos, tmp_path / "other", f"fit.resume={folder}")
 
 
+def test_rounding_is_no_change_of_a_photo_and_checkpoints_of_earlier_versions_know_none():
+    def brighter(by: float):
+        first, *others = SCENE.train
+        return replace(SCENE, train=(replace(first, lr=replace(first.lr, image=first.lr.image + by)), *others))
+
+    saved = start(()).checkpoint({})
+    resume.restore(start(()), brighter(1e-4), saved, Path("there"), {})
+    with pytest.raises(
+        DataError, match=f"there: photos: 1 of 3 have another content .* such as {SCENE.train[0].name}: "
+    ):
+        resume.restore(start(()), brighter(1e-2), saved, Path("there"), {})
+    earlier = {name: x for name, x in saved.tensors.items() if not name.startswith("photos/")}
+    resume.restore(start(()), brighter(1e-2), replace(saved, tensors=earlier), Path("there"), {})
+
+
 def test_that_few_photos_have_a_pose_is_said_first_and_last(tmp_path: Path, monkeypatch, caplog) -> None:
     caplog.set_level("INFO")
 
