@@ -353,13 +353,17 @@ class Attachment:
             self._finish_step()
 
     def _finish_step(self) -> None:
-        """Call `on_resize` and `after_step`, now that the host has stepped and perhaps densified."""
+        """Call `on_resize` and `after_step`, now that the host has stepped and perhaps densified. Passes whose gradients the loop
+        has dropped before it stepped, e.g. after an error, are of no iteration.
+        """
         params = self.params()
         self._resize(len(params["means"]))
-        if self._passes >= self.accumulation:
+        has_stepped = bool(self._stepped) or self._passes >= self.accumulation  # a gradient scaler may skip the step
+        if self._passes and has_stepped:
             if self._step is not None:
                 self.conductor.after_step({name: _to_change(p) for name, p in params.items()}, self._step)
             self.t += 1
+        if has_stepped or not any(p.grad is not None and bool(p.grad.any()) for p in params.values()):
             self._passes = 0
 
     def _resize(self, n: int) -> None:

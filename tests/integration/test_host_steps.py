@@ -197,6 +197,29 @@ def test_the_densifier_reads_a_score_that_has_the_scale_of_its_own_gradients(acc
     assert torch.allclose(*read, rtol=1e-5, atol=0)
 
 
+@pytest.mark.parametrize("set_to_none", [True, False])
+def test_an_iteration_ends_with_the_hosts_step_whatever_became_of_its_passes(set_to_none):
+    host, clear, render = started(toy.ShowsDark(), accumulation=2)
+
+    def ends(passes, *, steps, t):
+        for i in range(passes):
+            render(i).mean().backward()
+            assert clear.attachment.t == t
+        for optimizer in host.optimizers.values():
+            if steps:
+                optimizer.step()
+            optimizer.zero_grad(set_to_none=set_to_none)
+
+    ends(2, steps=True, t=1)
+    ends(1, steps=False, t=2)  # the other ran out of memory, and the loop goes on
+    ends(2, steps=True, t=2)
+    ends(1, steps=True, t=3)  # what is left of an epoch
+    ends(2, steps=False, t=4)  # a gradient scaler skips the step
+    ends(2, steps=True, t=5)
+    assert clear.attachment.t == 6
+    assert clear.attachment.counts["extra views"] == 4
+
+
 @pytest.mark.parametrize(
     ("threshold", "anchor_start", "with_hr"),
     [(None, 100, [1, 3, 5]), (1e-4, 100, [1, 2, 3, 4, 5, 6]), (1e-4, 4, [1, 2, 3, 5])],
