@@ -80,7 +80,7 @@ class Attachment:
         iterations: of the loop, where they are known.
 
     Attributes:
-        t: the current iteration, from 1.
+        t: the current iteration, from 1. passes: its backward passes so far.
         counts: how often each kind of work was done.
         removed: whether `remove` was called.
     """
@@ -109,14 +109,13 @@ class Attachment:
         self._views = {view.name: view for view in views}
         self.conductor, self.params, self.accumulation = conductor, params, accumulation
         self._masks, self._own_background, self._reads_score = dict(masks or {}), own_background, reads_score
-        self.t = 1
+        self.t, self.passes = 1, 0
         self.counts: Counter[str] = Counter()
         self.removed = False
         self._poll_parents, self._restart_parents, self._remedy = poll_parents, restart_parents, remedy
         self._loss_scale = loss_scale
         self._scaler = None if threshold is None else ScoreScaler(threshold)
         self._n = len(params()["means"])
-        self._passes = 0  # backward passes of this iteration
         self._detail_gradients = 0
         self._pending: Pending | None = None  # the last rendering
         self._pass: BackwardPass | None = None  # the last one that has reached a rendering
@@ -151,7 +150,7 @@ class Attachment:
             view = conductor.skips.view(view, t)
             hr, routed = self._hr_side(view, t, z, render_at, params)
         self._step = Step(t, view, params=params) if hr is None else hr.step
-        if self._passes == 0:  # one step of the host, however many passes it accumulates
+        if self.passes == 0:  # one step of the host, however many passes it accumulates
             self._extra.forget()
             if extra_views := conductor.extra_views(t):
                 self._extra.take(extra_views, lambda extra: self._of_extra(extra, view, t, render_at))
@@ -235,14 +234,14 @@ class Attachment:
         if not self.removed:
             self._resize(len(self.params()["means"]))  # the host may have densified since it rendered
         return {
-            "t": self.t, "passes": self._passes, "strategies": self.conductor.state_dict(),
+            "t": self.t, "passes": self.passes, "strategies": self.conductor.state_dict(),
             "view": None if self._step is None else self._step.view.name, "step": _rows_of(self._step),
             "score": None if self._scaler is None else self._scaler.state_dict(),
         }  # fmt: skip
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a state; the host has loaded its parameters already."""
-        self.t, self._passes = int(state["t"]), int(state["passes"])
+        self.t, self.passes = int(state["t"]), int(state["passes"])
         self.conductor.load_state_dict(state["strategies"])
         self._restart_parents()
         self._n = len(self.params()["means"])
@@ -358,13 +357,14 @@ class Attachment:
         """
         params = self.params()
         self._resize(len(params["means"]))
-        has_stepped = bool(self._stepped) or self._passes >= self.accumulation  # a gradient scaler may skip the step
-        if self._passes and has_stepped:
+        has_stepped = bool(self._stepped) or self.passes >= self.accumulation  # a gradient scaler may skip the step
+        if self.passes and has_stepped:
             if self._step is not None:
                 self.conductor.after_step({name: _to_change(p) for name, p in params.items()}, self._step)
             self.t += 1
-        if has_stepped or not any(p.grad is not None and bool(p.grad.any()) for p in params.values()):
-            self._passes = 0
+        gradients = (p.grad for name, p in params.items() if name != "detail")  # which the host may know nothing of
+        if has_stepped or not any(g is not None and bool(g.any()) for g in gradients):
+            self.passes = 0
 
     def _resize(self, n: int) -> None:
         """Gather the strategies' per-Gaussian state if the structure has changed."""
@@ -459,7 +459,7 @@ class Attachment:
         self.counts["merges"] += 1
         if not first:
             return
-        self._passes += 1
+        self.passes += 1
         if detail is not None:
             self._finish_detail(detail, [done.params[name] for name in names], hr is not None and hr.hf is not None)
         if (screen := pending.screen.get(done.task)) is not None and pending.output is not None and hr is not None:

@@ -54,6 +54,7 @@ class Attached:
         detail: train the detail feature f_det beside the host's parameters.
         own_background: the host chooses the colour behind its renderings (`--random_background`); else the strategies may choose
             another for `bg_color` where that is black.
+        accumulation: see `Attachment`.
 
     Attributes:
         views: the training views, by name and by camera.
@@ -78,6 +79,7 @@ class Attached:
         densify_until: int | None = None,
         detail: bool = True,
         own_background: bool = False,
+        accumulation: int = 1,
         seed: int = 0,
     ) -> None:
         required = (*_ATTRIBUTES.values(), "optimizer")
@@ -97,7 +99,7 @@ class Attached:
         self._warned: set[str] = set()
         self.attachment = Attachment(
             conductor, self.params, views=self.views.all, seed=seed, threshold=threshold, masks=self.views.masks,
-            poll_parents=self.detail.poll_parents, own_background=own_background,
+            poll_parents=self.detail.poll_parents, own_background=own_background, accumulation=accumulation,
             remedy="Nothing has their colour and rotation. End densification first.",
         )  # fmt: skip
         self._undo = ExitStack()
@@ -149,8 +151,10 @@ class Attached:
                 self._warn_of_what_was_not_read(overrides, output)
                 return output
 
-            self.detail.forget_gradient()
-            return self.attachment.render_view(view, render_at)
+            output = self.attachment.render_view(view, render_at)
+            if not self.attachment.passes:
+                self.detail.forget_gradient()
+            return output
 
         return wrapped
 

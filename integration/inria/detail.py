@@ -54,7 +54,7 @@ class DetailFeature:
         self._adam.zero_grad(set_to_none=True)
 
     def forget_gradient(self) -> None:
-        """Before a rendering: the host's `zero_grad`, of a step that it has left out, does not reach this Adam."""
+        """Before the first pass of a step: the host's `zero_grad`, of one that it has left out, does not reach this Adam."""
         self._adam.zero_grad(set_to_none=True)
 
     def state_dict(self) -> dict[str, Any]:

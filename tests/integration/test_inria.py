@@ -165,6 +165,24 @@ def test_a_host_that_densifies_after_the_anchor_nevertheless_is_stopped(inria_ho
         loop(inria_host, clear, options(inria_host, inria_capture), gaussians, scene)
 
 
+def test_accumulated_passes_have_the_gradient_of_one_and_are_one_iteration(inria_host, inria_attached):
+    found = []
+    for passes in (1, 2):
+        clear, gaussians, scene = inria_attached(GCO(), accumulation=passes)
+        render, camera = clear.wrap(inria_host.render), scene.cameras[0]
+        for i in range(2 * passes - 1):
+            if i == passes - 1:  # the first step fails
+                gaussians.optimizer.zero_grad()
+            image = render(camera, gaussians, None, None)["render"]
+            (inria_host.photometric(image, camera.original_image) / passes).backward()
+        found.append({name: p.grad.clone() for name, p in clear.params().items() if p.grad is not None})
+        gaussians.optimizer.step()
+        assert clear.attachment.t == 2
+    assert found[0]["detail"].any()
+    for name, g in found[0].items():
+        assert torch.allclose(found[1][name], g, rtol=1e-4, atol=1e-6 * float(g.abs().max())), name
+
+
 @pytest.mark.parametrize("indices", [False, True])
 def test_dropped_gaussians_are_not_visible(indices, inria_host, inria_attached):
     half = SVS(dropout=Ramp(maximum=0.5, shape="constant"))
