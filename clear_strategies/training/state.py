@@ -39,8 +39,15 @@ _CELLS: Final = 16  # a side
 
 
 def colours(views: Sequence[View]) -> dict[str, Tensor]:
-    """The mean colours of each LR photo in a grid, by its name: a checkpoint knows the photo by them."""
-    return {view.name: adaptive_avg_pool2d(view.lr.image.permute(2, 0, 1), _CELLS).cpu() for view in views}
+    """The mean colours of each LR photo in a grid, by its name: a checkpoint knows the photo by them. Hidden pixels count as 0,
+    and so do those that are not finite.
+    """
+    found: dict[str, Tensor] = {}
+    for view in views:
+        image = torch.nan_to_num(view.lr.image, 0.0, 0.0, 0.0)
+        image = image if view.lr.shown is None else image * view.lr.shown[..., None]
+        found[view.name] = adaptive_avg_pool2d(image.permute(2, 0, 1), _CELLS).cpu()
+    return found
 
 
 @dataclass(slots=True)

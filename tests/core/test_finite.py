@@ -56,10 +56,13 @@ def test_a_sum_that_overflows_is_finite_where_its_numbers_are():
 @pytest.mark.parametrize("scale", ["lr", "hr"])
 def test_a_pixel_that_is_not_finite_is_named_before_the_step(begun, scale, bad, monkeypatch):
     state, before = begun
-    monkeypatch.setattr(state, "views", without_a_pixel(bad, scale).train)
     photo = {"lr": "the LR photo", "hr": "the SR image"}[scale]
-    with pytest.raises(DivergedError, match=rf"^t=6, view view\d: the loss .*{photo} is not finite.*pixel \(5, 3\)"):
-        iterate(state, toy.RASTERIZER)
+    with monkeypatch.context() as now:
+        now.setattr(state, "views", without_a_pixel(bad, scale).train)
+        with pytest.raises(
+            DivergedError, match=rf"^t=6, view view\d: the loss .*{photo} is not finite.*pixel \(5, 3\)"
+        ):
+            iterate(state, toy.RASTERIZER)
     assert state.t == 6
     assert_same(before, tensors(state))
 
