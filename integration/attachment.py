@@ -80,7 +80,8 @@ class Attachment:
         iterations: of the loop, where they are known.
 
     Attributes:
-        t: the current iteration, from 1. passes: its backward passes so far.
+        t: the current iteration, from 1.
+        passes: its backward passes so far.
         counts: how often each kind of work was done.
         removed: whether `remove` was called.
     """
@@ -357,8 +358,10 @@ class Attachment:
         """
         params = self.params()
         self._resize(len(params["means"]))
+        if not self.passes:
+            return
         has_stepped = bool(self._stepped) or self.passes >= self.accumulation  # a gradient scaler may skip the step
-        if self.passes and has_stepped:
+        if has_stepped:
             if self._step is not None:
                 self.conductor.after_step({name: _to_change(p) for name, p in params.items()}, self._step)
             self.t += 1
