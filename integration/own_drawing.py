@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, TypeGuard
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -25,7 +25,8 @@ from clear_strategies.merging.iteration import HrSide
 from clear_strategies.merging.replays import RecordedWork, replays_on, why_strategies_are_not_recorded
 from integration.autograd_shot import AutogradShot, HostOutput, Target, every_number, to_parameters
 from rasterizers.autograd import BackwardHook, Drawing
-from rasterizers.interface import Camera, Rasterizer, Recordable, Splats, over
+from rasterizers.inputs import Inputs
+from rasterizers.interface import Camera, Rasterizer, Recordable, can_be_recorded, over
 from rasterizers.modes import in_full_precision
 from rasterizers.replays import Kind, Recorded, copied, write
 from rasterizers.told import name_of_view
@@ -53,18 +54,9 @@ class Drawable:
     params: Mapping[str, Tensor]
 
     @property
-    def tensors(self) -> tuple[Tensor | None, ...]:
-        """Means, quats, scales, opacities, the active bands of the colours and f_det, without their graph."""
-        means, quats, scales, opacities = (
-            self.drawn[name].detach() for name in ("means", "quats", "scales", "opacities")
-        )
-        offset = None if self.offset is None else self.offset.detach()
-        return means, quats, scales, opacities, self.drawn["colors"].detach()[:, : self.bands], offset
-
-
-def can_be_recorded(rasterizer: Rasterizer) -> TypeGuard[Recordable]:
-    """As `isinstance`, which for a protocol takes a tenth of the time that the host has in a replay."""
-    return hasattr(rasterizer, "over_changing")
+    def inputs(self) -> Inputs:
+        """What is drawn, without its graph."""
+        return Inputs(**self.drawn, rgb_offset=self.offset).drawn(self.bands)
 
 
 RenderAt = Callable[[Target, Float[Tensor, " N"] | None, View], HostOutput | Drawable]
@@ -78,12 +70,12 @@ class _Given:
     """What the work on one picture reads.
 
     Args:
-        drawn: see `Drawable.tensors`.
+        drawn: see `Drawable.inputs`.
         photo: what the picture is compared with.
         known: what strategies look up of its view, or the weight of the pixels of an extra view.
     """
 
-    drawn: tuple[Tensor | None, ...]
+    drawn: Inputs
     background: Float[Tensor, "1 3"]
     camera: Camera
     photo: Photo
@@ -92,10 +84,8 @@ class _Given:
 
     def copied(self) -> _Given:
         photo = Photo(self.photo.camera, self.photo.image.clone(), copied(self.photo.shown))
-        drawn = tuple(None if x is None else x.clone(memory_format=torch.contiguous_format) for x in self.drawn)
-        return _Given(
-            drawn, self.background.clone(), replace(self.camera), photo, copied(self.known), copied(self.mask)
-        )
+        drawn, background = self.drawn.copied(), self.background.clone()
+        return _Given(drawn, background, replace(self.camera), photo, copied(self.known), copied(self.mask))
 
     @property
     def of_the_scene(self) -> list[Tensor | None]:
@@ -116,9 +106,7 @@ class _Given:
         else:
             red, green, blue = self.background[0].tolist()
             rasterizer = over(rasterizer, (red, green, blue))
-        means, quats, scales, opacities, colors, offset = self.drawn
-        splats = Splats(means, quats, scales, opacities, colors[:, :1], colors[:, 1:], offset)  # type: ignore[arg-type, index]
-        r = rasterizer(splats, self.camera)
+        r = rasterizer(self.drawn.splats(), self.camera)
         drawing = Drawing(r, asked.drawn, r.image, BackwardHook())
         image = r.image if self.mask is None else r.image * self.mask
         return AutogradShot(image, r.means2d, r.visible, asked.params, drawings=(drawing,), mask=self.mask)
@@ -169,7 +157,7 @@ class OwnDrawing:
         conductor = self._conductor
         photo = view.hr.over(conductor.background(t), view.background)
         known = None if self._replays is None else conductor.looked_up(view)
-        given = _Given(asked.tensors, asked.background, asked.camera, photo, known, mask)
+        given = _Given(asked.inputs, asked.background, asked.camera, photo, known, mask)
 
         def work(given: _Given, recorded: bool) -> tuple[tuple[HrSide, Grads], dict[str, Number]]:
             if not recorded:
@@ -194,7 +182,7 @@ class OwnDrawing:
         """The gradient of `Conductor.extra_loss`, a number for each of the raw parameters."""
         conductor = self._conductor
         photo = extra.photo.over(conductor.background(t), extra.background)
-        given = _Given(asked.tensors, asked.background, asked.camera, photo, extra.weight, None)
+        given = _Given(asked.inputs, asked.background, asked.camera, photo, extra.weight, None)
 
         def work(given: _Given, recorded: bool) -> tuple[Grads, dict[str, Number]]:
             shot = given.shot(asked)

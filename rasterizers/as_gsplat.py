@@ -19,8 +19,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 import rasterizers
-from rasterizers.autograd import Inputs, Rendered, in_graph, render
+from rasterizers.autograd import Rendered, in_graph, render
 from rasterizers.geometry import REACH, constant_band, depths, low_and_span
+from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer, RasterSettings, WithRadii, over
 from rasterizers.modes import in_full_precision, uncompiled
 from rasterizers.native import empty_for

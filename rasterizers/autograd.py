@@ -21,6 +21,7 @@ from torch.autograd.function import once_differentiable
 from rasterizers import replayed
 from rasterizers.ahead import draw_or_take, is_drawing_ahead
 from rasterizers.checks import require_absgrad, require_depth
+from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, over
 from rasterizers.modes import in_full_precision, uncompiled
 from rasterizers.native import empty_for
@@ -142,24 +143,6 @@ def draw(
     return in_graph(rendered, inputs, means2d, pose=camera.world_to_camera)
 
 
-class Inputs(NamedTuple):
-    """The tensors that a drawing is a function of. The colours are one tensor, as hosts have them: autograd would fill others as
-    wide with zeros for the gradient of a slice.
-    """
-
-    means: Float[Tensor, "N 3"]
-    quats: Float[Tensor, "N 4"]
-    scales: Float[Tensor, "N 3"]
-    opacities: Float[Tensor, " N"]
-    colors: Float[Tensor, "N K 3"]
-    rgb_offset: Float[Tensor, "N 3"] | None
-
-    def splats(self, bands: int) -> Splats:
-        """The same without their graph, with the first bands of the colours."""
-        means, quats, scales, opacities, colors, offset = (x if x is None else x.detach() for x in self)
-        return Splats(means, quats, scales, opacities, colors[:, :1], colors[:, 1:bands], offset)  # type: ignore[arg-type, index]
-
-
 class Rendered(NamedTuple):
     rendering: Rendering
     rasterizer: Rasterizer
@@ -177,12 +160,11 @@ def render(
     """
     if depth:
         require_depth(rasterizer)
-    splats = inputs.splats(bands)
     with torch.no_grad():
         if replays and not is_drawing_ahead():
-            rendering = replayed.draw(rasterizer, splats, inputs.colors.detach()[:, :bands], camera, depth=depth)
+            rendering = replayed.draw(rasterizer, inputs.drawn(bands), camera, depth=depth)
         else:
-            rendering = draw_or_take(rasterizer, splats, camera, depth=depth)
+            rendering = draw_or_take(rasterizer, inputs.splats(bands), camera, depth=depth)
     return Rendered(rendering, rasterizer, camera, bands)
 
 

@@ -19,7 +19,7 @@ import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import chain
-from typing import Final, Protocol, cast, runtime_checkable
+from typing import Final, Protocol, TypeGuard, cast, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -327,9 +327,18 @@ class Recordable(Protocol):
         """
         ...
 
+    def background_on(self, device: torch.device) -> Float[Tensor, "1 3"]:
+        """The background, in a tensor that is not written to."""
+        ...
+
     def over_changing(self, background: Float[Tensor, "1 3"]) -> Rasterizer:
         """The rasterizer with a background on the device."""
         ...
+
+
+def can_be_recorded(rasterizer: Rasterizer) -> TypeGuard[Recordable]:
+    """As `isinstance`, which for a protocol takes a tenth of the time that the host has in a replay."""
+    return hasattr(rasterizer, "over_changing")
 
 
 @dataclass(frozen=True, slots=True)

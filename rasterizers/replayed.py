@@ -19,25 +19,19 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rasterizers.checks import drawing
-from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, WithRadii, over
+from rasterizers.inputs import Inputs
+from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, WithRadii, can_be_recorded, over
 from rasterizers.recording import Recording, on_side_stream, running
 from rasterizers.replays import Kind, Recorded, Replays, can_record, write
-from rasterizers.warp_runtime import sent
 
 _BLACK: Final = (0.0, 0.0, 0.0)
 _GRADIENTS: Final = tuple(f.name for f in fields(SplatGradients) if f.name != "absgrad")
 
 
-def draw(
-    rasterizer: Rasterizer, splats: Splats, colors: Float[Tensor, "N B1 3"], camera: Camera, *, depth: bool
-) -> Rendering:
-    """A drawing: by a replay where it can be one.
-
-    Args:
-        colors: the spherical harmonics that are drawn, of which `splats` has slices.
-    """
-    device, asked = splats.means.device, _Asked(rasterizer, splats, colors, camera, depth)
-    if not (can_record(device) and hasattr(rasterizer, "over_changing")) or running() is not None:
+def draw(rasterizer: Rasterizer, inputs: Inputs, camera: Camera, *, depth: bool) -> Rendering:
+    """A drawing of the inputs, which have no graph: by a replay where it can be one."""
+    device, asked = inputs.means.device, _Asked(rasterizer, inputs, camera, depth)
+    if not (can_record(device) and can_be_recorded(rasterizer)) or running() is not None:
         return asked.live()
     if device not in _threads.drawings:
         _threads.drawings[device] = _Drawings(device)
@@ -49,28 +43,24 @@ class _Asked:
     """What a drawing is made of; see `draw`."""
 
     rasterizer: Any
-    splats: Splats
-    colors: Float[Tensor, "N B1 3"]
+    inputs: Inputs
     camera: Camera
     depth: bool
 
     @property
-    def tensors(self) -> list[Tensor | None]:
-        s = self.splats
-        return [s.means, s.quats, s.scales, s.opacities, self.colors, s.rgb_offset]
+    def kind(self) -> Kind:
+        shapes = tuple(None if x is None else x.shape for x in self.inputs)
+        size = self.camera.width, self.camera.height
+        return Kind((len(self.inputs.means),), (*shapes, size), (_over_black(self.rasterizer), self.depth))
 
     @property
-    def kind(self) -> Kind:
-        shapes = tuple(None if x is None else x.shape for x in self.tensors)
-        size = self.camera.width, self.camera.height
-        return Kind((len(self.splats),), (*shapes, size), (_over_black(self.rasterizer), self.depth))
-
-    def numbers_of(self, camera: Camera) -> Sequence[Tensor]:
-        numbers: Sequence[Tensor] = self.rasterizer.numbers_of(camera, self.splats.means.device)
-        return numbers
+    def read(self) -> list[Tensor | None]:
+        """All tensors that the work reads."""
+        r, device = self.rasterizer, self.inputs.means.device
+        return [*self.inputs, *r.numbers_of(self.camera, device), r.background_on(device)]
 
     def live(self) -> Rendering:
-        return drawing(self.rasterizer, self.depth)(self.splats, self.camera)
+        return drawing(self.rasterizer, self.depth)(self.inputs.splats(), self.camera)
 
 
 class _RecordedDrawing(Recorded[_Asked, Rendering]):
@@ -83,19 +73,17 @@ class _RecordedDrawing(Recorded[_Asked, Rendering]):
     _work: Recording[tuple[Rendering, list[Tensor | None]]]
 
     def __init__(self, asked: _Asked) -> None:
-        device = asked.splats.means.device
-        own = [None if x is None else x.clone(memory_format=torch.contiguous_format) for x in asked.tensors]
-        means, quats, scales, opacities, colors, offset = own
-        splats = Splats(means, quats, scales, opacities, colors[:, :1], colors[:, 1:], offset)  # type: ignore[arg-type, index]
-        camera, self._color = replace(asked.camera), asked.rasterizer.background
-        self._own, self._numbers = own, asked.numbers_of(camera)
-        self._background = sent(torch.tensor([self._color], dtype=torch.float32), device)
-        self._cotangent = self._background.new_zeros(1, camera.height, camera.width, 3)
+        device, camera = asked.inputs.means.device, replace(asked.camera)  # its numbers become those of others
+        background = asked.rasterizer.background_on(device).clone()
+        own = replace(
+            asked, rasterizer=asked.rasterizer.over_changing(background), inputs=asked.inputs.copied(), camera=camera
+        )
+        self._own = own.read
+        self._cotangent = background.new_zeros(1, camera.height, camera.width, 3)
         self.turn = 0
-        drawn_by = drawing(asked.rasterizer.over_changing(self._background), asked.depth)
 
         def forward() -> tuple[Rendering, list[Tensor | None]]:
-            r = drawn_by(splats, camera)
+            r = own.live()
             return r, [r.image, r.alpha, r.depth, r.means2d, r.visible]
 
         with on_side_stream(device):
@@ -116,10 +104,7 @@ class _RecordedDrawing(Recorded[_Asked, Rendering]):
         return SplatGradients(*_copied([getattr(self._back.result, name) for name in _GRADIENTS]))
 
     def _write(self, given: _Asked) -> None:
-        write([*self._own, *self._numbers], [*given.tensors, *given.numbers_of(given.camera)])
-        if (color := given.rasterizer.background) != self._color:
-            self._background.copy_(sent(torch.tensor([color], dtype=torch.float32), self._background.device))
-            self._color = color
+        write(self._own, given.read)
 
 
 class _Replayed:

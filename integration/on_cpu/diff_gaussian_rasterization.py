@@ -26,6 +26,7 @@ from torch.utils.checkpoint import checkpoint
 import rasterizers
 from rasterizers import autograd
 from rasterizers.geometry import constant_band, depths, low_and_span
+from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer, Splats, over
 from rasterizers.reference.projection import footprints
 
@@ -142,7 +143,7 @@ class GaussianRasterizer(torch.nn.Module):
         else:
             raise ValueError("exactly one of shs and colors_precomp must be given.")
         red, green, blue = ((x - low) / span for x in behind)
-        inputs = autograd.Inputs(*shapes, colors, None)
+        inputs = Inputs(*shapes, colors, None)
         rendered = autograd.render(over(rasterizer, (red, green, blue)), inputs, bands, camera, depth=False)
         centres = _InNdc.apply(means2D, rendered.rendering.means2d, absgrad, camera)  # type: ignore[no-untyped-call]
         drawn = autograd.in_graph(rendered, inputs, centres, absgrad=absgrad)

@@ -269,7 +269,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         reconcile: {"_for_device": lambda device: warp_merge},
         rasterizers.native: {"empty": on_no_cpu},
         frame: {"DEFERRED_COUNTS": {"cpu": True}},
-        **{m: {"sent": sends} for m in (warp_runtime, settings, replay, replayed)},
+        **{m: {"sent": sends} for m in (warp_runtime, settings, replay)},
     }  # fmt: skip
     for owner, values in patches.items():
         for name, value in values.items():

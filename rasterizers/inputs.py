@@ -1,0 +1,38 @@
+"""The tensors that a drawing is a function of, as a loop has them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rasterizers.interface import Splats
+
+
+class Inputs(NamedTuple):
+    """The tensors that a drawing is a function of. The colours are one tensor, as hosts have them: autograd would fill others as
+    wide with zeros for the gradient of a slice.
+    """
+
+    means: Float[Tensor, "N 3"]
+    quats: Float[Tensor, "N 4"]
+    scales: Float[Tensor, "N 3"]
+    opacities: Float[Tensor, " N"]
+    colors: Float[Tensor, "N K 3"]
+    rgb_offset: Float[Tensor, "N 3"] | None
+
+    def drawn(self, bands: int | None = None) -> Inputs:
+        """The same without their graph, with the first bands of the colours; None: with all."""
+        means, quats, scales, opacities, colors, offset = (x if x is None else x.detach() for x in self)
+        return Inputs(means, quats, scales, opacities, colors[:, :bands], offset)  # type: ignore[arg-type, index]
+
+    def splats(self, bands: int | None = None) -> Splats:
+        """`drawn` as a rasterizer takes them."""
+        means, quats, scales, opacities, colors, offset = self.drawn(bands)
+        return Splats(means, quats, scales, opacities, colors[:, :1], colors[:, 1:], offset)
+
+    def copied(self) -> Inputs:
+        """The same in memory of their own, row by row."""
+        return Inputs(*(x if x is None else x.clone(memory_format=torch.contiguous_format) for x in self))  # type: ignore[arg-type]
