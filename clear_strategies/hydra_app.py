@@ -204,7 +204,9 @@ def _end(error: BaseException, ending: exit_codes.Ending, folder: Path, *, resum
         return
     _log.log(logging.INFO if code > exit_codes.SIGNALS else logging.ERROR, "%s", message)  # a stop is no error
     if in_sweep and code == exit_codes.UNUSABLE:
-        finished = (folder / "metrics.json").exists()  # its folder stays as it is
+        from clear_strategies.jobs import resume
+
+        finished = resume.begun(folder) == "results"  # its folder stays as it is
         note = folder.with_name(f"{folder.name}_{FAILED}") if finished else folder / FAILED
         files.write_text(note, f"job {hydra_config.job.num}: {message}\n")
         return
