@@ -2,7 +2,8 @@
 
 Both passes of one kind of drawing are recorded, see `replays`, and done again for other splats, cameras and backgrounds. A loop
 may keep a drawing, and a replay overwrites the one before. So its results are copied; while a drawing awaits its backward pass,
-another of its kind is live; and a backward pass that comes later than the next replay draws once more.
+another of its kind is live; and a backward pass that comes later than the next replay draws once more. A recording is used only
+if it has the bits of a live drawing of the same inputs.
 """
 
 from __future__ import annotations
@@ -71,6 +72,7 @@ class _RecordedDrawing(Recorded[_Asked, Rendering]):
     """
 
     _work: Recording[tuple[Rendering, list[Tensor | None]]]
+    _back: Recording[list[Tensor | None]]
 
     def __init__(self, asked: _Asked) -> None:
         device, camera = asked.inputs.means.device, replace(asked.camera)  # its numbers become those of others
@@ -79,17 +81,23 @@ class _RecordedDrawing(Recorded[_Asked, Rendering]):
             asked, rasterizer=asked.rasterizer.over_changing(background), inputs=asked.inputs.copied(), camera=camera
         )
         self._own = own.read
-        self._cotangent = background.new_zeros(1, camera.height, camera.width, 3)
+        self._cotangent = background.new_ones(1, camera.height, camera.width, 3)
         self.turn = 0
 
         def forward() -> tuple[Rendering, list[Tensor | None]]:
             r = own.live()
             return r, [r.image, r.alpha, r.depth, r.means2d, r.visible]
 
-        with on_side_stream(device):
-            forward()[0].vjp(self._cotangent)  # compiles the kernels of the backward pass
+        def backward(r: Rendering) -> list[Tensor | None]:
+            gradients = r.vjp(self._cotangent)
+            return [getattr(gradients, name) for name in _GRADIENTS]
+
+        with on_side_stream(device):  # live, which also compiles the kernels of the backward pass
+            rendering, live = forward()
+            live += backward(rendering)
         self._work = Recording(device, forward)
-        self._back = Recording(device, lambda: self._work.result[0].vjp(self._cotangent))
+        self._back = Recording(device, lambda: backward(self._work.result[0]))
+        _require_same_bits([*self._work.result[1], *self._back.result], live)
 
     def outcome(self, given: _Asked) -> Rendering:
         """See `Recorded`."""
@@ -101,7 +109,7 @@ class _RecordedDrawing(Recorded[_Asked, Rendering]):
         """Of what was drawn last."""
         self._cotangent.copy_(cotangents)
         self._back.replay()
-        return SplatGradients(*_copied([getattr(self._back.result, name) for name in _GRADIENTS]))
+        return SplatGradients(*_copied(self._back.result))
 
     def _write(self, given: _Asked) -> None:
         write(self._own, given.read)
@@ -164,6 +172,12 @@ _threads: Final = _Threads()
 @lru_cache(maxsize=64)
 def _over_black(rasterizer: Any) -> Rasterizer:
     return over(rasterizer, _BLACK)
+
+
+def _require_same_bits(replayed: Sequence[Tensor | None], live: Sequence[Tensor | None]) -> None:
+    for x, y in zip(replayed, live, strict=True):
+        if x is not None and y is not None and not torch.allclose(x, y, rtol=0, atol=0, equal_nan=True):
+            raise RuntimeError("a replay has other bits than a live drawing of the same splats.")
 
 
 def _copied(made: Sequence[Tensor | None]) -> list[Any]:

@@ -175,6 +175,24 @@ def test_where_a_recording_fails_drawings_are_live_from_then_on_and_one_line_say
     assert not replays
 
 
+@pytest.mark.parametrize("which", [0, 1], ids=["forward", "backward"])
+def test_a_recording_with_other_bits_than_a_live_drawing_is_not_used(recorded_on, replays, monkeypatch, caplog, which):
+    made = []
+
+    class Wrong(Recording):
+        def __init__(self, *args):
+            super().__init__(*args)
+            made.append(self)
+            if len(made) == which + 1:
+                (self.result if which else self.result[1])[0].view(-1)[0] += 1
+
+    monkeypatch.setattr(replayed, "Recording", Wrong)
+    both(recorded_on, lambda params, **how: [step(params, angle, **how) for angle in ANGLES])
+    assert caplog.text.count("a replay has other bits than a live drawing of the same splats") == 1
+    assert len(made) == 2
+    assert not replays
+
+
 def test_each_thread_has_drawings_of_its_own(recorded_on, replays):
     if recorded_on.type == "cpu":
         pytest.skip("the stand-in stands in for this thread only")
