@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from rasterizers.warp_backend.types import FAR, TILE, Cuts, Ellipse, Grid, Row, ellipse_of
+from rasterizers.warp_backend.types import FAR, TILE, Cuts, Ellipse, Grid
 
 wp.set_module_options({"enable_backward": False})
 
@@ -115,7 +115,7 @@ def nth_tile(ellipse: Ellipse, nth: wp.int32, grid: Grid) -> wp.int32:
 def list_pairs(
     order: wp.array[wp.int32],
     ends: wp.array[wp.int64],
-    rows: wp.array[Row],
+    ellipses: wp.array[Ellipse],
     grids: wp.array[Grid],
     firsts: wp.array[wp.int32],
     tiles: wp.array[wp.int32],
@@ -139,7 +139,7 @@ def list_pairs(
         nth -= wp.int32(ends[rank - 1])
     if nth == 0:
         firsts[i] = place
-    tiles[place] = nth_tile(ellipse_of(rows[i]), nth, grid)
+    tiles[place] = nth_tile(ellipses[i], nth, grid)
     splats[place] = i
 
 

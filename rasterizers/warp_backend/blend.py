@@ -23,7 +23,7 @@ from typing import Any, Final
 import warp as wp
 
 from rasterizers.warp_backend.bins import exponent
-from rasterizers.warp_backend.types import PIXELS, SEGMENT, SUMS, TILE, Cuts, Grid, Row, ellipse_of, width_of
+from rasterizers.warp_backend.types import PIXELS, SEGMENT, SUMS, TILE, Cuts, Ellipse, Grid, width_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -45,8 +45,8 @@ def inside(pixel: wp.vec2i, grid: Grid) -> wp.bool:
 
 
 @wp.func
-def near(row: Row, tile: wp.int32, grid: Grid) -> Near:
-    ellipse, first = ellipse_of(row), pixel_of(tile, 0, grid)
+def near(ellipse: Ellipse, tile: wp.int32, grid: Grid) -> Near:
+    first = pixel_of(tile, 0, grid)
     centre = ellipse.whole - wp.vec2(wp.float32(first[0]), wp.float32(first[1])) + (ellipse.rest - wp.vec2(0.5, 0.5))
     rgb = wp.max(ellipse.rgb, wp.vec3(0.0, 0.0, 0.0))
     return Near(centre[0], centre[1], ellipse.A, ellipse.B, ellipse.C, ellipse.opacity, rgb[0], rgb[1], rgb[2])
@@ -95,7 +95,7 @@ def blend_pieces(depth: bool, lanes: int) -> Any:
     def blend_pieces(
         grids: wp.array[Grid],
         cuts: Cuts,
-        rows: wp.array[Row],
+        ellipses: wp.array[Ellipse],
         depths: wp.array[wp.float32],
         tiles: wp.array[wp.int32],
         listed: wp.array[wp.int32],
@@ -117,7 +117,7 @@ def blend_pieces(depth: bool, lanes: int) -> Any:
             if mine < last:
                 found = tiles[mine]
                 if found < n_tiles:
-                    loaded = near(rows[listed[mine]], found, grid)
+                    loaded = near(ellipses[listed[mine]], found, grid)
             wp.tile_assign(batch, wp.tile(loaded, preserve_type=True), offset=(half,))
             wp.tile_assign(tile_of, wp.tile(found), offset=(half,))
             for nth in range(wp.min(lanes, last - start)):
@@ -156,7 +156,7 @@ def blend(depth: bool) -> Any:  # noqa: PLR0915 - a kernel
         grids: wp.array[Grid],
         cuts: Cuts,
         backgrounds: wp.array[wp.vec3],
-        rows: wp.array[Row],
+        ellipses: wp.array[Ellipse],
         depths: wp.array[wp.float32],
         listed: wp.array[wp.int32],
         starts: wp.array[wp.int32],
@@ -198,7 +198,7 @@ def blend(depth: bool) -> Any:  # noqa: PLR0915 - a kernel
                     light = wp.vec3()
                     for pair in range(wp.max(segment * SEGMENT, begin), wp.min((segment + 1) * SEGMENT, end)):
                         if stop == end:
-                            g = near(rows[listed[pair]], tile, grid)
+                            g = near(ellipses[listed[pair]], tile, grid)
                             free = alpha_of(g, offset_of(within, g))
                             if free >= cuts.alpha_min:
                                 share = wp.min(free, cuts.alpha_max)
@@ -281,7 +281,7 @@ def blend_vjp(K: int, lanes: int, shuffles: bool, absolute: bool = False) -> Any
         grids: wp.array[Grid],
         cuts: Cuts,
         backgrounds: wp.array[wp.vec3],
-        rows: wp.array[Row],
+        ellipses: wp.array[Ellipse],
         tiles: wp.array[wp.int32],
         listed: wp.array[wp.int32],
         places: wp.array[wp.int32],
@@ -306,7 +306,7 @@ def blend_vjp(K: int, lanes: int, shuffles: bool, absolute: bool = False) -> Any
             if mine >= segment * SEGMENT:
                 found = wp.vec2i(tiles[mine], places[mine])
                 if found[0] < n_tiles:
-                    loaded = near(rows[listed[mine]], found[0], grid)
+                    loaded = near(ellipses[listed[mine]], found[0], grid)
             wp.tile_assign(batch, wp.tile(loaded, preserve_type=True), offset=(half,))
             wp.tile_assign(where, wp.tile(found, preserve_type=True), offset=(half,))
             for nth in range(wp.min(lanes, last - segment * SEGMENT - done)):

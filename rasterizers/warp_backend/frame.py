@@ -11,10 +11,11 @@ and if the lists were too short, the image is drawn again before it is returned.
 
 from __future__ import annotations
 
+import ctypes
 import struct
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 import torch
 import warp as wp
@@ -33,7 +34,8 @@ from rasterizers.warp_backend.project import fold, project, project_vjp, radii
 from rasterizers.warp_backend.settings import PAIR_BYTES, SUMS_BYTES, TILE, WarpSettings, mebibytes, padded
 from rasterizers.warp_runtime import launch, on_device, on_stream, sort_pairs
 
-_ROW: Final = len(types.Row())
+_ELLIPSE: Final = ctypes.sizeof(cast(Any, types.Ellipse).ctype) // 4
+"""Numbers of a `types.Ellipse`."""
 DEFERRED_COUNTS: Final = {"cuda": True, "cpu": False}
 """Whether the host reads the number of pairs only when an image is accessed."""
 LANES: Final = {"cuda": 32, "cpu": 1}
@@ -54,7 +56,7 @@ class _View:
         self.opacities = splats.opacities.contiguous()
         self.offsets = None if splats.rgb_offset is None else splats.rgb_offset.contiguous()
         self.grid = numbers_of(camera, like.device).grid
-        self.ellipses, self.means2d = like.new_empty(n, _ROW), like.new_empty(n, 2)
+        self.ellipses, self.means2d = like.new_empty(n, _ELLIPSE), like.new_empty(n, 2)
         self.visible = visible
         self.counts, self.firsts = counts, firsts  # tiles of each Gaussian, and its first pair
         self.ends: Tensor  # pairs up to each Gaussian, front to back, and included; set by `WarpFrame.draw`

@@ -90,11 +90,6 @@ def centre_of(pose: Pose, mean: wp.vec3) -> Centre:
 
 
 @wp.func
-def largest_of(v: wp.vec3) -> wp.float32:
-    return wp.max(wp.max(wp.abs(v[0]), wp.abs(v[1])), wp.abs(v[2]))
-
-
-@wp.func
 def rotation_of(unit: wp.vec4) -> wp.mat33:
     w, x, y, z = unit[0], unit[1], unit[2], unit[3]
     return wp.mat33(
@@ -113,7 +108,7 @@ def geometry_of(pose: Pose, grid: Grid, centre: Centre, quat: wp.vec4, scale: wp
 
     # Divides by the largest component first, so that |q|² neither overflows nor underflows. The zero quaternion is the
     # identity.
-    largest = wp.max(wp.max(wp.abs(quat[0]), wp.abs(quat[1])), wp.max(wp.abs(quat[2]), wp.abs(quat[3])))
+    largest = wp.max(wp.abs(quat))
     g.unit = wp.vec4(1.0, 0.0, 0.0, 0.0)
     g.inverse_norm = 0.0
     if largest > 0.0:
@@ -134,7 +129,7 @@ def footprint_of(g: Geometry, grid: Grid, cuts: Cuts) -> Footprint:
     f = Footprint()
     f.X = grid.focal[0] * g.x
     f.Y = grid.focal[1] * g.y
-    f.size = wp.max(wp.sqrt(cuts.kernel), wp.max(largest_of(f.X), largest_of(f.Y)))
+    f.size = wp.max(wp.sqrt(cuts.kernel), wp.max(wp.max(wp.abs(f.X)), wp.max(wp.abs(f.Y))))
     shrink = 1.0 / f.size
     x, y = f.X * shrink, f.Y * shrink
     f.kernel = cuts.kernel * shrink * shrink

@@ -11,19 +11,7 @@ from rasterizers import geometry
 from rasterizers.warp_backend.bins import count_tiles, depth_key, reaches_image
 from rasterizers.warp_backend.colour import colour_of
 from rasterizers.warp_backend.geometry import Footprint, Sums, centre_of, footprint_of, geometry_of, geometry_vjp
-from rasterizers.warp_backend.types import (
-    FAR,
-    SEGMENT,
-    SUMS,
-    Cuts,
-    Ellipse,
-    Grid,
-    Pose,
-    Row,
-    ellipse_of,
-    row_of,
-    width_of,
-)
+from rasterizers.warp_backend.types import FAR, SEGMENT, SUMS, Cuts, Ellipse, Grid, Pose, width_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -64,11 +52,6 @@ def is_visible(ellipse: Ellipse, grid: Grid) -> wp.bool:
     return reaches_image(ellipse, grid)
 
 
-@wp.func
-def finite(v: wp.vec3) -> wp.bool:
-    return wp.isfinite(v[0]) and wp.isfinite(v[1]) and wp.isfinite(v[2])
-
-
 @wp.kernel
 def project(
     poses: wp.array[Pose],
@@ -88,7 +71,7 @@ def project(
     colours: wp.array[wp.vec3],
     slopes: wp.array[wp.mat33],
     depths: wp.array[wp.float32],
-    rows: wp.array[Row],
+    ellipses: wp.array[Ellipse],
     means2d: wp.array[wp.vec2],
     visible: wp.array[wp.bool],
     counts: wp.array[wp.int32],
@@ -101,10 +84,7 @@ def project(
     """
     i = wp.tid()
     quat, opacity = quats[i], opacities[i]
-    all_finite = finite(means[i]) and finite(scales[i]) and wp.isfinite(opacity)
-    all_finite = (
-        all_finite and wp.isfinite(quat[0]) and wp.isfinite(quat[1]) and wp.isfinite(quat[2]) and wp.isfinite(quat[3])
-    )
+    all_finite = wp.isfinite(means[i]) and wp.isfinite(quat) and wp.isfinite(scales[i]) and wp.isfinite(opacity)
     if first:
         keys[i] = FAR
         places[i] = i
@@ -141,8 +121,8 @@ def project(
                     ellipse.rgb = colours[i]
                     if has_offsets:
                         ellipse.rgb += offsets[i]
-                    rows[i] = row_of(ellipse)
-                    all_finite = all_finite and finite(ellipse.rgb)
+                    ellipses[i] = ellipse
+                    all_finite = all_finite and wp.isfinite(ellipse.rgb)
     if not all_finite:
         flags[0] = wp.int64(1)
 
@@ -229,7 +209,7 @@ def project_vjp(K: int, absolute: bool = False) -> Any:
         opacities: wp.array[wp.float32],
         slopes: wp.array[wp.mat33],
         has_slopes: wp.bool,
-        rows: wp.array[Row],
+        ellipses: wp.array[Ellipse],
         counts: wp.array[wp.int32],
         firsts: wp.array[wp.int32],
         pair_sums: wp.array[PairSums],
@@ -260,7 +240,7 @@ def project_vjp(K: int, absolute: bool = False) -> Any:
         pose, grid = poses[0], grids[0]
         g = geometry_of(pose, grid, centre_of(pose, means[i]), quats[i], scales[i])
         f = footprint_of(g, grid, cuts)
-        ellipse = ellipse_of(rows[i])
+        colour = ellipses[i].rgb
         for k in range(K):
             sums = Sums()
             sums.q = total[W * k]
@@ -271,7 +251,7 @@ def project_vjp(K: int, absolute: bool = False) -> Any:
             out = geometry_vjp(pose, grid, cuts, g, f, scales[i], sums)
             rgb = wp.vec3(0.0, 0.0, 0.0)
             for c in range(3):
-                if ellipse.rgb[c] >= -BLACK:  # where the colour is clamped, the image does not depend on it
+                if colour[c] >= -BLACK:  # where the colour is clamped, the image does not depend on it
                     rgb[c] = total[W * k + SUMS + c]
             if has_slopes:
                 out.mean += wp.transpose(slopes[i]) * rgb

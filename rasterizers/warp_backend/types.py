@@ -1,8 +1,8 @@
-"""The data types that the kernels share: structures passed by value, and rows of the tables between the stages."""
+"""The data types that the kernels share: structures, which are passed by value or lie in arrays."""
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 import warp as wp
 
@@ -76,33 +76,3 @@ class Ellipse:
     reach: wp.float32  # alpha >= alpha_min within A dx² + B dx dy + C dy² <= reach, with a margin
     half: wp.vec2  # half the box around that region, px
     rgb: wp.vec3  # before its clamp at 0
-
-
-Row: Final[Any] = wp.types.vector(length=14, dtype=wp.float32)
-"""An `Ellipse` as a row of a torch tensor."""
-
-
-@wp.func
-def row_of(ellipse: Ellipse) -> Row:
-    whole, rest, half, rgb = ellipse.whole, ellipse.rest, ellipse.half, ellipse.rgb
-    return Row(
-        whole[0], whole[1], rest[0], rest[1],
-        ellipse.A, ellipse.B, ellipse.C, ellipse.opacity,
-        ellipse.reach, half[0], half[1],
-        rgb[0], rgb[1], rgb[2],
-    )  # fmt: skip
-
-
-@wp.func
-def ellipse_of(row: Row) -> Ellipse:
-    ellipse = Ellipse()
-    ellipse.whole = wp.vec2(row[0], row[1])
-    ellipse.rest = wp.vec2(row[2], row[3])
-    ellipse.A = row[4]
-    ellipse.B = row[5]
-    ellipse.C = row[6]
-    ellipse.opacity = row[7]
-    ellipse.reach = row[8]
-    ellipse.half = wp.vec2(row[9], row[10])
-    ellipse.rgb = wp.vec3(row[11], row[12], row[13])
-    return ellipse

@@ -256,7 +256,7 @@ def _wander(
     j = wp.tid()
     i = wp.int32(rows[j])
     q = quats[i]
-    largest = wp.max(wp.max(wp.abs(q[0]), wp.abs(q[1])), wp.max(wp.abs(q[2]), wp.abs(q[3])))
+    largest = wp.max(wp.abs(q))
     turn = wp.quat_identity()
     if largest > 0.0:  # of any length; the zero quaternion is the identity
         q = q / largest

@@ -26,7 +26,6 @@ from clear_strategies.kernels.reconcile.warp_functions import (
     SHN,
     Counts,
     Products,
-    Six,
     Weights,
     counted,
     product_table,
@@ -59,11 +58,10 @@ class Rows:
 
 @wp.struct
 class Factors:
-    """A gradient of the spherical harmonics, Y ⊗ ∇rgb; no bases: none."""
+    """A gradient of the spherical harmonics, Y ⊗ ∇rgb; empty: none."""
 
-    rgb: wp.array[wp.float32]
-    basis: wp.array[wp.float32]
-    bases: wp.int32
+    rgb: wp.array2d[wp.float32]
+    basis: wp.array2d[wp.float32]
 
 
 @wp.struct
@@ -81,9 +79,9 @@ class Options:
 def product(f: Factors, a: Rows, i: wp.int32, d: wp.int32) -> wp.float32:
     """The d-th number of an attribute's row of Y ⊗ ∇rgb."""
     band = a.first_band + d / 3
-    if a.first_band < 0 or band >= f.bases:
+    if a.first_band < 0 or band >= f.basis.shape[1]:
         return 0.0
-    return f.basis[i * f.bases + band] * f.rgb[i * 3 + d % 3]
+    return f.basis[i, band] * f.rgb[i, d % 3]
 
 
 @wp.func
@@ -123,12 +121,13 @@ def compare(
     i = block * wp.block_dim() + lane
     tally = Counts()
     if i < o.n:
-        m, b, n = compared(means, i, o), compared(sh0, i, o), compared(shN, i, o)
-        a, s, q = compared(opacities, i, o), compared(scales, i, o), compared(quats, i, o)
         p = Products()
-        p.dot = Six(m[0], b[0], n[0], a[0], s[0], q[0])
-        p.l2 = Six(m[1], b[1], n[1], a[1], s[1], q[1])
-        p.h2 = Six(m[2], b[2], n[2], a[2], s[2], q[2])
+        p[MEANS] = compared(means, i, o)
+        p[SH0] = compared(sh0, i, o)
+        p[SHN] = compared(shN, i, o)
+        p[OPACITIES] = compared(opacities, i, o)
+        p[SCALES] = compared(scales, i, o)
+        p[QUATS] = compared(quats, i, o)
         store(p, table, i)
         tally = counted(p)
     wp.tile_store(counts, wp.tile_sum(wp.tile(tally, preserve_type=True)), offset=(block,))
@@ -234,10 +233,7 @@ def apply(
 
 
 def _options(n: int, lr: Grads, hr: Grads, lambda_hr: float = 1.0, keeps_lr: bool = True) -> Any:
-    low, high = (
-        struct(Factors, {}) if c is None else struct(Factors, c._asdict(), bases=c.basis.shape[1])
-        for c in (lr.colour, hr.colour)
-    )
+    low, high = (struct(Factors, {} if c is None else c._asdict()) for c in (lr.colour, hr.colour))
     return struct(Options, {}, n=n, lr=low, hr=high, lambda_hr=lambda_hr, keeps_lr=keeps_lr)
 
 

@@ -25,19 +25,11 @@ OPACITIES: Final = wp.constant(3)
 SCALES: Final = wp.constant(4)
 QUATS: Final = wp.constant(5)
 
-Six: Final[Any] = wp.types.vector(length=6, dtype=wp.float64)
+Products: Final[Any] = wp.types.matrix(shape=(GROUPS, 3), dtype=wp.float64)
+"""⟨l, h⟩, ‖l‖², ‖h‖² of one Gaussian, a row for each group."""
 COUNTS: Final = 14
 Counts: Final[Any] = wp.types.vector(length=COUNTS, dtype=wp.int32)
 """Comparable and opposed Gaussians, [7] each."""
-
-
-@wp.struct
-class Products:
-    """⟨l, h⟩, ‖l‖², ‖h‖² by group."""
-
-    dot: Six
-    l2: Six
-    h2: Six
 
 
 @wp.struct
@@ -93,25 +85,30 @@ def reconciled(high: wp.float32, low: wp.float32, keep: wp.float64, remove: wp.f
 
 
 @wp.func
+def compared_and_opposed(products: wp.vec3d) -> wp.vec2i:
+    """Whether neither gradient is zero, and whether their cosine is below 0, too; 0 or 1."""
+    zero = wp.float64(0.0)
+    comparable = wp.where(products[1] > zero and products[2] > zero, 1, 0)
+    return wp.vec2i(comparable, wp.where(products[0] < zero, comparable, 0))
+
+
+@wp.func
 def counted(p: Products) -> Counts:
     """What one Gaussian adds to the counts."""
-    tally, zero, dot, l2, h2 = Counts(), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+    tally, whole = Counts(), wp.vec3d()
     for k in range(GROUPS):
-        comparable = wp.where(p.l2[k] > zero and p.h2[k] > zero, 1, 0)
-        tally[k] = comparable
-        tally[GROUPS + 1 + k] = wp.where(p.dot[k] < zero, comparable, 0)
-        dot += p.dot[k]
-        l2 += p.l2[k]
-        h2 += p.h2[k]
-    whole = wp.where(l2 > zero and h2 > zero, 1, 0)
-    tally[GROUPS] = whole
-    tally[2 * GROUPS + 1] = wp.where(dot < zero, whole, 0)
+        found = compared_and_opposed(p[k])
+        tally[k] = found[0]
+        tally[GROUPS + 1 + k] = found[1]
+        whole += p[k]
+    found = compared_and_opposed(whole)
+    tally[GROUPS] = found[0]
+    tally[2 * GROUPS + 1] = found[1]
     return tally
 
 
 @wp.func
 def store(p: Products, table: wp.array2d[wp.float64], i: wp.int32) -> None:
     for k in range(GROUPS):
-        table[k, i] = p.dot[k]
-        table[GROUPS + k, i] = p.l2[k]
-        table[2 * GROUPS + k, i] = p.h2[k]
+        for c in range(3):
+            table[GROUPS * c + k, i] = p[k, c]

@@ -64,7 +64,7 @@ class WarpGaussianStep:
         self._kept = (activation, lr, base, hf)  # kept alive while kernels may read them
         self._has_base = base is not None
         view = struct(
-            raw_gradients.View, {}, n=self._n, bases=self._bases, lambda_hf=lambda_hf,
+            raw_gradients.View, {}, n=self._n, lambda_hf=lambda_hf,
             has_base=self._has_base, has_hf=hf is not None, routed=activation["route"] is not None,
         )  # fmt: skip
         inputs = {"scales": 3, "filtered": 3, "filter": 1, "sigmoid": 1, "factor": 1, "basis": self._bases, "route": 1}
@@ -90,7 +90,7 @@ class WarpGaussianStep:
         self._require_hr()
         width = math.prod(lr["shN"].shape[1:])
         widths = {name: _WIDTHS.get(name, width) for name in CONFLICT_GROUPS}
-        rows = (self._rows(passes.Rows, g, widths, width=width) for g in (lr, hr))
+        rows = (self._rows(passes.Rows, g, widths) for g in (lr, hr))
         with on_stream(self._like.device):
             launch(passes.write_dense, [self._n], (*self._gradients, *rows), self._like.device, block=self._lanes)
 
@@ -157,13 +157,12 @@ class WarpGaussianStep:
         tensors: Mapping[str, Tensor | None],
         widths: Mapping[str, int],
         optional: Sequence[str] = (),
-        **numbers: float,
     ) -> Any:
         """A structure of type `kind` over tensors of n rows with `widths` numbers each, for which it checks them."""
         for name, width in widths.items():
             if name not in optional or tensors[name] is not None:
                 self._require(name, tensors[name], width)
-        return struct(kind, tensors, **numbers)
+        return struct(kind, tensors)
 
     def _require(self, name: str, tensor: Tensor | None, width: int) -> None:
         """Check that a tensor has a row of `width` numbers for each Gaussian."""

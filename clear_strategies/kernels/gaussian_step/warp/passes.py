@@ -32,7 +32,6 @@ from clear_strategies.kernels.reconcile.warp_functions import (
     SHN,
     Counts,
     Products,
-    Six,
     Weights,
     counted,
     reconciled,
@@ -65,21 +64,15 @@ def products4(low: wp.vec4, high: wp.vec4) -> wp.vec3d:
 
 
 @wp.func
-def group_products(
-    low: RawGradient, high: RawGradient, activation: Activation, bases: wp.int32, i: wp.int32
-) -> Products:
+def group_products(low: RawGradient, high: RawGradient, activation: Activation, i: wp.int32) -> Products:
     a, b = wp.float64(low.opacity), wp.float64(high.opacity)
-    means, sh0, scales = (
-        products3(low.means, high.means),
-        products3(low.sh0, high.sh0),
-        products3(low.scales, high.scales),
-    )
-    shN = higher_bands2(activation, bases, i) * products3(low.rgb, high.rgb)
-    opacities, quats = wp.vec3d(a * b, a * a, b * b), products4(low.quats, high.quats)
     p = Products()
-    p.dot = Six(means[0], sh0[0], shN[0], opacities[0], scales[0], quats[0])
-    p.l2 = Six(means[1], sh0[1], shN[1], opacities[1], scales[1], quats[1])
-    p.h2 = Six(means[2], sh0[2], shN[2], opacities[2], scales[2], quats[2])
+    p[MEANS] = products3(low.means, high.means)
+    p[SH0] = products3(low.sh0, high.sh0)
+    p[SHN] = higher_bands2(activation, i) * products3(low.rgb, high.rgb)
+    p[OPACITIES] = wp.vec3d(a * b, a * a, b * b)
+    p[SCALES] = products3(low.scales, high.scales)
+    p[QUATS] = products4(low.quats, high.quats)
     return p
 
 
@@ -105,7 +98,7 @@ def compare(
     i, tally = block * wp.block_dim() + lane, Counts()
     if i < view.n:
         g_lr, g_hr, _ = load(activation, lr, base, hf, view, i)
-        products = group_products(g_lr, g_hr, activation, view.bases, i)
+        products = group_products(g_lr, g_hr, activation, i)
         store(products, table, i)
         tally = counted(products)
     wp.tile_store(counts, wp.tile_sum(wp.tile(tally, preserve_type=True)), offset=(block,))
@@ -113,32 +106,28 @@ def compare(
 
 @wp.struct
 class Rows:
-    """The gradient of the raw parameters with every number, row-major."""
+    """The gradient of the raw parameters with every number."""
 
-    means: wp.array[wp.float32]
-    quats: wp.array[wp.float32]
-    scales: wp.array[wp.float32]
+    means: wp.array[wp.vec3]
+    quats: wp.array[wp.vec4]
+    scales: wp.array[wp.vec3]
     opacities: wp.array[wp.float32]
-    sh0: wp.array[wp.float32]
-    shN: wp.array[wp.float32]  # noqa: N815 - gsplat's name
-    width: wp.int32  # of shN
+    sh0: wp.array[wp.vec3]
+    shN: wp.array2d[wp.vec3]  # noqa: N815 - gsplat's name
 
 
 @wp.func
-def write_rows(g: RawGradient, basis: wp.array[wp.float32], bases: wp.int32, i: wp.int32, to: Rows) -> None:
-    for d in range(3):
-        to.means[3 * i + d] = g.means[d]
-        to.scales[3 * i + d] = g.scales[d]
-        to.sh0[3 * i + d] = g.sh0[d]
-    for d in range(4):
-        to.quats[4 * i + d] = g.quats[d]
+def write_rows(g: RawGradient, basis: wp.array2d[wp.float32], i: wp.int32, to: Rows) -> None:
+    to.means[i] = g.means
+    to.quats[i] = g.quats
+    to.scales[i] = g.scales
     to.opacities[i] = g.opacity
-    for band in range(to.width / 3):
+    to.sh0[i] = g.sh0
+    for band in range(to.shN.shape[1]):
         basis_of_band = wp.float32(0.0)
-        if 1 + band < bases:
-            basis_of_band = basis[bases * i + 1 + band]
-        for channel in range(3):
-            to.shN[to.width * i + 3 * band + channel] = basis_of_band * g.rgb[channel]
+        if 1 + band < basis.shape[1]:
+            basis_of_band = basis[i, 1 + band]
+        to.shN[i, band] = basis_of_band * g.rgb
 
 
 @wp.kernel
@@ -147,8 +136,8 @@ def write_dense(
 ) -> None:  # fmt: skip
     i = wp.tid()
     g_lr, g_hr, _ = load(activation, lr, base, hf, view, i)
-    write_rows(g_lr, activation.basis, view.bases, i, to_lr)
-    write_rows(g_hr, activation.basis, view.bases, i, to_hr)
+    write_rows(g_lr, activation.basis, i, to_lr)
+    write_rows(g_hr, activation.basis, i, to_hr)
 
 
 @wp.kernel

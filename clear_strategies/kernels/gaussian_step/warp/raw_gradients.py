@@ -7,34 +7,33 @@ import warp as wp
 
 @wp.struct
 class Gradient:
-    """One cotangent's rasterizers.interface.SplatGradients, row-major; rgb is the factor beside Y of the colour gradient."""
+    """One cotangent's rasterizers.interface.SplatGradients; rgb is the factor beside Y of the colour gradient."""
 
-    means: wp.array[wp.float32]
-    quats: wp.array[wp.float32]
-    scales: wp.array[wp.float32]
+    means: wp.array[wp.vec3]
+    quats: wp.array[wp.vec4]
+    scales: wp.array[wp.vec3]
     opacities: wp.array[wp.float32]
-    rgb: wp.array[wp.float32]
+    rgb: wp.array[wp.vec3]
 
 
 @wp.struct
 class Activation:
     """The inputs of the activations' VJP (training.field.Activation), Y, and m unless it is 1."""
 
-    scales: wp.array[wp.float32]
-    filtered: wp.array[wp.float32]
+    scales: wp.array[wp.vec3]
+    filtered: wp.array[wp.vec3]
     filter: wp.array[wp.float32]
     sigmoid: wp.array[wp.float32]
     factor: wp.array[wp.float32]
-    basis: wp.array[wp.float32]
+    basis: wp.array2d[wp.float32]
     route: wp.array[wp.float32]
 
 
 @wp.struct
 class View:
-    """The sizes, and which gradients are given."""
+    """How many Gaussians there are, and which gradients are given."""
 
     n: wp.int32
-    bases: wp.int32  # columns of Y: 1 + active higher bands
     has_base: wp.bool
     has_hf: wp.bool
     routed: wp.bool
@@ -54,30 +53,20 @@ class RawGradient:
 
 
 @wp.func
-def row3(rows: wp.array[wp.float32], i: wp.int32) -> wp.vec3:
-    return wp.vec3(rows[3 * i], rows[3 * i + 1], rows[3 * i + 2])
-
-
-@wp.func
-def row4(rows: wp.array[wp.float32], i: wp.int32) -> wp.vec4:
-    return wp.vec4(rows[4 * i], rows[4 * i + 1], rows[4 * i + 2], rows[4 * i + 3])
-
-
-@wp.func
-def activation_vjp(g: Gradient, a: Activation, bases: wp.int32, i: wp.int32) -> RawGradient:
+def activation_vjp(g: Gradient, a: Activation, i: wp.int32) -> RawGradient:
     """The VJP of the 3D filter, exp and sigmoid. Same operations as training.field.Activation.vjp."""
     out = RawGradient()
-    scales, filtered, reach = row3(a.scales, i), row3(a.filtered, i), a.filter[i]
+    scales, filtered, reach = a.scales[i], a.filtered[i], a.filter[i]
     factor, sigmoid, d_opacity = a.factor[i], a.sigmoid[i], g.opacities[i]
     share = wp.vec3(reach / filtered[0], reach / filtered[1], reach / filtered[2])
     share = wp.cw_mul(share, share)  # log(coefficient) grows with log(s) by f² / (s² + f²)
-    along = wp.cw_div(wp.cw_mul(row3(g.scales, i), wp.cw_mul(scales, scales)), filtered)
-    out.means = row3(g.means, i)
-    out.quats = row4(g.quats, i)
+    along = wp.cw_div(wp.cw_mul(g.scales[i], wp.cw_mul(scales, scales)), filtered)
+    out.means = g.means[i]
+    out.quats = g.quats[i]
     out.scales = along + d_opacity * (factor * sigmoid) * share
     out.opacity = d_opacity * factor * sigmoid * (1.0 - sigmoid)
-    out.rgb = row3(g.rgb, i)
-    out.sh0 = a.basis[bases * i] * out.rgb
+    out.rgb = g.rgb[i]
+    out.sh0 = a.basis[i, 0] * out.rgb
     return out
 
 
@@ -108,32 +97,27 @@ def load(
     activation: Activation, lr: Gradient, base: Gradient, hf: Gradient, view: View, i: wp.int32
 ) -> tuple[RawGradient, RawGradient, RawGradient]:
     """∇L_LR, g^HR and ∇L_HF of a Gaussian; 0 for those not given."""
-    g_lr, g_hr, g_hf = activation_vjp(lr, activation, view.bases, i), RawGradient(), RawGradient()
+    g_lr, g_hr, g_hf = activation_vjp(lr, activation, i), RawGradient(), RawGradient()
     if view.has_base:
-        g_hr = activation_vjp(base, activation, view.bases, i)
+        g_hr = activation_vjp(base, activation, i)
     if view.has_hf:
-        g_hf = activation_vjp(hf, activation, view.bases, i)
+        g_hf = activation_vjp(hf, activation, i)
         g_hr = routed(g_hr, g_hf, route_of(activation, view, i), view.lambda_hf)
     return g_lr, g_hr, g_hf
 
 
 @wp.func
-def higher_bands2(a: Activation, bases: wp.int32, i: wp.int32) -> wp.float64:
+def higher_bands2(a: Activation, i: wp.int32) -> wp.float64:
     """‖Y‖² over the higher bands, for ⟨Y ⊗ a, Y ⊗ b⟩ = ‖Y‖² ⟨a, b⟩."""
     total = wp.float64(0.0)
-    for k in range(1, bases):
-        y = wp.float64(a.basis[bases * i + k])
+    for k in range(1, a.basis.shape[1]):
+        y = wp.float64(a.basis[i, k])
         total += y * y
     return total
 
 
 @wp.func
-def size3(v: wp.vec3) -> wp.float32:
-    return wp.abs(v[0]) + wp.abs(v[1]) + wp.abs(v[2])
-
-
-@wp.func
 def size(g: RawGradient) -> wp.float32:
     """A norm that is 0 only if the gradient is 0; sh0 follows rgb."""
-    turn = wp.abs(g.quats[0]) + wp.abs(g.quats[1]) + wp.abs(g.quats[2]) + wp.abs(g.quats[3])
-    return size3(g.means) + turn + size3(g.scales) + wp.abs(g.opacity) + size3(g.rgb)
+    shape = wp.norm_l1(g.means) + wp.norm_l1(g.quats) + wp.norm_l1(g.scales)
+    return shape + wp.abs(g.opacity) + wp.norm_l1(g.rgb)

@@ -30,11 +30,6 @@ def signs(v: wp.vec3) -> wp.vec3:
     return wp.vec3(sign(v[0]), sign(v[1]), sign(v[2]))
 
 
-@wp.func
-def magnitude(v: wp.vec3) -> wp.float32:
-    return wp.abs(v[0]) + wp.abs(v[1]) + wp.abs(v[2])
-
-
 @wp.kernel
 def low_part(x: wp.array2d[wp.vec3], y: wp.array2d[wp.vec3], first: wp.bool, low: wp.array2d[wp.vec3]) -> None:
     """One thread per block."""
@@ -69,7 +64,7 @@ def details(lanes: int) -> Any:
             a, b = pixel(x, y, first, 2 * i, 2 * j), pixel(x, y, first, 2 * i, 2 * j + 1)
             c, d = pixel(x, y, first, 2 * i + 1, 2 * j), pixel(x, y, first, 2 * i + 1, 2 * j + 1)
             horizontal, vertical, diagonal = a - b + c - d, a + b - c - d, a - b - c + d  # doubled
-            share += wp.float64(magnitude(horizontal) + magnitude(vertical) + magnitude(diagonal))
+            share += wp.float64(wp.norm_l1(horizontal) + wp.norm_l1(vertical) + wp.norm_l1(diagonal))
             h, v, hv = step * signs(horizontal), step * signs(vertical), step * signs(diagonal)
             low = wp.vec3(0.0, 0.0, 0.0)
             if not last:
