@@ -178,7 +178,7 @@ class Density(Densifier):
         children = splits.repeat(_CHILDREN)
         parents = torch.cat((stay, clones, children))
         fresh = torch.arange(len(parents), device=parents.device) >= len(stay)
-        field.take(parents, fresh)
+        field.take(parents)
         optimizer.take(parents, fresh)
         self._place_children(field, slice(len(stay) + len(clones), len(parents)), t)
         self.score, self.ordinary, self.count = (self.score.new_zeros(len(parents)) for _ in range(3))
@@ -189,10 +189,8 @@ class Density(Densifier):
         return parents
 
     def reset_opacity(self, field: GaussianField, optimizer: Adam) -> None:
-        """Lower every rendered opacity to at most 0.01 (the form of Mip-Splatting)."""
-        coefficient = field.opacity_coefficient().clamp_min(torch.finfo(torch.float32).tiny)
-        target = field.filtered_opacities().clamp_max(_RESET_OPACITY) / coefficient
-        field.opacities.data.clamp_max_(torch.logit(target.clamp(1e-6, 1 - 1e-6)))
+        """Lower every rendered opacity to at most 0.01."""
+        field.lower_opacities(_RESET_OPACITY)
         optimizer.forget("opacities")
 
     def state_dict(self) -> dict[str, Tensor]:

@@ -163,7 +163,7 @@ class Sampler(Densifier):
         parents[dead] = sources[: len(dead)]
         copies = torch.bincount(parents, minlength=n)[parents]
         shared = copies > 1  # sources and their copies, all of which start without momentum
-        field.take(parents, shared)
+        field.take(parents)
         optimizer.take(parents, shared)
         o, scales = relocation(field.opacities.data[shared].sigmoid(), field.scales.data[shared].exp(), copies[shared])
         field.opacities.data[shared] = torch.logit(o.clamp(s.dead_opacity, 1 - torch.finfo(o.dtype).eps))

@@ -84,7 +84,7 @@ class ShuffleSplit(Density):
         stay, parent = rows[~chosen], rows[chosen]
         parents = torch.cat((stay, parent.repeat(_CHILDREN)))
         fresh = torch.arange(len(parents), device=parents.device) >= len(stay)
-        field.take(parents, fresh)
+        field.take(parents)
         optimizer.take(parents, fresh)
         children = slice(len(stay), len(parents))
         side = torch.arange(_CHILDREN, device=parents.device).repeat_interleave(len(parent))

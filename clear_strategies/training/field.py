@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from clear_strategies.core.gradients import ATTRIBUTES, Grads, gathered
@@ -126,7 +126,7 @@ class GaussianField(nn.Module):
         else:
             self.filter_3d = stds
 
-    def take(self, parents: Int[Tensor, " M"], fresh: Bool[Tensor, " M"]) -> None:
+    def take(self, parents: Int[Tensor, " M"]) -> None:
         """Change the structure by one gather, see `gathered`: row i becomes a copy of row parents[i]."""
         for name in ATTRIBUTES:
             getattr(self, name).data = gathered(getattr(self, name).data, parents)
@@ -141,9 +141,11 @@ class GaussianField(nn.Module):
         """σ(opacity) times the 3D filter's coefficient, the opacity that is rendered; pruning uses it."""
         return self._activate().opacities
 
-    def opacity_coefficient(self) -> Float[Tensor, " N"]:
-        """Π_k s_k / √(s_k² + f²): a filtered Gaussian is larger, and its opacity lower by this factor."""
-        return self._activate().coefficient
+    def lower_opacities(self, most: float) -> None:
+        """Lower every rendered opacity to at most `most` (the form of Mip-Splatting)."""
+        active = self._activate()
+        target = active.opacities.clamp_max(most) / active.coefficient.clamp_min(torch.finfo(torch.float32).tiny)
+        self.opacities.data.clamp_max_(torch.logit(target.clamp(1e-6, 1 - 1e-6)))
 
     def baked(self) -> Splats:
         """Splats for exports and viewers: the filter in scales and opacities, f_det in the colour."""
@@ -160,7 +162,8 @@ class Activation:
     """The activated field, with what the chain rule to the raw parameters needs.
 
     Args:
-        scales: s = exp(raw). filtered: √(s² + f²). sigmoid: σ(raw). factor: coefficient · z. opacities: factor · σ.
+        scales: s = exp(raw). filtered: √(s² + f²). sigmoid: σ(raw). opacities: factor · σ.
+        coefficient: Π_k s_k / √(s_k² + f²): a filtered Gaussian is larger, and its opacity lower. factor: coefficient · z.
     """
 
     raw: Mapping[str, Tensor]

@@ -159,8 +159,8 @@ class TrainState:
             return False
         conductor.work_log.skip("Gaussians", "too faint to be drawn (skips.undrawn)", n - len(drawn))
         _log.debug("t=%d: %d too faint to be drawn: %d -> %d Gaussians.", self.t, n - len(drawn), n, len(drawn))
-        for per_gaussian in (self.field, self.optimizer):
-            per_gaussian.take(drawn, torch.zeros_like(drawn, dtype=torch.bool))
+        self.field.take(drawn)
+        self.optimizer.take(drawn, torch.zeros_like(drawn, dtype=torch.bool))
         self.density.gather(drawn)
         self.resized(drawn)
         return True
