@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from rasterizers.geometry import BLACK, depths, rotation_matrix, spherical_harmonics, tangent_limits
+from rasterizers.geometry import BLACK, REACH, depths, rotation_matrix, spherical_harmonics, tangent_limits
 from rasterizers.interface import Camera, RasterSettings, SplatGradients, Splats
 
 # Columns of the table that blending reads, one row per projected Gaussian; the last one is there if depth is drawn.
@@ -98,6 +98,12 @@ class Footprints(NamedTuple):
     conics: Float[Tensor, "M 3"]
     deviations: Float[Tensor, "M 2"]
     compensation: Float[Tensor, " M"]
+
+    @torch.no_grad()
+    def radii(self, opacities: Float[Tensor, " M"], alpha_min: float) -> Float[Tensor, "M 2"]:
+        """As `WithRadii.radii`, of Gaussians that are all visible."""
+        reach = (2 * (opacities / alpha_min).log()).clamp_min(0).sqrt().clamp_max(REACH)
+        return (reach[:, None] * self.deviations).ceil().clamp_min(1)
 
 
 def footprints(

@@ -232,10 +232,15 @@ def test_backgrounds_have_a_gradient_and_gsplats_own_defaults_are_drawn():
 def test_tensors_of_cameras_need_one_row_for_each(name):
     """Under pytest the shape annotations of `rasterization` would raise first."""
     right = {"viewmats": torch.zeros(2, 4, 4), "Ks": torch.zeros(2, 3, 3), "backgrounds": torch.zeros(2, 3)}
-    geometry = torch.zeros(5, 4), torch.zeros(5, 3), torch.zeros(5), torch.zeros(5, 3)
-    shape = as_gsplat._Shape((), 5, 2, None, True)
+    geometry, colors = (torch.zeros(5, 4), torch.zeros(5, 3), torch.zeros(5)), torch.zeros(5, 3)
+    given = {**right, name: right[name][0]}
+
+    def require():
+        as_gsplat._require_geometry((), 5, 2, *geometry, given["viewmats"], given["Ks"], None)
+        as_gsplat._require_colors((), 5, 2, colors, None, given["backgrounds"])
+
     with pytest.raises(ValueError, match=rf"^{name} must have the shape \[2, .*, got"):
-        shape.require(*geometry, **{**right, name: right[name][0]}, rgb_offset=None)
+        require()
 
 
 def test_gsplats_arguments_have_gsplats_order():

@@ -1,0 +1,114 @@
+"""The `info` of gsplat's `rasterization`: what its strategies read of a picture, of all Gaussians or of the visible alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, cast
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from rasterizers.autograd import Rendered, stacked
+from rasterizers.inputs import Inputs
+from rasterizers.interface import RasterSettings, WithRadii
+from rasterizers.modes import in_full_precision
+from rasterizers.reference.projection import footprints
+
+Picture = tuple[Rendered, Inputs]
+"""An image, and what it shows."""
+
+
+def info_of_all(
+    each: Sequence[Picture], lead: tuple[int, ...]
+) -> tuple[dict[str, Any], Sequence[Tensor], Sequence[None]]:
+    """What gsplat's strategies read, the centres of each image, and None for the rows of each: these are all.
+
+    Args:
+        lead: the dimensions of scenes and cameras, which `each` goes through.
+    """
+    renderings = [rendered.rendering for rendered, _ in each]
+    means2d = stacked([rendering.means2d for rendering in renderings])
+    means2d = means2d.clone() if len(each) == 1 else means2d
+    means2d = means2d.view(*lead, *means2d.shape[1:]).requires_grad_()
+
+    def radii() -> dict[str, Tensor]:
+        found = stacked([cast(WithRadii, rendering).radii for rendering in renderings])
+        return {"radii": found.view(*lead, *found.shape[1:])}
+
+    def ellipses() -> dict[str, Tensor]:
+        found: dict[str, list[Tensor]] = {name: [] for name in of_ellipses}
+        for rendered, splats in each:
+            rows = rendered.rendering.visible.nonzero()[:, 0]
+            columns = _columns(rendered, splats, rows)
+            for name, wholes in found.items():
+                whole = columns[name].new_zeros(len(splats.means), *columns[name].shape[1:])
+                wholes.append(whole.index_copy(0, rows, columns[name]))
+        return {name: torch.stack(x).view(*lead, *x[0].shape) for name, x in found.items()}
+
+    flat = means2d.view(len(each), *means2d.shape[len(lead) :])
+    values = {"means2d": means2d, "gaussian_ids": None, "camera_ids": None, "batch_ids": None}
+    own_radii = all(rendered.rasterizer.traits.radii for rendered, _ in each)
+    of_ellipses = ("depths", "conics", "opacities", *(() if own_radii else ("radii",)))
+    later = {"radii": radii, **dict.fromkeys(of_ellipses, ellipses)}
+    return _Info(values, later), flat.unbind(), [None] * len(each)
+
+
+def info_of_visible(each: Sequence[Picture], cameras: int) -> tuple[dict[str, Any], Sequence[Tensor], Sequence[Tensor]]:
+    """The same of the visible alone, and which rows these are."""
+    rows = [rendered.rendering.visible.nonzero()[:, 0] for rendered, _ in each]
+    columns = [_columns(*one, i) for one, i in zip(each, rows, strict=True)]
+    info: dict[str, Any] = {name: torch.cat([x[name] for x in columns]) for name in columns[0]}
+    info["means2d"].requires_grad_()
+    ids = torch.cat(rows)
+    view = torch.cat([torch.full_like(i, k) for k, i in enumerate(rows)])
+    info |= {"gaussian_ids": ids, "camera_ids": view % cameras, "batch_ids": view // cameras}
+    return info, torch.split(info["means2d"], [len(i) for i in rows]), rows
+
+
+@in_full_precision
+def _columns(rendered: Rendered, splats: Inputs, rows: Int[Tensor, " M"]) -> dict[str, Tensor]:
+    """What gsplat says of the visible Gaussians."""
+    settings = cast(RasterSettings, rendered.rasterizer)  # `over` has checked it
+    f = footprints(splats.means[rows], splats.quats[rows], splats.scales[rows], rendered.camera, settings.kernel)
+    opacities = splats.opacities[rows] * f.compensation if settings.antialiased else splats.opacities[rows]
+    radii = f.radii(opacities, settings.alpha_min).int()
+    means2d = rendered.rendering.means2d[rows]
+    return {"means2d": means2d, "radii": radii, "depths": f.depths, "conics": f.conics, "opacities": opacities}
+
+
+class _Info(dict[str, Any]):
+    """Gsplat's `info`. What not every loop reads is made when it is asked for, also by what goes through all of it.
+
+    Args:
+        later: what makes each of these values, and no other.
+    """
+
+    def __init__(self, values: Mapping[str, Any], later: Mapping[str, Callable[[], dict[str, Any]]]) -> None:
+        super().__init__(values)
+        self._later = later
+
+    def __contains__(self, name: object) -> bool:
+        return super().__contains__(name) or name in self._later
+
+    def __missing__(self, name: str) -> Any:
+        if name not in self._later:
+            raise KeyError(name)
+        for made, value in self._later[name]().items():
+            self.setdefault(made, value)  # what the loop has written stays
+        return self[name]
+
+    def __iter__(self) -> Iterator[str]:
+        # Names make nothing: a type checker asks for one.
+        return iter(dict.fromkeys((*super().__iter__(), *self._later)))
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+    get, keys, values, items = Mapping.get, Mapping.keys, Mapping.values, Mapping.items  # type: ignore[assignment]
+
+    def copy(self) -> dict[str, Any]:
+        return dict(self)
+
+    def __or__(self, other: dict[str, Any]) -> dict[str, Any]:  # type: ignore[override]
+        return self.copy() | other
