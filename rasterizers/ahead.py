@@ -20,30 +20,12 @@ class _Ahead(threading.local):
     """One image that is drawn together with another, before it is asked for.
 
     Attributes:
-        wanted: what the image shows, see `_shown`: its camera alone.
-        kept: that image, what it shows, and the splats: while these live, no other tensors lie at their addresses.
+        wanted: the camera of the image, until it is drawn.
+        kept: the image, what it shows, and the splats: while these live, no other tensors lie at their addresses.
     """
 
     wanted: Camera | None = None
     kept: tuple[tuple[Any, ...], Rendering, Splats] | None = None
-
-    def draw(self, rasterizer: Rasterizer, splats: Splats, camera: Camera, depth: bool) -> Rendering:
-        """The image, from `kept` where it lies there."""
-        if self.kept is not None and self.kept[0] == _shown(rasterizer, splats, camera, depth):
-            rendering, self.kept = self.kept[1], None
-            return rendering
-        wanted = self.wanted
-        if wanted is None or camera.world_to_camera.tolist() != wanted.world_to_camera.tolist():
-            return drawing(rasterizer, depth)(splats, camera)
-        self.wanted = None
-        plain = replace(splats, rgb_offset=None)
-        if splats.rgb_offset is None and _grid(camera) == _grid(wanted):  # it is this one
-            return drawing(rasterizer, depth)(splats, camera)
-        other = replace(wanted, world_to_camera=camera.world_to_camera)  # by the same tensor, as a backend sees at once
-        together = functools.partial(rasterizer.render_scales, depth=[True] * 2) if depth else rasterizer.render_scales
-        ahead, rendering = together([(plain, other), (splats, camera)])
-        self.kept = _shown(rasterizer, plain, other, depth), ahead, plain
-        return rendering
 
 
 _ahead: Final = _Ahead()
@@ -81,4 +63,18 @@ def is_drawing_ahead() -> bool:
 
 def draw_or_take(rasterizer: Rasterizer, splats: Splats, camera: Camera, *, depth: bool) -> Rendering:
     """The image, or the same that was drawn ahead."""
-    return _ahead.draw(rasterizer, splats, camera, depth)
+    if _ahead.kept is not None and _ahead.kept[0] == _shown(rasterizer, splats, camera, depth):
+        rendering, _ahead.kept = _ahead.kept[1], None
+        return rendering
+    wanted = _ahead.wanted
+    if wanted is None or camera.world_to_camera.tolist() != wanted.world_to_camera.tolist():
+        return drawing(rasterizer, depth)(splats, camera)
+    _ahead.wanted = None
+    if splats.rgb_offset is None and _grid(camera) == _grid(wanted):  # it is this one
+        return drawing(rasterizer, depth)(splats, camera)
+    plain = replace(splats, rgb_offset=None)
+    other = replace(wanted, world_to_camera=camera.world_to_camera)  # by the same tensor, as a backend sees at once
+    together = functools.partial(rasterizer.render_scales, depth=[True] * 2) if depth else rasterizer.render_scales
+    ahead, rendering = together([(plain, other), (splats, camera)])
+    _ahead.kept = _shown(rasterizer, plain, other, depth), ahead, plain
+    return rendering
