@@ -75,7 +75,9 @@ class Projection:
             gradients = torch.autograd.grad(
                 outputs[: len(parts)], inputs, cotangents, retain_graph=True, materialize_grads=True
             )
-            by_cotangent.append([*gradients, g[:, MEAN]])
+            moved = (g != 0).any(1)  # 0 times the derivative of an ellipse far below a pixel, which overflows, is NaN
+            rows = [x.where(moved.view(-1, *[1] * (x.dim() - 1)), 0) for x in gradients]
+            by_cotangent.append([*rows, g[:, MEAN]])
         means, quats, scales, opacities, rgb, screen = (
             torch.stack([self.scatter(g) for g in attribute]) for attribute in zip(*by_cotangent, strict=True)
         )

@@ -121,6 +121,18 @@ def test_a_pose_that_is_not_rigid_is_refused(change):
         Camera(pose, 10.0, 10.0, 5.0, 5.0, 10, 10)
 
 
+@pytest.mark.parametrize("scale", [1e-12, 1e-30])
+def test_an_ellipse_that_is_too_small_for_any_pixel_has_no_gradient(scale):
+    """Without Mip's kernel: the derivative of its conic overflows, and the gradient of the conic is 0."""
+    splats = scene(6, bands=0)
+    tiny = replace(splats, scales=torch.cat((torch.full((1, 3), scale), splats.scales[1:])))
+    rendering = ReferenceRasterizer(kernel=0.0)(tiny, Camera(torch.eye(4), 30.0, 30.0, 16.0, 12.0, 32, 24))
+    gradients = rendering.vjp(torch.ones_like(rendering.image)[None])
+    for name in ("means", "quats", "scales", "opacities"):
+        assert not getattr(gradients, name)[0, 0].any()
+        assert getattr(gradients, name).isfinite().all()
+
+
 def test_quaternions_of_any_norm_give_the_same_rotation_and_spherical_harmonics_are_orthonormal():
     q = torch.tensor([[0.3, -0.2, 0.8, 0.1]])
     expected = rotation_matrix(q)
