@@ -11,7 +11,7 @@ from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import Grads, to_ndc
 from clear_strategies.core.step import Step
 from clear_strategies.density.adaptive import DensitySettings
-from clear_strategies.kernels.per_gaussian import activate, dispatch, wander
+from clear_strategies.kernels.per_gaussian import activate, dispatch, evidence_score, route, wander
 from clear_strategies.merging.iteration import HrSide, Update
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
@@ -150,3 +150,15 @@ def test_other_tensors_take_torch(monkeypatch):
     monkeypatch.setattr(dispatch, "DEVICES", {"cpu"})
     assert activate(*x, None) == "Warp's"
     assert activate(*x, torch.zeros(1, dtype=torch.float64)) != "Warp's"
+
+
+def test_evidence_of_another_type_than_the_kernels_is_computed_in_torch(by_warp):
+    """A strategy's own, where the other tensors are the trainer's."""
+    visible, screen, ordinary = numbers(N) > 0, numbers(N, 2), numbers(N).abs()
+    e = Evidence(numbers(N).double().sigmoid(), numbers(N).double().sigmoid())
+
+    def both():
+        return route(e, visible, 0.25, True), evidence_score(e, screen, ordinary, True)
+
+    found, expected = by_warp(both)
+    assert all(map(torch.equal, found, expected))

@@ -10,6 +10,7 @@ from typing import Final, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
+from clear_strategies.core.evidence import Evidence
 from clear_strategies.kernels import native
 from clear_strategies.kernels.per_gaussian import cpp
 from rasterizers.warp_runtime import runs_warp
@@ -26,11 +27,17 @@ def compiled(function: Callable[P, T]) -> Callable[P, T]:
 
     @wraps(function)
     def chosen(*args: P.args, **kwargs: P.kwargs) -> T:
-        kernels = _kernels([x for x in args if isinstance(x, Tensor)])
+        kernels = _kernels([x for arg in args for x in _tensors(arg)])
         fastest: Callable[P, T] = getattr(kernels, function.__name__, function)
         return fastest(*args, **kwargs)
 
     return chosen
+
+
+def _tensors(argument: object) -> Sequence[Tensor]:
+    if isinstance(argument, Evidence):  # a strategy's, of any type
+        return argument.reliability, argument.demand
+    return [argument] if isinstance(argument, Tensor) else []
 
 
 def _kernels(given: Sequence[Tensor]) -> ModuleType | None:
