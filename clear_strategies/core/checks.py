@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
-from typing import NoReturn
+from collections.abc import Collection, Sequence
+from numbers import Real
+from typing import Any, NoReturn, TypeGuard
 
 from clear_strategies.errors import SettingError
 from rasterizers.interface import Color
@@ -49,11 +50,16 @@ def require_choice(name: str, value: object, choices: Collection[object]) -> Non
 
 def as_color(name: str, value: object) -> Color:
     """Three numbers in [0, 1], as a tuple; a SettingError if it is something else."""
-    parts = value if isinstance(value, list | tuple) else ()
-    if len(parts) != 3 or not all(isinstance(x, int | float) and 0 <= x <= 1 for x in parts):
+    if not is_color(value):
         refuse(name, "must be three numbers in [0, 1], an RGB colour", value, f"{name}=[1,1,1] is white")
-    r, g, b = map(float, parts)
+    r, g, b = map(float, value)
     return r, g, b
+
+
+def is_color(value: object) -> TypeGuard[Sequence[Any]]:
+    """Whether it is three numbers in [0, 1]."""
+    parts = value if isinstance(value, list | tuple) else ()
+    return len(parts) == 3 and all(isinstance(x, Real) and 0 <= float(x) <= 1 for x in parts)
 
 
 def refuse(name: str, rule: str, value: object, remedy: str) -> NoReturn:

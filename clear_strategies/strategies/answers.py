@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 from torch import Tensor
 
 from clear_strategies.core import deferred
+from clear_strategies.core.checks import is_color
 from clear_strategies.core.conflicts import Weights
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.finite import is_finite, rows_not_finite
@@ -43,11 +44,7 @@ def require_gate(s: Strategy, z: Any, n: int) -> None:
 
 
 def require_background(s: Strategy, color: Any) -> None:
-    if color is not None and not (
-        isinstance(color, tuple | list)
-        and len(color) == 3
-        and all(isinstance(x, Real) and 0 <= float(x) <= 1 for x in color)
-    ):
+    if color is not None and not is_color(color):
         _refuse(s, "background", "three numbers in [0, 1] or None", color)
 
 
