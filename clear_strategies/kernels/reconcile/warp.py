@@ -154,8 +154,11 @@ def write(
 def write_group(
     a: Rows, i: wp.int32, d: wp.int32, group: wp.int32, w: Weights, o: Options, lambda_hr: wp.float32,
     finite: wp.array[wp.int32],
-) -> None:  # fmt: skip
-    write(a, i, d, weight(w.keep, group, i), weight(w.remove, group, i), o, lambda_hr, finite)
+) -> wp.int32:  # fmt: skip
+    """Write the d-th number of a row if it has one. Returns which number of the attributes after this one it is, else < 0."""
+    if d >= 0 and d < a.width:
+        write(a, i, d, weight(w.keep, group, i), weight(w.remove, group, i), o, lambda_hr, finite)
+    return d - a.width
 
 
 @wp.kernel
@@ -165,33 +168,17 @@ def combine(
 ) -> None:  # fmt: skip
     """Thread (i, j) writes the j-th number of Gaussian i, over the attributes side by side."""
     i, j = wp.tid()
-    d, lambda_hr = j, wp.float32(o.lambda_hr)
+    lambda_hr = wp.float32(o.lambda_hr)
     if changing.shape[0] > 0:  # of a recording
         lambda_hr = wp.float32(changing[0])
-    if d < shN.width:
-        write_group(shN, i, d, SHN, w, o, lambda_hr, finite)
-        return
-    d -= shN.width
-    if d < means.width:
-        write_group(means, i, d, MEANS, w, o, lambda_hr, finite)
-        return
-    d -= means.width
-    if d < quats.width:
-        write_group(quats, i, d, QUATS, w, o, lambda_hr, finite)
-        return
-    d -= quats.width
-    if d < scales.width:
-        write_group(scales, i, d, SCALES, w, o, lambda_hr, finite)
-        return
-    d -= scales.width
-    if d < opacities.width:
-        write_group(opacities, i, d, OPACITIES, w, o, lambda_hr, finite)
-        return
-    d -= opacities.width
-    if d < sh0.width:
-        write_group(sh0, i, d, SH0, w, o, lambda_hr, finite)
-        return
-    write(detail, i, d - sh0.width, wp.float64(1.0), wp.float64(0.0), o, lambda_hr, finite)
+    d = write_group(shN, i, j, SHN, w, o, lambda_hr, finite)
+    d = write_group(means, i, d, MEANS, w, o, lambda_hr, finite)
+    d = write_group(quats, i, d, QUATS, w, o, lambda_hr, finite)
+    d = write_group(scales, i, d, SCALES, w, o, lambda_hr, finite)
+    d = write_group(opacities, i, d, OPACITIES, w, o, lambda_hr, finite)
+    d = write_group(sh0, i, d, SH0, w, o, lambda_hr, finite)
+    if d >= 0:
+        write(detail, i, d, wp.float64(1.0), wp.float64(0.0), o, lambda_hr, finite)
 
 
 def products(lr: Grads, hr: Grads, names: Sequence[str]) -> conflicts.Products:
