@@ -316,7 +316,7 @@ class Rasterizer(Protocol):
 
 
 @runtime_checkable
-class Recordable(Protocol):
+class Recordable(Rasterizer, Protocol):
     """A rasterizer whose renderings can be part of a `recording.Recording`: what changes from one replay to the next, it reads
     from tensors.
     """

@@ -13,9 +13,8 @@ import logging
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
-import torch
 from torch import Tensor
 
 from clear_strategies.core.view import Photo, View
@@ -24,10 +23,9 @@ from clear_strategies.merging.replays import LIVE, RecordedWork, why_strategies_
 from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.given import Given, GivenExtra, GivenView, L, Learned
 from clear_strategies.training.state import TrainState
-from rasterizers.interface import Rasterizer, Recordable
+from rasterizers.interface import Rasterizer, Recordable, over
 from rasterizers.replays import Kind, Recorded, Replays, copied, write
 from rasterizers.told import name_of_view
-from rasterizers.warp_runtime import sent
 
 _log = logging.getLogger(__name__)
 
@@ -98,10 +96,10 @@ class _Recorded(Recorded[Given, Any]):
         self, s: TrainState, rasterizer: Recordable, given: Given, count: Callable[[int], None], learn: Callable[..., Learned]
     ) -> None:  # fmt: skip
         self._count, self._device, self._look_up = count, s.device, s.conductor.looked_up
-        self._numbers_of = rasterizer.numbers_of
-        own, self._background = self._copied(given), s.field.means.new_empty(1, 3)
-        drawn_by = rasterizer if given.background is None else rasterizer.over_changing(self._background)
-        self._own = self._read_of(own)
+        self._rasterizer = rasterizer
+        own, background = self._copied(given), copied(self._behind(given))
+        drawn_by = rasterizer if background is None else rasterizer.over_changing(background)
+        self._own = [*self._read_of(own), background]
         self._write(given)
         self._work = RecordedWork(s.device, s.conductor.work_log, lambda: learn(s, drawn_by, own))
 
@@ -124,19 +122,23 @@ class _Recorded(Recorded[Given, Any]):
         looked_up = copied(self._look_up(given.view))
         return replace(given, view=view, gate=copied(given.gate), background=None, looked_up=looked_up)
 
+    def _behind(self, given: Given) -> Tensor | None:
+        """The background that an iteration has in place of the scene's."""
+        if given.background is None:
+            return None
+        return cast(Recordable, over(self._rasterizer, given.background)).background_on(self._device)
+
     def _read_of(self, given: Given) -> list[Tensor | None]:
-        """All tensors that an iteration reads of what it is given."""
+        """All other tensors that an iteration reads of what it is given."""
         read: list[Tensor | None] = []
         for photo in given.photos:
             image = photo.over(given.background, given.behind).image
-            read += [image, photo.shown, *self._numbers_of(photo.camera, self._device)]
+            read += [image, photo.shown, *self._rasterizer.numbers_of(photo.camera, self._device)]
         if isinstance(given, GivenExtra):
             return [*read, given.extra.weight]
         looked_up = self._look_up(given.view) if given.looked_up is None else given.looked_up
         return [*read, given.gate, looked_up]
 
     def _write(self, given: Given) -> None:
-        write(self._own, self._read_of(given))
-        if given.background is not None:
-            self._background.copy_(sent(torch.tensor([given.background], dtype=torch.float32), self._device))
+        write(self._own, [*self._read_of(given), self._behind(given)])
         self._count(given.t)

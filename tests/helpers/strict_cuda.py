@@ -203,7 +203,6 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     from clear_strategies.kernels import native, reconcile
     from clear_strategies.kernels.per_gaussian import dispatch
     from clear_strategies.kernels.reconcile import warp as warp_merge
-    from clear_strategies.training import replay
     from rasterizers import recording, replayed, replays, warp_runtime
     from rasterizers.warp_backend import frame, settings
 
@@ -269,7 +268,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         reconcile: {"_for_device": lambda device: warp_merge},
         rasterizers.native: {"empty": on_no_cpu},
         frame: {"DEFERRED_COUNTS": {"cpu": True}},
-        **{m: {"sent": sends} for m in (warp_runtime, settings, replay)},
+        **{m: {"sent": sends} for m in (warp_runtime, settings)},
     }  # fmt: skip
     for owner, values in patches.items():
         for name, value in values.items():
