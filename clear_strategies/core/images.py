@@ -12,7 +12,7 @@ from typing import Final, Literal, get_args
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor
 
@@ -120,13 +120,21 @@ def patch_means(values: Float[Tensor, "H W C"], patch: int) -> Float[Tensor, "ph
     return F.avg_pool2d(mean, patch, ceil_mode=True, count_include_pad=False)[0, 0]
 
 
-def agreement(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 1"]:
+def agreement(
+    image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], shown: Bool[Tensor, "h w"] | None = None
+) -> Float[Tensor, "h w 1"]:
     """1 / (1 + (r / 2m)²) at each pixel, with r the mean difference of the 5 x 5 pixels around it and m the median of r: a robust
     weight, near 1 at most pixels and low where `target` shows what `image` contradicts.
+
+    Args:
+        shown: the pixels whose r have a part in m; None: all.
     """
     difference = (image - target).abs().mean(dim=2)[None, None]
     r = F.avg_pool2d(difference, 5, 1, 2, count_include_pad=False)[0, 0]
-    return (1 / (1 + (r / (2 * r.median()).clamp_min(_LEAST_DIFFERENCE)).square()))[..., None]
+    m = (
+        r.median() if shown is None else torch.where(shown, r, torch.nan).nanmedian().nan_to_num(0.0)
+    )  # where none is shown
+    return (1 / (1 + (r / (2 * m).clamp_min(_LEAST_DIFFERENCE)).square()))[..., None]
 
 
 def to_bytes(image: Float[Tensor, "H W *C"]) -> np.ndarray:

@@ -276,7 +276,7 @@ class Conductor:
         target = torch.where(weight > 0, extra.photo.over(self.background(t), extra.background).image, 0.0)
         render = torch.where(weight > 0, image.detach(), 0.0)
         if extra.robust:
-            weight = weight * images.agreement(render, target)
+            weight = weight * images.agreement(render, target, extra.weight > 0)
         loss = self.objective.lr(render, target)
         require_finite_losses(f"t={t}, an extra view", loss.values, {"its picture": target, "the render": image})
         return loss._replace(cotangents=loss.cotangents * weight)

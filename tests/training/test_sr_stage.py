@@ -110,6 +110,21 @@ def test_a_robust_picture_counts_less_where_the_field_contradicts_it():
     assert torch.allclose(robust, plain * images.agreement(render, photo.image))
 
 
+def test_hidden_pixels_do_not_decide_how_far_a_robust_picture_is_trusted():
+    photo, conductor = SCENE.train[0].lr, Conductor(objective=Objective(kernels="torch", lambda_ssim=0.0))
+    whole = torch.ones(photo.image.shape[:2])
+    partly, shown = whole.clone(), photo.camera.width * 6 // 10
+    partly[:, :shown] = 0
+    nothing = torch.zeros_like(whole)
+    of_whole, of_part, of_nothing = (
+        conductor.extra_loss(photo.image + 0.1, ExtraView(photo, weight, robust=True), 1).cotangents
+        for weight in (whole, partly, nothing)
+    )
+    inner = slice(shown + 2, None)  # the windows of these show no hidden pixel
+    assert torch.allclose(of_part[:, :, inner], of_whole[:, :, inner])
+    assert not of_nothing.any()
+
+
 def test_timing_has_iterations_and_seconds_of_both_stages():
     state, history = start(()), pd.DataFrame({"t": range(1, 6), "seconds": [2.0, 4.0, 6.0, 8.0, 10.0]})
     assert results._two_stages(state, history) == []
