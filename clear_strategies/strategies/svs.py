@@ -75,7 +75,12 @@ class SVS(Strategy):
         n_views = max(1, n_views)
         # How far a run that sees each view `dropout.full` / n_views times needs the rate.
         self.cache["share"] = min(1.0, self.dropout.full / (self.looks * n_views)) if self.looks else 1.0
-        if self.cache["share"] < 1 and self.dropout.maximum > 0:
+        if self.dropout.full == 0 and self.looks and self.dropout.maximum > 0:
+            _log.warning(
+                "SVS drops nothing: until svs.dropout.full=0 no training view is seen, and svs.looks=%d lowers the rate by that. "
+                "Set svs.looks=0 for the whole rate from the first iteration on.", self.looks,
+            )  # fmt: skip
+        elif self.cache["share"] < 1 and self.dropout.maximum > 0:
             _log.debug(
                 "dropout rises to %.3f instead of %.3f: each of the %d training views is seen %d times (svs.looks: %d).",
                 self.dropout.maximum * self.cache["share"], self.dropout.maximum, n_views, self.dropout.full // n_views,

@@ -88,6 +88,14 @@ def test_the_rate_falls_with_the_looks_at_each_view(n_views, rate):
         assert kept_share(svs, 4_000) == pytest.approx(expected, abs=4e-3)
 
 
+def test_a_rate_that_the_looks_lower_to_nothing_is_told(caplog):
+    assert started(dropout=Ramp(0.2, full=0)).gate(100, 5) is None
+    assert "SVS drops nothing" in caplog.text
+    caplog.clear()
+    assert kept_share(started(dropout=Ramp(0.2, full=0), looks=0), 1) == pytest.approx(0.8, abs=4e-3)
+    assert not caplog.text
+
+
 def test_anchor_pulls_back_with_twice_the_weighted_distance():
     svs = started(anchor_start=10, anchor_strength=0.01, anchor_weights={"scales": 0.5, "opacities": 0.1})
     theta = params()
