@@ -10,6 +10,8 @@ fixed order.
 
 from __future__ import annotations
 
+from typing import Any
+
 import warp as wp
 
 from clear_strategies.kernels.gaussian_step.warp.adam import AdamStep, Attribute, is_still, step_number
@@ -52,41 +54,36 @@ class StepOptions:
 
 
 @wp.func
-def products3(low: wp.vec3, high: wp.vec3) -> wp.vec3d:
-    a, b = wp.vec3d(low), wp.vec3d(high)
-    return wp.vec3d(wp.dot(a, b), wp.dot(a, a), wp.dot(b, b))
-
-
-@wp.func
-def products4(low: wp.vec4, high: wp.vec4) -> wp.vec3d:
-    a, b = wp.vec4d(low), wp.vec4d(high)
-    return wp.vec3d(wp.dot(a, b), wp.dot(a, a), wp.dot(b, b))
+def products(low: Any, high: Any) -> wp.vec3d:
+    """Of two vectors."""
+    total = wp.vec3d()
+    for d in range(len(low)):
+        a, b = wp.float64(low[d]), wp.float64(high[d])
+        total += wp.vec3d(a * b, a * a, b * b)
+    return total
 
 
 @wp.func
 def group_products(low: RawGradient, high: RawGradient, activation: Activation, i: wp.int32) -> Products:
     a, b = wp.float64(low.opacity), wp.float64(high.opacity)
     p = Products()
-    p[MEANS] = products3(low.means, high.means)
-    p[SH0] = products3(low.sh0, high.sh0)
-    p[SHN] = higher_bands2(activation, i) * products3(low.rgb, high.rgb)
+    p[MEANS] = products(low.means, high.means)
+    p[SH0] = products(low.sh0, high.sh0)
+    p[SHN] = higher_bands2(activation, i) * products(low.rgb, high.rgb)
     p[OPACITIES] = wp.vec3d(a * b, a * a, b * b)
-    p[SCALES] = products3(low.scales, high.scales)
-    p[QUATS] = products4(low.quats, high.quats)
+    p[SCALES] = products(low.scales, high.scales)
+    p[QUATS] = products(low.quats, high.quats)
     return p
 
 
 @wp.func
-def merged3(low: wp.vec3, high: wp.vec3, w: Weights, group: wp.int32, i: wp.int32, lambda_hr: wp.float32) -> wp.vec3:
-    """The sum g_LR + λ ĝ_HR (Eq. 8)."""
+def merged(low: Any, high: Any, w: Weights, group: wp.int32, i: wp.int32, lambda_hr: wp.float32) -> Any:
+    """The sum g_LR + λ ĝ_HR (Eq. 8), of vectors."""
     keep, remove = weight(w.keep, group, i), weight(w.remove, group, i)
-    return low + wp.vec3(wp.vec3d(high) * keep - wp.vec3d(low) * remove) * lambda_hr
-
-
-@wp.func
-def merged4(low: wp.vec4, high: wp.vec4, w: Weights, group: wp.int32, i: wp.int32, lambda_hr: wp.float32) -> wp.vec4:
-    keep, remove = weight(w.keep, group, i), weight(w.remove, group, i)
-    return low + wp.vec4(wp.vec4d(high) * keep - wp.vec4d(low) * remove) * lambda_hr
+    g_hr = type(low)()
+    for d in range(len(low)):
+        g_hr[d] = reconciled(high[d], low[d], keep, remove)
+    return low + g_hr * lambda_hr
 
 
 @wp.kernel
@@ -98,9 +95,9 @@ def compare(
     i, tally = block * wp.block_dim() + lane, Counts()
     if i < view.n:
         g_lr, g_hr, _ = load(activation, lr, base, hf, view, i)
-        products = group_products(g_lr, g_hr, activation, i)
-        store(products, table, i)
-        tally = counted(products)
+        p = group_products(g_lr, g_hr, activation, i)
+        store(p, table, i)
+        tally = counted(p)
     wp.tile_store(counts, wp.tile_sum(wp.tile(tally, preserve_type=True)), offset=(block,))
 
 
@@ -174,15 +171,15 @@ def step(
     moves, λ = not still, wp.float32(0.0)
     if options.merges:
         λ = adam.lambda_hr
-    d_means = merged3(g_lr.means, g_hr.means, w, MEANS, i, λ)
-    d_quats = merged4(g_lr.quats, g_hr.quats, w, QUATS, i, λ)
-    d_scales = merged3(g_lr.scales, g_hr.scales, w, SCALES, i, λ)
+    d_means = merged(g_lr.means, g_hr.means, w, MEANS, i, λ)
+    d_quats = merged(g_lr.quats, g_hr.quats, w, QUATS, i, λ)
+    d_scales = merged(g_lr.scales, g_hr.scales, w, SCALES, i, λ)
     keep, remove = weight(w.keep, OPACITIES, i), weight(w.remove, OPACITIES, i)
     d_opacity = g_lr.opacity + reconciled(g_hr.opacity, g_lr.opacity, keep, remove) * λ
-    d_sh0 = merged3(g_lr.sh0, g_hr.sh0, w, SH0, i, λ)
+    d_sh0 = merged(g_lr.sh0, g_hr.sh0, w, SH0, i, λ)
     # f_det gets only the routed gradient of L_HF, uncorrected
     d_detail = g_hf.rgb * route_of(activation, view, i) * view.lambda_hf * adam.lambda_hr
-    d_rgb = merged3(g_lr.rgb, g_hr.rgb, w, SHN, i, λ)
+    d_rgb = merged(g_lr.rgb, g_hr.rgb, w, SHN, i, λ)
 
     count = wp.int32(0)
     if still and at < view.n:
