@@ -209,9 +209,8 @@ def _left_in(
         keep = depths(means, camera.world_to_camera.to(means)) <= far_plane
         if radius_clip > 0:
             f = footprints(means, quats, scales, camera, kernel)
-            keep &= ~(f.radii(opacities, 1 / 255) <= radius_clip).all(
-                -1
-            )  # NaN, of those behind the camera, which are not drawn
+            radii = f.radii(opacities, 1 / 255)  # NaN of those behind the camera, which are not drawn
+            keep &= ~(radii <= radius_clip).all(-1)
     return opacities * keep
 
 

@@ -131,9 +131,8 @@ def agreement(
     """
     difference = (image - target).abs().mean(dim=2)[None, None]
     r = F.avg_pool2d(difference, 5, 1, 2, count_include_pad=False)[0, 0]
-    m = (
-        r.median() if shown is None else torch.where(shown, r, torch.nan).nanmedian().nan_to_num(0.0)
-    )  # where none is shown
+    # nan_to_num: where no pixel is shown.
+    m = r.median() if shown is None else torch.where(shown, r, torch.nan).nanmedian().nan_to_num(0.0)
     return (1 / (1 + (r / (2 * m).clamp_min(_LEAST_DIFFERENCE)).square()))[..., None]
 
 
