@@ -113,7 +113,7 @@ def conductor(
         raise SettingError(f"iterations must be at least 1, got {iterations}.")
     names = strategy.strip() if isinstance(strategy, str) else f"[{','.join(map(str, strategy))}]"
     chosen = f"+strategy=[{names}]" if "," in names and not names.startswith("[") else f"+strategy={names}"
-    config = composed([chosen, *overrides])
+    config = composed((chosen, *overrides))
     settings: ConductorSettings = build(tree(config, _TRAINERS))
     for name, s in settings.strategies.items():
         if not s.shares_gate:
@@ -175,19 +175,20 @@ def flat(node: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
     return leaves
 
 
-def composed(overrides: list[str], config: str = "conductor") -> DictConfig:
+def composed(overrides: Sequence[str], config: str = "conductor") -> DictConfig:
     """conf/ with these overrides, from its file `config`: "config" for a run, "conductor" for a host.
 
     Raises:
         SettingError: an override names nothing, or is no override.
     """
+    require_text(overrides)
     # The caller may be a Hydra application, whose state is restored afterwards.
     shared = GlobalHydra.instance()
     before, shared.hydra = shared.hydra, None
     try:
         require_each_once(overrides)
         with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-            return hydra.compose(config, overrides)
+            return hydra.compose(config, list(overrides))
     except (HydraException, OmegaConfBaseException) as error:
         raise not_composed(error, overrides, config) from error
     finally:
@@ -261,6 +262,14 @@ def _is_itself(value: str) -> bool:
     except HydraException:
         return False
     return not parsed.is_sweep_override() and parsed.value() == value and not set("$\\") & set(value)
+
+
+def require_text(overrides: Iterable[object]) -> None:
+    """Raise a SettingError for an override that is no text, such as a list of them, as Python's callers may give."""
+    for override in overrides:
+        if not isinstance(override, str):
+            rule = f"overrides: must be given one by one, each as text, got {override!r}"
+            raise SettingError(f'{rule}. Write "skips=none", "objective=paper", or a list with a star: *overrides.')
 
 
 def require_each_once(overrides: Iterable[str]) -> None:

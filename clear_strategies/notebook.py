@@ -20,7 +20,7 @@ from torch import Tensor
 from clear_strategies import console
 from clear_strategies.commands import path_of
 from clear_strategies.commands import train as train_command
-from clear_strategies.compose import composed
+from clear_strategies.compose import composed, require_text
 from clear_strategies.core.checks import refuse
 from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.data.ply import read_gaussians
@@ -98,6 +98,7 @@ def train(photos: str | Path | None = None, *settings: str, folder: str | Path |
     exit_codes.require("train")
     console.steady()
     console.show()
+    require_text(settings)
     words = [readable(word) for word in settings]
     overrides = words if photos is None else train_command.overrides([str(photos), *words])
     if photos is None and not any(word.startswith(train_command.CHOOSE_STRATEGIES) for word in settings):

@@ -1,5 +1,8 @@
 """From conf/ to objects: names on the command line, the defaults' one owner, and what is refused."""
 
+import subprocess
+import sys
+
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -65,6 +68,19 @@ def test_names_and_overrides_are_those_of_the_command_line_and_milestones_stretc
 def test_what_does_not_exist_is_named(said, named):
     with pytest.raises(SettingError, match=named):
         conductor(*said)
+
+
+def test_a_list_of_settings_is_refused_with_the_remedy():
+    """In a process without pytest's checks of annotations."""
+    code = (
+        "import clear_strategies\nfrom clear_strategies.compose import conductor\n"
+        "for call in (conductor, clear_strategies.train):\n"
+        "    try:\n        call('gco', ['a=b'])\n"
+        "    except clear_strategies.ClearError as error:\n        print(error)\n"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    rule = "overrides: must be given one by one, each as text, got ['a=b']."
+    assert [line.startswith(rule) and "*overrides" in line for line in told.splitlines()] == [True, True]
 
 
 def test_readings_stand_beside_any_strategies_and_what_is_set_by_name_wins():
