@@ -25,6 +25,8 @@ _QUANTITIES: Final = {
     "bicubic": ("bicubic (dB)", ".2f"), "prior": ("prior (dB)", ".2f"), "conflict": ("conflict", ".3f"),
     "gaussians": ("Gaussians", ",.0f"), "seconds": ("seconds", ",.0f"),
 }  # fmt: skip
+_PAIRS: Final = 2  # the least of which a difference has an error
+_UNPAIRED: Final = "*"
 
 
 def compare(runs: Sequence[FinishedRun]) -> pd.DataFrame:
@@ -54,9 +56,9 @@ def layout(table: pd.DataFrame) -> pd.DataFrame:
     for quantity, (header, form) in _QUANTITIES.items():
         cells[header] = _numbers(table[quantity], table[f"{quantity}_std"], form)
         if quantity == "psnr":
-            several = bool((table["psnr_delta"].abs() > 0).any())
             delta = _numbers(table["psnr_delta"], table["psnr_delta_error"], "+.2f")
-            cells["Δ"] = delta if several else [""] * len(table)
+            marked = [cell + _UNPAIRED * int(few) for cell, few in zip(delta, _unpaired(table), strict=True)]
+            cells["Δ"] = marked if _differ(table) else [""] * len(table)
             cells["best"] = _numbers(table["psnr_best"], None, form)
     cells["seed"] = list(table["seeds"])
     return pd.DataFrame({name: column for name, column in cells.items() if any(column)})
@@ -65,9 +67,12 @@ def layout(table: pd.DataFrame) -> pd.DataFrame:
 def notes(table: pd.DataFrame, runs: Sequence[FinishedRun]) -> list[str]:
     """What a reader of the table has to know about it."""
     lines = [f"bicubic, prior: PSNR of the enlarged LR photos and of the SR images; {NOTE}."]
-    if (table["psnr_delta"].abs() > 0).any():
+    if _differ(table):
         error = "; its ±: standard error of the differences seed by seed" * int(table["psnr_delta_error"].notna().any())
         lines.append(f"Δ: PSNR over the scene's first method, dB{error}.")
+        if _unpaired(table).any():
+            why = "fewer than two seeds are common to both methods"
+            lines.append(f"Δ{_UNPAIRED}: {why}, so it is the difference of their means, and has no error.")
     if table["psnr_best"].notna().any():
         lines.append("±: standard deviation over seeds; best: PSNR of the best seed.")
     if table["average"].any():
@@ -76,6 +81,16 @@ def notes(table: pd.DataFrame, runs: Sequence[FinishedRun]) -> list[str]:
         if scene in set(table["scene"]) and (shared := in_all([run.settings for run in of_scene])):
             lines.append(f"All runs of {scene}: `{' '.join(shared)}`.")
     return lines
+
+
+def _differ(table: pd.DataFrame) -> bool:
+    return bool((table["psnr_delta"].abs() > 0).any())
+
+
+def _unpaired(table: pd.DataFrame) -> pd.Series[bool]:
+    """Which rows, other than the first of a scene, have a Δ of too few pairs for an error."""
+    later = table.groupby("scene", sort=False).cumcount() > 0
+    return later & table["psnr_delta"].notna() & (table["psnr_delta_pairs"] < _PAIRS)
 
 
 def markdown(cells: pd.DataFrame, lines: Sequence[str]) -> str:
@@ -177,7 +192,7 @@ def _differences(single: pd.DataFrame, key: str, means: pd.Series[float]) -> pd.
     table = pd.DataFrame(
         {"psnr_delta": pairs.mean(), "psnr_delta_error": pairs.sem(), "psnr_delta_pairs": pairs.count()}
     )
-    few = table["psnr_delta_pairs"] < 2
+    few = table["psnr_delta_pairs"] < _PAIRS
     table.loc[few, "psnr_delta"] = means[few[few].index] - means[first]
     table.loc[table.index == first, ["psnr_delta", "psnr_delta_error"]] = 0.0, math.nan
     return table
