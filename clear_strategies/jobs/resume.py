@@ -20,7 +20,7 @@ from clear_strategies.outputs.metrics import Metrics
 from clear_strategies.settings import CHANGES_NO_RESULT
 from clear_strategies.training import checkpoint
 from clear_strategies.training.checkpoint import CHECKPOINTS, Checkpoint
-from clear_strategies.training.state import PHOTOS, TrainState, colours
+from clear_strategies.training.state import PHOTOS, TrainState
 from clear_strategies.viewing.cameras import FILE as CAMERAS
 from clear_strategies.viewing.cameras import read_cameras
 from rasterizers.interface import Camera
@@ -34,9 +34,10 @@ AUTO: Final = "auto"  # the value of fit.resume that is not a path
 _NOT_COMPARED: Final = CHANGES_NO_RESULT | {"fit.device"}
 # Where the data set lies, which may be moved: the cameras that are read there are compared.
 _DATA: Final = ("data.path", "data.root", "data.reader.root", "data.reader.cache")
-# Where other files lie, by the ends of their keys: their names and sizes are compared.
+# Where other files lie, by the ends of their keys: what they hold is compared.
 _FILES: Final = ("path", "lr_folder")
-_HELD: Final = " holds"
+_HELD: Final = " content"
+_HELD_EARLIER: Final = " holds"  # of earlier versions: names and sizes
 _ROUNDED: Final = 1e-6  # of a position, as float32 has it
 _SAME: Final = 1e-3  # of a camera's focal length, and of the distances between the cameras
 _SAME_COLOUR: Final = 5e-4  # more than other machines round or decode differently
@@ -51,10 +52,19 @@ def comparable(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _held(path: Path) -> str:
-    """A digest of the names and sizes of the files at a place."""
-    files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else []
-    listed = [(file.relative_to(path).as_posix(), file.stat().st_size) for file in files] or path.stat().st_size
-    return hashlib.sha256(repr(listed).encode()).hexdigest()[:12]
+    """A digest of the files at a place: of their names in it, and of what they hold."""
+    whole = hashlib.sha256()
+    for file in sorted(filter(Path.is_file, path.rglob("*") if path.is_dir() else [path])):
+        whole.update(f"{file.relative_to(path).as_posix()} {_digest(file)}\n".encode())
+    return whole.hexdigest()[:12]
+
+
+def _digest(file: Path) -> str:
+    try:
+        with file.open("rb") as opened:
+            return hashlib.file_digest(opened, "sha256").hexdigest()
+    except OSError:  # who needs it says so
+        return ""
 
 
 def begun(folder: Path) -> str | None:
@@ -127,7 +137,7 @@ def restore(state: TrainState, scene: Scene, saved: Checkpoint, source: Path, co
     """Continue from a checkpoint of the same configuration, on the same photos and poses."""
     _require_same(source, saved.config, config)
     _require_same_cameras(source, scene)
-    _require_same_photos(source, saved, scene)
+    _require_same_photos(source, saved, state)
     state.restore(saved, source)
     _log.info("resumed from %s: %d iterations are done.", source, saved.t - 1)
     if saved.device != state.device.type:
@@ -141,7 +151,7 @@ def _require_same(source: Path, then: Mapping[str, Any], now: Mapping[str, Any])
     keys = then.keys() | now.keys()
     moved = {key for key in keys if key + _HELD in then and key + _HELD in now}  # what they hold is compared
     moved |= {*_DATA} if (folder_of(source) / CAMERAS).is_file() else set()
-    moved |= {key for key in then.keys() ^ now.keys() if key.endswith(_HELD)}
+    moved |= {key for key in then.keys() ^ now.keys() if key.endswith((_HELD, _HELD_EARLIER))}
     differ = [key for key in sorted(keys - moved) if then.get(key) != now.get(key)]
     if differ:
         listed = "; ".join(f"{key}: {then.get(key)!r} then, {now.get(key)!r} now" for key in differ[:5])
@@ -171,13 +181,14 @@ def _require_same_cameras(source: Path, scene: Scene) -> None:
         raise DataError(source, "data", problem, "give the same data, at whatever path, or start a new run")
 
 
-def _require_same_photos(source: Path, saved: Checkpoint, scene: Scene) -> None:
-    """Refuse training photos with another content; checkpoints of earlier versions do not have it."""
-    now = {name: (saved.tensors.get(f"{PHOTOS}/{name}", x), x) for name, x in colours(scene.train).items()}
+def _require_same_photos(source: Path, saved: Checkpoint, state: TrainState) -> None:
+    """Refuse photos or masks with another content; checkpoints of earlier versions have less of it, or nothing."""
+    now = {name: (saved.tensors.get(f"{PHOTOS}/{name}", x), x) for name, x in state.photos.items()}
     if changed := [name for name, (a, b) in now.items() if not _same_colours(a, b)]:
-        problem = f"{len(changed)} of {len(now)} have another content than in this run, such as {changed[0]}"
+        problem = f"{len(changed)} of {len(now)} have another content or mask than in this run, such as {changed[0]}"
         raise DataError(source, "photos", problem, "give the photos of this run, or start a new run")
 
 
 def _same_colours(a: Tensor, b: Tensor) -> bool:
-    return a.shape == b.shape and float((a.double() - b.double()).abs().max()) <= _SAME_COLOUR
+    both = min(len(a), len(b))
+    return a.shape[1:] == b.shape[1:] and float((a[:both].double() - b[:both].double()).abs().max()) <= _SAME_COLOUR

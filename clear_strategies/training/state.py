@@ -39,14 +39,17 @@ _CELLS: Final = 16  # a side
 
 
 def colours(views: Sequence[View]) -> dict[str, Tensor]:
-    """The mean colours of each LR photo in a grid, by its name: a checkpoint knows the photo by them. Hidden pixels count as 0,
-    and so do those that are not finite.
+    """By the name of each LR photo its means in a grid: red, green, blue, the share of pixels that its mask shows, and 1 - alpha. A
+    checkpoint knows the photo by them. Hidden pixels count as black, and so do those that are not finite.
     """
     found: dict[str, Tensor] = {}
     for view in views:
-        image = torch.nan_to_num(view.lr.image, 0.0, 0.0, 0.0)
-        image = image if view.lr.shown is None else image * view.lr.shown[..., None]
-        found[view.name] = adaptive_avg_pool2d(image.permute(2, 0, 1), _CELLS).cpu()
+        image, mask, transparency = view.lr.image, view.lr.shown, view.lr.transparency
+        shown = torch.ones_like(image[..., 0]) if mask is None else mask.to(image)
+        through = torch.zeros_like(shown) if transparency is None else transparency
+        image = torch.nan_to_num(image, 0.0, 0.0, 0.0) * shown[..., None]
+        layers = torch.cat([image, shown[..., None], through[..., None]], dim=-1)
+        found[view.name] = adaptive_avg_pool2d(layers.permute(2, 0, 1), _CELLS).cpu()
     return found
 
 
@@ -58,6 +61,7 @@ class TrainState:
         t: the iteration to come, from 1.
         rules: by which the rasterizer draws.
         history: one row per iteration; read it by `history_as_floats`, since on a device its numbers are deferred.
+        photos: the scene's `colours`, those of test views included, by which a resumed run knows its photos.
         replays: where iterations are replayed (`fit.replay`); no checkpoint needs them.
     """
 
@@ -72,6 +76,7 @@ class TrainState:
     t: int = 1
     history: History = field(default_factory=History)
     compiled_step: CompiledStep | None = None
+    photos: Mapping[str, Tensor] = field(default_factory=dict)
     replays: Replayer | None = None
 
     @classmethod
@@ -105,7 +110,8 @@ class TrainState:
             )
         optimizer = Adam(theta.raw(), rates, extent)
         conductor.on_fit_start(len(scene.train), settings.seed, device, scene.train)
-        state = cls(theta, conductor, optimizer, densifier, settings, mip, scene.train, rules)
+        photos = colours((*scene.train, *scene.test))
+        state = cls(theta, conductor, optimizer, densifier, settings, mip, scene.train, rules, photos=photos)
         state.compiled_step = compiled_step_for(conductor, optimizer, settings.fused)
         state.refilter()
         return state
@@ -189,7 +195,7 @@ class TrainState:
             ("optimizer", self.optimizer.state_dict()),
             ("density", self.density.state_dict()),
             ("strategies", self.conductor.state_dict()),
-            (PHOTOS, colours(self.views)),
+            (PHOTOS, self.photos),
         ):
             tensors |= {f"{prefix}/{name}": value for name, value in table.items()}
         facts = {"optimizer_steps": float(self.optimizer.steps), "degree": float(self.field.degree)}

@@ -17,6 +17,7 @@ from clear_strategies.jobs import job, resume
 from clear_strategies.jobs import scene as scenes
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.signals import Interrupted
+from clear_strategies.training.state import colours
 from tests.helpers import captures, forked, toy
 from tests.helpers.command_line import ALONE, TINY, run
 from tests.helpers.configs import composed
@@ -37,19 +38,19 @@ def test_resuming_on_another_device_is_logged(caplog):
     assert "this run trained on cuda until now and continues on cpu" in caplog.text
 
 
-def test_device_threads_and_memory_may_differ_and_of_files_that_moved_names_and_sizes_are_compared(tmp_path):
+def test_device_threads_and_memory_may_differ_and_of_files_that_moved_the_content_is_compared(tmp_path):
     assert compared("fit.device=cpu", "fit.threads=1", "rasterizer.memory=512") == compared()
     assert compared()["fit.seed"] == 0  # a default of the class, which no file gives
     saved = replace(start(()).checkpoint({}), config=compared("density.every=50"))
     with pytest.raises(DataError, match=r"density\.every: 50 then, 100 now"):
         resume.restore(start(()), SCENE, saved, Path("there"), compared())
-    for name, content in (("a", b"1"), ("b", b"1"), ("c", b"22")):
+    for name, content in (("a", b"1"), ("b", b"1"), ("c", b"2")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "0.png").write_bytes(content)
     a, b, c = (compared("prior=images", f"prior.path={tmp_path / name}") for name in "abc")
     saved = replace(start(()).checkpoint({}), config=a)
     resume.restore(start(()), SCENE, saved, Path("there"), b)
-    with pytest.raises(DataError, match=r"prior\.path holds: "):
+    with pytest.raises(DataError, match=r"prior\.path content: "):
         resume.restore(start(()), SCENE, saved, Path("there"), c)
 
 
@@ -104,29 +105,47 @@ def test_a_run_goes_on_where_its_data_moved_and_not_on_other_data(there: str, tm
     assert (folder / "metrics.json").is_file()
 
 
-def test_a_run_does_not_go_on_with_a_photo_whose_content_has_changed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("changed", ["a training photo", "a test photo", "a mask"])
+def test_a_run_does_not_go_on_with_a_photo_or_a_mask_whose_content_has_changed(changed: str, tmp_path: Path) -> None:
     photos, folder = captures.demo_on_disk(tmp_path / "photos"), tmp_path / "run"
-    train_on(photos, folder)
-    (photo,) = photos.rglob("0.png")
-    with Image.open(photo) as image:
-        ImageOps.mirror(image).save(photo)
-    with pytest.raises(DataError, match=r"run: photos: 1 of 4 have another content than in this run, such as 0\.png: "):
-        train_on(photos, tmp_path / "other", f"fit.resume={folder}")
+    test = ["data.views.test_every=4"] * (changed == "a test photo")
+    masks = photos / "masks"
+    if changed == "a mask":
+        masks.mkdir()
+        for photo in sorted(photos.rglob("*.png")):
+            Image.new("L", Image.open(photo).size, 255).save(masks / photo.name)
+    train_on(photos, folder, *test)
+    if changed == "a mask":
+        with Image.open(masks / "0.png") as mask:
+            mask.paste(0, (0, 0, 8, 8))
+            mask.save(masks / "0.png")
+    else:
+        (photo,) = (file for file in photos.rglob("0.png") if file.parent != masks)
+        with Image.open(photo) as image:
+            ImageOps.mirror(image).save(photo)
+    with pytest.raises(
+        DataError, match=r"run: photos: 1 of 4 have another content or mask than in this run, such as 0\.png: "
+    ):
+        train_on(photos, tmp_path / "other", f"fit.resume={folder}", *test)
 
 
-def test_rounding_is_no_change_of_a_photo_and_checkpoints_of_earlier_versions_know_none():
+def test_rounding_is_no_change_of_a_photo_and_checkpoints_of_earlier_versions_know_less_of_it_or_nothing():
     def brighter(by: float):
         first, *others = SCENE.train
-        return replace(SCENE, train=(replace(first, lr=replace(first.lr, image=first.lr.image + by)), *others))
+        changed = replace(SCENE, train=(replace(first, lr=replace(first.lr, image=first.lr.image + by)), *others))
+        (state := start(())).photos = colours((*changed.train, *changed.test))
+        return state
 
     saved = start(()).checkpoint({})
-    resume.restore(start(()), brighter(1e-4), saved, Path("there"), {})
-    with pytest.raises(
-        DataError, match=f"there: photos: 1 of 3 have another content .* such as {SCENE.train[0].name}: "
-    ):
-        resume.restore(start(()), brighter(1e-2), saved, Path("there"), {})
+    earlier = {name: x[:3] if name.startswith("photos/") else x for name, x in saved.tensors.items()}  # without masks
+    for of_version in (saved, replace(saved, tensors=earlier)):
+        resume.restore(brighter(1e-4), SCENE, of_version, Path("there"), {})
+        with pytest.raises(
+            DataError, match=f"there: photos: 1 of 4 have another content .* such as {SCENE.train[0].name}: "
+        ):
+            resume.restore(brighter(1e-2), SCENE, of_version, Path("there"), {})
     earlier = {name: x for name, x in saved.tensors.items() if not name.startswith("photos/")}
-    resume.restore(start(()), brighter(1e-2), replace(saved, tensors=earlier), Path("there"), {})
+    resume.restore(brighter(1e-2), SCENE, replace(saved, tensors=earlier), Path("there"), {})
 
 
 def test_that_few_photos_have_a_pose_is_said_first_and_last(tmp_path: Path, monkeypatch, caplog) -> None:
