@@ -14,6 +14,7 @@ import logging
 import logging.handlers
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final, TextIO
@@ -111,7 +112,11 @@ def show_in_host() -> None:
 
 @contextlib.contextmanager
 def logged(path: Path) -> Iterator[Callable[[], None]]:
-    """Write all messages to a file, those for `-v` included, once the function that this yields has been called."""
+    """Write all messages to a file, those for `-v` and Python's warnings included, once the function that this yields has been called.
+    The warnings are not shown meanwhile: matplotlib has one for each letter that its font lacks.
+    """
+    shown = warnings.showwarning
+    logging.captureWarnings(True)
     kept = logging.handlers.MemoryHandler(sys.maxsize, sys.maxsize, flushOnClose=False)
     before = {logger: logger.level for logger in map(logging.getLogger, _OURS)}
 
@@ -129,6 +134,8 @@ def logged(path: Path) -> Iterator[Callable[[], None]]:
     try:
         yield write
     finally:
+        if warnings.showwarning is not shown:  # else the whole program logs them
+            logging.captureWarnings(False)
         logging.getLogger().removeHandler(kept)
         for logger, level in before.items():
             logger.setLevel(level)

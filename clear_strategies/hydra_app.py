@@ -170,7 +170,6 @@ def _stop_workers(signum: int, frame: FrameType | None) -> None:
 
 
 def _job(config: DictConfig) -> float | None:
-    logging.captureWarnings(True)  # as `run.main`, which a launcher's processes do not pass
     hydra_config = HydraConfig.get()
     folder, overrides = Path(hydra_config.runtime.output_dir), list(hydra_config.overrides.task)
     with console.logged(folder / "run.log") as log:

@@ -57,6 +57,23 @@ def test_pythons_warnings_do_not_reach_the_user(tmp_path):
     assert subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, check=True).stderr == b""
 
 
+def test_warnings_of_a_run_from_python_are_in_its_log_alone_and_others_are_shown_again(tmp_path):
+    """As those of matplotlib for a scene whose name has letters that its font lacks."""
+    code = f"""if True:
+        import warnings
+        from pathlib import Path
+        from clear_strategies import console
+        console.show()
+        with console.logged(Path({str(tmp_path)!r}) / "run.log") as log:
+            log()
+            warnings.warn("Glyph 24237 missing")
+        warnings.warn("the user's own")
+    """
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True).stderr
+    assert ("Glyph" in said, "the user's own" in said) == (False, True)
+    assert "Glyph 24237 missing" in (tmp_path / "run.log").read_text()
+
+
 def test_a_message_stands_on_a_line_of_its_own_above_the_bar(logger, monkeypatch):
     screen = io.StringIO()
     monkeypatch.setattr(sys, "stderr", screen)
