@@ -112,8 +112,8 @@ def show_in_host() -> None:
 
 @contextlib.contextmanager
 def logged(path: Path) -> Iterator[Callable[[], None]]:
-    """Write all messages to a file, those for `-v` and Python's warnings included, once the function that this yields has been called.
-    The warnings are not shown meanwhile: matplotlib has one for each letter that its font lacks.
+    """Write all messages to a file, those for `-v` and Python's warnings included, once the function that this yields has been
+    called. The warnings are not shown meanwhile: matplotlib has one for each letter that its font lacks.
     """
     shown = warnings.showwarning
     logging.captureWarnings(True)

@@ -40,6 +40,7 @@ import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
 
 from clear_strategies.data.photo_files import read_image  # noqa: E402
+from clear_strategies.errors import ClearError, DataError  # noqa: E402
 from clear_strategies.outputs.figures import SheetRow, write_contact_sheet  # noqa: E402
 from clear_strategies.report.paper import data_of  # noqa: E402
 from clear_strategies.report.runs import FinishedRun, collect  # noqa: E402
@@ -187,13 +188,13 @@ def collect_training_time(sweep: Path) -> None:
     names, seeds = lines_of(runs_of_sweep), {run.seed for run in runs_of_sweep}
     for run in runs_of_sweep:
         name = f"{names[run]}, seed {run.seed}" if len(seeds) > 1 else names[run]
-        history = pd.read_csv(run.folder / "history.csv")
+        history = table_of(run, "history.csv", "t", "psnr_test", "processor_seconds")
         probed = history.dropna(subset="psnr_test")
         seconds, psnr = probed["processor_seconds"].round(1), probed["psnr_test"].round(3)
         tables.append(
             pd.DataFrame({"scene": run.scene, "method": name, "processor seconds": seconds, "PSNR (dB)": psnr})
         )
-        runs = pd.read_csv(run.folder / "timing.csv").set_index("stage")["runs"]
+        runs = table_of(run, "timing.csv", "stage", "runs").set_index("stage")["runs"]
         whole = history["processor_seconds"].iloc[-1]
         first = history[history["t"] <= runs.get("first stage", 0)]["processor_seconds"].max()
         stages[run.scene, name] = [whole] if pd.isna(first) else [first, whole - first]
@@ -218,6 +219,23 @@ def lines_of(runs: Sequence[FinishedRun]) -> dict[FinishedRun, str]:
     }
 
 
+def table_of(run: FinishedRun, name: str, *columns: str) -> pd.DataFrame:
+    """These columns of a CSV file of a run; each has a number at least."""
+    path = run.folder / name
+    try:
+        table = pd.read_csv(path)
+    except (OSError, ValueError) as error:
+        raise unfit(path, "file", f"cannot be read ({error})") from error
+    if absent := [column for column in columns if column not in table or table[column].isna().all()]:
+        raise unfit(path, absent[0], "has no numbers")
+    return table[[*columns]]
+
+
+def unfit(path: Path, field: str, problem: str) -> DataError:
+    """The error for a run that a figure cannot be drawn from."""
+    return DataError(path, field, problem, "give the sweep of the experiment that has the figure's name")
+
+
 def averaged(table: pd.DataFrame, *by: str) -> pd.DataFrame:
     """Means over scenes of the means over seeds."""
     return table.groupby([*by, "scene"], sort=False).mean().groupby([*by], sort=False).mean().reset_index()
@@ -226,9 +244,8 @@ def averaged(table: pd.DataFrame, *by: str) -> pd.DataFrame:
 def figure1b(runs: Sequence[FinishedRun], folder: Path) -> None:
     """The share of Gaussians in conflict by the number of training views."""
     lines = lines_of(runs)
-    views = {run: next(s for s in run.settings if s.startswith("data.views.train=")).split("=")[1] for run in runs}
     rows = [
-        {"line": lines[run], "views": int(views[run]), "scene": run.scene, "conflict": run.numbers["conflict"]}
+        {"line": lines[run], "views": views_of(run), "scene": run.scene, "conflict": run.numbers["conflict"]}
         for run in runs
     ]
     figure, axes = plt.subplots(figsize=(4, 2.6))
@@ -239,6 +256,14 @@ def figure1b(runs: Sequence[FinishedRun], folder: Path) -> None:
     axes.set_ylabel("Gaussians in conflict")
     axes.legend(fontsize=7, frameon=False)
     save(figure, folder / "figure1b.svg")
+
+
+def views_of(run: FinishedRun) -> int:
+    """The number of training views that an override of the run asks for."""
+    asked = (value for s in run.settings for key, _, value in [s.partition("=")] if key == "data.views.train")
+    if not (number := next(asked, "")).isdecimal():
+        raise unfit(run.folder, "data.views.train", "is no setting of this run")
+    return int(number)
 
 
 def figure1c(runs: Sequence[FinishedRun], folder: Path) -> None:
@@ -270,10 +295,14 @@ def figure3(runs: Sequence[FinishedRun], folder: Path, name: str = "figure3") ->
     for scene in dict.fromkeys(run.scene for run in runs):
         of_scene = [run for run in runs if run.scene == scene]
         views = [{path.stem for path in (run.folder / "renders").glob("*.png")} for run in of_scene]
-        view = sorted(set.intersection(*views))[0]
+        if not (shared := sorted(set.intersection(*views))):
+            raise unfit(of_scene[0].folder, "renders", f"have no view that every run of {scene} has")
+        view = shared[0]
         beside = of_scene[0].folder / "views" / view
         drawn = {line: picture(run.folder / "renders" / f"{view}.png") for run, line in lines_of(of_scene).items()}
         lr, truth = picture(Path(f"{beside}_lr.png")), picture(Path(f"{beside}_truth.png"))
+        if sizes := {image.shape for image in drawn.values()} - {truth.shape}:
+            raise unfit(of_scene[0].folder, view, f"has several sizes in {scene}: {truth.shape}, {sizes.pop()}")
         factor = len(truth) // len(lr)
         images = {"input": lr.repeat(factor, 0).repeat(factor, 1), **drawn, "truth": truth}
         captions = {line: f"{run.numbers['psnr']:.2f} dB" for run, line in lines_of(of_scene).items()}
@@ -289,7 +318,7 @@ def figure5(runs: Sequence[FinishedRun], folder: Path, parts: int = 50) -> None:
     """The share of Gaussians in conflict in training, and a test view of each rung."""
     tables = []
     for run, line in lines_of(runs).items():
-        conflict = pd.read_csv(run.folder / "conflict.csv")[["t", "conflict"]]
+        conflict = table_of(run, "conflict.csv", "t", "conflict")
         part = (
             conflict["t"] * parts // (conflict["t"].max() + 1) + 0.5
         ) / parts  # scenes may differ in their iterations
@@ -410,8 +439,8 @@ def notebook(path: Path) -> None:
     nbformat.write(content, path)
 
 
-if __name__ == "__main__":
-    match sys.argv[1:]:
+def command(words: Sequence[str]) -> None:
+    match words:
         case []:
             main(DOCS / "images")
         case ["training_time", sweep]:
@@ -428,3 +457,10 @@ if __name__ == "__main__":
             notebook(DOCS / "tutorial" / "notebook.ipynb")
         case _:
             sys.exit(__doc__)
+
+
+if __name__ == "__main__":
+    try:
+        command(sys.argv[1:])
+    except ClearError as error:
+        sys.exit(str(error))

@@ -39,8 +39,8 @@ _CELLS: Final = 16  # a side
 
 
 def colours(views: Sequence[View]) -> dict[str, Tensor]:
-    """By the name of each LR photo its means in a grid: red, green, blue, the share of pixels that its mask shows, and 1 - alpha. A
-    checkpoint knows the photo by them. Hidden pixels count as black, and so do those that are not finite.
+    """By the name of each LR photo its means in a grid: red, green, blue, the share of pixels that its mask shows, and 1 - alpha.
+    A checkpoint knows the photo by them. Hidden pixels count as black, and so do those that are not finite.
     """
     found: dict[str, Tensor] = {}
     for view in views:

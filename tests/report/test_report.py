@@ -310,6 +310,19 @@ def test_the_papers_figures_are_drawn_from_a_sweep(tmp_path: Path) -> None:
         assert height > 0 < width
 
 
+@pytest.mark.parametrize(
+    ("figure", "named"),
+    [
+        ("figure1b", "0: data.views.train: is no setting of this run"), ("figure3", "view_lr.png: file: is not there"),
+        ("figure5", "conflict.csv: file: cannot be read"), ("training_time", "processor_seconds: has no numbers"),
+    ],
+)  # fmt: skip
+def test_a_figure_refuses_runs_that_it_cannot_be_drawn_from(tmp_path: Path, figure: str, named: str) -> None:
+    make_run(tmp_path / "0", "+strategy=gco")
+    with pytest.raises(DataError, match=named):
+        loaded(DOCS / "figures.py").command([figure, str(tmp_path)])
+
+
 # ---- finished runs are found, named and read; others are left out with a warning
 @pytest.mark.parametrize(
     ("overrides", "facts", "name"),
