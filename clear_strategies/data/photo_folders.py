@@ -64,7 +64,7 @@ def image_folder(root: Path, name: str | None = None) -> Path:
     )
     if len(others := folders_of_images(root)) == 1:
         return next(iter(others))
-    raise DataError(root, "images", f"{problem}, but {_counted(root, others)}" if others else problem, remedy)
+    raise DataError(root, "images", f"{problem}, but {counted(root, others)}" if others else problem, remedy)
 
 
 def folder_note(folder: Path) -> str:
@@ -83,7 +83,7 @@ def list_images(folder: Path) -> list[Path]:
         return images
     problem, remedy = f"holds no image ({', '.join(SUFFIXES)})", "check the path"
     if inside := folders_of_images(folder):
-        problem, remedy = f"{problem}, but {_counted(folder, inside)}", "give one of these folders"
+        problem, remedy = f"{problem}, but {counted(folder, inside)}", "give one of these folders"
     elif other := in_place_of_photos(path for pattern in ("*", *_BELOW) for path in sorted(folder.glob(pattern))):
         problem, remedy = f"{problem}, but {other[0]}", other[1]
     raise DataError(folder, "images", problem, remedy)
@@ -95,7 +95,7 @@ def folders_of_images(root: Path) -> dict[Path, int]:
     return dict(Counter(path.parent for path in images if path.parent.name.lower() not in _NO_PHOTOS))
 
 
-def _counted(root: Path, folders: Mapping[Path, int]) -> str:
+def counted(root: Path, folders: Mapping[Path, int]) -> str:
     """Folders with the numbers of their photos, those with most first."""
     most = sorted(folders.items(), key=lambda item: -item[1])
     return some([f"{folder.relative_to(root).as_posix()} holds {count}" for folder, count in most])
@@ -191,18 +191,30 @@ def finder(folder: Path) -> Callable[[str], Path]:
     return find
 
 
+def names_below(paths: Sequence[Path]) -> list[str]:
+    """The names of photos below the deepest folder that all of them lie in."""
+    shared = os.path.commonprefix([path.parent.parts for path in paths])  # noqa: RUF071 - compares tuples of folders
+    return ["/".join(path.parts[len(shared) :]) for path in paths]
+
+
 def is_file(path: Path) -> bool:
     """Whether the path leads to a file; not for a name that no file can have, such as one of 5,000 letters."""
     return os.path.isfile(path)  # noqa: PTH113 - Path.is_file raises for a name that is too long
 
 
 def usable(
-    listing: Path, entries: Sequence[_Entry], path_of: Callable[[_Entry], Path], *, skip_faulty: bool
+    listing: Path,
+    entries: Sequence[_Entry],
+    path_of: Callable[[_Entry], Path],
+    *,
+    skip_faulty: bool,
+    scene: Path | None = None,
 ) -> list[_Entry]:
     """The entries whose photos can be used, in their order.
 
     Args:
         listing: the file or folder that lists the photos, for messages.
+        scene: the folder below which data.reader.images names that of the photos; None: the reader has no such setting.
         skip_faulty: decode every photo, and leave out those that are missing or cannot be decoded, with a warning for each.
             Else no photo is decoded: a damaged one fails when it is loaded, and a missing one is a DataError.
     """
@@ -217,7 +229,7 @@ def usable(
 
     absent = [path_of(entry) for entry in entries if not is_file(path_of(entry))]
     if absent and len(absent) == len(entries):
-        raise _none_there(listing, absent)
+        raise _none_there(listing, absent, scene)
     if absent and not skip_faulty:
         problem = f"{len(absent)} of {len(entries)} are not there: {some([path.name for path in absent])}"
         remedy = "put them back, or train without them: data.reader.skip_faulty=true"
@@ -228,15 +240,19 @@ def usable(
     return kept
 
 
-def _none_there(listing: Path, absent: Sequence[Path]) -> DataError:
+def _none_there(listing: Path, absent: Sequence[Path], scene: Path | None) -> DataError:
     """The error where no photo of a list is there: the folder that was searched, and what lies there or one folder deeper."""
     searched = next(folder for folder in absent[0].parents if folder.is_dir())
     remedy = f"give the photos these names, or correct those in {listing.name}"
     if photos := images_in(searched) or images_in(searched, "*/*"):
-        found = f"{len(photos)} others, such as {some([photos[0].relative_to(searched).as_posix()])}"
-        if listing.suffix != ".json":
-            inside = "" if photos[0].parent == searched else f"{searched.name}/{photos[0].parent.name}"
-            remedy = f"name the folder of the model's photos: data.reader.images={inside or 'FOLDER'}"
+        found, other = (
+            f"{len(photos)} others, such as {some([photos[0].relative_to(searched).as_posix()])}",
+            photos[0].parent,
+        )
+        if scene is not None:
+            setting = "name the folder of the photos: data.reader.images="
+            inside = shlex.quote(Path(os.path.relpath(other, scene)).as_posix())
+            remedy = f"{setting}FOLDER, or {remedy}" if other == searched else f"{setting}{inside}"
     else:
         endings = Counter(path.suffix or path.name for path in sorted(searched.iterdir()))
         found = ", ".join(f"{count} {ending}" for ending, count in endings.most_common(_LISTED)) or "nothing"

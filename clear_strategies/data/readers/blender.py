@@ -8,9 +8,10 @@ from typing import Final
 
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import Capture, lens_notes, require_names
-from clear_strategies.data.photo_folders import finder, named
-from clear_strategies.data.readers.nerfstudio import frames_of, points_of, transforms_of
+from clear_strategies.data.photo_folders import finder, named, names_below
+from clear_strategies.data.readers.nerfstudio import Listed, frames_of, points_of, transforms_of
 from clear_strategies.data.strict_json import read_object
+from clear_strategies.data.view_names import bare
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
 
@@ -26,7 +27,8 @@ def recognises(path: Path) -> int:
 
 
 def read(root: str | Path, *, background: Color = _WHITE, skip_faulty: bool = False) -> Capture:
-    """Read a scene folder. Frames are named by their file (r_2), test frames with the prefix "test/".
+    """Read a scene folder. Frames are named by their file (r_2), with its folder where a split has several, test frames with
+    the prefix "test/".
 
     Frames keep the order of the JSON files, which is the protocols' numbering. By name, r_10 would come before r_2.
 
@@ -47,12 +49,15 @@ def read(root: str | Path, *, background: Color = _WHITE, skip_faulty: bool = Fa
     else:
         _log.warning("%s has no transforms_test.json: there are no test views.", root)
     contents = {file: read_object(file) for file in splits}
-    transforms, photos = {}, {}
+    listed = {}
     for file, split in splits.items():
-        transforms[file] = transforms_of(file, contents[file])
-        paths, prefix = [find(transform.file_path) for transform in transforms[file]], "test/" * (split == "test")
-        photos[file] = [(f"{prefix}{path.stem}", path, split) for path in paths]
-    frames = frames_of(transforms, photos, background=background, skip_faulty=skip_faulty)
+        transforms = transforms_of(file, contents[file])
+        paths, prefix = [find(transform.file_path) for transform in transforms], "test/" * (split == "test")
+        listed[file] = [
+            Listed(transform, f"{prefix}{bare(name)}", path, split)
+            for transform, name, path in zip(transforms, names_below(paths), paths, strict=True)
+        ]
+    frames = frames_of(listed, background=background, skip_faulty=skip_faulty)
     require_names(frames, root)
     color = "white" if background == _WHITE else f"RGB {background}"
     notes = {

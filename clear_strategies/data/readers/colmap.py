@@ -77,7 +77,7 @@ def capture(
         DataError: an image cannot be used.
     """
     listing = model.listing
-    kept = usable(listing, model.images, lambda image: paths[image.name], skip_faulty=skip_faulty)
+    kept = usable(listing, model.images, lambda image: paths[image.name], skip_faulty=skip_faulty, scene=root)
     masks = masks_of(folder.parent, paths.values())
     frames = [
         Frame.of_photo(
@@ -86,7 +86,8 @@ def capture(
         )
         for image in kept
     ]  # fmt: skip
-    label = model.folder.relative_to(root).as_posix() if model.folder.is_relative_to(root) else model.folder.name
+    below = model.folder.is_relative_to(root) and model.folder != root
+    label = model.folder.relative_to(root).as_posix() if below else model.folder.name
     some_of = f" of its {len(model.images)}" if len(frames) < len(model.images) else ""
     notes = {
         "poses": f"COLMAP {label} ({listing.suffix[1:]}), {len(frames)}{some_of} images",

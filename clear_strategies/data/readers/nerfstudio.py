@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
-import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PureWindowsPath
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import msgspec
 import torch
@@ -18,7 +18,7 @@ from clear_strategies.data.capture import BLACK, Capture, Frame, SfmPoints, lens
 from clear_strategies.data.lenses import Lens, lens_of, pose_from_opengl
 from clear_strategies.data.masks import masks_of
 from clear_strategies.data.photo_files import image_size
-from clear_strategies.data.photo_folders import finder, image_folder, named, some, usable
+from clear_strategies.data.photo_folders import finder, image_folder, named, names_below, some, usable
 from clear_strategies.data.ply import read_points
 from clear_strategies.data.strict_json import Number, read_object, typed
 from clear_strategies.errors import DataError
@@ -81,9 +81,11 @@ def read(
         _log.warning(
             "%s: its split lists name %d photos that are no frame's file_path: %s.", file, len(removed), some(removed)
         )
-    shared = os.path.commonprefix([path.parent.parts for path in paths])  # noqa: RUF071 - compares tuples of folders
-    photos = [("/".join(path.parts[len(shared) :]), path, splits.get(path)) for path in paths]
-    frames = frames_of({file: transforms}, {file: photos}, background=background, skip_faulty=skip_faulty)
+    listed = [
+        Listed(transform, name, path, splits.get(path))
+        for transform, name, path in zip(transforms, names_below(paths), paths, strict=True)
+    ]
+    frames = frames_of({file: listed}, background=background, skip_faulty=skip_faulty, scene=folder)
     notes = {"poses": f"{file.name}, {len(frames)} images", **lens_notes(frames)}
     if splits:
         counts = Counter(frame.split for frame in frames)
@@ -97,9 +99,16 @@ def read(
 
 
 def _in_place_of_first(folder: Path) -> Callable[[str], Path]:
-    """`finder` of the names without their first folder, or where they are absolute, without their first folders."""
+    """`finder` of the names without their first folder, if they have one, or where they are absolute, without their first
+    folders.
+    """
     find = finder(folder)
-    return lambda name: find(f"/{'/'.join(PureWindowsPath(name).parts[1:])}")
+
+    def find_below_first(name: str) -> Path:
+        parts = PureWindowsPath(name).parts
+        return find(f"/{'/'.join(parts[1:] or parts)}")
+
+    return find_below_first
 
 
 def _sized(transform: Transform, find: Callable[[str], Path]) -> Transform:
@@ -161,6 +170,15 @@ class Transform(msgspec.Struct):
         return lens_of(path, where, model, size, pinhole, terms)
 
 
+class Listed(NamedTuple):
+    """A frame as a file lists it, its photo, and the name and the split of its view."""
+
+    transform: Transform
+    name: str
+    path: Path
+    split: str | None
+
+
 class _Points(msgspec.Struct):
     ply_file_path: str | None = None
 
@@ -177,31 +195,27 @@ def transforms_of(path: Path, content: Mapping[str, Any]) -> list[Transform]:
 
 
 def frames_of(
-    transforms: Mapping[Path, Sequence[Transform]],
-    photos: Mapping[Path, Sequence[tuple[str, Path, str | None]]],
-    *,
-    background: Color,
-    skip_faulty: bool,
+    listed: Mapping[Path, Sequence[Listed]], *, background: Color, skip_faulty: bool, scene: Path | None = None
 ) -> list[Frame]:
     """The frames of a folder's files whose photos can be used, with their masks: the frames' own, or those of `masks_of`.
 
     Args:
-        photos: name, file and split of each of `transforms`.
+        listed: what each file lists.
+        skip_faulty, scene: see `usable`.
     """
-    folder = next(iter(transforms)).parent
-    find, frames = finder(folder), list[Frame]()
-    listed = [
-        (frame, path) for file in transforms for frame, (_, path, _) in zip(transforms[file], photos[file], strict=True)
-    ]
-    own = {path: find(frame.mask_path) for frame, path in listed if frame.mask_path}
-    masks = masks_of(folder, [path for _, path in listed], own)
-    for file, of_file in photos.items():
-        paths = [path for _, path, _ in of_file]
-        for i in usable(file, range(len(paths)), paths.__getitem__, skip_faulty=skip_faulty):
-            where, transform, (name, path, split) = f"frames[{i}]", transforms[file][i], of_file[i]
-            pose = pose_from_opengl(file, f"{where}.transform_matrix", transform.transform_matrix)
-            lens, mask = transform.lens(file, where, path), masks.get(path)
-            frames.append(Frame.of_photo(name, path, lens, pose, background=background, split=split, mask=mask))
+    folder = next(iter(listed)).parent
+    find, every, frames = finder(folder), list(itertools.chain(*listed.values())), list[Frame]()
+    own = {entry.path: find(entry.transform.mask_path) for entry in every if entry.transform.mask_path}
+    masks = masks_of(folder, [entry.path for entry in every], own)
+    for file, entries in listed.items():
+        numbered = list(enumerate(entries))
+        for i, entry in usable(file, numbered, lambda item: item[1].path, skip_faulty=skip_faulty, scene=scene):
+            where, path = f"frames[{i}]", entry.path
+            pose = pose_from_opengl(file, f"{where}.transform_matrix", entry.transform.transform_matrix)
+            lens, mask = entry.transform.lens(file, where, path), masks.get(path)
+            frames.append(
+                Frame.of_photo(entry.name, path, lens, pose, background=background, split=entry.split, mask=mask)
+            )
     return frames
 
 

@@ -41,6 +41,16 @@ def test_the_order_is_that_of_the_file_and_endings_may_be_given(tmp_path: Path) 
     assert [frame.name for frame in blender.read(tmp_path).frames] == ["r_2", "r_10", "test/c"]
 
 
+def test_photos_of_one_name_in_several_folders_are_named_with_their_folder(tmp_path: Path) -> None:
+    tiny.blender(tmp_path)
+    for camera, name in (("left", "a"), ("right", "b")):
+        (tmp_path / "train" / camera).mkdir()
+        (tmp_path / f"train/{name}.png").rename(tmp_path / f"train/{camera}/0.png")
+        text = (tmp_path / "transforms_train.json").read_text()
+        (tmp_path / "transforms_train.json").write_text(text.replace(f"train/{name}", f"train/{camera}/0"))
+    assert [frame.name for frame in blender.read(tmp_path).frames] == ["left/0", "right/0", "test/c"]
+
+
 def test_the_lens_and_the_masks_that_a_file_names_are_used(tmp_path: Path) -> None:
     tiny.blender(tmp_path)
     Image.new("L", (tiny.WIDTH, tiny.HEIGHT)).save(tmp_path / "m.png")

@@ -106,6 +106,18 @@ def test_where_no_photo_is_there_the_message_says_what_is(moved: str, message: s
     assert len(colmap.read(root, images=moved).frames) == 3  # the remedy
 
 
+@pytest.mark.parametrize("beside", [True, False])
+def test_where_only_reduced_photos_of_nerfstudio_are_there_the_message_names_the_setting(
+    beside: bool, tmp_path: Path
+) -> None:
+    """As DL3DV is downloaded; and where the names have no folder."""
+    root = tiny.nerfstudio(tmp_path, listed=lambda name: Path(name).name if beside else name)
+    (root / "images").rename(root / "images_4")
+    with pytest.raises(DataError, match=r"such as images_4/a\.png: name .*: data\.reader\.images=images_4$"):
+        nerfstudio.read(root)
+    tiny.require_poses(nerfstudio.read(root, images="images_4"))  # the remedy
+
+
 def test_where_photos_have_an_ending_that_is_not_read_the_message_names_it(tmp_path: Path) -> None:
     root = tiny.nerfstudio(tmp_path)
     for name in NAMES:
