@@ -16,6 +16,7 @@ from clear_strategies.data.capture import MORE_PHOTOS, Capture
 from clear_strategies.data.masks import masks_among
 from clear_strategies.data.photo_files import SUFFIXES, focal_35mm
 from clear_strategies.data.photo_folders import (
+    counted,
     folders_of_images,
     images_in,
     in_place_of_photos,
@@ -136,14 +137,18 @@ def _instead_of(file: Path) -> str:
 
 
 def _photos_in(root: Path) -> tuple[Path, list[Path]]:
-    """The photos and their folder: `root`, its folder `images`, or where neither has any, the only one below that has."""
-    for folder in (root, named(root, "images")):
-        if images := images_in(folder):
-            return folder, images
-    if len(below := folders_of_images(root)) == 1:
-        (root,), above = below, root
-        _log.warning("%s holds no image; those in %s are used.", above, root.relative_to(above).as_posix())
-    return root, list_images(root)
+    """The photos and their folder: the first of `root`, its folder `images` and the only folder below that holds any, in which
+    there are enough, else in which there are most.
+    """
+    below, images = folders_of_images(root), named(root, "images")
+    found = {folder: images_in(folder) for folder in (root, images, *(below if len(below) == 1 else ()))}
+    folder = max(found, key=lambda folder: min(len(found[folder]), sfm.FEWEST))  # the first of these
+    if folder == root and below:
+        _log.info("%s: the images in folders below it are not used: %s.", root, counted(root, below))
+    if folder not in (root, images) or (folder != root and found[root]):
+        there = f"too few images ({len(found[root])})" if found[root] else "no image"
+        _log.warning("%s holds %s; those in %s are used.", root, there, folder.relative_to(root).as_posix())
+    return folder, found[folder] or list_images(folder)
 
 
 def _tell_of_other_poses(root: Path) -> None:

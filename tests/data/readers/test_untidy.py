@@ -338,6 +338,25 @@ def test_photos_in_the_only_folder_that_holds_any_are_used_with_a_line(place: st
     assert (f"holds no image; those in {place} are used" in caplog.text) == (place != "Images")
 
 
+@pytest.mark.parametrize("place", ["images", "cam1"])
+def test_an_image_beside_the_folder_of_the_photos_is_not_taken_for_them(place: str, of_photos, caplog) -> None:
+    folder, _ = of_photos
+    root = folder.parent / "scene"
+    root.mkdir()
+    folder.rename(root / place)
+    shutil.copy(root / place / "a.png", root / "preview.png")
+    assert [frame.name for frame in photos.read(root, folder.parent / "cache").frames] == ALL
+    assert f"scene holds too few images (1); those in {place} are used" in caplog.text
+
+
+def test_photos_below_those_that_are_used_are_told(of_photos, caplog) -> None:
+    folder, read = of_photos
+    captures.write_photos(folder / "cam2")
+    with caplog.at_level("INFO"):
+        read()
+    assert "the images in folders below it are not used: cam2 holds 3" in caplog.text
+
+
 def beside_each_other(folder: Path, *names: str) -> None:
     """Only these files, in place of the photos."""
     for photo in folder.iterdir():
