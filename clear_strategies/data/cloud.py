@@ -27,8 +27,7 @@ from clear_strategies.geometry.dense_stereo.cloud import stereo_cloud
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.filling import STRIDE, densify, pixel_grid
-from clear_strategies.geometry.projection import blackened
-from clear_strategies.geometry.pseudo_views import cut_out
+from clear_strategies.geometry.photos import blackened, cut_out
 from clear_strategies.geometry.sift import TriangulationSettings, triangulate
 from rasterizers.interface import Color
 

@@ -34,6 +34,7 @@ from clear_strategies.data.scene import Scene, require_shown
 from clear_strategies.data.view_names import ViewFiles, write_pngs
 from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split
 from clear_strategies.errors import DataError
+from clear_strategies.geometry.cameras import centers_of
 from clear_strategies.geometry.exposure import exposure_gains
 from rasterizers.interface import Camera
 
@@ -236,7 +237,7 @@ def _check_places(capture: Capture, cameras: Sequence[Camera], cloud: CloudSetti
     """Refuse photos from one place, whose depth nothing tells but a file of points, and warn where float32 cannot place
     Gaussians to a part of a pixel, as in a capture with geographic coordinates.
     """
-    centers = torch.stack([camera.center.double() for camera in cameras])
+    centers = centers_of(cameras)
     middle = centers.mean(0)
     apart, away = float((centers - middle).norm(dim=1).max()), float(middle.norm())
     least = _ONE_PLACE * away

@@ -22,7 +22,7 @@ from clear_strategies.core.finite import require_finite
 from clear_strategies.core.seeds import hashed_generator_at
 from clear_strategies.core.view import View
 from clear_strategies.errors import DensityError
-from clear_strategies.geometry.pseudo_views import cut_out
+from clear_strategies.geometry.photos import cut_out
 from clear_strategies.kernels import per_gaussian
 from clear_strategies.schedules import LogLinear, milestone
 from clear_strategies.strategies.base import Strategy

@@ -1,13 +1,15 @@
-"""What several cameras look at, and cameras beside a camera."""
+"""What several cameras look at, which of them are compared, and cameras beside a camera."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -16,12 +18,18 @@ from rasterizers.interface import Camera
 
 _PARTNERS: Final = 12  # of a photo, those that it is compared with
 _NEAREST: Final = 8  # of them, those that are nearest
+_ALONG: Final = 0.3  # movements along the viewing direction are this much shorter: going close leaves holes
+
+
+def centers_of(cameras: Sequence[Camera]) -> Float[Tensor, "C 3"]:
+    """Where the cameras are, float64 on the CPU."""
+    return torch.stack([camera.center.double().cpu() for camera in cameras])
 
 
 def common_box(photos: Sequence[Photo]) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
     """(smallest, largest corner) of the cube around the largest ball that all cameras see whole, about what they look at."""
     cameras = [photo.camera for photo in photos]
-    middle, centers = looked_at(cameras), torch.stack([c.center.double().cpu() for c in cameras])
+    middle, centers = looked_at(cameras), centers_of(cameras)
     distance = float(torch.linalg.vector_norm(centers - middle, dim=-1).mean())
     narrowest = min(math.atan(min(c.width / c.fx, c.height / c.fy) / 2) for c in cameras)
     half = distance * math.sin(narrowest)  # the ball touches the sides of the narrowest frustum
@@ -32,7 +40,7 @@ def looked_at(cameras: Sequence[Camera]) -> Float[Tensor, " 3"]:
     """The point closest to all optical axes, float64. If these are nearly parallel, it lies ahead of the cameras, at ten times
     their largest distance from their mean.
     """
-    centers = torch.stack([c.center.double().cpu() for c in cameras])
+    centers = centers_of(cameras)
     axes = torch.stack([c.world_to_camera[2, :3].double().cpu() for c in cameras])
     extent = float(torch.linalg.vector_norm(centers - centers.mean(0), dim=-1).max()) or 1.0
     ahead = centers.mean(0) + axes.mean(0) * 10 * extent
@@ -51,9 +59,33 @@ def partners(cameras: Sequence[Camera]) -> list[list[int]]:
 
     The nearest alone may be a burst, which shows no depth, or one side of the scene, which shows nothing of the other.
     """
-    centers, others = torch.stack([camera.center.double() for camera in cameras]), len(cameras) - 1
+    centers, others = centers_of(cameras), len(cameras) - 1
     far = np.geomspace(_NEAREST + 1, max(others, _PARTNERS), _PARTNERS - _NEAREST).round().astype(int) - 1
     ranks = range(others) if others <= _PARTNERS else [*range(_NEAREST), *far]
     ordered = torch.cdist(centers, centers).argsort(dim=1, stable=True).tolist()
     rows = ([b for b in row if b != a] for a, row in enumerate(ordered))
     return [sorted(row[rank] for rank in ranks) for row in rows]
+
+
+def moved_aside(camera: Camera, distance: float, reach: float, generator: torch.Generator) -> Camera:
+    """The camera moved by up to `reach` × `distance`, and turned to keep in its middle what it saw there at `distance`."""
+    direction = torch.randn(3, generator=generator, dtype=torch.float64)
+    length = torch.rand((), generator=generator, dtype=torch.float64)
+    direction = direction / torch.linalg.vector_norm(direction) * length
+    direction[2] *= _ALONG
+    pose = camera.world_to_camera.double()
+    axes, centre = pose[:3, :3], camera.center.double()
+    target = centre + axes[2] * distance
+    centre = centre + axes.T @ (direction * reach * distance)
+    z = F.normalize(target - centre, dim=0)
+    x = F.normalize(torch.linalg.cross(axes[1], z), dim=0)
+    axes = torch.stack((x, torch.linalg.cross(z, x), z))
+    turned = torch.eye(4, dtype=torch.float64)
+    turned[:3, :3], turned[:3, 3] = axes, -axes @ centre
+    return replace(camera, world_to_camera=turned.to(camera.world_to_camera))
+
+
+def beside(camera: Camera, means: Float[Tensor, "N 3"], reach: float, generator: torch.Generator) -> Camera:
+    """The camera moved aside at its distance to the middle of the points, the median of each coordinate; 1 if it is there."""
+    distance = torch.linalg.vector_norm(camera.center.double() - means.median(dim=0).values.cpu().double())
+    return moved_aside(camera, float(distance) or 1.0, reach, generator)

@@ -24,13 +24,8 @@ from torch.nn.functional import max_pool2d
 from clear_strategies.core.points import PointCloud
 from clear_strategies.core.progress import Progress
 from clear_strategies.core.view import DepthMap, Photo
-from clear_strategies.geometry.projection import (
-    back_project,
-    each_photo,
-    is_background,
-    sample_colors,
-    seen_pixels,
-)
+from clear_strategies.geometry.photos import each_photo, is_background
+from clear_strategies.geometry.projection import back_project, sample_colors, seen_pixels
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)

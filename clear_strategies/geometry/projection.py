@@ -2,37 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-from typing import Final, TypeVar
+from collections.abc import Sequence
+from typing import Final
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from clear_strategies.core.view import Photo
-from rasterizers.interface import Camera, Color
-from rasterizers.native import kernel_threads, threads
+from rasterizers.interface import Camera
 
-T = TypeVar("T")
-
-_AT_ONCE: Final = 4  # photos that are worked on at the same time, at most
 _BEHIND: Final = 0.03  # a camera sees a point whose depth there exceeds the camera's own by at most this share of it
-_SAME_COLOR: Final = 2 / 255  # largest difference of a background pixel from the background's colour
-
-
-def each_photo(work: Callable[[int], T], photos: Sequence[Photo]) -> Iterator[T]:
-    """work(0), work(1), … in order, for each photo; on the CPU of several at once: much of such work, as a path through an image,
-    has no use for a second thread, and torch's threads wait for each other by spinning. No more than `_AT_ONCE`, for the memory.
-    """
-    n, count = threads(), len(photos)
-    if any(photo.image.device.type != "cpu" for photo in photos):
-        yield from map(work, range(count))
-        return
-    at_once = max(1, min(n, count, _AT_ONCE))
-    with kernel_threads(n // at_once), ThreadPoolExecutor(at_once) as pool:
-        yield from pool.map(work, range(count))
 
 
 def intrinsics(camera: Camera) -> Float[Tensor, "3 3"]:
@@ -52,10 +31,9 @@ def project(camera: Camera, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor,
     return homogeneous[:, :2] / homogeneous[:, 2:], homogeneous[:, 2]
 
 
-def inside_of(camera: Camera, pixels: Float[Tensor, "N 2"], depth: Float[Tensor, " N"]) -> Bool[Tensor, " N"]:
-    """Whether points that project to these pixels, at these depths, lie in the camera's image."""
-    x, y = pixels.unbind(dim=1)  # by column: `all` along rows of two takes twice as long
-    return (depth > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+def inside(x: Tensor, y: Tensor, depth: Tensor, width: int | Tensor, height: int | Tensor) -> Bool[Tensor, "*shape"]:
+    """Whether what projects to these columns and rows, at these depths, lies in an image of this size."""
+    return (depth > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
 
 
 def seen_pixels(
@@ -63,9 +41,9 @@ def seen_pixels(
 ) -> tuple[Bool[Tensor, " N"], Int[Tensor, " M"], Int[Tensor, " M"], Float[Tensor, " M"]]:
     """Which points project into the image, and the rows, columns and depths of these M points."""
     pixels, depth = project(camera, points)
-    inside = inside_of(camera, pixels, depth)
-    column, row = pixels[inside].long().unbind(dim=1)
-    return inside, row, column, depth[inside]
+    seen = inside(pixels[:, 0], pixels[:, 1], depth, camera.width, camera.height)
+    column, row = pixels[seen].long().unbind(dim=1)
+    return seen, row, column, depth[seen]
 
 
 def times_seen(
@@ -74,8 +52,8 @@ def times_seen(
     """In how many cameras, each with its depth (nan without a surface), each point is inside the image and not hidden."""
     count = torch.zeros(len(points), dtype=torch.long)
     for camera, depth in cameras:
-        inside, row, column, z = seen_pixels(camera, points)
-        count[inside] += z <= depth[row, column] * (1 + _BEHIND)
+        seen, row, column, z = seen_pixels(camera, points)
+        count[seen] += z <= depth[row, column] * (1 + _BEHIND)
     return count
 
 
@@ -86,9 +64,9 @@ def on_surface(
     pixels that the points project to).
     """
     pixels, z = project(camera, points)
-    inside = inside_of(camera, pixels, z)
-    column, row = torch.where(inside[:, None], pixels, 0.0).long().unbind(dim=1)
-    return inside & ((depth[row, column] / z - 1).abs() <= tolerance), pixels
+    seen = inside(pixels[:, 0], pixels[:, 1], z, camera.width, camera.height)
+    column, row = torch.where(seen[:, None], pixels, 0.0).long().unbind(dim=1)
+    return seen & ((depth[row, column] / z - 1).abs() <= tolerance), pixels
 
 
 def back_project(camera: Camera, pixels: Float[Tensor, "G 2"], depth: Float[Tensor, " G"]) -> Float[Tensor, "G 3"]:
@@ -115,13 +93,3 @@ def sample_colors(image: Float[Tensor, "H W 3"], pixels: Float[Tensor, "N 2"]) -
     batch = image.permute(2, 0, 1)[None]
     samples = torch.nn.functional.grid_sample(batch, grid, padding_mode="border", align_corners=False)
     return samples[0, :, 0].T.cpu()
-
-
-def blackened(photo: Photo) -> Photo:
-    """The photo with black in place of what its mask hides, where no features are found then."""
-    return photo if photo.shown is None else replace(photo, image=photo.image * photo.shown[..., None])
-
-
-def is_background(colors: Float[Tensor, "*shape 3"], background: Color) -> Bool[Tensor, "*shape"]:
-    """Whether colours are that of the background, up to rounding, so that no surface is there."""
-    return ((colors - torch.tensor(background).to(colors)).abs() <= _SAME_COLOR).all(dim=-1)

@@ -7,7 +7,7 @@ wider field: its photo is known, the border around it is not. `clear_strategies.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final, NamedTuple
@@ -18,12 +18,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo
-from clear_strategies.geometry.projection import is_background, projection_matrix
+from clear_strategies.geometry.cameras import moved_aside
+from clear_strategies.geometry.photos import is_background
+from clear_strategies.geometry.projection import inside, projection_matrix
 from rasterizers.interface import Camera, Color
 
 _SOURCES: Final = 4  # the nearest photos that a pseudo view is made of
-_ALONG: Final = 0.3  # movements along the viewing direction are this much shorter: going close leaves holes
-_CUT_OUT: Final = 0.25  # share of background pixels from which the photos show an object cut out of its surroundings
 _NEIGHBOURS: Final = 3  # of a pixel and the eight around it, those that must be known, or it is an outlier
 
 
@@ -97,36 +97,6 @@ def border_view(photo: Photo, *, field: float, max_pixels: int) -> PseudoView:
     return PseudoView(Photo(wide, image, transparency=through), known)
 
 
-def cut_out(photos: Iterable[Photo], background: Color) -> bool:
-    """Whether the photos show an object cut out of its surroundings: a good part of them is the background's colour."""
-    shares = [float(is_background(photo.image, background).float().mean()) for photo in photos]
-    return bool(shares) and sum(shares) / len(shares) >= _CUT_OUT
-
-
-def moved_aside(camera: Camera, distance: float, reach: float, generator: torch.Generator) -> Camera:
-    """The camera moved by up to `reach` × `distance`, and turned to keep in its middle what it saw there at `distance`."""
-    direction = torch.randn(3, generator=generator, dtype=torch.float64)
-    length = torch.rand((), generator=generator, dtype=torch.float64)
-    direction = direction / torch.linalg.vector_norm(direction) * length
-    direction[2] *= _ALONG
-    pose = camera.world_to_camera.double()
-    axes, centre = pose[:3, :3], camera.center.double()
-    target = centre + axes[2] * distance
-    centre = centre + axes.T @ (direction * reach * distance)
-    z = F.normalize(target - centre, dim=0)
-    x = F.normalize(torch.linalg.cross(axes[1], z), dim=0)
-    axes = torch.stack((x, torch.linalg.cross(z, x), z))
-    turned = torch.eye(4, dtype=torch.float64)
-    turned[:3, :3], turned[:3, 3] = axes, -axes @ centre
-    return replace(camera, world_to_camera=turned.to(camera.world_to_camera))
-
-
-def beside(camera: Camera, means: Float[Tensor, "N 3"], reach: float, generator: torch.Generator) -> Camera:
-    """The camera moved aside at its distance to the middle of the points, the median of each coordinate; 1 if it is there."""
-    distance = torch.linalg.vector_norm(camera.center.double() - means.median(dim=0).values.cpu().double())
-    return moved_aside(camera, float(distance) or 1.0, reach, generator)
-
-
 def _source(photo: Photo, depth_map: DepthMap, background: Color) -> _Source:
     """Pixels at the border of the background are mixed with it: they give points but no colour."""
     known, depth = depth_map.known, torch.nan_to_num(depth_map.depth)
@@ -163,8 +133,8 @@ def _front(camera: Camera, sources: Sequence[_Source]) -> Float[Tensor, "h w"]:
         x, y, depth = _projected(s.points, s.photo.camera, camera)
         # Of the lower right one of its pixels, after a border of one.
         column, row = x.add_(0.5).floor_(), y.add_(0.5).floor_()
-        inside = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        place = torch.where(inside, row.mul_(width).add_(column), outside).long()
+        shown = inside(column, row, depth, width, height)
+        place = torch.where(shown, row.mul_(width).add_(column), outside).long()
         front.scatter_reduce_(0, place, depth, "amin")
     front = front[:outside].reshape(height, width)
     front = torch.minimum(front[:-1], front[1:])
@@ -177,12 +147,12 @@ def _seen(
     """Whether the photo shows each of the camera's points, at its own depth up to `tolerance`, and the photo's colours there."""
     own = source.photo.camera
     x, y, depth = _projected(points, camera, own)
-    inside = (depth > 0) & (x >= 0) & (x < own.width) & (y >= 0) & (y < own.height)
-    place = torch.where(inside, y.floor().mul_(own.width).add_(x.floor()), 0.0).long()
+    shown = inside(x, y, depth, own.width, own.height)
+    place = torch.where(shown, y.floor().mul_(own.width).add_(x.floor()), 0.0).long()
     grid = torch.view_as_real(torch.complex(x.mul_(2 / own.width).sub_(1), y.mul_(2 / own.height).sub_(1)))
     image = source.photo.image.permute(2, 0, 1)[None]
     colors = F.grid_sample(image, grid[None, None], padding_mode="border", align_corners=False)[0, :, 0]
-    return inside & ((source.depth.flatten()[place] / depth - 1).abs() <= tolerance), colors
+    return shown & ((source.depth.flatten()[place] / depth - 1).abs() <= tolerance), colors
 
 
 def _projected(points: Float[Tensor, "3 N"], of: Camera, to: Camera) -> tuple[Tensor, Tensor, Tensor]:

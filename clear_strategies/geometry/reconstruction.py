@@ -16,7 +16,8 @@ from clear_strategies.errors import DataError
 from clear_strategies.geometry.dense_stereo.cloud import stereo_cloud
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
-from clear_strategies.geometry.projection import blackened, seen_pixels
+from clear_strategies.geometry.photos import blackened
+from clear_strategies.geometry.projection import seen_pixels
 from clear_strategies.geometry.sift import features_of
 from rasterizers.interface import Camera
 

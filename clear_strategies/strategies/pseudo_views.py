@@ -21,7 +21,8 @@ import torch
 from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.seeds import generator_at
 from clear_strategies.core.view import DepthMap, ExtraView, Photo, View
-from clear_strategies.geometry.pseudo_views import PseudoView, border_view, continued, cut_out, pseudo_views
+from clear_strategies.geometry.photos import cut_out
+from clear_strategies.geometry.pseudo_views import PseudoView, border_view, continued, pseudo_views
 from clear_strategies.strategies.base import Strategy
 from rasterizers.interface import Color
 

@@ -18,8 +18,7 @@ import torch
 
 from clear_strategies.core.seeds import generator_at
 from clear_strategies.core.view import View
-from clear_strategies.geometry.projection import is_background
-from clear_strategies.geometry.pseudo_views import cut_out
+from clear_strategies.geometry.photos import cut_out, is_background
 from clear_strategies.schedules import milestone
 from clear_strategies.strategies.base import Strategy
 from rasterizers.interface import Color

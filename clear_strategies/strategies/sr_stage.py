@@ -18,7 +18,7 @@ from torch import Tensor
 from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.seeds import hashed_generator_at, one_of
 from clear_strategies.core.view import ExtraView, Photo, View
-from clear_strategies.geometry.pseudo_views import beside
+from clear_strategies.geometry.cameras import beside
 from clear_strategies.schedules import milestone
 from clear_strategies.strategies.base import Strategy
 from rasterizers.interface import Camera

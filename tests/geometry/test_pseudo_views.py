@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo
+from clear_strategies.geometry.cameras import moved_aside
 from clear_strategies.geometry.projection import back_project, project, sample_colors
-from clear_strategies.geometry.pseudo_views import PseudoView, border_view, continued, moved_aside, pseudo_views
+from clear_strategies.geometry.pseudo_views import PseudoView, border_view, continued, pseudo_views
 from tests.helpers import planes
 
 DEPTH = 4.0

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from clear_strategies.geometry.dense_stereo.cost import Grey
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
+from clear_strategies.geometry.projection import inside
 from clear_strategies.geometry.sift import missing
 
 
@@ -64,7 +65,7 @@ def carry(
     height, width = other.inverse_depth.shape
     ahead = (z > 0) & (inverse_depth > 0)
     u, v = x / z, y / z
-    seen = ahead & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    seen = ahead & inside(u, v, z, width, height)
     depth = torch.where(ahead, z / inverse_depth, torch.inf)
     u, v = (torch.where(ahead, c, 0.0).clamp(0, size - 1e-3) for c, size in ((u, width), (v, height)))
     return u, v, depth, seen

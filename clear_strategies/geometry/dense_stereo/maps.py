@@ -17,7 +17,8 @@ from clear_strategies.geometry.dense_stereo.cost import Grey, cost_volume, grey
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.dense_stereo.smoothing import smooth
 from clear_strategies.geometry.dense_stereo.sources import Comparison, comparisons, plane_count
-from clear_strategies.geometry.projection import each_photo, is_background, seen_pixels
+from clear_strategies.geometry.photos import each_photo, is_background
+from clear_strategies.geometry.projection import seen_pixels
 from clear_strategies.geometry.sift import features_of
 from rasterizers.interface import Color
 

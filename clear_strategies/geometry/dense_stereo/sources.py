@@ -11,9 +11,16 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.core.view import Photo
-from clear_strategies.geometry.cameras import common_box
+from clear_strategies.geometry.cameras import centers_of, common_box
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
-from clear_strategies.geometry.projection import back_project, project, projection_matrix, ray_angles, seen_pixels
+from clear_strategies.geometry.projection import (
+    back_project,
+    inside,
+    project,
+    projection_matrix,
+    ray_angles,
+    seen_pixels,
+)
 from rasterizers.interface import Camera
 
 _FEW: Final = 20  # points in a photo, below which a grid at guessed depths replaces them
@@ -49,20 +56,20 @@ def comparisons(photos: Sequence[Photo], points: Float[Tensor, "N 3"], most: int
     compared = []
     for i, photo in enumerate(photos):
         camera = photo.camera
-        inside, _, _, depth = seen_pixels(camera, points)
+        seen, _, _, depth = seen_pixels(camera, points)
         if len(depth) >= _FEW:
-            seen = points[inside].double()[:: math.ceil(len(depth) / _SAMPLED)]
+            sampled = points[seen].double()[:: math.ceil(len(depth) / _SAMPLED)]
             far, near = torch.quantile(1 / depth, torch.tensor(_QUANTILES, dtype=depth.dtype)).tolist()
             far, near = _FARTHER * far, _NEARER * near
         else:
             distance = float(project(camera, middle)[1][0])
             distance = distance if distance > 0 else float(torch.linalg.vector_norm(middle - camera.center))
-            seen, far, near = _grid(camera, distance), _GUESS_FAR / distance, _GUESS_NEAR / distance
+            sampled, far, near = _grid(camera, distance), _GUESS_FAR / distance, _GUESS_NEAR / distance
         others = torch.tensor([j for j in range(len(photos)) if j != i], dtype=torch.long)
         if len(others) > _CANDIDATES * most:
-            glance = cameras.scores(i, others, seen[:: math.ceil(len(seen) / _GLANCED)])
+            glance = cameras.scores(i, others, sampled[:: math.ceil(len(sampled) / _GLANCED)])
             others = others[glance.topk(_CANDIDATES * most).indices.sort().values]
-        scores = cameras.scores(i, others, seen)
+        scores = cameras.scores(i, others, sampled)
         best = scores.argsort(descending=True, stable=True)[:most]
         compared.append(Comparison(tuple(others[best[scores[best] >= _LEAST_SCORE]].tolist()), far, near))
     return compared
@@ -91,7 +98,7 @@ class _Cameras:
 
     def __init__(self, cameras: Sequence[Camera]) -> None:
         self.matrix = torch.stack([projection_matrix(c) for c in cameras])
-        self.center = torch.stack([c.center.double().cpu() for c in cameras])
+        self.center = centers_of(cameras)
         self.size = torch.tensor([(c.width, c.height) for c in cameras], dtype=torch.float64)
         self.fx = torch.tensor([c.fx for c in cameras], dtype=torch.float64)
 
@@ -100,14 +107,14 @@ class _Cameras:
         x, y, depth = self._projected(others, points).unbind(-1)
         width, height = self.size[others, :, None].unbind(1)
         x, y = x / depth, y / depth
-        inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+        shown = inside(x, y, depth, width, height)
         angle = ray_angles(self.center[one], self.center[others], points)
         none, best, until, different = _ANGLES
         suits = torch.minimum((angle - none) / (best - none), (different - angle) / (different - until)).clamp(0, 1)
         # Of the same surface in the two photos.
         scale = (self._projected(one, points)[:, 2] / self.fx[one]) / (depth / self.fx[others, None])
         suits = suits * torch.minimum(scale, 1 / scale).clamp(0, 1)
-        return torch.where(inside, suits, 0.0).mean(-1)
+        return torch.where(shown, suits, 0.0).mean(-1)
 
     def _projected(self, which: int | Int[Tensor, " K"], points: Float[Tensor, "M 3"]) -> Float[Tensor, "*K M 3"]:
         matrix = self.matrix[which]
