@@ -8,8 +8,8 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.data.photo_files import read_image
-from clear_strategies.data.priors.interface import compared, require_path
+from clear_strategies.data.photo_files import has_alpha, read_image
+from clear_strategies.data.priors.interface import AS_EXPECTED, compared, require_path
 from clear_strategies.data.view_names import ViewFiles
 
 
@@ -44,4 +44,6 @@ class Images:
 
     def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
         file = self._files.file(name, lr.shape[1] * factor, lr.shape[0] * factor)
-        return compared(file.name, read_image(file), lr, factor)
+        over_black = "its transparent pixels are black in the photos, too; else save it without alpha"
+        check = over_black if has_alpha(file) else AS_EXPECTED
+        return compared(file.name, read_image(file), lr, factor, check)

@@ -17,6 +17,8 @@ from clear_strategies.errors import DataError, SettingError
 
 _log = logging.getLogger(__name__)
 
+AS_EXPECTED: Final = "it shows this view, and is RGB in [0, 1]"
+"""What to check of an image at HR that is far from its LR image."""
 _USUAL_DISTANCE: Final = 0.03  # mean |D(SR) - LR|; bicubic and the small networks stay near 0.01 on real photos
 
 
@@ -104,7 +106,7 @@ def warn_if_far_from_lr(
     hr: Float[Tensor, "H W 3"],
     lr: Float[Tensor, "h w 3"],
     factor: int,
-    check: str = "it shows this view, and is RGB in [0, 1]",
+    check: str = AS_EXPECTED,
 ) -> None:
     """Warn where the image at HR, reduced, differs from its LR image: it is of another view, BGR, or in [0, 255]."""
     distance = float((images.downsample(hr, factor, "area") - lr).abs().mean())
@@ -115,8 +117,10 @@ def warn_if_far_from_lr(
         )  # fmt: skip
 
 
-def compared(what: str, sr: Float[Tensor, "H W 3"], lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
+def compared(
+    what: str, sr: Float[Tensor, "H W 3"], lr: Float[Tensor, "h w 3"], factor: int, check: str = AS_EXPECTED
+) -> Float[Tensor, "H W 3"]:
     """`sr` on 8-bit steps and the device of `lr`, after `warn_if_far_from_lr`."""
     result = images.quantize(sr).to(lr)
-    warn_if_far_from_lr(f"{what}: the SR image", result, lr, factor)
+    warn_if_far_from_lr(f"{what}: the SR image", result, lr, factor, check)
     return result

@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 from torch import Tensor
 
 from clear_strategies.core import images
@@ -81,6 +82,9 @@ def test_images_of_another_view_give_a_warning(tmp_path: Path, caplog: pytest.Lo
     assert not caplog.text
     Images(str(tmp_path))("wrong", lr, 4)
     assert "wrong.png: the SR image, reduced again, differs" in caplog.text
+    Image.new("RGBA", (64, 64)).save(tmp_path / "clear.png")
+    Images(str(tmp_path))("clear", torch.ones(16, 16, 3), 4)
+    assert "check that its transparent pixels are black in the photos, too; else save it without alpha" in caplog.text
 
 
 # ---- ONNX networks: computed as torch computes them; files that cannot be used are refused
