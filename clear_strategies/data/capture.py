@@ -15,10 +15,10 @@ from typing import Final
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from clear_strategies.data.file_names import normalized
 from clear_strategies.data.lenses import Lens
 from clear_strategies.data.masks import check_mask, read_mask
 from clear_strategies.data.photo_files import has_alpha, image_size, is_on_its_side, read_image
-from clear_strategies.data.photo_folders import normalized
 from clear_strategies.data.priors.interface import Prior
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera, Color

@@ -1,4 +1,4 @@
-"""Lenses and poses as files give them: intrinsics, their undistortion by OpenCV, and camera-to-world matrices."""
+"""Lenses as files give them, and their undistortion by OpenCV."""
 
 from __future__ import annotations
 
@@ -7,13 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Final
 
-import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float
-from msgspec import Meta
 from torch import Tensor
 
 from clear_strategies.errors import DataError
@@ -38,10 +36,6 @@ _CUT: Final = (
     "ns-process-data images --camera-type equirectangular --data images --output-dir flat"
 )
 _BORDER_SAMPLES: Final = 33
-_Coordinate = Annotated[float, Meta(gt=-FARTHEST, lt=FARTHEST)]
-_Rows = Annotated[
-    list[Annotated[list[_Coordinate], Meta(min_length=4, max_length=4)]], Meta(min_length=3, max_length=4)
-]
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +87,7 @@ class Lens:
             )
         return pinhole
 
-    def undistort(self, image: Float[Tensor, "H W 3"], pinhole: Lens) -> Float[Tensor, "H W 3"]:
+    def undistort(self, image: Float[Tensor, "H W *C"], pinhole: Lens) -> Float[Tensor, "H W *C"]:
         """The image resampled for `pinhole`; bicubic, in [0, 1]."""
         import cv2
 
@@ -150,31 +144,6 @@ def terms_of(file: Path, where: str, model: str) -> tuple[str, ...]:
         return _TERMS[model]
     remedy = _CUT if model == "EQUIRECTANGULAR" else f"undistort the photos first: {_UNDISTORT}"
     raise DataError(file, where, f"has the camera model {model[:40]}, which is not supported", remedy)
-
-
-def pose_from_opengl(file: Path, where: str, matrix: object) -> Float[Tensor, "4 4"]:
-    """World-to-camera (OpenCV axes) from a camera-to-world matrix with OpenGL axes (x right, y up, z back)."""
-    remedy = "write camera-to-world matrices: a rotation, a translation, last row 0 0 0 1"
-    try:
-        rows = np.array(msgspec.convert(matrix, _Rows))
-    except msgspec.ValidationError as error:
-        raise DataError(file, where, "is no 3x4 or 4x4 matrix of finite numbers", remedy) from error
-    if len(rows) == 4 and np.abs(rows[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise DataError(file, where, f"has the last row {rows[3].tolist()}", remedy)
-    rotation = rows[:3, :3] * np.array([1.0, -1.0, -1.0])  # OpenGL's y and z axes are opposite
-    return rigid_inverse(file, where, rotation, rows[:3, 3])
-
-
-def rigid_inverse(file: Path, where: str, rotation: np.ndarray, center: np.ndarray) -> Float[Tensor, "4 4"]:
-    """World-to-camera from a camera's axes (columns), which are orthonormal and right-handed within 1e-3, and centre."""
-    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or abs(np.linalg.det(rotation) - 1) > 1e-3:
-        problem = f"holds no rotation (determinant {np.linalg.det(rotation):.4g})"
-        raise DataError(file, where, problem, "remove scale and reflection from the camera-to-world matrices")
-    left, _, right = np.linalg.svd(rotation)  # the nearest exact rotation, because files keep six digits
-    pose = np.eye(4)
-    pose[:3, :3] = (left @ right).T
-    pose[:3, 3] = -pose[:3, :3] @ center
-    return torch.from_numpy(pose)
 
 
 @lru_cache(maxsize=64)  # a capture has few lenses

@@ -14,9 +14,10 @@ import torch.nn.functional as F
 from jaxtyping import Bool
 from torch import Tensor
 
+from clear_strategies.data.file_names import alike, some
 from clear_strategies.data.lenses import Lens
 from clear_strategies.data.photo_files import SUFFIXES, image_size, is_lossy, read_image
-from clear_strategies.data.photo_folders import alike, images_in, some
+from clear_strategies.data.photo_folders import images_in
 from clear_strategies.errors import DataError
 
 _log = logging.getLogger(__name__)
@@ -95,7 +96,7 @@ def read_mask(path: Path, lens: Lens, pinhole: Lens, turn: bool | None) -> Bool[
         shown = (values > (values.max() / 2 if is_lossy(path) else 0)).float()
     shown = F.interpolate(shown[None, None], (lens.height, lens.width), mode="nearest-exact")[0, 0]
     if lens.distorts:
-        shown = lens.undistort(shown[..., None].expand(-1, -1, 3).contiguous(), pinhole)[..., 0]
+        shown = lens.undistort(shown, pinhole)
     return shown > 0.5
 
 

@@ -91,9 +91,8 @@ def image_size(path: Path, *, turn: bool | None = None) -> tuple[int, int]:
     """(width, height), from the header only; `turn` and the DataErrors as of `read_image`."""
     with _opened(path, turn) as image:
         width, height = image.size
-        if isinstance(
-            image, TiffImagePlugin.TiffImageFile
-        ):  # of a turned one some versions of PIL say the upright size
+        # Of a turned TIFF some versions of PIL say the upright size.
+        if isinstance(image, TiffImagePlugin.TiffImageFile):
             width, height = image.tag_v2[TiffImagePlugin.IMAGEWIDTH], image.tag_v2[TiffImagePlugin.IMAGELENGTH]
         return (height, width) if turn and _orientation_of(image) in _ON_THE_SIDE else (width, height)
 

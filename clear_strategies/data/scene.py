@@ -14,7 +14,7 @@ import torch
 from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import Photo, View
 from clear_strategies.core.work_log import WorkLog
-from clear_strategies.data.photo_folders import some
+from clear_strategies.data.file_names import some
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
 

@@ -29,9 +29,8 @@ def read(path: Path) -> Any:
     """The content of a file; a DataError where it is no JSON, which has neither NaN nor numbers beyond a float."""
     try:
         data = read_bytes(path, most=_LARGEST)
-        return msgspec.json.decode(
-            data.decode(json.detect_encoding(data))
-        )  # some editors write a byte order mark, or UTF-16
+        text = data.decode(json.detect_encoding(data))  # some editors write a byte order mark, or UTF-16
+        return msgspec.json.decode(text)
     except RecursionError as error:
         raise DataError(path, "json", "is nested too deeply", "write it again") from error
     except (msgspec.DecodeError, UnicodeDecodeError) as error:

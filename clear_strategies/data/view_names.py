@@ -10,8 +10,9 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies.data.file_names import alike, named, normalized
 from clear_strategies.data.photo_files import SUFFIXES, image_size, png_bytes
-from clear_strategies.data.photo_folders import alike, list_images, named, normalized
+from clear_strategies.data.photo_folders import list_images
 from clear_strategies.errors import DataError
 from clear_strategies.files import read_bytes, write_bytes
 
@@ -77,12 +78,9 @@ class ViewFiles:
         """The image of the view; a DataError where it has none or several, one of another view, or of another size."""
         name = normalized(name)
         view = bare(name)
-        below, stem, whole = (
-            named(self.folder, view.rpartition("/")[0]),
-            _file(view) + self.suffix,
-            _file(name) + self.suffix,
-        )
+        below = named(self.folder, view.rpartition("/")[0])
         folder = below if below.is_dir() else self.folder
+        stem, whole = _file(view) + self.suffix, _file(name) + self.suffix
         if self._listed.get(folder, {}).keys().isdisjoint((stem, whole)):
             self._listed[folder] = {}
             for path in list_images(folder):

@@ -8,7 +8,6 @@ widest angle gives its position.
 
 from __future__ import annotations
 
-import importlib
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,14 +24,13 @@ from clear_strategies.core.points import PointCloud
 from clear_strategies.core.progress import Progress
 from clear_strategies.core.view import Photo
 from clear_strategies.geometry.cameras import partners
+from clear_strategies.geometry.optional import REMEDY, missing
 from clear_strategies.geometry.projection import project, projection_matrix, ray_angles, sample_colors
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
 _ROWS: Final = 512  # features matched at a time, so that their distances stay in the cache
-_PACKAGES: Final = {"cv2": "opencv-contrib-python-headless", "kornia": "kornia", "scipy": "scipy"}
-REMEDY: Final = "pip install 'clear-strategies[train]'"
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,14 +183,3 @@ def one_per_track(pairs: Pairs, view: Int[Tensor, " F"]) -> Int[Tensor, " T"]:
     order = np.argsort(-pairs.angles.numpy(), kind="stable")
     tracks, widest = np.unique(track[a[order]], return_index=True)
     return torch.from_numpy(order[widest[~contradictory[tracks]]])
-
-
-def missing(*modules: str) -> str:
-    """The packages of those modules that cannot be imported, joined by commas; empty where all can."""
-    packages = []
-    for module in modules:
-        try:
-            importlib.import_module(module)
-        except (ImportError, OSError):  # not installed, or its system libraries are missing
-            packages.append(_PACKAGES[module])
-    return ", ".join(packages)

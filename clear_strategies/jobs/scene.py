@@ -11,7 +11,7 @@ from typing import Any, Final, cast
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.capture import MORE_PHOTOS, Capture
 from clear_strategies.data.cloud import CloudSettings
-from clear_strategies.data.photo_folders import require_text
+from clear_strategies.data.file_names import require_text
 from clear_strategies.data.prepare import at_hr, prepare
 from clear_strategies.data.priors import Bicubic, Ncnn, Prior, cached, network_of
 from clear_strategies.data.priors.ncnn import factors, missing_packages

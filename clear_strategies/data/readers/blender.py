@@ -8,7 +8,7 @@ from typing import Final
 
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import Capture, lens_notes, require_names
-from clear_strategies.data.photo_folders import finder, named, names_below
+from clear_strategies.data.file_names import finder, named, names_below
 from clear_strategies.data.readers.nerfstudio import Listed, frames_of, points_of, transforms_of
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.data.view_names import bare

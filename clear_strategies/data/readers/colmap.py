@@ -13,8 +13,9 @@ import torch
 
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import BLACK, Capture, Frame, SfmPoints, lens_notes, sorted_by_name
+from clear_strategies.data.file_names import finder, is_file
 from clear_strategies.data.masks import masks_of
-from clear_strategies.data.photo_folders import finder, folder_note, image_folder, images_in, is_file, usable
+from clear_strategies.data.photo_folders import folder_note, image_folder, images_in, usable
 from clear_strategies.data.readers.colmap_model import Model, find_model, is_model, model_folders, read_model
 from rasterizers.interface import Color
 

@@ -20,8 +20,8 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from clear_strategies.data.file_names import named
 from clear_strategies.data.lenses import FARTHEST, Lens, lens_of, terms_of
-from clear_strategies.data.photo_folders import named
 from clear_strategies.errors import DataError
 from clear_strategies.files import read_bytes
 from rasterizers.geometry import rotation_matrix

@@ -15,11 +15,13 @@ import torch
 
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import BLACK, Capture, Frame, SfmPoints, lens_notes, sorted_by_name
-from clear_strategies.data.lenses import Lens, lens_of, pose_from_opengl
+from clear_strategies.data.file_names import finder, named, names_below, some
+from clear_strategies.data.lenses import Lens, lens_of
 from clear_strategies.data.masks import masks_of
 from clear_strategies.data.photo_files import image_size
-from clear_strategies.data.photo_folders import finder, image_folder, named, names_below, some, usable
+from clear_strategies.data.photo_folders import image_folder, usable
 from clear_strategies.data.ply import read_points
+from clear_strategies.data.poses import pose_from_opengl
 from clear_strategies.data.strict_json import Number, read_object, typed
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color

@@ -13,6 +13,7 @@ from typing import Final, Literal
 
 from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.data.capture import MORE_PHOTOS, Capture
+from clear_strategies.data.file_names import named, require_text, some
 from clear_strategies.data.masks import masks_among
 from clear_strategies.data.photo_files import SUFFIXES, focal_35mm
 from clear_strategies.data.photo_folders import (
@@ -21,9 +22,6 @@ from clear_strategies.data.photo_folders import (
     images_in,
     in_place_of_photos,
     list_images,
-    named,
-    require_text,
-    some,
     usable,
 )
 from clear_strategies.data.priors import cache_folder

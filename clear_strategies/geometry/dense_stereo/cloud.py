@@ -15,8 +15,8 @@ from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.cleaning import OUTLIER_NEIGHBOURS, OUTLIER_RATIO, without_outliers
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.filling import STRIDE, grid_points
+from clear_strategies.geometry.optional import REMEDY, missing
 from clear_strategies.geometry.projection import back_project, seen_pixels
-from clear_strategies.geometry.sift import REMEDY, missing
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from clear_strategies.geometry.dense_stereo.cost import Grey
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
+from clear_strategies.geometry.optional import missing
 from clear_strategies.geometry.projection import inside
-from clear_strategies.geometry.sift import missing
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,7 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.readers import demo
-from clear_strategies.data.readers.demo import Texture
+from clear_strategies.data.readers.demo_surfaces import Rays, Texture
 from clear_strategies.errors import SettingError
 from rasterizers.interface import Camera
 
@@ -26,7 +26,7 @@ def capture() -> Capture:
 
 def depth_of(camera: Camera) -> Tensor:
     """Depth (z) through each pixel's centre: the ground truth."""
-    rays = demo.Rays.through(camera, 0, camera.height, 1)
+    rays = Rays.through(camera, 0, camera.height, 1)
     return torch.from_numpy(np.min([surface.depth(rays) for surface in demo.room()], axis=0))
 
 

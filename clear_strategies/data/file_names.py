@@ -1,0 +1,103 @@
+"""The names of files: which are the same, and which file a capture means by one."""
+
+from __future__ import annotations
+
+import os
+import unicodedata
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
+from pathlib import Path, PureWindowsPath
+from typing import Final
+
+from clear_strategies.data.photo_files import SUFFIXES
+from clear_strategies.errors import DataError
+
+LISTED: Final = 5
+"""The most names in a message."""
+
+
+def normalized(name: str) -> str:
+    """A name with its letters composed, as names are compared: those of zips from a Mac are decomposed, and look the same."""
+    return unicodedata.normalize("NFC", name)
+
+
+def alike(name: str) -> str:
+    """What names have in common that differ in the case or the composition of their letters alone."""
+    return normalized(name).lower()
+
+
+def named(folder: Path, name: str) -> Path:
+    """What lies in a folder under a name that is `alike`; a path to nothing where there is none."""
+    path = folder / name
+    if path.exists() or not folder.is_dir():
+        return path
+    wanted = alike(name)
+    return next((folder / other for other in sorted(os.listdir(folder)) if alike(other) == wanted), path)  # noqa: PTH208 - faster
+
+
+def finder(folder: Path) -> Callable[[str], Path]:
+    """How each reader finds the files that a capture names, in or below a folder.
+
+    A name is taken as it stands, without an ending as that of a PNG file. Where no such file is there, backslashes separate
+    folders, names need only be `alike`, the beginning of an absolute path may differ, the folder's own name may stand first, and
+    the ending is that of the only image of this name. Where all of this finds none, the path leads to nothing.
+    """
+
+    @cache
+    def entries(parent: Path) -> dict[str, list[Path]]:
+        """What lies there, by what is `alike` of its name, and images also of their names without ending."""
+        found: dict[str, list[Path]] = {}
+        for path in sorted(parent.iterdir()) if parent.is_dir() else ():
+            for key in {alike(path.name), alike(path.stem if path.suffix.lower() in SUFFIXES else path.name)}:
+                found.setdefault(key, []).append(path)
+        return found
+
+    def below(parts: Sequence[str]) -> Path | None:
+        parent, last = folder, PureWindowsPath(parts[-1])
+        for part in parts[:-1]:
+            there = parent / part
+            same = [] if os.path.isdir(there) else entries(parent).get(alike(part), [])  # noqa: PTH112 - as in `is_file`
+            parent = next((path for path in same if path.is_dir()), there)
+        for key in (last.name, last.stem) if last.suffix[1:2].isalpha() else (last.name,):  # "rgb.0001" has no ending
+            files = [path for path in entries(parent).get(alike(key), []) if path.is_file()]
+            if len(files) == 1:
+                return files[0]
+        return None
+
+    def find(name: str) -> Path:
+        for exact in (folder / name, folder / f"{name}.png"):
+            if is_file(exact):
+                inside = folder.absolute()
+                return folder / exact.relative_to(inside) if exact.is_relative_to(inside) else exact
+        path = PureWindowsPath(name)
+        parts = [part for part in path.parts if part != path.anchor]
+        twice = len(parts) > 1 and alike(parts[0]) == alike(folder.absolute().name)
+        starts = range(len(parts) if path.anchor else min(1 + twice, len(parts)))
+        missing = folder.joinpath(*(parts[-1:] if path.anchor else parts))
+        return next(filter(None, (below(parts[i:]) for i in starts)), missing)
+
+    return find
+
+
+def names_below(paths: Sequence[Path]) -> list[str]:
+    """The names of photos below the deepest folder that all of them lie in."""
+    shared = os.path.commonprefix([path.parent.parts for path in paths])  # noqa: RUF071 - compares tuples of folders
+    return ["/".join(path.parts[len(shared) :]) for path in paths]
+
+
+def is_file(path: Path) -> bool:
+    """Whether the path leads to a file; not for a name that no file can have, such as one of 5,000 letters."""
+    return os.path.isfile(path)  # noqa: PTH113 - Path.is_file raises for a name that is too long
+
+
+def require_text(names: Iterable[str]) -> None:
+    """Raise a DataError for a name that is not UTF-8, which the JSON files and pages written after training could not hold."""
+    for name in names:
+        if (shown := name.encode(errors="backslashreplace").decode()) != name:
+            raise DataError(shown, "name", "must be UTF-8, has another byte", "rename this folder or photo")
+
+
+def some(names: Sequence[str]) -> str:
+    """The first few names, each at most 80 characters of it."""
+    shown = [name[:80].encode(errors="backslashreplace").decode() for name in names[:LISTED]]
+    return ", ".join(shown) + (", …" if len(names) > LISTED else "")
