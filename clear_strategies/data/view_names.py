@@ -40,7 +40,11 @@ def file_stems(names: Iterable[str]) -> dict[str, str]:
 def matching(names: Sequence[str], wanted: str) -> list[str]:
     """The names that are `wanted`, with or without suffix; if there is none, those whose file name is."""
     wanted = normalized(wanted)
-    return [n for n in names if wanted in (n, bare(n))] or [n for n in names if wanted in (_file(n), _file(bare(n)))]
+
+    def is_wanted(name: str) -> bool:
+        return wanted in (name, bare(name)) or name == bare(wanted)  # the names of a Blender scene have no suffix
+
+    return list(filter(is_wanted, names)) or [name for name in names if is_wanted(_file(name))]
 
 
 def write_pngs(folder: Path, images: Iterable[tuple[str, Float[Tensor, "h w 3"]]]) -> int:
