@@ -162,10 +162,8 @@ def _none_there(listing: Path, absent: Sequence[Path], scene: Path | None) -> Da
     searched = next(folder for folder in absent[0].parents if folder.is_dir())
     remedy = f"give the photos these names, or correct those in {listing.name}"
     if photos := images_in(searched) or images_in(searched, "*/*"):
-        found, other = (
-            f"{len(photos)} others, such as {some([photos[0].relative_to(searched).as_posix()])}",
-            photos[0].parent,
-        )
+        found = f"{len(photos)} others, such as {some([photos[0].relative_to(searched).as_posix()])}"
+        other = photos[0].parent
         if scene is not None:
             setting = "name the folder of the photos: data.reader.images="
             inside = shlex.quote(Path(os.path.relpath(other, scene)).as_posix())
