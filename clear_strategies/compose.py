@@ -31,7 +31,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from clear_strategies import files
-from clear_strategies.errors import SettingError, of_hydra, one_line
+from clear_strategies.errors import SettingError, no_option, of_hydra, one_line
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.objective import Objective
@@ -200,6 +200,9 @@ _SWEEPS: Final = re.compile(r"\+?(experiment=|strategy=[^\[]*,)")  # overrides b
 
 def not_composed(error: Exception, overrides: Sequence[str], config: str) -> SettingError:
     """The error for overrides that Hydra cannot compose; where there is no such setting, it names the most similar one."""
+    # Of a list of options Hydra names the file alone, and not the options that there are.
+    if listed := re.search(r"Could not load '(\w+)/([^'/]+)'", str(error)):
+        return SettingError(no_option(listed[1], listed[2], [*options(listed[1])]))
     if (unknown := re.match(r"Could not (?:override|delete from config\.) '([^']+)'", str(error))) is None:
         return SettingError(of_hydra(error))
     key = unknown[1]
@@ -227,6 +230,8 @@ def not_composed(error: Exception, overrides: Sequence[str], config: str) -> Set
             "Hydra composes a sweep first without what is swept, here the strategies. Sweep this setting, too "
             f"({key}=a,b), or name the strategies that remain (+strategy=[gco,svs])."
         )
+    elif name == TARGET:  # of a strategy or a decorator that is new
+        remedy = f"A plus adds it: +{key}=…."
     elif f"~{key}" in overrides and beside:
         remedy = f"There are {', '.join(sorted(beside))}."
     elif has_parameter(

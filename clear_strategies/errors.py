@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -87,7 +88,11 @@ def of_hydra(error: Exception) -> str:
     if (match := _NO_OPTION.search(str(error))) is None:
         return one_line(error)
     group, name, listed = match.groups()
-    options = [option for option in listed.split() if not option.startswith("_")]
+    return no_option(group, name, [option for option in listed.split() if not option.startswith("_")])
+
+
+def no_option(group: str, name: str, options: Sequence[str]) -> str:
+    """The message for an option that a group of conf/ does not have."""
     near = difflib.get_close_matches(name, options, 1)
     suggestion = f" Did you mean {near[0]}?" if near else ""
     return f"{group}={name}: there is no such option.{suggestion} There are {', '.join(options)}."

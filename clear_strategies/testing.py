@@ -191,7 +191,7 @@ def random_params(n: int, g: torch.Generator) -> dict[str, Tensor]:
 
 def _situation(seed: int) -> tuple[StubShot, StubShot, View, dict[str, Tensor]]:
     g = torch.Generator().manual_seed(0)  # one view, whatever the seed: strategies may remember it by name
-    camera = Camera(torch.eye(4), 40.0, 40.0, 20.0, 16.0, 40, 32)
+    camera = Camera(torch.eye(4, dtype=torch.float64), 40.0, 40.0, 20.0, 16.0, 40, 32)  # as the readers give poses
     hr_image = images.quantize(torch.rand(32, 40, 3, generator=g))
     lr_image = images.downsample(hr_image, _FACTOR)
     noisy = (hr_image + 0.1 * torch.randn(32, 40, 3, generator=g)).clamp(0, 1)

@@ -261,7 +261,7 @@ class Conductor:
         if self.objective.lambda_lr == 0 or not showing:
             return []
         with self.work_log.stage("pictures of extra views"):  # a pseudo view is made when it is first asked for
-            return [extra for s in showing for extra in s.extra_views(t)]
+            return [extra for s in showing for extra in answers.extra_views(s, s.extra_views(t))]
 
     @in_full_precision
     def extra_loss(self, image: Float[Tensor, "h w 3"], extra: ExtraView, t: int) -> Losses:

@@ -5,7 +5,7 @@ Types and shapes are looked at, and the numbers where `finite` asks for it, but 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from numbers import Real
 from typing import Any, NoReturn
 
@@ -17,6 +17,7 @@ from clear_strategies.core.conflicts import Weights
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.finite import is_finite, rows_not_finite
 from clear_strategies.core.gradients import Grads
+from clear_strategies.core.view import ExtraView
 from clear_strategies.errors import AnswerError
 from clear_strategies.strategies.base import Strategy
 
@@ -88,6 +89,18 @@ def require_score(s: Strategy, score: Any, n: int) -> None:
     if score is not None and not _is_rows(score, n):
         _refuse(s, "score", f"a tensor [{n}] or None", score)
     _require_finite(s, "score", {"S": score})
+
+
+def extra_views(s: Strategy, answer: Any) -> list[ExtraView]:
+    """The answer of `extra_views`."""
+    extras = [*answer] if isinstance(answer, Iterable) else _refuse(s, "extra_views", "a sequence of ExtraView", answer)
+    for extra in extras:
+        if not isinstance(extra, ExtraView):
+            _refuse(s, "extra_views", "a sequence of ExtraView", extra)
+        shape = extra.photo.image.shape[:2]
+        if not (isinstance(extra.weight, Tensor) and extra.weight.shape == shape):
+            _refuse(s, "extra_views", f"an ExtraView whose weight is a tensor {[*shape]}, as its photo", extra.weight)
+    return extras
 
 
 def _require_finite(s: Strategy, hook: str, numbers: Mapping[str, Any]) -> None:

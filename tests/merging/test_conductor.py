@@ -13,6 +13,7 @@ from clear_strategies import (
     SVS,
     Conductor,
     Evidence,
+    ExtraView,
     Grads,
     Objective,
     Photo,
@@ -127,6 +128,12 @@ ANSWERS = {
     "regularize, NaN": ("regularize", lambda p, t: {"means": nan_of_first(p["means"])}, "must give finite numbers, but means"),
     "score": ("score", 1.0, "must give a tensor \\[30\\] or None, got 1.0"),
     "score NaN": ("score", lambda step, screen: nan_of_first(screen.ordinary), "must give finite numbers, but S"),
+    "extra_views": ("extra_views", None, "must give a sequence of ExtraView, got None"),
+    "extra_views, views": ("extra_views", lambda t: [toy.scene().train[0]], "must give a sequence of ExtraView, got View"),
+    "extra_views, weight": (
+        "extra_views", lambda t: [ExtraView(toy.scene().train[0].lr, weight=torch.ones(3, 5))],
+        "must give an ExtraView whose weight is a tensor \\[.*\\], as its photo, got a tensor \\[3, 5\\]",
+    ),
     "start": ("on_fit_start", None, "must call super\\(\\).on_fit_start"),
 }  # fmt: skip
 
@@ -136,6 +143,17 @@ def test_an_answer_that_a_hook_must_not_give_is_refused_by_the_name_of_both(answ
     hook, given, message = ANSWERS[answer]
     with pytest.raises(ContractError, match=f"^Mine.{hook}\\(\\) .*{message}"):
         check_strategy(answering(hook, given))
+
+
+def test_the_contract_shows_poses_in_the_type_that_the_readers_give_them():
+    """A strategy that multiplies its float32 means by the pose would end the first iteration of every run."""
+
+    def by_distance(step):
+        pose = step.view.hr.camera.world_to_camera
+        return (step.params["means"] @ pose[:3, :3].T + pose[:3, 3])[:, 2].abs()
+
+    with pytest.raises(RuntimeError, match="same dtype"):
+        check_strategy(answering("route", by_distance))
 
 
 def test_state_of_other_rows_and_settings_of_taken_names_are_refused():
