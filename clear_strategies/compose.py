@@ -225,7 +225,15 @@ def not_composed(error: Exception, overrides: Sequence[str], config: str) -> Set
     remedy = "clear-strategies --cfg job prints all of them."
     parent, _, name = key.rpartition(".")
     beside = {".".join(k.split(".")[: key.count(".") + 1]) for k in flat(known) if k.startswith(f"{parent}.")}
-    if key.startswith("strategies.") and any(_SWEEPS.match(o) for o in overrides):
+    if has_parameter(str(flat(known).get(f"{parent}.{TARGET}")), name):
+        remedy = (
+            f"Its class has it; a plus adds it: +{key}=…."  # of the user's own class, named by an override or a file
+        )
+    elif (
+        key.startswith("strategies.") and not known
+    ):  # the options are in a folder that only Hydra's command line knows
+        remedy = f"If its class has it, a plus adds it: +{key}=…."
+    elif key.startswith("strategies.") and any(_SWEEPS.match(o) for o in overrides):
         remedy = (
             "Hydra composes a sweep first without what is swept, here the strategies. Sweep this setting, too "
             f"({key}=a,b), or name the strategies that remain (+strategy=[gco,svs])."
@@ -234,10 +242,6 @@ def not_composed(error: Exception, overrides: Sequence[str], config: str) -> Set
         remedy = f"A plus adds it: +{key}=…."
     elif f"~{key}" in overrides and beside:
         remedy = f"There are {', '.join(sorted(beside))}."
-    elif has_parameter(
-        str(flat(known).get(f"{parent}.{TARGET}")), name
-    ):  # of the user's own class, named by an override
-        remedy = f"Its class has it; a plus adds it: +{key}=…."
     elif near := difflib.get_close_matches(key, [name for name in flat(known) if not name.endswith(TARGET)], 1, 0.8):
         remedy = f"Did you mean {near[0]}?"
     elif known and config == "conductor":

@@ -6,6 +6,7 @@ import sys
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import ConfigCompositionException
 
 from clear_strategies import GCO, P2G, SVS, Conductor, hydra_app
 from clear_strategies import compose as compose_module
@@ -51,6 +52,8 @@ def test_names_and_overrides_are_those_of_the_command_line_and_milestones_stretc
             ("baseline", f"+strategies.x._target_={MINE}", "strategies.x.share=1"),
             r"strategies.x.share: there is no such setting. Its class has it; a plus adds it: \+strategies.x.share=",
         ),
+        (("gco,claer",), r"strategy=claer: there is no such option\. Did you mean clear\?"),
+        (("gco", f"strategies.x._target_={MINE}"), r"A plus adds it: \+strategies\.x\._target_="),
         (("best", "strategies.gco.tolerence=1"), r"tolerence: there .* Did you mean strategies\.gco\.tolerance\?"),
         (("gco", "strategies.gco.tolerance=2"), "tolerance: must lie in"),
         (("gco,gco",), "gco twice"),
@@ -81,6 +84,16 @@ def test_a_list_of_settings_is_refused_with_the_remedy():
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     rule = "overrides: must be given one by one, each as text, got ['a=b']."
     assert [line.startswith(rule) and "*overrides" in line for line in told.splitlines()] == [True, True]
+
+
+def test_a_setting_of_a_class_that_a_sweep_leaves_in_place_is_added_by_a_plus():
+    words = ["experiment=llff_x4", f"+strategies.x._target_={MINE}", "strategies.x.share=1"]
+    with pytest.raises(SettingError, match=r"a plus adds it: \+strategies\.x\.share="):
+        compose_module.composed(words, "config")
+    unknown = ConfigCompositionException("Could not override 'strategies.x.share'.")
+    from_a_folder = ["experiment=only_in_a_folder_of_config_dir", "+strategy=x", "strategies.x.share=1"]
+    told = compose_module.not_composed(unknown, from_a_folder, "config")
+    assert "a plus adds it: +strategies.x.share=" in str(told)
 
 
 def test_readings_stand_beside_any_strategies_and_what_is_set_by_name_wins():
