@@ -131,7 +131,7 @@ class Attachment:
         self._hooked: list[torch.optim.Optimizer] = []
         self._stepped: set[int] = set()  # the optimizers that have made this step of the host
         self._has_merged = False  # since the last step
-        self._has_warned = False
+        self._has_warned = self._has_told_of_accumulation = False
         conductor.on_fit_start(len(views), seed, params()["means"].device, views)
         _announce(conductor, views, own_background=own_background, iterations=iterations)
         self._farewell = finalize(self, _warn_without_hr, self.counts, first_hr(conductor))
@@ -323,7 +323,7 @@ class Attachment:
             return (
                 "none of its renderings was recognised as that of a training view",
                 "Check that the training loop renders with the function that was replaced, and with the cameras that were "
-                "passed.",
+                "passed. A loop with `attach` that moves its cameras names the view: with clear.rendering(view): …",
             )
         shot = pending.output.shot
         if (
@@ -457,6 +457,8 @@ class Attachment:
             must_be_finite=self._loss_scale is None,
         )  # fmt: skip
         pending.merged.update(names or ("detail",))
+        if first and self.passes == 0 and not self._stepped:
+            self._warn_of_accumulation([done.before[name] for name in names if name in done.before])
         self._stepped.clear()
         self._has_merged = True
         self.counts["merges"] += 1
@@ -477,6 +479,22 @@ class Attachment:
             now = self.log
             losses_now = ", ".join(f"L_{name} {now[name]:.4f}" for name in losses) or "no HR"
             _log.info("t=%d: %s, lambda_HR %.3f, %s Gaussians.", self.t, losses_now, λ, f"{self._n:,}")
+
+    def _warn_of_accumulation(self, before: Sequence[Tensor]) -> None:
+        """Tell once that a step sums more passes than `accumulation` names.
+
+        Args:
+            before: the gradients to which the first of `accumulation` passes has added.
+        """
+        if self._has_told_of_accumulation or not self.counts["merges"] or not any(bool(g.any()) for g in before):
+            return
+        self._has_told_of_accumulation = True
+        _log.warning(
+            "%d backward passes over training views add to the same gradients, without an optimizer step between them, but "
+            "accumulation=%d: HR weighs too much, and the schedules of the strategies end too early. Pass accumulation=n, the "
+            "number of views in a step, and divide each loss by n.",
+            self.accumulation + 1, self.accumulation,
+        )  # fmt: skip
 
     def _finish_detail(self, detail: Tensor, others: Sequence[Tensor], by_hf: bool) -> None:
         """After the merge of f_det, which the host's optimizer steps as the others."""

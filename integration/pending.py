@@ -145,7 +145,7 @@ class Pending:
         if correcting and (again := [name for name in names if name in self.merged]):
             raise HostError(
                 f"a second backward pass over the rendering of {self.view} adds to the gradient of {', '.join(again)}, which is "
-                f"merged already: {correcting} compares HR with the gradient of the whole loss. Sum the losses and call "
+                f"merged already, and {correcting} must compare HR with the gradient of the whole loss. Sum the losses and call "
                 "backward() once; what is only looked at, take by torch.autograd.grad. For a second pass over the same view, "
                 "call the function that was wrapped, its __wrapped__."
             )

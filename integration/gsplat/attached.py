@@ -273,7 +273,7 @@ class Attached:
                 raise HostError(
                     f"{view.name} is rendered at {arguments['width']}x{arguments['height']}, but its photo has "
                     f"{view.lr.camera.width}x{view.lr.camera.height} pixels. Train at one resolution (nerfstudio: "
-                    "num_downscales=0)."
+                    "num_downscales=0), cut a crop out of the picture of the whole photo, and evaluate without gradients."
                 )
         if own is not None:
             return self._drawable(own, call, params, target)

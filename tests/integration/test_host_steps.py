@@ -149,6 +149,16 @@ def test_a_step_without_a_strategy_is_refused_at_first_and_told_later_with_its_c
     assert clear.attachment.counts["steps of the host alone"] == 3
 
 
+@pytest.mark.parametrize(("backwards", "accumulation", "told"), [(2, 1, 1), (1, 1, 0), (2, 2, 0), (3, 2, 1)])
+def test_more_backward_passes_than_accumulation_names_are_told_once(backwards, accumulation, told, caplog):
+    """Each would bring the whole HR gradient, and count as an iteration."""
+    scene = toy.scene(20)
+    host = Host(scene, accumulation=backwards)
+    attached(host, scene, Conductor(), accumulation=accumulation)
+    host.train([scene.train[0].name] * 3 * backwards)
+    assert caplog.text.count(f"but accumulation={accumulation}: HR weighs too much") == told
+
+
 def test_optimizers_of_other_tensors_than_those_that_were_passed_are_refused():
     scene = toy.scene(20)
     host = Host(scene)
