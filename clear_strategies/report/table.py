@@ -39,7 +39,7 @@ def compare(runs: Sequence[FinishedRun]) -> pd.DataFrame:
         its standard error `_delta_error` and the number of its pairs `_delta_pairs`: runs of one seed, of an average of one
         scene and seed.
     """
-    single = pd.DataFrame([row for of_scene in _by_scene(runs).values() for row in _single(of_scene)])
+    single = _each_seed_once(pd.DataFrame([row for of_scene in _by_scene(runs).values() for row in _single(of_scene)]))
     tables = [_summary(rows) for _, rows in single.groupby("scene", sort=False)]
     # Scores against LR photos, or of training views, are not averaged with others.
     for marks, alike in single.groupby("marks", sort=False):
@@ -144,14 +144,20 @@ def _single(runs: Sequence[FinishedRun]) -> list[dict[str, Any]]:
     return rows
 
 
+def _each_seed_once(single: pd.DataFrame) -> pd.DataFrame:
+    """Of the runs of one method and seed, the last: a mean over seeds that counts one twice has a wrong error."""
+    again = single.duplicated(["scene", "key", "seed"], keep="last")
+    for scene, method, seed, run in single.loc[again, ["scene", "method", "seed", "run"]].itertuples(index=False):
+        _log.warning("%s, %s: another run has seed %s, too; %s is left out.", scene, method, seed, run.folder)
+    return single[~again]
+
+
 def _summary(single: pd.DataFrame) -> pd.DataFrame:
     """Of one scene: a row for each method."""
     groups = single.groupby("key", sort=False)
     table = groups[["scene", "method", "run"]].first().assign(average=False, runs=groups.size())
     for _, of_method in groups:
         row = f"{of_method['scene'].iloc[0]}, {of_method['method'].iloc[0]}"
-        if of_method["seed"].duplicated().any():
-            _log.warning("%s: a row holds several runs with the same seed.", row)
         if of_method["psnr"].isna().any():
             _log.warning("%s: runs without a finite PSNR are left out of its mean.", row)
     table["seeds"] = groups["seed"].agg(lambda seeds: ", ".join(map(str, sorted(set(seeds)))))

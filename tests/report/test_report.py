@@ -172,12 +172,13 @@ def test_what_changes_no_result_does_not_separate_runs(tmp_path: Path, settings:
     assert rows_of(tmp_path)["srgs"]["seeds"] == "0, 1"
 
 
-def test_one_seed_twice_and_a_score_that_is_not_finite_give_a_warning(tmp_path, caplog):
-    for i, psnr in enumerate((20.0, 20.0, None)):
-        make_run(tmp_path / str(i), "+strategy=gco", psnr=psnr)
-    assert rows_of(tmp_path)["gco"]["psnr"] == 20.0
-    assert "demo, gco: a row holds several runs with the same seed" in caplog.text
-    assert "demo, gco: runs without a finite PSNR are left out of its mean" in caplog.text
+def test_of_one_seed_the_last_run_counts_and_a_score_that_is_not_finite_gives_a_warning(tmp_path, caplog):
+    for i, (seed, psnr) in enumerate([(0, 10.0), (0, 20.0), (1, 22.0), (2, None)]):
+        make_run(tmp_path / str(i), "+strategy=gco", psnr=psnr, seed=seed)
+    row = rows_of(tmp_path)["gco"]
+    assert (row["psnr"], row["seeds"]) == (21.0, "0, 1, 2")
+    assert f"demo, gco: another run has seed 0, too; {tmp_path / '0'} is left out." in caplog.text
+    assert "runs without a finite PSNR are left out of its mean" in caplog.text
 
 
 def test_each_method_has_the_psnr_of_its_own_sr_images_and_of_bicubic(tmp_path: Path) -> None:
