@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from clear_strategies.core.deferred import Number
-from clear_strategies.core.finite import require_finite
+from clear_strategies.core.finite import is_finite, require_finite
 from clear_strategies.core.gradients import Colour, Grads
 from clear_strategies.core.step import Step
 from clear_strategies.merging.conductor import Conductor
@@ -68,7 +68,9 @@ def merge_in_place(
     values = {name: p.detach() for name, p in trained.items()}
     merged = (merge or conductor.merge_routed)(values, g_lr, high, step, t, out)
     if must_be_finite and not isinstance(merged.finite, Tensor) and not merged.finite:
-        require_finite(f"t={t}: the merged gradient", merged.grads)
+        by_host = all(map(is_finite, [*high.values(), *(high.colour or ())]))
+        hint = " (that of HR is finite: look at the loop's own loss)" if by_host else ""
+        require_finite(f"t={t}: the merged gradient{hint}", merged.grads)
     for name, p in trained.items():
         g = out[name] if scale == 1 else out[name].mul_(scale)
         _give(p, g.add_(before[name]) if name in before else g)

@@ -162,7 +162,7 @@ def whole(g: Grads, name: str) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("keeps_lr", [True, False])
-@pytest.mark.parametrize(("keep", "remove"), zip(FORMS, [*FORMS][1:] + [*FORMS][:1], strict=True))
+@pytest.mark.parametrize(("keep", "remove"), list(zip(FORMS, [*FORMS][1:] + [*FORMS][:1], strict=True)))
 def test_weights_of_any_form_and_rows_beside_factors_are_merged_as_written(passes, keep, remove, keeps_lr):
     """Eq. 7, 8 and 16, attribute by attribute. HR has no gradient of the means, which is 0 then."""
     lr, hr, plus = rows_and_factors(1, "detail"), rows_and_factors(2, "means"), Grads(drawn(5, SHAPES))
@@ -233,14 +233,16 @@ def test_half_precision_is_merged_in_float32(passes):
     assert torch.allclose(merged[0].float(), merged[1], rtol=2e-3, atol=1e-6)
 
 
-def test_what_is_not_finite_is_refused_but_under_a_gradient_scaler():
+@pytest.mark.parametrize(
+    ("side", "hint"), [("lr", r" \(that of HR is finite: look at the loop's own loss\)"), ("hr", "")]
+)
+def test_what_is_not_finite_is_refused_but_under_a_gradient_scaler(side, hint):
     params, before, hr, step = setting(torch.float32, accumulated=False, factors=False, scale=1.0)
-    params["scales"].grad[17, 1] = torch.nan
+    (params["scales"].grad if side == "lr" else hr["scales"])[17, 1] = torch.nan
     run = partial(merge_in_place, conductor(), params, hr, step, T, before=before)
     run(must_be_finite=False)
-    with pytest.raises(
-        DivergedError, match=r"merged gradient of scales is not finite for 1 Gaussians, first Gaussian 17"
-    ):
+    where = f"the merged gradient{hint} of scales"
+    with pytest.raises(DivergedError, match=f"{where} is not finite for 1 Gaussians, first Gaussian 17"):
         run()
 
 
