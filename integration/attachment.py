@@ -45,6 +45,7 @@ from clear_strategies.strategies.base import overrides
 from clear_strategies.strategies.sr_stage import SRStage
 from integration.autograd_shot import AutogradShot
 from integration.densification import ScoreScaler, write_score
+from integration.detail import Fading
 from integration.extra_steps import ExtraSteps
 from integration.own_drawing import Drawable, OwnDrawing, RenderAt
 from integration.pending import BackwardPass, Pending, current_pass
@@ -56,7 +57,6 @@ from rasterizers.interface import Color
 _log = logging.getLogger(__name__)
 _LOGGED_EVERY: Final = 100  # merges between two lines of the log
 _STRETCH: Final = "Make the conductor for the length of the loop: conductor(…, iterations=…)."
-_PATIENCE: Final = 10  # steps with a gradient of f_det, before a warning that none was made on it
 
 
 class Attachment:
@@ -117,7 +117,7 @@ class Attachment:
         self._loss_scale = loss_scale
         self._scaler = None if threshold is None else ScoreScaler(threshold)
         self._n = len(params()["means"])
-        self._detail_gradients = 0
+        self._fading = Fading(conductor.detail, accumulation)
         self._pending: Pending | None = None  # the last rendering
         self._pass: BackwardPass | None = None  # the last one that has reached a rendering
         self._merge_in_place: Callable[..., Mapping[str, deferred.Number]] = partial(
@@ -296,6 +296,7 @@ class Attachment:
             return
         has_merged, self._has_merged = self._has_merged, False
         if has_merged:
+            self._fading.before_step()
             return
         trained = [name for name, p in self.params().items() if p.requires_grad and name != "detail"]
         cause = self._why_nothing_was_merged(trained)
@@ -368,6 +369,7 @@ class Attachment:
         gradients = (p.grad for name, p in params.items() if name != "detail")  # which the host may know nothing of
         if has_stepped or not any(g is not None and bool(g.any()) for g in gradients):
             self.passes = 0
+            self._fading.forget()
 
     def _resize(self, n: int) -> None:
         """Gather the strategies' per-Gaussian state if the structure has changed."""
@@ -504,20 +506,7 @@ class Attachment:
                 if p.grad is not None:
                     detail.grad += 0 * p.grad.sum(dtype=torch.float32)
         if by_hf:
-            self._decay_detail(detail)
-
-    def _decay_detail(self, detail: Tensor) -> None:
-        """L_HF does not change with a constant added to the colours, so that nothing else would hold the mean of f_det."""
-        rates = self.conductor.detail
-        detail.mul_(1 - rates.decay / self.accumulation)
-        if self.conductor.objective.lambda_hr(self.t) == 0:
-            return
-        self._detail_gradients += 1
-        if self._detail_gradients == _PATIENCE * self.accumulation and rates.rate > 0 and not bool(detail.any()):
-            _log.warning(
-                "f_det has no effect: none of its first %d gradients was stepped on. Step the optimizer of the parameter detail: "
-                "attach adds it to the optimizers that it is given, and one that is made anew must hold it, too.", _PATIENCE,
-            )  # fmt: skip
+            self._fading.add_pass(detail, is_learned=self.conductor.objective.lambda_hr(self.t) > 0)
 
 
 def _to_change(p: Tensor) -> Tensor:

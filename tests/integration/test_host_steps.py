@@ -230,6 +230,30 @@ def test_an_iteration_ends_with_the_hosts_step_whatever_became_of_its_passes(set
     assert clear.attachment.counts["extra views"] == 4
 
 
+def test_f_det_fades_with_a_step_and_not_with_passes_that_the_loop_drops():
+    scene = toy.scene(20)
+    host = Host(scene)
+    conductor = Conductor(objective=HR_FROM_START, detail=DetailRates(decay=0.5))
+    attached(host, scene, conductor, accumulation=2)
+    host.splats["detail"].data += 1.0
+    host.optimizers["detail"].param_groups[0]["lr"] = 0.0
+
+    def share_after(passes, *, steps):
+        before = float(host.splats["detail"].mean())
+        for i in range(passes):
+            host.render(scene.train[i].lr.camera)[0].mean().backward()
+        for optimizer in host.optimizers.values():
+            if steps:
+                optimizer.step()
+            optimizer.zero_grad()
+        return float(host.splats["detail"].mean()) / before
+
+    assert share_after(1, steps=False) == 1  # the other ran out of memory
+    assert share_after(2, steps=False) == 1  # a gradient scaler skips the step
+    assert share_after(2, steps=True) == 0.75**2
+    assert share_after(1, steps=True) == 0.75
+
+
 @pytest.mark.parametrize(
     ("threshold", "anchor_start", "with_hr"),
     [(None, 100, [1, 3, 5]), (1e-4, 100, [1, 2, 3, 4, 5, 6]), (1e-4, 4, [1, 2, 3, 5])],
