@@ -8,6 +8,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from typing import Any, Final
+from weakref import WeakSet
 
 import numpy as np
 import torch
@@ -68,7 +69,7 @@ class Attached:
 
     Raises:
         ValueError: there is no view, or a parameter is missing.
-        HostError: a network makes the colours.
+        HostError: a network makes the colours; `params` are attached already.
         SettingError: densification outlasts the anchor; a scheduler exists that an optimizer of all parameters cannot follow.
     """
 
@@ -100,6 +101,8 @@ class Attached:
         require_bands(params)
         if missing := [name for name in self._names.values() if name not in params]:
             raise ValueError(f"params must hold {', '.join(self._names.values())}; {missing[0]} is missing.")
+        if any(other._params is params and not other.attachment.removed for other in _MADE):
+            raise HostError("these params are attached already; remove() the attachment that did it first.")
         means = params[self._names["means"]]
         if detail and "detail" not in params:
             params["detail"] = torch.nn.Parameter(means.new_zeros(len(means), 3))
@@ -125,6 +128,7 @@ class Attached:
             own_background=own_background, reads_score=threshold is not None, remedy=self._rows.remedy, iterations=iterations,
         )  # fmt: skip
         self._follow_optimizers()
+        _MADE.add(self)
 
     def params(self) -> dict[str, Tensor]:
         """The current leaves, by gsplat's names."""
@@ -134,7 +138,10 @@ class Attached:
     def wrap(self, rasterization: Rasterization) -> Rasterization:
         """`rasterization` that renders training views at both scales, and shows f_det in renderings without gradients."""
         if (attached := getattr(rasterization, _ATTACHED, None)) is not None and not attached.attachment.removed:
-            raise HostError("this rasterization is wrapped already; remove() the attachment that wrapped it first.")
+            raise HostError(
+                "this rasterization is wrapped already; remove() the attachment that wrapped it first, or "
+                "wrap its __wrapped__."
+            )
         signature = inspect.signature(rasterization)
         var_keyword = [name for name, p in signature.parameters.items() if p.kind is p.VAR_KEYWORD]
         if missing := {"means", "opacities", "colors", "viewmats", "Ks", "width", "height"} - {*signature.parameters}:
@@ -392,6 +399,7 @@ class Attached:
 
 
 attach = Attached
+_MADE: Final = WeakSet[Attached]()  # since what they change in a loop cannot be seen there
 
 
 def require_bands(params: Mapping[str, Any] | torch.nn.ParameterDict) -> None:

@@ -144,6 +144,20 @@ def test_remove_restores_the_loop():
         assert torch.equal(p, host.splats[name])
 
 
+def test_splats_are_attached_once_at_a_time():
+    """A second attachment would step and number the same Gaussians; a cell of a notebook may be run twice."""
+    host, clear, render = started(GCO())
+    with pytest.raises(HostError, match=r"attached already; remove\(\) the attachment"):
+        attach(host.splats, host.optimizers, toy.scene(20).train, Conductor())
+    render().mean().backward()
+    host.optimizers["means"].step()
+    clear.remove()
+    _, again, render = started(GCO(), host=host)
+    render().mean().backward()
+    host.optimizers["means"].step()
+    assert clear.attachment.counts["merges"] == again.attachment.counts["merges"] == 1
+
+
 def test_a_pose_that_two_views_share_is_refused_unless_the_view_is_named():
     scene = toy.scene(20)
     first, second = scene.train[:2]
