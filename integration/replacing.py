@@ -31,7 +31,8 @@ def replace_everywhere(original: Callable[..., Any], replacement: Callable[..., 
 
 
 def replace_methods(owner: Any, replacements: Mapping[str, Callable[..., Any]]) -> Callable[[], None]:
-    """Replace methods of one object; returns what undoes it. Each replacement gets the original as its first argument.
+    """Replace methods of one object; returns what undoes it. Each replacement gets the original as its first argument. Copies and
+    pickles of the object have its own methods.
 
     Args:
         replacements: by the name of the method. Those that the object does not have are left out.
@@ -39,13 +40,25 @@ def replace_methods(owner: Any, replacements: Mapping[str, Callable[..., Any]]) 
     names = [name for name in replacements if hasattr(owner, name)]
     for name in names:
         original = getattr(owner, name)
-        setattr(owner, name, functools.wraps(original)(functools.partial(replacements[name], original)))
+        setattr(owner, name, functools.wraps(original)(_Method(replacements[name], owner, name)))
 
     def undo() -> None:
         for name in names:
             vars(owner).pop(name, None)
 
     return undo
+
+
+class _Method:
+    def __init__(self, replacement: Callable[..., Any], owner: Any, name: str) -> None:
+        self._call = functools.partial(replacement, getattr(owner, name))
+        self._own = owner, name
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return self._call(*args, **kwargs)
+
+    def __reduce__(self) -> Any:
+        return getattr, self._own
 
 
 @contextmanager

@@ -26,6 +26,7 @@ class Settings:
         points: "own": the Gaussians start as the host makes them; "stereo": from dense stereo between its training photos.
         seed: of the strategies.
         hr_by: what draws HR in a gsplat-style host, see `integration.gsplat.attach`; others draw it themselves.
+        accumulation: see `Attachment`.
 
     Raises:
         SettingError: `points` is neither of these.
@@ -39,6 +40,7 @@ class Settings:
     points: Points = "own"
     seed: int = 0
     hr_by: str = "auto"
+    accumulation: int = 1
 
     def __post_init__(self) -> None:
         require_choice("points", self.points, get_args(Points))

@@ -123,6 +123,7 @@ class _Installed:
         self.attached = Attached(
             runner.splats, runner.optimizers, views, chosen, strategy=runner.cfg.strategy, seed=wanted.seed, masks=masks,
             state=getattr(getattr(runner, "scene", None), "signal", None), iterations=runner.cfg.max_steps, hr_by=wanted.hr_by,
+            accumulation=wanted.accumulation,
         )  # fmt: skip
         self.attached.replace_everywhere(rendering.rasterization)
         self._undo = ExitStack()
@@ -130,7 +131,7 @@ class _Installed:
         if export is not None:
             with_detail = functools.wraps(export)(functools.partial(self._export, export))
             self._undo.callback(replace_everywhere(export, with_detail))
-        runner.splats.register_state_dict_post_hook(functools.partial(self._fold))  # torch marks it by an attribute
+        runner.splats.register_state_dict_post_hook(_fold)
 
     def finish(self) -> None:
         """Leave its splats as they are drawn, and gsplat's functions to the next Runner."""
@@ -147,10 +148,11 @@ class _Installed:
             kwargs["sh0"] = sh0.detach() + sh0_offset(detail.detach(), sh0)
         return export(*args, **kwargs)
 
-    def _fold(self, _: Any, stored: dict[str, Any], prefix: str, *__: Any) -> None:
-        """A checkpoint's sh0 is f_base + f_det, and it has the keys that the trainer's evaluation expects."""
-        detail = stored.pop(f"{prefix}detail")
-        stored[f"{prefix}sh0"] = stored[f"{prefix}sh0"] + sh0_offset(detail, stored[f"{prefix}sh0"])
+
+def _fold(_: Any, stored: dict[str, Any], prefix: str, *__: Any) -> None:
+    """A checkpoint's sh0 is f_base + f_det, and it has the keys that the trainer's evaluation expects."""
+    detail = stored.pop(f"{prefix}detail")
+    stored[f"{prefix}sh0"] = stored[f"{prefix}sh0"] + sh0_offset(detail, stored[f"{prefix}sh0"])
 
 
 def photos_of(dataset: Any, device: torch.device | str = "cpu") -> list[HostPhoto]:

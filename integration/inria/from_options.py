@@ -50,7 +50,7 @@ def install(gaussians: Any, scene: Any, opt: Any, settings: Settings | None = No
     attached = Attached(
         gaussians, scene.getTrainCameras(), chosen, sr=wanted.sr, suffix=wanted.suffix, factor=wanted.factor, seed=wanted.seed,
         threshold=getattr(opt, "densify_grad_threshold", None), densify_until=getattr(opt, "densify_until_iter", None),
-        own_background=bool(getattr(opt, "random_background", False)),
+        own_background=bool(getattr(opt, "random_background", False)), accumulation=wanted.accumulation,
     )  # fmt: skip
     renderer = sys.modules.get("gaussian_renderer")
     if renderer is None or not hasattr(renderer, "render"):

@@ -1,7 +1,9 @@
 """CLEAR in a trainer of the shape of gsplat's examples/simple_trainer.py: `python -m integration.gsplat simple_trainer.py`."""
 
+import copy
 import functools
 import logging
+import pickle
 import runpy
 from pathlib import Path
 from types import SimpleNamespace
@@ -126,5 +128,8 @@ def test_a_second_runner_in_one_process_trains_too(trainer, monkeypatch):
         drawn.append(torch.load(trainer.folder / name / "image.pt"))
         assert runner.clear.attached.attachment.counts["merges"] == 8
     assert torch.equal(*drawn)
+    copied = copy.deepcopy(runner.splats)
+    assert torch.equal(copied.state_dict()["sh0"], runner.splats.state_dict()["sh0"])  # f_base + f_det
+    assert len(pickle.dumps(copied)) < 50_000  # without the photos
     runner.clear.finish()
     assert not hasattr(gsplat.export_splats, "__wrapped__")  # else the splats of every Runner stay in memory

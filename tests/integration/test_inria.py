@@ -4,6 +4,7 @@ import copy
 import importlib
 import logging
 import math
+import pickle
 import runpy
 import sys
 from dataclasses import replace
@@ -255,6 +256,26 @@ def test_remove_restores_the_loop(inria_host, inria_capture):
     assert torch.equal(alone[0]._opacity, attached[0]._opacity)
 
 
+@pytest.mark.parametrize(
+    "copied",
+    [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))],
+    ids=["copy", "pickle"],  # noqa: S301
+)
+def test_a_copy_of_the_model_is_the_hosts_own(copied, inria_host, inria_attached):
+    """It has neither the photos, nor rows that follow another model."""
+    clear, gaussians, scene = inria_attached(GCO())
+    render = clear.wrap(inria_host.render)
+    for camera in scene.cameras:
+        render(camera, gaussians, None, None)["render"].mean().backward()
+        gaussians.optimizer.step()
+        model = copied(gaussians)
+        assert torch.equal(model._xyz, gaussians._xyz)
+        assert all(
+            getattr(model, name).__func__ is getattr(type(model), name) for name in ("save_ply", "_prune_optimizer")
+        )
+    assert clear.attachment.counts["merges"] == 3
+
+
 def test_a_renderer_that_does_not_read_the_getters_is_warned_of(inria_host, caplog, inria_attached):
     always = SVS(dropout=Ramp(maximum=0.2, shape="constant"))
     clear, gaussians, scene = inria_attached(always)
@@ -400,6 +421,12 @@ def test_schedules_are_those_of_the_hosts_own_options(inria_host, inria_capture)
     assert conductor.objective.lambda_hr(9) == conductor.objective.lambda_hr.peak  # full at 3,000 of 10,000
     with pytest.raises(HostError, match="has no iterations"):
         install(gaussians, scene, object(), sr=inria_capture / "sr")
+    clear.remove()
+    clear = install(gaussians, scene, opt, sr=inria_capture / "sr", accumulation=2)
+    for passes in (1, 2):
+        inria_host.render(scene.cameras[0], gaussians, None, torch.zeros(3))["render"].mean().backward()
+        assert clear.attachment.passes == passes
+    clear.remove()
 
 
 @pytest.mark.parametrize("points", ["own", "stereo"])
