@@ -11,6 +11,9 @@ One training iteration:
 4. After the host's optimizer has stepped, it steps once more on the gradient of each extra view. Once all optimizers have
    stepped, the strategies do what they do after a step.
 
+HR and extra views are in hr_drawing.py, the merge in host_merge.py, the optimizers' steps in host_steps.py, changes of the
+structure in structure.py, and the lines of the log at the start in announcement.py.
+
 The merge runs at the end of `backward()`, not in an optimizer hook. Gradient clipping therefore sees the merged gradient,
 optimizers other than `torch.optim.Optimizer` work, and so do hosts that densify before the step (3DGS) as well as hosts
 that densify after it (gsplat).
@@ -22,8 +25,6 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
-from functools import partial
 from typing import Any, Final
 from weakref import WeakMethod, finalize
 
@@ -33,30 +34,26 @@ from torch import Tensor
 
 from clear_strategies.core import deferred
 from clear_strategies.core.evidence import Evidence
-from clear_strategies.core.gradients import Grads, conflict_columns
+from clear_strategies.core.gradients import conflict_columns
 from clear_strategies.core.step import Step
-from clear_strategies.core.view import ExtraView, View
+from clear_strategies.core.view import View
 from clear_strategies.data.scene import require_shown
 from clear_strategies.errors import HostError, SettingError
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.merging.in_place import merge_in_place
-from clear_strategies.merging.iteration import HrSide
-from clear_strategies.strategies.base import overrides
-from clear_strategies.strategies.sr_stage import SRStage
-from integration.autograd_shot import AutogradShot
-from integration.densification import ScoreScaler, write_score
-from integration.detail import Fading
+from integration.announcement import announce, warn_without_hr
 from integration.extra_steps import ExtraSteps
-from integration.own_drawing import Drawable, OwnDrawing, RenderAt
-from integration.pending import BackwardPass, Pending, current_pass
-from integration.replayed_merge import ReplayedMerge
-from integration.views import enlarged_mask, require_unique
+from integration.host_merge import HostMerge
+from integration.host_steps import HostSteps
+from integration.hr_drawing import HrDrawing
+from integration.own_drawing import Drawable, RenderAt
+from integration.pending import BackwardPass, Pending, current_pass, why_nothing_was_merged
+from integration.structure import Structure
+from integration.views import require_unique
 from rasterizers.autograd import TakeColours
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 _LOGGED_EVERY: Final = 100  # merges between two lines of the log
-_STRETCH: Final = "Make the conductor for the length of the loop: conductor(…, iterations=…)."
 
 
 class Attachment:
@@ -109,32 +106,28 @@ class Attachment:
         require_shown(views)
         self._views = {view.name: view for view in views}
         self.conductor, self.params, self.accumulation = conductor, params, accumulation
-        self._masks, self._own_background, self._reads_score = dict(masks or {}), own_background, reads_score
+        self._own_background = own_background
         self.t, self.passes = 1, 0
         self.counts: Counter[str] = Counter()
         self.removed = False
-        self._poll_parents, self._restart_parents, self._remedy = poll_parents, restart_parents, remedy
-        self._loss_scale = loss_scale
-        self._scaler = None if threshold is None else ScoreScaler(threshold)
-        self._n = len(params()["means"])
-        self._fading = Fading(conductor.detail, accumulation)
+        n, device = len(params()["means"]), params()["means"].device
+        self._structure = Structure(conductor, n, poll_parents, remedy, restart_parents)
+        self._hr = HrDrawing(conductor, device, masks or {}, self.counts, reads_score=reads_score)
         self._pending: Pending | None = None  # the last rendering
         self._pass: BackwardPass | None = None  # the last one that has reached a rendering
-        self._merge_in_place: Callable[..., Mapping[str, deferred.Number]] = partial(
-            merge_in_place, conductor, merge=ReplayedMerge(conductor, params()["means"].device)
+        self._merging = HostMerge(
+            conductor, device, threshold=threshold, loss_scale=loss_scale, accumulation=accumulation
         )
         self._step: Step | None = None  # of the rendering, until `after_step`
         self._extra = ExtraSteps(params)
+        self._has_told_of_accumulation = False
         self._logged: dict[str, deferred.Number | Callable[[], deferred.Number]] = {}
-        self._own_drawing = OwnDrawing(conductor, params()["means"].device)
-        self._hooks: list[Any] = []
-        self._hooked: list[torch.optim.Optimizer] = []
-        self._stepped: set[int] = set()  # the optimizers that have made this step of the host
-        self._has_merged = False  # since the last step
-        self._has_warned = self._has_told_of_accumulation = False
-        conductor.on_fit_start(len(views), seed, params()["means"].device, views)
-        _announce(conductor, views, own_background=own_background, iterations=iterations)
-        self._farewell = finalize(self, _warn_without_hr, self.counts, first_hr(conductor))
+        self._steps = HostSteps(
+            self._extra, is_waiting=self._is_waiting, begins=self._step_begins, after=self._after_step_of
+        )
+        conductor.on_fit_start(len(views), seed, device, views)
+        announce(conductor, views, own_background=own_background, iterations=iterations)
+        self._farewell = finalize(self, warn_without_hr, conductor, self.counts)
 
     def render_view(self, view: View, render_at: RenderAt) -> Any:
         """Render a training view at both scales; returns what the host's render function returns at LR."""
@@ -142,69 +135,25 @@ class Attachment:
         conductor, t, params = self.conductor, self.t, {name: p.detach() for name, p in self.params().items()}
         means = params["means"]
         conductor.forget_logs()
-        z = conductor.gate(t, self._n)
+        z = conductor.gate(t, self._structure.n)
         if z is not None:
             z = z.to(means)
         hr = routed = None
-        if self._wants_hr(t):
-            self.counts["HR renders"] += 1
+        if self._hr.wanted(t):
             view = conductor.skips.view(view, t)
-            hr, routed = self._hr_side(view, t, z, render_at, params)
+            hr, routed = self._hr.hr(view, t, z, render_at, params)
         self._step = Step(t, view, params=params) if hr is None else hr.step
         if self.passes == 0:  # one step of the host, however many passes it accumulates
             self._extra.forget()
             if extra_views := conductor.extra_views(t):
-                self._extra.take(extra_views, lambda extra: self._of_extra(extra, view, t, render_at))
+                self._extra.take(extra_views, lambda extra: self._hr.extra_view(extra, view, t, render_at))
         output = render_at("lr", z, view)
         if isinstance(output, Drawable):
             raise TypeError("an adapter renders LR by the host's own function, got a Drawable.")
         self.counts["LR renders"] += 1
         self._pending = Pending(self.counts["LR renders"], view.name, output, hr, routed)
-        scored = self._reads_score and hr is not None and conductor.owner("score") is not None
-        self._pending.listen(WeakMethod(self._reached), to_screen=scored)
+        self._pending.listen(WeakMethod(self._reached), to_screen=hr is not None and self._hr.is_scored)
         return output.returned
-
-    def _hr_side(
-        self, view: View, t: int, z: Tensor | None, render_at: RenderAt, params: Mapping[str, Tensor]
-    ) -> tuple[HrSide, Grads | None]:
-        """The gradients of HR, and the same of the raw parameters where HR takes part in the merge."""
-        conductor, mask, drawn = self.conductor, self._masks.get(view.name), render_at("hr", z, view)
-        merges = conductor.objective.lambda_hr(t) > 0
-        fine = None if mask is None else enlarged_mask(mask.to(params["means"]), view.factor)[..., None]
-        if isinstance(drawn, Drawable):
-            hr, routed = self._own_drawing.hr(drawn, view, t, fine)
-            return hr, routed if merges else None
-        shot = drawn.shot
-        if len(shot.drawings) > 1:
-            self._count_parts(len(shot.drawings))
-        if fine is not None:
-            shot = replace(shot, image=shot.image * fine.to(shot.image))
-        apart = shot.drawing is not None or "detail" in shot.params
-        hr = conductor.hr_gradients(shot, view, t, AutogradShot.gradients, apart=apart, params=params)
-        return hr, shot.routed(hr, conductor.objective.lambda_hf) if merges else None
-
-    def _of_extra(self, extra: ExtraView, view: View, t: int, render_at: RenderAt) -> Grads:
-        """The gradient of an extra view."""
-        drawn = render_at(extra.photo.camera, None, view)
-        if isinstance(drawn, Drawable):
-            return self._own_drawing.extra_view(drawn, extra, t)
-        (g,) = drawn.shot.vjp(self.conductor.extra_loss(drawn.shot.image, extra, t).cotangents)
-        return g
-
-    def _wants_hr(self, t: int) -> bool:
-        """Whether HR takes part at t. Where the host's densifier reads its score, no iteration is skipped."""
-        conductor = self.conductor
-        scores = self._reads_score and conductor.owner("score") is not None and conductor.may_densify(t)
-        return conductor.wants_hr(t) and (scores or not conductor.skips.leaves_out_hr(t, conductor.work_log))
-
-    def _count_parts(self, n: int) -> None:
-        self.counts["HR renders in parts"] += 1
-        if self.counts["HR renders in parts"] == 1:
-            _log.info(
-                "The host calls its rasterizer %d times for one rendering, so each of the two HR gradients needs a backward "
-                "pass of its own: with 46,000 Gaussians a step takes 1.4 times as long. Call it under torch.no_grad() for "
-                "what is only looked at, and outside of the wrapped function for what only the LR loss needs.", n,
-            )  # fmt: skip
 
     @property
     def background(self) -> Color | None:
@@ -213,45 +162,29 @@ class Attachment:
 
     def hook(self, optimizers: Sequence[torch.optim.Optimizer]) -> None:
         """Hook the steps of the optimizers that the host now has, and no longer those of earlier ones."""
-        distinct = list(
-            {id(o): o for o in optimizers if isinstance(o, torch.optim.Optimizer)}.values()
-        )  # others have no hooks
-        if list(map(id, distinct)) == list(map(id, self._hooked)):
-            return
-        for hook in self._hooks:
-            hook.remove()
-        self._hooked = distinct
-        self._stepped.clear()
-        self._hooks = [
-            *(
-                o.register_step_pre_hook(lambda o, given, named: self._before_step(o, *given, *named.values()))
-                for o in distinct
-            ),
-            *(o.register_step_post_hook(lambda o, *_: self._after_step_of(o)) for o in distinct),
-        ]
+        self._steps.hook(optimizers)
 
     def state_dict(self) -> dict[str, Any]:
         """The iteration, and what the strategies store per Gaussian, for the host's checkpoint."""
         if not self.removed:
-            self._resize(len(self.params()["means"]))  # the host may have densified since it rendered
+            self._follow_structure(len(self.params()["means"]))  # the host may have densified since it rendered
         return {
             "t": self.t, "passes": self.passes, "strategies": self.conductor.state_dict(),
             "view": None if self._step is None else self._step.view.name, "step": _rows_of(self._step),
-            "score": None if self._scaler is None else self._scaler.state_dict(),
+            "score": None if self._merging.scaler is None else self._merging.scaler.state_dict(),
         }  # fmt: skip
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a state; the host has loaded its parameters already."""
         self.t, self.passes = int(state["t"]), int(state["passes"])
         self.conductor.load_state_dict(state["strategies"])
-        self._restart_parents()
-        self._n = len(self.params()["means"])
+        self._structure.restart(len(self.params()["means"]))
         if (view := self._views.get(state.get("view") or "")) is not None:  # its `after_step` is still to come
             rows = {name: x.to(self.params()["means"].device) for name, x in state.get("step", {}).items()}
             evidence = Evidence(rows["reliability"], rows["demand"]) if "demand" in rows else None
             self._step = Step(self.t, view, rows.get("visible"), evidence)
-        if self._scaler is not None and state.get("score") is not None:
-            self._scaler.load_state_dict(state["score"])
+        if self._merging.scaler is not None and state.get("score") is not None:
+            self._merging.scaler.load_state_dict(state["score"])
 
     def summary(self) -> str:
         """What was done how often, e.g. for the end of a log."""
@@ -270,87 +203,33 @@ class Attachment:
         self.conductor.on_fit_end()
         self._farewell()
 
-    def _before_step(self, optimizer: torch.optim.Optimizer, *given: Any) -> None:
-        """Refuse a first step in which no strategy takes part, and tell of a later one.
-
-        Args:
-            given: what `step` was called with.
-        """
-        if self._extra.stepping:
-            return
-        if any(callable(x) for x in given):
-            raise HostError(
-                "the host gives its optimizer a closure, which renders inside of step(), but the gradients are merged before. "
-                "Render and call loss.backward(), then step() without a closure."
-            )
-        if current_pass() >= 0 and self._pending is not None and self._pending.output is not None:
-            raise HostError(
-                "the host steps inside of its backward pass, where the gradients of the views are not merged yet. Step after "
-                "loss.backward() has returned, not in a hook of a gradient."
-            )
-        if id(optimizer) in self._stepped:  # one step of the host is each optimizer once
-            self._stepped.clear()
-        begins = not self._stepped
-        self._stepped.add(id(optimizer))
-        if not begins:
-            return
-        has_merged, self._has_merged = self._has_merged, False
+    def _step_begins(self, has_merged: bool) -> None:
+        """Refuse a first step in which no strategy takes part, and tell of a later one."""
         if has_merged:
-            self._fading.before_step()
+            self._merging.fading.before_step()
             return
         trained = [name for name, p in self.params().items() if p.requires_grad and name != "detail"]
-        cause = self._why_nothing_was_merged(trained)
+        cause, remedy = why_nothing_was_merged(self._pending, trained)
         if not self.counts["merges"]:
             raise HostError(
-                f"the host makes its first optimizer step, but {cause[0]}, so that no strategy would take part. {cause[1]}"
+                f"the host makes its first optimizer step, but {cause}, so that no strategy would take part. {remedy}"
             )
         self.counts["steps of the host alone"] += 1
-        if not self._has_warned:
-            self._has_warned = True
+        if self.counts["steps of the host alone"] == 1:
             _log.warning(
                 "the host makes a step in which no strategy takes part: %s, and %s changed without CLEAR or not at all. %s",
-                cause[0], ", ".join(trained) or "nothing", cause[1],
+                cause, ", ".join(trained) or "nothing", remedy,
             )  # fmt: skip
-
-    def _why_nothing_was_merged(self, trained: Sequence[str]) -> tuple[str, str]:
-        """The cause, and what to do."""
-        pending = self._pending
-        if not trained:
-            return (
-                "all parameters of the Gaussians are frozen",
-                "Let those that should train require gradients, or remove() what was attached.",
-            )
-        if pending is None or pending.output is None:
-            return (
-                "none of its renderings was recognised as that of a training view",
-                "Check that the training loop renders with the function that was replaced, and with the cameras that were "
-                "passed. A loop with `attach` that moves its cameras names the view: with clear.rendering(view): …",
-            )
-        shot = pending.output.shot
-        if (
-            not any(x.requires_grad for drawing in shot.drawings for x in drawing.inputs.values())
-            and not pending.output.marks
-        ):
-            return (
-                f"the rendering of {pending.view} does not depend on {', '.join(trained)}",
-                "Pass the function tensors that are made of the parameters, with gradients enabled and not detached.",
-            )
-        return (
-            f"no backward() has given {', '.join(trained)} a gradient by the rendering of {pending.view}",
-            "Take the gradients by loss.backward(), not by torch.autograd.grad, of a loss of that rendering.",
-        )
 
     def _after_step_of(self, optimizer: torch.optim.Optimizer) -> None:
         """Step on extra views; and once all optimizers have stepped, let the strategies do so: what the loop computes of the
         parameters from then on, before it renders, is of what they have left. In the iteration in which densification ends they
         wait for the next rendering, since a host may densify in it, and an anchor is taken after that.
         """
-        if self._extra.stepping:
-            return
         if steps := self._extra.step(optimizer):
             self.counts["extra views"] += steps
         may_densify = self.conductor.may_densify
-        if len(self._stepped) == len(self._hooked) and may_densify(self.t) == may_densify(max(1, self.t - 1)):
+        if self._steps.is_complete and may_densify(self.t) == may_densify(max(1, self.t - 1)):
             self._finish_step()
 
     def _finish_step(self) -> None:
@@ -358,10 +237,10 @@ class Attachment:
         has dropped before it stepped, e.g. after an error, are of no iteration.
         """
         params = self.params()
-        self._resize(len(params["means"]))
+        self._follow_structure(len(params["means"]))
         if not self.passes:
             return
-        has_stepped = bool(self._stepped) or self.passes >= self.accumulation  # a gradient scaler may skip the step
+        has_stepped = self._steps.has_begun or self.passes >= self.accumulation  # a gradient scaler may skip the step
         if has_stepped:
             if self._step is not None:
                 self.conductor.after_step({name: _to_change(p) for name, p in params.items()}, self._step)
@@ -369,35 +248,17 @@ class Attachment:
         gradients = (p.grad for name, p in params.items() if name != "detail")  # which the host may know nothing of
         if has_stepped or not any(g is not None and bool(g.any()) for g in gradients):
             self.passes = 0
-            self._fading.forget()
+            self._merging.fading.forget()
 
-    def _resize(self, n: int) -> None:
-        """Gather the strategies' per-Gaussian state if the structure has changed."""
-        parents = self._poll_parents()
-        if parents is None and n == self._n:
-            return
-        if parents is not None and len(parents) != n:
-            raise HostError(f"the host says of {len(parents):,} Gaussians which they come from, but has {n:,}.")
-        state = ", ".join(self.conductor.state_dict())
-        if parents is not None and (unknown := int((parents < 0).sum())):
-            if state:
-                raise HostError(
-                    f"{unknown:,} new Gaussians come from no other, but {state} is stored of each Gaussian. {self._remedy}"
-                )
-            parents = parents.clamp_min(0)
-        if self._step is not None:  # without parents, what it holds per Gaussian cannot be gathered
-            self._step = Step(self._step.t, self._step.view) if parents is None else self._step.resized(parents)
-        if parents is not None:
-            self.conductor.on_resize(parents)
-        elif state:
-            # SVS raises an AnchorError here, which says more: the anchor's iteration, and the setting to change.
-            self.conductor.on_resize(torch.zeros(n, dtype=torch.long))
-            raise HostError(
-                f"the number of Gaussians changed from {self._n:,} to {n:,} and the host does not say which came from "
-                f"which, but {state} is stored per Gaussian. End densification first, or pass the host's state."
-            )
-        self.counts["structure changes"] += 1
-        self._n = n
+    def _follow_structure(self, n: int) -> None:
+        """The host has N Gaussians now."""
+        has_changed, self._step = self._structure.follow(n, self._step)
+        if has_changed:
+            self.counts["structure changes"] += 1
+
+    def _is_waiting(self) -> bool:
+        """Whether a rendering waits for its backward pass."""
+        return self._pending is not None and self._pending.output is not None
 
     def _reached(self, nth: int) -> TakeColours | None:
         """A backward pass of the host has reached the nth rendering, but no parameter yet."""
@@ -433,54 +294,25 @@ class Attachment:
             pending.output = pending.hr = pending.routed = None
 
     def _merge(self, pending: Pending, done: BackwardPass, names: Sequence[str]) -> None:
-        hr, first = pending.hr, not pending.merged
-        params = {name: done.params[name] for name in names}
-        for name, p in params.items():
-            if p.grad is not None and p.grad.is_sparse:
-                raise HostError(
-                    f"{name}.grad is sparse, but the gradients of all Gaussians are merged. In gsplat: "
-                    "rasterization(sparse_grad=False)."
-                )
-            if (
-                p.grad is not None and p.grad.requires_grad
-            ):  # of create_graph=True, of which the merged gradient is no part
-                p.grad = p.grad.detach()
-        scale = (self._loss_scale() if self._loss_scale is not None else 1.0) / self.accumulation
-        detail = done.params.get("detail") if first else None
-        if detail is not None and not detail.requires_grad:
-            detail = None
-        if detail is not None:
-            params["detail"] = detail
-            if detail.grad is not None:  # what the host has given it stays
-                done.before["detail"] = detail.grad
-        conflict = self._merge_in_place(
-            params, pending.routed_of(names, done.params), None if hr is None else hr.step, self.t,
-            before=done.before, lr_colour=done.colour, scale=scale,
-            must_be_finite=self._loss_scale is None,
-        )  # fmt: skip
-        pending.merged.update(names or ("detail",))
-        if first and self.passes == 0 and not self._stepped:
+        first, scale = not pending.merged, self._merging.scale()
+        conflict = self._merging.merge(pending, done, names, self.t, scale)
+        if first and self.passes == 0 and not self._steps.has_begun:
             self._warn_of_accumulation([done.before[name] for name in names if name in done.before])
-        self._stepped.clear()
-        self._has_merged = True
+        self._steps.on_merge()
         self.counts["merges"] += 1
         if not first:
             return
         self.passes += 1
-        if detail is not None:
-            self._finish_detail(detail, [done.params[name] for name in names], hr is not None and hr.hf is not None)
-        if (screen := pending.screen.get(done.task)) is not None and pending.output is not None and hr is not None:
-            scores = partial(self.conductor.scores, hr=hr, weights=self.conductor.objective.weights(self.t))
-            if write_score(pending.output.shot, screen / scale, scores, self._scaler, scale):
-                self.counts["scores written"] += 1
+        if self._merging.write_score(pending, done, self.t, scale):
+            self.counts["scores written"] += 1
         λ = self.conductor.objective.lambda_hr(self.t)
-        losses = {} if hr is None else hr.losses
+        losses = {} if pending.hr is None else pending.hr.losses
         shares = conflict_columns(conflict)
         self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **shares, **self.conductor.uncounted_logs()}
         if self.counts["merges"] % _LOGGED_EVERY == 0:
             now = self.log
             losses_now = ", ".join(f"L_{name} {now[name]:.4f}" for name in losses) or "no HR"
-            _log.info("t=%d: %s, lambda_HR %.3f, %s Gaussians.", self.t, losses_now, λ, f"{self._n:,}")
+            _log.info("t=%d: %s, lambda_HR %.3f, %s Gaussians.", self.t, losses_now, λ, f"{self._structure.n:,}")
 
     def _warn_of_accumulation(self, before: Sequence[Tensor]) -> None:
         """Tell once that a step sums more passes than `accumulation` names.
@@ -497,16 +329,6 @@ class Attachment:
             "number of views in a step, and divide each loss by n.",
             self.accumulation + 1, self.accumulation,
         )  # fmt: skip
-
-    def _finish_detail(self, detail: Tensor, others: Sequence[Tensor], by_hf: bool) -> None:
-        """After the merge of f_det, which the host's optimizer steps as the others."""
-        if self._loss_scale is not None and detail.grad is not None:
-            # A gradient scaler asks each optimizer apart whether to step; 0 times a number that is not finite is not finite.
-            for p in others:
-                if p.grad is not None:
-                    detail.grad += 0 * p.grad.sum(dtype=torch.float32)
-        if by_hf:
-            self._fading.add_pass(detail, is_learned=self.conductor.objective.lambda_hr(self.t) > 0)
 
 
 def _to_change(p: Tensor) -> Tensor:
@@ -536,55 +358,6 @@ def _require_supported(conductor: Conductor, accumulation: int) -> None:
     distributed = torch.distributed
     if distributed.is_available() and distributed.is_initialized() and (n := distributed.get_world_size()) > 1:
         raise SettingError(f"CLEAR trains in one process, got {n}. Start the training without torchrun, on one device.")
-
-
-def first_hr(conductor: Conductor) -> int | None:
-    """The first iteration in which HR takes part in the gradient; None: in none."""
-    λ = conductor.objective.lambda_hr
-    return λ.start + 1 if λ.peak > 0 else λ.decay_from + 1 if λ.final > 0 else None
-
-
-def _warn_without_hr(counts: Counter[str], first: int | None) -> None:
-    """At the end of a loop."""
-    if first is not None and 0 < counts["merges"] < first and not counts["HR renders"]:
-        _log.warning(
-            "HR took no part in the %d steps of this loop: it would from step %d on. %s",
-            counts["merges"],
-            first,
-            _STRETCH,
-        )
-
-
-def _announce(conductor: Conductor, views: Sequence[View], *, own_background: bool, iterations: int | None) -> None:
-    """Log what each strategy will do, and which have no effect. After `on_fit_start`.
-
-    Args:
-        own_background: the host chooses its background by itself. iterations: of the loop, where they are known.
-    """
-    if (first := first_hr(conductor)) is not None:
-        _log.info("HR takes part from step %d on (objective.lambda_hr.start).", first)
-        if iterations is not None and first > iterations:
-            _log.warning("HR takes part from step %d on, but the loop has %d steps. %s", first, iterations, _STRETCH)
-    for s in conductor.strategies:
-        if (prepared := s.summary()) is not None:
-            _log.info("%s: %s.", type(s).__name__, prepared)
-    if not conductor.decorated and any(view.factor > 1 for view in views):
-        _log.warning(
-            "%s has no effect: the views were made without it. Make them with sr=conductor.prior(sr).",
-            ", ".join(getattr(getattr(d, "func", d), "__name__", str(d)) for d in conductor.decorators),
-        )
-    for phrase in conductor.skips.descriptions(views, in_host=True):
-        _log.info("Skipped: %s.", phrase)
-    for hook, reason in {
-        "densifier": "keeps its own density control",
-        **({"background": "chooses its background itself"} if own_background else {}),
-    }.items():
-        for owner in (s for s in conductor.strategies if overrides(s, hook)):
-            _log.info("%s has no effect here: the host %s.", type(owner).__name__, reason)
-    for stage in (s for s in conductor.strategies if isinstance(s, SRStage)):
-        _log.info("%s has no effect here: the host draws no picture for it.", type(stage).__name__)
-    if not conductor.strategies:
-        _log.info("no strategy is attached: both losses are summed, as in the paper's baseline.")
 
 
 @contextmanager

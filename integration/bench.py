@@ -73,8 +73,8 @@ class Loop:
             sr = chosen.prior(Bicubic())
             views = [view(*x, sr=sr) for x in zip(demo.names, self.photos, self.viewmats, self.Ks, strict=True)]
             attached = attach(self.splats, self.optimizers, views, chosen)
-            self.draw, self.merge = attached.wrap(self.draw), _TimedMerge(attached.attachment._merge_in_place)
-            attached.attachment.t, attached.attachment._merge_in_place = _FROM, self.merge
+            self.draw, self.merge = attached.wrap(self.draw), _TimedMerge(attached.attachment._merging._merge_in_place)
+            attached.attachment.t, attached.attachment._merging._merge_in_place = _FROM, self.merge
 
     def backward(self) -> None:
         """Render the next photo and take the gradients."""

@@ -50,7 +50,7 @@ class ExtraSteps:
 
         An optimizer whose parameters were replaced after the views were rendered makes none (3DGS densifies before it steps).
         """
-        if self.stepping or not self._gradients:
+        if not self._gradients:
             return 0
         stepped = [p for group in optimizer.param_groups for p in group["params"]]
         ids = {id(p) for p in stepped}

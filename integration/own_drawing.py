@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float
@@ -186,7 +186,7 @@ class OwnDrawing:
 
         def work(given: _Given, recorded: bool) -> tuple[Grads, dict[str, Number]]:
             shot = given.shot(asked)
-            shown = extra if given.known is None else replace(extra, photo=given.photo, weight=given.known)
+            shown = replace(extra, photo=given.photo, weight=cast(Tensor, given.known))
             (g,) = shot.gradients(conductor.extra_loss(shot.image, shown, t).cotangents)
             return g, {}
 

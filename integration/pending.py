@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from weakref import WeakMethod
 
@@ -159,3 +159,32 @@ def current_pass() -> int:
     """Torch's number of the backward pass under way in this thread; -1: there is none."""
     number: int = torch._C._current_graph_task_id()
     return number
+
+
+def why_nothing_was_merged(pending: Pending | None, trained: Sequence[str]) -> tuple[str, str]:
+    """The cause that a host steps without a merge, and what to do.
+
+    Args:
+        pending: the last rendering. trained: names of the parameters that require gradients.
+    """
+    if not trained:
+        return (
+            "all parameters of the Gaussians are frozen",
+            "Let those that should train require gradients, or remove() what was attached.",
+        )
+    if pending is None or pending.output is None:
+        return (
+            "none of its renderings was recognised as that of a training view",
+            "Check that the training loop renders with the function that was replaced, and with the cameras that were "
+            "passed. A loop with `attach` that moves its cameras names the view: with clear.rendering(view): …",
+        )
+    drawings, names = pending.output.shot.drawings, ", ".join(trained)
+    if not pending.output.marks and not any(x.requires_grad for d in drawings for x in d.inputs.values()):
+        return (
+            f"the rendering of {pending.view} does not depend on {names}",
+            "Pass the function tensors that are made of the parameters, with gradients enabled and not detached.",
+        )
+    return (
+        f"no backward() has given {names} a gradient by the rendering of {pending.view}",
+        "Take the gradients by loss.backward(), not by torch.autograd.grad, of a loss of that rendering.",
+    )

@@ -10,38 +10,32 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, nullco
 from typing import Any, Final
 from weakref import WeakSet
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.core.view import View
 from clear_strategies.errors import HostError
-from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment, random_state_kept
-from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot, Target
+from integration.autograd_shot import HostOutput, Target
 from integration.densification import require_end, warn_if_score_is_unused
 from integration.detail import sh0_offset
+from integration.gsplat.calls import Rasterization, aliased, drawable, enlarged, host_output, seen_by, with_offset
+from integration.gsplat.poses import Poses
 from integration.lineage import RowNumbers
 from integration.optimizers import optimizers_of, step_detail
 from integration.own_drawing import Drawable
 from integration.replacing import replace_everywhere
 from rasterizers.ahead import drawing_ahead
-from rasterizers.as_gsplat import cameras_of, rasterizer_of
-from rasterizers.autograd import recorded
-from rasterizers.geometry import SH_C0
+from rasterizers.as_gsplat import rasterizer_of
 from rasterizers.interface import BackendUnavailable, Camera, Rasterizer
 from rasterizers.modes import uncompiled
 
 _log = logging.getLogger(__name__)
 
 _ATTACHED: Final = "clear_attached"  # attribute of a wrapped function: its Attached
-_SAME_POSE: Final = 1e-3  # largest difference between the entries of two poses of one camera
-_POSE_RATIO: Final = 10  # how many times as far the second nearest pose must be, since frames of a video lie close
-
-Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 
 
 class Attached:
@@ -97,7 +91,7 @@ class Attached:
                 "at least one view is needed; integration.views.view(...) makes one from an image and a camera."
             )
         self._names = {name: name for name in PARAMETERS} | dict(names or {})
-        self._params, self._views = params, tuple(views)
+        self._params = params
         require_bands(params)
         if missing := [name for name in self._names.values() if name not in params]:
             raise ValueError(f"params must hold {', '.join(self._names.values())}; {missing[0]} is missing.")
@@ -110,7 +104,7 @@ class Attached:
         self._rows = RowNumbers(
             params if state is None else state, lambda: params[self._names["means"]], as_parameter=state is None
         )
-        self._poses = torch.stack([view.lr.camera.world_to_camera for view in self._views]).double().cpu().numpy()
+        self._poses = Poses(views)
         self._found_by_pose = True  # else renderings are those of `_named`, see `rendering`
         self._named: View | None = None
         self._has_drawn_bands = False  # after a call with spherical harmonics, one without them draws no colours
@@ -122,8 +116,8 @@ class Attached:
         stop, threshold = (getattr(strategy, name, None) for name in ("refine_stop_iter", "grow_grad2d"))
         require_end(conductor, stop, "refine_stop_iter", first=0)
         warn_if_score_is_unused(conductor, strategy, threshold)
-        self.attachment = Attachment(
-            conductor, self.params, views=self._views, seed=seed, loss_scale=loss_scale, accumulation=accumulation,
+        self.attachment: Attachment = Attachment(
+            conductor, self.params, views=views, seed=seed, loss_scale=loss_scale, accumulation=accumulation,
             poll_parents=self._rows.poll, restart_parents=self._rows.restart, threshold=threshold, masks=masks,
             own_background=own_background, reads_score=threshold is not None, remedy=self._rows.remedy, iterations=iterations,
         )  # fmt: skip
@@ -162,7 +156,7 @@ class Attached:
                 return rasterization(**call)
             if not torch.is_grad_enabled():
                 return rasterization(**self._with_detail(call, trained=False))
-            view = self._find_view(call["viewmats"]) if self._found_by_pose else self._named
+            view = self._poses.find(call["viewmats"]) if self._found_by_pose else self._named
             if view is None:  # a viewer, a camera without a photo
                 return rasterization(**self._with_detail(call, trained=False))
 
@@ -232,21 +226,6 @@ class Attached:
         of_no_photo = self._named is None and not self._found_by_pose
         return as_bands or not (self._has_drawn_bands or of_no_photo)
 
-    def _find_view(self, viewmats: Float[Tensor, "*C 4 4"]) -> View | None:
-        poses = viewmats.detach().reshape(-1, 4, 4).cpu().numpy()  # compared in numpy: a step has few torch operations
-        if len(poses) != 1:
-            raise HostError(
-                f"only one view per step is supported, got {len(poses)}. Set batch_size=1, or call joint_loss for each view "
-                "and average."
-            )
-        distances = np.abs(self._poses - poses).max((1, 2)).tolist()
-        tolerance = _SAME_POSE * max(1.0, float(np.abs(poses).max()))
-        near = sorted((distance, i) for i, distance in enumerate(distances) if distance <= tolerance)
-        if len(near) > 1 and near[1][0] <= _POSE_RATIO * near[0][0]:
-            names = " and ".join(self._views[i].name for _, i in near[:2])
-            raise HostError(f"{names} have the same pose. Say which is rendered: with clear.rendering(view): …")
-        return self._views[near[0][1]] if near else None
-
     def _render(
         self, rasterization: Rasterization, arguments: Mapping[str, Any], view: View, target: Target, gate: Tensor | None
     ) -> HostOutput | Drawable:  # fmt: skip
@@ -260,20 +239,12 @@ class Attached:
             call["opacities"] = self._gated(call["opacities"], gate)
         own = None if target == "lr" else self._own_rasterizer(call)
         if target == "hr":
-            call, factor = self._with_detail(call, trained=True) if own is None else call, view.factor
-            call["Ks"] = call["Ks"] * call["Ks"].new_tensor([[factor], [factor], [1]])
-            call |= {"width": call["width"] * factor, "height": call["height"] * factor, "render_mode": "RGB"}
+            call = enlarged(self._with_detail(call, trained=True) if own is None else call, view.factor)
             call |= {"packed": False} if self._is_ours else {}  # nobody reads its `info`
         else:
             params.pop("detail", None)
         if isinstance(target, Camera):
-            call |= {
-                "viewmats": target.world_to_camera.to(call["viewmats"]).reshape(call["viewmats"].shape),
-                "Ks": intrinsics(target).to(call["Ks"]).reshape(call["Ks"].shape),
-                "width": target.width,
-                "height": target.height,
-                "render_mode": "RGB",
-            }
+            call = seen_by(call, target)
         else:
             expected = view.hr.camera if target == "hr" else view.lr.camera
             if (call["width"], call["height"]) != (expected.width, expected.height):
@@ -283,12 +254,12 @@ class Attached:
                     "num_downscales=0), cut a crop out of the picture of the whole photo, and evaluate without gradients."
                 )
         if own is not None:
-            return self._drawable(own, call, params, target)
-        aliases = () if self._is_ours else _aliased(call)
+            return drawable(own, call, params, target if isinstance(target, Camera) else None)
+        call, aliases = (call, ()) if self._is_ours else aliased(call)
         if target == "lr":
-            return self._drawn(rasterization, call, params, gate, aliases)
+            return host_output(rasterization, call, params, gate, aliases)
         with random_state_kept(call["means"].device):
-            return self._drawn(rasterization, call, params, gate, ())
+            return host_output(rasterization, call, params, gate)
 
     def _own_rasterizer(self, call: Mapping[str, Any]) -> Rasterizer | None:
         """What draws HR and extra views in place of the host's function; None: nothing does. The log says once, which."""
@@ -311,68 +282,11 @@ class Attached:
         self._told_of_hr = backend
         return rasterizer
 
-    def _drawable(
-        self, rasterizer: Rasterizer, call: Mapping[str, Any], params: Mapping[str, Tensor], target: Target
-    ) -> Drawable:  # fmt: skip
-        """A call, as this package draws it."""
-        if isinstance(target, Camera):
-            camera = target
-        else:
-            (camera,) = cameras_of(
-                call["viewmats"].reshape(1, 4, 4), call["Ks"].reshape(1, 3, 3), call["width"], call["height"]
-            )
-        behind = call.get("backgrounds")
-        background = call["means"].new_zeros(1, 3) if behind is None else behind.detach().reshape(1, 3).float()
-        drawn = {name: call[name] for name in ("means", "quats", "scales", "opacities", "colors")}
-        drawn["colors"] = drawn["colors"].to(drawn["means"].dtype)  # some hosts have them in float16
-        return Drawable(
-            rasterizer, camera, drawn, (call["sh_degree"] + 1) ** 2, params.get("detail"), background, params
-        )
-
     def _gated(self, opacities: Float[Tensor, " N"], gate: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
         """Their product, made once for both scales."""
         if self._product is None or self._product[0] is not opacities or self._product[1] is not gate:
             self._product = opacities, gate, opacities * gate.to(opacities)
         return self._product[2]
-
-    def _drawn(
-        self, rasterization: Rasterization, call: Mapping[str, Any], params: Mapping[str, Tensor], gate: Tensor | None,
-        marks: Sequence[Tensor],
-    ) -> HostOutput:  # fmt: skip
-        """One rendering. Gaussians that the gate drops are marked as not visible in its `info`."""
-        with recorded() as drawings:
-            result = rasterization(**call)
-        if len(result) != 3:
-            raise HostError(
-                f"the wrapped function returns {len(result)} values, gsplat's rasterization returns 3: colours, alphas and info. "
-                "2DGS draws other primitives and is not supported."
-            )
-        renders, alphas, info = result
-        size, n, packed = (call["width"], call["height"]), len(params["means"]), info["means2d"].dim() == 2
-        rows = info.get("gaussian_ids") if packed else None
-        means2d = info["means2d"].detach().reshape(-1, 2)
-        if len(drawings) == 1:  # what the gate drops is not visible in it
-            means2d, visible = drawings[0].rendering.means2d, drawings[0].rendering.visible
-        else:
-            visible = _visible(info["radii"], packed)
-            if gate is not None:
-                kept = (gate > 0)[rows] if rows is not None else gate > 0
-                visible = visible & kept
-                radii = info["radii"]
-                info["radii"] = radii * kept.view(*kept.shape, *[1] * (radii.dim() - (1 if packed else 2))).to(radii)
-            visible = visible.reshape(-1)
-            if rows is not None:
-                means2d = means2d.new_zeros(n, 2).index_copy_(0, rows, means2d)
-                visible = torch.zeros(n, dtype=torch.bool, device=rows.device).index_copy_(0, rows, visible)
-        image = renders[..., :3].reshape(size[1], size[0], 3)
-        drawn = {
-            name: call[name]
-            for name in ("means", "quats", "scales", "opacities", "colors")
-            if call.get(name) is not None
-        }
-        slot = ScreenGradientSlot(info["means2d"], size, rows=rows)
-        shot = AutogradShot(image, means2d, visible, params, slot, drawn, drawings)
-        return HostOutput(shot, (renders, alphas, info), marks)
 
     def _background(self, call: Mapping[str, Any]) -> dict[str, Tensor]:
         """The `backgrounds` that the strategies choose for a call; none where it names its own."""
@@ -383,19 +297,10 @@ class Attached:
 
     def _with_detail(self, arguments: Mapping[str, Any], *, trained: bool) -> dict[str, Any]:
         """The same call with colours f_base + f_det; f_det gets a gradient only if it is trained by the rendering."""
-        call = dict(arguments)
-        if "detail" not in self._params or len(call["means"]) != len(self._params["detail"]):
-            return call  # only a part of the scene is rendered, and it is unknown which
-        colors = call["colors"]
-        detail = self._params["detail"] if trained else self._params["detail"].detach()
-        if call.get("sh_degree") is None:
-            call["colors"] = colors + detail.to(colors)
-        elif self._is_ours:
-            call["rgb_offset"] = detail
-        else:
-            constant = colors[..., :1, :] + (detail[:, None] / SH_C0).to(colors)
-            call["colors"] = torch.cat((constant, colors[..., 1:, :]), -2)
-        return call
+        detail = self._params.get("detail")
+        if detail is None or len(arguments["means"]) != len(detail):
+            return dict(arguments)  # only a part of the scene is rendered, and it is unknown which
+        return with_offset(arguments, detail if trained else detail.detach(), is_ours=self._is_ours)
 
 
 attach = Attached
@@ -410,18 +315,3 @@ def require_bands(params: Mapping[str, Any] | torch.nn.ParameterDict) -> None:
             "strategies merge gradients of spherical harmonics: train with simple_trainer.py in place of simple_trainer_nht.py, "
             "without app_opt."
         )
-
-
-def _aliased(call: dict[str, Any]) -> tuple[Tensor, ...]:
-    """Put other tensors over the same memory in place of those of the call that require gradients; returns them. They have none
-    of the loop's hooks, and what the loop does to its renderings cannot reach theirs.
-    """
-    aliases = {name: x.view_as(x) for name, x in call.items() if isinstance(x, Tensor) and x.requires_grad}
-    call |= aliases
-    return tuple(aliases.values())
-
-
-def _visible(radii: Tensor, packed: bool) -> Bool[Tensor, "*shape"]:
-    """Gaussians with positive radii: one number per Gaussian in gsplat 1.4, two in 1.5."""
-    two_radii = radii.dim() == (2 if packed else 3)
-    return (radii > 0).all(-1) if two_radii else radii > 0

@@ -9,7 +9,6 @@ import torch
 
 from clear_strategies import GCO, P2G, SVS, Conductor, Objective, Photo, View
 from clear_strategies.compose import conductor as composed_conductor
-from clear_strategies.merging.detail import DetailRates
 from clear_strategies.schedules import scaled
 from clear_strategies.training.loop import iterate, view_at
 from clear_strategies.training.optim import LearningRates
@@ -117,20 +116,6 @@ def test_f_det_learns_at_a_lower_rate_in_a_short_run(iterations, share):
     host = Host(scene)
     attached(host, scene, composed_conductor("baseline", iterations=iterations))
     assert host.optimizers["detail"].param_groups[0]["lr"] == pytest.approx(LearningRates().detail * share)
-
-
-@pytest.mark.parametrize("accumulation", [1, 2])
-@pytest.mark.parametrize("decay", [0.0, 0.5])
-def test_f_det_fades_once_a_step_at_the_decay_of_the_conductor(decay, accumulation):
-    scene = toy.scene(20)
-    host = Host(scene, accumulation=accumulation)
-    conductor = Conductor(objective=HR_FROM_START, detail=DetailRates(decay=decay))
-    attached(host, scene, conductor, accumulation=accumulation)
-    host.splats["detail"].data += 1.0
-    host.optimizers["detail"].param_groups[0]["lr"] = 0.0
-    host.train([scene.train[0].name] * accumulation)
-    faded = (1 - decay / accumulation) ** accumulation
-    assert float(host.splats["detail"].mean()) == pytest.approx(faded)
 
 
 def test_remove_restores_the_loop():

@@ -12,7 +12,7 @@ from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.merging.in_place import merge_in_place
 from clear_strategies.schedules import Ramp
 from integration import HostError
-from integration.gsplat import attach
+from integration.gsplat.poses import Poses
 from rasterizers import autograd
 from tests.helpers import gsplat_host, toy
 from tests.helpers.backends import needs
@@ -77,7 +77,7 @@ def test_a_photo_of_a_part_of_the_gaussians_and_a_loop_without_backward_are_refu
 
 @pytest.mark.parametrize("origin", [0.0, 3e5], ids=["near the origin", "in coordinates of a map"])
 def test_cameras_that_lie_close_together_are_told_apart(origin):
-    host, scene = Host(toy.scene(20)), toy.scene(20)
+    scene = toy.scene(20)
     step = 5e-4 if origin == 0 else 0.5
     poses = [scene.train[0].lr.camera.world_to_camera.clone() for _ in range(3)]
     views = []
@@ -87,16 +87,16 @@ def test_cameras_that_lie_close_together_are_told_apart(origin):
             replace(p, camera=replace(p.camera, world_to_camera=pose)) for p in (scene.train[0].lr, scene.train[0].hr)
         ]
         views.append(View(f"frame{i}", *at))
-    clear = attach(host.splats, host.optimizers, views, Conductor())
+    poses = Poses(views)
     for view in views:
         rounded = torch.linalg.inv(torch.linalg.inv(view.lr.camera.world_to_camera))[None]
-        assert clear._find_view(rounded) is view
+        assert poses.find(rounded) is view
 
 
 @pytest.mark.parametrize(("ratio", "found"), [(8, False), (12, True)])
 def test_the_nearest_camera_is_the_one_that_is_rendered_if_the_next_is_ten_times_as_far(ratio, found):
     """Poses that a loop optimizes or adds noise to lie beside those of the photos."""
-    host, scene, noise = Host(toy.scene(20)), toy.scene(20), 1e-5
+    scene, noise = toy.scene(20), 1e-5
     pose = scene.train[0].lr.camera.world_to_camera
     views = []
     for i, x in enumerate((noise, -ratio * noise)):
@@ -111,9 +111,8 @@ def test_the_nearest_camera_is_the_one_that_is_rendered_if_the_next_is_ten_times
                 ),
             )
         )
-    clear = attach(host.splats, host.optimizers, views, Conductor())
     with nullcontext() if found else pytest.raises(HostError, match="frame0 and frame1 have the same pose"):
-        assert clear._find_view(pose[None]) is views[0]
+        assert Poses(views).find(pose[None]) is views[0]
 
 
 @pytest.mark.parametrize("by_name", [False, True])
@@ -149,7 +148,7 @@ def test_the_gradient_of_the_colours_comes_by_its_factors_but_where_a_hook_looks
         by_factors.append(lr_colour is not None)
         return merge_in_place(*arguments, lr_colour=lr_colour, **settings)
 
-    monkeypatch.setattr("integration.attachment.merge_in_place", spied)
+    monkeypatch.setattr("integration.host_merge.merge_in_place", spied)
     merged = []
     for hooked in (False, True):
         host, _, render = started()

@@ -230,17 +230,19 @@ def test_an_iteration_ends_with_the_hosts_step_whatever_became_of_its_passes(set
     assert clear.attachment.counts["extra views"] == 4
 
 
-def test_f_det_fades_with_a_step_and_not_with_passes_that_the_loop_drops():
+@pytest.mark.parametrize("passes", [1, 2])
+@pytest.mark.parametrize("decay", [0.0, 0.5])
+def test_f_det_fades_with_a_step_and_not_with_passes_that_the_loop_drops(decay, passes):
     scene = toy.scene(20)
     host = Host(scene)
-    conductor = Conductor(objective=HR_FROM_START, detail=DetailRates(decay=0.5))
-    attached(host, scene, conductor, accumulation=2)
+    conductor = Conductor(objective=HR_FROM_START, detail=DetailRates(decay=decay))
+    attached(host, scene, conductor, accumulation=passes)
     host.splats["detail"].data += 1.0
     host.optimizers["detail"].param_groups[0]["lr"] = 0.0
 
-    def share_after(passes, *, steps):
+    def share_after(n, *, steps):
         before = float(host.splats["detail"].mean())
-        for i in range(passes):
+        for i in range(n):
             host.render(scene.train[i].lr.camera)[0].mean().backward()
         for optimizer in host.optimizers.values():
             if steps:
@@ -248,10 +250,10 @@ def test_f_det_fades_with_a_step_and_not_with_passes_that_the_loop_drops():
             optimizer.zero_grad()
         return float(host.splats["detail"].mean()) / before
 
-    assert share_after(1, steps=False) == 1  # the other ran out of memory
-    assert share_after(2, steps=False) == 1  # a gradient scaler skips the step
-    assert share_after(2, steps=True) == 0.75**2
-    assert share_after(1, steps=True) == 0.75
+    assert share_after(1, steps=False) == 1  # where there is another, it ran out of memory
+    assert share_after(passes, steps=False) == 1  # a gradient scaler skips the step
+    assert share_after(passes, steps=True) == (1 - decay / passes) ** passes
+    assert share_after(1, steps=True) == 1 - decay / passes
 
 
 @pytest.mark.parametrize(

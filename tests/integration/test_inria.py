@@ -258,8 +258,8 @@ def test_remove_restores_the_loop(inria_host, inria_capture):
 
 @pytest.mark.parametrize(
     "copied",
-    [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))],
-    ids=["copy", "pickle"],  # noqa: S301
+    [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))],  # noqa: S301
+    ids=["copy", "pickle"],
 )
 def test_a_copy_of_the_model_is_the_hosts_own(copied, inria_host, inria_attached):
     """It has neither the photos, nor rows that follow another model."""

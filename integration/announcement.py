@@ -1,0 +1,65 @@
+"""What a host's log says of the strategies when they are attached, and at the end of a loop in which HR took no part."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+from clear_strategies.core.view import View
+from clear_strategies.merging.conductor import Conductor
+from clear_strategies.strategies.base import overrides
+from clear_strategies.strategies.sr_stage import SRStage
+
+_log = logging.getLogger(__name__)
+_STRETCH: Final = "Make the conductor for the length of the loop: conductor(…, iterations=…)."
+
+
+def announce(conductor: Conductor, views: Sequence[View], *, own_background: bool, iterations: int | None) -> None:
+    """Log what each strategy will do, and which have no effect. After `on_fit_start`.
+
+    Args:
+        own_background: the host chooses its background by itself. iterations: of the loop, where they are known.
+    """
+    if (first := _first_hr(conductor)) is not None:
+        _log.info("HR takes part from step %d on (objective.lambda_hr.start).", first)
+        if iterations is not None and first > iterations:
+            _log.warning("HR takes part from step %d on, but the loop has %d steps. %s", first, iterations, _STRETCH)
+    for s in conductor.strategies:
+        if (prepared := s.summary()) is not None:
+            _log.info("%s: %s.", type(s).__name__, prepared)
+    if not conductor.decorated and any(view.factor > 1 for view in views):
+        _log.warning(
+            "%s has no effect: the views were made without it. Make them with sr=conductor.prior(sr).",
+            ", ".join(getattr(getattr(d, "func", d), "__name__", str(d)) for d in conductor.decorators),
+        )
+    for phrase in conductor.skips.descriptions(views, in_host=True):
+        _log.info("Skipped: %s.", phrase)
+    for hook, reason in {
+        "densifier": "keeps its own density control",
+        **({"background": "chooses its background itself"} if own_background else {}),
+    }.items():
+        for owner in (s for s in conductor.strategies if overrides(s, hook)):
+            _log.info("%s has no effect here: the host %s.", type(owner).__name__, reason)
+    for stage in (s for s in conductor.strategies if isinstance(s, SRStage)):
+        _log.info("%s has no effect here: the host draws no picture for it.", type(stage).__name__)
+    if not conductor.strategies:
+        _log.info("no strategy is attached: both losses are summed, as in the paper's baseline.")
+
+
+def warn_without_hr(conductor: Conductor, counts: Mapping[str, int]) -> None:
+    """At the end of a loop. `counts` are those of its `Attachment`."""
+    first = _first_hr(conductor)
+    if first is not None and 0 < counts["merges"] < first and not counts["HR renders"]:
+        _log.warning(
+            "HR took no part in the %d steps of this loop: it would from step %d on. %s",
+            counts["merges"],
+            first,
+            _STRETCH,
+        )
+
+
+def _first_hr(conductor: Conductor) -> int | None:
+    """The first iteration in which HR takes part in the gradient; None: in none."""
+    λ = conductor.objective.lambda_hr
+    return λ.start + 1 if λ.peak > 0 else λ.decay_from + 1 if λ.final > 0 else None

@@ -1,0 +1,126 @@
+"""Calls of gsplat's `rasterization`, by the names of its parameters: the same call at another size, from another camera, or with
+f_det in the colours; and what a call returns, as an `Attachment` needs it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from clear_strategies.errors import HostError
+from clear_strategies.geometry.projection import intrinsics
+from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot
+from integration.own_drawing import Drawable
+from rasterizers.as_gsplat import cameras_of
+from rasterizers.autograd import recorded
+from rasterizers.geometry import SH_C0
+from rasterizers.interface import Camera, Rasterizer
+
+Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
+Call = Mapping[str, Any]
+"""The arguments by name."""
+
+
+def enlarged(call: Call, factor: int) -> dict[str, Any]:
+    """With `factor` times as many pixels along an edge, colours alone."""
+    Ks = call["Ks"] * call["Ks"].new_tensor([[factor], [factor], [1]])
+    return {**call, "Ks": Ks, "width": call["width"] * factor, "height": call["height"] * factor, "render_mode": "RGB"}
+
+
+def seen_by(call: Call, camera: Camera) -> dict[str, Any]:
+    """From another camera, colours alone."""
+    viewmats, Ks = call["viewmats"], call["Ks"]
+    return {
+        **call, "viewmats": camera.world_to_camera.to(viewmats).reshape(viewmats.shape),
+        "Ks": intrinsics(camera).to(Ks).reshape(Ks.shape), "width": camera.width, "height": camera.height, "render_mode": "RGB",
+    }  # fmt: skip
+
+
+def with_offset(call: Call, detail: Float[Tensor, "N 3"], *, is_ours: bool) -> dict[str, Any]:
+    """With f_det as an offset of the colours.
+
+    Args:
+        is_ours: the function is this package's, which takes an offset by itself.
+    """
+    colors = call["colors"]
+    if call.get("sh_degree") is None:
+        return {**call, "colors": colors + detail.to(colors)}
+    if is_ours:
+        return {**call, "rgb_offset": detail}
+    constant = colors[..., :1, :] + (detail[:, None] / SH_C0).to(colors)
+    return {**call, "colors": torch.cat((constant, colors[..., 1:, :]), -2)}
+
+
+def aliased(call: Call) -> tuple[dict[str, Any], tuple[Tensor, ...]]:
+    """With other tensors over the same memory in place of those that require gradients; and these. They have none of the loop's
+    hooks, and what the loop does to its renderings cannot reach theirs.
+    """
+    aliases = {name: x.view_as(x) for name, x in call.items() if isinstance(x, Tensor) and x.requires_grad}
+    return {**call, **aliases}, tuple(aliases.values())
+
+
+def drawable(rasterizer: Rasterizer, call: Call, params: Mapping[str, Tensor], camera: Camera | None) -> Drawable:
+    """A call, as this package draws it.
+
+    Args:
+        camera: None: that of the call.
+    """
+    if camera is None:
+        viewmats, Ks = call["viewmats"].reshape(1, 4, 4), call["Ks"].reshape(1, 3, 3)
+        (camera,) = cameras_of(viewmats, Ks, call["width"], call["height"])
+    behind = call.get("backgrounds")
+    background = call["means"].new_zeros(1, 3) if behind is None else behind.detach().reshape(1, 3).float()
+    drawn = {name: call[name] for name in ("means", "quats", "scales", "opacities", "colors")}
+    drawn["colors"] = drawn["colors"].to(drawn["means"].dtype)  # some hosts have them in float16
+    return Drawable(rasterizer, camera, drawn, (call["sh_degree"] + 1) ** 2, params.get("detail"), background, params)
+
+
+def host_output(
+    rasterization: Rasterization, call: Call, params: Mapping[str, Tensor], gate: Float[Tensor, " N"] | None,
+    marks: Sequence[Tensor] = (),
+) -> HostOutput:  # fmt: skip
+    """One rendering. Gaussians that the gate drops are marked as not visible in its `info`.
+
+    Raises:
+        HostError: the function does not return what gsplat's does.
+    """
+    with recorded() as drawings:
+        result = rasterization(**call)
+    if len(result) != 3:
+        raise HostError(
+            f"the wrapped function returns {len(result)} values, gsplat's rasterization returns 3: colours, alphas and info. "
+            "2DGS draws other primitives and is not supported."
+        )
+    renders, alphas, info = result
+    size, n, packed = (call["width"], call["height"]), len(params["means"]), info["means2d"].dim() == 2
+    rows = info.get("gaussian_ids") if packed else None
+    means2d = info["means2d"].detach().reshape(-1, 2)
+    if len(drawings) == 1:  # what the gate drops is not visible in it
+        means2d, visible = drawings[0].rendering.means2d, drawings[0].rendering.visible
+    else:
+        visible = _visible(info["radii"], packed)
+        if gate is not None:
+            kept = (gate > 0)[rows] if rows is not None else gate > 0
+            visible = visible & kept
+            radii = info["radii"]
+            info["radii"] = radii * kept.view(*kept.shape, *[1] * (radii.dim() - (1 if packed else 2))).to(radii)
+        visible = visible.reshape(-1)
+        if rows is not None:
+            means2d = means2d.new_zeros(n, 2).index_copy_(0, rows, means2d)
+            visible = torch.zeros(n, dtype=torch.bool, device=rows.device).index_copy_(0, rows, visible)
+    image = renders[..., :3].reshape(size[1], size[0], 3)
+    names = ("means", "quats", "scales", "opacities", "colors")
+    drawn = {name: call[name] for name in names if call.get(name) is not None}
+    slot = ScreenGradientSlot(info["means2d"], size, rows=rows)
+    shot = AutogradShot(image, means2d, visible, params, slot, drawn, drawings)
+    return HostOutput(shot, (renders, alphas, info), marks)
+
+
+def _visible(radii: Tensor, packed: bool) -> Bool[Tensor, "*shape"]:
+    """Gaussians with positive radii: one number per Gaussian in gsplat 1.4, two in 1.5."""
+    two_radii = radii.dim() == (2 if packed else 3)
+    return (radii > 0).all(-1) if two_radii else radii > 0
