@@ -1,21 +1,24 @@
 """A stand-in for CUDA's streams and graphs, for tensors in the CPU's memory, which refuses what `cuda_rules` says.
 
 As on a GPU, what is captured is not done: results are NaN or 0 until a replay. A graph does not keep the memory that it reads.
+Backward passes run in a thread of their own, which sees the modes of the thread that asked for them, but not its other state.
 """
 
 from __future__ import annotations
 
 import contextlib
+import threading
 import weakref
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any, Final
 
 import pytest
 import torch
-from torch.overrides import TorchFunctionMode
-from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
+from torch.overrides import TorchFunctionMode, _get_current_function_mode_stack
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes, _get_current_dispatch_mode_stack
 from torch.utils._pytree import tree_leaves, tree_map
 
 from rasterizers.interface import BackendUnavailable
@@ -193,6 +196,36 @@ class _Functions(TorchFunctionMode):
         return args[0] if act == "pin" else func(*args, **(kwargs or {}))
 
 
+class _Elsewhere:
+    """A thread that does what is called, as autograd's own of a device: thread-local state of the caller is not there."""
+
+    def __init__(self) -> None:
+        self._thread = ThreadPoolExecutor(1)
+        self._ident = self._thread.submit(threading.get_ident).result()
+
+    def does(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            if threading.get_ident() == self._ident:
+                return function(*args, **kwargs)
+            modes = [
+                *_get_current_function_mode_stack(),
+                *_get_current_dispatch_mode_stack(),
+            ]  # autograd takes these along
+            return self._thread.submit(self._within, modes, partial(function, *args, **kwargs)).result()
+
+        return call
+
+    def close(self) -> None:
+        self._thread.shutdown()
+
+    @staticmethod
+    def _within(modes: list[Any], function: Callable[[], Any]) -> Any:
+        with contextlib.ExitStack() as stack:
+            for mode in modes:
+                stack.enter_context(mode)
+            return function()
+
+
 @contextlib.contextmanager
 def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     """A scope in which torch, Warp and this package take the CPU for a CUDA device."""
@@ -206,7 +239,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     from rasterizers import recording, replayed, replays, warp_runtime
     from rasterizers.warp_backend import frame, settings
 
-    cuda = StrictCuda()
+    cuda, autograd = StrictCuda(), _Elsewhere()
     sort, prepare, allocate, init = wp.utils.radix_sort_pairs, warp_runtime._Launch.prepare, wp.empty, wp.init
 
     def initialises() -> None:
@@ -257,6 +290,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
             "init": initialises, "stream_from_torch": warp_stream, "capture_begin": warp_begins, "capture_end": warp_ends,
             "empty": allocates,
         },
+        torch.autograd: {name: autograd.does(getattr(torch.autograd, name)) for name in ("backward", "grad")},
         wp.utils: {"radix_sort_pairs": sorts},
         warp_runtime._Launch: {"prepare": prepared},
         recording: {"_side_stream": cache(lambda device: Stream(cuda))},
@@ -273,5 +307,5 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     for owner, values in patches.items():
         for name, value in values.items():
             monkeypatch.setattr(owner, name, value)
-    with _Functions(cuda), _Operations(cuda):
+    with contextlib.closing(autograd), _Functions(cuda), _Operations(cuda):
         yield cuda

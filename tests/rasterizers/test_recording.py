@@ -2,6 +2,7 @@
 
 import gc
 import re
+import threading
 import weakref
 from collections.abc import Callable
 from contextlib import suppress
@@ -109,6 +110,13 @@ class Before(Recording[Any]):
         graph.capture_begin(pool=None, capture_error_mode="thread_local")
         self._ends.callback(graph.capture_end)
         self._capturing, self._pool = graph, graph.pool()
+
+
+def test_a_backward_pass_runs_in_a_thread_of_its_own(recorded_on):
+    x, seen = torch.ones(1, device=recorded_on, requires_grad=True), []
+    x.register_hook(lambda _: seen.append(threading.get_ident()))
+    x.sum().backward()
+    assert seen != [threading.get_ident()]
 
 
 def test_asking_for_the_pool_in_the_capture_is_refused(strict_cuda):
