@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import gc
 import logging
-import multiprocessing
 import os
 import re
 import signal
@@ -18,7 +17,6 @@ from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import FrameType
 from typing import Any, Final
 
 import hydra
@@ -26,14 +24,12 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException, HydraException
 from hydra.experimental.callback import Callback
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from clear_strategies import console, files
 from clear_strategies.compose import CONF, not_composed, quoted, require_each_once
 from clear_strategies.errors import ClearError, SettingError
-from clear_strategies.jobs import exit_codes
-from clear_strategies.settings import missing
+from clear_strategies.jobs import exit_codes, sweep
 from clear_strategies.training import signals
 
 _log = logging.getLogger(__name__)
@@ -77,9 +73,9 @@ def main(overrides: Sequence[str] | None = None) -> None:
         overrides = [word for word in sys.argv[1:] if not word.startswith(("-", "hydra."))]
         raise not_composed(error, overrides, "config") from error
     except Exception as error:
-        if not _stopped:
+        if not sweep.stopped:
             raise
-        raise KeyboardInterrupt(_stopped[0]) from error  # a process of joblib's had not begun, and was ended
+        raise KeyboardInterrupt(sweep.stopped[0]) from error  # a process of joblib's had not begun, and was ended
 
 
 def readable(word: str) -> str:
@@ -121,52 +117,18 @@ def _flags_last(arguments: Sequence[str]) -> list[str]:
     return [*settings, *filter(None, flags)]
 
 
-_stopped: Final = list[int]()
-"""The signals by which a sweep of several processes was stopped: in the process that was started, and in each of the others."""
-
-
 def job(config: DictConfig) -> float | None:
     """One job of Hydra's. Returns what `jobs.job.run` does; in a sweep also None for a job that failed, was stopped, or is left
     to another.
     """
-    if not _in_worker():
+    if not sweep.in_worker():
         return _job(config)
-    signals.handle(_end_job)
     try:
-        return None if _stopped else _job(config)
+        with sweep.first_signal_ends_job():
+            return None if sweep.stopped else _job(config)
     finally:
-        signals.handle(_note)
         with suppress(OSError):
             Path(HydraConfig.get().runtime.output_dir).rmdir()  # where nothing was written
-
-
-def _in_worker() -> bool:
-    """Whether this is a process of joblib's, which ends all others at once where one of them ends or has an error."""
-    return HydraConfig.get().mode == RunMode.MULTIRUN and multiprocessing.parent_process() is not None
-
-
-def _note(signum: int, _frame: FrameType | None) -> None:
-    """The handler of joblib's processes between two jobs."""
-    _stopped.append(signum)
-
-
-def _end_job(signum: int, frame: FrameType | None) -> None:
-    """The handler of joblib's processes in a job, where no step defers signals: only the first ends the job, which saves."""
-    if not _stopped and not signals.asked():
-        _note(signum, frame)
-        signals.stop(signum, frame)
-
-
-def _stop_workers(signum: int, frame: FrameType | None) -> None:
-    """The handler of a sweep: joblib's processes save their runs, and begin no other; a second signal acts at once."""
-    if not (workers := multiprocessing.active_children()):
-        signals.stop(signum, frame)
-    _stopped.append(signum)
-    for twice in signals.TWICE:
-        signal.signal(twice, signals.stop)
-    for worker in workers:
-        with suppress(ProcessLookupError):
-            os.kill(worker.pid, signum)  # type: ignore[arg-type]
 
 
 def _job(config: DictConfig) -> float | None:
@@ -197,7 +159,7 @@ def _end(error: BaseException, ending: exit_codes.Ending, folder: Path, *, resum
     """Log why a job ended, and exit; a job that fails in a sweep leaves a note instead, and the other jobs continue."""
     code, message = ending
     hydra_config = HydraConfig.get()
-    in_sweep = hydra_config.mode == RunMode.MULTIRUN
+    in_sweep = sweep.in_sweep()
     if in_sweep and resumes and isinstance(error, files.HeldError):
         _log.warning("left to the other process: %s", message)
         return
@@ -213,8 +175,8 @@ def _end(error: BaseException, ending: exit_codes.Ending, folder: Path, *, resum
         folder.rmdir()  # where nothing was written
     if code > exit_codes.SIGNALS and code - exit_codes.SIGNALS not in signals.STOPS:
         signal.raise_signal(code - exit_codes.SIGNALS)  # all is saved: now the launcher's handler may resubmit the job
-    if code > exit_codes.SIGNALS and _in_worker():
-        _stopped.append(code - exit_codes.SIGNALS)
+    if code > exit_codes.SIGNALS and sweep.in_worker():
+        sweep.stopped.append(code - exit_codes.SIGNALS)
         return
     sys.exit(code)
 
@@ -223,17 +185,16 @@ class SweepCallback(Callback):
     """Runs at the beginning and end of a sweep, in the process that was started; jobs may run in other processes."""
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        given = [override.lstrip("+").partition("=")[0] for override in config.hydra.overrides.task]
-        if OmegaConf.is_missing(config.data, "root") and "data.root" not in given:  # no job's own settings name it
-            _log.error("%s", missing("data.root"))  # of an error that a callback raises Hydra makes a warning
+        if refusal := sweep.refusal(config):
+            _log.error("%s", refusal)  # of an error that a callback raises Hydra makes a warning
             sys.exit(exit_codes.UNUSABLE)
-        signals.handle(_stop_workers)
+        signals.handle(sweep.stop_workers)
         for note in Path(config.hydra.sweep.dir).rglob(f"*{FAILED}"):  # of an earlier sweep
             note.unlink()
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        if _stopped:
-            sys.exit(exit_codes.SIGNALS + _stopped[0])
+        if sweep.stopped:
+            sys.exit(exit_codes.SIGNALS + sweep.stopped[0])
         folder = Path(config.hydra.sweep.dir)
         _report(folder)
         failed = defaultdict[str, list[int]](list)

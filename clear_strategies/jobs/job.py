@@ -13,7 +13,6 @@ from typing import Any, Final
 
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from clear_strategies import files
@@ -25,6 +24,7 @@ from clear_strategies.errors import DataError
 from clear_strategies.jobs import device, exit_codes, resume
 from clear_strategies.jobs import scene as scenes
 from clear_strategies.jobs.settings import JobSettings, settings_of
+from clear_strategies.jobs.sweep import in_sweep
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.outputs import metrics, plan, results
 from clear_strategies.outputs.metrics import Evaluation
@@ -108,7 +108,7 @@ class _Job:
                 score = finished.shown.mean.get("ours")
                 return None if score is None else score.psnr
         # In a sweep the console shows one line per job; the rest is in run.log.
-        level = logging.DEBUG if _in_sweep() else logging.INFO
+        level = logging.DEBUG if in_sweep() else logging.INFO
         asked, source = settings.fit, settings.data.source
         choices = plan.describe_choices(self.chosen, self.conductor, source, asked.iterations, asked.seed)
         _log.log(level, "%s", choices)
@@ -129,7 +129,7 @@ class _Job:
         evaluation, training = self._train(scene, there, state, drawing)
         seconds = time.perf_counter() - self.began
         _log.log(level, "%s", metrics.describe(folder, evaluation, seconds, _parts(scene, state, training)))
-        if _in_sweep():
+        if in_sweep():
             _log.info("%s", metrics.describe_job(HydraConfig.get().job.num, folder, evaluation, seconds))
         if few:
             _log.warning("%s.", few)
@@ -216,7 +216,3 @@ def _parts(scene: Scene, state: TrainState, training: float) -> dict[str, float]
     before = {**scene.work_log.entries, **{name: e for name, e in entries.items() if name == _PREPARED}}
     after = sum(entries[name].seconds for name in _AFTER if name in entries)
     return {**{name: e.seconds for name, e in before.items()}, "training": training, "scores and pictures": after}
-
-
-def _in_sweep() -> bool:
-    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN

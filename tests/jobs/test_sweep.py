@@ -68,6 +68,40 @@ def test_an_experiment_without_the_folder_of_its_scenes_is_refused_once_before_a
     assert not list(tmp_path.iterdir())
 
 
+LLFF = ["-m", "data=llff", "+strategy=clear,gco"]
+
+
+@pytest.mark.parametrize(
+    ("sweep", "reason"),
+    [
+        (LLFF, "data.path: is needed and missing. Add data.path=…."),
+        ([*LLFF, "data.path=gone/fern,gone/horns"], "gone: data.path: is not there: correct the path"),
+        (["-m", "+strategy=clear,gco", "prior=onnx", "prior.path=gone"], "gone: prior.path: is not there: correct the path"),
+        (["experiment=table1", "data.root=gone"], "gone: data.path: is not there: correct the path"),
+    ],
+)  # fmt: skip
+def test_a_sweep_whose_jobs_all_lack_the_same_is_refused_once_before_any_of_them_starts(sweep, reason, tmp_path):
+    result = run(*sweep, cwd=tmp_path)
+    assert (result.returncode, result.stdout + result.stderr) == (2, f"error: {reason}\n")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("swept", "failed"),
+    [
+        ([*LLFF, "data.path=gone,here"], 4),
+        (["-m", "prior=images,demo,onnx", *TINY], 2),  # the job between those that fail
+        (
+            ["-m", "prior=images", "prior.path=gone", "data.save_lr=lr", *TINY],
+            0,
+        ),  # the SR images are made of what this writes
+    ],
+)
+def test_a_sweep_whose_jobs_do_not_all_lack_the_same_begins(swept, failed, tmp_path):
+    result = run(*swept, "hydra.sweep.dir=all", cwd=tmp_path)
+    assert f"{failed} job(s) failed" in result.stdout if failed else not result.returncode, result.stdout
+
+
 @pytest.mark.slow
 def test_a_killed_run_goes_on_from_the_newest_whole_checkpoint_and_ends_the_same(whole, tmp_path):
     """SIGKILL, then a damaged newest checkpoint: the one before it is taken; seconds and counts go on."""
@@ -193,7 +227,9 @@ def test_a_clusters_announcement_saves_before_its_handler_acts(tmp_path):
 def test_failed_jobs_are_told_where_the_report_cannot_be_written(tmp_path, caplog):
     callback, config = (
         SweepCallback(),
-        OmegaConf.create({"data": {}, "hydra": {"sweep": {"dir": str(tmp_path)}, "overrides": {"task": []}}}),
+        OmegaConf.create(
+            {"hydra": {"sweep": {"dir": str(tmp_path)}, "runtime": {"choices": {"hydra/sweeper": "optuna"}}}}
+        ),
     )
     make_run(tmp_path / "0")
     (tmp_path / "0" / FAILED).write_text("job 0: of an earlier sweep")

@@ -1,0 +1,123 @@
+"""A sweep of jobs: why none of them can begin, and how a signal reaches those that joblib runs in processes of their own."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+
+from clear_strategies.compose import flat
+from clear_strategies.errors import DataError
+from clear_strategies.files import expanded
+from clear_strategies.settings import missing
+from clear_strategies.training import signals
+
+# Launchers whose jobs see the folders that the process sees which was started; on the nodes of a cluster there may be others.
+_LOCAL: Final = ("basic", "cores", "joblib", "submitit_local")
+
+stopped: Final = list[int]()
+"""The signals by which a sweep of several processes was stopped: in the process that was started, and in each of the others."""
+
+
+def in_sweep() -> bool:
+    """Whether this job is one of a sweep."""
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+
+
+def refusal(config: DictConfig) -> str | None:
+    """Why every job of a sweep would fail: the value, folder or file that all of them lack; None where one may not fail.
+
+    Jobs are composed until one lacks nothing, or something else than the first.
+
+    Args:
+        config: of the sweep, as Hydra gives it to callbacks.
+    """
+    try:
+        lacks = map(_lack, _jobs(config))
+        first = next(lacks, None)
+        return first if first and all(lack == first for lack in lacks) else None
+    except HydraException:  # Hydra, which composes all jobs next, tells it
+        return None
+
+
+def _jobs(config: DictConfig) -> Iterator[DictConfig]:
+    """The configuration of each job; none where another sweeper than Hydra's own chooses the values."""
+    hydra = config.hydra
+    if hydra.runtime.choices["hydra/sweeper"] != "basic":
+        return
+    loader = GlobalHydra.instance().config_loader()
+    words = [*(f"{key}={values}" for key, values in (hydra.sweeper.params or {}).items()), *hydra.overrides.task]
+    (jobs,) = BasicSweeper.split_arguments(OverridesParser.create(loader).parse_overrides(words), None)
+    for overrides in jobs:
+        yield loader.load_sweep_config(config, overrides)
+
+
+def _lack(config: DictConfig) -> str | None:
+    """What a job needs and has not."""
+    values = flat(OmegaConf.to_container(config))  # type: ignore[arg-type]
+    if absent := [key for key, value in values.items() if value == "???" and not key.startswith("hydra.")]:
+        return str(missing(absent[0]))
+    done = config.fit.resume == "auto" and any(
+        Path(config.hydra.sweep.dir).rglob("metrics.json")
+    )  # jobs that read nothing
+    if done or config.hydra.runtime.choices["hydra/launcher"] not in _LOCAL:
+        return None
+    for key in ("data.path", *["prior.path"] * (config.data.save_lr is None)):
+        if path := OmegaConf.select(config, key):
+            whole = Path(expanded(path))
+            # The first folder of the path that is not there is the same for all scenes of a wrong data.root.
+            if gone := [part for part in (*reversed(whole.parents), whole) if not part.exists()]:
+                return str(DataError(gone[0], key, "is not there", "correct the path"))
+    return None
+
+
+def in_worker() -> bool:
+    """Whether this is a process of joblib's, which ends all others at once where one of them ends or has an error."""
+    return HydraConfig.get().mode == RunMode.MULTIRUN and multiprocessing.parent_process() is not None
+
+
+@contextmanager
+def first_signal_ends_job() -> Iterator[None]:
+    """A job in a process of joblib's: the first signal ends it, after it has saved."""
+    signals.handle(_end_job)
+    try:
+        yield
+    finally:
+        signals.handle(_note)
+
+
+def _note(signum: int, _frame: FrameType | None) -> None:
+    """The handler of joblib's processes between two jobs."""
+    stopped.append(signum)
+
+
+def _end_job(signum: int, frame: FrameType | None) -> None:
+    """The handler of joblib's processes in a job, where no step defers signals."""
+    if not stopped and not signals.asked():
+        _note(signum, frame)
+        signals.stop(signum, frame)
+
+
+def stop_workers(signum: int, frame: FrameType | None) -> None:
+    """The handler of a sweep: joblib's processes save their runs, and begin no other; a second signal acts at once."""
+    if not (workers := multiprocessing.active_children()):
+        signals.stop(signum, frame)
+    stopped.append(signum)
+    for twice in signals.TWICE:
+        signal.signal(twice, signals.stop)
+    for worker in workers:
+        with suppress(ProcessLookupError):
+            os.kill(worker.pid, signum)  # type: ignore[arg-type]
