@@ -5,6 +5,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from functools import partial
 from importlib import metadata
 
 import pytest
@@ -153,13 +154,24 @@ def test_doctor_names_versions_memory_backends_and_missing_extras(capsys, monkey
     assert set(doctor.EXTRAS) == set(extras) - {"photos", "docs", "dev"}
 
 
+def test_gsplat_which_has_cut_offs_of_its_own_alone_is_tested_by_them(capsys, monkeypatch):
+    load, here = (
+        rasterizers.load,
+        {"device": "cpu", "rasterization": partial(rasterizers.rasterization, backend="torch")},
+    )
+    monkeypatch.setattr(rasterizers, "names", lambda: ["gsplat"])
+    monkeypatch.setattr(rasterizers, "load", lambda name, **s: load(name, **s, **(here if name == "gsplat" else {})))
+    doctor.main([])
+    assert "gsplat                  works: differs from the reference by" in capsys.readouterr().out
+
+
 def test_a_backend_that_draws_something_else_is_an_error(capsys, monkeypatch):
     load = rasterizers.load
 
     def darker(name, **settings):
         return load(name, **settings) if name != "torch" or "alpha_max" in settings else load(name, alpha_max=0.3)
 
-    reference = load("torch", preset="accurate")
+    reference = load("torch")
     monkeypatch.setattr(rasterizers, "names", lambda: ["torch"])
     calls = iter([reference])
     monkeypatch.setattr(rasterizers, "load", lambda name, **s: next(calls, None) or darker(name))
