@@ -23,34 +23,23 @@ from pathlib import Path
 from typing import Any, Final
 
 import matplotlib as mpl
+import matplotlib.pyplot as plt
+import sweep_figures  # beside this file, as style
+from style import save
 
-mpl.use("Agg")
-mpl.rcParams.update(
-    {
-        "svg.hashsalt": "clear",
-        "svg.fonttype": "none",
-        "font.size": 9,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-    }
-)
-
-import matplotlib.pyplot as plt  # noqa: E402 - after the backend was chosen
-import numpy as np  # noqa: E402
-import pandas as pd  # noqa: E402
-
-from clear_strategies.data.photo_files import read_image  # noqa: E402
-from clear_strategies.errors import ClearError, DataError  # noqa: E402
-from clear_strategies.outputs.figures import SheetRow, write_contact_sheet  # noqa: E402
-from clear_strategies.report.paper import data_of  # noqa: E402
-from clear_strategies.report.runs import FinishedRun, collect  # noqa: E402
+from clear_strategies.errors import ClearError
+from clear_strategies.report.runs import collect
 
 DOCS: Final = Path(__file__).resolve().parent
 GREY: Final = "0.6"
 
 
+def csv_file(name: str) -> Path:
+    return DOCS / "data" / "evidence" / f"{name}.csv"
+
+
 def table(name: str) -> list[dict[str, str]]:
-    with (DOCS / "data" / "evidence" / f"{name}.csv").open(encoding="utf-8", newline="") as file:
+    with csv_file(name).open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
 
 
@@ -63,16 +52,6 @@ def numbers(cell: str) -> list[float]:
 def error(cell: str) -> float:
     """The number after ±; 0 without one."""
     return float(cell.partition("±")[2] or 0)
-
-
-def write(figure: Any, folder: Path, name: str) -> None:
-    save(figure, folder / f"evidence_{name}.svg")
-
-
-def save(figure: Any, path: Path) -> None:
-    figure.tight_layout()
-    figure.savefig(path, metadata={"Date": None})
-    plt.close(figure)
 
 
 def ablation(folder: Path) -> None:
@@ -96,8 +75,8 @@ def ablation(folder: Path) -> None:
     axes.axhline(0, color=GREY, linewidth=1)
     axes.set_xticks(range(len(methods)), methods)
     axes.set_ylabel("Δ PSNR over the baseline, dB")
-    axes.legend(fontsize=7, ncols=3, frameon=False)
-    write(figure, folder, "ablation")
+    axes.legend(ncols=3)
+    save(figure, folder / "evidence_ablation.svg")
 
 
 def skips(folder: Path) -> None:
@@ -109,10 +88,9 @@ def skips(folder: Path) -> None:
         (line,) = axes.plot(seconds, [p - psnr[0] for p in psnr], marker="o", label=row["scene"])
         axes.errorbar(seconds[1], psnr[1] - psnr[0], error(row["Δ"]), color=line.get_color(), elinewidth=1)
     axes.axhline(0, color=GREY, linewidth=1, zorder=0)
-    axes.set_xlabel("seconds (right: everything drawn, left: default skips)")
-    axes.set_ylabel("Δ PSNR, dB")
-    axes.legend(fontsize=7, frameon=False)
-    write(figure, folder, "skips")
+    axes.set(xlabel="seconds (right: everything drawn, left: default skips)", ylabel="Δ PSNR, dB")
+    axes.legend()
+    save(figure, folder / "evidence_skips.svg")
 
 
 def best(folder: Path) -> None:
@@ -124,7 +102,7 @@ def best(folder: Path) -> None:
     axes.axhline(0, color=GREY, linewidth=1)
     axes.set_xticks(places, [f"{row['scene']}\n{numbers(row['baseline'])[0]:.2f} dB" for row in rows])
     axes.set_ylabel("Δ PSNR of best, dB")
-    write(figure, folder, "best")
+    save(figure, folder / "evidence_best.svg")
 
 
 def hosts(folder: Path) -> None:
@@ -141,10 +119,9 @@ def hosts(folder: Path) -> None:
         label = "alone, its own points" if strategies == "none" else f"{strategies}, from stereo"
         axes.bar([i + 0.25 * (k - 1) for i in range(len(names))], heights, width=0.23, label=label)
     axes.set_xticks(range(len(names)), names)
-    axes.set_ylim(14, None)
-    axes.set_ylabel("PSNR at HR, dB")
-    axes.legend(fontsize=7, ncols=3, frameon=False, loc="upper left", bbox_to_anchor=(0, 1.16))
-    write(figure, folder, "hosts")
+    axes.set(ylim=(14, None), ylabel="PSNR at HR, dB")
+    axes.legend(ncols=3, loc="upper left", bbox_to_anchor=(0, 1.16))
+    save(figure, folder / "evidence_hosts.svg")
 
 
 def conflict(folder: Path) -> None:
@@ -156,9 +133,9 @@ def conflict(folder: Path) -> None:
             of_method = [(float(row[x]), float(row["conflict"])) for row in rows if row["method"] == method]
             axes.plot(*zip(*of_method, strict=True), marker="o" if x == "views" else None, markersize=4, label=method)
         axes.set_xlabel(f"training {x}" if x == "views" else x)
-        axes.legend(fontsize=7, frameon=False)
+        axes.legend()
     by_views.set_ylabel("Gaussians in conflict")
-    write(figure, folder, "conflict")
+    save(figure, folder / "evidence_conflict.svg")
 
 
 def training_time(folder: Path) -> None:
@@ -168,173 +145,13 @@ def training_time(folder: Path) -> None:
     figure, all_axes = plt.subplots(1, len(scenes), figsize=(7, 2.4), squeeze=False)
     for axes, scene in zip(all_axes[0], scenes, strict=True):
         for method in dict.fromkeys(row["method"] for row in rows):
-            axes.plot(*curve(rows, scene, method), marker=".", label=method)
-        axes.set_title(scene)
-        axes.set_xlabel("processor seconds")
+            of_run = [row for row in rows if (row["scene"], row["method"]) == (scene, method)]
+            seconds, psnr = ([float(row[key]) for row in of_run] for key in ("processor seconds", "PSNR (dB)"))
+            axes.plot(seconds, psnr, marker=".", label=method)
+        axes.set(title=scene, xlabel="processor seconds")
     all_axes[0][0].set_ylabel("PSNR of the test views, dB")
-    all_axes[0][0].legend(fontsize=7, frameon=False)
-    write(figure, folder, "training_time")
-
-
-def curve(rows: list[dict[str, str]], scene: str, method: str) -> tuple[list[float], list[float]]:
-    """Seconds and PSNR of a run of `training_time.csv`."""
-    of_run = [row for row in rows if (row["scene"], row["method"]) == (scene, method)]
-    return [float(row["processor seconds"]) for row in of_run], [float(row["PSNR (dB)"]) for row in of_run]
-
-
-def collect_training_time(sweep: Path) -> None:
-    """Write `training_time.csv` from the runs of experiment=training_time, and print their table."""
-    tables, stages, runs_of_sweep = [], {}, collect([sweep])
-    names, seeds = lines_of(runs_of_sweep), {run.seed for run in runs_of_sweep}
-    for run in runs_of_sweep:
-        name = f"{names[run]}, seed {run.seed}" if len(seeds) > 1 else names[run]
-        history = table_of(run, "history.csv", "t", "psnr_test", "processor_seconds")
-        probed = history.dropna(subset="psnr_test")
-        seconds, psnr = probed["processor_seconds"].round(1), probed["psnr_test"].round(3)
-        tables.append(
-            pd.DataFrame({"scene": run.scene, "method": name, "processor seconds": seconds, "PSNR (dB)": psnr})
-        )
-        runs = table_of(run, "timing.csv", "stage", "runs").set_index("stage")["runs"]
-        whole = history["processor_seconds"].iloc[-1]
-        first = history[history["t"] <= runs.get("first stage", 0)]["processor_seconds"].max()
-        stages[run.scene, name] = [whole] if pd.isna(first) else [first, whole - first]
-    pd.concat(tables).to_csv(DOCS / "data" / "evidence" / "training_time.csv", index=False)
-    rows = table("training_time")
-    lines = ["| scene | method | processor seconds | PSNR (dB) | seconds to equal PSNR |", "|---|---|---|---|---|"]
-    for scene in dict.fromkeys(scene for scene, _ in stages):
-        curves = {method: curve(rows, scene, method) for of, method in stages if of == scene}
-        equal = min(max(psnr) for _, psnr in curves.values())
-        for method, (seconds, psnr) in curves.items():
-            until = next(s for s, p in zip(seconds, psnr, strict=True) if p >= equal)
-            took = " + ".join(f"{of_stage:.0f}" for of_stage in stages[scene, method])
-            lines.append(f"| {scene} | {method} | {took} | {psnr[-1]:.2f} | {until:.0f}, to {equal:.2f} dB |")
-    sys.stdout.write("\n".join(lines) + "\n")
-
-
-def lines_of(runs: Sequence[FinishedRun]) -> dict[FinishedRun, str]:
-    """The line of each run in a figure: its name, and the readings where they are not the same for all."""
-    readings = {run: next((s for s in run.settings if s.startswith("readings=")), "") for run in runs}
-    return {
-        run: f"{run.name}, {of}" if of and len({*readings.values()}) > 1 else run.name for run, of in readings.items()
-    }
-
-
-def table_of(run: FinishedRun, name: str, *columns: str) -> pd.DataFrame:
-    """These columns of a CSV file of a run; each has a number at least."""
-    path = run.folder / name
-    try:
-        table = pd.read_csv(path)
-    except (OSError, ValueError) as error:
-        raise unfit(path, "file", f"cannot be read ({error})") from error
-    if absent := [column for column in columns if column not in table or table[column].isna().all()]:
-        raise unfit(path, absent[0], "has no numbers")
-    return table[[*columns]]
-
-
-def unfit(path: Path, field: str, problem: str) -> DataError:
-    """The error for a run that a figure cannot be drawn from."""
-    return DataError(path, field, problem, "give the sweep of the experiment that has the figure's name")
-
-
-def averaged(table: pd.DataFrame, *by: str) -> pd.DataFrame:
-    """Means over scenes of the means over seeds."""
-    return table.groupby([*by, "scene"], sort=False).mean().groupby([*by], sort=False).mean().reset_index()
-
-
-def figure1b(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """The share of Gaussians in conflict by the number of training views."""
-    lines = lines_of(runs)
-    rows = [
-        {"line": lines[run], "views": views_of(run), "scene": run.scene, "conflict": run.numbers["conflict"]}
-        for run in runs
-    ]
-    figure, axes = plt.subplots(figsize=(4, 2.6))
-    for line, of_line in averaged(pd.DataFrame(rows), "line", "views").groupby("line", sort=False):
-        points = of_line.sort_values("views")
-        axes.plot(points["views"], points["conflict"], marker="o", markersize=4, label=line)
-    axes.set_xlabel("training views")
-    axes.set_ylabel("Gaussians in conflict")
-    axes.legend(fontsize=7, frameon=False)
-    save(figure, folder / "figure1b.svg")
-
-
-def views_of(run: FinishedRun) -> int:
-    """The number of training views that an override of the run asks for."""
-    asked = (value for s in run.settings for key, _, value in [s.partition("=")] if key == "data.views.train")
-    if not (number := next(asked, "")).isdecimal():
-        raise unfit(run.folder, "data.views.train", "is no setting of this run")
-    return int(number)
-
-
-def figure1c(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """PSNR, SSIM and GMSD of the methods by data set."""
-    scores = {"psnr": "PSNR, dB", "ssim": "SSIM", "gmsd": "GMSD"}
-    lines = lines_of(runs)
-    rows = [
-        {
-            "line": lines[run],
-            "data": data_of(run) or run.scene,
-            "scene": run.scene,
-            **{s: run.numbers[s] for s in scores},
-        }
-        for run in runs
-    ]
-    means = averaged(pd.DataFrame(rows), "line", "data").set_index(["data", "line"])
-    figure, all_axes = plt.subplots(1, len(scores), figsize=(9, 2.8))
-    for axes, (score, title) in zip(all_axes, scores.items(), strict=True):
-        means[score].unstack(sort=False).plot.bar(
-            ax=axes, rot=0, legend=score == "ssim", xlabel="", ylabel=title, width=0.8
-        )
-    all_axes[1].legend(fontsize=6, frameon=False, ncols=3, loc="upper center", bbox_to_anchor=(0.5, 1.3))
-    save(figure, folder / "figure1c.svg")
-
-
-def figure3(runs: Sequence[FinishedRun], folder: Path, name: str = "figure3") -> None:
-    """A test view of each scene: the LR photo, the picture of every method, the truth, and the part where they differ most."""
-    sheet = []
-    for scene in dict.fromkeys(run.scene for run in runs):
-        of_scene = [run for run in runs if run.scene == scene]
-        views = [{path.stem for path in (run.folder / "renders").glob("*.png")} for run in of_scene]
-        if not (shared := sorted(set.intersection(*views))):
-            raise unfit(of_scene[0].folder, "renders", f"have no view that every run of {scene} has")
-        view = shared[0]
-        beside = of_scene[0].folder / "views" / view
-        drawn = {line: picture(run.folder / "renders" / f"{view}.png") for run, line in lines_of(of_scene).items()}
-        lr, truth = picture(Path(f"{beside}_lr.png")), picture(Path(f"{beside}_truth.png"))
-        if sizes := {image.shape for image in drawn.values()} - {truth.shape}:
-            raise unfit(of_scene[0].folder, view, f"has several sizes in {scene}: {truth.shape}, {sizes.pop()}")
-        factor = len(truth) // len(lr)
-        images = {"input": lr.repeat(factor, 0).repeat(factor, 1), **drawn, "truth": truth}
-        captions = {line: f"{run.numbers['psnr']:.2f} dB" for run, line in lines_of(of_scene).items()}
-        sheet.append(SheetRow(scene, images, captions, drawn))
-    write_contact_sheet(folder / f"{name}.png", sheet, ", ".join(row.name for row in sheet), "dB: of all test views")
-
-
-def picture(path: Path) -> np.ndarray:
-    return np.asarray(read_image(path))
-
-
-def figure5(runs: Sequence[FinishedRun], folder: Path, parts: int = 50) -> None:
-    """The share of Gaussians in conflict in training, and a test view of each rung."""
-    tables = []
-    for run, line in lines_of(runs).items():
-        conflict = table_of(run, "conflict.csv", "t", "conflict")
-        part = (
-            conflict["t"] * parts // (conflict["t"].max() + 1) + 0.5
-        ) / parts  # scenes may differ in their iterations
-        tables.append(conflict.assign(line=line, scene=run.scene, part=part))
-    figure, axes = plt.subplots(figsize=(5, 2.8))
-    for line, of_line in averaged(pd.concat(tables), "line", "part").groupby("line", sort=False):
-        points = of_line.sort_values("part")
-        axes.plot(points["part"], points["conflict"], label=line)
-    axes.set_xlabel("part of the training")
-    axes.set_ylabel("Gaussians in conflict")
-    axes.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
-    save(figure, folder / "figure5.svg")
-    figure3([run for run in runs if run.seed == runs[0].seed], folder, "figure5_views")
-
-
-OF_SWEEPS: Final = {draw.__name__: draw for draw in (figure1b, figure1c, figure3, figure5)}
+    all_axes[0][0].legend()
+    save(figure, folder / "evidence_training_time.svg")
 
 
 def main(folder: Path) -> None:
@@ -444,11 +261,12 @@ def command(words: Sequence[str]) -> None:
         case []:
             main(DOCS / "images")
         case ["training_time", sweep]:
-            collect_training_time(Path(sweep))
+            runs = collect([Path(sweep)])
+            sys.stdout.write(sweep_figures.write_training_time(runs, csv_file("training_time")))
             training_time(DOCS / "images")
-        case [name, *sweeps] if name in OF_SWEEPS and sweeps:
+        case [name, *sweeps] if name in sweep_figures.DRAWN and sweeps:
             folders = list(map(Path, sweeps))
-            OF_SWEEPS[name](collect(folders), folders[0])
+            sweep_figures.DRAWN[name](collect(folders), folders[0])
         case ["demo", *overrides]:
             demo(DOCS / "images", *overrides)
         case ["host"]:

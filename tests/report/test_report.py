@@ -283,7 +283,7 @@ def test_the_papers_numbers_stand_beside_ours(tmp_path: Path) -> None:
 
 def test_the_papers_figures_are_drawn_from_a_sweep(tmp_path: Path) -> None:
     """A point for each number of views, a bar for each method, a line for each rung: means over scenes and seeds."""
-    figures = loaded(DOCS / "figures.py")
+    figures = loaded(DOCS / "sweep_figures.py")
     for k, (scene, views, strategy) in enumerate(itertools.product(("fern", "horns"), (3, 6), ("baseline", "clear"))):
         share = 0.1 * views + 0.02 * (scene == "horns")
         settings = [f"+strategy={strategy}", f"data.views.train={views}"]
@@ -294,7 +294,7 @@ def test_the_papers_figures_are_drawn_from_a_sweep(tmp_path: Path) -> None:
     drawn: dict[str, Any] = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(figures, "save", lambda figure, path: drawn.setdefault(path.name, figure))
-        for draw in figures.OF_SWEEPS.values():
+        for draw in figures.DRAWN.values():
             draw(runs, tmp_path)
     lines = {
         name: [line.get_xydata() for line in drawn[name].axes[0].lines] for name in ("figure1b.svg", "figure5.svg")
