@@ -22,6 +22,7 @@ from clear_strategies.data.photo_files import PNG_LEVEL
 from clear_strategies.files import write_bytes
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
 
 DPI: Final = 100
@@ -80,10 +81,6 @@ def save(figure: Figure, path: Path) -> None:
     how = {"png": {"compress_level": PNG_LEVEL}, "jpg": {"quality": _JPEG_QUALITY, "subsampling": 0}}[kind]
     figure.savefig(buffer, format=kind, dpi=DPI, pil_kwargs=how)
     write_bytes(path, buffer.getvalue())
-
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 def write_curves(path: Path, histories: Mapping[str, pd.DataFrame], title: str) -> None:
@@ -174,11 +171,36 @@ def window(images: Sequence[np.ndarray]) -> tuple[slice, slice]:
     return max(windows, key=lambda window: float(deviation[window].sum())) if deviation.any() else middle
 
 
+class _Sheet:
+    """A figure of `width` x `height` px, on which things are placed in px from its upper left corner. It has no axes, which take
+    matplotlib longer than all the rest.
+
+    Args:
+        larger: how many times larger letters are.
+    """
+
+    def __init__(self, width: int, height: int, larger: float = 1.0) -> None:
+        from matplotlib.figure import Figure
+
+        self.figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
+        self._width, self._height, self._larger = width, height, larger
+
+    def text(self, x: float, y: float, words: str, size: float = 8.5, **style: Any) -> None:
+        style = {"ha": "center", "va": "center", "color": INK, **AS_WRITTEN, **style}
+        self.figure.text(x / self._width, 1 - y / self._height, words, fontsize=size * self._larger, **style)
+
+    def image(self, pixels: np.ndarray, x: int, y: int, **colors: Any) -> Any:
+        return self.figure.figimage(pixels, x, self._height - y - len(pixels), **colors)
+
+    def box(self, x: float, y: float, w: float, h: float) -> tuple[float, float, float, float]:
+        """The place of w x h px in matplotlib's units: parts of the figure, from its lower left corner."""
+        return x / self._width, 1 - (y + h) / self._height, w / self._width, h / self._height
+
+
 def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: str = "") -> None:
     """Draw the rows below the names of their columns, and a bar of colours beside them where there are errors. `note` stands
     below.
     """
-    from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle
 
     columns = list(dict.fromkeys(column for row in rows for column in row.images))
@@ -195,41 +217,33 @@ def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: 
     tops = [top + j * (cell_h + 2 * line + _GAP) + sum(part_h[:j]) for j in range(len(rows) + 1)]
     right, with_bar = left + len(columns) * (cell_w + _GAP), any(len(shape) == 2 for shape in shapes)
     width, height = right + 5 * line * with_bar, tops[-1] + line
-    figure, error = Figure(figsize=(width / DPI, height / DPI), dpi=DPI), None
-
-    def text(x: float, y: float, words: str, size: float = 8.5, **style: Any) -> None:
-        style = {"fontsize": size * larger, "ha": "center", "va": "center", "color": INK, **AS_WRITTEN, **style}
-        figure.text(x / width, 1 - y / height, words, **style)
-
-    def box(x: float, y: float, w: float, h: float) -> tuple[float, float, float, float]:
-        return x / width, 1 - (y + h) / height, w / width, h / height
-
-    def image(shown: np.ndarray, x: int, y: int) -> Any:
-        return figure.figimage(shown, x, height - y - len(shown), cmap="magma", vmin=0, vmax=ERROR_MAX)
-
-    text(_GAP, 1.5 * line, title, 12, ha="left")
+    sheet, error, errors = _Sheet(width, height, larger), None, {"cmap": "magma", "vmin": 0, "vmax": ERROR_MAX}
+    sheet.text(_GAP, 1.5 * line, title, 12, ha="left")
     for i, lines in enumerate(heads):
         x = left + i * (cell_w + _GAP)
-        text(x + cell_w / 2, top - line / 2, "\n".join(lines), 10, va="bottom")
+        sheet.text(x + cell_w / 2, top - line / 2, "\n".join(lines), 10, va="bottom")
         for y, row, part, below in zip(tops, rows, parts, part_h, strict=False):
             if (pixels := row.images.get(columns[i])) is not None:
-                drawn = image(_resized(pixels, times), x, y)
+                drawn = sheet.image(_resized(pixels, times), x, y, **errors)
                 error = drawn if pixels.ndim == 2 else error
                 if part is not None:
-                    image(_resized(pixels[part], zoom), x, y + cell_h + _GAP)
+                    sheet.image(_resized(pixels[part], zoom), x, y + cell_h + _GAP, **errors)
                     down, across = (slice(times * s.start, times * s.stop) for s in part)
-                    place = box(x + across.start, y + down.start, across.stop - across.start, down.stop - down.start)
-                    figure.add_artist(Rectangle(place[:2], *place[2:], fill=False, color="white", linewidth=1))
-            text(x + cell_w / 2, y + cell_h + below + line, row.captions.get(columns[i], ""))
+                    place = sheet.box(
+                        x + across.start, y + down.start, across.stop - across.start, down.stop - down.start
+                    )
+                    sheet.figure.add_artist(Rectangle(place[:2], *place[2:], fill=False, color="white", linewidth=1))
+            sheet.text(x + cell_w / 2, y + cell_h + below + line, row.captions.get(columns[i], ""))
     for y, row in zip(tops, rows, strict=False):
-        text(line, y + cell_h / 2, row.name, rotation=90, color=FAINT)
-    text(left, height - line, note, ha="left", color=FAINT)
+        sheet.text(line, y + cell_h / 2, row.name, rotation=90, color=FAINT)
+    sheet.text(left, height - line, note, ha="left", color=FAINT)
     if error is not None:
-        bar = figure.colorbar(error, cax=figure.add_axes(box(right, top, 12, cell_h)), extend="max", extendfrac=0.03)
+        beside = sheet.figure.add_axes(sheet.box(right, top, 12, cell_h))
+        bar = sheet.figure.colorbar(error, cax=beside, extend="max", extendfrac=0.03)
         bar.set_label("mean |difference| over RGB", fontsize=8 * larger, color=INK)
         bar.ax.tick_params(labelsize=8 * larger, colors=INK)
         bar.outline.set_visible(False)
-    save(figure, path)
+    save(sheet.figure, path)
 
 
 def write_tiles(path: Path, tiles: Mapping[str, np.ndarray], title: str, columns: int) -> None:
@@ -239,7 +253,6 @@ def write_tiles(path: Path, tiles: Mapping[str, np.ndarray], title: str, columns
         tiles: RGB [H, W, 3], or numbers in [0, 1], [H, W], which get colours: dark is 0, bright is 1, grey is nan.
     """
     from matplotlib import colormaps
-    from matplotlib.figure import Figure
 
     h, w = (max(image.shape[axis] for image in tiles.values()) for axis in (0, 1))
     cell_h, cell_w = (round(magnification(h, w) * size) for size in (h, w))
@@ -247,16 +260,14 @@ def write_tiles(path: Path, tiles: Mapping[str, np.ndarray], title: str, columns
     head = (2 + max(name.count("\n") for name in heads)) * _LINE
     width = _GAP + min(columns, len(tiles)) * (cell_w + _GAP)
     height = 2 * _LINE + -(-len(tiles) // columns) * (head + cell_h) + _GAP
-    figure, colors = Figure(figsize=(width / DPI, height / DPI), dpi=DPI), colormaps["viridis"].with_extremes(bad=RULE)
-    # No axes: these take matplotlib longer than all the rest.
+    sheet, numbers = _Sheet(width, height), colormaps["viridis"].with_extremes(bad=RULE)
+    sheet.text(_GAP, 1.2 * _LINE, title, 12, ha="left")
     for i, (name, image) in enumerate(zip(heads, tiles.values(), strict=True)):
-        x, top = _GAP + i % columns * (cell_w + _GAP), 2 * _LINE + i // columns * (head + cell_h) + head
+        x, y = _GAP + i % columns * (cell_w + _GAP), 2 * _LINE + i // columns * (head + cell_h) + head
         shown = _resized(image, min(cell_h / image.shape[0], cell_w / image.shape[1]))
-        figure.figimage(shown, x, height - top - len(shown), cmap=colors, vmin=0, vmax=1)
-        middle, above = (x + cell_w / 2) / width, 1 - (top - _LINE / 3) / height
-        figure.text(middle, above, name, fontsize=8.5, ha="center", va="bottom", color=INK, **AS_WRITTEN)
-    figure.text(_GAP / width, 1 - 1.2 * _LINE / height, title, fontsize=12, va="center", color=INK, **AS_WRITTEN)
-    save(figure, path)
+        sheet.image(shown, x, y, cmap=numbers, vmin=0, vmax=1)
+        sheet.text(x + cell_w / 2, y - _LINE / 3, name, va="bottom")
+    save(sheet.figure, path)
 
 
 def _resized(pixels: np.ndarray, times: float) -> np.ndarray:
