@@ -57,17 +57,14 @@ def _beside(printed: pd.DataFrame, runs: Sequence[FinishedRun]) -> pd.DataFrame:
         for run in runs
     ]
     by_scene = pd.DataFrame(records).groupby(["row", "label", "scene"], sort=False).mean(numeric_only=True)
-    means = by_scene.groupby(["row", "label"], sort=False).mean().reset_index()
-    table = printed.merge(means, "left", left_on="ours", right_on="row", suffixes=("_paper", ""))
-    method = table["method"] + table["label"].fillna("")
-    cells = {"method": method}
+    means = by_scene.groupby(["row", "label"], sort=False).mean().reindex(columns=[*_COLUMNS]).reset_index()
+    paper = {quantity: f"{quantity}_paper" for quantity in _COLUMNS}
+    table = printed.rename(columns=paper).merge(means, "left", left_on="ours", right_on="row")
+    cells = {"method": table["method"] + table["label"].fillna("")}
     for quantity, (header, form) in _COLUMNS.items():
-        ours = table[quantity] if f"{quantity}_paper" in table else pd.Series(float("nan"), table.index)
-        paper = table[f"{quantity}_paper"] if f"{quantity}_paper" in table else table[quantity]
-        if paper.notna().any():
-            cells |= {
-                name: [_number(v, form) for v in of] for name, of in ((header, ours), (f"{header}, paper", paper))
-            }
+        if table[paper[quantity]].notna().any():
+            cells[header] = [_number(value, form) for value in table[quantity]]
+            cells[f"{header}, paper"] = [_number(value, form) for value in table[paper[quantity]]]
     return pd.DataFrame({**cells, "source": table["source"]})
 
 
