@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
-import re
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
 
 class ClearError(Exception):
@@ -61,38 +57,3 @@ class HostError(ClearError, RuntimeError):
 def one_line(text: object) -> str:
     """A text, or the message of an error, in one line."""
     return " ".join(str(text).split())
-
-
-_NO_OPTION: Final = re.compile(
-    r"Could not find '([^']+)/([^'/]+)'\s+Available options in '[^']*':(.*?)Config search path", re.DOTALL
-)
-
-_CHOSEN: Final = re.compile(r"Multiple values for (\S+)\. To override a value use 'override \S+: (\S+)'")
-
-_LAUNCHER: Final = re.compile(
-    r"Could not (?:load|find) 'hydra/launcher/((joblib|submitit|ray)(?:_local|_slurm|_aws)?)'"
-)
-"""A launcher that a package `hydra-NAME-launcher` brings."""
-
-
-def of_hydra(error: Exception) -> str:
-    """The message of an error of Hydra's, in one line: of an option that is not there, the nearest one and all others, or the
-    package that brings it.
-    """
-    if (launcher := _LAUNCHER.search(str(error))) is not None:
-        name, package = launcher.groups()
-        return f"hydra/launcher: {name} is not installed: pip install hydra-{package}-launcher."
-    if (chosen := _CHOSEN.fullmatch(one_line(error))) is not None:
-        group, name = chosen.groups()
-        return f"+{group}={name}: a choice of this group is there already. Replace it: {group}={name}."
-    if (match := _NO_OPTION.search(str(error))) is None:
-        return one_line(error)
-    group, name, listed = match.groups()
-    return no_option(group, name, [option for option in listed.split() if not option.startswith("_")])
-
-
-def no_option(group: str, name: str, options: Sequence[str]) -> str:
-    """The message for an option that a group of conf/ does not have."""
-    near = difflib.get_close_matches(name, options, 1)
-    suggestion = f" Did you mean {near[0]}?" if near else ""
-    return f"{group}={name}: there is no such option.{suggestion} There are {', '.join(options)}."

@@ -27,9 +27,11 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from clear_strategies import console, files
-from clear_strategies.compose import CONF, not_composed, quoted, require_each_once
+from clear_strategies.compose import quoted, require_each_once
 from clear_strategies.errors import ClearError, SettingError
+from clear_strategies.hydra_errors import not_composed
 from clear_strategies.jobs import exit_codes, sweep
+from clear_strategies.options import CONF
 from clear_strategies.training import signals
 
 _log = logging.getLogger(__name__)

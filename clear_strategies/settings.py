@@ -77,6 +77,16 @@ def defaults_of(target: str, *field: str) -> Any:
     return functools.reduce(lambda node, name: node[name], field, _defaults(_located(target)))
 
 
+def flat(node: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
+    """The leaves of a tree by their dotted keys. The entries of a list that holds tables or lists have their number as key."""
+    leaves: dict[str, Any] = {}
+    for name, value in node.items():
+        nested = isinstance(value, list) and any(isinstance(entry, dict | list) for entry in value)
+        below = dict(enumerate(value)) if nested else value
+        leaves |= flat(below, f"{prefix}{name}.") if isinstance(below, dict) else {f"{prefix}{name}": value}
+    return leaves
+
+
 def build(node: Any, key: str = "") -> Any:
     """What a node describes: the result of its call, with the nodes inside it built first.
 

@@ -10,13 +10,15 @@ from hydra.errors import ConfigCompositionException
 
 from clear_strategies import GCO, P2G, SVS, Conductor, hydra_app
 from clear_strategies import compose as compose_module
-from clear_strategies.compose import CONF, conductor, tree
+from clear_strategies.compose import conductor, tree
 from clear_strategies.data.priors import BackProjected, Bicubic
 from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.errors import SettingError
+from clear_strategies.hydra_errors import not_composed
 from clear_strategies.jobs import device
 from clear_strategies.jobs.settings import settings_of
 from clear_strategies.merging.detail import DetailRates
+from clear_strategies.options import CONF
 from clear_strategies.training.settings import FitSettings
 from tests.helpers.configs import composed, options
 
@@ -92,7 +94,7 @@ def test_a_setting_of_a_class_that_a_sweep_leaves_in_place_is_added_by_a_plus():
         compose_module.composed(words, "config")
     unknown = ConfigCompositionException("Could not override 'strategies.x.share'.")
     from_a_folder = ["experiment=only_in_a_folder_of_config_dir", "+strategy=x", "strategies.x.share=1"]
-    told = compose_module.not_composed(unknown, from_a_folder, "config")
+    told = not_composed(unknown, from_a_folder, "config")
     assert "a plus adds it: +strategies.x.share=" in str(told)
 
 

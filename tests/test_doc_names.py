@@ -15,7 +15,8 @@ from omegaconf import OmegaConf
 
 import clear_strategies
 from clear_strategies import Strategy
-from clear_strategies.compose import CONF, composed
+from clear_strategies.compose import composed
+from clear_strategies.options import CONF
 from tests.helpers.pages import DOCS, GENERATE, OURS, PAGES, ROOT, loaded, name
 
 

@@ -22,10 +22,10 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from PIL import Image
 
-from clear_strategies import Conductor, compose
+from clear_strategies import Conductor, options
 from clear_strategies.commands import train
-from clear_strategies.compose import CONF
 from clear_strategies.files import write_text
+from clear_strategies.options import CONF
 from tests.helpers import command_line, documented
 from tests.helpers.configs import jobs_of, loader
 from tests.helpers.pages import DOCS, OURS, PAGES, ROOT, blocks, commands, loaded, name
@@ -158,7 +158,7 @@ def test_the_guides_reader_reads_a_folder_and_is_chosen_for_it(tmp_path, monkeyp
     (tmp_path / "your_package.py").write_text(block)
     (option,) = blocks(DOCS / "how-to" / "own-reader.md", "yaml")
     write_text(tmp_path / "conf" / "data" / "mine.yaml", option)
-    monkeypatch.setattr(compose, "CONF", tmp_path / "conf")
+    monkeypatch.setattr(options, "CONF", tmp_path / "conf")
     monkeypatch.syspath_prepend(tmp_path)
     for i in range(3):
         Image.new("RGB", (24, 16), (80 * i, 0, 0)).save(tmp_path / f"{i}.png")

@@ -16,8 +16,9 @@ import torch
 
 import clear_strategies
 import clear_strategies as cs
-from clear_strategies.compose import OPTIONS, conductor
+from clear_strategies.compose import conductor
 from clear_strategies.errors import DataError, SettingError
+from clear_strategies.options import OPTIONS
 from tests.helpers.command_line import TINY, started
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -69,7 +69,7 @@ def detect(path: Path) -> str:
     """The option of conf/data whose reader knows what lies there best: `recognises`, beside the reader's function, returns how
     well it does, 0 for not at all. One format's folder may hold files of another, as LLFF's a COLMAP model, so there is a rank.
     """
-    from clear_strategies.compose import options
+    from clear_strategies.options import options
 
     ranks = {}
     for name, node in options("data").items():

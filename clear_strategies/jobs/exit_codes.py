@@ -10,7 +10,7 @@ import errno
 from importlib.util import find_spec
 from typing import Final, NamedTuple
 
-from clear_strategies.errors import ClearError, SettingError, of_hydra, one_line
+from clear_strategies.errors import ClearError, SettingError, one_line
 from clear_strategies.training.signals import signal_of
 
 _NO_MEMORY: Final = "can't allocate memory"  # of torch's allocator on the CPU
@@ -49,6 +49,8 @@ def describe(error: BaseException) -> Ending | None:
         signum = signal_of(error)
         return Ending(SIGNALS + signum, f"stopped by {signum.name}.")  # a job says what it has saved
     if isinstance(error, _library_errors()):
+        from clear_strategies.hydra_errors import of_hydra
+
         return Ending(UNUSABLE, of_hydra(error))  # before OSError: Hydra's error for an option that is not there is one
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY in str(error)):
         return Ending(UNUSABLE, f"out of memory: {one_line(error) or 'Python had none left'} {_LESS_MEMORY}")

@@ -12,12 +12,11 @@ import msgspec
 import torch
 from torch import Tensor
 
-from clear_strategies.compose import flat
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DataError
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.metrics import Metrics
-from clear_strategies.settings import CHANGES_NO_RESULT
+from clear_strategies.settings import CHANGES_NO_RESULT, flat
 from clear_strategies.training import checkpoint
 from clear_strategies.training.checkpoint import CHECKPOINTS, Checkpoint
 from clear_strategies.training.state import PHOTOS, TrainState

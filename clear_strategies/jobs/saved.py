@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from clear_strategies.compose import options
 from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.core.images import to_bytes
 from clear_strategies.data.photo_files import read_image
@@ -23,6 +22,7 @@ from clear_strategies.errors import DataError, SettingError
 from clear_strategies.jobs import device
 from clear_strategies.jobs.device import ReadyRasterizer
 from clear_strategies.jobs.resume import folder_of
+from clear_strategies.options import options
 from clear_strategies.settings import TARGET, build, with_defaults
 from clear_strategies.training import checkpoint
 from clear_strategies.training.checkpoint import CHECKPOINTS

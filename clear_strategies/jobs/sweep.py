@@ -19,10 +19,9 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from clear_strategies.compose import flat
 from clear_strategies.errors import DataError
 from clear_strategies.files import expanded
-from clear_strategies.settings import missing
+from clear_strategies.settings import flat, missing
 from clear_strategies.training import signals
 
 # Launchers whose jobs see the folders that the process sees which was started; on the nodes of a cluster there may be others.

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from clear_strategies import commands, compose, hydra_app
+from clear_strategies import commands, hydra_app, options
 from clear_strategies.commands import train
 from clear_strategies.compose import composed, tree
 from clear_strategies.errors import SettingError
@@ -26,7 +26,7 @@ def test_a_reader_that_another_package_brings_is_found_by_its_yaml_alone(tmp_pat
     (tmp_path / "conf/data").mkdir(parents=True)
     (tmp_path / "conf/data/mine.yaml").write_text("reader: {_target_: mine_reader.read}")
     (tmp_path / "mine_reader.py").write_text("def recognises(path): return 9")
-    monkeypatch.setattr(compose, "CONF", tmp_path / "conf")
+    monkeypatch.setattr(options, "CONF", tmp_path / "conf")
     monkeypatch.syspath_prepend(tmp_path)
     assert train.detect(tmp_path) == "mine"
 

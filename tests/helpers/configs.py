@@ -12,7 +12,7 @@ from hydra.core.plugins import Plugins
 from hydra.core.utils import setup_globals
 from omegaconf import DictConfig
 
-from clear_strategies.compose import CONF
+from clear_strategies.options import CONF
 
 
 def composed(*overrides: str, hydra: bool = False) -> DictConfig:

@@ -20,7 +20,7 @@ from safetensors import safe_open
 import clear_strategies
 from clear_strategies import report
 from clear_strategies.commands import export, render
-from clear_strategies.compose import flat, tree
+from clear_strategies.compose import tree
 from clear_strategies.data.ply import read_points
 from clear_strategies.data.readers import blender, nerfstudio
 from clear_strategies.errors import ClearError, DataError, SettingError
@@ -30,6 +30,7 @@ from clear_strategies.jobs.saved import open_splat
 from clear_strategies.notebook import Run
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.results import export_ply
+from clear_strategies.settings import flat
 from clear_strategies.training import checkpoint
 from clear_strategies.viewing.cameras import read_cameras, write_cameras
 from rasterizers.reference import ReferenceRasterizer

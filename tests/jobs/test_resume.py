@@ -11,10 +11,11 @@ from omegaconf import OmegaConf
 from PIL import Image, ImageOps
 
 import clear_strategies
-from clear_strategies.compose import CONF, tree
+from clear_strategies.compose import tree
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.jobs import job, resume
 from clear_strategies.jobs import scene as scenes
+from clear_strategies.options import CONF
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.signals import Interrupted
 from clear_strategies.training.state import colours

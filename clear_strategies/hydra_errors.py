@@ -1,0 +1,106 @@
+"""Hydra's errors in words that name our commands and settings."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Sequence
+from typing import Any, Final
+
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from clear_strategies.errors import SettingError, one_line
+from clear_strategies.options import CONF, composed_by_hydra, options
+from clear_strategies.settings import TARGET, flat, has_parameter
+
+_NO_OPTION: Final = re.compile(
+    r"Could not find '([^']+)/([^'/]+)'\s+Available options in '[^']*':(.*?)Config search path", re.DOTALL
+)
+
+_CHOSEN: Final = re.compile(r"Multiple values for (\S+)\. To override a value use 'override \S+: (\S+)'")
+
+_LAUNCHER: Final = re.compile(
+    r"Could not (?:load|find) 'hydra/launcher/((joblib|submitit|ray)(?:_local|_slurm|_aws)?)'"
+)
+"""A launcher that a package `hydra-NAME-launcher` brings."""
+
+
+def of_hydra(error: Exception) -> str:
+    """The message of an error of Hydra's, in one line: of an option that is not there, the nearest one and all others, or the
+    package that brings it.
+    """
+    if (launcher := _LAUNCHER.search(str(error))) is not None:
+        name, package = launcher.groups()
+        return f"hydra/launcher: {name} is not installed: pip install hydra-{package}-launcher."
+    if (chosen := _CHOSEN.fullmatch(one_line(error))) is not None:
+        group, name = chosen.groups()
+        return f"+{group}={name}: a choice of this group is there already. Replace it: {group}={name}."
+    if (match := _NO_OPTION.search(str(error))) is None:
+        return one_line(error)
+    group, name, listed = match.groups()
+    return _no_option(group, name, [option for option in listed.split() if not option.startswith("_")])
+
+
+def _no_option(group: str, name: str, options: Sequence[str]) -> str:
+    """The message for an option that a group of conf/ does not have."""
+    near = difflib.get_close_matches(name, options, 1)
+    suggestion = f" Did you mean {near[0]}?" if near else ""
+    return f"{group}={name}: there is no such option.{suggestion} There are {', '.join(options)}."
+
+
+_SWEEPS: Final = re.compile(r"\+?(experiment=|strategy=[^\[]*,)")  # overrides by which strategies come later
+
+
+def not_composed(error: Exception, overrides: Sequence[str], config: str) -> SettingError:
+    """The error for overrides that Hydra cannot compose; where there is no such setting, it names the most similar one."""
+    # Of a list of options Hydra names the file alone, and not the options that there are.
+    if listed := re.search(r"Could not load '(\w+)/([^'/]+)'", str(error)):
+        return SettingError(_no_option(listed[1], listed[2], [*options(listed[1])]))
+    if (unknown := re.match(r"Could not (?:override|delete from config\.) '([^']+)'", str(error))) is None:
+        return SettingError(of_hydra(error))
+    key = unknown[1]
+    if (CONF / key).is_dir():
+        return SettingError(f"{key}: no choice of this group is there to be replaced, so it is added: +{key}=….")
+    others, group = [o for o in overrides if _key(o) != key], key.partition(".")[0]
+
+    def settings(*chosen: str) -> dict[str, Any]:
+        try:
+            return OmegaConf.to_container(composed_by_hydra([*others, *chosen], config))  # type: ignore[return-value]
+        except (HydraException, OmegaConfBaseException):  # another override is wrong as well
+            return {}
+
+    if having := [option for option in options(group) if key in flat(settings(f"{group}={option}"))]:
+        train = ", or let the command find it: clear-strategies train FOLDER" if key == "data.path" else ""
+        return SettingError(
+            f"{key}: there is no such setting without one of {', '.join(f'{group}={o}' for o in having)}. Add it{train}."
+        )
+    known = settings()
+    remedy = "clear-strategies --cfg job prints all of them."
+    parent, _, name = key.rpartition(".")
+    beside = {".".join(k.split(".")[: key.count(".") + 1]) for k in flat(known) if k.startswith(f"{parent}.")}
+    if has_parameter(str(flat(known).get(f"{parent}.{TARGET}")), name):
+        # of the user's own class, named by an override or a file
+        remedy = f"Its class has it; a plus adds it: +{key}=…."
+    elif key.startswith("strategies.") and not known:
+        # the options are in a folder that only Hydra's command line knows
+        remedy = f"If its class has it, a plus adds it: +{key}=…."
+    elif key.startswith("strategies.") and any(_SWEEPS.match(o) for o in overrides):
+        remedy = (
+            "Hydra composes a sweep first without what is swept, here the strategies. Sweep this setting, too "
+            f"({key}=a,b), or name the strategies that remain (+strategy=[gco,svs])."
+        )
+    elif name == TARGET:  # of a strategy or a decorator that is new
+        remedy = f"A plus adds it: +{key}=…."
+    elif f"~{key}" in overrides and beside:
+        remedy = f"There are {', '.join(sorted(beside))}."
+    elif near := difflib.get_close_matches(key, [name for name in flat(known) if not name.endswith(TARGET)], 1, 0.8):
+        remedy = f"Did you mean {near[0]}?"
+    elif known and config == "conductor":
+        remedy = f"A conductor has settings of {', '.join(known)}."
+    return SettingError(f"{key}: there is no such setting. {remedy}")
+
+
+def _key(override: str) -> str:
+    return override.lstrip("+~").partition("=")[0]

@@ -1,0 +1,132 @@
+"""The options of conf/ and of other packages, as Hydra reads and composes them.
+
+Each node with a `_target_` is filled with the defaults of what it names. To import this file registers conf/ and its resolvers.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+import hydra
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigResult
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import DictConfig, OmegaConf
+
+from clear_strategies.errors import SettingError
+from clear_strategies.settings import CHANGES_NO_RESULT, TARGET, defaults_of, with_defaults
+
+_PACKAGE: Final = Path(__file__).resolve().parent
+# In a wheel conf/ lies inside the package, in a checkout beside it.
+CONF: Final = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / "conf"
+
+OPTIONS: Final = "clear_strategies_conf"
+"""The group of entry points by which other packages bring options, such as strategies; docs/template is such a package."""
+
+READINGS: Final = "readings"
+"""The key of a configuration for what `readings=` says of each strategy."""
+_LONGEST_NAME: Final = 200  # bytes of a folder's name; most file systems take 255
+
+
+def composed_by_hydra(overrides: Sequence[str], config: str) -> DictConfig:
+    """conf/ with these overrides, from its file `config`; the errors are Hydra's and OmegaConf's."""
+    # The caller may be a Hydra application, whose state is restored afterwards.
+    shared = GlobalHydra.instance()
+    before, shared.hydra = shared.hydra, None
+    try:
+        with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+            return hydra.compose(config, list(overrides))
+    finally:
+        GlobalHydra.instance().hydra = before
+
+
+def strategies_of(option: str) -> list[str]:
+    """The strategies that an option of conf/strategy consists of, those of the options that it names included."""
+    file = CONF / "strategy" / f"{option}.yaml"
+    content: Any = OmegaConf.to_container(OmegaConf.load(file)) if file.is_file() else {}
+    parts = [part for part in content.get("defaults", []) if isinstance(part, str) and not part.startswith(("/", "_"))]
+    return [strategy for part in parts for strategy in strategies_of(part)] or [option]
+
+
+def options(group: str) -> dict[str, Mapping[str, Any]]:
+    """The content of each file in a group of conf/ and of the folders that other packages bring, by its name."""
+    folders = (CONF, *(Path(_folder_of(point)) for point in entry_points(group=OPTIONS)))
+    files = [file for folder in folders for file in sorted((folder / group).glob("[!_]*.yaml"))]
+    return {file.stem: OmegaConf.to_container(OmegaConf.load(file)) for file in files}  # type: ignore[misc]
+
+
+class _ConfSource(FileConfigSource):
+    """The files of conf/, each node with a `_target_` filled with the defaults of what it names."""
+
+    @staticmethod
+    def scheme() -> str:
+        return "clear"
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        result = super().load_config(config_path)
+        result.config = OmegaConf.create(with_defaults(OmegaConf.to_container(result.config)))
+        return result
+
+
+class _ReadConf(SearchPathPlugin):
+    """Makes Hydra read conf/, and after it the folders that other packages bring, by `_ConfSource`."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        conf = [e for e in search_path.get_path() if e.path is not None and e.path.removeprefix("file://") == str(CONF)]
+        for element in conf:
+            element.path = f"{_ConfSource.scheme()}://{CONF}"
+        for point in entry_points(group=OPTIONS) if conf else ():
+            search_path.append(point.name, f"{_ConfSource.scheme()}://{_folder_of(point)}")
+
+
+def _folder_of(point: EntryPoint) -> str:
+    """The folder of the package that an entry point of `OPTIONS` names; a SettingError where there is none."""
+    try:
+        spec = find_spec(point.value)
+    except ModuleNotFoundError:  # the package that it lies in
+        spec = None
+    if spec is None or not spec.submodule_search_locations:
+        raise SettingError(
+            f"the entry point {point.name} = {point.value!r} of {OPTIONS!r} must name a package, and there is none of this "
+            f"name. Mend or remove the package that brings it: pip show -f {point.dist.name if point.dist else point.name}."
+        )
+    return str(next(iter(spec.submodule_search_locations)))
+
+
+def _one_folder(name: str) -> str:
+    """`${one_folder:name}` in conf/: the name of a job's folder, one word that every file system takes. A path among the
+    overrides would otherwise lead elsewhere: behind `../..` all jobs share a folder.
+    """
+    word = name.replace("/", "_")
+    if len(word.encode()) <= _LONGEST_NAME:
+        return word
+    digest = hashlib.sha256(name.encode()).hexdigest()[:8]
+    return f"{word.encode()[: _LONGEST_NAME - len(digest) - 1].decode(errors='ignore')}_{digest}"
+
+
+def _reading(*, _node_: Any, _root_: Any) -> Any:
+    """`${reading:}` in conf/strategy: what readings= says of this setting, else the default of the class.
+
+    So readings of strategies that take no part have no effect, whatever the order of the options.
+    """
+    _, strategy, *field = _node_._get_full_key(None).split(".")
+    read = OmegaConf.select(_root_, ".".join((READINGS, strategy, *field)))
+    return defaults_of(_root_.strategies[strategy][TARGET], *field) if read is None else read
+
+
+# `${settings_without_result:more, …}` in conf/: the keys of overrides that do not name a sweep's folders.
+OmegaConf.register_new_resolver(
+    "settings_without_result", lambda *more: [*sorted(CHANGES_NO_RESULT), *more], replace=True
+)
+OmegaConf.register_new_resolver("one_folder", _one_folder, replace=True)
+OmegaConf.register_new_resolver("reading", _reading, replace=True)
+Plugins.instance().register(_ConfSource)
+Plugins.instance().register(_ReadConf)
