@@ -27,7 +27,7 @@ from clear_strategies.merging.objective import Objective
 from clear_strategies.merging.skips import Skips
 from clear_strategies.options import READINGS, composed_by_hydra, strategies_of
 from clear_strategies.schedules import REFERENCE_ITERATIONS, scaled
-from clear_strategies.settings import TARGET, build, flat, missing
+from clear_strategies.settings import TARGET, absent, build, missing
 from clear_strategies.strategies.base import Strategy
 
 _log = logging.getLogger(__name__)
@@ -114,8 +114,8 @@ def tree(config: DictConfig, without: Iterable[str] = ()) -> dict[str, Any]:
         SettingError: an interpolation leads to nothing, or to a value that is missing.
     """
     values: dict[str, Any] = OmegaConf.to_container(config)  # type: ignore[assignment]
-    if (absent := next((key for key, value in flat(values).items() if value == "???"), None)) is not None:
-        raise missing(absent)
+    if (key := absent(values)) is not None:
+        raise missing(key)
     try:
         values = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
     except OmegaConfBaseException as error:

@@ -110,6 +110,11 @@ def build(node: Any, key: str = "") -> Any:
     return node
 
 
+def absent(tree: Mapping[str, Any]) -> str | None:
+    """The key of the first value that has to be given and is not; None where there is none."""
+    return next((key for key, value in flat(tree).items() if value == _MISSING), None)
+
+
 def missing(key: str, *, known: bool = True) -> SettingError:
     """The error for a setting that has no default.
 

@@ -68,7 +68,7 @@ def _digest(file: Path) -> str:
 
 def begun(folder: Path) -> str | None:
     """What a run has left in this folder, "results" or "checkpoints"; None where there was none."""
-    if (folder / "metrics.json").exists():
+    if (folder / metrics.FILE).exists():
         return "results"
     return "checkpoints" if newest(folder) is not None else None
 
@@ -79,7 +79,7 @@ def finished(folder: Path, config: Mapping[str, Any], scene: Callable[[], Scene]
     Args:
         scene: reads that of `config`, if its place is another.
     """
-    path = folder / "metrics.json"
+    path = folder / metrics.FILE
     if not path.exists():
         return None
     content = metrics.read(path, _TRAIN_AGAIN)

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Final
+from typing import Any, Final
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
@@ -18,10 +18,12 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from clear_strategies.errors import DataError
 from clear_strategies.files import expanded
-from clear_strategies.settings import flat, missing
+from clear_strategies.outputs import metrics
+from clear_strategies.settings import absent, missing
 from clear_strategies.training import signals
 
 # Launchers whose jobs see the folders that the process sees which was started; on the nodes of a cluster there may be others.
@@ -48,7 +50,11 @@ def refusal(config: DictConfig) -> str | None:
         lacks = map(_lack, _jobs(config))
         first = next(lacks, None)
         return first if first and all(lack == first for lack in lacks) else None
-    except HydraException:  # Hydra, which composes all jobs next, tells it
+    except (
+        HydraException,
+        OmegaConfBaseException,
+        OSError,
+    ):  # the jobs tell it, or Hydra, which composes all of them next
         return None
 
 
@@ -66,17 +72,16 @@ def _jobs(config: DictConfig) -> Iterator[DictConfig]:
 
 def _lack(config: DictConfig) -> str | None:
     """What a job needs and has not."""
-    values = flat(OmegaConf.to_container(config))  # type: ignore[arg-type]
-    if absent := [key for key, value in values.items() if value == "???" and not key.startswith("hydra.")]:
-        return str(missing(absent[0]))
-    done = config.fit.resume == "auto" and any(
-        Path(config.hydra.sweep.dir).rglob("metrics.json")
-    )  # jobs that read nothing
-    if done or config.hydra.runtime.choices["hydra/launcher"] not in _LOCAL:
+    values: dict[str, Any] = OmegaConf.to_container(config)  # type: ignore[assignment]
+    if (key := absent({name: node for name, node in values.items() if name != "hydra"})) is not None:
+        return str(missing(key))
+    if config.hydra.runtime.choices["hydra/launcher"] not in _LOCAL:
         return None
+    if config.fit.resume == "auto" and any(Path(config.hydra.sweep.dir).rglob(metrics.FILE)):
+        return None  # a job that has finished reads nothing
     for key in ("data.path", *["prior.path"] * (config.data.save_lr is None)):
         if path := OmegaConf.select(config, key):
-            whole = Path(expanded(path))
+            whole = Path(expanded(str(path)))
             # The first folder of the path that is not there is the same for all scenes of a wrong data.root.
             if gone := [part for part in (*reversed(whole.parents), whole) if not part.exists()]:
                 return str(DataError(gone[0], key, "is not there", "correct the path"))

@@ -58,7 +58,7 @@ class FinishedRun:
     @classmethod
     def read(cls, folder: Path) -> FinishedRun:
         """Read a run's folder."""
-        path = folder / "metrics.json"
+        path = folder / metrics.FILE
         content = metrics.read(path, "train the run again")
         overrides, part = content.overrides or [], content.shown
         if "ours" not in part.mean:
@@ -95,7 +95,7 @@ def collect(folders: Iterable[Path]) -> list[FinishedRun]:
     folders += [link for folder in folders for link in sorted(folder.glob("*")) if link.is_symlink() and link.is_dir()]
     finished: dict[Path, None] = {}
     for folder in folders:
-        in_folder = sorted(path.parent for path in folder.rglob("metrics.json"))
+        in_folder = sorted(path.parent for path in folder.rglob(metrics.FILE))
         sweeps = [run.parent for run in in_folder]
         in_order = sorted(in_folder, key=lambda run: (sweeps.index(run.parent), _job(run), in_folder.index(run)))
         finished |= dict.fromkeys(run.resolve() for run in in_order)
