@@ -50,12 +50,8 @@ def refusal(config: DictConfig) -> str | None:
         lacks = map(_lack, _jobs(config))
         first = next(lacks, None)
         return first if first and all(lack == first for lack in lacks) else None
-    except (
-        HydraException,
-        OmegaConfBaseException,
-        OSError,
-    ):  # the jobs tell it, or Hydra, which composes all of them next
-        return None
+    except (HydraException, OmegaConfBaseException, OSError):
+        return None  # the jobs tell it, or Hydra, which composes all of them next
 
 
 def _jobs(config: DictConfig) -> Iterator[DictConfig]:
