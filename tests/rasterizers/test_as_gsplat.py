@@ -1,12 +1,13 @@
 """`rasterization`, with gsplat's signature: every call that gsplat's own test makes, against pixels composited one by one."""
 
+import inspect
 import itertools
 
 import pytest
 import torch
 
 import rasterizers
-from rasterizers import Camera, rasterization
+from rasterizers import Camera, as_gsplat, rasterization
 from rasterizers.geometry import spherical_harmonics
 from rasterizers.reference.projection import footprints
 from tests.helpers.backends import needs
@@ -104,6 +105,10 @@ def gradients(image, alpha, inputs):
     )
 
 
+def drawn(splats, colors, viewmats, Ks, **call):
+    return rasterization(*splats.values(), colors, viewmats, Ks, WIDTH, HEIGHT, **call)
+
+
 def moved(viewmats, motion):
     """The cameras after a small rigid motion each: [..., 6]."""
     generator = motion.new_zeros(*motion.shape[:-1], 4, 4)
@@ -128,7 +133,7 @@ def test_every_call_of_gsplats_own_test(per_view, sh_degree, mode, packed, batch
     motion = torch.zeros(*batch, CAMERAS, 6, dtype=torch.float64, requires_grad=True)
     inputs = {**splats, "colors": colors, "motion": motion}
     poses = moved(viewmats.detach(), motion)
-    image, alpha, info = rasterization(*splats.values(), colors, poses, Ks, WIDTH, HEIGHT, **call)
+    image, alpha, info = drawn(splats, colors, poses, Ks, **call)
     exact, exact_alpha = expected(splats, colors, poses, Ks, mode, sh_degree)
     require_close((image, alpha), (exact, exact_alpha), 1e-6, ("image", "alpha"))
     exact_gradients = gradients(exact, exact_alpha, inputs)
@@ -141,14 +146,16 @@ def test_every_call_of_gsplats_own_test(per_view, sh_degree, mode, packed, batch
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("channels", [1, 2, 4, 7])
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 7])
 @pytest.mark.parametrize("mode", ["RGB", "RGB+ED"])
-def test_any_number_of_channels_over_a_background_that_is_trained(backend, channels, mode):
+def test_any_number_of_channels_of_any_range_over_a_background_that_is_trained(backend, channels, mode):
+    """Normals are rendered so: numbers below 0 and above 1 are not cut off."""
     splats, colors, (viewmats, Ks) = gaussians(), colours(False, None, channels=channels), cameras()
-    backgrounds = torch.rand(CAMERAS, channels, dtype=torch.float64, requires_grad=True)
+    colors.data.mul_(2)
+    backgrounds = (3 * torch.rand(CAMERAS, channels, dtype=torch.float64) - 1).requires_grad_()
     inputs = {**splats, "colors": colors, "backgrounds": backgrounds}
     call = {"backgrounds": backgrounds, "render_mode": mode, "rasterize_mode": "antialiased", "backend": backend}
-    image, alpha, _ = rasterization(*splats.values(), colors, viewmats, Ks, WIDTH, HEIGHT, **call)
+    image, alpha, _ = drawn(splats, colors, viewmats, Ks, **call)
     exact, exact_alpha = expected(splats, colors, viewmats, Ks, mode, backgrounds=backgrounds, antialiased=True)
     require_close((image, alpha), (exact, exact_alpha), 1e-6, ("image", "alpha"))
     require_close(gradients(image, alpha, inputs), gradients(exact, exact_alpha, inputs), 1e-5, inputs)
@@ -183,7 +190,7 @@ def test_absolute_gradients_are_summed_over_pixels(backend, packed, mode):
     dtype = torch.float32 if backend == "warp" else torch.float64
     splats, colors, (viewmats, Ks) = gaussians(dtype=dtype), colours(False, 3, dtype=dtype), cameras(dtype=dtype)
     call = {"sh_degree": 3, "packed": packed, "backend": backend, "render_mode": mode}
-    image, _, info = rasterization(*splats.values(), colors, viewmats, Ks, WIDTH, HEIGHT, absgrad=True, **call)
+    image, _, info = drawn(splats, colors, viewmats, Ks, absgrad=True, **call)
     weights, rows, columns = torch.zeros_like(image), range(1, HEIGHT, 3), range(0, WIDTH, 3)
     some = weights[:, rows.start :: rows.step, columns.start :: columns.step]
     some.copy_(torch.randn(some.shape, dtype=dtype, generator=torch.Generator().manual_seed(5)))
@@ -201,33 +208,44 @@ def test_absolute_gradients_are_summed_over_pixels(backend, packed, mode):
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("packed", [True, False])
 @pytest.mark.parametrize("antialiased", [True, False])
-def test_radii_are_gsplats_pixels_as_far_as_the_opacity_lets_them_reach(backend, packed, antialiased):
+def test_info_has_gsplats_projections_and_radii_as_far_as_the_opacity_lets_them_reach(backend, packed, antialiased):
     torch_impl = pytest.importorskip("gsplat.cuda._torch_impl")
     splats, colors, (viewmats, Ks) = gaussians(), colours(False, None), cameras()
     splats["opacities"] = torch.linspace(0.003, 1.5, N, dtype=torch.float64)  # above 1 under inverted dropout
     splats["scales"] = splats["scales"] * torch.logspace(-2, 0, N, dtype=torch.float64)[:, None]
     mode = "antialiased" if antialiased else "classic"
-    _, _, info = rasterization(
-        *splats.values(), colors, viewmats, Ks, WIDTH, HEIGHT, packed=packed, rasterize_mode=mode, backend=backend
-    )
+    _, _, info = drawn(splats, colors, viewmats, Ks, packed=packed, rasterize_mode=mode, backend=backend)
     covariances, _ = torch_impl._quat_scale_to_covar_preci(splats["quats"], splats["scales"], True, False)
-    _, _, _, conics, compensations = torch_impl._fully_fused_projection(
+    _, means2d, depths, conics, compensations = torch_impl._fully_fused_projection(
         splats["means"], covariances, viewmats, Ks, WIDTH, HEIGHT, calc_compensations=True
     )
     blurred = torch.linalg.inv(conics[..., [0, 1, 1, 2]].unflatten(-1, (2, 2)))
     opacities = splats["opacities"] * (compensations if antialiased else 1)
     # As gsplat's kernel; its torch function always takes 3.33.
     reach = (2 * (255 * opacities).log()).clamp(0, 3.33**2).sqrt()
-    expected = (reach[..., None] * blurred.diagonal(dim1=-2, dim2=-1).sqrt()).ceil().int()
+    radii = (reach[..., None] * blurred.diagonal(dim1=-2, dim2=-1).sqrt()).ceil().int()
     assert "radii" in info  # as gsplat's strategies ask before they read it
     ids = (info["camera_ids"], info["gaussian_ids"]) if packed else (info["radii"] > 0).all(-1).nonzero(as_tuple=True)
     assert CAMERAS * N > len(ids[0]) > N
-    assert torch.equal(info["radii"] if packed else info["radii"][ids], expected[ids])
+    found = {
+        name: info[name] if packed else info[name][ids]
+        for name in ("radii", "means2d", "depths", "conics", "opacities")
+    }
+    assert torch.equal(found["radii"], radii[ids])
+    for name, of_gsplat in {"means2d": means2d, "depths": depths, "conics": conics, "opacities": opacities}.items():
+        assert torch.allclose(
+            found[name], of_gsplat.expand(depths.shape)[ids] if name == "opacities" else of_gsplat[ids]
+        ), name
+    gradients = [
+        torch.autograd.grad((z * conic.sum(-1)).sum(), splats["means"])[0]
+        for z, conic in ((found["depths"], found["conics"]), (depths[ids], conics[ids]))
+    ]
+    assert torch.allclose(*gradients, rtol=1e-6)
 
 
 def test_names_of_info_make_nothing_and_what_reads_it_as_a_dictionary_has_the_whole():
     splats, (viewmats, Ks) = gaussians(), cameras()
-    _, _, info = rasterization(*splats.values(), colours(False, None), viewmats, Ks, WIDTH, HEIGHT, packed=False)
+    _, _, info = drawn(splats, colours(False, None), viewmats, Ks, packed=False)
     assert len(info) == len(list(info)) == len(set(info))
     assert {"means2d", "radii", "conics"} <= info.keys()
     assert not any(dict.__contains__(info, name) for name in ("radii", "conics", "depths"))
@@ -258,14 +276,10 @@ def test_radii_of_warp_are_those_of_the_reference_as_float32_rounds_them(mode):
 def test_what_lies_too_far_or_is_too_small_is_left_out(backend):
     splats, colors, (viewmats, Ks) = gaussians(), colours(False, None), cameras()
     call = {"backend": backend}
-    _, _, info = rasterization(*splats.values(), colors, viewmats, Ks, WIDTH, HEIGHT, packed=True, **call)
+    _, _, info = drawn(splats, colors, viewmats, Ks, packed=True, **call)
     far, radius = float(info["depths"].median()), float(info["radii"].amax(1).median())
-    _, _, near = rasterization(
-        *splats.values(), colors, viewmats, Ks, WIDTH, HEIGHT, far_plane=far, packed=True, **call
-    )
-    _, _, large = rasterization(
-        *splats.values(), colors, viewmats, Ks, WIDTH, HEIGHT, radius_clip=radius, packed=True, **call
-    )
+    _, _, near = drawn(splats, colors, viewmats, Ks, far_plane=far, packed=True, **call)
+    _, _, large = drawn(splats, colors, viewmats, Ks, radius_clip=radius, packed=True, **call)
     assert near["depths"].max() <= far
     assert len(near["depths"]) == int((info["depths"] <= far).sum())
     assert len(large["radii"]) == int((info["radii"] > radius).any(1).sum())
@@ -274,18 +288,80 @@ def test_what_lies_too_far_or_is_too_small_is_left_out(backend):
 @pytest.mark.parametrize(
     ("call", "named"),
     [
-        ({"camera_model": "fisheye"}, "camera_model='fisheye'"),
-        ({"with_ut": True}, "with_ut=True"),
+        ({"camera_model": "fisheye"}, "does not support camera_model='fisheye'"),
+        ({"rendermode": "D"}, "does not support rendermode='D'"),
+        ({"with_ut": True}, "does not support with_ut=True"),
         ({"distributed": True}, "distributed=True"),
-        ({"covars": torch.zeros(N, 3, 3)}, "covars"),
+        ({"covars": torch.zeros(N, 3, 3)}, "does not support covars"),
         ({"render_mode": "normals"}, "render_mode must be one of RGB, D, ED, RGB[+]D, RGB[+]ED"),
         ({"backgrounds": torch.zeros(CAMERAS, 4)}, r"backgrounds must have the shape \[2, 3\]"),
+        ({"colors": torch.zeros(N, 4, 3), "sh_degree": 3}, r"must .*\[24, K, 3\] with K >= 16, .*got \[24, 4, 3\]"),
+        ({"colors": torch.zeros(N - 1, 16)}, r"must .*\[24, D\], .*got \[23, 16\]"),
     ],
 )
 def test_what_is_not_drawn_is_refused_by_name(call, named):
-    splats, colors, (viewmats, Ks) = gaussians(), colours(False, None), cameras()
+    splats, (viewmats, Ks) = gaussians(), cameras()
     with pytest.raises(ValueError, match=named):
-        rasterization(*splats.values(), colors, viewmats, Ks, WIDTH, HEIGHT, **call)
+        drawn(splats, **{"colors": colours(False, None), "viewmats": viewmats, "Ks": Ks, **call})
+
+
+@pytest.mark.parametrize("name", ["viewmats", "Ks", "backgrounds"])
+def test_tensors_of_cameras_need_one_row_for_each(name):
+    """Under pytest the shape annotations of `rasterization` would raise first."""
+    right = {"viewmats": torch.zeros(2, 4, 4), "Ks": torch.zeros(2, 3, 3), "backgrounds": torch.zeros(2, 3)}
+    geometry, colors = (torch.zeros(5, 4), torch.zeros(5, 3), torch.zeros(5)), torch.zeros(5, 3)
+    given = {**right, name: right[name][0]}
+
+    def require():
+        as_gsplat._require_geometry((), 5, 2, *geometry, given["viewmats"], given["Ks"], None)
+        as_gsplat._require_colors((), 5, 2, colors, None, given["backgrounds"])
+
+    with pytest.raises(ValueError, match=rf"^{name} must have the shape \[2, .*, got"):
+        require()
+
+
+# ---- as gsplat's own programs use it
+def test_gsplats_arguments_have_gsplats_order_and_its_defaults_are_drawn():
+    theirs, ours = (
+        inspect.signature(f).parameters for f in (pytest.importorskip("gsplat").rasterization, rasterization)
+    )
+    shared = list(ours).index("backend")
+    assert list(theirs)[:shared] == list(ours)[:shared]
+    defaults = {name: p.default for name, p in theirs.items() if p.default is not p.empty}
+    image, *_ = drawn(gaussians(), colours(False, None), *cameras(), **defaults)
+    assert image.shape == (CAMERAS, HEIGHT, WIDTH, 3)
+
+
+def test_gsplats_strategy_reads_the_packed_info():
+    """Of two cameras, one of which sees a part of the scene."""
+    strategies = pytest.importorskip("gsplat").strategy
+    viewmats, Ks = (x.detach() for x in cameras(dtype=torch.float32))
+    viewmats[1, 0, 3] += 2
+    infos, states = [], []
+    for packed in (False, True):
+        splats = gaussians(dtype=torch.float32)
+        strategy = strategies.DefaultStrategy(verbose=False)
+        params, state = {"means": splats["means"]}, strategy.initialize_state()
+        images, _, info = drawn(
+            splats, colours(False, 3, dtype=torch.float32), viewmats, Ks, sh_degree=3, packed=packed
+        )
+        strategy.step_pre_backward(params, {}, state, 1, info)
+        images.square().sum().backward()
+        strategy.step_post_backward(params, {}, state, 1, info, packed=packed)
+        infos.append(info)
+        states.append(state)
+    unpacked, packed = infos
+    ids = packed["camera_ids"], packed["gaussian_ids"]
+    assert N < len(ids[0]) < CAMERAS * N
+    assert torch.equal(torch.stack(ids, 1), (unpacked["radii"] > 0).all(-1).nonzero())
+    assert torch.equal(packed["means2d"], unpacked["means2d"][ids])
+    assert torch.equal(packed["means2d"].grad, unpacked["means2d"].grad[ids])
+    assert {name: info.shape[1:] for name, info in packed.items() if torch.is_tensor(info)} == {
+        "means2d": (2,), "radii": (2,), "depths": (), "conics": (3,), "opacities": (), "gaussian_ids": (), "camera_ids": (),
+        "batch_ids": (),
+    }  # fmt: skip
+    for name in ("grad2d", "count"):
+        assert torch.allclose(states[0][name], states[1][name]), name
 
 
 def test_the_names_of_before_go_on_working():
