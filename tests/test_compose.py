@@ -1,8 +1,5 @@
 """From conf/ to objects: names on the command line, the defaults' one owner, and what is refused."""
 
-import subprocess
-import sys
-
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -20,6 +17,7 @@ from clear_strategies.jobs.settings import settings_of
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.options import CONF
 from clear_strategies.training.settings import FitSettings
+from tests.helpers import command_line
 from tests.helpers.configs import composed, options
 
 MINE = "tests.merging.test_conductor.Halve"
@@ -75,7 +73,7 @@ def test_what_does_not_exist_is_named(said, named):
         conductor(*said)
 
 
-def test_a_list_of_settings_is_refused_with_the_remedy():
+def test_a_list_of_settings_is_refused_with_the_remedy(tmp_path):
     """In a process without pytest's checks of annotations."""
     code = (
         "import clear_strategies\nfrom clear_strategies.compose import conductor\n"
@@ -83,7 +81,7 @@ def test_a_list_of_settings_is_refused_with_the_remedy():
         "    try:\n        call('gco', ['a=b'])\n"
         "    except clear_strategies.ClearError as error:\n        print(error)\n"
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    told = command_line.run(cwd=tmp_path, code=code).stdout
     rule = "overrides: must be given one by one, each as text, got ['a=b']."
     assert [line.startswith(rule) and "*overrides" in line for line in told.splitlines()] == [True, True]
 

@@ -3,7 +3,6 @@
 import io
 import logging
 import re
-import subprocess
 import sys
 
 import pytest
@@ -54,7 +53,8 @@ def test_pythons_warnings_do_not_reach_the_user(tmp_path):
         commands.named = lambda arguments: lambda: warnings.warn("this library has a new name")
         run.main()
     """
-    assert subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, check=True).stderr == b""
+    done = run(cwd=tmp_path, code=code)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_warnings_of_a_run_from_python_are_in_its_log_alone_and_others_are_shown_again(tmp_path):
@@ -69,7 +69,7 @@ def test_warnings_of_a_run_from_python_are_in_its_log_alone_and_others_are_shown
             warnings.warn("Glyph 24237 missing")
         warnings.warn("the user's own")
     """
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True).stderr
+    said = run(cwd=tmp_path, code=code).stderr
     assert ("Glyph" in said, "the user's own" in said) == (False, True)
     assert "Glyph 24237 missing" in (tmp_path / "run.log").read_text()
 

@@ -23,11 +23,11 @@ def environment(cwd: Path) -> dict[str, str]:
 
 
 def run(
-    *arguments: str, cwd: Path, module: str = "clear_strategies.run", drawn: bool = False
+    *arguments: str, cwd: Path, module: str = "clear_strategies.run", code: str | None = None, drawn: bool = False
 ) -> subprocess.CompletedProcess[str]:
-    """A run to its end, as subprocess.run; with pictures only if `drawn`."""
+    """A run to its end, as subprocess.run, or another module or code; with pictures only if `drawn`."""
     with tempfile.TemporaryFile("w+") as stdout, tempfile.TemporaryFile("w+") as stderr:
-        command = ["-m", module, *arguments]
+        command = [*(["-m", module] if code is None else ["-c", code]), *arguments]
         code = Forked(*command, cwd=cwd, env=environment(cwd), stdout=stdout, stderr=stderr, drawn=drawn).wait()
         for file in (stdout, stderr):
             file.seek(0)

@@ -4,6 +4,7 @@ Each is a process as `python -m` makes one, with arguments, a folder, an environ
 """
 
 import atexit
+import gc
 import importlib
 import json
 import os
@@ -143,6 +144,7 @@ def main() -> None:
     """What `python -m tests.helpers.forked FILENO` does."""
     for name in _IMPORTED:
         importlib.import_module(name)
+    gc.freeze()  # a fork would take a second to end, and copy all of these objects' memory, to find no garbage among them
     with socket.socket(fileno=int(sys.argv[1])) as requests:
         request = _serve(requests)
     if request is None:

@@ -1,28 +1,19 @@
 """A host whose tensors are on another device than the CPU, with the strategies: no operation finds tensors of both."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 import torch
 from torch.utils import backend_registration
 
-ROOT = Path(__file__).parents[2]
+from tests.helpers.command_line import run
+
 STRATEGIES = ["best", "splatsure"]  # together all strategies
-
-
-def run(code):
-    return subprocess.run([sys.executable, *code], cwd=ROOT, capture_output=True, text=True, check=False)
-
-
 pytestmark = pytest.mark.skipif(
     not hasattr(backend_registration, "_setup_privateuseone_for_python_backend"),
     reason=f"torch {torch.__version__} has no devices written in Python",
 )
 
 
-def test_public_functions_take_photos_of_another_device_and_cameras_stay_on_the_cpu():
+def test_public_functions_take_photos_of_another_device_and_cameras_stay_on_the_cpu(tmp_path):
     code = """
 import torch
 from clear_strategies import PseudoViews, View
@@ -58,15 +49,15 @@ with Elsewhere():
         assert torch.equal(here.photo.image, there.photo.image.cpu()) and torch.equal(here.weight, there.weight.cpu())
     print(there.photo.image.device)
 """
-    ran = run(["-c", code])
+    ran = run(cwd=tmp_path, code=code)
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout.split() == ["elsewhere:0", "elsewhere:0", "cpu", "elsewhere:0", "elsewhere:0", "elsewhere:0"]
 
 
 @pytest.mark.slow
-def test_strategies_train_in_a_gsplat_loop_elsewhere():
+def test_strategies_train_in_a_gsplat_loop_elsewhere(tmp_path):
     pytest.importorskip("gsplat")
-    ran = run(["-m", "tests.helpers.gsplat_elsewhere", *STRATEGIES])
+    ran = run(*STRATEGIES, cwd=tmp_path, module="tests.helpers.gsplat_elsewhere")
     assert ran.returncode == 0, ran.stderr
     assert [line.split()[0] for line in ran.stdout.splitlines()] == STRATEGIES
 

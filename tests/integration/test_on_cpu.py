@@ -1,10 +1,7 @@
 """What stands in for CUDA: the modules against independent computations, and the launcher as a program."""
 
 import math
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -17,6 +14,7 @@ from integration.on_cpu.__main__ import REFUSED
 from integration.on_cpu.diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
 from integration.on_cpu.fused_ssim import fused_ssim
 from integration.on_cpu.simple_knn import distances_and_indices, mean_distances
+from tests.helpers import command_line
 from tests.helpers.host_parts import FOLDER, FROM_START
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -303,10 +301,7 @@ def launched(folder, *arguments, source=TRAINER):
     (folder / "trainer").mkdir(exist_ok=True)
     (folder / "trainer" / "train.py").write_text(source)
     (folder / "trainer" / "helper.py").write_text("NAME = 'beside'")
-    return subprocess.run(
-        [sys.executable, "-m", "integration.on_cpu", *map(str, arguments)], cwd=folder, capture_output=True, text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)}, check=False,
-    )  # fmt: skip
+    return command_line.run(*map(str, arguments), cwd=folder, module="integration.on_cpu")
 
 
 def test_cuda_is_the_cpu_and_the_script_is_run_as_python_runs_it(tmp_path):
