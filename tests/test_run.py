@@ -52,9 +52,7 @@ def test_a_run_leaves_everything_it_promises(finished):
 SAVING = ["+strategy=gco", *TINY, "hydra.run.dir=cut", "fit.checkpoint_every=0"]
 
 
-@pytest.mark.parametrize(
-    "signals", [(signal.SIGTERM,), (signal.SIGHUP,), (signal.SIGHUP,) * 3], ids=["SIGTERM", "SIGHUP", "three of SIGHUP"]
-)
+@pytest.mark.parametrize("signals", [(signal.SIGTERM,), (signal.SIGHUP,) * 3], ids=["SIGTERM", "three of SIGHUP"])
 def test_a_signal_that_ends_a_run_saves_before(signals, tmp_path):
     """Of a terminal that is closed, the system and the shell send SIGHUP."""
     said = tmp_path / "said"
@@ -221,10 +219,12 @@ def gone() -> TextIO:
     return os.fdopen(writes, "w")
 
 
-@pytest.mark.parametrize("unread", [("stdout",), ("stderr",), ("stdout", "stderr")], ids="+".join)
-def test_a_run_trains_on_where_who_reads_its_output_has_left(unread, tmp_path):
+@pytest.mark.parametrize(
+    "read", [*(pytest.param(name, marks=pytest.mark.slow) for name in ("stdout", "stderr")), "neither"]
+)
+def test_a_run_trains_on_where_who_reads_its_output_has_left(read, tmp_path):
     with gone() as pipe, (tmp_path / "said").open("w") as said:
-        streams = {name: pipe if name in unread else said for name in ("stdout", "stderr")}
+        streams = {name: said if name == read else pipe for name in ("stdout", "stderr")}
         arguments = ["-m", "clear_strategies.run", "+strategy=gco", *TINY, "hydra.run.dir=here", "-v"]
         code = Forked(*arguments, cwd=tmp_path, env=environment(tmp_path), **streams).wait()
     assert (code, (tmp_path / "here/metrics.json").is_file()) == (0, True), (tmp_path / "said").read_text()

@@ -3,6 +3,7 @@
 import json
 import math
 from functools import partial
+from multiprocessing import get_context
 
 import pandas as pd
 import pytest
@@ -123,6 +124,9 @@ def test_an_iteration_is_measured_with_and_without_hr():
 def test_growth_has_an_exponent_for_each_step_and_none_across_what_grows(monkeypatch):
     for name, size in {"_WIDTH": 96, "_GAUSSIANS": 100}.items():
         monkeypatch.setattr(scale, name, size)
+    forking = get_context("forkserver")  # in place of "spawn": the processes share their imports
+    forking.set_forkserver_preload([scale.__name__])
+    monkeypatch.setattr(scale, "get_context", lambda _: forking)
     table = measured(scale, gaussians=[200, 100], widths=[96], photos=[], iterations=1, repeats=1).tables["scale"]
     assert list(table["size"]) == [100, 200, 96 * 72]
     assert [math.isnan(p) for p in table["exponent"]] == [True, False, True]

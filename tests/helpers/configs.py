@@ -3,22 +3,26 @@
 from collections.abc import Sequence
 from functools import cache
 
-from hydra import compose, initialize_config_dir
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.utils import create_config_search_path
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.core.utils import setup_globals
-from omegaconf import DictConfig
+from hydra.types import RunMode
+from hydra.version import setbase
+from omegaconf import DictConfig, open_dict
 
 from clear_strategies.options import CONF
 
 
 def composed(*overrides: str, hydra: bool = False) -> DictConfig:
     """As the command line composes it; with `hydra`, the node of that name too."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", list(overrides), return_hydra_config=hydra)
+    config = loader().load_configuration("config", list(overrides), run_mode=RunMode.RUN)
+    if not hydra:
+        with open_dict(config):
+            del config["hydra"]
+    return config
 
 
 def options(group: str) -> list[str]:
@@ -28,7 +32,8 @@ def options(group: str) -> list[str]:
 
 @cache
 def loader() -> ConfigLoaderImpl:
-    """Hydra's, of conf/."""
+    """Hydra's, of conf/; all tests share it, for making one takes a third of the time of composing."""
+    setbase("1.3")
     setup_globals()
     Plugins.instance()
     return ConfigLoaderImpl(create_config_search_path(str(CONF)))
