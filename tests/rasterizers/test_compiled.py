@@ -15,6 +15,7 @@ from rasterizers.testing import CHECKS, gradient_of, magnitude, pixels_of, scene
 from tests.helpers.backends import (
     ATTRIBUTES,
     CLEAN,
+    EVERY,
     backends,
     balls,
     camera,
@@ -22,6 +23,7 @@ from tests.helpers.backends import (
     dense_scene,
     everything,
     exact,
+    needs,
     require_gradient,
     require_image,
     require_same_bits,
@@ -49,8 +51,9 @@ def require_reference(backend, splats, view, v, *, depth=False, **settings):
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda c: c.__name__)
-@backends()
+@pytest.mark.parametrize("backend", [pytest.param(make, id=name, marks=needs(name)) for name, make in EVERY.items()])
 def test_every_backend_passes_the_checks(backend, check):
+    """The reference, too, and each instruction set."""
     check(backend)
 
 

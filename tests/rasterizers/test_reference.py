@@ -14,11 +14,6 @@ from rasterizers.testing import CHECKS, ContractError, check_rasterizer, scene
 from tests.helpers.backends import balls
 
 
-@pytest.mark.parametrize("check", CHECKS, ids=lambda c: c.__name__)
-def test_the_reference_passes_every_check(check):
-    check(ReferenceRasterizer)
-
-
 def test_a_rasterizer_that_ignores_the_background_fails_the_checks():
     with pytest.raises(ContractError, match="background"):
         check_rasterizer(lambda **settings: ReferenceRasterizer(**{**settings, "background": (0.0, 0.0, 0.0)}))
