@@ -16,6 +16,7 @@ from clear_strategies.training.loop import iterate
 from clear_strategies.training.optim import Adam, LearningRates
 from rasterizers import Camera, load
 from tests.helpers import toy
+from tests.helpers.backends import needs
 from tests.helpers.short_run import start, tensors
 
 N = 60
@@ -203,7 +204,7 @@ def test_a_densifier_without_state_resumes(tmp_path):
     assert state.t == 2
 
 
-@pytest.mark.skipif(not native.available(), reason="the compiled kernels were not built")
+@needs("cpp")
 def test_compiled_noise_is_that_of_torch(monkeypatch):
     theta, optimizer, densifier = start_of_run(noise=1e3, start=9, opacity=-6.0)
     generator = torch.Generator().manual_seed(3)

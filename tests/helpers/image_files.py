@@ -12,14 +12,10 @@ def noise(seed: int, height: int = 24, width: int = 20) -> Tensor:
     return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(seed))
 
 
-def random_image(seed: int, height: int = 40, width: int = 60) -> Tensor:
+def array(seed: int, height: int = 40, width: int = 60) -> np.ndarray:
     """8-bit levels, so that a PNG holds it exactly."""
     generator = torch.Generator().manual_seed(seed)
-    return torch.randint(0, 256, (height, width, 3), generator=generator).float() / 255
-
-
-def array(seed: int, height: int = 40, width: int = 60) -> np.ndarray:
-    return random_image(seed, height, width).numpy()
+    return (torch.randint(0, 256, (height, width, 3), generator=generator).float() / 255).numpy()
 
 
 def read(path: Path) -> np.ndarray:

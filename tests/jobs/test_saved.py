@@ -34,7 +34,6 @@ def test_a_run_its_checkpoints_one_of_them_and_its_ply_file_open_alike(saved_run
         assert [saved.split for saved in splat.cameras] == ["train"] * 3 + ["test"]
         assert splat.folder == folder
         assert len(splat.poses()) == 3
-    folder, field = saved_run
     splat = open_splat(folder / "point_cloud.ply", "torch")
     torch.testing.assert_close(splat.painter.color(CAMERA), exact(field), atol=2e-5, rtol=0)
     assert len(splat.cameras) == 4
@@ -50,16 +49,14 @@ def test_a_run_is_drawn_over_the_background_of_its_photos(saved_run, tmp_path):
 
 
 def test_a_ply_file_of_3dgs_and_of_a_run_without_compensation_is_drawn_with_its_blur(saved_run, tmp_path):
-    folder, _ = saved_run
+    folder, field = saved_run
     content = (folder / "point_cloud.ply").read_bytes()
     (tmp_path / "a.ply").write_bytes(content.replace(b"comment SplatRenderMode: mip\n", b""))
     plain, mip = (open_splat(path, "torch").painter for path in (tmp_path / "a.ply", folder / "point_cloud.ply"))
     rasterizer = rasterizers.load("torch", kernel=0.3, antialiased=False)
     assert torch.equal(plain.color(CAMERA), mip.field.render(rasterizer, CAMERA).clamp(0, 1))
-    _, field = saved_run
     export_ply(tmp_path / "run" / "point_cloud.ply", field, antialiased=False)
     export.main([str(tmp_path / "run"), "--out", str(tmp_path / "again.ply")])
-    rasterizer = rasterizers.load("torch", kernel=0.3, antialiased=False)
     for path in (tmp_path / "run" / "point_cloud.ply", tmp_path / "again.ply"):
         assert b"SplatRenderMode" not in path.read_bytes()[:300]
         found = open_splat(path, "torch").painter.color(CAMERA)
@@ -138,26 +135,11 @@ def test_width_sets_the_size_and_a_file_of_cameras_gives_a_picture_of_each_and_o
     folder, _ = saved_run
     render.main([str(folder), "--path", "train", "--width", "48"])
     assert image_size(folder / "rendered" / "view0.png") == (48, 32)
-    folder, _ = saved_run
     (entry, *_) = json.loads((folder / "cameras.json").read_text())
     (tmp_path / "path.json").write_text(json.dumps([{**entry, "img_name": name} for name in "ab"]))
     render.main([str(folder), "--path", str(tmp_path / "path.json"), "--depth", "--out", str(tmp_path / "out")])
     assert files(tmp_path / "out") == ["a.png", "b.png", "depth/a.png", "depth/b.png"]
     assert image_size(tmp_path / "out" / "depth" / "b.png") == (96, 64)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--path", "nowhere"], "--path: must be cameras, train, test or a file"),
-        (["--frames", "0"], "must be a whole number above 0"),
-        (["--width", "0"], "must be a whole number above 0"),
-        (["--typo"], "unrecognized arguments: --typo"),
-    ],
-)
-def test_wrong_arguments_are_refused_in_one_line(saved_run, arguments, message):
-    with pytest.raises(SettingError, match=message):
-        render.main([str(saved_run[0]), *arguments])
 
 
 # ---- files for viewers hold the splat as it was measured; another program reads them
@@ -186,9 +168,16 @@ def test_another_program_reads_what_is_written(saved_run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    [(["--sh", "4"], "invalid choice"), (["--out", "a.spz"], "must end in .ply, got a.spz. splat-transform makes")],
+    ("command", "arguments", "message"),
+    [
+        (render, ["--path", "nowhere"], "--path: must be cameras, train, test or a file"),
+        (render, ["--frames", "0"], "must be a whole number above 0"),
+        (render, ["--width", "0"], "must be a whole number above 0"),
+        (render, ["--typo"], "unrecognized arguments: --typo"),
+        (export, ["--sh", "4"], "invalid choice"),
+        (export, ["--out", "a.spz"], "must end in .ply, got a.spz. splat-transform makes"),
+    ],
 )
-def test_wrong_arguments_of_export_are_refused_in_one_line(saved_run, arguments, message):
+def test_wrong_arguments_are_refused_in_one_line(saved_run, command, arguments, message):
     with pytest.raises(SettingError, match=message):
-        export.main([str(saved_run[0]), *arguments])
+        command.main([str(saved_run[0]), *arguments])

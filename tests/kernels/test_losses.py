@@ -15,9 +15,7 @@ from clear_strategies.merging.objective import Objective
 from rasterizers.interface import BackendUnavailable
 from rasterizers.native import load_kernels
 from rasterizers.warp_runtime import runs_warp
-
-needs_cpp = pytest.mark.skipif(not native.available(), reason="the compiled kernels were not built")
-needs_warp = pytest.mark.skipif(not runs_warp("cpu"), reason="NVIDIA Warp is not installed")
+from tests.helpers.backends import needs, why_not
 
 
 def image(height, width, seed=0, dtype=torch.float64):
@@ -115,8 +113,8 @@ PAIRS = {
     "photo inverted": (photo(50, 60), 1 - photo(50, 60)),
     "beyond [0, 1]": (3 * photo(50, 60) - 1, photo(50, 60, 6)),
 }
-RUNNING = ["cpp"] * native.available() + ["warp"] * runs_warp("cpu")
-COMPILED = [pytest.param("cpp", marks=needs_cpp), pytest.param("warp", marks=needs_warp)]
+RUNNING = [name for name in ("cpp", "warp") if why_not(name) is None]
+COMPILED = [pytest.param(name, marks=needs(name)) for name in ("cpp", "warp")]
 every_compiled = pytest.mark.parametrize("name", COMPILED)
 every_implementation = pytest.mark.parametrize("name", [*COMPILED, "torch"])
 
@@ -151,7 +149,7 @@ def threads():
     torch.set_num_threads(before)
 
 
-@needs_cpp
+@needs("cpp")
 @pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
 def test_the_bits_do_not_depend_on_threads(loss, threads):
     x, y = rough(photo(261, 350), 0.1)
@@ -167,7 +165,7 @@ def test_the_bits_do_not_depend_on_threads(loss, threads):
         assert torch.equal(gradient, results[0].gradient)
 
 
-@needs_cpp
+@needs("cpp")
 @pytest.mark.parametrize("isa", ["baseline", "avx2"])
 def test_every_instruction_set_agrees(isa, monkeypatch):
     if isa not in [*native.module().instruction_sets(), "baseline"]:
@@ -323,7 +321,7 @@ def test_without_warp_torch_is_used_on_cuda(missing):
     assert losses.running_on("cuda") == ["torch"]
 
 
-@needs_warp
+@needs("warp")
 @pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
 def test_repeated_losses_have_the_same_bits(loss):
     x, y = rough(photo(61, 150), 0.1)
@@ -336,7 +334,7 @@ def test_repeated_losses_have_the_same_bits(loss):
 
 
 @pytest.mark.slow
-@needs_warp
+@needs("warp")
 @pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
 def test_blocks_of_many_threads_agree_with_one_thread(blocks_of, loss):
     from clear_strategies.kernels.losses.warp import launches
@@ -350,7 +348,7 @@ def test_blocks_of_many_threads_agree_with_one_thread(blocks_of, loss):
 
 
 @pytest.mark.slow
-@needs_warp
+@needs("warp")
 def test_the_kernels_compile_for_cuda_on_a_machine_without(ptx_of):
     from clear_strategies.kernels.losses.warp import haar, launches, similarity, sums
 

@@ -8,19 +8,15 @@ from clear_strategies import GCO, P2G, SVS
 from clear_strategies.core import deferred
 from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.optim import Adam, LearningRates
-from rasterizers.interface import BackendUnavailable
-from rasterizers.warp_runtime import require_warp
 from tests.helpers import toy
+from tests.helpers.backends import needs
 from tests.helpers.compiled_step_cases import Case, T, as_floats, case, conductors
+
+pytestmark = needs("warp")
 
 
 @pytest.fixture
 def warp_step():
-    try:
-        require_warp("the compiled pass", "cpu", "")
-    except BackendUnavailable as reason:
-        pytest.skip(str(reason))
-
     from clear_strategies.kernels.gaussian_step import warp
 
     return warp

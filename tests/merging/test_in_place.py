@@ -2,6 +2,7 @@
 
 from collections import Counter
 from functools import partial
+from importlib import import_module
 
 import pytest
 import torch
@@ -10,34 +11,22 @@ from clear_strategies import GCO, SVS, Conductor, Evidence, Grads, Objective, We
 from clear_strategies.core import deferred
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Colour
 from clear_strategies.errors import DivergedError
-from clear_strategies.kernels import native, reconcile
+from clear_strategies.kernels import reconcile
 from clear_strategies.kernels.reconcile import dense, reference
 from clear_strategies.merging.in_place import merge_in_place
 from clear_strategies.schedules import WarmupDecay
-from rasterizers.interface import BackendUnavailable
-from rasterizers.warp_runtime import require_warp
 from tests.helpers import toy
+from tests.helpers.backends import needs
 
 T, N = 50, 1003  # N: a last block of sixteen that is not full, and more than one chunk of 1,024 numbers
 SHAPES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (15, 3), "detail": (3,)}
 RULES = {"means": 1e-5, "quats": 1e-6, "scales": 1e-5, "opacities": 1e-4, "sh0": 1e-5, "shN": 1e-6, "detail": 1e-5}
 
 
-@pytest.fixture(params=["cpp", "warp", "torch"])
+@pytest.fixture(params=[*(pytest.param(name, marks=needs(name)) for name in ("cpp", "warp")), "reference"])
 def passes(request, monkeypatch):
     """What computes products and apply for float32 in the CPU's memory."""
-    if request.param == "torch":
-        chosen = reference
-    elif request.param == "warp":
-        try:
-            require_warp("the merge", "cpu", "")
-        except BackendUnavailable as reason:
-            pytest.skip(str(reason))
-        from clear_strategies.kernels.reconcile import warp as chosen
-    else:
-        if not native.available():
-            pytest.skip("the kernels are not compiled")
-        from clear_strategies.kernels.reconcile import cpp as chosen
+    chosen = import_module(f"{reconcile.__name__}.{request.param}")
     monkeypatch.setattr(
         reconcile, "_chosen", lambda *tensors: chosen if all(x.dtype == torch.float32 for x in tensors) else reference
     )
@@ -288,7 +277,7 @@ def operations(n: int, device: str = "cpu") -> Counter[str]:
 def test_the_number_of_operations_does_not_depend_on_that_of_gaussians(passes):
     few, many = operations(500), operations(20_000)
     assert few == many
-    assert few.total() <= {"cpp": 22, "warp": 26, "torch": 300}[passes]
+    assert few.total() <= {"cpp": 22, "warp": 26, "reference": 300}[passes]
 
 
 def test_on_a_device_nothing_is_read():

@@ -13,6 +13,7 @@ from clear_strategies.kernels import native
 from clear_strategies.kernels.per_gaussian import lift
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
+from tests.helpers.backends import needs
 
 
 @pytest.mark.parametrize("scale", [0.01, "relative:1"])
@@ -132,7 +133,7 @@ def test_without_a_high_frequency_loss_there_is_nothing_to_route():
     assert "lambda_HF is 0" in P2G().without_effect(**weights, lambda_hf=0.0)
 
 
-@pytest.mark.skipif(not native.available(), reason="the compiled kernels were not built")
+@needs("cpp")
 def test_compiled_lifting_has_the_bits_of_torch(monkeypatch):
     g = torch.Generator().manual_seed(0)
     maps, u = torch.rand(2, 5, 7, generator=g), 300 * torch.randn(999, 2, generator=g)

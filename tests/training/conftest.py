@@ -9,21 +9,14 @@ import torch
 from clear_strategies.core.conflicts import Weights
 from clear_strategies.kernels.gaussian_step import Attribute
 from clear_strategies.kernels.gaussian_step.cpp import CppGaussianStep
-from rasterizers.interface import BackendUnavailable
-from rasterizers.native import load_kernels
-from rasterizers.warp_runtime import require_warp
+from tests.helpers.backends import needs
 
 
-@pytest.fixture(params=["cpp", "warp", "warp-cuda"])
+@pytest.fixture(params=[pytest.param(name, marks=needs(name)) for name in ("cpp", "warp", "warp-cuda")])
 def passes(request):
     """The pass in C++ or in Warp, for tensors in the CPU's memory."""
-    try:
-        if request.param == "cpp":
-            load_kernels("clear_strategies.kernels")
-            return CppGaussianStep
-        require_warp("the compiled pass", "cuda" if request.param == "warp-cuda" else "cpu", "")
-    except BackendUnavailable as reason:
-        pytest.skip(str(reason))
+    if request.param == "cpp":
+        return CppGaussianStep
     from clear_strategies.kernels.gaussian_step import warp
 
     return warp.WarpGaussianStep if request.param == "warp" else partial(Elsewhere, warp.WarpGaussianStep, "cuda")

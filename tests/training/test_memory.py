@@ -5,9 +5,9 @@ import logging
 import pytest
 
 from clear_strategies.errors import SettingError
-from clear_strategies.kernels import native
 from clear_strategies.training import memory
 from rasterizers.native import empty
+from tests.helpers.backends import needs
 from tests.helpers.short_run import start
 
 MIB = 1 << 20
@@ -47,7 +47,7 @@ def test_the_estimate_holds_the_parameters_and_their_moments_and_the_system_tell
     assert memory.system_bytes("/proc/nothing", "VmRSS") is None
 
 
-@pytest.mark.skipif(not native.available(), reason="the compiled kernels were not built")
+@needs("cpp")
 def test_what_the_kernels_keep_for_their_next_use_is_given_back():
     def resident() -> int:
         return memory.system_bytes("/proc/self/status", "VmRSS")
