@@ -28,10 +28,10 @@ def run(
     """A run to its end, as subprocess.run, or another module or code; with pictures only if `drawn`."""
     with tempfile.TemporaryFile("w+") as stdout, tempfile.TemporaryFile("w+") as stderr:
         command = [*(["-m", module] if code is None else ["-c", code]), *arguments]
-        code = Forked(*command, cwd=cwd, env=environment(cwd), stdout=stdout, stderr=stderr, drawn=drawn).wait()
+        ended = Forked(*command, cwd=cwd, env=environment(cwd), stdout=stdout, stderr=stderr, drawn=drawn).wait()
         for file in (stdout, stderr):
             file.seek(0)
-        return subprocess.CompletedProcess(command, code, stdout.read(), stderr.read())
+        return subprocess.CompletedProcess(command, ended, stdout.read(), stderr.read())
 
 
 def started(*arguments: str, said: Path, cwd: Path, session: bool = False) -> Forked:
