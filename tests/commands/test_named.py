@@ -16,7 +16,7 @@ from clear_strategies import commands, hydra_app
 from clear_strategies.commands import doctor
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs import exit_codes
-from tests.helpers.command_line import ROOT
+from tests.helpers.forked import ROOT
 
 SLOW = ("hydra", "numpy", "omegaconf", "torch")
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.helpers.forked import ROOT, Forked
+from tests.helpers.forked import Forked, python_path
 
 ALONE = ["fit.video=0", "fit.map_views=0"]
 """A run that writes little beside its field."""
@@ -19,7 +19,7 @@ TINY = [
 
 
 def environment(cwd: Path) -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": str(ROOT), "CLEAR_CACHE": str(cwd / "cache"), "OMP_NUM_THREADS": "1"}
+    return {**os.environ, "PYTHONPATH": python_path(), "CLEAR_CACHE": str(cwd / "cache"), "OMP_NUM_THREADS": "1"}
 
 
 def run(

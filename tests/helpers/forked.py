@@ -87,11 +87,16 @@ def _send(status: socket.socket, number: int) -> None:
     status.sendall(number.to_bytes(8, "big", signed=True))
 
 
+def python_path() -> str:
+    """This checkout's modules before those that the caller's PYTHONPATH names."""
+    return os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+
+
 @cache
 def _server() -> socket.socket:
     """Sends requests to the process that forks, which ends with this one."""
     requests, server_end = socket.socketpair()
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    env = {**os.environ, "PYTHONPATH": python_path(), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "tests.helpers.forked", str(server_end.fileno())]
     with server_end:
         process = subprocess.Popen(command, cwd=ROOT, env=env, pass_fds=[server_end.fileno()])

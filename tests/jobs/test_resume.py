@@ -14,7 +14,6 @@ from clear_strategies.compose import tree
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.jobs import job, resume
 from clear_strategies.jobs import scene as scenes
-from clear_strategies.options import CONF
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.signals import Interrupted
 from clear_strategies.training.state import colours
