@@ -18,6 +18,8 @@ from clear_strategies.errors import DataError
 _log = logging.getLogger(__name__)
 
 LOCK: Final = "run.lock"
+FINISHED: Final = "metrics.json"
+"""The last file that a run writes: a folder that has it holds a finished run."""
 _PARTIAL: Final = ".partial"
 _KEPT: Final = 40  # characters of a file's name in that of its part, so that a name may be as long as the disk allows
 _LARGEST: Final = 64 << 30

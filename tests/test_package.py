@@ -173,6 +173,17 @@ def test_importing_is_light_and_of_the_package_alone_imports_no_torch():
     assert result.stdout.strip() == "False False True True"
 
 
+def test_training_without_what_it_needs_says_what_to_install(tmp_path):
+    missing = HEAVY - {"gsplat", "hydra", "nerfstudio", "open3d", "warp"}
+    code = (
+        f"import sys; sys.modules |= dict.fromkeys({missing}); sys.argv = ['clear-strategies', '+strategy=clear']; "
+        "from clear_strategies.run import main; main()"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert ran.returncode == 2, ran.stderr
+    assert "pip install 'clear-strategies[train]'" in ran.stderr
+
+
 @pytest.mark.slow
 def test_messages_are_shown_where_the_host_has_not_configured_logging(tmp_path):
     setup, said = (

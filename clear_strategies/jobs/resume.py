@@ -14,6 +14,7 @@ from torch import Tensor
 
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DataError
+from clear_strategies.files import FINISHED
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.metrics import Metrics
 from clear_strategies.settings import CHANGES_NO_RESULT, flat
@@ -68,7 +69,7 @@ def _digest(file: Path) -> str:
 
 def begun(folder: Path) -> str | None:
     """What a run has left in this folder, "results" or "checkpoints"; None where there was none."""
-    if (folder / metrics.FILE).exists():
+    if (folder / FINISHED).exists():
         return "results"
     return "checkpoints" if newest(folder) is not None else None
 
@@ -79,7 +80,7 @@ def finished(folder: Path, config: Mapping[str, Any], scene: Callable[[], Scene]
     Args:
         scene: reads that of `config`, if its place is another.
     """
-    path = folder / metrics.FILE
+    path = folder / FINISHED
     if not path.exists():
         return None
     content = metrics.read(path, _TRAIN_AGAIN)

@@ -21,8 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from clear_strategies.errors import DataError
-from clear_strategies.files import expanded
-from clear_strategies.outputs import metrics
+from clear_strategies.files import FINISHED, expanded
 from clear_strategies.settings import absent, missing
 from clear_strategies.training import signals
 
@@ -73,7 +72,7 @@ def _lack(config: DictConfig) -> str | None:
         return str(missing(key))
     if config.hydra.runtime.choices["hydra/launcher"] not in _LOCAL:
         return None
-    if config.fit.resume == "auto" and any(Path(config.hydra.sweep.dir).rglob(metrics.FILE)):
+    if config.fit.resume == "auto" and any(Path(config.hydra.sweep.dir).rglob(FINISHED)):
         return None  # a job that has finished reads nothing
     for key in ("data.path", *["prior.path"] * (config.data.save_lr is None)):
         if path := OmegaConf.select(config, key):

@@ -44,8 +44,6 @@ from rasterizers.native import threads
 
 _log = logging.getLogger(__name__)
 
-FILE: Final = "metrics.json"
-
 NOTE: Final = (
     "bicubic and prior enlarge the LR photo of the view itself, which a run never sees of a test view: they show what "
     "this photo holds, not what can be learned from the other photos"

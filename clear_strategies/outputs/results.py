@@ -109,7 +109,7 @@ def write_results(
     stages = pd.DataFrame([*scene.work_log.rows(), *_two_stages(state, history), *work_log.rows()])
     _write_tables(folder, history, stages)
     files.write_json(
-        folder / metrics.FILE,
+        folder / files.FINISHED,
         metrics.to_json(
             evaluation, scene=scene.name, **asdict(chosen), seed=settings.seed, iterations=state.t - 1,
             gaussians=len(field), seconds=seconds, conflict=_mean_conflict(history), synthetic_prior=scene.synthetic_prior,
@@ -160,7 +160,7 @@ def remove_earlier(folder: Path, *, all_files: bool) -> None:
         all_files: also the other files of that run, which would be taken for those of the new run. The views in its
             metrics.json and cameras.json name them; all other files stay.
     """
-    path = folder / metrics.FILE
+    path = folder / files.FINISHED
     if not path.exists():
         return
     _log.warning("%s: of an earlier run; removed%s.", path, ", and the pictures and tables of that run" * all_files)

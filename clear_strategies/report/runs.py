@@ -13,6 +13,7 @@ from typing import Final
 import pandas as pd
 
 from clear_strategies.errors import DataError
+from clear_strategies.files import FINISHED
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.plan import OF_STRATEGY, Chosen
 from clear_strategies.settings import CHANGES_NO_RESULT
@@ -58,7 +59,7 @@ class FinishedRun:
     @classmethod
     def read(cls, folder: Path) -> FinishedRun:
         """Read a run's folder."""
-        path = folder / metrics.FILE
+        path = folder / FINISHED
         content = metrics.read(path, "train the run again")
         overrides, part = content.overrides or [], content.shown
         if "ours" not in part.mean:
@@ -95,7 +96,7 @@ def collect(folders: Iterable[Path]) -> list[FinishedRun]:
     folders += [link for folder in folders for link in sorted(folder.glob("*")) if link.is_symlink() and link.is_dir()]
     finished: dict[Path, None] = {}
     for folder in folders:
-        in_folder = sorted(path.parent for path in folder.rglob(metrics.FILE))
+        in_folder = sorted(path.parent for path in folder.rglob(FINISHED))
         sweeps = [run.parent for run in in_folder]
         in_order = sorted(in_folder, key=lambda run: (sweeps.index(run.parent), _job(run), in_folder.index(run)))
         finished |= dict.fromkeys(run.resolve() for run in in_order)
