@@ -99,7 +99,7 @@ class _Launch:
         self.size: tuple[int, ...] = ()
         self.bounds: dict[tuple[int, ...], Any] = {}  # Warp's description of a size, for the sizes so far
         self.kinds = [argument.type for argument in kernel.adj.args]
-        # For each argument that is an array: by shape and strides, its description, of which only the address changes.
+        # For each argument that is an array: by type, shape and strides, its description, of which only the address changes.
         self.arrays: list[dict[Any, Any] | None] = [{} if wp.types.is_array(kind) else None for kind in self.kinds]
 
     def prepare(self, size: tuple[int, ...], arguments: Sequence[Any]) -> Any:
@@ -116,7 +116,7 @@ class _Launch:
             elif argument is None:
                 params[index] = _empty_array()
             else:
-                layout = argument.shape, argument.stride()
+                layout = argument.dtype, argument.shape, argument.stride()
                 described = params[index] = known.get(layout) or self._described(index, layout, argument)
                 described.data = argument.data_ptr()
             if self.on_cuda:
@@ -185,11 +185,16 @@ def array(tensor: Tensor | None, kind: Any) -> Any:
 
     The tensor may have more dimensions than the array: those of the array's vectors or matrices, or one with the numbers of a
     structure, and before them some that the array's last dimension goes through.
+
+    Raises:
+        TypeError: its numbers are of another type than the array's.
+        ValueError: it is no such array in memory.
     """
     if tensor is None:
         return _empty_array()
     n, shape, strides = kind.ndim, tensor.shape, tensor.stride()
-    is_struct = hasattr(kind.dtype, "ctype")
+    if not (is_struct := hasattr(kind.dtype, "ctype")):
+        _require_numbers(tensor, kind.dtype)
     inner = (
         (ctypes.sizeof(kind.dtype.ctype) // tensor.element_size(),) if is_struct else getattr(kind.dtype, "_shape_", ())
     )
@@ -208,6 +213,14 @@ def array(tensor: Tensor | None, kind: Any) -> Any:
     return type(_empty_array())(tensor.data_ptr(), 0, n, lengths, in_bytes)
 
 
+def _require_numbers(tensor: Tensor, kind: Any) -> None:
+    import warp as wp
+
+    read, given = getattr(kind, "_wp_scalar_type_", kind), wp.dtype_from_torch(tensor.dtype)  # of a vector, of a number
+    if given is not read:
+        raise TypeError(f"a kernel reads numbers of type {read.__name__}, got {given.__name__}: cast the tensor.")
+
+
 def struct(kind: Any, rows: Mapping[str, Tensor | None], **values: Any) -> Any:
     """A Warp structure as a kernel argument: `rows` as arrays, numbers. What is not given is empty, or 0.
 
@@ -216,7 +229,8 @@ def struct(kind: Any, rows: Mapping[str, Tensor | None], **values: Any) -> Any:
     given = {name: x for name, x in rows.items() if x is not None}
     if not given:
         return kind.ctype(**values)
-    key = kind, *given, *values, *values.values(), *[size for x in given.values() for size in (x.shape, x.stride())]
+    layouts = [part for x in given.values() for part in (x.dtype, x.shape, x.stride())]
+    key = kind, *given, *values, *values.values(), *layouts
     known = _structures.get(key)
     if known is None:
         if len(_structures) >= _MOST_STRUCTURES:

@@ -50,6 +50,17 @@ def test_the_last_dimension_of_an_array_goes_through_several_of_a_tensor():
 
 
 @installed
+def test_numbers_of_another_type_than_a_kernel_reads_are_refused():
+    """After those of the right type, whose description is kept."""
+    from clear_strategies.kernels.gaussian_step.warp import adam
+    from rasterizers.warp_runtime import struct
+
+    struct(adam.Attribute, {"p": torch.rand(5, 3)}, width=3)
+    with pytest.raises(TypeError, match="reads numbers of type float32, got float64: cast the tensor"):
+        struct(adam.Attribute, {"p": torch.rand(5, 3, dtype=torch.float64)}, width=3)
+
+
+@installed
 def test_structures_of_the_same_shapes_have_their_own_addresses():
     from clear_strategies.kernels.gaussian_step.warp import adam
     from rasterizers.warp_runtime import struct
