@@ -26,6 +26,7 @@ from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
+from clear_strategies.files import FINISHED
 from clear_strategies.hydra_app import readable
 from clear_strategies.jobs import exit_codes, job
 from clear_strategies.jobs.device import BY_NAME
@@ -51,13 +52,13 @@ class Run:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "folder", path_of(str(self.folder)))
-        if not (self.folder / "metrics.json").is_file():
-            raise DataError(self.folder, "metrics.json", "is not there, so no run has finished here", "train first")
+        if not (self.folder / FINISHED).is_file():
+            raise DataError(self.folder, FINISHED, "is not there, so no run has finished here", "train first")
 
     @cached_property
     def metrics(self) -> Mapping[str, Any]:
         """The content of metrics.json: scores of every view and their means, seconds, configuration, provenance."""
-        return read_object(self.folder / "metrics.json")
+        return read_object(self.folder / FINISHED)
 
     @cached_property
     def splats(self) -> Mapping[str, Tensor]:

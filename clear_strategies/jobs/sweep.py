@@ -85,7 +85,7 @@ def _lack(config: DictConfig) -> str | None:
 
 def in_worker() -> bool:
     """Whether this is a process of joblib's, which ends all others at once where one of them ends or has an error."""
-    return HydraConfig.get().mode == RunMode.MULTIRUN and multiprocessing.parent_process() is not None
+    return in_sweep() and multiprocessing.parent_process() is not None
 
 
 @contextmanager
