@@ -162,19 +162,21 @@ def geometry_vjp(
     dv = f.xy * sums.first[0] + f.yy * sums.first[1]
     out.screen = wp.vec2(du, dv)
 
-    # ∂L/∂T, row by row; P = Σ'⁻¹ T.
-    px, py = f.xx * f.X + f.xy * f.Y, f.xy * f.X + f.yy * f.Y
+    # ∂L/∂T, row by row, with P = Σ'⁻¹ T. The rows of P, (y × n + κ x)/det and (n × x + κ y)/det with the rows x and y of T, have
+    # sums without cancellation; products of Σ'⁻¹ and T would lose all digits for a needle.
+    shrink = 1.0 / f.size
+    x, y = f.X * shrink, f.Y * shrink
+    along_x, along_y = wp.cross(y, f.normal), wp.cross(f.normal, x)
+    px, py = (along_x + f.kernel * x) * (shrink / f.det), (along_y + f.kernel * y) * (shrink / f.det)
     mx, my = sums.xx * px + sums.xy * py, sums.xy * px + sums.yy * py
     dX, dY = f.xx * mx + f.xy * my, f.xy * mx + f.yy * my
     if cuts.antialiased:
         # log ρ = ½ log area² - ½ log(area² + κ tr + κ²). This form avoids the cancellation for large Gaussians:
         # ∂ log ρ/∂x = κ/det ((tr + κ)/area² (y × n) - x), and for y with n × x.
-        shrink = 1.0 / f.size
-        x, y = f.X * shrink, f.Y * shrink
         weight = sums.q * shrink * f.kernel / f.det
         turn = (f.a + f.c + f.kernel) / (f.area * f.area)
-        dX += weight * (turn * wp.cross(y, f.normal) - x)
-        dY += weight * (turn * wp.cross(f.normal, x) - y)
+        dX += weight * (turn * along_x - x)
+        dY += weight * (turn * along_y - y)
 
     # T = J axes: gradients of the axes, of 1/z, and of the tangents where they are not clamped.
     gx, gy = grid.focal[0] * g.inverse_z * dX, grid.focal[1] * g.inverse_z * dY

@@ -162,25 +162,26 @@ CLEAR_INLINE void project_vjp(const Pose& pose, const Grid<T>& grid, const Setti
   L du = out.screen[0] = f.xx * qx + f.xy * qy;
   L dv = out.screen[1] = f.xy * qx + f.yy * qy;
 
-  // ∂L/∂T
-  L dX[3], dY[3];
+  // ∂L/∂T, with P = Σ'⁻¹ T. The rows of P, (y x n + κ x)/det and (n x x + κ y)/det with the rows x and y of T, have sums
+  // without cancellation; products of Σ'⁻¹ and T would lose all digits for a needle.
+  L tx[3], ty[3], along_x[3], along_y[3], dX[3], dY[3];
+  const L shrink = L(T(1)) / f.size, over_det = shrink / f.det;
+  for (int k = 0; k < 3; ++k) tx[k] = f.X[k] * shrink, ty[k] = f.Y[k] * shrink;
+  cross<T>(ty, f.normal, along_x);
+  cross<T>(f.normal, tx, along_y);
   for (int k = 0; k < 3; ++k) {
-    L px = f.xx * f.X[k] + f.xy * f.Y[k], py = f.xy * f.X[k] + f.yy * f.Y[k];  // P = Σ'⁻¹ T
-    L mx = qxx * px + qxy * py, my = qxy * px + qyy * py;                      // M P
+    L px = (along_x[k] + f.kernel * tx[k]) * over_det, py = (along_y[k] + f.kernel * ty[k]) * over_det;
+    L mx = qxx * px + qxy * py, my = qxy * px + qyy * py;  // M P
     dX[k] = f.xx * mx + f.xy * my;
     dY[k] = f.xy * mx + f.yy * my;
   }
   if (s.antialiased) {
     // log ρ = ½ log area² - ½ log(area² + κ tr + κ²). This form avoids the cancellation for large Gaussians:
     //   ∂ log ρ/∂x = κ/det ((tr + κ)/area² (y x n) - x),   and for y with n x x.
-    L x[3], y[3], along_x[3], along_y[3], shrink = L(T(1)) / f.size;
-    for (int k = 0; k < 3; ++k) x[k] = f.X[k] * shrink, y[k] = f.Y[k] * shrink;
-    cross<T>(y, f.normal, along_x);
-    cross<T>(f.normal, x, along_y);
-    L weight = q * shrink * f.kernel / f.det, turn = (f.a + f.c + f.kernel) / (f.area * f.area);
+    L weight = q * f.kernel * over_det, turn = (f.a + f.c + f.kernel) / (f.area * f.area);
     for (int k = 0; k < 3; ++k) {
-      dX[k] += weight * (turn * along_x[k] - x[k]);
-      dY[k] += weight * (turn * along_y[k] - y[k]);
+      dX[k] += weight * (turn * along_x[k] - tx[k]);
+      dY[k] += weight * (turn * along_y[k] - ty[k]);
     }
   }
 
