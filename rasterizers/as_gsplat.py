@@ -100,7 +100,7 @@ def rasterization(
         ValueError: a mode or an argument that only gsplat supports, or a wrong shape.
     """
     _require_supported(render_mode, rasterize_mode, more)
-    batch, n, cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
+    batch, n, cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3] if viewmats.dim() > 2 else 1
     replays = replay and not absgrad and torch.is_grad_enabled()
     n_scenes = batch.numel()
     _require_geometry(batch, n, cameras, quats, scales, opacities, viewmats, Ks, rgb_offset)
@@ -124,7 +124,7 @@ def rasterization(
         mu, q, s, opacity = (of_scene(x, scene) for x in (means, quats, scales, opacities))
         offset = None if rgb_offset is None else of_scene(rgb_offset, scene)
         for c, camera in enumerate(cameras_of(poses, K, width, height)):
-            left_in = _left_in(mu, q, s, opacity, camera, far_plane, radius_clip, eps2d)
+            left_in = _left_in(mu, q, s, opacity, camera, far_plane, radius_clip, eps2d, rasterize_mode)
             inputs = Inputs(mu, q, s, left_in, own[c] if by_camera else own, offset)
             views.append(
                 CameraView(
@@ -200,7 +200,7 @@ def _camera(
 
 def _left_in(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, camera: Camera, far_plane: float, radius_clip: float,
-    kernel: float,
+    kernel: float, rasterize_mode: str,
 ) -> Float[Tensor, " N"]:  # fmt: skip
     """The opacities, 0 for what is too far or too small."""
     if far_plane >= _FARTHEST and radius_clip <= 0:
@@ -209,7 +209,8 @@ def _left_in(
         keep = depths(means, camera.world_to_camera.to(means)) <= far_plane
         if radius_clip > 0:
             f = footprints(means, quats, scales, camera, kernel)
-            radii = f.radii(opacities, 1 / 255)  # NaN of those behind the camera, which are not drawn
+            reach = opacities * f.compensation if rasterize_mode == "antialiased" else opacities
+            radii = f.radii(reach, 1 / 255)  # NaN of those behind the camera, which are not drawn
             keep &= ~(radii <= radius_clip).all(-1)
     return opacities * keep
 
@@ -227,16 +228,20 @@ def _require_geometry(
     for name, (value, shape) in each.items():
         if value is not None and value.shape != shape:
             raise ValueError(f"{name} must have the shape {list(shape)}, got {list(value.shape)}.")
+    if 0 in (*batch, cameras):
+        raise ValueError(f"at least one scene and one camera must be given, got viewmats {list(viewmats.shape)}.")
 
 
 def _require_colors(
     batch: tuple[int, ...], n: int, cameras: int, colors: Tensor, sh_degree: int | None, backgrounds: Tensor | None
 ) -> None:
     """The same of the colours, which are of all cameras or of each, and of what is behind them."""
+    if sh_degree is not None and sh_degree not in range(4):
+        raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {sh_degree!r}.")
     bands = None if sh_degree is None else (sh_degree + 1) ** 2
     fits = colors.shape[: -1 if bands is None else -2] in ((*batch, n), (*batch, cameras, n))
-    if not fits or (bands is not None and (colors.shape[-1] != 3 or colors.shape[-2] < bands)):
-        last = "D]" if bands is None else f"K, 3] with K >= {bands}"
+    if not fits or not colors.shape[-1] or (bands is not None and (colors.shape[-1] != 3 or colors.shape[-2] < bands)):
+        last = "D] with D >= 1" if bands is None else f"K, 3] with K >= {bands}"
         raise ValueError(
             f"colors{'' if sh_degree is None else f' with sh_degree={sh_degree}'} must have the shape "
             f"[{', '.join(map(str, (*batch, n)))}, {last}, or that of each camera, got {list(colors.shape)}."

@@ -203,12 +203,13 @@ class _Draw(torch.autograd.Function):
     ) -> Any:  # fmt: skip
         ctx.rendered, ctx.rows, ctx.hook, ctx.absgrad, rendering = rendered, rows, hook, absgrad, rendered.rendering
         ctx.pose = None if pose is None else (pose.device, pose.dtype)
-        ctx.save_for_backward(*inputs)
         ctx.mark_non_differentiable(visible := rendering.visible.data)
         ctx.set_materialize_grads(False)
         # Other tensors over the same memory: an output that ctx holds would hold ctx in turn, and nothing would free either.
-        depth = None if rendering.depth is None else rendering.depth.data
-        return rendering.image.data, rendering.alpha.data, visible, depth
+        alpha, depth = rendering.alpha.data, None if rendering.depth is None else rendering.depth.data
+        # The gradient of depth reads both outputs: torch refuses it if one was changed in place.
+        ctx.save_for_backward(*inputs, *([] if depth is None else [alpha, depth]))
+        return rendering.image.data, alpha, visible, depth
 
     @staticmethod
     @in_full_precision
@@ -224,7 +225,8 @@ class _Draw(torch.autograd.Function):
                 "traits.depth_gradient is False); detach it, draw with cpp or torch, or let rasterizers.rasterization draw it."
             )
         take_colours = ctx.hook.reached()
-        inputs = Inputs(*ctx.saved_tensors)  # raises if one was changed in place since it was drawn
+        saved = ctx.saved_tensors  # raises if one was changed in place since it was drawn
+        inputs = Inputs(*saved[: len(Inputs._fields)])
         if d_image is None:
             d_image = torch.zeros_like(rendering.image)
         if whole or d_alpha is None or not besides:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -52,11 +53,14 @@ def constant_band(rgb: Float[Tensor, "N 3"]) -> Float[Tensor, "N 1 3"]:
 def low_and_span(colors: Float[Tensor, "N 3"], background: Sequence[float]) -> tuple[float, float]:
     """RGB in any range is drawn as (RGB - low) / span, with colours >= 0 over a background in [0, 1].
 
-    The weights of a pixel's colours and background sum to 1, so the image is low + span times what is drawn.
+    The weights of a pixel's colours and background sum to 1, so the image is low + span times what is drawn. A span below 1, a
+    power of two, keeps the digits of small colours: `constant_band` adds numbers near 1/2.
     """
     finite = colors.detach().nan_to_num(0, 0, 0)  # NaN is refused by the rasterizer
-    low = min(0.0, float(finite.min()) if len(finite) else 0.0, *background)
-    return low, max(1.0, max(background) - low)
+    least, most = (float(x) for x in finite.aminmax()) if finite.numel() else (0.0, 0.0)
+    low = min(0.0, least, *background)
+    power = 2.0 ** max(math.frexp(max(most, *background) - low)[1], -126)
+    return low, max(min(1.0, power), max(background) - low)
 
 
 def spherical_harmonics(directions: Float[Tensor, "M 3"], bands: int) -> Float[Tensor, "M B1"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from typing import Any, cast
 
 import torch
@@ -86,7 +86,7 @@ class _Info(dict[str, Any]):
 
     def __init__(self, values: Mapping[str, Any], later: Mapping[str, Callable[[], dict[str, Any]]]) -> None:
         super().__init__(values)
-        self._later = later
+        self._later = dict(later)
 
     def __contains__(self, name: object) -> bool:
         return super().__contains__(name) or name in self._later
@@ -95,7 +95,8 @@ class _Info(dict[str, Any]):
         if name not in self._later:
             raise KeyError(name)
         for made, value in self._later[name]().items():
-            self.setdefault(made, value)  # what the loop has written stays
+            super().setdefault(made, value)  # what the loop has written stays
+            self._later.pop(made, None)
         return self[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -105,10 +106,14 @@ class _Info(dict[str, Any]):
     def __len__(self) -> int:
         return sum(1 for _ in self)
 
+    pop, setdefault = MutableMapping.pop, MutableMapping.setdefault
     get, keys, values, items = Mapping.get, Mapping.keys, Mapping.values, Mapping.items  # type: ignore[assignment]
 
     def copy(self) -> dict[str, Any]:
         return dict(self)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return dict, (self.copy(),)
 
     def __or__(self, other: dict[str, Any]) -> dict[str, Any]:  # type: ignore[override]
         return self.copy() | other

@@ -2,6 +2,7 @@
 
 import inspect
 import itertools
+import pickle
 
 import pytest
 import torch
@@ -259,6 +260,20 @@ def test_names_of_info_make_nothing_and_what_reads_it_as_a_dictionary_has_the_wh
     assert "nothing" not in info
 
 
+@pytest.mark.parametrize("packed", [False, True])
+def test_info_is_pickled_and_emptied_as_a_dictionary_is(packed):
+    splats, (viewmats, Ks) = {name: x.detach() for name, x in gaussians().items()}, cameras()
+    call = splats, colours(False, None).detach(), viewmats.detach(), Ks
+    info = drawn(*call, packed=packed)[2]
+    saved = pickle.loads(pickle.dumps(info))  # noqa: S301
+    assert saved.keys() == info.keys()
+    assert torch.equal(saved["conics"], info["conics"])
+    info = drawn(*call, packed=packed)[2]
+    assert torch.equal(info.setdefault("radii", None), saved["radii"])
+    assert all(torch.equal(info.pop(name), saved[name]) for name in ("radii", "depths"))
+    assert not {"radii", "depths"} & info.keys()
+
+
 @needs("warp")
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 def test_radii_of_warp_are_those_of_the_reference_as_float32_rounds_them(mode):
@@ -285,6 +300,44 @@ def test_what_lies_too_far_or_is_too_small_is_left_out(backend):
     assert len(large["radii"]) == int((info["radii"] > radius).any(1).sum())
 
 
+def test_radius_clip_reads_the_radii_of_info():
+    """Of antialiased Gaussians, too, whose opacity is smaller."""
+    splats, colors, (viewmats, Ks) = gaussians(), colours(False, None), cameras()
+    splats["scales"] = splats["scales"] * 0.3
+    call = {"rasterize_mode": "antialiased", "eps2d": 3.0, "packed": True, "backend": "torch"}
+    radii = drawn(splats, colors, viewmats, Ks, **call)[2]["radii"]
+    clip = int(radii.amax(1).median())
+    left = drawn(splats, colors, viewmats, Ks, radius_clip=clip, **call)[2]["radii"]
+    assert len(radii) > len(left) == int((radii > clip).any(1).sum()) > 0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("size", [1e-3, 1e-9, 1e-30])
+def test_small_channels_keep_their_digits(backend, size):
+    splats, colors = gaussians(dtype=torch.float32), colours(False, None, dtype=torch.float32)
+    call = *(x.float() for x in cameras()), WIDTH, HEIGHT
+    small = (colors.detach() * size).requires_grad_()
+    (whole, *_), (image, *_) = (rasterization(*splats.values(), x, *call, backend=backend) for x in (colors, small))
+    assert torch.allclose(image / size, whole, atol=1e-6 * float(whole.abs().max()))
+    of_whole, of_small = (torch.autograd.grad(x.sum(), c)[0] for x, c in ((whole, colors), (image, small)))
+    assert torch.allclose(of_small, of_whole, rtol=1e-4, atol=1e-5 * float(of_whole.abs().max()))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_backward_pass_of_depth_is_refused_after_alpha_was_changed_in_place(backend):
+    """It would read the changed numbers. Of an image without depth, nothing reads them; the images of two cameras are copies."""
+    splats, colors, (viewmats, Ks) = gaussians(), colours(False, None), cameras()
+    for mode in ("RGB", "RGB+ED"):
+        image, alpha, _ = drawn(splats, colors, viewmats[:1], Ks[:1], render_mode=mode, backend=backend)
+        with torch.no_grad():
+            alpha.mul_(2)
+        if mode == "RGB":
+            image.sum().backward()
+        else:
+            with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+                image.sum().backward()
+
+
 @pytest.mark.parametrize(
     ("call", "named"),
     [
@@ -296,7 +349,10 @@ def test_what_lies_too_far_or_is_too_small_is_left_out(backend):
         ({"render_mode": "normals"}, "render_mode must be one of RGB, D, ED, RGB[+]D, RGB[+]ED"),
         ({"backgrounds": torch.zeros(CAMERAS, 4)}, r"backgrounds must have the shape \[2, 3\]"),
         ({"colors": torch.zeros(N, 4, 3), "sh_degree": 3}, r"must .*\[24, K, 3\] with K >= 16, .*got \[24, 4, 3\]"),
-        ({"colors": torch.zeros(N - 1, 16)}, r"must .*\[24, D\], .*got \[23, 16\]"),
+        ({"colors": torch.zeros(N - 1, 16)}, r"must .*\[24, D\] with D >= 1, .*got \[23, 16\]"),
+        ({"colors": torch.zeros(N, 0)}, r"must .*\[24, D\] with D >= 1, .*got \[24, 0\]"),
+        ({"colors": torch.zeros(N, 25, 3), "sh_degree": 4}, "sh_degree must be 0, 1, 2 or 3, got 4"),
+        ({"viewmats": torch.zeros(0, 4, 4), "Ks": torch.zeros(0, 3, 3)}, "at least one scene and one camera"),
     ],
 )
 def test_what_is_not_drawn_is_refused_by_name(call, named):
