@@ -137,10 +137,11 @@ def rasterization(
     # The parts of a picture have the same centres.
     each = [(parts[0].rendered, view.inputs) for parts, view in zip(drawn, views, strict=True)]
     rows: Sequence[Tensor | None]
+    learns = any(x.requires_grad for x in (*(x for inputs in each for x in inputs[1] if x is not None), viewmats))
     if packed:
-        info, centres, rows = info_of_visible(each, cameras)
+        info, centres, rows = info_of_visible(each, cameras, learns)
     else:
-        info, centres, rows = info_of_all(each, lead)
+        info, centres, rows = info_of_all(each, lead, learns)
     info |= {"width": width, "height": height, "n_cameras": cameras, "n_batches": n_scenes, "tile_size": tile_size}
     absolute: Sequence[Tensor | None] = [None] * len(views)
     if absgrad:

@@ -20,17 +20,18 @@ Picture = tuple[Rendered, Inputs]
 
 
 def info_of_all(
-    each: Sequence[Picture], lead: tuple[int, ...]
+    each: Sequence[Picture], lead: tuple[int, ...], learns: bool
 ) -> tuple[dict[str, Any], Sequence[Tensor], Sequence[None]]:
     """What gsplat's strategies read, the centres of each image, and None for the rows of each: these are all.
 
     Args:
         lead: the dimensions of scenes and cameras, which `each` goes through.
+        learns: whether a backward pass may follow, and `means2d` is to have a gradient.
     """
     renderings = [rendered.rendering for rendered, _ in each]
     means2d = stacked([rendering.means2d for rendering in renderings])
     means2d = means2d.clone() if len(each) == 1 else means2d
-    means2d = means2d.view(*lead, *means2d.shape[1:]).requires_grad_()
+    means2d = means2d.view(*lead, *means2d.shape[1:]).requires_grad_(learns)
 
     def radii() -> dict[str, Tensor]:
         found = stacked([cast(WithRadii, rendering).radii for rendering in renderings])
@@ -54,12 +55,14 @@ def info_of_all(
     return _Info(values, later), flat.unbind(), [None] * len(each)
 
 
-def info_of_visible(each: Sequence[Picture], cameras: int) -> tuple[dict[str, Any], Sequence[Tensor], Sequence[Tensor]]:
+def info_of_visible(
+    each: Sequence[Picture], cameras: int, learns: bool
+) -> tuple[dict[str, Any], Sequence[Tensor], Sequence[Tensor]]:
     """The same of the visible alone, and which rows these are."""
     rows = [rendered.rendering.visible.nonzero()[:, 0] for rendered, _ in each]
     columns = [_columns(*one, i) for one, i in zip(each, rows, strict=True)]
     info: dict[str, Any] = {name: torch.cat([x[name] for x in columns]) for name in columns[0]}
-    info["means2d"].requires_grad_()
+    info["means2d"].requires_grad_(learns)
     ids = torch.cat(rows)
     view = torch.cat([torch.full_like(i, k) for k, i in enumerate(rows)])
     info |= {"gaussian_ids": ids, "camera_ids": view % cameras, "batch_ids": view // cameras}

@@ -261,6 +261,23 @@ def test_names_of_info_make_nothing_and_what_reads_it_as_a_dictionary_has_the_wh
 
 
 @pytest.mark.parametrize("packed", [False, True])
+def test_an_image_of_tensors_without_gradients_has_none(packed):
+    """`image.numpy()` works, and images stack in the workers of a DataLoader."""
+    viewmats, Ks = (x.detach() for x in cameras())
+    inputs = {
+        name: x.detach() for name, x in {**gaussians(), "colors": colours(False, None), "viewmats": viewmats}.items()
+    }
+
+    def gradients_of(name):
+        given = {k: x.clone().requires_grad_(k == name) for k, x in inputs.items()}
+        image, _, info = rasterization(*given.values(), Ks, WIDTH, HEIGHT, packed=packed, backend="torch")
+        return image.requires_grad, info["means2d"].requires_grad
+
+    assert gradients_of(None) == (False, False)
+    assert all(gradients_of(name) == (True, True) for name in inputs)
+
+
+@pytest.mark.parametrize("packed", [False, True])
 def test_info_is_pickled_and_emptied_as_a_dictionary_is(packed):
     splats, (viewmats, Ks) = {name: x.detach() for name, x in gaussians().items()}, cameras()
     call = splats, colours(False, None).detach(), viewmats.detach(), Ks
