@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -14,13 +15,13 @@ from torch import Tensor
 
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DataError
-from clear_strategies.files import FINISHED
+from clear_strategies.files import FINISHED, read_bytes
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.metrics import Metrics
 from clear_strategies.settings import CHANGES_NO_RESULT, flat
 from clear_strategies.training import checkpoint
 from clear_strategies.training.checkpoint import CHECKPOINTS, Checkpoint
-from clear_strategies.training.state import PHOTOS, TrainState
+from clear_strategies.training.state import PHOTOS, TrainState, colours
 from clear_strategies.viewing.cameras import FILE as CAMERAS
 from clear_strategies.viewing.cameras import read_cameras
 from rasterizers.interface import Camera
@@ -32,12 +33,12 @@ AUTO: Final = "auto"  # the value of fit.resume that is not a path
 
 # What may differ between a run and the one that it resumes. Another device changes bits, which is logged.
 _NOT_COMPARED: Final = CHANGES_NO_RESULT | {"fit.device"}
-# Where the data set lies, which may be moved: the cameras that are read there are compared.
-_DATA: Final = ("data.path", "data.root", "data.reader.root", "data.reader.cache")
-# Where other files lie, by the ends of their keys: what they hold is compared.
-_FILES: Final = ("path", "lr_folder")
-_HELD: Final = " content"
-_HELD_EARLIER: Final = " holds"  # of earlier versions: names and sizes
+# Where photos and SR images lie, which may be moved: cameras and colours of what is read there are compared.
+_PLACE: Final = re.compile(r"data\.(path|root|reader\.(root|cache)|views\.lr_folder)|prior\.(.*\.)?path")
+# A file, such as initial points or a network, has its digest beside the key of its path.
+_FILE: Final = ".path"
+_DIGEST: Final = " digest"
+_DIGEST_EARLIER: Final = (" content", " holds")  # of earlier versions, also of folders
 _ROUNDED: Final = 1e-6  # of a position, as float32 has it
 _SAME: Final = 1e-3  # of a camera's focal length, and of the distances between the cameras
 _SAME_COLOUR: Final = 5e-4  # more than other machines round or decode differently
@@ -46,25 +47,13 @@ _SAME_COLOUR: Final = 5e-4  # more than other machines round or decode different
 def comparable(values: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration, flat and JSON-ready, without what a resumed run may change."""
     compared = {key: value for key, value in flat(values).items() if key not in _NOT_COMPARED}
-    places = {key: Path(str(value)) for key, value in compared.items() if key.rpartition(".")[2] in _FILES and value}
-    compared |= {key + _HELD: _held(path) for key, path in places.items() if key not in _DATA and path.exists()}
+    files = {key: Path(str(value)) for key, value in compared.items() if key.endswith(_FILE) and value}
+    compared |= {
+        key + _DIGEST: hashlib.sha256(read_bytes(path)).hexdigest()
+        for key, path in files.items()
+        if key != "data.path" and path.is_file()
+    }
     return dict(msgspec.json.decode(msgspec.json.encode(compared)))  # as it comes back from a file
-
-
-def _held(path: Path) -> str:
-    """A digest of the files at a place: of their names in it, and of what they hold."""
-    whole = hashlib.sha256()
-    for file in sorted(filter(Path.is_file, path.rglob("*") if path.is_dir() else [path])):
-        whole.update(f"{file.relative_to(path).as_posix()} {_digest(file)}\n".encode())
-    return whole.hexdigest()[:12]
-
-
-def _digest(file: Path) -> str:
-    try:
-        with file.open("rb") as opened:
-            return hashlib.file_digest(opened, "sha256").hexdigest()
-    except OSError:  # who needs it says so
-        return ""
 
 
 def begun(folder: Path) -> str | None:
@@ -78,15 +67,19 @@ def finished(folder: Path, config: Mapping[str, Any], scene: Callable[[], Scene]
     """The results of the finished run in this folder; None where there is none.
 
     Args:
-        scene: reads that of `config`, if its place is another.
+        scene: reads that of `config`, if its place is another, or has been written to since.
     """
     path = folder / FINISHED
     if not path.exists():
         return None
     content = metrics.read(path, _TRAIN_AGAIN)
     _require_same(folder, content.config, config)
-    if any(content.config.get(key) != config.get(key) for key in _DATA):
-        _require_same_cameras(folder, scene())
+    places = {key: config[key] for key in filter(_PLACE.fullmatch, config) if config[key]}
+    moved = any(content.config.get(key) != place for key, place in places.items())
+    if moved or any(_written(Path(place), path) for key, place in places.items() if key.endswith(_FILE)):
+        _require_same_cameras(folder, there := scene())
+        if (last := newest(folder)) is not None:
+            _require_same_photos(folder, checkpoint.load(last), colours(there))
     mean = content.shown.mean.get("ours")
     score = "no PSNR" if mean is None or mean.psnr is None else f"PSNR {mean.psnr:.2f} dB"
     _log.info(
@@ -96,6 +89,11 @@ def finished(folder: Path, config: Mapping[str, Any], scene: Callable[[], Scene]
         score,
     )
     return content
+
+
+def _written(place: Path, since: Path) -> bool:
+    """Whether a place has a file that is newer than this one."""
+    return any(file.lstat().st_mtime > since.stat().st_mtime for file in place.rglob("*"))
 
 
 def resume(state: TrainState, scene: Scene, source: str | None, folder: Path, config: Mapping[str, Any]) -> None:
@@ -137,7 +135,7 @@ def restore(state: TrainState, scene: Scene, saved: Checkpoint, source: Path, co
     """Continue from a checkpoint of the same configuration, on the same photos and poses."""
     _require_same(source, saved.config, config)
     _require_same_cameras(source, scene)
-    _require_same_photos(source, saved, state)
+    _require_same_photos(source, saved, state.photos)
     state.restore(saved, source)
     _log.info("resumed from %s: %d iterations are done.", source, saved.t - 1)
     if saved.device != state.device.type:
@@ -149,9 +147,9 @@ def restore(state: TrainState, scene: Scene, saved: Checkpoint, source: Path, co
 
 def _require_same(source: Path, then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     keys = then.keys() | now.keys()
-    moved = {key for key in keys if key + _HELD in then and key + _HELD in now}  # what they hold is compared
-    moved |= {*_DATA} if (folder_of(source) / CAMERAS).is_file() else set()
-    moved |= {key for key in then.keys() ^ now.keys() if key.endswith((_HELD, _HELD_EARLIER))}
+    moved = {key for key in keys if key + _DIGEST in then and key + _DIGEST in now}  # their content is compared
+    moved |= {*filter(_PLACE.fullmatch, keys)} if (folder_of(source) / CAMERAS).is_file() else set()
+    moved |= {key for key in then.keys() ^ now.keys() if key.endswith((_DIGEST, *_DIGEST_EARLIER))}
     differ = [key for key in sorted(keys - moved) if then.get(key) != now.get(key)]
     if differ:
         listed = "; ".join(f"{key}: {then.get(key)!r} then, {now.get(key)!r} now" for key in differ[:5])
@@ -181,12 +179,12 @@ def _require_same_cameras(source: Path, scene: Scene) -> None:
         raise DataError(source, "data", problem, "give the same data, at whatever path, or start a new run")
 
 
-def _require_same_photos(source: Path, saved: Checkpoint, state: TrainState) -> None:
-    """Refuse photos or masks with another content; checkpoints of earlier versions have less of it, or nothing."""
-    now = {name: (saved.tensors.get(f"{PHOTOS}/{name}", x), x) for name, x in state.photos.items()}
+def _require_same_photos(source: Path, saved: Checkpoint, photos: Mapping[str, Tensor]) -> None:
+    """Refuse photos, masks or SR images with another content; checkpoints of earlier versions have less of it, or nothing."""
+    now = {name: (saved.tensors.get(f"{PHOTOS}/{name}", x), x) for name, x in photos.items()}
     if changed := [name for name, (a, b) in now.items() if not _same_colours(a, b)]:
-        problem = f"{len(changed)} of {len(now)} have another content or mask than in this run, such as {changed[0]}"
-        raise DataError(source, "photos", problem, "give the photos of this run, or start a new run")
+        problem = f"{len(changed)} of {len(now)} have another content, mask or SR image than in this run, such as {changed[0]}"
+        raise DataError(source, "photos", problem, "give the photos and SR images of this run, or start a new run")
 
 
 def _same_colours(a: Tensor, b: Tensor) -> bool:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
@@ -38,19 +38,22 @@ PHOTOS: Final = "photos"
 _CELLS: Final = 16  # a side
 
 
-def colours(views: Sequence[View]) -> dict[str, Tensor]:
-    """By the name of each LR photo its means in a grid: red, green, blue, the share of pixels that its mask shows, and 1 - alpha.
-    A checkpoint knows the photo by them. Hidden pixels count as black, and so do those that are not finite.
+def colours(scene: Scene) -> dict[str, Tensor]:
+    """By the name of each view its means in a grid, by which a checkpoint knows its photo: red, green, blue, the share of pixels
+    that its mask shows, and 1 - alpha; of a training view also the mean squares of its SR image, since back-projection gives
+    all SR images of a photo the same means. Hidden pixels count as black, and so do those that are not finite.
     """
     found: dict[str, Tensor] = {}
-    for view in views:
+    for view in (*scene.train, *scene.test):
         image, mask, transparency = view.lr.image, view.lr.shown, view.lr.transparency
         shown = torch.ones_like(image[..., 0]) if mask is None else mask.to(image)
         through = torch.zeros_like(shown) if transparency is None else transparency
-        image = torch.nan_to_num(image, 0.0, 0.0, 0.0) * shown[..., None]
-        layers = torch.cat([image, shown[..., None], through[..., None]], dim=-1)
-        found[view.name] = adaptive_avg_pool2d(layers.permute(2, 0, 1), _CELLS).cpu()
-    return found
+        found[view.name] = _means(torch.cat([image * shown[..., None], shown[..., None], through[..., None]], dim=-1))
+    return found | {v.name: torch.cat([found[v.name], _means(v.hr.image.square())]) for v in scene.train}
+
+
+def _means(layers: Float[Tensor, "H W C"]) -> Float[Tensor, "C h w"]:
+    return adaptive_avg_pool2d(torch.nan_to_num(layers, 0.0, 0.0, 0.0).permute(2, 0, 1), _CELLS).cpu()
 
 
 @dataclass(slots=True)
@@ -110,7 +113,7 @@ class TrainState:
             )
         optimizer = Adam(theta.raw(), rates, extent)
         conductor.on_fit_start(len(scene.train), settings.seed, device, scene.train)
-        photos = colours((*scene.train, *scene.test))
+        photos = colours(scene)
         state = cls(theta, conductor, optimizer, densifier, settings, mip, scene.train, rules, photos=photos)
         state.compiled_step = compiled_step_for(conductor, optimizer, settings.fused)
         state.refilter()

@@ -44,13 +44,38 @@ def test_device_threads_and_memory_may_differ_and_of_files_that_moved_the_conten
     with pytest.raises(DataError, match=r"density\.every: 50 then, 100 now"):
         resume.restore(start(()), SCENE, saved, Path("there"), compared())
     for name, content in (("a", b"1"), ("b", b"1"), ("c", b"2")):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "0.png").write_bytes(content)
-    a, b, c = (compared("prior=images", f"prior.path={tmp_path / name}") for name in "abc")
+        (tmp_path / name).write_bytes(content)
+    a, b, c = (compared("data.cloud.init=ply", f"data.cloud.path={tmp_path / name}") for name in "abc")
     saved = replace(start(()).checkpoint({}), config=a)
     resume.restore(start(()), SCENE, saved, Path("there"), b)
-    with pytest.raises(DataError, match=r"prior\.path content: "):
+    with pytest.raises(DataError, match=r"data\.cloud\.path digest: "):
         resume.restore(start(()), SCENE, saved, Path("there"), c)
+
+
+@pytest.mark.parametrize("left", ["checkpoint", "finished"])
+def test_a_run_goes_on_with_sr_images_at_another_place_and_not_with_others_be_it_that_they_shrink_to_the_same_photos(
+    left: str, tmp_path: Path, caplog
+) -> None:
+    caplog.set_level("INFO")
+    photos, sr, folder = captures.demo_on_disk(tmp_path / "photos"), tmp_path / "sr", tmp_path / "run"
+    words = ["prior=images", "+strategy=back_projected", "data.views.photos_are=hr"]
+    sr.mkdir()
+    for photo in photos.rglob("*.png"):
+        shutil.copy(photo, sr)
+    train_on(photos, folder, *words, f"prior.path={sr}")
+    if left == "checkpoint":
+        (folder / "metrics.json").unlink()
+    (sr / "of_no_training_view.png").write_bytes(b"no picture")
+    moved = sr.rename(tmp_path / "moved")
+    train_on(photos, folder, *words, f"prior.path={moved}", "fit.resume=auto")
+    assert ("resumed from" if left == "checkpoint" else "nothing is trained") in caplog.text
+    if left == "checkpoint":
+        (folder / "metrics.json").unlink()
+    moved.rename(sr)
+    with Image.open(sr / "0.png") as image:
+        image.resize((image.width // 4, image.height // 4)).resize(image.size).save(sr / "0.png")
+    with pytest.raises(DataError, match=r"1 of 4 have another content, mask or SR image .*, such as 0\.png"):
+        train_on(photos, folder, *words, f"prior.path={sr}", "fit.resume=auto")
 
 
 def test_ctrl_c_after_training_names_the_checkpoint_that_was_saved(tmp_path: Path, monkeypatch):
@@ -123,7 +148,8 @@ def test_a_run_does_not_go_on_with_a_photo_or_a_mask_whose_content_has_changed(c
         with Image.open(photo) as image:
             ImageOps.mirror(image).save(photo)
     with pytest.raises(
-        DataError, match=r"run: photos: 1 of 4 have another content or mask than in this run, such as 0\.png: "
+        DataError,
+        match=r"run: photos: 1 of 4 have another content, mask or SR image than in this run, such as 0\.png: ",
     ):
         train_on(photos, tmp_path / "other", f"fit.resume={folder}", *test)
 
@@ -132,7 +158,7 @@ def test_rounding_is_no_change_of_a_photo_and_checkpoints_of_earlier_versions_kn
     def brighter(by: float):
         first, *others = SCENE.train
         changed = replace(SCENE, train=(replace(first, lr=replace(first.lr, image=first.lr.image + by)), *others))
-        (state := start(())).photos = colours((*changed.train, *changed.test))
+        (state := start(())).photos = colours(changed)
         return state
 
     saved = start(()).checkpoint({})
@@ -140,7 +166,7 @@ def test_rounding_is_no_change_of_a_photo_and_checkpoints_of_earlier_versions_kn
     for of_version in (saved, replace(saved, tensors=earlier)):
         resume.restore(brighter(1e-4), SCENE, of_version, Path("there"), {})
         with pytest.raises(
-            DataError, match=f"there: photos: 1 of 4 have another content .* such as {SCENE.train[0].name}: "
+            DataError, match=f"there: photos: 1 of 4 have another content, .* such as {SCENE.train[0].name}: "
         ):
             resume.restore(brighter(1e-2), SCENE, of_version, Path("there"), {})
     earlier = {name: x for name, x in saved.tensors.items() if not name.startswith("photos/")}
