@@ -8,6 +8,7 @@ import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -15,7 +16,7 @@ from omegaconf import OmegaConf
 
 from clear_strategies.files import LOCK, HeldError, hold
 from clear_strategies.hydra_app import FAILED, SweepCallback
-from clear_strategies.jobs import device
+from clear_strategies.jobs import device, sweep
 from clear_strategies.training import checkpoint
 from tests.helpers.command_line import TINY, run, started, stopped_by, wait_for
 from tests.helpers.configs import composed
@@ -206,6 +207,34 @@ def test_a_stopped_joblib_sweep_saves_its_running_jobs_begins_no_other_and_leave
 
     wait_for(gone, 30, "the workers to end")
     assert "Traceback" not in (tmp_path / "said").read_text()
+
+
+@joblib
+def test_a_stopped_sweep_composes_none_of_its_remaining_jobs(monkeypatch):
+    """Hydra's launcher, with joblib in this process: a signal comes while it hands out the first job."""
+    from hydra_plugins.hydra_joblib_launcher import _core as launcher
+
+    handed_out = list[int]()
+
+    def parallel(**_):
+        def run(jobs):
+            for _, (number, *_), _ in jobs:
+                handed_out.append(number)
+                sweep.stop_workers(signal.SIGTERM, sys._getframe())
+            return []
+
+        return run
+
+    monkeypatch.setattr(launcher, "Parallel", parallel)
+    monkeypatch.setattr(sweep.multiprocessing, "active_children", lambda: [SimpleNamespace(pid=2**22 + 1)])
+    monkeypatch.setattr(sweep.signal, "signal", lambda *_: None)
+    monkeypatch.setattr(sweep, "stopped", [])
+    config = OmegaConf.create({"hydra": {"hydra_logging": None, "verbose": False, "sweep": {"dir": "."}}})
+    asked = SimpleNamespace(
+        config=config, task_function=len, hydra_context=SimpleNamespace(config_loader=None), joblib={}
+    )
+    launcher.launch(asked, [["fit.seed=0"], ["fit.seed=1"], ["fit.seed=2"]], 0)
+    assert handed_out == [0]
 
 
 def test_a_clusters_announcement_saves_before_its_handler_acts(tmp_path):
