@@ -120,7 +120,8 @@ def tree(config: DictConfig, without: Iterable[str] = ()) -> dict[str, Any]:
         values = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
     except OmegaConfBaseException as error:
         raise SettingError(one_line(error)) from error
-    for name, node in (values.get("strategies") or {}).items():
+    strategies = values.get("strategies")
+    for name, node in strategies.items() if isinstance(strategies, dict) else ():
         if isinstance(node, dict) and node.get(TARGET) is None:
             raise SettingError(
                 f"strategies.{name}: has settings ({', '.join(node)}), and takes no part. Add it, +strategy={name}, or leave out "

@@ -29,9 +29,9 @@ from omegaconf import DictConfig, OmegaConf
 from clear_strategies import console, files
 from clear_strategies.compose import quoted, require_each_once
 from clear_strategies.errors import ClearError, SettingError
-from clear_strategies.hydra_errors import not_composed
+from clear_strategies.hydra_errors import no_option, not_composed
 from clear_strategies.jobs import exit_codes, sweep
-from clear_strategies.options import CONF
+from clear_strategies.options import CONF, options
 from clear_strategies.training import signals
 
 _log = logging.getLogger(__name__)
@@ -93,9 +93,11 @@ def readable(word: str) -> str:
         value = files.expanded(value)
         word = f"{key}={value}"
     try:
-        OverridesParser.create().parse_override(word)
+        chosen = OverridesParser.create().parse_override(word)
     except HydraException:
         return f"{key}={quoted(value)}"
+    if not chosen.value() and (CONF / (group := chosen.key_or_group)).is_dir():
+        raise SettingError(no_option(group, value, [*options(group)]))
     return f"{key}={quoted(value)}" if "," in value and os.path.exists(value) else word  # noqa: PTH110 - as `is_file`
 
 

@@ -40,14 +40,18 @@ def of_hydra(error: Exception) -> str:
     if (match := _NO_OPTION.search(str(error))) is None:
         return one_line(error)
     group, name, listed = match.groups()
-    return _no_option(group, name, [option for option in listed.split() if not option.startswith("_")])
+    return no_option(group, name, [option for option in listed.split() if not option.startswith("_")])
 
 
-def _no_option(group: str, name: str, options: Sequence[str]) -> str:
-    """The message for an option that a group of conf/ does not have."""
-    near = difflib.get_close_matches(name, options, 1)
-    suggestion = f" Did you mean {near[0]}?" if near else ""
-    return f"{group}={name}: there is no such option.{suggestion} There are {', '.join(options)}."
+def no_option(group: str, name: object, listed: Sequence[str]) -> str:
+    """The message for an option that a group of conf/ does not have: the nearest one, or the group that has this name."""
+    base: Any = OmegaConf.load(CONF / "config.yaml")
+    chosen = {key for entry in base.defaults if entry != "_self_" for key in entry}
+    groups = sorted(folder.name for folder in CONF.iterdir() if (folder / f"{name}.yaml").is_file())
+    near = [f"{'' if other in chosen else '+'}{other}={name}" for other in groups]
+    near += difflib.get_close_matches(str(name), listed, 1)
+    suggestion = f" Did you mean {' or '.join(near)}?" if near else ""
+    return f"{group}={name}: there is no such option.{suggestion} There are {', '.join(listed)}."
 
 
 _SWEEPS: Final = re.compile(r"\+?(experiment=|strategy=[^\[]*,)")  # overrides by which strategies come later
@@ -57,7 +61,7 @@ def not_composed(error: Exception, overrides: Sequence[str], config: str) -> Set
     """The error for overrides that Hydra cannot compose; where there is no such setting, it names the most similar one."""
     # Of a list of options Hydra names the file alone, and not the options that there are.
     if listed := re.search(r"Could not load '(\w+)/([^'/]+)'", str(error)):
-        return SettingError(_no_option(listed[1], listed[2], [*options(listed[1])]))
+        return SettingError(no_option(listed[1], listed[2], [*options(listed[1])]))
     if (unknown := re.match(r"Could not (?:override|delete from config\.) '([^']+)'", str(error))) is None:
         return SettingError(of_hydra(error))
     key = unknown[1]
