@@ -156,11 +156,13 @@ class Density(Densifier):
 
         Raises:
             DensityError: fewer than min_gaussians would be left.
-            DivergedError: a parameter is not finite.
+            DivergedError: a parameter or a statistic is not finite.
         """
         s, n = self.settings, len(field)
         # NaN fails every comparison: such a Gaussian would be pruned as if it were faint.
-        require_finite(f"t={t}: before densification, the parameter", field.raw())
+        require_finite(f"t={t}: before densification, the parameter", field.raw(), waits=True)
+        statistics = {"score": self.score, "‖∇_u L‖": self.ordinary}
+        require_finite(f"t={t}: before densification, the sum", statistics, waits=True)
         chosen = self._chosen()
         largest = field.scales.data.exp().amax(-1)
         split = chosen & (largest > s.clone_below * self.extent)

@@ -146,7 +146,7 @@ class Sampler(Densifier):
     ) -> Int[Tensor, " M"] | None:
         """Move the dead and add copies: returns parents[M], or None where nothing changes."""
         s, n = self.settings, len(field)
-        require_finite(f"t={t}: before densification, the parameter", field.raw())
+        require_finite(f"t={t}: before densification, the parameter", field.raw(), waits=True)
         opacities = field.opacities.data.sigmoid()
         live = opacities > s.dead_opacity
         dead = torch.nonzero(~live)[:, 0]

@@ -1,6 +1,7 @@
 """The field through clone, split, prune and reset: every per-Gaussian tensor stays with its Gaussian."""
 
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -9,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clear_strategies import SVS, Grads, Photo, Update
+from clear_strategies.core import deferred
 from clear_strategies.core.points import PointCloud
 from clear_strategies.density.adaptive import Density, DensitySettings
-from clear_strategies.errors import DensityError
+from clear_strategies.errors import DensityError, DivergedError
 from clear_strategies.schedules import scaled
 from clear_strategies.testing import StubShot
 from clear_strategies.training.densifier import cameras_extent
@@ -175,6 +177,17 @@ def test_an_error_names_each_setting_that_pruned_too_many(prune_world):
     with pytest.raises(DensityError, match=r"leave 0 of 12 .* Lower density.prune_opacity=0.99") as error:
         density.restructure(field, optimizer, 10)
     assert ("raise density.prune_world=1e-06" in str(error.value)) is (prune_world is not None)
+
+
+@pytest.mark.parametrize("named", ["parameter of means", "sum of score", "sum of ‖∇_u L‖"])
+def test_a_round_refuses_numbers_that_are_not_finite_also_on_a_device(named, monkeypatch):
+    """Sorted downwards NaN comes first: such a score takes the place of another Gaussian's."""
+    monkeypatch.setattr(deferred, "is_immediate", lambda x: False)
+    field, optimizer, density = tagged()
+    tables = {"means": field.means.data, "score": density.score, "‖∇_u L‖": density.ordinary}
+    tables[named.partition(" of ")[2]][5] = torch.nan
+    with pytest.raises(DivergedError, match=rf"before densification, the {re.escape(named)} .* first Gaussian 5"):
+        density.restructure(field, optimizer, 10)
 
 
 def test_adam_is_torchs_adam():
