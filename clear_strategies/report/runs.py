@@ -8,7 +8,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pandas as pd
 
@@ -26,6 +26,8 @@ _SEED: Final = "fit.seed="
 # The overrides that name a run; the others are its settings.
 _METHOD, _STRATEGY = "method=", "strategy="
 _DATA: Final = ("data.path", "data.root")  # keys of a run's configuration
+# Ends of keys that never tell runs apart; what lies at a place may have moved.
+_OF_SEED_OR_PLACE: Final = ("seed", "path", "root", "cache", "lr_folder")
 # Where the photos lie: the scene has a name.
 _PATH: Final = re.compile(r"scene|data\.root|data\.(reader\.)?path")
 
@@ -39,10 +41,11 @@ class FinishedRun:
         marks: that the prior is synthetic, that the scores are of training views, that they are against LR photos.
         name: method or strategies as given on the command line ("clear"), else as they are named in the run ("gco + p2g").
         protocol: the option of conf/protocol or conf/scene that it is of; None: of neither.
-        settings: the other overrides, without the seed and those that change no result.
+        settings: the other overrides, without the seed and those that change no result; then those of files in which runs differ
+            that are alike in all that was said. See `_each_setting`.
         numbers: mean scores of the test views, or of the training views where there are no test views; "bicubic", "prior":
             PSNR of these images; conflict, gaussians, seconds. NaN where unknown.
-        views: whose scores they are. data: where the photos lay.
+        views: whose scores they are. data: where the photos lay. config: every setting, by its dotted key.
     """
 
     folder: Path
@@ -55,6 +58,7 @@ class FinishedRun:
     numbers: Mapping[str, float]
     views: tuple[str, ...]
     data: str
+    config: Mapping[str, Any]
 
     @classmethod
     def read(cls, folder: Path) -> FinishedRun:
@@ -85,6 +89,7 @@ class FinishedRun:
             },
             views=tuple(sorted(part.views)),
             data=str(next((content.config[key] for key in _DATA if content.config.get(key)), "")),
+            config=content.config,
         )
 
 
@@ -112,7 +117,7 @@ def collect(folders: Iterable[Path]) -> list[FinishedRun]:
     if not runs:
         names = ", ".join(map(str, folders))
         raise DataError(names, "runs", "there is no finished run here", "give the folder of a run or of a sweep")
-    return _told_apart(runs)
+    return _each_setting(_told_apart(runs))
 
 
 def _told_apart(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
@@ -135,6 +140,23 @@ def _told_apart(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
     for scene in dict.fromkeys(run.scene for run, other in zip(runs, apart, strict=True) if run.scene != other.scene):
         _log.warning("%s: runs of other photos, or scored on other views, are not compared.", scene)
     return apart
+
+
+def _each_setting(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
+    """The runs with the settings that files give, where runs of the same scene, name and overrides have others: a file, or a
+    default of the package, has changed between them.
+    """
+    alike: dict[Any, list[FinishedRun]] = {}
+    for run in runs:
+        alike.setdefault((run.scene, run.name, frozenset(run.settings)), []).append(run)
+    told = {}
+    for of in alike.values():
+        known = dict.fromkeys(key for run in of for key in run.config if not key.endswith(_OF_SEED_OR_PLACE))
+        differ = [k for k in known if len({str(run.config[k]) for run in of if k in run.config}) > 1]
+        for run in of:
+            more = (f"{key}={run.config[key]}" for key in differ if key in run.config)
+            told[run] = replace(run, settings=(*run.settings, *more))
+    return [told[run] for run in runs]
 
 
 def _shortest(path: str, others: Collection[str]) -> str:

@@ -45,6 +45,18 @@ def test_a_report_has_a_table_records_a_page_and_images(tmp_path: Path) -> None:
     assert (float(records["gco"]["bicubic"]), float(records["gco"]["prior"])) == (18.0, 19.0)
 
 
+def test_runs_whose_files_or_defaults_changed_between_them_share_no_row_and_the_row_tells_what_changed(tmp_path: Path):
+    for seed, iterations in enumerate((1000, 1000, 3000)):
+        config = {"fit.iterations": iterations, "fit.seed": seed, "prior.path": f"/{seed}"}
+        config |= {"skips.undrawn": 0.05} if seed else {}  # a version before has no such setting
+        make_run(tmp_path / str(seed), "experiment=mine", "+strategy=gco", seed=seed, psnr=20.0 + seed, config=config)
+    rows = rows_of(tmp_path)
+    assert {name: (row["psnr"], row["seeds"]) for name, row in rows.items()} == {
+        "gco, fit.iterations=1000": (20.5, "0, 1"),
+        "gco, fit.iterations=3000": (22.0, "2"),
+    }
+
+
 def test_the_page_shows_every_table_note_and_picture_as_text_and_refers_to_files_beside_it(tmp_path: Path) -> None:
     for scene in ("fern", "horns"):
         for job, strategy in enumerate(("baseline", "<b>clear</b>")):
