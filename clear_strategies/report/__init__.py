@@ -26,6 +26,7 @@ from clear_strategies import console, files
 from clear_strategies.commands import path_of
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.errors import ClearError, DataError
+from clear_strategies.jobs import exit_codes
 from clear_strategies.outputs.figures import SheetRow, write_contact_sheet, write_curves
 from clear_strategies.report import paper
 from clear_strategies.report.runs import FinishedRun, collect, history
@@ -39,7 +40,7 @@ _LONGEST: Final = 60  # characters of a scene in the name of a file
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command; returns its exit code: 0, or 2 where there is nothing to report."""
+    """The command; returns its exit code, see `jobs.exit_codes`."""
     parser = argparse.ArgumentParser(
         prog="python -m clear_strategies.report", description=(__doc__ or "").split("\n")[0]
     )
@@ -53,8 +54,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         text = write(collect(options.folders), out)
     except (ClearError, OSError) as error:
-        _log.error("%s", error)
-        return 2
+        if (ending := exit_codes.describe(error)) is None:
+            raise
+        _log.error("%s", ending.message)
+        return ending.code
     sys.stdout.write(text)
     return 0
 

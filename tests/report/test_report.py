@@ -77,6 +77,8 @@ def test_runs_without_images_or_history_are_still_in_the_table(tmp_path, caplog)
     (run / "history.csv").write_text("t,psnr_test\n1,oops\n")
     (run / "renders" / "view.png").write_bytes(b"no image")
     assert report.main([str(tmp_path)]) == 0
+    assert report.main([str(tmp_path), "--out", str(run / "history.csv")]) == 3
+    assert "history.csv: File exists. Write elsewhere (" in caplog.text
     assert "its history cannot be drawn" in caplog.text
     assert "there is no comparison image" in caplog.text
 
