@@ -27,9 +27,12 @@ _LAUNCHER: Final = re.compile(
 """A launcher that a package `hydra-NAME-launcher` brings."""
 
 
-def of_hydra(error: Exception) -> str:
+def of_hydra(error: Exception, config: str = "config") -> str:
     """The message of an error of Hydra's, in one line: of an option that is not there, the nearest one and all others, or the
     package that brings it.
+
+    Args:
+        config: as of `compose.composed`.
     """
     if (launcher := _LAUNCHER.search(str(error))) is not None:
         name, package = launcher.groups()
@@ -40,14 +43,16 @@ def of_hydra(error: Exception) -> str:
     if (match := _NO_OPTION.search(str(error))) is None:
         return one_line(error)
     group, name, listed = match.groups()
-    return no_option(group, name, [option for option in listed.split() if not option.startswith("_")])
+    return no_option(group, name, [option for option in listed.split() if not option.startswith("_")], config)
 
 
-def no_option(group: str, name: object, listed: Sequence[str]) -> str:
+def no_option(group: str, name: object, listed: Sequence[str], config: str = "config") -> str:
     """The message for an option that a group of conf/ does not have: the nearest one, or the group that has this name."""
-    base: Any = OmegaConf.load(CONF / "config.yaml")
+    base: Any = OmegaConf.load(CONF / f"{config}.yaml")
     chosen = {key for entry in base.defaults if entry != "_self_" for key in entry}
     groups = sorted(folder.name for folder in CONF.iterdir() if (folder / f"{name}.yaml").is_file())
+    if config == "conductor":  # a host has no method, and no scene
+        groups = [other for other in groups if other in chosen]
     near = [f"{'' if other in chosen else '+'}{other}={name}" for other in groups]
     near += difflib.get_close_matches(str(name), listed, 1)
     suggestion = f" Did you mean {' or '.join(near)}?" if near else ""
@@ -61,9 +66,9 @@ def not_composed(error: Exception, overrides: Sequence[str], config: str) -> Set
     """The error for overrides that Hydra cannot compose; where there is no such setting, it names the most similar one."""
     # Of a list of options Hydra names the file alone, and not the options that there are.
     if listed := re.search(r"Could not load '(\w+)/([^'/]+)'", str(error)):
-        return SettingError(no_option(listed[1], listed[2], [*options(listed[1])]))
+        return SettingError(no_option(listed[1], listed[2], [*options(listed[1])], config))
     if (unknown := re.match(r"Could not (?:override|delete from config\.) '([^']+)'", str(error))) is None:
-        return SettingError(of_hydra(error))
+        return SettingError(of_hydra(error, config))
     key = unknown[1]
     if (CONF / key).is_dir():
         return SettingError(f"{key}: no choice of this group is there to be replaced, so it is added: +{key}=….")

@@ -47,6 +47,7 @@ def test_names_and_overrides_are_those_of_the_command_line_and_milestones_stretc
     ("said", "named"),
     [
         (("nope",), "strategy=nope: there is no such option"),
+        (("srgs",), r"strategy=srgs: there is no such option\. There are "),  # +method=srgs is for runs alone
         (("gco", "strategies.gco.tau=1"), "strategies.gco.tau: there is no such setting"),
         (
             ("baseline", f"+strategies.x._target_={MINE}", "strategies.x.share=1"),
