@@ -24,7 +24,10 @@ _DATA: Final[Mapping[str, str]] = {
     "llff_x4": "LLFF", "llff_x4_quarter": "LLFF", "fern": "LLFF", "horns": "LLFF", "blender_x4": "Blender",
     "lego": "Blender", "mip360_x4": "Mip-NeRF 360",
 }  # fmt: skip
-_VIEWS: Final = "data.views.train"  # another number of them is not in the paper's tables
+_OTHERS: Final = (
+    "data.views.train",
+    "data.views.sr_scale",
+)  # another number of views, or scale, is not in the paper's tables
 _COLUMNS: Final = {
     "psnr": ("PSNR (dB)", ".2f"), "ssim": ("SSIM", ".3f"), "lpips": ("LPIPS", ".3f"), "conflict": ("conflict", ".3f"),
     "seconds": ("seconds", ",.0f"),
@@ -32,8 +35,8 @@ _COLUMNS: Final = {
 
 
 def data_of(run: FinishedRun) -> str | None:
-    """The data set of the paper that a run is of; None: none, or another number of views."""
-    return None if any(s.startswith(_VIEWS) for s in run.settings) else _DATA.get(run.protocol or "")
+    """The data set of the paper that a run is of; None: none, or another number of views, or scale."""
+    return None if any(s.lstrip("+").startswith(_OTHERS) for s in run.settings) else _DATA.get(run.protocol or "")
 
 
 def beside(runs: Sequence[FinishedRun]) -> dict[str, pd.DataFrame]:

@@ -272,15 +272,15 @@ def test_scenes_that_share_no_method_have_no_average(tmp_path: Path) -> None:
 
 
 def test_the_papers_numbers_stand_beside_ours(tmp_path: Path) -> None:
-    """Means over scenes of means over seeds, rows of other settings below each other; not for other data or other views."""
+    """Means over scenes of means over seeds, rows of other settings below each other; not for other data, views or scales."""
     chosen = {"fern": "scene: fern", "horns": "protocol: llff_x4", "demo": "data: demo"}
     for k, (scene, seed, psnr) in enumerate(
         (("fern", 0, 19.0), ("fern", 1, 21.0), ("horns", 0, 24.0), ("demo", 0, 50.0))
     ):
-        for more in ([], ["data.views.train=6"]) if k == 0 else ([],):
+        for more in ("", "data.views.train=6", "++data.views.sr_scale=2") if k == 0 else ("",):
             for readings in ("paper", "measured"):
-                settings = ["+strategy=clear", f"data.scene={scene}", f"readings={readings}", *more]
-                folder = make_run(tmp_path / f"{k}{readings}{len(more)}", *settings, seed=seed, psnr=psnr, scene=scene)
+                settings = ["+strategy=clear", f"data.scene={scene}", f"readings={readings}", *more.split()]
+                folder = make_run(tmp_path / f"{k}{readings}{more}", *settings, seed=seed, psnr=psnr, scene=scene)
                 files.write_text(folder / ".hydra" / "hydra.yaml", f"  runtime:\n    choices:\n      {chosen[scene]}\n")
     text = report.write(report.collect([tmp_path]), tmp_path)
     assert "LLFF, beside the paper's numbers" in (tmp_path / "report.html").read_text().replace("&#39;", "'")
