@@ -29,7 +29,6 @@ from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer, Recordable, can_be_recorded, over
 from rasterizers.modes import in_full_precision
 from rasterizers.replays import Kind, Recorded, copied, write
-from rasterizers.told import name_of_view
 
 _log = logging.getLogger(__name__)
 
@@ -163,14 +162,16 @@ class OwnDrawing:
             if not recorded:
                 return self._compared(given, asked, view, t), {}
             logged = conductor.logs()
-            shown = View(name_of_view(view.name), view.lr, given.photo, background=view.background)
+            shown = replace(view, hr=given.photo)
             made = self._compared(given, asked, shown, t)
             return made, {**made[0].losses, **conductor.take_logs(logged)}
 
         (hr, g), replayed = self._done(asked, given, t, ("hr", view.factor), work)
         params = {name: p.detach() for name, p in asked.params.items()}
         conductor.log_replayed(replayed)
-        hr = replace(hr, step=replace(hr.step, t=t, view=view, params=params))
+        hr = replace(
+            hr, step=replace(hr.step if self._replays is None else hr.step.copied(), t=t, view=view, params=params)
+        )
         routed = to_parameters(g, asked.drawn, asked.params)
         if "detail" in g:
             routed["detail"] = g["detail"]

@@ -14,13 +14,12 @@ import torch
 from torch import Tensor
 
 from clear_strategies.core.deferred import Number
-from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import Colour, Grads
 from clear_strategies.core.step import Step
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Merged
-from clear_strategies.merging.replays import RecordedWork, replays_on
-from rasterizers.replays import Kind, Recorded, copied, write
+from clear_strategies.merging.replays import RecordedWork, replays_on, that_merge
+from rasterizers.replays import Kind, Recorded, write
 from rasterizers.told import iteration, unread
 
 _FINITE: Final = "finite"
@@ -52,11 +51,7 @@ class _Given:
 
     def copied(self) -> _Given:
         """The same with copies. They do not tell the view of the iteration, which is another one in a replay."""
-        step, e = self.step, self.step.evidence
-        own = replace(
-            step, view=unread(step.view, "the view"), visible=copied(step.visible), looked_up=None,
-            evidence=None if e is None else Evidence(e.reliability.clone(), e.demand.clone(), copied(e.sums)),
-        )  # fmt: skip
+        own = replace(self.step.copied(), view=unread(self.step.view, "the view"), looked_up=None)
         return _Given(self.params, _copied(self.lr), _copied(self.hr), own, self.out)
 
 
@@ -78,7 +73,7 @@ class _Recorded(Recorded[_Given, tuple[Merged, dict[str, Number]]]):
             return [*out.values()], {_FINITE: merged.finite, **conflict, **conductor.take_logs(logged)}
 
         self._write(given)
-        self._work = RecordedWork(first.device, conductor.work_log, work)
+        self._work = RecordedWork(first.device, conductor.work_log, work, that_merge(conductor))
 
     def outcome(self, given: _Given) -> tuple[Merged, dict[str, Number]]:
         """See `Recorded`. What the strategies have logged is the second."""

@@ -128,7 +128,10 @@ class Replays:
             if known is not None and not known.holds_at(t):
                 known, self._turns = None, self._turns + 1
                 if self._turns > _MOST_KINDS:
-                    raise RuntimeError("a strategy decides by the iteration, and again and again another way.")
+                    raise RuntimeError(
+                        "a strategy decides by the iteration, or by what it stores in Python, and again and again another way. "
+                        "Numbers that it changes belong in tensors that it writes in place."
+                    )
             recorded = record() if known is None else known if known.replay(given) else None
             self._moves = 0 if recorded is known is not None else self._moves
             reason = "the recorded lists of pairs are too short"  # recorded anew, with space for more

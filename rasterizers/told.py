@@ -1,4 +1,4 @@
-"""What recorded work is told and a replay would be told otherwise: the iteration, and the name of a view.
+"""What recorded work is told and a replay would be told otherwise: the iteration, and a view's name and camera.
 
 A replay repeats what Python has decided by them. Decisions by the iteration become guards of the recording, which does not hold
 where one of them would be another one. Anything else that is read of them ends the recording by an error.
@@ -7,7 +7,7 @@ where one of them would be another one. Anything else that is read of them ends 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, Final, TypeVar, cast
 
 from torch import Tensor
@@ -19,20 +19,24 @@ R = TypeVar("R")
 
 
 class Unread:
-    """What recorded work must not read. It can be put into a message.
+    """What recorded work must not read.
 
     Args:
         what: its name, for the error.
+        but: attributes that may be read, since they are the same in every replay.
     """
 
-    def __init__(self, value: Any, what: str) -> None:
-        self._value, self._what = value, what
+    def __init__(self, value: Any, what: str, but: Collection[str] = ()) -> None:
+        self._value, self._what, self._but = value, what, but
 
     @property  # type: ignore[misc]  # for isinstance, which type checks ask
     def __class__(self) -> Any:
         return type(self._value)
 
     def __str__(self) -> str:
+        """A seed or a key may be made of it. After the recording it can be put into a message."""
+        if running() is not None:
+            self._refuse()
         return str(self._value)
 
     __repr__ = __str__
@@ -40,7 +44,7 @@ class Unread:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        self._refuse()
+        return getattr(self._value, name) if name in self._but else self._refuse()
 
     def _refuse(self, *_: Any) -> Any:
         raise RuntimeError(f"recorded work must not read {self._what}, which is another one in a replay.")
@@ -109,11 +113,6 @@ def iteration(t: int) -> int:
     return t if running() is None else cast(int, Guarded(t, "the iteration"))
 
 
-def unread(value: R, what: str) -> R:
-    """A value that recorded work must not read, `what` for the error."""
-    return cast(R, Unread(value, what))
-
-
-def name_of_view(name: str) -> str:
-    """The name of a view, for recorded work."""
-    return unread(name, "the name of the view")
+def unread(value: R, what: str, but: Collection[str] = ()) -> R:
+    """A value that recorded work must not read, see `Unread`."""
+    return cast(R, Unread(value, what, but))

@@ -32,6 +32,13 @@ class Step:
     params: Mapping[str, Tensor] = field(default_factory=dict)
     looked_up: Tensor | None = None
 
+    def copied(self) -> Step:
+        """The same step with tensors of its own."""
+        e, visible = self.evidence, self.visible
+        if e is not None:
+            e = Evidence(e.reliability.clone(), e.demand.clone(), None if e.sums is None else e.sums.clone())
+        return replace(self, visible=None if visible is None else visible.clone(), evidence=e)
+
     def resized(self, parents: Int[Tensor, " M"]) -> Step:
         """The same step after the structure changed: row i of everything per Gaussian comes from row parents[i]."""
         visible = None if self.visible is None else self.visible[parents]

@@ -17,7 +17,7 @@ from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import require_finite, require_finite_losses
 from clear_strategies.core.gradients import Grads, Shot, screen_norm, screen_of, to_ndc
 from clear_strategies.core.step import Step
-from clear_strategies.core.view import ExtraView, View
+from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import StrategyConflict
 from clear_strategies.kernels import per_gaussian, reconcile
@@ -31,7 +31,8 @@ from clear_strategies.strategies.base import ScreenGradients, Strategy, by_class
 from rasterizers.interface import Color
 from rasterizers.modes import in_full_precision
 from rasterizers.native import empty_for
-from rasterizers.told import iteration
+from rasterizers.recording import running
+from rasterizers.told import iteration, unread
 
 _log = logging.getLogger(__name__)
 
@@ -212,10 +213,10 @@ class Conductor:
         else:
             # Where Î_LR is the area mean of Î_HR, the cotangent of L_LR passes through the same HR render.
             through_mean = images.area_mean_transposed(l_lr.cotangents, view.factor) if reduced else None
-            drawn = Step(iteration(t), view, hr.visible, params=params, looked_up=looked_up)
-            g_mean, from_hr = self._backward_hr(hr, drawn, t, vjp, through_mean)
+            drawn = Step(iteration(t), _told(view), hr.visible, params=params, looked_up=looked_up)
+            g_mean, from_hr = self._backward_hr(hr, view, drawn, t, vjp, through_mean)
             g_lr = g_mean if reduced else g_lr
-        step = Step(iteration(t), view, params=params) if from_hr is None else from_hr.step
+        step = Step(iteration(t), _told(view), params=params) if from_hr is None else from_hr.step
         with stage("strategies" if stepper is None else stepper.stage):
             score = ordinary = None
             if scored:
@@ -252,8 +253,8 @@ class Conductor:
             params, looked_up: for `Step`.
         """
         apart = apart or self.owner("route") is not None or self.owner("score") is not None
-        step = Step(iteration(t), view, hr.visible, params=params, looked_up=looked_up)
-        return self._backward_hr(hr, step, t, vjp or _vjp, apart=apart)[1]
+        step = Step(iteration(t), _told(view), hr.visible, params=params, looked_up=looked_up)
+        return self._backward_hr(hr, view, step, t, vjp or _vjp, apart=apart)[1]
 
     def extra_views(self, t: int) -> list[ExtraView]:
         """The pictures that the field should match at t besides the view; each gets a step on `extra_loss`."""
@@ -418,9 +419,14 @@ class Conductor:
         s = self._owner[hook]
         return None if type(s) is Strategy else s
 
-    def logs(self) -> dict[str, Number]:
-        """The scalars that the strategies logged in the last iteration."""
-        return {name: x() if callable(x) else x for name, x in self.uncounted_logs().items()}
+    def logs(self, besides: Mapping[str, Any] = _UNKNOWN) -> dict[str, Number]:
+        """The scalars that the strategies logged in the last iteration.
+
+        Args:
+            besides: an earlier answer of `uncounted_logs`; what is the same there is left out.
+        """
+        logged = {name: x for name, x in self.uncounted_logs().items() if besides.get(name) is not x}
+        return {name: x() if callable(x) else x for name, x in logged.items()}
 
     def uncounted_logs(self) -> dict[str, Number | Callable[[], Number]]:
         """The same as the strategies logged them: some are what computes the scalar."""
@@ -447,6 +453,7 @@ class Conductor:
     def _backward_hr(
         self,
         hr: Shot,
+        view: View,
         step: Step,
         t: int,
         vjp: Callable[..., Sequence[Grads]],
@@ -456,14 +463,12 @@ class Conductor:
         """∇(λ_LR L_LR) where its cotangents [1, H, W, 3] are given, and the gradients of the HR losses."""
         stage = self.work_log.stage
         with stage("losses HR"):
-            sr = step.view.hr.over(self.background(t), step.view.background)
-            _require_size(step.view, "HR", hr.image, sr.image)
+            sr = view.hr.over(self.background(t), view.background)
+            _require_size(view, "HR", hr.image, sr.image)
             # The memory is kept: an allocator maps tens of megabytes afresh each time, at a page fault for every 4 KB.
             losses = self.objective.hr(hr.image.detach(), sr.image, sr.shown, reuse=self._hr_cotangents)  # Eq. 5
             self._hr_cotangents = losses.cotangents
-        require_finite_losses(
-            _where(step.view, t), losses.values, {"the SR image": sr.image, "the HR render": hr.image}
-        )
+        require_finite_losses(_where(view, t), losses.values, {"the SR image": sr.image, "the HR render": hr.image})
         with stage("backward HR"):  # one pass for all cotangents
             of_hr = losses.cotangents
             if not apart and len(of_hr) == 2:
@@ -488,6 +493,25 @@ def _screen_gradients(lr: Float[Tensor, "N 2"], hr: HrSide, weights: LossWeights
 
 def _vjp(shot: Shot, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[Grads]:
     return shot.vjp(cotangents)
+
+
+def _told(view: View) -> View:
+    """The view as strategies are told it in what may be recorded: the images alone are copied before a replay."""
+    if running() is None:
+        return view
+
+    def photo(p: Photo) -> Photo:
+        return replace(p, camera=unread(p.camera, "the camera of the view", ("width", "height")))
+
+    def layer(x: Any, what: str) -> Any:
+        return None if x is None else unread(x, f"the {what} of the view", ("shape", "dtype"))
+
+    lr, hr = photo(view.lr), photo(view.hr)
+    return View(
+        unread(view.name, "the name of the view"), lr, hr, hr.image if view.hr_is_photo else layer(view.truth, "truth"),
+        unread(view.sr_source, "the sr_source of the view"), layer(view.depth, "depth"),
+        layer(view.disagreement, "disagreement"), view.background,
+    )  # fmt: skip
 
 
 def _require_size(view: View, scale: str, render: Tensor, image: Tensor) -> None:

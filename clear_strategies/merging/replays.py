@@ -4,7 +4,8 @@ strategies can be recorded.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from typing import Any, Final
 
@@ -15,7 +16,7 @@ from clear_strategies.core import deferred
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.strategies.base import describes, overrides
+from clear_strategies.strategies.base import Strategy, describes, overrides
 from rasterizers.recording import Recording
 from rasterizers.replays import Replays, can_record
 from rasterizers.told import Guarded
@@ -29,12 +30,15 @@ class RecordedWork:
 
     Args:
         work: returns what it makes, and numbers by name. See `Recording`.
+        asked: strategies that the work asks. It holds while they store what they stored before it.
     """
 
     def __init__(
-        self, device: torch.device, work_log: WorkLog, work: Callable[[], tuple[Any, Mapping[str, Number]]]
-    ) -> None:
-        self._work_log = work_log
+        self, device: torch.device, work_log: WorkLog, work: Callable[[], tuple[Any, Mapping[str, Number]]],
+        asked: Iterable[Strategy] = (),
+    ) -> None:  # fmt: skip
+        self._work_log, self._asked = work_log, [*asked]
+        self._stored = [*map(_stored_by, self._asked)]  # before the work, which may change it
         self._of_t: dict[str, Any] = {}  # numbers that Python has made of the iteration
         self._t: int | None = None  # of the replay; None: of the recording
 
@@ -50,7 +54,7 @@ class RecordedWork:
     def holds_at(self, t: int) -> bool:
         """See `rasterizers.recording.Recording`."""
         self._t = t
-        return self._recording.holds_at(t)
+        return self._stored == [*map(_stored_by, self._asked)] and self._recording.holds_at(t)
 
     def replay(self) -> bool:
         """See `rasterizers.recording.Recording`."""
@@ -66,6 +70,26 @@ class RecordedWork:
             on_device = isinstance(counted, deferred.Element)
             self._work_log.skip(name, reason, counted.vector[counted.k].long() if on_device else count)  # type: ignore[union-attr]
         return made, row
+
+
+def that_merge(conductor: Conductor) -> Iterator[Strategy]:
+    """The strategies that a merge asks."""
+    return (s for s in conductor.strategies if any(overrides(s, h) for h in ("reconcile", "correct", "regularize")))
+
+
+def _stored_by(strategy: Strategy) -> Any:
+    """All that the strategy stores beside `state`, to be compared. A tensor that is written in place stays the same."""
+    return [_comparable(x) for name, x in vars(strategy).items() if name not in ("state", "logs")]
+
+
+def _comparable(x: Any) -> Any:
+    if isinstance(x, dict):
+        return [*x, *map(_comparable, x.values())]
+    if isinstance(x, (list, tuple, set, deque)):
+        return [*map(_comparable, x)]
+    if type(x) in (bool, int, float, str):
+        return x
+    return id(x), x, _comparable(getattr(x, "__dict__", None) or ())  # with x itself, so that its id is nobody else's
 
 
 def replays_on(device: torch.device, work_log: WorkLog, name: str) -> Replays | None:

@@ -48,8 +48,11 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     needs_hr = not conductor.wants_lr or s.density.collects(t)  # for Î_LR, or for a score
     hr_due = conductor.wants_hr(t) and (needs_hr or not conductor.skips.leaves_out_hr(t, conductor.work_log))
     scales = {"lr": conductor.wants_lr and conductor.skips.lr_due(view, hr_due, conductor.work_log), "hr": hr_due}
+    conductor.forget_logs()
     z, background = conductor.gate(t, len(θ)), conductor.background(t)  # zᵗ             Eq. 15       SVS
+    logs = conductor.logs()  # which the update forgets
     u, row = _learned(s, rasterizer, GivenView(t, view, scales, z, background), learn)
+    known = conductor.uncounted_logs()
     begin_sr_stage(s, over(rasterizer, background))
     extra = extra_steps(s, rasterizer, conductor.extra_views(t), background)
     conductor.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS
@@ -58,7 +61,9 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
         restructured = conductor.may_densify(t) and s.density.step(θ, s.optimizer, t, s.resized)
         if s.filter_due() and not restructured and not s.remove_undrawn():  # each recomputes the filter
             s.refilter()
-    s.history.append(_with_logs(_row(s), row) | extra)
+    logs |= conductor.logs(besides=known)  # of the hooks that are called outside of the update
+    row = {name: x for name, x in row.items() if name not in logs or name not in u.logs}
+    s.history.append(_with_logs(_with_logs(_row(s), row) | extra, logs))
     if s.conductor.skips.measured(t) and not (restructured or s.reset_due(t)):
         with stage("training views drawn whole"):
             s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)

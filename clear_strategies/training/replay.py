@@ -17,15 +17,14 @@ from typing import Any, cast
 
 from torch import Tensor
 
-from clear_strategies.core.view import Photo, View
+from clear_strategies.core.view import Photo
 from clear_strategies.kernels import losses
-from clear_strategies.merging.replays import LIVE, RecordedWork, why_strategies_are_not_recorded
+from clear_strategies.merging.replays import LIVE, RecordedWork, that_merge, why_strategies_are_not_recorded
 from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.given import Given, GivenExtra, GivenView, L, Learned
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Rasterizer, Recordable, over
 from rasterizers.replays import Kind, Recorded, Replays, copied, write
-from rasterizers.told import name_of_view
 
 _log = logging.getLogger(__name__)
 
@@ -81,6 +80,7 @@ class IterationReplays:
         facts: list[Any] = [s.field.degree, given.background is None, given.behind, λ > 0]
         if isinstance(given, GivenView):
             facts += [given.gate is None, *given.scales.values(), s.density.collects(given.t)]
+            facts += [x is None for x in (given.view.depth, given.view.disagreement, given.view.truth)]
         else:
             facts.append(given.extra.robust)
         shapes = [(photo.image.shape, photo.shown is None) for photo in given.photos]
@@ -101,13 +101,15 @@ class _Recorded(Recorded[Given, Any]):
         drawn_by = rasterizer if background is None else rasterizer.over_changing(background)
         self._own = [*self._read_of(own), background]
         self._write(given)
-        self._work = RecordedWork(s.device, s.conductor.work_log, lambda: learn(s, drawn_by, own))
+        asked = that_merge(s.conductor) if isinstance(given, GivenView) else ()
+        self._work = RecordedWork(s.device, s.conductor.work_log, lambda: learn(s, drawn_by, own), asked)
 
     def outcome(self, given: Given) -> Any:
         """See `Recorded`."""
         update, row = self._work.outcome()
         if isinstance(given, GivenView):
-            update = replace(update, step=replace(update.step, t=given.t, view=given.view))
+            # A strategy may store its tensors, which the next replay overwrites.
+            update = replace(update, step=replace(update.step.copied(), t=given.t, view=given.view))
         return update, row
 
     def _copied(self, given: Given) -> Given:
@@ -118,7 +120,8 @@ class _Recorded(Recorded[Given, Any]):
             extra = replace(given.extra, photo=photos[0], weight=given.extra.weight.clone())
             return replace(given, extra=extra, background=None)
         lr, hr, *_ = [*photos, given.view.hr]  # where HR is not drawn, its size alone is read
-        view = View(name_of_view(given.view.name), lr, hr, background=given.behind)
+        truth = hr.image if given.view.hr_is_photo else given.view.truth
+        view = replace(given.view, lr=lr, hr=hr, truth=truth)
         looked_up = copied(self._look_up(given.view))
         return replace(given, view=view, gate=copied(given.gate), background=None, looked_up=looked_up)
 

@@ -266,6 +266,11 @@ class ByTime(cs.Strategy):
             "every second": lambda: 0.5 if t % 2 else 1.0, "a number": lambda: 1 / float(t),
             "a tensor": lambda: 0.5 + 0.5 * (t > torch.ones(len(products.dot))),
             "the name": lambda: 0.5 if name.endswith("1") else 1.0,
+            "a text": lambda: 0.5 if f"{self.seed}-{t}".endswith("5") else 1.0,
+            "a key": lambda: {"at view1": 0.5}.get(f"at {name}", 1.0),
+            "the camera": lambda: step.view.hr.camera.cx / 100,
+            "the depth": lambda: 1.0 if step.view.depth is None else step.view.depth.confidence.mean().double() / 2,
+            "the prior": lambda: 0.5 if step.view.sr_source == "made" else 1.0,
         }  # fmt: skip
         return cs.Weights(keep=keep[self.reads]() if self.reads in keep else 1.0)
 
@@ -280,12 +285,108 @@ def test_what_a_strategy_decides_by_the_iteration_holds_in_replays_or_they_are_r
     assert replays_of(replayed) >= 8
 
 
-@pytest.mark.parametrize("reads", ["every second", "a number", "a tensor", "the name", "an anchor"])
+NO_GUARD = (
+    "every second", "a number", "a tensor", "the name", "an anchor", "a text", "a key", "the camera", "the depth", "the prior",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("reads", NO_GUARD)
 def test_a_strategy_that_reads_the_iteration_or_the_view_is_live(reads, caplog):
     """tests/rasterizers/test_told.py has more ways to read them."""
     replayed = both(lambda: start(reconciles=ByTime(reads), density=False, rises_at=2), 16)
     assert live_in(replayed)[FAILED] >= 2
     assert "must not read the" in caplog.text or "decides by the iteration" in caplog.text
+
+
+@dataclass(frozen=True)
+class ByMemory(cs.Strategy):
+    """Decides by what it has stored beside its state."""
+
+    stores: str = "a count"
+
+    def reconcile(self, products, step):
+        last, q = self.cache.get("last"), step.evidence.reliability
+        if self.stores == "a count":
+            self.cache["count"] = self.cache.get("count", 0) + 1
+            return cs.Weights(keep=0.5 if self.cache["count"] % 4 == 0 else 1.0)
+        if self.stores == "a list":
+            self.cache.setdefault("list", []).append(1)
+            return cs.Weights(keep=0.5 if len(self.cache["list"]) % 4 == 0 else 1.0)
+        if self.stores == "an attribute of its own class":
+            memory = self.cache.setdefault("memory", SimpleNamespace(count=0))
+            memory.count += 1
+            return cs.Weights(keep=0.5 if memory.count % 4 == 0 else 1.0)
+        if self.stores == "a new tensor":
+            self.cache["last"] = q.mean() if last is None else 0.9 * last + 0.1 * q.mean()
+            return cs.Weights(keep=self.cache["last"].double())
+        if self.stores == "what it was given":
+            self.cache["last"] = q
+            return cs.Weights() if last is None else cs.Weights(keep=(1 + last - q).clamp(0, 1))
+        return cs.Weights(keep=self.cache.get("weight", 1.0))
+
+    def after_step(self, params, step):
+        if self.stores == "a number after the step":
+            self.cache["weight"] = 1 / (1 + step.t // 5)
+
+
+@pytest.mark.parametrize("stores", [
+    "a count", "a list", "an attribute of its own class", "a new tensor", "what it was given", "a number after the step",
+])  # fmt: skip
+def test_what_a_strategy_decides_by_what_it_stores_holds_in_replays_or_they_are_recorded_anew(stores, caplog):
+    replayed = both(lambda: start(reconciles=ByMemory(stores), density=False, rises_at=2), 16)
+    if stores == "a number after the step":
+        assert replays_of(replayed) >= 7
+    else:
+        require_one_line(caplog, 13)
+        assert "by what it stores" in caplog.text
+
+
+@dataclass(frozen=True)
+class Remembers(cs.Strategy):
+    """Moves opacities by how the evidence has changed since the last iteration, whose tensors it has stored."""
+
+    def after_step(self, params, step):
+        if (last := self.cache.get("last")) is not None:
+            change = step.evidence.reliability - last.evidence.reliability
+            params["opacities"].add_(0.1 * change + 0.1 * (step.visible ^ last.visible))
+        self.cache["last"] = None if step.evidence is None else step
+
+
+def test_what_a_strategy_keeps_of_an_iteration_does_not_change_in_the_next_replay():
+    assert replays_of(both(lambda: start(Remembers(), density=False, rises_at=2), 12)) >= 8
+
+
+@dataclass(frozen=True)
+class Logs(cs.Strategy):
+    """Logs by every hook of an iteration."""
+
+    def background(self, t):
+        self.log("in_background", float(t))
+
+    def reconcile(self, products, step):
+        self.log("in_reconcile", step.t / 2)
+        return cs.Weights()
+
+    def extra_views(self, t):
+        self.log("in_extra_views", float(t))
+        return ()
+
+    def after_step(self, params, step):
+        self.log("in_after_step", float(step.t))
+
+    def may_densify(self, t):
+        self.log("in_may_densify", float(t))
+        return True
+
+
+def test_what_any_hook_logs_is_in_the_row_of_its_iteration():
+    replayed = both(lambda: start(reconciles=Logs(), density=False, rises_at=2), 12)
+    assert replays_of(replayed) >= 8
+    for row in replayed.history_as_floats()[3:]:
+        assert {name: x for name, x in row.items() if name.startswith("in_")} == {
+            "in_background": row["t"], "in_reconcile": row["t"] / 2, "in_extra_views": row["t"], "in_after_step": row["t"],
+            "in_may_densify": row["t"],
+        }  # fmt: skip
 
 
 def fails(*_: object) -> None:
