@@ -69,7 +69,11 @@ def check_is_frozen_settings(make: Make) -> None:
         else:
             raise ContractError("settings can be assigned; declare the dataclass frozen")
     require(all(name in repr(strategy) for name in settings), f"repr does not show every setting: {strategy!r}")
-    require(strategy == make(), "two strategies with the same settings are not equal")
+    try:
+        equal = bool(strategy == make())
+    except Exception as error:
+        raise ContractError(f"settings cannot be compared, as tensors cannot ({error}): {strategy!r}") from error
+    require(equal, "two strategies with the same settings are not equal")
     require(scaled(strategy, 1.0) == strategy, "stretching milestones by 1 changes the strategy")
 
 
@@ -108,12 +112,15 @@ def check_answers_have_their_shapes(make: Make) -> None:
 
 
 def check_works_without_hr(make: Make) -> None:
-    """While HR is not rendered the authentic gradient passes, whatever the strategy."""
+    """While HR is not rendered the authentic gradient passes, whatever the strategy, and nothing else is asked of the view."""
     conductor = _conductor(make)
-    lr, _, view, params = _situation(2)
-    update = conductor.update(params, lr, None, view, 1)
-    for name in ("means", "opacities"):
-        require(bool(_grads(update)[name].isfinite().all()), f"the gradient of {name} is not finite without HR")
+    for t in range(1, _STEPS):
+        lr, _, view, params = _situation(2)
+        conductor.gate(t, _N)
+        update = conductor.update(params, lr, None, view, t)
+        for name in ("means", "opacities"):
+            require(bool(_grads(update)[name].isfinite().all()), f"the gradient of {name} is not finite without HR")
+        _without_error("after_step", "in an iteration without HR", conductor.after_step, params, update.step)
 
 
 def check_is_reproducible(make: Make) -> None:
@@ -150,9 +157,38 @@ def check_state_follows_its_gaussians(make: Make) -> None:
         require(torch.equal(rows, before[name][order]), f"state {name!r} did not follow its Gaussians")
 
 
+def check_goes_on_with_another_number_of_gaussians(make: Make) -> None:
+    """Densification changes the number of Gaussians, in iterations with and without HR; nothing else has a row for each."""
+    conductor, n = _conductor(make), _N
+    for t, wanted in zip(range(1, _STEPS), (_N, _N + 7, _N - 5, _N - 2, _N - 3), strict=False):
+        if conductor.may_densify(t):
+            parents = torch.arange(wanted) % n
+            _without_error("on_resize", f"from {n} Gaussians to {wanted}", conductor.on_resize, parents)
+            n = wanted
+        _without_error(
+            "a hook", f"after the number of Gaussians has changed to {n}", list, _trace(conductor, t, t + 1, n)
+        )
+
+
+def check_facts_can_be_asked(make: Make) -> None:
+    """`summary` and `without_effect` give a text or None; the plan of a run has them."""
+    conductor = _conductor(make)
+    for s in conductor.strategies:
+        for λ in (0.0, 1.0):
+            effect = _without_error("without_effect", "", s.without_effect, lambda_lr=λ, lambda_hr=λ, lambda_hf=λ)
+            for fact in (effect, _without_error("summary", "", s.summary)):
+                require(
+                    fact is None or isinstance(fact, str),
+                    f"summary and without_effect give a text or None, got {fact!r}",
+                )
+
+
 def check_can_be_copied(make: Make) -> None:
     """Sweeps send strategies to other processes."""
-    sent = ForkingPickler.dumps(make())
+    try:
+        sent = ForkingPickler.dumps(make())
+    except Exception as error:
+        raise ContractError(f"a strategy cannot be sent to another process: {error}") from error
     require(ForkingPickler.loads(sent) == make(), "a strategy does not survive pickling")
 
 
@@ -164,6 +200,8 @@ CHECKS: Final[Sequence[Callable[[Make], None]]] = (
     check_is_reproducible,
     check_state_is_all_there_is,
     check_state_follows_its_gaussians,
+    check_goes_on_with_another_number_of_gaussians,
+    check_facts_can_be_asked,
     check_can_be_copied,
 )
 
@@ -189,7 +227,16 @@ def random_params(n: int, g: torch.Generator) -> dict[str, Tensor]:
     return {name: torch.randn(n, *shapes[name], generator=g) for name in ATTRIBUTES}
 
 
-def _situation(seed: int) -> tuple[StubShot, StubShot, View, dict[str, Tensor]]:
+def _without_error(hook: str, when: str, call: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    try:
+        return call(*args, **kwargs)
+    except AnswerError:
+        raise
+    except Exception as error:
+        raise ContractError(f"{hook} fails {when} ({type(error).__name__}: {error})".replace("  ", " ")) from error
+
+
+def _situation(seed: int, n: int = _N) -> tuple[StubShot, StubShot, View, dict[str, Tensor]]:
     g = torch.Generator().manual_seed(0)  # one view, whatever the seed: strategies may remember it by name
     camera = Camera(torch.eye(4, dtype=torch.float64), 40.0, 40.0, 20.0, 16.0, 40, 32)  # as the readers give poses
     hr_image = images.quantize(torch.rand(32, 40, 3, generator=g))
@@ -197,18 +244,18 @@ def _situation(seed: int) -> tuple[StubShot, StubShot, View, dict[str, Tensor]]:
     noisy = (hr_image + 0.1 * torch.randn(32, 40, 3, generator=g)).clamp(0, 1)
     view = View("checked", Photo(camera.scaled(1 / _FACTOR), lr_image), Photo(camera, noisy))
     g = torch.Generator().manual_seed(seed)
-    visible = torch.rand(_N, generator=g) < 0.8
-    u = torch.rand(_N, 2, generator=g) * torch.tensor([40.0, 32.0])
+    visible = torch.rand(n, generator=g) < 0.8
+    u = torch.rand(n, 2, generator=g) * torch.tensor([40.0, 32.0])
 
     def gradients(detail: bool) -> Grads:
-        values = {name: 1e-6 * p * visible.view(-1, *[1] * (p.dim() - 1)) for name, p in random_params(_N, g).items()}
+        values = {name: 1e-6 * p * visible.view(-1, *[1] * (p.dim() - 1)) for name, p in random_params(n, g).items()}
         if not detail:
             del values["detail"]
-        return Grads(values, screen=1e-6 * torch.randn(_N, 2, generator=g))
+        return Grads(values, screen=1e-6 * torch.randn(n, 2, generator=g))
 
     lr = StubShot(lr_image * 0.9, u / _FACTOR, visible, [gradients(False)])
     hr = StubShot(hr_image * 0.9, u, visible, [gradients(True), gradients(True)])
-    return lr, hr, view, random_params(_N, g)
+    return lr, hr, view, random_params(n, g)
 
 
 def _conductor(make: Make, *, lambda_hf: float = 0.2) -> Conductor:
@@ -219,12 +266,12 @@ def _conductor(make: Make, *, lambda_hf: float = 0.2) -> Conductor:
     return conductor
 
 
-def _trace(conductor: Conductor, start: int, stop: int) -> Any:
+def _trace(conductor: Conductor, start: int, stop: int, n: int = _N) -> Any:
     """All answers of a conductor in the iterations from `start` to before `stop`."""
     for t in range(start, stop):
-        lr, hr, view, params = _situation(100 + t)
-        z = conductor.gate(t, _N)
-        yield torch.ones(_N) if z is None else z
+        lr, hr, view, params = _situation(100 + t, n)
+        z = conductor.gate(t, n)
+        yield torch.ones(n) if z is None else z
         yield torch.tensor(conductor.background(t) or (0.0, 0.0, 0.0))
         update = conductor.update(params, lr, hr, view, t)
         yield update.score

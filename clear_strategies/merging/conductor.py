@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any, Final, TypeVar
 
 import torch
@@ -134,7 +135,7 @@ class Conductor:
         answers.require_gate(self._owner["gate"], z, n)
         if z is None and self.owner("gate") is not None:
             self.work_log.skip("gate", "no Gaussian is dropped at this rate")
-        return z
+        return None if z is None else z.detach().float()  # kernels read no other type
 
     def looked_up(self, view: View) -> Tensor | None:
         """What the strategy that observes looks up of a view, for `Step.looked_up`."""
@@ -382,6 +383,7 @@ class Conductor:
 
     def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
         """After the optimizer steps of an iteration."""
+        params = MappingProxyType(params)  # a tensor that was put into it would change nothing
         for s in self.strategies:
             s.after_step(params, step)
             answers.require_state(s, params)

@@ -5,6 +5,7 @@ Types and shapes are looked at, and the numbers where `finite` asks for it, but 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from numbers import Real
 from typing import Any, NoReturn
@@ -30,10 +31,10 @@ def require_started(s: Strategy, seed: int) -> None:
 def require_state(s: Strategy, params: Mapping[str, Tensor]) -> None:
     n = {len(p) for p in params.values()} if s.state else set()
     for name, rows in s.state.items():
-        if n and rows.shape[:1] != (*n,):
+        if not isinstance(rows, Tensor) or (n and rows.shape[:1] != (*n,)):
             raise AnswerError(
-                f"{type(s).__name__}.state[{name!r}] must have a row for each Gaussian, {min(n)}, got {[*rows.shape]}. Other "
-                "things belong in cache."
+                f"{type(s).__name__}.state[{name!r}] must be a tensor with a row for each Gaussian, {min(n, default=0)}, got "
+                f"{_shown(rows)}. Other things belong in cache."
             )
 
 
@@ -42,6 +43,7 @@ def require_gate(s: Strategy, z: Any, n: int) -> None:
     if z is not None and not (isinstance(z, Tensor) and z.shape == shape):
         scales = "" if s.shares_gate else ", a row for LR and one for HR,"
         _refuse(s, "gate", f"a tensor {[*shape]}{scales} or None", z)
+    _require_numbers(s, "gate", "z", z)
 
 
 def require_background(s: Strategy, color: Any) -> None:
@@ -100,6 +102,7 @@ def extra_views(s: Strategy, answer: Any) -> list[ExtraView]:
         shape = extra.photo.image.shape[:2]
         if not (isinstance(extra.weight, Tensor) and extra.weight.shape == shape):
             _refuse(s, "extra_views", f"an ExtraView whose weight is a tensor {[*shape]}, as its photo", extra.weight)
+        _require_numbers(s, "extra_views", "the weight", extra.weight)
     return extras
 
 
@@ -108,6 +111,15 @@ def _require_finite(s: Strategy, hook: str, numbers: Mapping[str, Any]) -> None:
         if isinstance(x, Tensor) and deferred.is_immediate(x) and not is_finite(x):
             found = rows_not_finite(x) if x.dim() else f"is {float(x)}"
             raise AnswerError(f"{_named(s, hook)} must give finite numbers, but {name} {found}.")
+
+
+def _require_numbers(s: Strategy, hook: str, name: str, x: Tensor | None) -> None:
+    """Finite numbers >= 0."""
+    if x is None or x.numel() == 0 or not deferred.is_immediate(x):
+        return
+    least, most = map(float, x.float().aminmax())
+    if not (least >= 0 and most < math.inf):
+        raise AnswerError(f"{_named(s, hook)} must give finite numbers >= 0, but {name} has {least:.3g} to {most:.3g}.")
 
 
 def _is_rows(x: Any, n: int) -> bool:
@@ -134,5 +146,8 @@ def _named(s: Strategy, hook: str) -> str:
 
 
 def _refuse(s: Strategy, hook: str, rule: str, found: Any) -> NoReturn:
-    shown = f"a tensor {[*found.shape]}" if isinstance(found, Tensor) else f"{found!r:.80}"
-    raise AnswerError(f"{_named(s, hook)} must give {rule}, got {shown}.")
+    raise AnswerError(f"{_named(s, hook)} must give {rule}, got {_shown(found)}.")
+
+
+def _shown(found: Any) -> str:
+    return f"a tensor {[*found.shape]}" if isinstance(found, Tensor) else f"{found!r:.80}"

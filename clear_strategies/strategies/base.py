@@ -10,6 +10,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any, Final
 
 import torch
@@ -17,7 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.core.conflicts import Products, Weights
-from clear_strategies.core.deferred import Number
+from clear_strategies.core.deferred import Deferred, Element, Number
 from clear_strategies.core.evidence import Evidence, PatchMaps
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, Shot, gathered
 from clear_strategies.core.step import Step
@@ -215,10 +216,10 @@ class Strategy:
         """Log a scalar of this iteration, or what computes it where it is asked for before the next one: a host asks for it in
         every hundredth. A 0-dim tensor on a device is read later, see `core.deferred`.
         """
-        if isinstance(value, Tensor) and value.dim() > 0:
-            raise AnswerError(
-                f"{type(self).__name__}.log({name!r}, …) takes one number, got a tensor {[*value.shape]}."
-            )
+        is_number = value.dim() == 0 if isinstance(value, Tensor) else isinstance(value, (Real, Deferred, Element))
+        if not (is_number or callable(value)):
+            found = f"a tensor {[*value.shape]}" if isinstance(value, Tensor) else f"{value!r:.80}"
+            raise AnswerError(f"{type(self).__name__}.log({name!r}, …) takes one number, got {found}.")
         self.logs[name] = value
 
     def to(self, device: torch.device | str) -> None:

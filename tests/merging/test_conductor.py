@@ -1,6 +1,6 @@
 """The conductor: Eq. 8 and 13, exclusivity, and the strategies' contract."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import pytest
 import torch
@@ -25,9 +25,10 @@ from clear_strategies.errors import AnswerError
 from clear_strategies.kernels.losses import reference
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.testing import CHECKS, ContractError, check_strategy
+from clear_strategies.training import loop
 from clear_strategies.training.field import GaussianField
 from rasterizers import Splats, autograd
-from tests.helpers import toy
+from tests.helpers import short_run, toy
 from tests.helpers.compiled_step_cases import ALWAYS
 
 
@@ -81,10 +82,60 @@ class Secretive(Strategy):
         return screens.ordinary * self.cache["calls"]
 
 
+@dataclass(frozen=True)
+class NeedsHR(Strategy):
+    """Reads what an iteration without HR does not have."""
+
+    def after_step(self, params, step):
+        step.visible.float()
+
+
+@dataclass(frozen=True)
+class Fixed(Strategy):
+    """Has a row for each Gaussian where they do not follow."""
+
+    def reconcile(self, products, step):
+        return Weights(keep=self.cache.setdefault("rows", torch.ones(len(products.dot))))
+
+
+@dataclass(frozen=True)
+class Resizes(Strategy):
+    """Changes what is not there yet."""
+
+    def reconcile(self, products, step):
+        return Weights(keep=self.state.setdefault("rows", torch.ones(len(products.dot))))
+
+    def on_resize(self, parents):
+        self.state["rows"] = self.state["rows"][parents]
+
+
+@dataclass(frozen=True)
+class Untold(Strategy):
+    """Has a summary of what is not prepared."""
+
+    def summary(self):
+        return self.cache["prepared"]
+
+
+@dataclass(frozen=True)
+class OfTensors(Strategy):
+    weights: torch.Tensor = field(default_factory=lambda: torch.ones(6))
+
+
+@dataclass(frozen=True)
+class OfFunctions(Strategy):
+    weight: object = lambda t: 1.0
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
-    [(Careless, "changed in place"), (Forgetful, "derive randomness"), (Secretive, "does not continue")],
-)
+    [
+        (Careless, "changed in place"), (Forgetful, "derive randomness"), (Secretive, "does not continue"),
+        (NeedsHR, "after_step fails in an iteration without HR"), (Fixed, r"Fixed.reconcile\(\) must give .* \[37\]"),
+        (Resizes, "on_resize fails from 30 Gaussians to 30"), (Untold, "summary fails"),
+        (OfTensors, "settings cannot be compared"), (OfFunctions, "cannot be sent to another process"),
+    ],
+)  # fmt: skip
 def test_the_contract_can_fail(make, message):
     with pytest.raises(ContractError, match=message):
         check_strategy(make)
@@ -106,6 +157,8 @@ def nan_of_first(rows):
 ANSWERS = {
     "gate [N]": ("gate", lambda t, n: torch.ones(n + 1), "must give a tensor \\[30\\] or None, got a tensor \\[31\\]"),
     "gate": ("gate", 0.5, "must give a tensor .* or None, got 0.5"),
+    "gate NaN": ("gate", lambda t, n: nan_of_first(torch.ones(n)), "must give finite numbers >= 0, but z has nan to nan"),
+    "gate < 0": ("gate", lambda t, n: -torch.ones(n), "must give finite numbers >= 0, but z has -1 to -1"),
     "background": ("background", torch.zeros(3), "must give three numbers in \\[0, 1\\] or None"),
     "observe": ("observe", (1.0, 2.0), "must give an Evidence or None, got \\(1.0, 2.0\\)"),
     "evidence [N]": ("observe", lambda step, hr: Evidence(torch.ones(5), torch.ones(5)), "reliability is a tensor \\[30\\]"),
@@ -134,6 +187,10 @@ ANSWERS = {
         "extra_views", lambda t: [ExtraView(toy.scene().train[0].lr, weight=torch.ones(3, 5))],
         "must give an ExtraView whose weight is a tensor \\[.*\\], as its photo, got a tensor \\[3, 5\\]",
     ),
+    "extra_views, NaN": (
+        "extra_views", lambda t: [ExtraView(photo := toy.scene().train[0].lr, weight=photo.image[..., 0] * torch.nan)],
+        "must give finite numbers >= 0, but the weight has nan to nan",
+    ),
     "start": ("on_fit_start", None, "must call super\\(\\).on_fit_start"),
 }  # fmt: skip
 
@@ -143,6 +200,26 @@ def test_an_answer_that_a_hook_must_not_give_is_refused_by_the_name_of_both(answ
     hook, given, message = ANSWERS[answer]
     with pytest.raises(ContractError, match=f"^Mine.{hook}\\(\\) .*{message}"):
         check_strategy(answering(hook, given))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bool])
+def test_a_gate_of_any_type_is_what_it_is_as_float32(dtype):
+    def trained(dtype):
+        state = short_run.start((), more=[answering("gate", lambda t, n: (torch.arange(n) % 3 > 0).to(dtype))()])
+        loop.iterate(state, toy.RASTERIZER)
+        return short_run.tensors(state)
+
+    expected = trained(torch.float32)
+    assert not [name for name, x in trained(dtype).items() if not torch.equal(x, expected[name])]
+
+
+def test_a_parameter_that_is_replaced_in_place_of_changed_is_refused():
+    class Replaces(Strategy):
+        def after_step(self, params, step):
+            params["means"] = params["means"] * 2
+
+    with pytest.raises(TypeError, match="does not support item assignment"):
+        Conductor(Replaces()).after_step({"means": torch.ones(1, 3)}, toy.step())
 
 
 def test_the_contract_shows_poses_in_the_type_that_the_readers_give_them():
@@ -161,7 +238,10 @@ def test_state_of_other_rows_and_settings_of_taken_names_are_refused():
         def after_step(self, params, step):
             self.state["seen"] = torch.zeros(5)
 
-    with pytest.raises(AnswerError, match=r"Short.state\['seen'\] must have a row for each Gaussian, 30, got \[5\]"):
+    with pytest.raises(
+        AnswerError,
+        match=r"Short.state\['seen'\] must be a tensor with a row for each Gaussian, 30, got a tensor \[5\]",
+    ):
         Conductor(Short()).after_step({"means": torch.zeros(30, 3)}, toy.step())
     with pytest.raises(TypeError, match="a setting must not be called seed"):
         type("Mine", (Strategy,), {"__annotations__": {"seed": int}})
