@@ -19,14 +19,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core import deferred, images
+from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import ATTRIBUTES, Grads
+from clear_strategies.core.step import Step
 from clear_strategies.core.view import Photo, View
 from clear_strategies.errors import AnswerError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Update
 from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import WarmupDecay, scaled
-from clear_strategies.strategies.base import Strategy
+from clear_strategies.strategies.base import Strategy, overrides
 from rasterizers.interface import Camera
 from rasterizers.testing import ContractError, require
 
@@ -82,7 +84,9 @@ def check_gradients_are_left_alone(make: Make) -> None:
     lr, hr, view, params = _situation(0)
     before = [copy.deepcopy(dict(g)) for shot in (lr, hr) for g in shot.gradients]
     values = {name: p.clone() for name, p in params.items()}
-    conductor = _conductor(make, lambda_hf=0.0)  # then g_HR is the shot's own tensor, and no sum of two
+    given = _evidence()
+    # Then g_HR is the shot's own tensor, and no sum of two.
+    conductor = _conductor(make, lambda_hf=0.0, evidence=given)
     for t in range(1, _STEPS):
         conductor.gate(t, _N)
         conductor.update(params, lr, hr, view, t)
@@ -90,6 +94,8 @@ def check_gradients_are_left_alone(make: Make) -> None:
     for old, new in zip(before, after, strict=True):
         require(all(torch.equal(old[k], new[k]) for k in old), "a gradient was changed in place")
     require(all(torch.equal(values[k], params[k]) for k in values), "a parameter was changed in place by update()")
+    for found, q in zip((given.reliability, given.demand), (_evidence().reliability, _evidence().demand), strict=True):
+        require(torch.equal(found, q), "the evidence was changed in place")
 
 
 def check_answers_have_their_shapes(make: Make) -> None:
@@ -135,9 +141,9 @@ def check_is_reproducible(make: Make) -> None:
 
 def check_state_is_all_there_is(make: Make) -> None:
     """A strategy given its state back goes on as if it had never stopped, from any iteration."""
-    trace = [*_trace(_conductor(make), 1, _STEPS)]
+    trace = [*_trace(_conductor(make, evidence=_evidence()), 1, _STEPS)]
     for cut in range(1, _STEPS):
-        first, second = _conductor(make), _conductor(make)
+        first, second = (_conductor(make, evidence=_evidence()) for _ in range(2))
         beginning = [*_trace(first, 1, cut)]
         second.load_state_dict(first.state_dict())
         rest = [*_trace(second, cut, _STEPS)]
@@ -258,10 +264,31 @@ def _situation(seed: int, n: int = _N) -> tuple[StubShot, StubShot, View, dict[s
     return lr, hr, view, random_params(n, g)
 
 
-def _conductor(make: Make, *, lambda_hf: float = 0.2) -> Conductor:
-    """Milestones are compressed, so that every phase falls inside the few steps of a check."""
+@dataclass(frozen=True)
+class _Observes(Strategy):
+    """Has the evidence that another strategy may read."""
+
+    evidence: Evidence
+
+    def observe(self, step: Step, hr: Any) -> Evidence:
+        return self.evidence
+
+
+def _evidence() -> Evidence:
+    q = torch.linspace(0, 1, _N)
+    return Evidence(q, q.flip(0))
+
+
+def _conductor(make: Make, *, lambda_hf: float = 0.2, evidence: Evidence | None = None) -> Conductor:
+    """Milestones are compressed, so that every phase falls inside the few steps of a check.
+
+    Args:
+        evidence: of another strategy, where this one has none.
+    """
     objective = Objective(WarmupDecay(start=0, full=1, decay_from=_STEPS, end=_STEPS), lambda_hf)
-    conductor = Conductor(scaled(make(), _STEPS / 2 / 5_000), objective=objective)
+    strategy = scaled(make(), _STEPS / 2 / 5_000)
+    others = [] if evidence is None or overrides(strategy, "observe") else [_Observes(evidence)]
+    conductor = Conductor(strategy, *others, objective=objective)
     conductor.on_fit_start(3, seed=11, views=[_situation(0)[2]])
     return conductor
 
@@ -280,6 +307,7 @@ def _trace(conductor: Conductor, start: int, stop: int, n: int = _N) -> Any:
         for extra in conductor.extra_views(t):
             yield from (extra.photo.image, extra.weight)
         conductor.after_step(params, update.step)
+        yield from params.values()
 
 
 def _grads(update: Update) -> Grads:

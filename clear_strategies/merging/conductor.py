@@ -431,8 +431,13 @@ class Conductor:
         return {name: x() if callable(x) else x for name, x in logged.items()}
 
     def uncounted_logs(self) -> dict[str, Number | Callable[[], Number]]:
-        """The same as the strategies logged them: some are what computes the scalar."""
-        return {name: x for s in self.strategies for name, x in s.logs.items()} | self._replayed
+        """The same as the strategies logged them: some are what computes the scalar. A name that another strategy has logged
+        follows that of the class.
+        """
+        logged: dict[str, Number | Callable[[], Number]] = {}
+        for owner, s in by_class(self.strategies).items():
+            logged |= {f"{owner}.{name}" if name in logged else name: x for name, x in s.logs.items()}
+        return logged | self._replayed
 
     def take_logs(self, known: Mapping[str, Number]) -> dict[str, Number]:
         """The scalars that were logged besides the known ones, and which are then logged no more."""

@@ -214,7 +214,8 @@ class Strategy:
 
     def log(self, name: str, value: Number | Callable[[], Number]) -> None:
         """Log a scalar of this iteration, or what computes it where it is asked for before the next one: a host asks for it in
-        every hundredth. A 0-dim tensor on a device is read later, see `core.deferred`.
+        every hundredth. A 0-dim tensor on a device is read later, see `core.deferred`. Where another strategy has logged this
+        name, the column is "<class>.<name>".
         """
         is_number = value.dim() == 0 if isinstance(value, Tensor) else isinstance(value, (Real, Deferred, Element))
         if not (is_number or callable(value)):

@@ -83,6 +83,16 @@ class Secretive(Strategy):
 
 
 @dataclass(frozen=True)
+class Distrusts(Strategy):
+    """Changes the evidence of another strategy."""
+
+    def reconcile(self, products, step):
+        if step.evidence is not None:
+            step.evidence.reliability.mul_(0.5)
+        return Weights()
+
+
+@dataclass(frozen=True)
 class NeedsHR(Strategy):
     """Reads what an iteration without HR does not have."""
 
@@ -131,6 +141,7 @@ class OfFunctions(Strategy):
     ("make", "message"),
     [
         (Careless, "changed in place"), (Forgetful, "derive randomness"), (Secretive, "does not continue"),
+        (Distrusts, "the evidence was changed in place"),
         (NeedsHR, "after_step fails in an iteration without HR"), (Fixed, r"Fixed.reconcile\(\) must give .* \[37\]"),
         (Resizes, "on_resize fails from 30 Gaussians to 30"), (Untold, "summary fails"),
         (OfTensors, "settings cannot be compared"), (OfFunctions, "cannot be sent to another process"),
@@ -211,6 +222,20 @@ def test_a_gate_of_any_type_is_what_it_is_as_float32(dtype):
 
     expected = trained(torch.float32)
     assert not [name for name, x in trained(dtype).items() if not torch.equal(x, expected[name])]
+
+
+@dataclass(frozen=True)
+class LogsShare(Strategy):
+    share: float
+
+    def regularize(self, params, t):
+        self.log("share", self.share)
+
+
+def test_what_two_strategies_of_one_class_log_is_both_there():
+    conductor = Conductor(LogsShare(0.25), LogsShare(0.5))
+    conductor.regularized({}, 1)
+    assert conductor.logs() == {"share": 0.25, "LogsShare2.share": 0.5}
 
 
 def test_a_parameter_that_is_replaced_in_place_of_changed_is_refused():
