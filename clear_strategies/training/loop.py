@@ -7,7 +7,7 @@ functions of (seed, t), so a resumed run has the same bits as one that was never
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
@@ -233,7 +233,7 @@ def fit(
     before = state.t - 1
     with deferred_signals() as pending, kernel_threads(state, rasterizer):
         while not state.ended:
-            done = state.t
+            done, steps = state.t, state.optimizer.steps
             try:
                 iterate(state, rasterizer)
             except (DivergedError, AnswerError) as error:
@@ -242,6 +242,12 @@ def fit(
                 if isinstance(error, AnswerError):
                     raise AnswerError(f"t={done}: {error}{where}") from error
                 raise DivergedError(f"{error}{where} Check that view's photos, or lower the learning rates.") from error
+            except Exception as error:  # of a strategy's own code, or of a device
+                error.add_note(f"This was in iteration t={done}.")
+                if state.optimizer.steps == steps and checkpoints is not None:
+                    with suppress(Exception):  # the first error is the one to tell
+                        error.add_note(f"The state before that step is {save()}; fit.resume goes on from it.")
+                raise
             ended = state.ended
             state.history[-1].update(clock.read())
             if settings.probe_every and (_passed(settings.probe_every, before, done) or ended):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+import clear_strategies as cs
 from clear_strategies.core.finite import is_finite
 from clear_strategies.errors import DivergedError
 from clear_strategies.training import checkpoint
@@ -101,3 +102,25 @@ def test_a_run_that_meets_nan_saves_the_state_before_and_says_where(tmp_path):
     saved = checkpoint.load(tmp_path)
     assert saved.t == state.t == len(saved.history) + 1
     assert_same(dict(saved.tensors), tensors(state))
+
+
+@pytest.mark.parametrize("hook", ["reconcile", "after_step"])
+def test_a_run_whose_strategy_raises_says_when_and_saves_the_state_before_where_no_step_was_made(hook, tmp_path):
+    class Fails(cs.Strategy):
+        """Raises at t=5."""
+
+    def fails(self, given, step):
+        if step.t == 5:
+            raise KeyError("mine")
+        return cs.Weights()
+
+    setattr(Fails, hook, fails)
+    state = start((), more=[Fails()])
+    with pytest.raises(KeyError) as raised:
+        fit(state, SCENE, toy.RASTERIZER, checkpoints=tmp_path)
+    when, *where = raised.value.__notes__
+    assert when == "This was in iteration t=5."
+    assert len(where) == (hook == "reconcile")
+    if where:
+        assert where[0].startswith("The state before that step is ")
+        assert checkpoint.load(tmp_path).t == 5
