@@ -6,11 +6,13 @@ EXIF share a camera, whose estimate starts at that focal length.
 
 from __future__ import annotations
 
+import errno
 import functools
 import itertools
 import logging
 import math
 import os
+import shutil
 import signal
 import statistics
 import tempfile
@@ -49,6 +51,7 @@ _DIAGONAL_35MM: Final = math.hypot(36, 24)  # mm
 _LARGE: Final = 1_200_000  # px of a copy, above which its own scale has features enough
 _ENOUGH: Final = 0.25  # of the features that a photo may have
 _PER_THREAD: Final = 2  # photos whose features are found between two looks at the progress
+_PER_FEATURE, _PER_DATABASE = 320, 8 << 20  # bytes that features, matches and models take on the disk, at most
 _BLOCK: Final = 20  # photos that are matched between two looks: COLMAP indexes their features anew for each block
 
 _Groups = dict[tuple[int, int, float | None], list[str]]
@@ -127,6 +130,8 @@ def _map(pycolmap: Any, photos: Mapping[Path, float | None], work: Path, setting
     try:
         pycolmap.set_random_seed(settings.seed)
         groups = _write_copies(photos, copies, settings.max_side)
+        if shutil.disk_usage(work).free < count * settings.max_features * _PER_FEATURE + _PER_DATABASE:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(work.parent))  # COLMAP would end the process
         find = functools.partial(_find_features, pycolmap, database, groups, settings)
         if min(width * height for width, height, _ in groups) <= _LARGE:
             find(octave=-1)

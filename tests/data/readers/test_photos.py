@@ -81,6 +81,14 @@ def test_what_can_be_known_is_refused_before_the_long_work(tmp_path: Path, monke
         photos.read(folder, tmp_path / "cache")
 
 
+def test_a_disk_that_is_too_full_for_the_features_is_told_before_colmap_ends_the_process(tmp_path, monkeypatch):
+    monkeypatch.setattr(sfm.shutil, "disk_usage", lambda _: SimpleNamespace(free=3 * 8192 * 320))
+    with pytest.raises(OSError, match="No space left") as refused:
+        photos.read(flat_photos(tmp_path / "photos", 3), tmp_path / "cache")
+    assert refused.value.filename == str(tmp_path / "cache")
+    assert list((tmp_path / "cache").iterdir()) == []
+
+
 def test_a_run_that_is_terminated_while_it_reads_photos_ends_without_a_stack_trace() -> None:
     program = "import os, signal; from clear_strategies.data.readers import sfm; sfm._pycolmap(); "
     command = [sys.executable, "-c", f"{program}os.kill(os.getpid(), signal.SIGTERM)"]
