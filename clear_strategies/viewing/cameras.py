@@ -28,6 +28,7 @@ from rasterizers.interface import Camera, Color
 
 FILE: Final = "cameras.json"
 _MOST_KEYS: Final = 24  # a path through more cameras passes every n-th
+_FAR: Final = 2.0  # longest steps, beyond which a path's ends are not joined: the way between them may lead through the scene
 _WRAP: Final = 3  # keys repeated at both ends, so that the rotation's spline has no seam
 _SWAY: Final = 0.1  # world units: how far a single camera moves to each side
 
@@ -106,8 +107,9 @@ def at_most(camera: Camera, longest: int | None) -> Camera:
 def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """A closed, smooth path through the cameras: splines of position and rotation, at an even pace.
 
-    The path goes from each camera to the nearest that is left, and passes at most `_MOST_KEYS` of them. A single camera sways
-    to both sides. All frames have the first camera's lens and size.
+    The path goes from each camera to the nearest that is left, and passes at most `_MOST_KEYS` of them. It comes back the same
+    way where its ends are far from each other. A single camera sways to both sides. All frames have the first camera's lens and
+    size.
     """
     from scipy.interpolate import CubicSpline
     from scipy.spatial.transform import Rotation, RotationSpline
@@ -120,6 +122,9 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
         axes = axes.repeat(len(centers), 0)
     order = _tour(centers)
     order = order[:: -(-len(order) // _MOST_KEYS)]
+    steps = np.linalg.norm(centers[order] - centers[np.roll(order, 1)], axis=1)  # the first is that between the ends
+    if steps[0] > _FAR * steps[1:].max(initial=0):
+        order += order[-2:0:-1]
     keys = np.array([order[i % len(order)] for i in range(-_WRAP, len(order) + _WRAP + 1)])
     rotations = Rotation.from_matrix(axes[keys])
     turned = (rotations[:-1].inv() * rotations[1:]).magnitude()
@@ -134,8 +139,9 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 
 def _tour(centers: Float[np.ndarray, "C 3"]) -> list[int]:
-    """All indices, each followed by the nearest of those that are left."""
-    tour, left = [0], np.arange(1, len(centers))
+    """All indices, from one that lies outermost, each followed by the nearest of those that are left."""
+    tour = [int(np.linalg.norm(centers - centers[0], axis=1).argmax())]
+    left = np.delete(np.arange(len(centers)), tour)
     while len(left):
         nearest = int(np.linalg.norm(centers[left] - centers[tour[-1]], axis=1).argmin())
         tour.append(int(left[nearest]))

@@ -101,6 +101,16 @@ def test_a_path_passes_its_cameras_and_is_even_and_closed_and_looks_where_they_l
         torch.testing.assert_close(R @ R.T, torch.eye(3, dtype=R.dtype))
 
 
+def test_a_path_along_an_arc_comes_back_along_it_and_not_through_the_scene():
+    arc = [at((3 * math.cos(a), 0.0, 3 * math.sin(a))) for a in np.linspace(0, math.pi, 12)]
+    path = centers(cameras.through([*arc[5:], *arc[:5]], 60))
+    np.testing.assert_allclose(np.linalg.norm(path, axis=1), 3, atol=0.05)
+    for end in (arc[0], arc[-1]):
+        assert np.linalg.norm(path - end.center.numpy(), axis=1).min() < 0.1
+    steps = np.linalg.norm(np.roll(path, -1, axis=0) - path, axis=1)
+    assert steps.max() < 0.6
+
+
 def test_many_cameras_are_thinned_and_the_point_that_they_look_at():
     dense = [at((3 * math.cos(a), 0.0, 3 * math.sin(a))) for a in np.arange(100) * math.tau / 100]
     steps = np.linalg.norm(np.diff(centers(cameras.through(dense, 60)), axis=0), axis=1)
