@@ -286,7 +286,7 @@ def _pycolmap() -> Any:
     handler = signal.getsignal(signal.SIGTERM)
     try:
         import pycolmap
-    except ImportError as error:
+    except (ImportError, RuntimeError) as error:  # its own, where a library of the system is missing
         raise DataError(
             "data=photos", "pycolmap", f"cannot be imported ({error})", "pip install 'clear-strategies[colmap]'"
         ) from error

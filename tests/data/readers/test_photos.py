@@ -81,6 +81,14 @@ def test_what_can_be_known_is_refused_before_the_long_work(tmp_path: Path, monke
         photos.read(folder, tmp_path / "cache")
 
 
+def test_a_pycolmap_that_does_not_run_here_is_told_as_one_that_is_not_installed(tmp_path, monkeypatch):
+    (tmp_path / "pycolmap.py").write_text('raise RuntimeError("Cannot import the C++ backend")')
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "pycolmap")
+    with pytest.raises(DataError, match=r"cannot be imported \(Cannot import the C\+\+ backend\).*clear-strategies\[colmap\]"):
+        sfm._pycolmap()
+
+
 def test_a_disk_that_is_too_full_for_the_features_is_told_before_colmap_ends_the_process(tmp_path, monkeypatch):
     monkeypatch.setattr(sfm.shutil, "disk_usage", lambda _: SimpleNamespace(free=3 * 8192 * 320))
     with pytest.raises(OSError, match="No space left") as refused:
