@@ -202,6 +202,10 @@ ENDINGS = {
         3,
         "x: Read-only. Write elsewhere (hydra.run.dir=FOLDER of a run, --out of",
     ),
+    PermissionError(errno.EACCES, "Permission denied", "x"): (
+        3,
+        "x: Permission denied. Allow access to it, or write elsewhere (hydra.run.dir=FOLDER of a run",
+    ),
     OSError("Broken pipe\n\nCOMMAND:\nffmpeg"): (3, "output: Broken pipe COMMAND: ffmpeg. Write elsewhere"),
 }
 

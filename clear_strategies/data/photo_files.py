@@ -149,6 +149,9 @@ def _opened(path: Path, turn: bool | None) -> Iterator[Image.Image]:
     except FileNotFoundError as error:
         raise DataError(path, "file", "is not there", "check the path") from error
     except Exception as error:  # PIL raises many types of error on damaged headers
+        if isinstance(error, OSError) and error.strerror:  # the system's, such as for a file of another user
+            remedy = "check the file, or go on without it: data.reader.skip_faulty=true"
+            raise DataError(path, "file", f"cannot be read ({error.strerror})", remedy) from error
         remedy = f"use one of {', '.join(_FORMATS)}, or go on without the file: data.reader.skip_faulty=true"
         raise DataError(path, "file", f"is no readable image ({type(error).__name__})", remedy) from error
     with image:

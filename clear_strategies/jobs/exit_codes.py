@@ -19,7 +19,11 @@ _LESS_MEMORY: Final = (
     "Of clear-strategies render: lower --width."
 )
 
-_FULL: Final = (errno.ENOSPC, errno.EDQUOT)
+# What may help before writing elsewhere does, by the system's error; of one without access, a photo's folder may be meant.
+_FIRST: Final = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "Free space, or write"),
+    errno.EACCES: "Allow access to it, or write",
+}
 
 UNUSABLE: Final = 2
 NO_DISK: Final = 3
@@ -57,7 +61,7 @@ def describe(error: BaseException) -> Ending | None:
     disk = error if isinstance(error, OSError) else error.__cause__  # logging wraps it where it cannot open its file
     if isinstance(disk, OSError):
         where = one_line(f"{disk.filename or 'output'}: {disk.strerror or disk}")
-        remedy = "Free space, or write elsewhere" if disk.errno in _FULL else "Write elsewhere"
+        remedy = f"{_FIRST.get(disk.errno or 0, 'Write')} elsewhere"
         elsewhere = "hydra.run.dir=FOLDER of a run, --out of a command, $CLEAR_CACHE of the cache"
         return Ending(NO_DISK, f"{where}. {remedy} ({elsewhere}). Earlier checkpoints are untouched.")
     return None
