@@ -32,7 +32,7 @@ from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
-SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".heic", ".heif")
+SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".jfif", ".webp", ".tif", ".tiff", ".heic", ".heif")
 _FORMATS: Final = ("PNG", "JPEG", "WEBP", "TIFF")
 _LOSSLESS: Final = ("PNG", "TIFF")
 _HEIF_BRANDS: Final = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1")  # bytes 8 to 12, behind "ftyp"

@@ -28,7 +28,9 @@ from rasterizers.interface import Camera, Color
 
 FILE: Final = "cameras.json"
 _MOST_KEYS: Final = 24  # a path through more cameras passes every n-th
-_FAR: Final = 2.0  # longest steps, beyond which a path's ends are not joined: the way between them may lead through the scene
+_FAR: Final = (
+    2.0  # longest steps, beyond which a path's ends are not joined: the way between them may lead through the scene
+)
 _WRAP: Final = 3  # keys repeated at both ends, so that the rotation's spline has no seam
 _SWAY: Final = 0.1  # world units: how far a single camera moves to each side
 

@@ -146,6 +146,9 @@ def _photos_in(root: Path) -> tuple[Path, list[Path]]:
     if folder not in (root, images) or (folder != root and found[root]):
         there = f"too few images ({len(found[root])})" if found[root] else "no image"
         _log.warning("%s holds %s; those in %s are used.", root, there, folder.relative_to(root).as_posix())
+    stems = {path.stem for path in found[folder]}  # a phone saves a short clip, and a camera raw data, beside a photo
+    if stems and (other := in_place_of_photos(p for p in sorted(folder.iterdir()) if p.stem not in stems)):
+        _log.info("%s: not used: %s.", folder, other[0])
     return folder, found[folder] or list_images(folder)
 
 

@@ -85,7 +85,9 @@ def test_a_pycolmap_that_does_not_run_here_is_told_as_one_that_is_not_installed(
     (tmp_path / "pycolmap.py").write_text('raise RuntimeError("Cannot import the C++ backend")')
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "pycolmap")
-    with pytest.raises(DataError, match=r"cannot be imported \(Cannot import the C\+\+ backend\).*clear-strategies\[colmap\]"):
+    with pytest.raises(
+        DataError, match=r"cannot be imported \(Cannot import the C\+\+ backend\).*clear-strategies\[colmap\]"
+    ):
         sfm._pycolmap()
 
 

@@ -263,6 +263,7 @@ READ: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     "what a Mac and a phone leave": (lambda f: beside(f, "._a.png", ".DS_Store", "clip.mov", "Thumbs.db"), ALL),
     "links to another folder": (lambda f: captures.link(f, f.parent / "elsewhere"), ALL),
     "a link to nowhere": (lambda f: (f / "d.png").symlink_to(f / "gone.png"), ALL),
+    "a browser's ending of JPEG": (lambda f: again(f, "b.jfif", format="JPEG"), ["a.png", "b.jfif", "c.png"]),
     "an ending in capitals, a name with spaces": (lambda f: again(f, "b é (1).JPG"), ["a.png", "b é (1).JPG", "c.png"]),
     "masks among the photos": (
         lambda f: [Image.new("L", (captures.WIDTH, captures.HEIGHT), 1).save(f / f"{n}.mask.png") for n in NAMES],
@@ -355,6 +356,16 @@ def test_photos_below_those_that_are_used_are_told(of_photos, caplog) -> None:
     with caplog.at_level("INFO"):
         read()
     assert "the images in folders below it are not used: cam2 holds 3" in caplog.text
+
+
+def test_files_that_are_no_photos_are_told_but_for_those_that_a_camera_saves_beside_a_photo(of_photos, caplog) -> None:
+    folder, read = of_photos
+    beside(folder, "a.CR2", "b.mov", "d.avif")
+    with caplog.at_level("INFO"):
+        assert [frame.name for frame in read().frames] == ALL
+    assert "photos: not used: images of another format (1): d.avif." in caplog.text
+    assert "a.CR2" not in caplog.text
+    assert "b.mov" not in caplog.text
 
 
 def beside_each_other(folder: Path, *names: str) -> None:

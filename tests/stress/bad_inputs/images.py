@@ -48,7 +48,10 @@ _PNG, _JPEG, _WEBP, _TIFF = (_encoded(form) for form in ("PNG", "JPEG", "WEBP", 
 _UNREADABLE, _BROKEN = "a.png: file: is no readable image", "a.png: pixels: cannot be decoded"
 _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "absent": (at("none.png", read_image), "none.png: file: is not there"),
-    "a folder": (at("a.png", read_image, Path.mkdir), r"a.png: file: cannot be read \(Is a directory\): check the file"),
+    "a folder": (
+        at("a.png", read_image, Path.mkdir),
+        r"a.png: file: cannot be read \(Is a directory\): check the file",
+    ),
     "a pipe": (at("a.png", image_size, os.mkfifo), "a.png: file: is a pipe, a device or a socket"),
     "a device": (at("a.png", read_image, a_device), "a.png: file: is a pipe, a device or a socket"),
     "empty": (_read(b""), _UNREADABLE),
