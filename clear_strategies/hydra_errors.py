@@ -16,9 +16,10 @@ from clear_strategies.options import CONF, composed_by_hydra, options
 from clear_strategies.settings import TARGET, flat, has_parameter
 
 _NO_OPTION: Final = re.compile(
-    r"Could not find '([^']+)/([^'/]+)'\s+Available options in '[^']*':(.*?)Config search path", re.DOTALL
+    r"Could not find '([^']+)/([^'/]*)'\s+Available options in '[^']*':(.*?)Config search path", re.DOTALL
 )
 
+_NO_VALUE: Final = re.compile(r"Error parsing override '(.*)'\s+missing EQUAL")
 _CHOSEN: Final = re.compile(r"Multiple values for (\S+)\. To override a value use 'override \S+: (\S+)'")
 
 _LAUNCHER: Final = re.compile(
@@ -37,6 +38,8 @@ def of_hydra(error: Exception, config: str = "config") -> str:
     if (launcher := _LAUNCHER.search(str(error))) is not None:
         name, package = launcher.groups()
         return f"hydra/launcher: {name} is not installed: pip install hydra-{package}-launcher."
+    if (word := _NO_VALUE.match(str(error))) is not None:
+        return f"{word[1]}: is no setting. A setting is written name=value."
     if (chosen := _CHOSEN.fullmatch(one_line(error))) is not None:
         group, name = chosen.groups()
         return f"+{group}={name}: a choice of this group is there already. Replace it: {group}={name}."

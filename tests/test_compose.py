@@ -65,6 +65,10 @@ def test_names_and_overrides_are_those_of_the_command_line_and_milestones_stretc
         (("best,svs",), "svs twice"),
         (("gco", "fit.iterations=3"), r"fit\.iterations: .* A conductor has settings of .*objective"),
         (("gco", "+strategies.p2g.floor=0"), r"strategies.p2g: has settings .*\+strategy=p2g"),
+        (
+            ("gco", "strategies.gco.tolerance"),
+            r"^strategies\.gco\.tolerance: is no setting\. A setting is written name=value",
+        ),
         (("gco", "+readings=paper"), r"\+readings=paper: .*: readings=paper\."),
         (("gco", "readings=literal"), "readings=literal: there is no such option. There are measured, paper"),
     ],

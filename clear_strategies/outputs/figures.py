@@ -40,8 +40,8 @@ Item = TypeVar("Item")
 # Title, column of history.csv, what it is drawn over, whether as a running mean.
 _CHARTS: Final = (
     ("LR loss (running mean)", "loss_lr", "t", True),
-    ("PSNR of test views, dB", "psnr_test", "t", False),
-    ("PSNR of test views, dB", "psnr_test", "seconds", False),
+    ("PSNR of test views at HR, dB", "psnr_test", "t", False),
+    ("PSNR of test views at HR, dB", "psnr_test", "seconds", False),
     ("share of Gaussians in conflict, before correction (running mean)", "conflict", "t", True),
     ("share of the Gaussians that is corrected (running mean)", "corrected", "t", True),
     ("number of Gaussians", "n_gaussians", "t", False),
