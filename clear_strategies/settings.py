@@ -18,7 +18,7 @@ import traceback
 import types
 import typing
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, Union, get_args, get_origin
@@ -282,12 +282,24 @@ def _of_type(value: Any, hint: Any, key: str) -> Any:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", BeartypeDecorHintPep585DeprecationWarning)
-                if is_bearable(candidate, hint, conf=_NUMBERS):
+                if _is_of(candidate, hint):
                     return candidate
         except BeartypeException:  # a hint that beartype does not support
             return value
     shown = repr(value) if isinstance(value, str | int | float | list | Mapping | None) else f"a {type(value).__name__}"
     raise SettingError(f"{key}: must be {_in_words(hint)}, got {shown}.")
+
+
+def _is_of(value: Any, hint: Any) -> bool:
+    """Whether every entry is of the annotated type. Beartype looks at one entry of a sequence, which it draws by `random`: a
+    wrong one may pass, and the program's own random numbers change.
+    """
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):
+        return any(_is_of(value, part) for part in parts)
+    if isinstance(origin, type) and issubclass(origin, Sequence) and (len(parts) == 1 or parts[1:] == (...,)):
+        return isinstance(value, origin) and all(_is_of(entry, parts[0]) for entry in value)
+    return is_bearable(value, hint, conf=_NUMBERS)
 
 
 def _takes_bool(hint: Any) -> bool:
