@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import Any, Final
@@ -16,6 +16,7 @@ from torch import Tensor
 from clear_strategies.core.view import View
 from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
+from clear_strategies.strategies.base import overrides
 from integration.attachment import Attachment, random_state_kept
 from integration.autograd_shot import HostOutput, Target
 from integration.densification import require_end, warn_if_score_is_unused
@@ -133,6 +134,7 @@ class Attached:
                 raise HostError(
                     "rays are jittered, and two scales of a view cannot share that. Train without ray_jitter."
                 )
+            self._require_pose_of_camera(signature.bind(viewpoint_camera, pc, *args, **kwargs).arguments)
             if self._model.optimizer is not self._optimizer:
                 self._hook_optimizer()
 
@@ -185,6 +187,15 @@ class Attached:
     def _ranks_by_absgrad(self) -> bool:
         """Mip-Splatting splits as many Gaussians by the absolute gradient as by the gradient: only its order counts."""
         return hasattr(self._model, "xyz_gradient_accum_abs")
+
+    def _require_pose_of_camera(self, call: Mapping[str, Any]) -> None:
+        """InstantSplat's render takes its pose from an argument, not from the camera."""
+        making = [type(s).__name__ for s in self.attachment.conductor.strategies if overrides(s, "extra_views")]
+        if making and call.get("camera_pose") is not None:
+            raise HostError(
+                f"render is given camera_pose, from which it would also draw the views of {', '.join(making)}, whose cameras lie "
+                "elsewhere. Leave that strategy out, e.g. --overrides '~strategies.pseudo_views'."
+            )
 
     def _camera_of(self, target: Target, camera: Any, view: View) -> tuple[Any, Camera]:
         """The host's camera that draws the target, and the same as a pinhole camera."""

@@ -354,11 +354,23 @@ def test_a_step_that_follows_no_recognised_rendering_is_an_error(inria_host, inr
     inria_host.loop(opt, gaussians, scene)
 
 
+def posed(host):
+    def render(*args, camera_pose):
+        return host.render(*args)
+
+    return render
+
+
 def test_unsupported_calls_are_refused(inria_host, inria_capture, inria_attached):
     clear, gaussians, scene = inria_attached(GCO(), objective=WITHOUT_HR)
     render, camera = clear.wrap(inria_host.render), scene.cameras[1]
     with pytest.raises(HostError, match="jittered"):
         render(camera, gaussians, None, None, subpixel_offset=torch.zeros(1))
+    assert clear.wrap(posed(inria_host))(camera, gaussians, None, None, camera_pose=torch.eye(4))["render"].shape == (
+        3,
+        16,
+        24,
+    )
     with pytest.raises(HostError, match="render must return a dict"):
         clear.wrap(lambda *_: (1, 2))(camera, gaussians, None, None)
     camera.image_width *= 2
@@ -370,6 +382,14 @@ def test_unsupported_calls_are_refused(inria_host, inria_capture, inria_attached
     clear.remove()
     with pytest.raises(HostError, match="has no optimizer"):
         attach(gaussians, scene.cameras, Conductor(GCO()), sr=inria_capture / "sr")
+
+
+def test_a_pose_that_is_not_the_cameras_is_refused_with_strategies_that_show_other_views(inria_host, inria_attached):
+    """InstantSplat trains its poses beside the cameras, and draws from them."""
+    clear, gaussians, scene = inria_attached(toy.ShowsDark())
+    render = clear.wrap(posed(inria_host))
+    with pytest.raises(HostError, match=r"camera_pose.* ShowsDark"):
+        render(scene.cameras[1], gaussians, None, None, camera_pose=torch.eye(4))
 
 
 def test_views_need_unique_names_and_sr_images_of_the_right_size(inria_host, inria_capture) -> None:
