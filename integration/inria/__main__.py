@@ -31,11 +31,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 @contextmanager
 def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> Iterator[list[Any]]:
-    """CLEAR is installed after the script's first call of `training_setup`, for the cameras of the last `Scene`."""
+    """CLEAR is installed after the first call of `training_setup` of each model (CoR-GS trains two), for the cameras of the last
+    `Scene`.
+    """
     importlib.import_module("gaussian_renderer")  # whose `render` install replaces
     scene: Any = importlib.import_module("scene")
     setup, init = scene.GaussianModel.training_setup, scene.Scene.__init__
-    scenes, attached = list[Any](), list[Any]()
+    scenes, models, attached = list[Any](), list[Any](), list[Any]()
 
     @functools.wraps(init)
     def init_and_remember(loaded: Any, *args: Any, **kwargs: Any) -> None:
@@ -45,7 +47,9 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
     @functools.wraps(setup)
     def setup_and_install(gaussians: Any, opt: Any, *args: Any, **kwargs: Any) -> Any:
         result = setup(gaussians, opt, *args, **kwargs)
-        scene.GaussianModel.training_setup = setup  # points=stereo, and a restored checkpoint, call it again
+        if any(model is gaussians for model in models):  # points=stereo, and a restored checkpoint, call it again
+            return result
+        models.append(gaussians)
         if not scenes:
             raise HostError(
                 "training_setup was called before a Scene was made, so the training cameras are unknown. Put the line "
@@ -64,7 +68,7 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
             _log.info("%s.", each.attachment.summary())
     finally:
         scene.GaussianModel.training_setup, scene.Scene.__init__ = setup, init
-        for each in attached:
+        for each in reversed(attached):
             each.remove()
 
 

@@ -482,6 +482,16 @@ def test_save_lr_writes_the_photos_as_they_are_trained_on_and_stops(inria_host, 
     assert Image.open(written[0]).size == (24, 16)
 
 
+def test_each_of_two_models_that_a_script_trains_has_the_strategies(inria_host, inria_capture, caplog):
+    source = (FOLDER / "train.py").read_text()
+    script, arguments = inria_capture / "two.py", ["-s", str(inria_capture), "--iterations", "4", "--save"]
+    script.write_text(source.replace("    training(parser()", "    training(parser().parse_args())\n    training(parser()"))
+    with caplog.at_level(logging.INFO):
+        assert main(["--sr", str(inria_capture / "sr"), str(script), *arguments, str(inria_capture / "it")]) == 0
+    assert caplog.text.count("4 merges") == 2
+    assert not hasattr(inria_host.render, "__wrapped__")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
