@@ -113,8 +113,8 @@ def host_output(
     *,
     ranks_by_third_column: bool,
 ) -> HostOutput:
-    """The result of a host's `render`: a dict with "render" [3, H, W], "viewspace_points" [N, 2 or more] in NDC, "radii" and
-    "visibility_filter" [N]. Gaussians that the gate drops are marked as not visible in it.
+    """The result of a host's `render`: a dict with "render" [3 or more, H, W], whose first channels are RGB, "viewspace_points"
+    [N, 2 or more] in NDC, "radii" and "visibility_filter" [N]. Gaussians that the gate drops are marked as not visible in it.
 
     Args:
         camera: the camera of the photo at this resolution. drawings: see `AutogradShot`.
@@ -128,9 +128,9 @@ def host_output(
         found = ", ".join(map(str, result)) if isinstance(result, Mapping) else type(result).__name__
         raise HostError(f"render must return a dict with {', '.join(names)}, got {found}. Wrap a function that does.")
     image, centres, radii = (result[name] for name in names[:3])
-    if tuple(image.shape) != (3, camera.height, camera.width):
+    if tuple(image.shape[1:]) != (camera.height, camera.width) or len(image) < 3:
         raise HostError(
-            f"render must return an image of {camera.width}x{camera.height} pixels, got shape {tuple(image.shape)}. Train "
+            f"render must return an RGB image of {camera.width}x{camera.height} pixels, got shape {tuple(image.shape)}. Train "
             "at the resolution of the photos."
         )
     marks = () if drawings or not image.requires_grad else (image,)
@@ -152,7 +152,7 @@ def host_output(
     ranked = 2 if ranks_by_third_column and centres.shape[-1] == 3 else None
     slot = ScreenGradientSlot(centres, (width, height), (2 / width, 2 / height), ranked=ranked)
     means2d = project(params["means"].detach(), camera)
-    shot = AutogradShot(image.permute(1, 2, 0), means2d, visible, params, slot, drawings=drawings)
+    shot = AutogradShot(image[:3].permute(1, 2, 0), means2d, visible, params, slot, drawings=drawings)
     return HostOutput(shot, result, marks)
 
 

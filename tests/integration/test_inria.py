@@ -354,6 +354,26 @@ def test_a_step_that_follows_no_recognised_rendering_is_an_error(inria_host, inr
     inria_host.loop(opt, gaussians, scene)
 
 
+def test_channels_behind_the_colours_are_the_hosts_own(inria_host, inria_attached):
+    """GOF draws normals and depth there."""
+    merged = []
+    for more in (0, 4):
+        clear, gaussians, scene = inria_attached(GCO(), objective=HR_FROM_START)
+
+        def render(*args, more=more):
+            package = inria_host.render(*args)
+            return package | {"render": torch.cat((package["render"], *[package["render"][:1]] * more))}
+
+        image = clear.wrap(render)(scene.cameras[1], gaussians, None, None)["render"]
+        assert len(image) == 3 + more
+        image[:3].square().mean().backward()
+        merged.append(
+            [p.grad for p in (gaussians._xyz, gaussians._features_dc, gaussians._opacity, clear.detail.value)]
+        )
+        clear.remove()
+    assert all(torch.allclose(a, b, atol=1e-6 * float(a.abs().max())) for a, b in zip(*merged, strict=True))
+
+
 def posed(host):
     def render(*args, camera_pose):
         return host.render(*args)
@@ -374,7 +394,7 @@ def test_unsupported_calls_are_refused(inria_host, inria_capture, inria_attached
     with pytest.raises(HostError, match="render must return a dict"):
         clear.wrap(lambda *_: (1, 2))(camera, gaussians, None, None)
     camera.image_width *= 2
-    with pytest.raises(HostError, match=r"an image of 24x16 pixels, got shape \(3, 16, 48\)"):
+    with pytest.raises(HostError, match=r"an RGB image of 24x16 pixels, got shape \(3, 16, 48\)"):
         render(camera, gaussians, None, None)
     with pytest.raises(HostError, match="attached already"):
         attach(gaussians, scene.cameras, Conductor(GCO()), sr=inria_capture / "sr")
@@ -485,7 +505,9 @@ def test_save_lr_writes_the_photos_as_they_are_trained_on_and_stops(inria_host, 
 def test_each_of_two_models_that_a_script_trains_has_the_strategies(inria_host, inria_capture, caplog):
     source = (FOLDER / "train.py").read_text()
     script, arguments = inria_capture / "two.py", ["-s", str(inria_capture), "--iterations", "4", "--save"]
-    script.write_text(source.replace("    training(parser()", "    training(parser().parse_args())\n    training(parser()"))
+    script.write_text(
+        source.replace("    training(parser()", "    training(parser().parse_args())\n    training(parser()")
+    )
     with caplog.at_level(logging.INFO):
         assert main(["--sr", str(inria_capture / "sr"), str(script), *arguments, str(inria_capture / "it")]) == 0
     assert caplog.text.count("4 merges") == 2
