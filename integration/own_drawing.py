@@ -16,10 +16,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core.deferred import Number
+from clear_strategies.core.deferred import Element, Number
 from clear_strategies.core.gradients import Grads, scale_rows
 from clear_strategies.core.view import ExtraView, Photo, View
-from clear_strategies.core.work_log import WorkLog
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide
 from clear_strategies.merging.replays import RecordedWork, replays_on, why_strategies_are_not_recorded
@@ -112,7 +111,7 @@ class _Given:
 
 
 _Work = Callable[[_Given, bool], tuple[Any, dict[str, Number]]]
-"""Work on what is given, and whether it is being recorded. It returns what it makes, and its numbers where it is."""
+"""Work on what is given, and whether it is being recorded. It returns what it makes, and its numbers."""
 
 
 class _Recorded(Recorded[_Given, tuple[Any, dict[str, Number]]]):
@@ -120,10 +119,10 @@ class _Recorded(Recorded[_Given, tuple[Any, dict[str, Number]]]):
 
     _work: RecordedWork
 
-    def __init__(self, work_log: WorkLog, rasterizer: Recordable, given: _Given, work: _Work) -> None:
+    def __init__(self, conductor: Conductor, rasterizer: Recordable, given: _Given, work: _Work) -> None:
         own, self._rasterizer = given.copied(), rasterizer
         self._own = own.tensors(rasterizer)
-        self._work = RecordedWork(given.background.device, work_log, lambda: work(own, True))
+        self._work = RecordedWork(given.background.device, conductor, lambda: work(own, True))
 
     def _write(self, given: _Given) -> None:
         write(self._own, given.tensors(self._rasterizer))
@@ -159,19 +158,14 @@ class OwnDrawing:
         given = _Given(asked.inputs, asked.background, asked.camera, photo, known, mask)
 
         def work(given: _Given, recorded: bool) -> tuple[tuple[HrSide, Grads], dict[str, Number]]:
-            if not recorded:
-                return self._compared(given, asked, view, t), {}
-            logged = conductor.logs()
-            shown = replace(view, hr=given.photo)
-            made = self._compared(given, asked, shown, t)
-            return made, {**made[0].losses, **conductor.take_logs(logged)}
+            made = self._compared(given, asked, replace(view, hr=given.photo) if recorded else view, t)
+            return made, {**made[0].losses}
 
-        (hr, g), replayed = self._done(asked, given, t, ("hr", view.factor), work)
+        (hr, g), losses = self._done(asked, given, t, ("hr", view.factor), work)
         params = {name: p.detach() for name, p in asked.params.items()}
-        conductor.log_replayed(replayed)
-        hr = replace(
-            hr, step=replace(hr.step if self._replays is None else hr.step.copied(), t=t, view=view, params=params)
-        )
+        losses = {name: x.vector[x.k] if isinstance(x, Element) else x for name, x in losses.items()}
+        step = hr.step if self._replays is None else hr.step.copied()
+        hr = replace(hr, step=replace(step, t=t, view=view, params=params), losses=losses)
         routed = to_parameters(g, asked.drawn, asked.params)
         if "detail" in g:
             routed["detail"] = g["detail"]
@@ -209,7 +203,7 @@ class OwnDrawing:
         self, asked: Drawable, given: _Given, t: int, facts: tuple[Any, ...], work: _Work
     ) -> tuple[Any, dict[str, Number]]:
         """The work, live or by a replay."""
-        rasterizer, log = asked.rasterizer, self._conductor.work_log
+        rasterizer = asked.rasterizer
         if self._replays is None or not can_be_recorded(rasterizer):
             return work(given, False)
         asked_of = (self._conductor.owner(hook) for hook in ("observe", "route"))
@@ -217,5 +211,5 @@ class OwnDrawing:
         kind = Kind((len(asked.drawn["means"]), *state), given.shapes, (rasterizer, *facts))
         return self._replays.do(
             kind, t, given,
-            live=lambda: work(given, False), record=lambda: _Recorded(log, rasterizer, given, work),
+            live=lambda: work(given, False), record=lambda: _Recorded(self._conductor, rasterizer, given, work),
         )  # fmt: skip

@@ -24,7 +24,7 @@ from rasterizers.told import iteration, unread
 
 _FINITE: Final = "finite"
 _CONFLICT: Final = "conflict of "
-"""Keys of a replay's numbers, before a group's name; all others were logged by strategies."""
+"""Keys of a replay's numbers; the latter before a group's name."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +55,7 @@ class _Given:
         return _Given(self.params, _copied(self.lr), _copied(self.hr), own, self.out)
 
 
-class _Recorded(Recorded[_Given, tuple[Merged, dict[str, Number]]]):
+class _Recorded(Recorded[_Given, Merged]):
     """The recording of one kind of merge, and the tensors from which it reads what it is given."""
 
     _work: RecordedWork
@@ -66,21 +66,21 @@ class _Recorded(Recorded[_Given, tuple[Merged, dict[str, Number]]]):
         self._λ, self._λ_now = first.new_empty(1), -1.0  # on the device
 
         def work() -> tuple[list[Tensor], dict[str, Number]]:
-            logged, step = conductor.logs(), replace(own.step, t=iteration(given.step.t))
+            step = replace(own.step, t=iteration(given.step.t))
             out = {name: torch.empty_like(x, memory_format=torch.contiguous_format) for name, x in given.out.items()}
             merged = conductor.merge_routed(own.params, own.lr, own.hr, step, given.step.t, out, self._λ)
             conflict = {f"{_CONFLICT}{group}": share for group, share in merged.conflict.items()}
-            return [*out.values()], {_FINITE: merged.finite, **conflict, **conductor.take_logs(logged)}
+            return [*out.values()], {_FINITE: merged.finite, **conflict}
 
         self._write(given)
-        self._work = RecordedWork(first.device, conductor.work_log, work, that_merge(conductor))
+        self._work = RecordedWork(first.device, conductor, work, that_merge(conductor))
 
-    def outcome(self, given: _Given) -> tuple[Merged, dict[str, Number]]:
-        """See `Recorded`. What the strategies have logged is the second."""
+    def outcome(self, given: _Given) -> Merged:
+        """See `Recorded`."""
         made, row = self._work.outcome()
         write([*given.out.values()], made)
-        conflict = {group.removeprefix(_CONFLICT): row.pop(group) for group in [*row] if group.startswith(_CONFLICT)}
-        return Merged(Grads(given.out), conflict, row.pop(_FINITE)), row
+        conflict = {name.removeprefix(_CONFLICT): x for name, x in row.items() if name.startswith(_CONFLICT)}
+        return Merged(Grads(given.out), conflict, row[_FINITE])
 
     def _write(self, given: _Given) -> None:
         write(self._own, [*given.tensors.values()])
@@ -106,17 +106,13 @@ class ReplayedMerge:
         """See `Conductor.merge_routed`."""
         conductor = self._conductor
 
-        def live() -> tuple[Merged, dict[str, Number]]:
-            return conductor.merge_routed(params, g_lr, g_hr, step, t, out), {}
+        def live() -> Merged:
+            return conductor.merge_routed(params, g_lr, g_hr, step, t, out)
 
         if self._replays is None or step is None or not g_hr.tensors or conductor.objective.lambda_hr(t) == 0:
-            return live()[0]
+            return live()
         given = _Given(params, g_lr, g_hr, step, out)
-        merged, logged = self._replays.do(
-            self._kind(given), t, given, live=live, record=lambda: _Recorded(conductor, given)
-        )
-        conductor.log_replayed(logged)
-        return merged
+        return self._replays.do(self._kind(given), t, given, live=live, record=lambda: _Recorded(conductor, given))
 
     def _kind(self, given: _Given) -> Kind:
         asked = self._conductor.owner("reconcile"), *self._conductor.regularizers

@@ -28,7 +28,7 @@ from clear_strategies.merging.iteration import HrSide, LossWeights, Merged, Step
 from clear_strategies.merging.objective import Losses, Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
 from clear_strategies.strategies import answers
-from clear_strategies.strategies.base import ScreenGradients, Strategy, by_class, overrides
+from clear_strategies.strategies.base import Logged, ScreenGradients, Strategy, by_class, overrides
 from rasterizers.interface import Color
 from rasterizers.modes import in_full_precision
 from rasterizers.native import empty_for
@@ -79,7 +79,7 @@ class Conductor:
         self.sr: Any = None
         self.work_log = WorkLog()
         self._hr_cotangents: Tensor | None = None
-        self._replayed: dict[str, Number] = {}  # see `log_replayed`
+        self._logged: list[dict[str, Logged]] = [{} for _ in strategies]  # in this iteration, before Strategy.logs
         self._owner = dict.fromkeys(_ONE_ANSWER, Strategy())  # its hooks hold where no strategy overrides them
         for hook in _ONE_ANSWER:
             hooks = [hook, *_ALSO_BY.get(hook, ())]
@@ -197,9 +197,9 @@ class Conductor:
                 f"this objective needs the {'HR' if reduced else 'LR'} scale at t={t}, got None. Render what wants_lr "
                 "and wants_hr(t) ask for."
             )
-        self.forget_logs()
+        self.keep_logs()
         with stage("losses LR"):
-            low, photo = rendered.image.detach(), view.lr.over(self.background(t), view.background)
+            low, photo = rendered.image.detach(), self._before_background(view.lr, t, view.background)
             _require_size(view, "HR" if reduced else "LR", low, view.hr.image if reduced else photo.image)
             l_lr = o.lr(images.area_mean(low, view.factor) if reduced else low, photo.image, photo.shown)  # Eq. 4
         where = _where(view, t)
@@ -232,7 +232,8 @@ class Conductor:
             else:
                 grads, conflict = None, stepper.step(params, rendered, g_lr, from_hr, t)
         losses = {} if from_hr is None else from_hr.losses
-        return Update(step, grads, score, ordinary, conflict, {**l_lr.values, **losses}, self.logs())
+        logs = _counted(_named(self.strategies, [s.logs for s in self.strategies]))
+        return Update(step, grads, score, ordinary, conflict, {**l_lr.values, **losses}, logs)
 
     @in_full_precision
     def hr_gradients(
@@ -275,7 +276,8 @@ class Conductor:
             DivergedError: the loss is not finite.
         """
         weight = extra.weight[..., None]
-        target = torch.where(weight > 0, extra.photo.over(self.background(t), extra.background).image, 0.0)
+        photo = self._before_background(extra.photo, t, extra.background)
+        target = torch.where(weight > 0, photo.image, 0.0)
         render = torch.where(weight > 0, image.detach(), 0.0)
         if extra.robust:
             weight = weight * images.agreement(render, target, extra.weight > 0)
@@ -421,41 +423,33 @@ class Conductor:
         s = self._owner[hook]
         return None if type(s) is Strategy else s
 
-    def logs(self, besides: Mapping[str, Any] = _UNKNOWN) -> dict[str, Number]:
-        """The scalars that the strategies logged in the last iteration.
+    def logs(self) -> dict[str, Number]:
+        """The scalars that the strategies have logged in this iteration: since `forget_logs`."""
+        return _counted(self.uncounted_logs())
 
-        Args:
-            besides: an earlier answer of `uncounted_logs`; what is the same there is left out.
-        """
-        logged = {name: x for name, x in self.uncounted_logs().items() if besides.get(name) is not x}
-        return {name: x() if callable(x) else x for name, x in logged.items()}
-
-    def uncounted_logs(self) -> dict[str, Number | Callable[[], Number]]:
+    def uncounted_logs(self) -> dict[str, Logged]:
         """The same as the strategies logged them: some are what computes the scalar. A name that another strategy has logged
         follows that of the class.
         """
-        logged: dict[str, Number | Callable[[], Number]] = {}
-        for owner, s in by_class(self.strategies).items():
-            logged |= {f"{owner}.{name}" if name in logged else name: x for name, x in s.logs.items()}
-        return logged | self._replayed
+        return _named(self.strategies, [kept | s.logs for kept, s in zip(self._logged, self.strategies, strict=True)])
 
-    def take_logs(self, known: Mapping[str, Number]) -> dict[str, Number]:
-        """The scalars that were logged besides the known ones, and which are then logged no more."""
-        taken = {name: x for name, x in self.logs().items() if name not in known}
-        for s in self.strategies:
-            for name in taken.keys() & s.logs.keys():
-                del s.logs[name]
-        return taken
+    def keep_logs(self) -> None:
+        """Keep what `Strategy.logs` hold for `logs`, and empty them: then they hold what is logged from now on."""
+        for kept, s in zip(self._logged, self.strategies, strict=True):
+            kept.update(s.logs)
+            s.logs.clear()
 
     def forget_logs(self) -> None:
         """Before an iteration: what the strategies log from now on belongs to it."""
-        self._replayed.clear()
-        for s in self.strategies:
-            s.logs.clear()
+        self.keep_logs()
+        for kept in self._logged:
+            kept.clear()
 
-    def log_replayed(self, numbers: Mapping[str, Number]) -> None:
-        """Scalars of this iteration from a replay, in which no strategy is called."""
-        self._replayed.update(numbers)
+    def _before_background(self, photo: Photo, t: int, behind: Color) -> Photo:
+        """The photo before the background of iteration t, which a strategy is asked for where it shows through: a recording has
+        photos that are opaque.
+        """
+        return photo if photo.transparency is None else photo.over(self.background(t), behind)
 
     def _backward_hr(
         self,
@@ -470,7 +464,7 @@ class Conductor:
         """∇(λ_LR L_LR) where its cotangents [1, H, W, 3] are given, and the gradients of the HR losses."""
         stage = self.work_log.stage
         with stage("losses HR"):
-            sr = view.hr.over(self.background(t), view.background)
+            sr = self._before_background(view.hr, t, view.background)
             _require_size(view, "HR", hr.image, sr.image)
             # The memory is kept: an allocator maps tens of megabytes afresh each time, at a page fault for every 4 KB.
             losses = self.objective.hr(hr.image.detach(), sr.image, sr.shown, reuse=self._hr_cotangents)  # Eq. 5
@@ -496,6 +490,17 @@ class Conductor:
 def _screen_gradients(lr: Float[Tensor, "N 2"], hr: HrSide, weights: LossWeights) -> ScreenGradients:
     hf = None if hr.hf is None else screen_of(hr.hf)
     return ScreenGradients(lr, *per_gaussian.screens(lr, screen_of(hr.base), hf, hr.size, weights))
+
+
+def _named(strategies: Sequence[Strategy], logged: Sequence[Mapping[str, Logged]]) -> dict[str, Logged]:
+    named: dict[str, Logged] = {}
+    for owner, own in zip(by_class(strategies), logged, strict=True):
+        named |= {f"{owner}.{name}" if name in named else name: x for name, x in own.items()}
+    return named
+
+
+def _counted(logged: Mapping[str, Logged]) -> dict[str, Number]:
+    return {name: x() if callable(x) else x for name, x in logged.items()}
 
 
 def _vjp(shot: Shot, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[Grads]:

@@ -69,7 +69,7 @@ class Update:
         score: S_i, the statistic that densification uses; `ordinary` is that of 3DGS, without strategies. None where nothing
             collects them.
         conflict: share of Gaussians in conflict before correction, by group and as "gaussian"; empty without HR.
-        losses: scalars by name. logs: the scalars that the strategies logged.
+        losses: scalars by name. logs: the scalars that the strategies logged in the update.
 
     On a device, losses, conflict and logs are not floats yet: `deferred.read`.
     """

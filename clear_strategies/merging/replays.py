@@ -26,7 +26,7 @@ LIVE: Final = "live in place of a replay"
 
 
 class RecordedWork:
-    """A recording of work, what it has skipped, and its numbers for the history and for logs.
+    """A recording of work, what it has skipped, its numbers for the history, and what strategies log in it.
 
     Args:
         work: returns what it makes, and numbers by name. See `Recording`.
@@ -34,22 +34,30 @@ class RecordedWork:
     """
 
     def __init__(
-        self, device: torch.device, work_log: WorkLog, work: Callable[[], tuple[Any, Mapping[str, Number]]],
+        self, device: torch.device, conductor: Conductor, work: Callable[[], tuple[Any, Mapping[str, Number]]],
         asked: Iterable[Strategy] = (),
     ) -> None:  # fmt: skip
-        self._work_log, self._asked = work_log, [*asked]
+        self._work_log, self._strategies, self._asked = conductor.work_log, conductor.strategies, [*asked]
         self._stored = [*map(_stored_by, self._asked)]  # before the work, which may change it
         self._of_t: dict[str, Any] = {}  # numbers that Python has made of the iteration
         self._t: int | None = None  # of the replay; None: of the recording
 
         def gathered() -> tuple[Any, Tensor, Callable[[Tensor], dict[str, Number]]]:
-            made, row = work()
+            made, numbers = work()
+            logged = [(s, name, x) for s in self._strategies for name, x in s.logs.items()]
+            self._logged = [(s, name) for s, name, _ in logged]
+            row = {**numbers, **{f"log {k}": x() if callable(x) else x for k, (*_, x) in enumerate(logged)}}
             self._of_t = {name: x for name, x in row.items() if isinstance(x, Guarded)}
             counts = {f"skip {k}": count for k, (*_, count) in enumerate(self._skips) if isinstance(count, Tensor)}
             return made, *deferred.gathered({name: x for name, x in row.items() if name not in self._of_t} | counts)
 
-        with work_log.noted() as self._skips:
-            self._recording = Recording(device, gathered)
+        conductor.keep_logs()
+        try:
+            with self._work_log.noted() as self._skips:
+                self._recording = Recording(device, gathered)
+        finally:
+            for s in self._strategies:
+                s.logs.clear()  # of the recording's tensors
 
     def holds_at(self, t: int) -> bool:
         """See `rasterizers.recording.Recording`."""
@@ -62,13 +70,17 @@ class RecordedWork:
             return self._recording.replay()
 
     def outcome(self) -> tuple[Any, dict[str, Number]]:
-        """What the work has made, whose tensors the next replay overwrites, and its numbers, copied."""
+        """What the work has made, whose tensors the next replay overwrites, and its numbers, copied. The strategies have then
+        logged theirs.
+        """
         made, numbers, row_of = self._recording.result
         row: dict[str, Number] = row_of(numbers.clone()) | {name: x.at(self._t) for name, x in self._of_t.items()}
         for k, (name, reason, count) in enumerate(self._skips):
             counted = row.pop(f"skip {k}", None)
             on_device = isinstance(counted, deferred.Element)
             self._work_log.skip(name, reason, counted.vector[counted.k].long() if on_device else count)  # type: ignore[union-attr]
+        for k, (s, name) in enumerate(self._logged):
+            s.logs[name] = row.pop(f"log {k}")
         return made, row
 
 

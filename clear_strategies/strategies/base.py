@@ -31,6 +31,9 @@ from rasterizers.native import empty_for
 _DEVICE, _SEED = "device", "seed"  # in the cache
 _OWN_NAMES: Final = {"state", "cache", "logs", "device", "seed"}
 
+Logged = Number | Callable[[], Number]
+"""A scalar, or what computes it."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScreenGradients:
@@ -54,14 +57,14 @@ class Strategy:
     Args:
         state: per-Gaussian tensors [N, …] and nothing else; checkpoints save them, `on_resize` gathers them.
         cache: values that can be computed again (patch maps, keyed by view); never saved.
-        logs: scalars of the last iteration, see `log`.
+        logs: scalars of this iteration, see `log`.
 
     Randomness must be a function of (seed, t), so that resuming needs no generator state.
     """
 
     state: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
     cache: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
-    logs: dict[str, Number | Callable[[], Number]] = field(default_factory=dict, init=False, repr=False, compare=False)
+    logs: dict[str, Logged] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
@@ -212,7 +215,7 @@ class Strategy:
 
     # ---- for subclasses ---------------------------------------------------------------------------------------------
 
-    def log(self, name: str, value: Number | Callable[[], Number]) -> None:
+    def log(self, name: str, value: Logged) -> None:
         """Log a scalar of this iteration, or what computes it where it is asked for before the next one: a host asks for it in
         every hundredth. A 0-dim tensor on a device is read later, see `core.deferred`. Where another strategy has logged this
         name, the column is "<class>.<name>".

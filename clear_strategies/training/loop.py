@@ -40,19 +40,17 @@ EXTRA_LOSS: Final = "loss_extra"
 """The column of the history: the LR loss of the iteration's last extra view."""
 
 
-def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
+def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
     """One iteration, in the paper's order."""
     t, θ, conductor, stage = s.t, s.field, s.conductor, s.conductor.work_log.stage
+    conductor.forget_logs()
     θ.degree = min(s.settings.max_degree, (t - 1) // max(1, s.settings.degree_every))
     view = conductor.skips.view(view_at(s), t)
     needs_hr = not conductor.wants_lr or s.density.collects(t)  # for Î_LR, or for a score
     hr_due = conductor.wants_hr(t) and (needs_hr or not conductor.skips.leaves_out_hr(t, conductor.work_log))
     scales = {"lr": conductor.wants_lr and conductor.skips.lr_due(view, hr_due, conductor.work_log), "hr": hr_due}
-    conductor.forget_logs()
     z, background = conductor.gate(t, len(θ)), conductor.background(t)  # zᵗ             Eq. 15       SVS
-    logs = conductor.logs()  # which the update forgets
     u, row = _learned(s, rasterizer, GivenView(t, view, scales, z, background), learn)
-    known = conductor.uncounted_logs()
     begin_sr_stage(s, over(rasterizer, background))
     extra = extra_steps(s, rasterizer, conductor.extra_views(t), background)
     conductor.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS
@@ -61,14 +59,11 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
         restructured = conductor.may_densify(t) and s.density.step(θ, s.optimizer, t, s.resized)
         if s.filter_due() and not restructured and not s.remove_undrawn():  # each recomputes the filter
             s.refilter()
-    logs |= conductor.logs(besides=known)  # of the hooks that are called outside of the update
-    row = {name: x for name, x in row.items() if name not in logs or name not in u.logs}
-    s.history.append(_with_logs(_with_logs(_row(s), row) | extra, logs))
+    s.history.append(_with_logs(_row(s) | row | extra, conductor.logs()))
     if s.conductor.skips.measured(t) and not (restructured or s.reset_due(t)):
         with stage("training views drawn whole"):
             s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)
     s.advance()
-    return u
 
 
 def _learned(s: TrainState, rasterizer: Rasterizer, given: Given, learn: Callable[..., L]) -> L:
@@ -99,7 +94,7 @@ def learn(s: TrainState, rasterizer: Rasterizer, given: GivenView) -> tuple[Upda
     photo = view.lr.over(given.background, view.background)
     row: dict[str, Number] = {"psnr_train_lr": psnr_of(low, photo.image, photo.shown)}
     row |= {f"loss_{name}": value for name, value in u.losses.items()}
-    return u, _with_logs(row | conflict_columns(u.conflict), u.logs)
+    return u, row | conflict_columns(u.conflict)
 
 
 def view_at(s: TrainState) -> View:

@@ -102,7 +102,7 @@ class _Recorded(Recorded[Given, Any]):
         self._own = [*self._read_of(own), background]
         self._write(given)
         asked = that_merge(s.conductor) if isinstance(given, GivenView) else ()
-        self._work = RecordedWork(s.device, s.conductor.work_log, lambda: learn(s, drawn_by, own), asked)
+        self._work = RecordedWork(s.device, s.conductor, lambda: learn(s, drawn_by, own), asked)
 
     def outcome(self, given: Given) -> Any:
         """See `Recorded`."""

@@ -362,9 +362,11 @@ class Logs(cs.Strategy):
 
     def background(self, t):
         self.log("in_background", float(t))
+        self.log("in_two_hooks", float(t))
 
     def reconcile(self, products, step):
         self.log("in_reconcile", step.t / 2)
+        self.log("in_two_hooks", -step.t)
         return cs.Weights()
 
     def extra_views(self, t):
@@ -379,13 +381,22 @@ class Logs(cs.Strategy):
         return True
 
 
-def test_what_any_hook_logs_is_in_the_row_of_its_iteration():
-    replayed = both(lambda: start(reconciles=Logs(), density=False, rises_at=2), 12)
+@dataclass(frozen=True)
+class LogsToo(cs.Strategy):
+    """Logs a name that another strategy logs in an earlier hook."""
+
+    def after_step(self, params, step):
+        self.log("in_reconcile", -1.0)
+
+
+def test_what_any_hook_logs_is_in_the_row_of_its_iteration_and_of_two_values_the_later_one():
+    replayed = both(lambda: start(LogsToo(), reconciles=Logs(), density=False, rises_at=2), 12)
     assert replays_of(replayed) >= 8
     for row in replayed.history_as_floats()[3:]:
+        assert row["LogsToo.in_reconcile"] == -1
         assert {name: x for name, x in row.items() if name.startswith("in_")} == {
             "in_background": row["t"], "in_reconcile": row["t"] / 2, "in_extra_views": row["t"], "in_after_step": row["t"],
-            "in_may_densify": row["t"],
+            "in_may_densify": row["t"], "in_two_hooks": -row["t"],
         }  # fmt: skip
 
 
