@@ -211,8 +211,10 @@ def fit(
 
     Raises:
         Interrupted: after a signal, once the step is done and saved.
-        DivergedError: a loss, a gradient or a parameter became NaN or infinite; the state before that step is saved.
-        AnswerError: a strategy answers a hook with what that hook must not give; as above.
+        DivergedError: a loss, a gradient or a parameter became NaN or infinite.
+        AnswerError: a strategy answers a hook with what that hook must not give.
+
+    After any error the state before the iteration is saved, unless the optimizer has made its step.
     """
     settings = state.settings
 
@@ -231,17 +233,18 @@ def fit(
             done, steps = state.t, state.optimizer.steps
             try:
                 iterate(state, rasterizer)
-            except (DivergedError, AnswerError) as error:
-                saved = save()
-                where = "" if saved is None else f" The state before that step is {saved}."
+            except Exception as error:
+                where = "" if checkpoints is None else " Its step was made, so that its state is not saved."
+                if state.optimizer.steps == steps and checkpoints is not None:
+                    where = ""
+                    with suppress(Exception):  # the first error is the one to tell
+                        where = f" The state before that step is {save()}; fit.resume goes on from it."
                 if isinstance(error, AnswerError):
                     raise AnswerError(f"t={done}: {error}{where}") from error
-                raise DivergedError(f"{error}{where} Check that view's photos, or lower the learning rates.") from error
-            except Exception as error:  # of a strategy's own code, or of a device
-                error.add_note(f"This was in iteration t={done}.")
-                if state.optimizer.steps == steps and checkpoints is not None:
-                    with suppress(Exception):  # the first error is the one to tell
-                        error.add_note(f"The state before that step is {save()}; fit.resume goes on from it.")
+                if isinstance(error, DivergedError):
+                    remedy = "Check that view's photos, or lower the learning rates."
+                    raise DivergedError(f"{error}{where} {remedy}") from error
+                error.add_note(f"This was in iteration t={done}.{where}")  # of a strategy's own code, or of a device
                 raise
             ended = state.ended
             state.history[-1].update(clock.read())
