@@ -40,7 +40,7 @@ def require_state(s: Strategy, params: Mapping[str, Tensor]) -> None:
 
 def require_gate(s: Strategy, z: Any, n: int) -> None:
     shape = (n,) if s.shares_gate else (2, n)
-    if z is not None and not (isinstance(z, Tensor) and z.shape == shape):
+    if z is not None and not _is_real(z, shape):
         scales = "" if s.shares_gate else ", a row for LR and one for HR,"
         _refuse(s, "gate", f"a tensor {[*shape]}{scales} or None", z)
     _require_numbers(s, "gate", "z", z)
@@ -57,20 +57,22 @@ def require_evidence(s: Strategy, e: Any, n: int) -> None:
     if not isinstance(e, Evidence):
         _refuse(s, "observe", "an Evidence or None", e)
     for name in ("reliability", "demand"):
-        if not _is_rows(getattr(e, name), n):
+        if not _is_real(getattr(e, name), (n,)):
             _refuse(s, "observe", f"an Evidence whose {name} is a tensor [{n}]", getattr(e, name))
 
 
 def require_route(s: Strategy, m: Any, n: int) -> None:
-    if not (isinstance(m, Real) or _is_rows(m, n)):
+    if not (isinstance(m, Real) or _is_real(m, (n,))):
         _refuse(s, "route", f"a number or a tensor [{n}]", m)
+    if not isinstance(m, Tensor):
+        _require_finite(s, "route", {"m": m})
 
 
 def require_weights(s: Strategy, weights: Any, n: int, groups: int, *, finite: bool) -> None:
     if not isinstance(weights, Weights):
         _refuse(s, "reconcile", "Weights(keep, remove)", weights)
     for name, w in weights._asdict().items():
-        if not (isinstance(w, Real) or (isinstance(w, Tensor) and w.shape in ((), (n,), (n, groups)))):
+        if not (isinstance(w, Real) or _is_real(w, (), (n,), (n, groups))):
             _refuse(s, "reconcile", f"Weights whose {name} is a number or a tensor [{n}] or [{n}, {groups}]", w)
     if finite:
         _require_finite(s, "reconcile", weights._asdict())
@@ -88,7 +90,7 @@ def regularized(s: Strategy, answer: Any, params: Mapping[str, Tensor], *, finit
 
 def require_score(s: Strategy, score: Any, n: int) -> None:
     """Its numbers, too: a Gaussian whose score is NaN never grows."""
-    if score is not None and not _is_rows(score, n):
+    if score is not None and not _is_real(score, (n,)):
         _refuse(s, "score", f"a tensor [{n}] or None", score)
     _require_finite(s, "score", {"S": score})
 
@@ -100,7 +102,7 @@ def extra_views(s: Strategy, answer: Any) -> list[ExtraView]:
         if not isinstance(extra, ExtraView):
             _refuse(s, "extra_views", "a sequence of ExtraView", extra)
         shape = extra.photo.image.shape[:2]
-        if not (isinstance(extra.weight, Tensor) and extra.weight.shape == shape):
+        if not _is_real(extra.weight, shape):
             _refuse(s, "extra_views", f"an ExtraView whose weight is a tensor {[*shape]}, as its photo", extra.weight)
         _require_numbers(s, "extra_views", "the weight", extra.weight)
     return extras
@@ -108,8 +110,9 @@ def extra_views(s: Strategy, answer: Any) -> list[ExtraView]:
 
 def _require_finite(s: Strategy, hook: str, numbers: Mapping[str, Any]) -> None:
     for name, x in numbers.items():
-        if isinstance(x, Tensor) and deferred.is_immediate(x) and not is_finite(x):
-            found = rows_not_finite(x) if x.dim() else f"is {float(x)}"
+        is_read = deferred.is_immediate(x) if isinstance(x, Tensor) else isinstance(x, Real)
+        if is_read and not (is_finite(x) if isinstance(x, Tensor) else math.isfinite(x)):
+            found = rows_not_finite(x) if isinstance(x, Tensor) and x.dim() else f"is {float(x)}"
             raise AnswerError(f"{_named(s, hook)} must give finite numbers, but {name} {found}.")
 
 
@@ -122,8 +125,9 @@ def _require_numbers(s: Strategy, hook: str, name: str, x: Tensor | None) -> Non
         raise AnswerError(f"{_named(s, hook)} must give finite numbers >= 0, but {name} has {least:.3g} to {most:.3g}.")
 
 
-def _is_rows(x: Any, n: int) -> bool:
-    return isinstance(x, Tensor) and x.shape == (n,)
+def _is_real(x: Any, *shapes: tuple[int, ...]) -> bool:
+    """Whether it is a tensor of one of the shapes. A conversion of complex numbers drops their imaginary part."""
+    return isinstance(x, Tensor) and x.shape in shapes and not x.is_complex()
 
 
 def _rows_like(
@@ -134,7 +138,7 @@ def _rows_like(
     for name, x in answer.items():
         if name not in like:
             _refuse(s, hook, f"attributes {whose}, {', '.join(like)}", name)
-        if not (isinstance(x, Tensor) and x.shape == like[name].shape):
+        if not _is_real(x, like[name].shape):
             _refuse(s, hook, f"{name} as a tensor {[*like[name].shape]}", x)
     if finite:
         _require_finite(s, hook, answer)
@@ -150,4 +154,6 @@ def _refuse(s: Strategy, hook: str, rule: str, found: Any) -> NoReturn:
 
 
 def _shown(found: Any) -> str:
-    return f"a tensor {[*found.shape]}" if isinstance(found, Tensor) else f"{found!r:.80}"
+    if isinstance(found, Tensor):
+        return f"a {'complex ' if found.is_complex() else ''}tensor {[*found.shape]}"
+    return f"{found!r:.80}"

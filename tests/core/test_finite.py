@@ -1,13 +1,13 @@
 """What is not finite is found before a step, named, and never reaches a parameter or a checkpoint."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
 
 import clear_strategies as cs
 from clear_strategies.core.finite import is_finite
-from clear_strategies.errors import DivergedError
+from clear_strategies.errors import AnswerError, DivergedError
 from clear_strategies.training import checkpoint
 from clear_strategies.training.field import FieldShot
 from clear_strategies.training.loop import fit, iterate
@@ -96,7 +96,7 @@ def test_a_run_that_meets_nan_saves_the_state_before_and_says_where(tmp_path):
     state = start(NAMES)
     state.views = without_a_pixel(float("nan"), "hr").train
     with pytest.raises(
-        DivergedError, match=r"first pixel \(5, 3\). The state before that step is .*step_\d+\.safetensors. Check"
+        DivergedError, match=r"first pixel \(5, 3\). The state before that step is .*step_\d+\.safetensors; .* Check"
     ):
         fit(state, SCENE, toy.RASTERIZER, checkpoints=tmp_path)
     saved = checkpoint.load(tmp_path)
@@ -104,23 +104,41 @@ def test_a_run_that_meets_nan_saves_the_state_before_and_says_where(tmp_path):
     assert_same(dict(saved.tensors), tensors(state))
 
 
-@pytest.mark.parametrize("hook", ["reconcile", "after_step"])
-def test_a_run_whose_strategy_raises_says_when_and_saves_the_state_before_where_no_step_was_made(hook, tmp_path):
-    class Fails(cs.Strategy):
-        """Raises at t=5."""
+@dataclass(frozen=True)
+class Fails(cs.Strategy):
+    """Does something wrong at t=5."""
 
-    def fails(self, given, step):
-        if step.t == 5:
+    what: str
+
+    def reconcile(self, products, step):
+        if step.t == 5 and self.what == "it raises before the step":
             raise KeyError("mine")
-        return cs.Weights()
+        return cs.Weights(keep=float("nan") if step.t == 5 and self.what == "a weight is NaN" else 1.0)
 
-    setattr(Fails, hook, fails)
-    state = start((), more=[Fails()])
-    with pytest.raises(KeyError) as raised:
+    def extra_views(self, t):
+        photo = SCENE.train[0].lr
+        spoilt = replace(photo, image=photo.image * float("nan"))
+        return [cs.ExtraView(spoilt, photo.image[..., 0] * 0 + 1)] if t == 5 and self.what == "an extra view is NaN" else []
+
+    def after_step(self, params, step):
+        if step.t == 5 and self.what == "it raises after the step":
+            raise KeyError("mine")
+        if step.t == 5 and self.what == "it logs a column of the history":
+            self.log("loss_lr", 1.0)
+        if step.t == 5 and self.what == "its state is no tensor":
+            self.state["mine"] = "text"
+
+
+@pytest.mark.parametrize(("what", "stepped"), [
+    ("it raises before the step", False), ("a weight is NaN", False), ("it raises after the step", True),
+    ("an extra view is NaN", True), ("it logs a column of the history", True), ("its state is no tensor", True),
+])  # fmt: skip
+def test_a_run_that_ends_by_an_error_says_when_and_saves_the_state_before_where_no_step_was_made(what, stepped, tmp_path):
+    state = start((), more=[Fails(what)])
+    with pytest.raises((KeyError, AnswerError, DivergedError)) as raised:
         fit(state, SCENE, toy.RASTERIZER, checkpoints=tmp_path)
-    when, *where = raised.value.__notes__
-    assert when == "This was in iteration t=5."
-    assert len(where) == (hook == "reconcile")
-    if where:
-        assert where[0].startswith("The state before that step is ")
-        assert checkpoint.load(tmp_path).t == 5
+    told = " ".join([str(raised.value), *getattr(raised.value, "__notes__", [])])
+    assert "t=5" in told
+    assert ("Its step was made, so that its state is not saved." in told) is stepped
+    assert (" The state before that step is " in told) is not stepped
+    assert [checkpoint.load(path).t for path in checkpoint.saved(tmp_path)] == ([] if stepped else [5])
