@@ -199,10 +199,12 @@ class CompiledStep:
 
     def _gaussians(self, a: Activation, g_lr: Grads, hr: HrSide | None) -> kernel.GaussianStep:
         """The passes over the gradients of one view."""
-        m = None if hr is None else hr.m
+        m = None if hr is None or (not isinstance(hr.m, Tensor) and hr.m == 1) else hr.m
+        if m is not None and not isinstance(m, Tensor):
+            m = a.sigmoid.new_full(a.sigmoid.shape, m)
         activation = {
             "scales": a.scales, "filtered": a.filtered, "filter": a.filter_3d, "sigmoid": a.sigmoid,
-            "factor": a.factor.contiguous(), "route": m.float().contiguous() if isinstance(m, Tensor) else None,
+            "factor": a.factor.contiguous(), "route": None if m is None else m.float().contiguous(),
             "basis": _basis(g_lr, None if hr is None else hr.base),
         }  # fmt: skip
         base, hf = (None, None) if hr is None else (hr.base.tensors, None if hr.hf is None else hr.hf.tensors)

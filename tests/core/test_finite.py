@@ -118,7 +118,11 @@ class Fails(cs.Strategy):
     def extra_views(self, t):
         photo = SCENE.train[0].lr
         spoilt = replace(photo, image=photo.image * float("nan"))
-        return [cs.ExtraView(spoilt, photo.image[..., 0] * 0 + 1)] if t == 5 and self.what == "an extra view is NaN" else []
+        return (
+            [cs.ExtraView(spoilt, photo.image[..., 0] * 0 + 1)]
+            if t == 5 and self.what == "an extra view is NaN"
+            else []
+        )
 
     def after_step(self, params, step):
         if step.t == 5 and self.what == "it raises after the step":
@@ -133,7 +137,9 @@ class Fails(cs.Strategy):
     ("it raises before the step", False), ("a weight is NaN", False), ("it raises after the step", True),
     ("an extra view is NaN", True), ("it logs a column of the history", True), ("its state is no tensor", True),
 ])  # fmt: skip
-def test_a_run_that_ends_by_an_error_says_when_and_saves_the_state_before_where_no_step_was_made(what, stepped, tmp_path):
+def test_a_run_that_ends_by_an_error_says_when_and_saves_the_state_before_where_no_step_was_made(
+    what, stepped, tmp_path
+):
     state = start((), more=[Fails(what)])
     with pytest.raises((KeyError, AnswerError, DivergedError)) as raised:
         fit(state, SCENE, toy.RASTERIZER, checkpoints=tmp_path)

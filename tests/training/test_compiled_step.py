@@ -122,6 +122,12 @@ def test_every_subset_of_strategies_with_and_without_hr(passes, names):
         assert repr(as_floats(found_conflict)) == repr(as_floats(conflict))
 
 
+def test_one_route_for_all_gaussians_is_that_of_the_readable_path(passes):
+    c = replace(case(50, evidence=False), m=0.25)
+    expected, _, found, _ = both_ways(passes, c, *conductors(GCO))
+    assert_same_gradient(c, expected, found)
+
+
 def test_hr_for_the_score_alone_is_neither_compared_nor_corrected(passes):
     later = WarmupDecay(start=T + 5, full=T + 10, decay_from=40, end=50)
     c = case(50)
