@@ -26,6 +26,8 @@ DEVICES: Final = {"cuda"}
 _FAILED: Final = "a recording failed"
 _RESTLESS: Final = 20  # changes of memory without a replay between them, where no structure changes so often
 _MOST_KINDS: Final = 8  # a recording keeps the memory of its work
+_MOST_TURNS: Final = 8  # recordings made anew that have not paid off
+_PAYS_AFTER: Final = 2  # replays
 
 T = TypeVar("T")
 G = TypeVar("G")
@@ -97,7 +99,7 @@ class Replays:
         self._done = set[tuple[Any, ...]]()
         self._addresses: tuple[int, ...] = ()
         self._moves = 0  # changes of these since the last replay
-        self._turns = 0  # how often a recording did not hold at its iteration
+        self._turns = 0.0  # how often a recording did not hold at its iteration, less what the replays since have saved
         self._failed = False
 
     def do(self, kind: Kind, t: int, given: Any, *, live: Callable[[], T], record: Callable[[], Recorded[Any, T]]) -> T:
@@ -127,13 +129,14 @@ class Replays:
             known = self._recorded[kind]
             if known is not None and not known.holds_at(t):
                 known, self._turns = None, self._turns + 1
-                if self._turns > _MOST_KINDS:
+                if self._turns > _MOST_TURNS:
                     raise RuntimeError(
                         "a strategy decides by the iteration, or by what it stores in Python, and again and again another way. "
                         "Numbers that it changes belong in tensors that it writes in place."
                     )
             recorded = record() if known is None else known if known.replay(given) else None
-            self._moves = 0 if recorded is known is not None else self._moves
+            if recorded is known is not None:
+                self._moves, self._turns = 0, max(0.0, self._turns - 1 / _PAYS_AFTER)
             reason = "the recorded lists of pairs are too short"  # recorded anew, with space for more
         except Exception as error:
             self._failed, recorded, reason = True, None, _FAILED

@@ -246,6 +246,23 @@ def test_recordings_of_an_earlier_structure_are_dropped():
         assert len(made) == address + 1
 
 
+@pytest.mark.parametrize(("lasts", "pays"), [(1, False), (2, False), (3, True), (20, True)])
+def test_work_is_recorded_anew_as_long_as_recordings_pay_off(lasts, pays):
+    kept = Replays(DEVICE, "")
+
+    def do(t: int) -> str:
+        def record():
+            return SimpleNamespace(
+                holds_at=lambda now: now // lasts == t // lasts, replay=lambda _: True, outcome=lambda _: "replayed"
+            )
+
+        return kept.do(Kind((), (), ()), t, None, live=lambda: "live", record=record)
+
+    found = [do(t) for t in range(240)]
+    assert found[1] == "replayed"
+    assert found[-1] == ("replayed" if pays else "live")
+
+
 def test_memory_that_is_new_in_each_iteration_is_told_and_not_recorded(caplog):
     kept = Replays(DEVICE, "")
     found = [kept.do(Kind((k,), (), ()), k, None, live=lambda: "live", record=fails) for k in range(30)]
