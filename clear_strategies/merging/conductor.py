@@ -28,7 +28,7 @@ from clear_strategies.merging.iteration import HrSide, LossWeights, Merged, Step
 from clear_strategies.merging.objective import Losses, Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
 from clear_strategies.strategies import answers
-from clear_strategies.strategies.base import Logged, ScreenGradients, Strategy, by_class, overrides
+from clear_strategies.strategies.base import Logged, ScreenGradients, Strategy, by_class, misspelled, overrides
 from rasterizers.interface import Color
 from rasterizers.modes import in_full_precision
 from rasterizers.native import empty_for
@@ -97,6 +97,8 @@ class Conductor:
         for s in strategies:
             if not any(overrides(s, hook) for hook in (*_ONE_ANSWER, "correct", *others)):
                 _log.warning("%s implements no hook; it has no effect.", type(s).__name__)
+            for hook, name in misspelled(type(s)).items():
+                _log.warning("%s.%s() is no hook: nothing calls it. There is %s().", type(s).__name__, name, hook)
 
     def on_fit_start(
         self, n_views: int, seed: int, device: torch.device | str = "cpu", views: Sequence[View] = ()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from numbers import Real
 from typing import Any, Final
 
@@ -29,6 +30,7 @@ from rasterizers.interface import Color
 from rasterizers.native import empty_for
 
 _DEVICE, _SEED = "device", "seed"  # in the cache
+_ALIKE: Final = 0.85  # "regularise" to "regularize" 0.9, "densify" to "densifier" 0.75
 _OWN_NAMES: Final = {"state", "cache", "logs", "device", "seed"}
 
 Logged = Number | Callable[[], Number]
@@ -246,6 +248,17 @@ class Strategy:
 def overrides(strategy: Strategy, hook: str) -> bool:
     """Whether the strategy's class overrides `hook`."""
     return getattr(type(strategy), hook) is not getattr(Strategy, hook)
+
+
+def misspelled(cls: type[Strategy]) -> dict[str, str]:
+    """Public methods that `Strategy` does not have, by the hook which each resembles and which the class does not override."""
+    found = dict[str, str]()
+    inherited = (name for name in vars(Strategy) if getattr(cls, name) is getattr(Strategy, name))
+    hooks = [name for name in inherited if name not in _OWN_NAMES | {"log", "to"} and name[0] != "_"]
+    for name, _ in inspect.getmembers(cls, inspect.isfunction):
+        if name[0] != "_" and not hasattr(Strategy, name):
+            found |= dict.fromkeys(get_close_matches(name, hooks, n=1, cutoff=_ALIKE), name)
+    return found
 
 
 def describes(strategy: Strategy, fact: str) -> bool:

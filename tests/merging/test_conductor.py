@@ -24,6 +24,7 @@ from clear_strategies import (
 from clear_strategies.errors import AnswerError
 from clear_strategies.kernels.losses import reference
 from clear_strategies.schedules import WarmupDecay
+from clear_strategies.strategies.base import misspelled
 from clear_strategies.testing import CHECKS, ContractError, check_strategy
 from clear_strategies.training import loop
 from clear_strategies.training.field import GaussianField
@@ -228,6 +229,37 @@ def test_a_gate_of_any_type_is_what_it_is_as_float32(dtype):
 
     expected = trained(torch.float32)
     assert not [name for name, x in trained(dtype).items() if not torch.equal(x, expected[name])]
+
+
+@dataclass(frozen=True)
+class Misspells(Strategy):
+    """Beside a hook of the right name."""
+
+    def gate(self, t, n):
+        return None
+
+    def regularise(self, params, t):
+        return Grads({"means": params["means"]})
+
+    def on_resized(self, parents):
+        self.gates(1)
+
+    def gates(self, t):
+        """A helper of `gate`."""
+
+    def weights(self):
+        """A helper that resembles nothing."""
+
+
+def test_a_method_whose_name_is_nearly_that_of_a_hook_is_told(caplog):
+    Conductor(Misspells())
+    assert sorted(r.getMessage() for r in caplog.records) == [
+        "Misspells.on_resized() is no hook: nothing calls it. There is on_resize().",
+        "Misspells.regularise() is no hook: nothing calls it. There is regularize().",
+    ]
+    ours = [cls for cls in Strategy.__subclasses__() if cls.__module__.startswith("clear_strategies.")]
+    assert {cls.__name__ for cls in ours} >= {"GCO", "P2G", "SVS", "PseudoViews", "MCMC"}
+    assert not [cls for cls in ours if misspelled(cls)]
 
 
 @dataclass(frozen=True)
