@@ -216,10 +216,10 @@ class Conductor:
         else:
             # Where Î_LR is the area mean of Î_HR, the cotangent of L_LR passes through the same HR render.
             through_mean = images.area_mean_transposed(l_lr.cotangents, view.factor) if reduced else None
-            drawn = Step(iteration(t), _told(view), hr.visible, params=params, looked_up=looked_up)
+            drawn = Step(iteration(t), self._told(view), hr.visible, params=params, looked_up=looked_up)
             g_mean, from_hr = self._backward_hr(hr, view, drawn, t, vjp, through_mean)
             g_lr = g_mean if reduced else g_lr
-        step = Step(iteration(t), _told(view), params=params) if from_hr is None else from_hr.step
+        step = Step(iteration(t), self._told(view), params=params) if from_hr is None else from_hr.step
         with stage("strategies" if stepper is None else stepper.stage):
             score = ordinary = None
             if scored:
@@ -257,7 +257,7 @@ class Conductor:
             params, looked_up: for `Step`.
         """
         apart = apart or self.owner("route") is not None or self.owner("score") is not None
-        step = Step(iteration(t), _told(view), hr.visible, params=params, looked_up=looked_up)
+        step = Step(iteration(t), self._told(view), hr.visible, params=params, looked_up=looked_up)
         return self._backward_hr(hr, view, step, t, vjp or _vjp, apart=apart)[1]
 
     def extra_views(self, t: int) -> list[ExtraView]:
@@ -448,10 +448,30 @@ class Conductor:
             kept.clear()
 
     def _before_background(self, photo: Photo, t: int, behind: Color) -> Photo:
-        """The photo before the background of iteration t, which a strategy is asked for where it shows through: a recording has
-        photos that are opaque.
-        """
-        return photo if photo.transparency is None else photo.over(self.background(t), behind)
+        """The photo before the background of iteration t; a recording is given it so."""
+        is_so = photo.transparency is None or running() is not None
+        return photo if is_so else photo.over(self.background(t), behind)
+
+    def _told(self, view: View) -> View:
+        """The view as strategies are told it in what may be recorded: the images alone are copied before a replay."""
+        if running() is None:
+            return view
+
+        def layer(x: Any, what: str) -> Any:
+            return None if x is None else unread(x, f"the {what} of the view", ("shape", "dtype"))
+
+        def photo(p: Photo) -> Photo:
+            changes = p.transparency is not None and self.owner("background") is not None  # as the background does
+            image = layer(p.image, "transparent image") if changes else p.image
+            camera = unread(p.camera, "the camera of the view", ("width", "height"))
+            return replace(p, camera=camera, image=image, transparency=layer(p.transparency, "transparency"))
+
+        lr, hr = photo(view.lr), photo(view.hr)
+        return View(
+            unread(view.name, "the name of the view"), lr, hr, hr.image if view.hr_is_photo else layer(view.truth, "truth"),
+            unread(view.sr_source, "the sr_source of the view"), layer(view.depth, "depth"),
+            layer(view.disagreement, "disagreement"), view.background,
+        )  # fmt: skip
 
     def _backward_hr(
         self,
@@ -507,25 +527,6 @@ def _counted(logged: Mapping[str, Logged]) -> dict[str, Number]:
 
 def _vjp(shot: Shot, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[Grads]:
     return shot.vjp(cotangents)
-
-
-def _told(view: View) -> View:
-    """The view as strategies are told it in what may be recorded: the images alone are copied before a replay."""
-    if running() is None:
-        return view
-
-    def photo(p: Photo) -> Photo:
-        return replace(p, camera=unread(p.camera, "the camera of the view", ("width", "height")))
-
-    def layer(x: Any, what: str) -> Any:
-        return None if x is None else unread(x, f"the {what} of the view", ("shape", "dtype"))
-
-    lr, hr = photo(view.lr), photo(view.hr)
-    return View(
-        unread(view.name, "the name of the view"), lr, hr, hr.image if view.hr_is_photo else layer(view.truth, "truth"),
-        unread(view.sr_source, "the sr_source of the view"), layer(view.depth, "depth"),
-        layer(view.disagreement, "disagreement"), view.background,
-    )  # fmt: skip
 
 
 def _require_size(view: View, scale: str, render: Tensor, image: Tensor) -> None:

@@ -83,7 +83,7 @@ class IterationReplays:
             facts += [x is None for x in (given.view.depth, given.view.disagreement, given.view.truth)]
         else:
             facts.append(given.extra.robust)
-        shapes = [(photo.image.shape, photo.shown is None) for photo in given.photos]
+        shapes = [(photo.image.shape, photo.shown is None, photo.transparency is None) for photo in given.photos]
         return Kind((len(s.field), *addresses), tuple(shapes), tuple(facts))
 
 
@@ -113,9 +113,12 @@ class _Recorded(Recorded[Given, Any]):
         return update, row
 
     def _copied(self, given: Given) -> Given:
-        """The same with tensors and cameras of its own, and photos that no background shows through."""
-        copies = (p.over(given.background, given.behind) for p in given.photos)
-        photos = [Photo(replace(p.camera), p.image.clone(), copied(p.shown)) for p in copies]
+        """The same with tensors and cameras of its own, and photos before the background of the iteration."""
+        images = (p.over(given.background, given.behind).image.clone() for p in given.photos)
+        photos = [
+            Photo(replace(p.camera), image, copied(p.shown), p.transparency)
+            for p, image in zip(given.photos, images, strict=True)
+        ]
         if isinstance(given, GivenExtra):
             extra = replace(given.extra, photo=photos[0], weight=given.extra.weight.clone())
             return replace(given, extra=extra, background=None)

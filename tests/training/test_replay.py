@@ -11,7 +11,7 @@ import torch
 
 import clear_strategies as cs
 import rasterizers
-from clear_strategies.core.view import ExtraView, View
+from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.density.mcmc import MCMC
@@ -313,6 +313,35 @@ def test_a_strategy_that_reads_the_iteration_or_the_view_is_live(reads, caplog):
     replayed = both(lambda: start(reconciles=ByTime(reads), density=False, rises_at=2), 16)
     assert live_in(replayed)[FAILED] >= 2
     assert "must not read the" in caplog.text or "decides by the iteration" in caplog.text
+
+
+@dataclass(frozen=True)
+class ByPhoto(cs.Strategy):
+    """Decides by a layer of the photo."""
+
+    layer: str
+
+    def reconcile(self, products, step):
+        layer = getattr(step.view.lr, self.layer)
+        return cs.Weights() if layer is None else cs.Weights(keep=layer.double().mean())
+
+
+@pytest.mark.parametrize(("layer", "has_alpha", "is_live"), [
+    ("image", True, True), ("image", False, False), ("transparency", True, True), ("transparency", False, False),
+])  # fmt: skip
+def test_a_strategy_that_reads_a_photo_which_a_background_shows_through_is_live(layer, has_alpha, is_live):
+    def transparent(photo: Photo) -> Photo:
+        return replace(photo, transparency=1 - photo.image.mean(dim=2))
+
+    views = tuple(replace(v, lr=transparent(v.lr), hr=transparent(v.hr), truth=None) for v in SCENE.train)
+    scene = replace(SCENE, train=views) if has_alpha else SCENE
+    replayed = both(
+        lambda: start(
+            cs.RandomBackground(until=1_350), reconciles=ByPhoto(layer), density=False, rises_at=2, scene=scene
+        ),
+        10,
+    )
+    assert (FAILED in live_in(replayed)) is is_live
 
 
 @dataclass(frozen=True)
