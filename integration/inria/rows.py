@@ -44,15 +44,16 @@ class Change:
 
 
 class CarriedRows:
-    """Row indices that follow a GaussianModel's `_prune_optimizer` and `cat_tensors_to_optimizer`.
+    """Row indices that follow a GaussianModel's `_prune_optimizer`, `cat_tensors_to_optimizer` and `relocate_gs`.
 
-    The densifiers of 3DGS and its forks end in these two functions. The first keeps rows, and says which. The second appends
-    rows, which are copies of rows that exist at that moment except for position, scale and opacity, so that their parents are
-    found by value among them. If other functions have changed the structure, or a row is no copy of the parent that was
-    carried, the parents of all rows are found by value.
+    The densifiers of 3DGS and its forks end in the first two. `_prune_optimizer` keeps rows, and says which.
+    `cat_tensors_to_optimizer` appends rows, which are copies of rows that exist at that moment except for position, scale and
+    opacity, so that their parents are found by value among them. `relocate_gs`, of 3dgs-mcmc, writes copies over dead rows. If
+    other functions have changed the structure, or a row is no copy of the parent that was carried, the parents of all rows are
+    found by value.
 
     Args:
-        model: the GaussianModel; both methods are replaced in this object.
+        model: the GaussianModel; the methods are replaced in this object.
         params: returns its current leaves, by gsplat's names.
     """
 
@@ -61,6 +62,7 @@ class CarriedRows:
         self._undo = replace_methods(model, {
             "_prune_optimizer": functools.partial(_hooked, self._keep),
             "cat_tensors_to_optimizer": functools.partial(_hooked, self._append),
+            "relocate_gs": self._relocate,
         })  # fmt: skip
         self.restart()
 
@@ -110,9 +112,23 @@ class CarriedRows:
         if len(self._parents) != len(now["means"]) or any(name not in tensors for name in _GROUPS.values()):
             return
         nearest = _nearest_copied(now, {name: tensors[_GROUPS[name]] for name in _COMPARED})
-        parents = self._parents[nearest.clamp_min(0)] if len(now["means"]) else nearest
-        self._parents = torch.cat((self._parents, torch.where(nearest < 0, -1, parents)))
+        self._parents = torch.cat((self._parents, self._parents_of(nearest)))
         self._fresh = torch.cat((self._fresh, torch.ones_like(nearest, dtype=torch.bool)))
+
+    def _relocate(self, relocate_gs: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """It writes into the memory of the replaced parameters too, so that these no longer show which row was the dead one."""
+        before = {name: rows.detach().clone() for name, rows in self._compared().items()}
+        result = relocate_gs(*args, **kwargs)
+        change = find_change(before, self._compared())
+        if change is not None and len(self._parents) == len(before["means"]) == len(change.parents):
+            self._carried = True
+            self._parents = self._parents_of(change.parents)
+            self._fresh |= change.parents != torch.arange(len(self._fresh), device=self._fresh.device)
+        return result
+
+    def _parents_of(self, rows: Int[Tensor, " M"]) -> Int[Tensor, " M"]:
+        """What these current rows come from; -1, no row, stays."""
+        return torch.where(rows < 0, -1, self._parents[rows.clamp_min(0)]) if len(self._parents) else rows
 
 
 def _hooked(hook: Callable[[Any], None], method: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:

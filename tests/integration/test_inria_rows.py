@@ -96,6 +96,29 @@ def test_a_change_by_another_function_is_found_by_its_values(also_pruned, model,
     assert ("found by the values" in caplog.text) == also_pruned
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("also_added", [False, True], ids=["alone", "before others are added"])
+def test_a_relocated_gaussian_comes_from_the_one_whose_copy_it_is(also_added, model):
+    """3dgs-mcmc writes over the dead rows in place, then makes new parameters of the same memory."""
+
+    def relocate_gs(dead_mask):
+        for name in ("_xyz", "_features_dc", "_rotation"):
+            p = getattr(model, name)
+            p[dead_mask] = p[[5, 2]]
+            setattr(model, name, torch.nn.Parameter(p))
+
+    model.relocate_gs = relocate_gs
+    carried = rows_of(model)
+    model.relocate_gs(dead_mask=pruned(3, 6))
+    if also_added:
+        for name in ("_features_rest", "_opacity", "_scaling"):
+            setattr(model, name, torch.nn.Parameter(getattr(model, name)))
+        append(model, [0])
+    change = carried.poll()
+    assert change.parents.tolist() == [0, 1, 2, 5, 4, 5, 2, *range(7, N), *[0] * also_added]
+    assert change.fresh.nonzero()[:, 0].tolist() == [3, 6, *[N] * also_added]
+
+
 def test_the_loop_reports_the_rows_and_gets_its_methods_back(inria_host, inria_capture, inria_attached):
     recorder = toy.Recorder()
     clear, gaussians, scene = inria_attached(recorder)
