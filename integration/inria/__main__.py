@@ -1,6 +1,7 @@
 """Run an unchanged 3DGS-style train.py with CLEAR: `python -m integration.inria --sr sr_x4 train.py -s data`.
 
-When the script has called `GaussianModel.training_setup(opt)`, CLEAR is installed with the options that it passed.
+When the script has called `GaussianModel.training_setup(opt)`, CLEAR is installed with the options that it passed. So it is after
+another method whose name begins so, as InstantSplat's `training_setup_pp(opt, confidence_lr)`.
 """
 
 from __future__ import annotations
@@ -9,19 +10,24 @@ import functools
 import importlib
 import logging
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
+
+import torch
 
 from clear_strategies.errors import HostError
 from integration import launcher
 from integration.inria.cameras import photo_of
 from integration.inria.from_options import install
+from integration.replacing import replace_everywhere
 from integration.settings import Settings
-from integration.views import save_photos
+from integration.views import no_stereo, save_photos
 
 _log = logging.getLogger("integration.inria")  # __name__ is "__main__" here
+_SETUP: Final = "training_setup"
+_BY_HAND: Final = "Put the line install(gaussians, scene, opt, …) into the script instead."
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -34,9 +40,13 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
     """CLEAR is installed after the first call of `training_setup` of each model (CoR-GS trains two), for the cameras of the last
     `Scene`.
     """
-    importlib.import_module("gaussian_renderer")  # whose `render` install replaces
+    renderer: Any = importlib.import_module("gaussian_renderer")  # whose `render` install replaces
     scene: Any = importlib.import_module("scene")
-    setup, init = scene.GaussianModel.training_setup, scene.Scene.__init__
+    init, render = scene.Scene.__init__, getattr(renderer, "render", None)
+    if render is None:
+        raise HostError("gaussian_renderer has no function render, which it has in 3DGS.")
+    of = scene.GaussianModel
+    setups = {name: getattr(of, name) for name in dir(of) if name.startswith(_SETUP)}
     scenes, models, attached = list[Any](), list[Any](), list[Any]()
 
     @functools.wraps(init)
@@ -44,32 +54,51 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
         init(loaded, *args, **kwargs)
         scenes.append(loaded)
 
-    @functools.wraps(setup)
-    def setup_and_install(gaussians: Any, opt: Any, *args: Any, **kwargs: Any) -> Any:
-        result = setup(gaussians, opt, *args, **kwargs)
-        if any(model is gaussians for model in models):  # points=stereo, and a restored checkpoint, call it again
+    def installing(setup: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(setup)
+        def setup_and_install(gaussians: Any, opt: Any, *args: Any, **kwargs: Any) -> Any:
+            result = setup(gaussians, opt, *args, **kwargs)
+            if any(model is gaussians for model in models):  # points=stereo, and a restored checkpoint, call it again
+                return result
+            models.append(gaussians)
+            if not scenes:
+                raise HostError(
+                    f"{setup.__name__} was called before a Scene was made, so the training cameras are unknown. {_BY_HAND}"
+                )
+            if save_lr is not None:
+                save_photos(map(photo_of, scenes[-1].getTrainCameras()), save_lr)
+                raise SystemExit(0)
+            if settings.from_stereo and setup.__name__ != _SETUP:
+                raise no_stereo(f"the script calls {setup.__name__}, whose arguments belong to its own points")
+            attached.append(install(gaussians, scenes[-1], opt, settings))
             return result
-        models.append(gaussians)
-        if not scenes:
-            raise HostError(
-                "training_setup was called before a Scene was made, so the training cameras are unknown. Put the line "
-                "install(gaussians, scene, opt, …) into the script instead."
-            )
-        if save_lr is not None:
-            save_photos(map(photo_of, scenes[-1].getTrainCameras()), save_lr)
-            raise SystemExit(0)
-        attached.append(install(gaussians, scenes[-1], opt, settings))
-        return result
 
-    scene.GaussianModel.training_setup, scene.Scene.__init__ = setup_and_install, init_and_remember
+        return setup_and_install
+
+    @functools.wraps(render)
+    def render_unless_unknown(camera: Any, gaussians: Any, *args: Any, **kwargs: Any) -> Any:
+        if not models and torch.is_grad_enabled() and getattr(gaussians, "optimizer", None) is not None:
+            raise HostError(
+                f"{type(gaussians).__name__} would train without CLEAR: it has an optimizer, but not by "
+                f"scene.GaussianModel.{_SETUP}. {_BY_HAND}"
+            )
+        return render(camera, gaussians, *args, **kwargs)
+
+    restore = replace_everywhere(render, render_unless_unknown)
+    scene.Scene.__init__ = init_and_remember
+    for name, setup in setups.items():
+        setattr(of, name, installing(setup))
     try:
         yield attached
         for each in attached:
             _log.info("%s.", each.attachment.summary())
     finally:
-        scene.GaussianModel.training_setup, scene.Scene.__init__ = setup, init
+        scene.Scene.__init__ = init
+        for name, setup in setups.items():
+            setattr(of, name, setup)
         for each in reversed(attached):
             each.remove()
+        restore()
 
 
 HOST: Final = launcher.Host(

@@ -528,6 +528,42 @@ def test_wrong_arguments_are_refused_before_the_host_starts(arguments, message, 
     assert message in caplog.text
 
 
+def script_with_setup(inria_capture, call):
+    """The host's train.py, in which `call` stands for `gaussians.training_setup(opt)`."""
+    script = inria_capture / "changed.py"
+    script.write_text((FOLDER / "train.py").read_text().replace("gaussians.training_setup(opt)", call))
+    return [str(script), "-s", str(inria_capture), "--iterations", "4"]
+
+
+def training_setup_pp(gaussians, opt, rates):
+    type(gaussians).own_setup(gaussians, opt)
+
+
+@pytest.mark.parametrize("points", ["own", "stereo"])
+def test_another_method_that_sets_a_model_up_is_known_by_its_name(
+    points, inria_host, inria_capture, caplog, monkeypatch
+):
+    """InstantSplat's for a rate of each point, which those of stereo have not."""
+    monkeypatch.setattr(inria_host.GaussianModel, "own_setup", inria_host.GaussianModel.training_setup, raising=False)
+    monkeypatch.setattr(inria_host.GaussianModel, "training_setup_pp", training_setup_pp, raising=False)
+    run = script_with_setup(inria_capture, "gaussians.training_setup_pp(opt, None)")
+    with caplog.at_level(logging.INFO):
+        status = main(["--points", points, "--sr", str(inria_capture / "sr"), *run])
+    assert (status, "4 merges" in caplog.text) == ((0, True) if points == "own" else (2, False))
+    assert ("the script calls training_setup_pp" in caplog.text) == (points == "stereo")
+    assert inria_host.GaussianModel.training_setup_pp is training_setup_pp
+
+
+def test_a_model_that_would_train_without_the_strategies_is_refused_at_its_first_rendering(
+    inria_host, inria_capture, caplog, monkeypatch
+):
+    monkeypatch.setattr(inria_host.GaussianModel, "own_setup", inria_host.GaussianModel.training_setup, raising=False)
+    run = script_with_setup(inria_capture, "gaussians.own_setup(opt)")
+    assert main(["--sr", str(inria_capture / "sr"), *run]) == 2
+    assert "GaussianModel would train without CLEAR" in caplog.text
+    assert not hasattr(inria_host.render, "__wrapped__")
+
+
 def test_a_train_py_that_trains_nothing_is_an_error(inria_capture, inria_host, caplog):
     (inria_capture / "train.py").write_text("import gaussian_renderer")
     assert main(["--sr", str(inria_capture / "sr"), str(inria_capture / "train.py")]) == 1
