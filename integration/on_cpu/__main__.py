@@ -73,6 +73,7 @@ def prepared(script: Path, arguments: Sequence[str] = ()) -> launcher.Host:
     found = importlib.util.find_spec("gaussian_renderer")
     renderer = None if found is None or found.origin is None else Path(found.origin).parent
     cuda.replace()
+    sys.meta_path.append(_OwnRasterizers)
     sys.modules |= {
         "diff_gaussian_rasterization": diff_gaussian_rasterization, "fused_ssim": fused_ssim,
         "simple_knn": ModuleType("simple_knn"), "simple_knn._C": _knn(renderer),
@@ -82,6 +83,15 @@ def prepared(script: Path, arguments: Sequence[str] = ()) -> launcher.Host:
         gsplat_functions.replace()
     _log.info("CUDA means the CPU here; images are drawn by rasterizer=%s.", rasterizers.fastest("cpu"))
     return GSPLAT if renderer is None else INRIA
+
+
+class _OwnRasterizers:
+    """Behind all finders of modules: what a fork names its rasterizer, e.g. diff_surfel_rasterization, and none of them finds."""
+
+    @staticmethod
+    def find_spec(name: str, path: Any = None, target: Any = None) -> None:
+        if "rasterization" in name and path is None:
+            raise diff_gaussian_rasterization.OwnRasterizerError(f"the module {name}")
 
 
 def _is_of_nerfstudio(script: Path) -> bool:

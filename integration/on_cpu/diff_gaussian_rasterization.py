@@ -16,6 +16,8 @@ the projected centres in NDC; for Mip-Splatting its third column is Σ (|∂L/�
 from __future__ import annotations
 
 import functools
+import inspect
+from collections.abc import Callable
 from typing import Any, Final, NamedTuple, cast
 
 import torch
@@ -24,6 +26,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 import rasterizers
+from clear_strategies.errors import HostError
 from rasterizers import autograd
 from rasterizers.geometry import constant_band, depths, low_and_span
 from rasterizers.inputs import Inputs
@@ -32,6 +35,39 @@ from rasterizers.reference.projection import footprints
 
 _NEAR: Final = 0.2  # what 3DGS draws begins at this depth
 _KERNEL: Final = 0.3  # its 2D kernel's variance, px²
+
+
+class OwnRasterizerError(HostError, ImportError):
+    """A trainer needs what its own CUDA rasterizer has, and none of the four above; a trainer may do without, by ImportError.
+
+    Args:
+        what: of it the trainer uses.
+    """
+
+    def __init__(self, what: str) -> None:
+        super().__init__(
+            f"this trainer needs its own CUDA rasterizer, for {what}, and with it a GPU. On a CPU images are drawn as by those "
+            "of 3DGS, Mip-Splatting, DropGaussian and FSGS."
+        )
+
+
+def __getattr__(name: str) -> Any:
+    if name.startswith("__"):
+        raise AttributeError(name)
+    raise OwnRasterizerError(name)
+
+
+def _refusing(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function, which tells arguments that it does not know."""
+    known = inspect.signature(function).parameters
+
+    @functools.wraps(function)
+    def refusing(*args: Any, **kwargs: Any) -> Any:
+        if unknown := [name for name in kwargs if name not in known]:
+            raise OwnRasterizerError(", ".join(unknown))
+        return function(*args, **kwargs)
+
+    return refusing
 
 
 class GaussianRasterizationSettings(NamedTuple):
@@ -80,6 +116,9 @@ class GaussianRasterizationSettings(NamedTuple):
         return _loaded(self.kernel, self.kernel_size is not None or bool(self.antialiasing))
 
 
+GaussianRasterizationSettings.__new__ = _refusing(GaussianRasterizationSettings.__new__)  # type: ignore[method-assign]
+
+
 @functools.lru_cache(maxsize=8)
 def _loaded(kernel: float, antialiased: bool) -> Rasterizer:
     return rasterizers.load(rasterizers.fastest("cpu"), near=_NEAR, kernel=kernel, antialiased=antialiased)
@@ -90,6 +129,7 @@ class GaussianRasterizer(torch.nn.Module):
 
     Raises:
         ValueError: `subpixel_offset` or `confidence` is used, which only the CUDA rasterizers of Mip-Splatting and FSGS have.
+        OwnRasterizerError: the call has another argument.
     """
 
     def __init__(self, raster_settings: GaussianRasterizationSettings) -> None:
@@ -106,6 +146,7 @@ class GaussianRasterizer(torch.nn.Module):
         """Which positions are far enough before the camera."""
         return depths(positions.detach(), self.raster_settings.camera().world_to_camera.to(positions)) > _NEAR
 
+    @_refusing
     def forward(
         self,
         means3D: Float[Tensor, "N 3"],

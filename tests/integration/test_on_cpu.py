@@ -1,7 +1,9 @@
 """What stands in for CUDA: the modules against independent computations, and the launcher as a program."""
 
+import importlib
 import math
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,8 +11,9 @@ import torch
 import torch.nn.functional as F
 from safetensors.torch import load_file
 
-from integration.on_cpu import gsplat_functions
-from integration.on_cpu.__main__ import REFUSED
+from clear_strategies.errors import HostError
+from integration.on_cpu import diff_gaussian_rasterization, gsplat_functions
+from integration.on_cpu.__main__ import REFUSED, _OwnRasterizers
 from integration.on_cpu.diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
 from integration.on_cpu.fused_ssim import fused_ssim
 from integration.on_cpu.simple_knn import distances_and_indices, mean_distances
@@ -311,6 +314,31 @@ def test_cuda_is_the_cpu_and_the_script_is_run_as_python_runs_it(tmp_path):
     theirs = [str(tmp_path / "x.pt"), "--sr", "theirs"]
     assert argv == f"argv {theirs} file True first {tmp_path / 'trainer'} beside"
     assert seen == "seen ['cpu', 'cpu'] False torch.Size([9])"
+
+
+@pytest.mark.parametrize(
+    ("use", "named"),
+    [
+        (lambda: importlib.import_module("diff_surfel_rasterization"), "the module diff_surfel_rasterization"),
+        (lambda: diff_gaussian_rasterization.compute_relocation, "compute_relocation"),
+        (lambda: GaussianRasterizationSettings(f_count=True), "f_count"),
+        (lambda: GaussianRasterizer(settings("3dgs"))(**cloud(), scores=None), "scores"),
+    ],
+)
+def test_a_fork_that_needs_its_own_rasterizer_is_told_so(use, named, monkeypatch):
+    monkeypatch.setattr(sys, "meta_path", [*sys.meta_path, _OwnRasterizers])
+    with pytest.raises(HostError, match=f"needs its own CUDA rasterizer, for {named}, and with it a GPU"):
+        use()
+
+
+def test_a_fork_may_do_without_what_it_tries_to_import(tmp_path):
+    """3DGS tries its SparseGaussianAdam. What ends a script is one line."""
+    module = "diff_gaussian_rasterization"
+    source = f"try:\n    from {module} import SparseGaussianAdam\nexcept ImportError:\n    import {module}_ms"
+    done = launched(tmp_path, "trainer/train.py", source=source)
+    assert done.returncode == 2
+    assert f"for the module {module}_ms" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_gsplats_functions_are_there_without_cuda_and_those_that_are_not_are_named(tmp_path):
