@@ -40,7 +40,8 @@ def replace_methods(owner: Any, replacements: Mapping[str, Callable[..., Any]]) 
     names = [name for name in replacements if hasattr(owner, name)]
     for name in names:
         original = getattr(owner, name)
-        setattr(owner, name, functools.wraps(original)(_Method(replacements[name], owner, name)))
+        named = functools.wraps(original, updated=())  # the attributes of a method that was replaced before are its own
+        setattr(owner, name, named(_Method(replacements[name], owner, name)))
 
     def undo() -> None:
         for name in names:

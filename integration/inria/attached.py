@@ -106,7 +106,7 @@ class Attached:
         self._undo = ExitStack()
         self._undo.callback(replace_methods(gaussians, {
             **dict.fromkeys(_SAVERS, self._save_with_detail), "compute_3D_filter": self._compute_filter_at_hr,
-            "training_setup": self._training_setup,
+            "training_setup": self._training_setup, "relocate_gs": self._relocate,
         }))  # fmt: skip
         self._black: bool | None = None  # the host's background, once it is known
         self._hooks: list[Any] = []
@@ -230,6 +230,15 @@ class Attached:
             if not self._black:
                 _log.warning("the background stays as it is: strategies choose another only in place of a black one.")
         return {"bg_color": own.new_tensor(color)} if self._black else {}
+
+    def _relocate(self, original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """3dgs-mcmc has a threshold of the gradient among its options, but reads opacities alone."""
+        if (scoring := self.attachment.conductor.owner("score")) is not None:
+            self._warn_once(
+                "%s relocates Gaussians by their opacity: the densification score of %s has no effect.",
+                type(self._model).__name__, type(scoring).__name__,
+            )  # fmt: skip
+        return original(*args, **kwargs)
 
     def _training_setup(self, original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """The host starts again with a new optimizer, as `restore` does with the parameters of a checkpoint."""

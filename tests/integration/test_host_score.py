@@ -159,6 +159,16 @@ def test_mip_splattings_filter_is_that_of_the_hr_cameras(inria_host, inria_captu
     assert scene.cameras[0].image_width == 24
 
 
+def test_a_host_that_relocates_by_opacity_does_not_read_the_score(inria_host, inria_capture, caplog):
+    gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
+    gaussians.relocate_gs = lambda dead_mask: None
+    attach(gaussians, scene.cameras, Conductor(P2G(patch=4), objective=HR_FROM_START), sr=inria_capture / "sr")
+    assert "relocates" not in caplog.text
+    for _ in range(2):
+        gaussians.relocate_gs(dead_mask=torch.zeros(N, dtype=torch.bool))
+    assert caplog.text.count("the densification score of P2G has no effect") == 1
+
+
 def test_absolute_gradients_stay_the_hosts_own(inria_host, caplog, inria_attached):
     clear, gaussians, scene = inria_attached(P2G(patch=4))
     renders = inria_host.render, clear.wrap(inria_host.render)
