@@ -17,6 +17,8 @@ from torch import Tensor
 
 from clear_strategies.console import show_in_host
 from clear_strategies.errors import HostError, SettingError
+from clear_strategies.merging.conductor import Conductor
+from clear_strategies.strategies.base import overrides
 from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
 from integration.gsplat.attached import Attached, require_bands
@@ -78,6 +80,7 @@ def install(
         require_supported(runner.cfg, runner.world_size)
         require_bands(runner.splats)
         chosen = wanted.conductor(runner.cfg.max_steps)
+        require_pinhole(runner.cfg, chosen, from_stereo=wanted.from_stereo)
         end_with_strategies(chosen, runner.cfg.strategy, "refine_stop_iter", first=0)
         source, scale = wanted.sr_source(chosen)
         photos = photos_of(runner.trainset, runner.device)
@@ -112,6 +115,18 @@ def require_supported(config: Any, processes: int = 1) -> None:
             raise SettingError(f"{name}: CLEAR needs {needed}, got {found}: {why}.")
     if processes > 1:
         raise SettingError(f"CLEAR trains in one process, got {processes}. Set CUDA_VISIBLE_DEVICES to one device.")
+
+
+def require_pinhole(config: Any, conductor: Conductor, *, from_stereo: bool) -> None:
+    """Raise a SettingError for other cameras, which gsplat draws, where views or points are computed between photos."""
+    model = getattr(config, "camera_model", "pinhole")
+    computing = [type(s).__name__ for s in conductor.strategies if overrides(s, "extra_views")]
+    computing += ["points=stereo"] * from_stereo
+    if model != "pinhole" and computing:
+        raise SettingError(
+            f"camera_model: {' and '.join(computing)} must have pinhole cameras, got {model}. Undistort the photos, or leave "
+            "out what is named."
+        )
 
 
 class _Installed:

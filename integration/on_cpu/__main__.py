@@ -32,7 +32,9 @@ _log = logging.getLogger("integration.on_cpu")  # __name__ is "__main__" here
 REFUSED: Final = {
     "with_ut": "leave it out: 3DGUT's projection is gsplat's alone",
     "with_eval3d": "leave it out: 3DGUT's projection is gsplat's alone",
-    "camera_model=fisheye": "undistort the photos first",
+    **dict.fromkeys(
+        ("camera_model=fisheye", "camera_model=ftheta", "camera_model=ortho"), "train on photos of a pinhole camera"
+    ),
     "compression": "compress the result on a GPU",
     "use_fused_bilagrid": "use_bilateral_grid alone does the same in torch",
     "bilateral_grid_fused": "post_processing=bilateral_grid alone does the same in torch",

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from clear_strategies import GCO, Conductor, PseudoViews
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.ply import read_gaussians
@@ -80,6 +81,19 @@ def test_options_that_do_not_work_with_two_scales_are_refused_before_the_first_s
 
     with pytest.raises(SettingError, match="one process, got 2"):
         require_supported(SimpleNamespace(), 2)
+
+
+@pytest.mark.parametrize(
+    ("strategies", "points", "named"), [([PseudoViews()], "own", "PseudoViews"), ([GCO()], "stereo", "points=stereo")]
+)
+def test_what_is_computed_between_photos_is_refused_for_other_than_pinhole_cameras(strategies, points, named):
+    from integration.gsplat.simple_trainer import require_pinhole
+
+    conductor, stereo = Conductor(*strategies), points == "stereo"
+    with pytest.raises(SettingError, match=f"camera_model: {named} must have pinhole cameras, got fisheye"):
+        require_pinhole(SimpleNamespace(camera_model="fisheye"), conductor, from_stereo=stereo)
+    require_pinhole(SimpleNamespace(camera_model="pinhole"), conductor, from_stereo=stereo)
+    require_pinhole(SimpleNamespace(camera_model="fisheye"), Conductor(GCO()), from_stereo=False)
 
 
 def test_save_lr_writes_the_photos_as_they_are_trained_on_and_stops(trainer):
