@@ -68,21 +68,22 @@ class GaussianPly:
         return self.means.shape[0]
 
 
-def write_gaussians(path: Path, g: GaussianPly) -> None:
+def write_gaussians(path: Path | str, g: GaussianPly) -> None:
     """Binary little-endian, atomically; a ValueError where a number is not finite."""
     rest = g.shN.transpose(1, 2).reshape(len(g), g.shN.shape[1] * 3)  # channel-major
     groups = (
         (_XYZ, g.means), (_NORMAL, torch.zeros_like(g.means)), (_DC, g.sh0[:, 0]), (_rest_names(rest.shape[1]), rest),
         (("opacity",), g.opacities[:, None]), (_SCALE, g.scales), (_ROTATION, g.quats),
     )  # fmt: skip
-    _write(path, groups, (_MIP,) if g.antialiased else ())
+    _write(Path(path), groups, (_MIP,) if g.antialiased else ())
 
 
-def read_gaussians(path: Path) -> GaussianPly:
+def read_gaussians(path: Path | str) -> GaussianPly:
     """Read the standard layout. Other properties are ignored, with a warning that names them.
 
     Opacities of exactly 0 and 1, whose logits are infinite, are read, since formats of 8 bits have them, and so are scales of 0.
     """
+    path = Path(path)
     table, comments = _read_vertices(path)
     rest = _rest_names(sum(name.startswith("f_rest_") for name in _names_of(table)))
     if len(rest) not in {3 * bands for bands in _BANDS}:
@@ -136,8 +137,9 @@ def _write(path: Path, groups: Sequence[tuple[Sequence[str], Tensor]], comments:
     write_bytes(path, "\n".join([*lines, "end_header\n"]).encode("ascii", "replace") + table.tobytes())
 
 
-def read_points(path: Path) -> PointCloud:
+def read_points(path: Path | str) -> PointCloud:
     """Read positions and colours: red, green, blue (8 or 16 bits, or floats in [0, 1]), or f_dc of Gaussians, else grey."""
+    path = Path(path)
     table, _ = _read_vertices(path)
     names = set(_names_of(table))
     means = _columns(path, table, _XYZ)

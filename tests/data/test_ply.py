@@ -33,6 +33,13 @@ def header(*lines: str, form: str = "binary_little_endian") -> bytes:
 XYZ = ("property float x", "property float y", "property float z")
 
 
+def test_a_file_may_be_named_by_a_text(tmp_path: Path) -> None:
+    file, one = str(tmp_path / "one.ply"), gaussians(1, 3)
+    write_gaussians(file, one)
+    assert torch.equal(read_gaussians(file).means, one.means)
+    assert torch.equal(read_points(file).means, one.means)
+
+
 def test_gaussians_and_points_are_written_byte_for_byte_as_3dgs_reads_them(tmp_path: Path) -> None:
     shN = torch.arange(9.0).view(1, 3, 3) + 10  # band b, channel c: 10 + 3b + c
     one = GaussianPly(
