@@ -47,7 +47,7 @@ class Frame:
     @staticmethod
     def of_photo(
         name: str,
-        path: Path,
+        path: Path | str,
         lens: Lens,
         pose: Float[Tensor, "4 4"],
         *,
@@ -55,7 +55,7 @@ class Frame:
         background: Color | None = None,
         split: str | None = None,
         sfm_id: int | None = None,
-        mask: Path | None = None,
+        mask: Path | str | None = None,
     ) -> Frame:
         """The frame of a file, with the lens fitted to the photo's real size. Reads the file's header only.
 
@@ -67,6 +67,7 @@ class Frame:
             background: behind transparent pixels; None: black, logged.
             mask: see `read_mask`; `masks_of` finds it.
         """
+        path, mask = Path(path), None if mask is None else Path(mask)
         turn = _turned_as(path, lens) if upright is None else upright
         width, height = image_size(path, turn=turn)
         fitted = lens.resized(width, height, path)

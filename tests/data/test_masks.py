@@ -9,7 +9,8 @@ import pytest
 import torch
 from PIL import Image
 
-from clear_strategies.data.capture import Capture
+from clear_strategies.data.capture import Capture, Frame
+from clear_strategies.data.lenses import Lens
 from clear_strategies.data.masks import masks_of
 from clear_strategies.data.prepare import prepare
 from clear_strategies.data.priors import Bicubic
@@ -44,6 +45,15 @@ def test_what_is_not_0_is_shown(tmp_path: Path, kind: str) -> None:
     shown = colmap.read(tmp_path).frames[0].shown
     assert shown is not None
     assert torch.equal(shown(), torch.from_numpy(LEFT))
+
+
+def test_photo_and_mask_of_a_frame_may_be_named_by_texts(tmp_path: Path) -> None:
+    for name in ("photo.png", "mask.png"):
+        save(tmp_path / name, 255 * LEFT)
+    lens = Lens(tiny.WIDTH, tiny.HEIGHT, 9.0, 9.0, tiny.WIDTH / 2, tiny.HEIGHT / 2)
+    frame = Frame.of_photo("a", f"{tmp_path}/photo.png", lens, torch.eye(4), mask=f"{tmp_path}/mask.png")
+    assert frame.shown is not None
+    assert torch.equal(frame.load()[..., 0] > 0, frame.shown())
 
 
 NAMED = ("a.png", "a.PNG", "a.jpg", "A.png", "a.png.png", "dynamic_mask_a.png", "a_mask.png", "mask-a.jpeg")
