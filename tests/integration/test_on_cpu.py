@@ -369,6 +369,7 @@ def test_with_strategies_it_does_what_the_trainers_launcher_does(inria_capture, 
     [
         (["trainer/train.py", "x", "--with-ut"], "--with_ut needs CUDA; on a CPU, leave it out"),
         (["trainer/train.py", "--optimizer_type", "sparse_adam"], "--optimizer_type=sparse_adam needs CUDA"),
+        (["trainer/train.py", "--camera_model", "ortho"], "--camera_model=ortho needs CUDA"),
         (["--sr", "sr", "trainer/train.py"], "--sr has no effect without --strategies"),
         (["--strategies", "gcco", "trainer/train.py"], "gcco"),
         (["nowhere.py"], "nowhere.py"),
