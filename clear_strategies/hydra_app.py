@@ -68,7 +68,6 @@ def main(overrides: Sequence[str] | None = None) -> None:
     gc.freeze()  # what has been imported stays: collections need not look through torch's objects, which takes 0.1 s
     sys.argv[1:] = [_VERBOSE if a in ("-v", "--verbose") else readable(a) for a in arguments]  # Hydra reads them there
     exit_codes.require("train")
-    signals.handle(signals.stop)  # else the system ends us at once, and joblib's workers go on without us
     try:
         hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(job)()
     except ConfigCompositionException as error:

@@ -15,6 +15,7 @@ from importlib import import_module
 
 from clear_strategies import commands, console
 from clear_strategies.jobs import exit_codes
+from clear_strategies.training import signals
 
 
 def main() -> None:
@@ -22,6 +23,7 @@ def main() -> None:
     atexit.register(gc.freeze)  # else Python looks through all of torch's objects before it ends, for 0.3 s
     logging.captureWarnings(True)  # of libraries: they are for run.log
     console.steady()
+    signals.handle(signals.stop)  # else the system ends us at once, and joblib's workers go on without us
     try:
         command = commands.named(sys.argv[1:])
         command() if command is not None else import_module("clear_strategies.hydra_app").main()

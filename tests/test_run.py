@@ -183,6 +183,23 @@ def test_a_signal_while_data_is_prepared_is_one_line(stop, tmp_path):
     assert said.read_text().endswith(f"\nreading\nstopped by {stop.name} before training began. Nothing was saved.\n")
 
 
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_an_error_after_a_signal_whose_exception_a_library_has_lost_is_the_signals_one_line(stop, tmp_path):
+    """As numpy's import does: an attribute is missing later."""
+    code = (
+        "import contextlib, signal\n"
+        "from clear_strategies import commands, run\n"
+        "def named(_):\n"
+        "    with contextlib.suppress(KeyboardInterrupt):\n"
+        f"        signal.raise_signal({int(stop)})\n"
+        "    raise AttributeError\n"
+        "commands.named = named\n"
+        "run.main()\n"
+    )
+    ended = run(cwd=tmp_path, code=code)
+    assert (ended.returncode, ended.stdout + ended.stderr) == (128 + stop, f"stopped by {stop.name}.\n")
+
+
 @pytest.mark.parametrize(
     ("chosen", "package"), [("slurm", "submitit"), ("ray_gpus", "ray"), ("submitit_local", "submitit")]
 )

@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from typing import Final, NamedTuple
 
 from clear_strategies.errors import ClearError, SettingError, one_line
-from clear_strategies.training.signals import signal_of
+from clear_strategies.training import signals
 
 _NO_MEMORY: Final = "can't allocate memory"  # of torch's allocator on the CPU
 _LESS_MEMORY: Final = (
@@ -47,10 +47,12 @@ class Ending(NamedTuple):
 
 def describe(error: BaseException) -> Ending | None:
     """The message and exit code of an error that the user can solve; None for a bug."""
+    if signals.told and not isinstance(error, signals.Interrupted | KeyboardInterrupt):
+        error = KeyboardInterrupt(signals.told[0])  # whatever fails after it fails by it
     if isinstance(error, ClearError):
         return Ending(error.exit_code, one_line(error))
     if isinstance(error, KeyboardInterrupt):
-        signum = signal_of(error)
+        signum = signals.signal_of(error)
         return Ending(SIGNALS + signum, f"stopped by {signum.name}.")  # a job says what it has saved
     if isinstance(error, _library_errors()):
         from clear_strategies.hydra_errors import of_hydra

@@ -91,8 +91,13 @@ def handle(handler: Callable[[int, FrameType | None], object]) -> None:
             signal.signal(signum, handler)
 
 
+told: Final = list[int]()
+"""The signals that `stop` was called for. A library that is being imported may lose the exception, and fail later."""
+
+
 def stop(signum: int, _frame: FrameType | None) -> NoReturn:
     """The handler of `STOPS` where no step defers them: as Python's own of Ctrl-C, but it tells the signal."""
+    told.append(signum)
     raise KeyboardInterrupt(signum)
 
 

@@ -283,15 +283,24 @@ def _write_copies(photos: Mapping[Path, float | None], folder: Path, max_side: i
 
 
 def _pycolmap() -> Any:
-    handler = signal.getsignal(signal.SIGTERM)
+    """The module. A signal waits until it is imported, whose C++ code makes an ImportError of an exception or loses it."""
+    came, handlers = list[int](), dict[int, Any]()
+    if threading.current_thread() is threading.main_thread():
+        stops = [
+            s for s in signal.Signals if s.name in ("SIGINT", "SIGTERM", "SIGHUP") and signal.getsignal(s) is not None
+        ]
+        handlers = {s: signal.signal(s, lambda signum, _: came.append(signum)) for s in stops}
     try:
         import pycolmap
     except (ImportError, RuntimeError) as error:  # its own, where a library of the system is missing
         raise DataError(
             "data=photos", "pycolmap", f"cannot be imported ({error})", "pip install 'clear-strategies[colmap]'"
         ) from error
-    if handler is not None and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, handler)  # the import sets one that prints a stack trace
+    finally:
+        for signum, handler in handlers.items():
+            signal.signal(signum, handler)  # the import sets one of SIGTERM that prints a stack trace
+        for signum in came:
+            signal.raise_signal(signum)
     return pycolmap
 
 

@@ -91,6 +91,21 @@ def test_a_pycolmap_that_does_not_run_here_is_told_as_one_that_is_not_installed(
         sfm._pycolmap()
 
 
+@pytest.mark.parametrize("swallowed", ["", "raise ImportError"])
+def test_a_signal_while_pycolmap_is_imported_arrives_whatever_the_import_does_with_exceptions(
+    swallowed, tmp_path, monkeypatch
+):
+    (tmp_path / "pycolmap.py").write_text(
+        f"import signal\ntry:\n    signal.raise_signal(signal.SIGINT)\nexcept KeyboardInterrupt:\n    pass\n{swallowed}\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "pycolmap")
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        sfm._pycolmap()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
 def test_a_disk_that_is_too_full_for_the_features_is_told_before_colmap_ends_the_process(tmp_path, monkeypatch):
     monkeypatch.setattr(sfm.shutil, "disk_usage", lambda _: SimpleNamespace(free=3 * 8192 * 320))
     with pytest.raises(OSError, match="No space left") as refused:
