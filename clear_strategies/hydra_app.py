@@ -15,6 +15,7 @@ import signal
 import sys
 from collections import defaultdict
 from collections.abc import Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -74,9 +75,11 @@ def main(overrides: Sequence[str] | None = None) -> None:
         overrides = [word for word in sys.argv[1:] if not word.startswith(("-", "hydra."))]
         raise not_composed(error, overrides, "config") from error
     except Exception as error:
-        if not sweep.stopped:
-            raise
-        raise KeyboardInterrupt(sweep.stopped[0]) from error  # a process of joblib's had not begun, and was ended
+        if sweep.stopped:
+            raise KeyboardInterrupt(sweep.stopped[0]) from error  # a process of joblib's had not begun, and was ended
+        if isinstance(error, BrokenProcessPool):
+            raise sweep.worker_ended(error) from error
+        raise
 
 
 def readable(word: str) -> str:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import re
 import signal
 from collections.abc import Iterator
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -20,7 +22,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from clear_strategies.errors import DataError
+from clear_strategies.errors import ClearError, DataError
 from clear_strategies.files import FINISHED, expanded
 from clear_strategies.settings import absent, missing
 from clear_strategies.training import signals
@@ -108,6 +110,16 @@ def _end_job(signum: int, frame: FrameType | None) -> None:
     if not stopped and not signals.asked():
         _note(signum, frame)
         signals.stop(signum, frame)
+
+
+def worker_ended(error: BrokenProcessPool) -> ClearError:
+    """What to tell where one of joblib's processes has ended before its job: joblib ends the others, too."""
+    how = re.search(r"\{(.*)\}", str(error))  # joblib's: "The exit codes of the workers are {SIGKILL(-9)}"
+    return ClearError(
+        f"a process of the sweep was ended ({how[1] if how else 'unknown'}), as the system does where memory runs out (SIGKILL). "
+        "Finished jobs stay; the others go on from their checkpoints with fit.resume=auto and the same hydra.sweep.dir. "
+        "Lower hydra.launcher.n_jobs."
+    )
 
 
 def stop_workers(signum: int, frame: FrameType | None) -> None:

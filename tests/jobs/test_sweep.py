@@ -210,6 +210,29 @@ def test_a_stopped_joblib_sweep_saves_its_running_jobs_begins_no_other_and_leave
 
 
 @joblib
+@pytest.mark.slow
+def test_a_sweep_whose_process_the_system_kills_ends_with_one_line_that_tells_how_to_go_on(tmp_path):
+    """As the kernel does where memory runs out."""
+    (tmp_path / "killed.py").write_text(
+        "import os, signal\n\n\ndef read():\n    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    killed = [
+        "~data.reader.width",
+        "~data.reader.height",
+        "~data.reader.views",
+        "~data.reader.train",
+        "data.reader._target_=killed.read",
+    ]
+    process = started(
+        *DOOR, "-m", "hydra.sweep.dir=all", *JOBLIB, *killed, "fit.seed=0,1", cwd=tmp_path, said=tmp_path / "said"
+    )
+    code, said = process.wait(), (tmp_path / "said").read_text()
+    assert (code, "Traceback" in said) == (2, False), said
+    assert "a process of the sweep was ended (SIGKILL(-9)" in said.splitlines()[-1]
+    assert said.endswith("with fit.resume=auto and the same hydra.sweep.dir. Lower hydra.launcher.n_jobs.\n")
+
+
+@joblib
 def test_a_stopped_sweep_composes_none_of_its_remaining_jobs(monkeypatch):
     """Hydra's launcher, with joblib in this process: a signal comes while it hands out the first job."""
     from hydra_plugins.hydra_joblib_launcher import _core as launcher
