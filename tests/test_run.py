@@ -223,6 +223,14 @@ ENDINGS = {
         3,
         "x: Permission denied. Allow access to it, or write elsewhere (hydra.run.dir=FOLDER of a run",
     ),
+    MemoryError(): (
+        2,
+        "out of memory: Python had none left. Raise `ulimit -v` where it is set. Lower density.max_gaus",
+    ),
+    ImportError("x.so: failed to map segment from shared object"): (
+        2,
+        "x.so: failed to map segment from shared object: memory is limited to too little (raise `ulimit -v`), or",
+    ),
     OSError("Broken pipe\n\nCOMMAND:\nffmpeg"): (3, "output: Broken pipe COMMAND: ffmpeg. Write elsewhere"),
 }
 

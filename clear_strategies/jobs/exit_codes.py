@@ -15,8 +15,8 @@ from clear_strategies.training import signals
 
 _NO_MEMORY: Final = "can't allocate memory"  # of torch's allocator on the CPU
 _LESS_MEMORY: Final = (
-    "Lower density.max_gaussians or raise data.views.shrink; rasterizer.memory bounds the rasterizer's lists. "
-    "Of clear-strategies render: lower --width."
+    "Raise `ulimit -v` where it is set. Lower density.max_gaussians or raise data.views.shrink; rasterizer.memory bounds the "
+    "rasterizer's lists. Of clear-strategies render: lower --width."
 )
 
 # What may help before writing elsewhere does, by the system's error; of one without access, a photo's folder may be meant.
@@ -58,14 +58,24 @@ def describe(error: BaseException) -> Ending | None:
         from clear_strategies.hydra_errors import of_hydra
 
         return Ending(UNUSABLE, of_hydra(error))  # before OSError: Hydra's error for an option that is not there is one
-    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY in str(error)):
-        return Ending(UNUSABLE, f"out of memory: {one_line(error) or 'Python had none left'} {_LESS_MEMORY}")
+    if message := _of_memory(error):
+        return Ending(UNUSABLE, message)
     disk = error if isinstance(error, OSError) else error.__cause__  # logging wraps it where it cannot open its file
     if isinstance(disk, OSError):
         where = one_line(f"{disk.filename or 'output'}: {disk.strerror or disk}")
         remedy = f"{_FIRST.get(disk.errno or 0, 'Write')} elsewhere"
         elsewhere = "hydra.run.dir=FOLDER of a run, --out of a command, $CLEAR_CACHE of the cache"
         return Ending(NO_DISK, f"{where}. {remedy} ({elsewhere}). Earlier checkpoints are untouched.")
+    return None
+
+
+def _of_memory(error: BaseException) -> str | None:
+    """What to tell where memory ran out, or may have."""
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY in str(error)):
+        return f"out of memory: {one_line(error) or 'Python had none left.'} {_LESS_MEMORY}"
+    if isinstance(error, ImportError) and "failed to map segment" in str(error):  # of a library, by the system
+        why = "memory is limited to too little (raise `ulimit -v`), or its folder's disk runs no programs (noexec)"
+        return f"{one_line(error)}: {why}."
     return None
 
 

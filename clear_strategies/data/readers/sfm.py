@@ -11,6 +11,7 @@ import functools
 import itertools
 import logging
 import math
+import mmap
 import os
 import shutil
 import signal
@@ -52,6 +53,7 @@ _LARGE: Final = 1_200_000  # px of a copy, above which its own scale has feature
 _ENOUGH: Final = 0.25  # of the features that a photo may have
 _PER_THREAD: Final = 2  # photos whose features are found between two looks at the progress
 _PER_FEATURE, _PER_DATABASE = 320, 8 << 20  # bytes that features, matches and models take on the disk, at most
+_PER_WORKER: Final = 256 << 20  # addresses that a thread of COLMAP's takes, and COLMAP itself
 _BLOCK: Final = 20  # photos that are matched between two looks: COLMAP indexes their features anew for each block
 
 _Groups = dict[tuple[int, int, float | None], list[str]]
@@ -76,9 +78,10 @@ def reconstruct(root: Path, photos: Mapping[Path, float | None], folder: Path, s
         photos: with their focal lengths on 35 mm film, as `focal_35mm` gives them.
 
     Raises:
-        DataError: pycolmap is not installed, or too few photos can be placed.
+        DataError: pycolmap is not installed, memory is limited to too little, or too few photos can be placed.
     """
     pycolmap = _pycolmap()
+    _require_addresses(root, _threads(settings))
     folder.parent.mkdir(parents=True, exist_ok=True)
     count = len(photos)
     _log.info("%s: estimating the poses of %d photos, up to %d features each.", root, count, settings.max_features)
@@ -174,7 +177,7 @@ def _find_features(pycolmap: Any, database: Path, groups: _Groups, settings: Sfm
     count = sum(map(len, groups.values()))
     _log.info("features of %d photos.", count)
     progress = Progress("features", "photos", count)
-    at_once = _PER_THREAD * (settings.threads if settings.threads > 0 else os.cpu_count() or 1)
+    at_once = _PER_THREAD * _threads(settings)
     for (width, height, focal), names in groups.items():
         reader = pycolmap.ImageReaderOptions()
         if focal is not None:
@@ -280,6 +283,21 @@ def _write_copies(photos: Mapping[Path, float | None], folder: Path, max_side: i
         focal = focal_35mm and round(focal_35mm / _DIAGONAL_35MM * math.hypot(*size), 2)
         groups.setdefault((*size, focal), []).append(copy_name(i))
     return groups
+
+
+def _threads(settings: SfmSettings) -> int:
+    return settings.threads if settings.threads > 0 else os.cpu_count() or 1
+
+
+def _require_addresses(root: Path, threads: int) -> None:
+    """Refuse where the system limits memory to less than COLMAP takes: its libraries then end the process, or wait for ever."""
+    try:
+        if hasattr(mmap, "MAP_PRIVATE"):  # Windows has no such limit
+            mmap.mmap(-1, (threads + 1) * _PER_WORKER, flags=mmap.MAP_PRIVATE, prot=0).close()
+    except OSError as error:
+        needed = f"COLMAP takes up to {(threads + 1) * _PER_WORKER >> 20} MB of addresses with {threads} thread(s)"
+        remedy = "raise `ulimit -v`" + ", or set data.reader.threads=1" * (threads > 1)
+        raise DataError(root, "memory", f"{needed}, and the system leaves this process less", remedy) from error
 
 
 def _pycolmap() -> Any:

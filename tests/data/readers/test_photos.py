@@ -114,6 +114,31 @@ def test_a_disk_that_is_too_full_for_the_features_is_told_before_colmap_ends_the
     assert list((tmp_path / "cache").iterdir()) == []
 
 
+LIMITED = """
+import re, resource
+from pathlib import Path
+from clear_strategies.data.readers import sfm
+sfm._pycolmap()
+used = 1024 * int(re.search(r"VmSize:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
+resource.setrlimit(resource.RLIMIT_AS, (used + (600 << 20), -1))
+sfm._require_addresses(Path("here"), 1)
+try:
+    sfm.reconstruct(Path("here"), {}, Path("model"), sfm.SfmSettings(480, 2000, False, 2, 0))
+except sfm.DataError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_less_memory_than_colmap_takes_is_told_before_its_libraries_end_the_process_or_wait_for_ever(tmp_path):
+    ended = subprocess.run([sys.executable, "-c", LIMITED], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout) == (
+        0,
+        "here: memory: COLMAP takes up to 768 MB of addresses with 2 thread(s), and the system leaves this process less: "
+        "raise `ulimit -v`, or set data.reader.threads=1\n",
+    ), ended.stderr
+
+
 def test_a_run_that_is_terminated_while_it_reads_photos_ends_without_a_stack_trace() -> None:
     program = "import os, signal; from clear_strategies.data.readers import sfm; sfm._pycolmap(); "
     command = [sys.executable, "-c", f"{program}os.kill(os.getpid(), signal.SIGTERM)"]
