@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from numbers import Real
 from typing import Any, NoReturn
 
+import torch
 from torch import Tensor
 
 from clear_strategies.core import deferred
@@ -120,7 +121,7 @@ def _require_numbers(s: Strategy, hook: str, name: str, x: Tensor | None) -> Non
     """Finite numbers >= 0."""
     if x is None or x.numel() == 0 or not deferred.is_immediate(x):
         return
-    least, most = map(float, x.float().aminmax())
+    least, most = torch.stack(x.float().aminmax()).tolist()
     if not (least >= 0 and most < math.inf):
         raise AnswerError(f"{_named(s, hook)} must give finite numbers >= 0, but {name} has {least:.3g} to {most:.3g}.")
 
