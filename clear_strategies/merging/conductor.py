@@ -59,6 +59,7 @@ class Conductor:
     Attributes:
         skips: which work of the run is left out.
         regularizers: the strategies that override `regularize`.
+        showing: those that override `extra_views`.
         decorated: whether `prior` has been called, or there are no decorators.
         sr: the prior that `prior` was called with; None before.
 
@@ -93,6 +94,7 @@ class Conductor:
             if owners:
                 self._owner[hook] = owners[0]
         self.regularizers = [s for s in strategies if overrides(s, "regularize")]
+        self.showing = [s for s in strategies if overrides(s, "extra_views")]
         others = ("regularize", "extra_views", "may_densify", "after_step")
         for s in strategies:
             if not any(overrides(s, hook) for hook in (*_ONE_ANSWER, "correct", *others)):
@@ -262,11 +264,10 @@ class Conductor:
 
     def extra_views(self, t: int) -> list[ExtraView]:
         """The pictures that the field should match at t besides the view; each gets a step on `extra_loss`."""
-        showing = [s for s in self.strategies if overrides(s, "extra_views")]
-        if self.objective.lambda_lr == 0 or not showing:
+        if self.objective.lambda_lr == 0 or not self.showing:
             return []
         with self.work_log.stage("pictures of extra views"):  # a pseudo view is made when it is first asked for
-            return [extra for s in showing for extra in answers.extra_views(s, s.extra_views(t))]
+            return [extra for s in self.showing for extra in answers.extra_views(s, s.extra_views(t))]
 
     @in_full_precision
     def extra_loss(self, image: Float[Tensor, "h w 3"], extra: ExtraView, t: int) -> Losses:

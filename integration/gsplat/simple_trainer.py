@@ -18,7 +18,6 @@ from torch import Tensor
 from clear_strategies.console import show_in_host
 from clear_strategies.errors import HostError, SettingError
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.strategies.base import overrides
 from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
 from integration.gsplat.attached import Attached, require_bands
@@ -120,8 +119,7 @@ def require_supported(config: Any, processes: int = 1) -> None:
 def require_pinhole(config: Any, conductor: Conductor, *, from_stereo: bool) -> None:
     """Raise a SettingError for other cameras, which gsplat draws, where views or points are computed between photos."""
     model = getattr(config, "camera_model", "pinhole")
-    computing = [type(s).__name__ for s in conductor.strategies if overrides(s, "extra_views")]
-    computing += ["points=stereo"] * from_stereo
+    computing = [type(s).__name__ for s in conductor.showing] + ["points=stereo"] * from_stereo
     if model != "pinhole" and computing:
         raise SettingError(
             f"camera_model: {' and '.join(computing)} must have pinhole cameras, got {model}. Undistort the photos, or leave "

@@ -16,7 +16,6 @@ from torch import Tensor
 from clear_strategies.core.view import View
 from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.strategies.base import overrides
 from integration.attachment import Attachment, random_state_kept
 from integration.autograd_shot import HostOutput, Target
 from integration.densification import require_end, warn_if_score_is_unused
@@ -190,7 +189,7 @@ class Attached:
 
     def _require_pose_of_camera(self, call: Mapping[str, Any]) -> None:
         """InstantSplat's render takes its pose from an argument, not from the camera."""
-        making = [type(s).__name__ for s in self.attachment.conductor.strategies if overrides(s, "extra_views")]
+        making = [type(s).__name__ for s in self.attachment.conductor.showing]
         if making and call.get("camera_pose") is not None:
             raise HostError(
                 f"render is given camera_pose, from which it would also draw the views of {', '.join(making)}, whose cameras lie "
