@@ -27,13 +27,12 @@ from hydra.errors import ConfigCompositionException, HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from clear_strategies import console, files
+from clear_strategies import console, files, signals
 from clear_strategies.compose import quoted, require_each_once
 from clear_strategies.errors import ClearError, SettingError
 from clear_strategies.hydra_errors import no_option, not_composed
 from clear_strategies.jobs import exit_codes, sweep
 from clear_strategies.options import CONF, options
-from clear_strategies.training import signals
 
 _log = logging.getLogger(__name__)
 

@@ -13,9 +13,8 @@ import logging
 import sys
 from importlib import import_module
 
-from clear_strategies import commands, console
+from clear_strategies import commands, console, signals
 from clear_strategies.jobs import exit_codes
-from clear_strategies.training import signals
 
 
 def main() -> None:

@@ -10,8 +10,8 @@ import errno
 from importlib.util import find_spec
 from typing import Final, NamedTuple
 
+from clear_strategies import signals
 from clear_strategies.errors import ClearError, SettingError, one_line
-from clear_strategies.training import signals
 
 _NO_MEMORY: Final = "can't allocate memory"  # of torch's allocator on the CPU
 _LESS_MEMORY: Final = (

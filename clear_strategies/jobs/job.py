@@ -15,7 +15,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from clear_strategies import files
+from clear_strategies import files, signals
 from clear_strategies.compose import tree
 from clear_strategies.core.images import to_bytes
 from clear_strategies.data.prepare import save_lr
@@ -29,7 +29,7 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.outputs import metrics, plan, results
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.schedules import scaled
-from clear_strategies.training import memory, signals
+from clear_strategies.training import memory
 from clear_strategies.training.checkpoint import CHECKPOINTS
 from clear_strategies.training.loop import fit
 from clear_strategies.training.state import TrainState

@@ -22,10 +22,10 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from clear_strategies import signals
 from clear_strategies.errors import ClearError, DataError
 from clear_strategies.files import FINISHED, expanded
 from clear_strategies.settings import absent, missing
-from clear_strategies.training import signals
 
 # Launchers whose jobs see the folders that the process sees which was started; on the nodes of a cluster there may be others.
 _LOCAL: Final = ("basic", "cores", "joblib", "submitit_local")

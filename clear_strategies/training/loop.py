@@ -25,13 +25,13 @@ from clear_strategies.data.scene import Scene
 from clear_strategies.errors import AnswerError, DivergedError
 from clear_strategies.merging.iteration import Update, require_finite_parts
 from clear_strategies.merging.skips import PLATEAU_LOSS
+from clear_strategies.signals import Interrupted, deferred_signals, foremost
 from clear_strategies.strategies.sr_stage import SRStage
 from clear_strategies.training import checkpoint
 from clear_strategies.training.clock import Clock
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
 from clear_strategies.training.given import Given, GivenExtra, GivenView, L
 from clear_strategies.training.replay import replays_for
-from clear_strategies.training.signals import Interrupted, deferred_signals, foremost
 from clear_strategies.training.state import TrainState
 from rasterizers import native
 from rasterizers.interface import Camera, Color, Rasterizer, over

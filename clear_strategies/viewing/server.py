@@ -30,10 +30,10 @@ from jaxtyping import Float
 from nerfview._renderer import InterruptRenderException, Renderer
 from torch import Tensor
 
+from clear_strategies import signals
 from clear_strategies.core.images import to_bytes
 from clear_strategies.errors import one_line
 from clear_strategies.geometry.cameras import looked_at
-from clear_strategies.training import signals
 from clear_strategies.viewing.look import Painter, Pixels, colored, depth_range
 from rasterizers.interface import Camera
 

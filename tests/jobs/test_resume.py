@@ -14,8 +14,8 @@ from clear_strategies.compose import tree
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.jobs import job, resume
 from clear_strategies.jobs import scene as scenes
+from clear_strategies.signals import Interrupted
 from clear_strategies.training.loop import iterate
-from clear_strategies.training.signals import Interrupted
 from clear_strategies.training.state import colours
 from tests.helpers import captures, forked, toy
 from tests.helpers.command_line import ALONE, TINY, run

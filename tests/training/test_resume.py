@@ -8,11 +8,11 @@ import signal
 import pytest
 import torch
 
+from clear_strategies.signals import Interrupted
 from clear_strategies.training import checkpoint
 from clear_strategies.training.clock import WALL
 from clear_strategies.training.loop import fit, iterate
 from clear_strategies.training.settings import FitSettings
-from clear_strategies.training.signals import Interrupted
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
 from tests.helpers.short_run import ITERATIONS, SCENE, start, tensors

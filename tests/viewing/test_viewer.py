@@ -22,8 +22,8 @@ from clear_strategies.core.images import to_bytes
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs import exit_codes
 from clear_strategies.jobs.saved import open_splat
+from clear_strategies.signals import deferred_signals
 from clear_strategies.training.field import GaussianField
-from clear_strategies.training.signals import deferred_signals
 from clear_strategies.viewing.look import Painter, colored, depth_range
 from tests.helpers import toy, wall
 from tests.helpers.command_line import TINY, run

@@ -14,10 +14,8 @@ import math
 import mmap
 import os
 import shutil
-import signal
 import statistics
 import tempfile
-import threading
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +25,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image as Picture
 
-from clear_strategies import files
+from clear_strategies import files, signals
 from clear_strategies.core.images import to_bytes
 from clear_strategies.core.progress import Progress
 from clear_strategies.data.capture import MORE_PHOTOS, NO_PARALLAX, STEP_ASIDE
@@ -301,24 +299,14 @@ def _require_addresses(root: Path, threads: int) -> None:
 
 
 def _pycolmap() -> Any:
-    """The module. A signal waits until it is imported, whose C++ code makes an ImportError of an exception or loses it."""
-    came, handlers = list[int](), dict[int, Any]()
-    if threading.current_thread() is threading.main_thread():
-        stops = [
-            s for s in signal.Signals if s.name in ("SIGINT", "SIGTERM", "SIGHUP") and signal.getsignal(s) is not None
-        ]
-        handlers = {s: signal.signal(s, lambda signum, _: came.append(signum)) for s in stops}
     try:
-        import pycolmap
+        # The import sets a handler of SIGTERM that prints a stack trace, and makes an ImportError of an exception, or loses it.
+        with signals.held():
+            import pycolmap
     except (ImportError, RuntimeError) as error:  # its own, where a library of the system is missing
         raise DataError(
             "data=photos", "pycolmap", f"cannot be imported ({error})", "pip install 'clear-strategies[colmap]'"
         ) from error
-    finally:
-        for signum, handler in handlers.items():
-            signal.signal(signum, handler)  # the import sets one of SIGTERM that prints a stack trace
-        for signum in came:
-            signal.raise_signal(signum)
     return pycolmap
 
 

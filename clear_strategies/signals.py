@@ -1,4 +1,4 @@
-"""Signals while training: the step in progress finishes, the run saves, and then it stops."""
+"""Signals that end a program. While training the step in progress finishes, the run saves, and then it stops."""
 
 from __future__ import annotations
 
@@ -82,6 +82,24 @@ def deferred_signals() -> Iterator[list[int]]:
         _collected.pop()
         for s, handler in before.items():
             signal.signal(s, handler)
+
+
+@contextmanager
+def held() -> Iterator[None]:
+    """Hold `STOPS` back: they are raised again behind the scope, with the handlers of before, whatever it has done to these."""
+    came = list[int]()
+    known = [s for s in STOPS if signal.getsignal(s) is not None]  # others have been set by C
+    try:
+        before = {s: signal.signal(s, lambda signum, _: came.append(signum)) for s in known}
+    except ValueError:  # as in `deferred_signals`
+        before = {}
+    try:
+        yield
+    finally:
+        for s, handler in before.items():
+            signal.signal(s, handler)
+        for signum in came:
+            signal.raise_signal(signum)
 
 
 def handle(handler: Callable[[int, FrameType | None], object]) -> None:
