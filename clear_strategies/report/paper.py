@@ -24,10 +24,8 @@ _DATA: Final[Mapping[str, str]] = {
     "llff_x4": "LLFF", "llff_x4_quarter": "LLFF", "fern": "LLFF", "horns": "LLFF", "blender_x4": "Blender",
     "lego": "Blender", "mip360_x4": "Mip-NeRF 360",
 }  # fmt: skip
-_OTHERS: Final = (
-    "data.views.train",
-    "data.views.sr_scale",
-)  # another number of views, or scale, is not in the paper's tables
+# Another number of views, or scale, is not in the paper's tables.
+_OTHERS: Final = ("data.views.train", "data.views.sr_scale")
 _COLUMNS: Final = {
     "psnr": ("PSNR (dB)", ".2f"), "ssim": ("SSIM", ".3f"), "lpips": ("LPIPS", ".3f"), "conflict": ("conflict", ".3f"),
     "seconds": ("seconds", ",.0f"),

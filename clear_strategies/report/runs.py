@@ -45,7 +45,7 @@ class FinishedRun:
             that are alike in all that was said. See `_each_setting`.
         numbers: mean scores of the test views, or of the training views where there are no test views; "bicubic", "prior":
             PSNR of these images; conflict, gaussians, seconds. NaN where unknown.
-        views: whose scores they are. data: where the photos lay. config: every setting, by its dotted key.
+        views: whose scores they are. config: every setting, by its dotted key.
     """
 
     folder: Path
@@ -57,8 +57,12 @@ class FinishedRun:
     seed: int
     numbers: Mapping[str, float]
     views: tuple[str, ...]
-    data: str
     config: Mapping[str, Any]
+
+    @property
+    def data(self) -> str:
+        """Where the photos lay."""
+        return str(next((self.config[key] for key in _DATA if self.config.get(key)), ""))
 
     @classmethod
     def read(cls, folder: Path) -> FinishedRun:
@@ -88,7 +92,6 @@ class FinishedRun:
                 "seconds": content.seconds,
             },
             views=tuple(sorted(part.views)),
-            data=str(next((content.config[key] for key in _DATA if content.config.get(key)), "")),
             config=content.config,
         )
 

@@ -111,10 +111,16 @@ def extra_views(s: Strategy, answer: Any) -> list[ExtraView]:
 
 def _require_finite(s: Strategy, hook: str, numbers: Mapping[str, Any]) -> None:
     for name, x in numbers.items():
-        is_read = deferred.is_immediate(x) if isinstance(x, Tensor) else isinstance(x, Real)
-        if is_read and not (is_finite(x) if isinstance(x, Tensor) else math.isfinite(x)):
+        if not _may_be_finite(x):
             found = rows_not_finite(x) if isinstance(x, Tensor) and x.dim() else f"is {float(x)}"
             raise AnswerError(f"{_named(s, hook)} must give finite numbers, but {name} {found}.")
+
+
+def _may_be_finite(x: Any) -> bool:
+    """False: it has been looked at, and is not."""
+    if isinstance(x, Tensor):
+        return not deferred.is_immediate(x) or is_finite(x)
+    return not isinstance(x, Real) or math.isfinite(x)
 
 
 def _require_numbers(s: Strategy, hook: str, name: str, x: Tensor | None) -> None:

@@ -234,9 +234,10 @@ def fit(
             try:
                 iterate(state, rasterizer)
             except Exception as error:
-                where = "" if checkpoints is None else " Its step was made, so that its state is not saved."
-                if state.optimizer.steps == steps and checkpoints is not None:
-                    where = ""
+                where = ""
+                if checkpoints is not None and state.optimizer.steps != steps:
+                    where = " Its step was made, so that its state is not saved."
+                elif checkpoints is not None:
                     with suppress(Exception):  # the first error is the one to tell
                         where = f" The state before that step is {save()}; fit.resume goes on from it."
                 if isinstance(error, AnswerError):

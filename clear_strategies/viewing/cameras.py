@@ -29,7 +29,7 @@ from rasterizers.interface import Camera, Color
 FILE: Final = "cameras.json"
 _MOST_KEYS: Final = 24  # a path through more cameras passes every n-th
 _FAR: Final = (
-    2.0  # longest steps, beyond which a path's ends are not joined: the way between them may lead through the scene
+    2.0  # longest steps; a path's ends beyond that are not joined, since the way between may lead through the scene
 )
 _WRAP: Final = 3  # keys repeated at both ends, so that the rotation's spline has no seam
 _SWAY: Final = 0.1  # world units: how far a single camera moves to each side
