@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from clear_strategies.core.gradients import Grads, gradients_of
+from clear_strategies.core.gradients import Grads, gradients_of, summed
 from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.iteration import HrSide
 from integration.colours import are_joined, is_hooked
 from rasterizers.autograd import Drawing, outer
 from rasterizers.geometry import SH_C0
-from rasterizers.interface import Camera
+from rasterizers.interface import Camera, summed_vjp
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,12 +112,22 @@ class AutogradShot:
             for g in self.gradients(cotangents)
         ]
 
-    def gradients(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
+    def gradients(
+        self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
+    ) -> list[Grads]:  # fmt: skip
         """The first part, for every cotangent: by the names of `drawn`; of this package's rasterizers means, quats, scales,
-        opacities, and the colours by their factors.
+        opacities, and the colours by their factors. With `weight` as `core.gradients.summed` makes them.
         """
         if self.drawing is not None:
-            return gradients_of(self.drawing.rendering.vjp(self._at_drawing(cotangents)))
+            rendering, v = self.drawing.rendering, self._at_drawing(cotangents)
+            return gradients_of(rendering.vjp(v) if weight is None else summed_vjp(rendering, v, weight))
+        each = self._gradients_of_host(cotangents)
+        if weight is None:
+            return each
+        last = Grads(each[-1].without_detail() | self._detail(each[-1]), screen=each[-1].screen)
+        return summed([*each[:-1], last], weight)
+
+    def _gradients_of_host(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
         slot = self.gradient_slot
         tensors = {name: x for name, x in (self.drawn or self.params).items() if x.requires_grad}
         projected = [slot.tensor] if slot.tensor.requires_grad else []  # gsplat's 3DGUT draws without projected centres
@@ -132,11 +142,10 @@ class AutogradShot:
             results.append(Grads(values, screen=slot.per_gaussian(screen, len(self.visible))))
         return results
 
-    def routed(self, hr: HrSide, lambda_hf: float) -> Grads:
-        """g^HR of the raw parameters, and the gradient of f_det.  Eq. 12, 13"""
-        g = self._raw(hr.routed(lambda_hf))
-        detail = Grads() if hr.hf is None else self._detail(hr.hf) * (hr.m * lambda_hf)
-        return g + detail
+    def routed(self, hr: HrSide) -> Grads:
+        """g^HR of the raw parameters, and the gradient of f_det."""
+        g = self._raw(hr.g)
+        return Grads({**g, **(hr.detail or {})}, colour=g.colour) if "detail" in self.params else g
 
     def _raw(self, g: Grads) -> Grads:
         """The second part, without f_det."""

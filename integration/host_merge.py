@@ -81,7 +81,7 @@ class HostMerge:
             lr_colour=done.colour, scale=scale, must_be_finite=self._loss_scale is None,
         )  # fmt: skip
         if "detail" in params:
-            self._finish_detail(params.pop("detail"), params, t, by_hf=hr is not None and hr.hf is not None)
+            self._finish_detail(params.pop("detail"), params, t, by_hf=hr is not None and hr.detail is not None)
         pending.merged.update(names or ("detail",))
         return conflict
 

@@ -64,7 +64,7 @@ class HrDrawing:
             shot = replace(shot, image=shot.image * fine.to(shot.image))
         apart = shot.drawing is not None or "detail" in shot.params
         hr = conductor.hr_gradients(shot, view, t, AutogradShot.gradients, apart=apart, params=params)
-        return hr, shot.routed(hr, conductor.objective.lambda_hf) if merges else None
+        return hr, shot.routed(hr) if merges else None
 
     def extra_view(self, extra: ExtraView, view: View, t: int, render_at: RenderAt) -> Grads:
         """The gradient of an extra view, which is drawn without a gate and without f_det."""

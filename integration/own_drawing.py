@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.deferred import Element, Number
-from clear_strategies.core.gradients import Grads, scale_rows
+from clear_strategies.core.gradients import Grads
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide
@@ -191,13 +191,8 @@ class OwnDrawing:
 
     def _compared(self, given: _Given, asked: Drawable, view: View, t: int) -> tuple[HrSide, Grads]:
         """The HR side, and g^HR of what was drawn, with f_det's.  Eq. 9, 10, 12, 13"""
-        λ_hf = self._conductor.objective.lambda_hf
-        shot = given.shot(asked)
-        hr = self._conductor.hr_gradients(shot, view, t, AutogradShot.gradients, looked_up=given.known)
-        g = hr.routed(λ_hf)
-        if hr.hf is not None and hr.hf.colour is not None and asked.offset is not None:
-            g["detail"] = scale_rows(hr.hf.colour.rgb, hr.m * λ_hf)
-        return hr, g
+        hr = self._conductor.hr_gradients(given.shot(asked), view, t, AutogradShot.gradients, looked_up=given.known)
+        return hr, hr.g if asked.offset is None else hr.routed
 
     def _done(
         self, asked: Drawable, given: _Given, t: int, facts: tuple[Any, ...], work: _Work

@@ -170,12 +170,14 @@ class SplatGradients:
         rgb: with respect to the colour before its clamp; also the gradient of `rgb_offset`.
         basis: Y, the spherical harmonics of this view's directions.
         absgrad: the sum over pixels of the absolute value of what each adds to `screen` (AbsGS), where it was asked for.
+
+    What `summed` returns has J = K - 1 gradients; else J = K.
     """
 
-    means: Float[Tensor, "K N 3"]
-    quats: Float[Tensor, "K N 4"]
-    scales: Float[Tensor, "K N 3"]
-    opacities: Float[Tensor, "K N"]
+    means: Float[Tensor, "J N 3"]
+    quats: Float[Tensor, "J N 4"]
+    scales: Float[Tensor, "J N 3"]
+    opacities: Float[Tensor, "J N"]
     screen: Float[Tensor, "K N 2"]
     rgb: Float[Tensor, "K N 3"]
     basis: Float[Tensor, "N B1"]
@@ -188,6 +190,19 @@ class SplatGradients:
     @property
     def shN(self) -> Float[Tensor, "K N B 3"]:  # noqa: N802 - gsplat's name
         return self.basis[None, :, 1:, None] * self.rgb[:, :, None, :]
+
+    def summed(self, weight: Float[Tensor, " N"]) -> SplatGradients:
+        """The last gradient added to the one before, `weight` times each Gaussian's row.
+
+        `screen` stays that of each cotangent, for statistics, and the last row of `rgb` is what was added.
+        """
+
+        def total(g: Tensor) -> Tensor:
+            last = g[-1] * weight.to(g).view(-1, *[1] * (g.dim() - 2))
+            return torch.cat((g[:-2], (g[-2] + last)[None], last[None]))
+
+        means, quats, scales, opacities = (total(g)[:-1] for g in (self.means, self.quats, self.scales, self.opacities))
+        return SplatGradients(means, quats, scales, opacities, self.screen, total(self.rgb), self.basis)
 
 
 @runtime_checkable
@@ -276,6 +291,28 @@ class WithDepthGradient(Protocol):
             ValueError: `depth` is given for a rendering that was drawn without it.
         """
         ...
+
+
+class WithSummedVjp(Protocol):
+    """A rendering that sums before its projection's VJP what `SplatGradients.summed` sums after it."""
+
+    def summed_vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"]) -> SplatGradients:
+        """See the function of this name."""
+        ...
+
+
+def summed_vjp(
+    rendering: Rendering, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"]
+) -> SplatGradients:
+    """The gradients of two losses of an image that count as one, the second `weight` times, Gaussian by Gaussian.
+
+    Args:
+        cotangents: those of the two losses last, after any others.
+    """
+    of_rendering = getattr(rendering, "summed_vjp", None)
+    if of_rendering is None:
+        return rendering.vjp(cotangents).summed(weight)
+    return cast(WithSummedVjp, rendering).summed_vjp(cotangents, weight)
 
 
 class WithRadii(Protocol):

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from rasterizers.checks import drawing
-from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats
+from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, summed_vjp
 from rasterizers.reference import ReferenceRasterizer
 
 Make = Callable[..., Rasterizer]
@@ -99,6 +99,20 @@ def check_cotangents_together_equal_one_by_one(make: Make) -> None:
         alone = rendering.vjp(v[k : k + 1])
         for name in (*_ATTRIBUTES, "screen"):
             _close(gradient_of(together, name)[k], gradient_of(alone, name)[0], 1e-5, f"cotangent {k} of {name}")
+
+
+def check_sum_equals_sum_of_gradients(make: Make) -> None:
+    """Two cotangents that count as one, the second by a weight of each Gaussian: `summed_vjp` is the sum of their gradients."""
+    rasterizer = make()
+    dtype = min(rasterizer.traits.dtypes, key=lambda dtype: dtype.itemsize)  # in which it may sum by itself
+    splats, camera = scene(60, dtype=dtype), _camera(48, 33)
+    rendering = rasterizer(splats, camera)
+    g = torch.Generator().manual_seed(4)
+    v, weight = _cotangents(rendering, 3, g), torch.rand(60, generator=g).to(splats.means)
+    weight[::5] = 0
+    found, expected = summed_vjp(rendering, v, weight), rendering.vjp(v).summed(weight)
+    for name in ("means", "quats", "scales", "opacities", "screen", "rgb"):
+        _close(getattr(found, name), getattr(expected, name), 1e-5, f"the sum's {name}")
 
 
 def check_dropped_equals_absent(make: Make, *, depth: bool = False) -> None:
@@ -217,6 +231,7 @@ _WITH_OR_WITHOUT_DEPTH: Final = (
 CHECKS: Final[Sequence[Check]] = (
     check_gradients_are_finite_differences,
     check_cotangents_together_equal_one_by_one,
+    check_sum_equals_sum_of_gradients,
     *_WITH_OR_WITHOUT_DEPTH,
     check_equal_depths_have_an_order,
     *(_of_depth(check) for check in _WITH_OR_WITHOUT_DEPTH),

@@ -37,7 +37,7 @@ from clear_strategies.training.optim import Adam, LearningRates
 from clear_strategies.training.replay import replays_for
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
-from rasterizers.interface import PRESETS, Camera, Rasterizer, Recordable, Rendering, SplatGradients, Splats
+from rasterizers.interface import PRESETS, Camera, Rasterizer, Recordable, Rendering, SplatGradients, Splats, summed_vjp
 
 FROZEN: Final = LearningRates(LogLinear(1e-30, 1e-30), *(0.0,) * 6, detail_decay=0.002)
 """Adam does all its work, and the scene stays the same from turn to turn."""
@@ -161,9 +161,13 @@ def _outputs(
         outputs["render"][scale] = r.image
         image = r.image if given is None else given["render"][scale].to(r.image)
 
-        def vjp(cotangents: Tensor) -> SplatGradients:
+        def vjp(cotangents: Tensor, *weight: Tensor) -> SplatGradients:
             outputs[f"losses {scale}"] = {"cotangents": cotangents.clone()}
-            g = r.vjp(cotangents if given is None else given[f"losses {scale}"]["cotangents"].to(image))
+            if weight:
+                outputs["evidence"] = {"weight": weight[0].clone()}
+            v = cotangents if given is None else given[f"losses {scale}"]["cotangents"].to(image)
+            weights = weight if given is None else [given["evidence"]["weight"].to(w) for w in weight]
+            g = summed_vjp(r, v, *weights) if weight else r.vjp(v)
             outputs[f"backward {scale}"] = {
                 f.name: x.clone() for f in fields(g) if (x := getattr(g, f.name)) is not None
             }
@@ -172,7 +176,7 @@ def _outputs(
             return SplatGradients(**{name: x.to(image) for name, x in given[f"backward {scale}"].items()})
 
         kept = {name: getattr(r, name) for name in ("alpha", "depth", "means2d", "visible")}
-        return SimpleNamespace(**kept, image=image, vjp=vjp)
+        return SimpleNamespace(**kept, image=image, vjp=vjp, summed_vjp=vjp)
 
     def render_scales(jobs: Any, **options: Any) -> list[Any]:
         return list(map(watched, rasterizer.render_scales(jobs, **options), ("LR", "HR")))

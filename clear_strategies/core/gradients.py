@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Final, NamedTuple, Protocol, runtime_checkable
 
@@ -90,20 +90,37 @@ class Grads(dict[str, Tensor]):
 
     def without_detail(self) -> Grads:
         """The same without f_det, which is never corrected."""
-        return Grads({name: value for name, value in self.items() if name != "detail"}, colour=self.colour)
+        kept = {name: value for name, value in self.items() if name != "detail"}
+        return Grads(kept, colour=self.colour, screen=self.screen)
 
 
 def gradients_of(g: SplatGradients) -> list[Grads]:
-    """The gradients of what was drawn, one for each cotangent, that of the colours by its factors."""
-    basis = g.basis.contiguous()
-    each = zip(*(x.unbind() for x in (g.means, g.quats, g.scales, g.opacities, g.rgb, g.screen)), strict=True)
-    return [
+    """The gradients of what was drawn, one for each cotangent, that of the colours by its factors; of `SplatGradients.summed` as
+    of `summed`.
+    """
+    basis, n = g.basis.contiguous(), len(g.means)
+    rows = (g.means, g.quats, g.scales, g.opacities, g.rgb[:n], g.screen[:n])
+    each = [
         Grads(
-            {name: x.contiguous() for name, x in zip(_DRAWN, rows, strict=True)},
+            {name: x.contiguous() for name, x in zip(_DRAWN, drawn, strict=True)},
             colour=Colour(rgb.contiguous(), basis), screen=screen,
         )
-        for *rows, rgb, screen in each
+        for *drawn, rgb, screen in zip(*(x.unbind() for x in rows), strict=True)
     ]  # fmt: skip
+    last = zip(g.rgb[n:], g.screen[n:], strict=True)
+    return each + [Grads({"detail": rgb.contiguous()}, screen=screen) for rgb, screen in last]
+
+
+def summed(each: Sequence[Grads], weight: Float[Tensor, " N"]) -> list[Grads]:
+    """The last gradient, `weight` times each row, added to the one before, whose `screen` stays.  Eq. 13
+
+    Of the last itself remain its `screen` and the gradient of f_det, `weight` times: f_det gets nothing else.
+    """
+    *others, base, hf = each
+    total = base.without_detail().plus(hf.without_detail(), weight)
+    total.screen = base.screen
+    detail = {"detail": scale_rows(hf["detail"], weight)} if "detail" in hf else {}
+    return [*others, total, Grads(detail, screen=hf.screen)]
 
 
 @runtime_checkable

@@ -16,7 +16,7 @@ from clear_strategies.core import images
 from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import require_finite, require_finite_losses
-from clear_strategies.core.gradients import Grads, Shot, screen_norm, screen_of, to_ndc
+from clear_strategies.core.gradients import Grads, Shot, screen_norm, screen_of, summed, to_ndc
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.core.work_log import WorkLog
@@ -245,17 +245,17 @@ class Conductor:
         hr: Shot,
         view: View,
         t: int,
-        vjp: Callable[[Any, Tensor], Sequence[Grads]] | None = None,
+        vjp: Callable[..., Sequence[Grads]] | None = None,
         *,
         apart: bool = True,
         params: Mapping[str, Tensor] = _UNKNOWN,
         looked_up: Tensor | None = None,
     ) -> HrSide:
-        """Compare Î_HR with the SR image, backpropagate both losses in one pass, and ask for the evidence.
+        """Compare Î_HR with the SR image, ask for the evidence, and backpropagate both losses in one pass.
 
         Args:
-            vjp: maps a shot and K cotangents to K gradients, each with `.screen`; None: `Shot.vjp`.
-            apart: False: the gradient of L_base + λ_HF L_HF as `base`, where no strategy routes or scores by the two apart.
+            vjp: as `Stepper.vjp`; None: by `Shot.vjp`.
+            apart: False: one cotangent, of L_base + λ_HF L_HF, where no strategy routes or scores by the two apart.
             params, looked_up: for `Step`.
         """
         apart = apart or self.owner("route") is not None or self.owner("score") is not None
@@ -297,7 +297,7 @@ class Conductor:
         g_lr = g_lr.without_detail()
         if hr is None:
             return self.merge_routed(params, g_lr, Grads(), None, t, finite=True)
-        return self.merge_routed(params, g_lr, hr.routed(self.objective.lambda_hf), hr.step, t, finite=True)
+        return self.merge_routed(params, g_lr, hr.routed, hr.step, t, finite=True)
 
     def merge_routed(
         self, params: Mapping[str, Tensor], g_lr: Grads, g_hr: Grads, step: Step | None, t: int,
@@ -493,26 +493,27 @@ class Conductor:
             losses = self.objective.hr(hr.image.detach(), sr.image, sr.shown, reuse=self._hr_cotangents)  # Eq. 5
             self._hr_cotangents = losses.cotangents
         require_finite_losses(_where(view, t), losses.values, {"the SR image": sr.image, "the HR render": hr.image})
-        with stage("backward HR"):  # one pass for all cotangents
-            of_hr = losses.cotangents
-            if not apart and len(of_hr) == 2:
-                of_hr = torch.add(of_hr[:1], of_hr[1:], alpha=self.objective.lambda_hf)
-            both = of_hr if lr_cotangents is None else torch.cat((lr_cotangents, of_hr))
-            gradients = list(vjp(hr, both))
-        g_lr = None if lr_cotangents is None else gradients.pop(0)
-        base, hf = gradients if len(gradients) > 1 else (gradients[0], None)
+        of_hr, λ_hf = losses.cotangents, self.objective.lambda_hf
+        if not apart and len(of_hr) == 2:
+            of_hr = torch.add(of_hr[:1], of_hr[1:], alpha=λ_hf)
         with stage("evidence"):
             n, evidence = len(hr.visible), self._owner["observe"].observe(step, hr)  # q, a, w        Eq. 9, 10
             answers.require_evidence(self._owner["observe"], evidence, n)
             step = replace(step, evidence=evidence)
-            m = 1.0 if hf is None else self._owner["route"].route(step)  # m              Eq. 12
+            m = 1.0 if len(of_hr) == 1 else self._owner["route"].route(step)  # m              Eq. 12
             answers.require_route(self._owner["route"], m, n)
-        return g_lr, HrSide(base, hf, _size(hr.image), step, m, losses.values)
+        with stage("backward HR"):  # one pass for all cotangents
+            both = of_hr if lr_cotangents is None else torch.cat((lr_cotangents, of_hr))
+            if len(of_hr) == 1:
+                *of_lr, g, detail = *vjp(hr, both), None
+            else:
+                *of_lr, g, detail = vjp(hr, both, _rows_of(m, n, hr.image) * λ_hf)  # g^HR        Eq. 13
+        return of_lr[0] if of_lr else None, HrSide(g.without_detail(), detail, _size(hr.image), step, m, losses.values)
 
 
 def _screen_gradients(lr: Float[Tensor, "N 2"], hr: HrSide, weights: LossWeights) -> ScreenGradients:
-    hf = None if hr.hf is None else screen_of(hr.hf)
-    return ScreenGradients(lr, *per_gaussian.screens(lr, screen_of(hr.base), hf, hr.size, weights))
+    hf = None if hr.detail is None else screen_of(hr.detail)
+    return ScreenGradients(lr, *per_gaussian.screens(lr, screen_of(hr.g), hf, hr.size, weights))
 
 
 def _named(strategies: Sequence[Strategy], logged: Sequence[Mapping[str, Logged]]) -> dict[str, Logged]:
@@ -526,8 +527,18 @@ def _counted(logged: Mapping[str, Logged]) -> dict[str, Number]:
     return {name: x() if callable(x) else x for name, x in logged.items()}
 
 
-def _vjp(shot: Shot, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[Grads]:
-    return shot.vjp(cotangents)
+def _vjp(
+    shot: Shot, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
+) -> Sequence[Grads]:  # fmt: skip
+    """As `Stepper.vjp`, of any shot."""
+    if weight is None:
+        return shot.vjp(cotangents)
+    of_shot = getattr(shot, "summed_vjp", None)
+    return summed(shot.vjp(cotangents), weight) if of_shot is None else of_shot(cotangents, weight)
+
+
+def _rows_of(m: float | Tensor, n: int, image: Tensor) -> Float[Tensor, " N"]:
+    return m.to(image.dtype) if isinstance(m, Tensor) else image.new_full((n,), float(m))
 
 
 def _require_size(view: View, scale: str, render: Tensor, image: Tensor) -> None:

@@ -26,23 +26,25 @@ class HrSide:
     """What the HR render of one view gives: its gradients, the evidence, and the routing weights.
 
     Args:
-        base, hf: ∇L_base and ∇L_HF, each with `.screen` in 1/pixel of an image of `size` (width, height); hf is None
+        g: g^HR, with the `.screen` of ∇L_base.  Eq. 13
+        detail: m λ_HF ∇L_HF of f_det, which is never corrected and gets nothing of L_base, with the `.screen` of ∇L_HF; None
             where λ_HF = 0.
+        size: (width, height) of the image in whose pixels `.screen` counts.
         step: the iteration, with the answer of `observe`. m: the answer of `route`, [N] or 1.
         losses: L_base and L_HF by name.
     """
 
-    base: Grads
-    hf: Grads | None
+    g: Grads
+    detail: Grads | None
     size: tuple[int, int]
     step: Step
     m: float | Float[Tensor, " N"] = 1.0
     losses: Mapping[str, Scalar] = field(default_factory=dict)
 
-    def routed(self, lambda_hf: float) -> Grads:
-        """g^HR, and m λ_HF ∇L_HF of f_det, which is never corrected and gets nothing of L_base.  Eq. 12, 13"""
-        g = self.base.without_detail()
-        return g if self.hf is None else g.plus(self.hf, self.m * lambda_hf)
+    @property
+    def routed(self) -> Grads:
+        """g^HR, and the gradient of f_det."""
+        return Grads({**self.g, **(self.detail or {})}, colour=self.g.colour)
 
 
 class Merged(NamedTuple):
@@ -97,8 +99,10 @@ class Stepper(Protocol):
         """The stage of the work log that the pass is timed as."""
         ...
 
-    def vjp(self, shot: Any, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[Grads]:
-        """One gradient per cotangent."""
+    def vjp(
+        self, shot: Any, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
+    ) -> Sequence[Grads]:  # fmt: skip
+        """One gradient per cotangent; with `weight` as `core.gradients.summed` makes them."""
         ...
 
     def step(
@@ -120,11 +124,12 @@ def require_finite_parts(where: str, g_lr: Grads, hr: HrSide | None) -> None:
     """Check what a `Stepper` merges: the gradients, and the weights of the strategies; those on a device are not read."""
     if g_lr.screen is None or not deferred.is_immediate(g_lr.screen):
         return
-    parts: dict[str, Mapping[str, Tensor]] = {"∇L_LR": g_lr.tensors}
-    if hr is not None:
-        parts |= {"∇L_base": hr.base.tensors} | ({} if hr.hf is None else {"∇L_HF": hr.hf.tensors})
+    parts: dict[str, Mapping[str, Tensor]] = {}
+    if hr is not None:  # the weights first, which are in the gradients
         weights = {} if hr.step.evidence is None else {"reliability": hr.step.evidence.reliability}
         parts["the evidence"] = weights | ({"m": hr.m} if isinstance(hr.m, Tensor) else {})
+        parts |= {"∇L_HR": hr.g.tensors} | ({} if hr.detail is None else {"∇L_HF": hr.detail.tensors})
+    parts["∇L_LR"] = g_lr.tensors
     if not native.all_finite([x for tensors in parts.values() for x in tensors.values()]):
         for part, tensors in parts.items():
             require_finite(f"{where}: {part}", tensors)

@@ -179,7 +179,7 @@ def _gradients(
     # The field is drawn over the scene's own background, whichever one a strategy would choose.
     opaque = replace(view, hr=replace(view.hr, transparency=None))
     from_hr = aside.hr_gradients(hr, opaque, t, params={name: p.detach() for name, p in field.raw().items()})
-    g_lr, g_hr = g_lr.without_detail(), from_hr.routed(objective.lambda_hf).without_detail()
+    g_lr, g_hr = g_lr.without_detail(), from_hr.g
     if (owner := aside.owner("reconcile")) is None:
         return g_lr, g_hr, None, hr.image.detach().cpu()
     answer = answers.corrected(owner, owner.correct(g_lr, g_hr, from_hr.step), g_hr, finite=False)

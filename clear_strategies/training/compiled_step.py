@@ -111,8 +111,10 @@ class CompiledStep:
         """Whether a step can be part of a recording."""
         return getattr(self._passes, "records", False)
 
-    def vjp(self, shot: FieldShot, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
-        return gradients_of(shot.gradients(cotangents))
+    def vjp(
+        self, shot: FieldShot, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
+    ) -> list[Grads]:  # fmt: skip
+        return gradients_of(shot.gradients(cotangents, weight))
 
     def step(
         self, params: Mapping[str, Tensor], shot: FieldShot, g_lr: Grads, hr: HrSide | None, t: int
@@ -129,7 +131,7 @@ class CompiledStep:
             else:
                 weights, given = Weights(keep=0.0), answer
         plus = self.conductor.regularized(params, t, finite=True)
-        decays = (hr is not None and hr.hf is not None) or "detail" in plus
+        decays = (hr is not None and hr.detail is not None) or "detail" in plus
         self._apply(gaussians, params, g_lr, t, weights, given, plus, decays=decays)
         return conflict
 
@@ -199,16 +201,11 @@ class CompiledStep:
 
     def _gaussians(self, a: Activation, g_lr: Grads, hr: HrSide | None) -> kernel.GaussianStep:
         """The passes over the gradients of one view."""
-        m = None if hr is None or (not isinstance(hr.m, Tensor) and hr.m == 1) else hr.m
-        if m is not None and not isinstance(m, Tensor):
-            m = a.sigmoid.new_full(a.sigmoid.shape, m)
         activation = {
             "scales": a.scales, "filtered": a.filtered, "filter": a.filter_3d, "sigmoid": a.sigmoid,
-            "factor": a.factor.contiguous(), "route": None if m is None else m.float().contiguous(),
-            "basis": _basis(g_lr, None if hr is None else hr.base),
+            "factor": a.factor.contiguous(), "basis": _basis(g_lr, None if hr is None else hr.g),
         }  # fmt: skip
-        base, hf = (None, None) if hr is None else (hr.base.tensors, None if hr.hf is None else hr.hf.tensors)
-        return self._passes(activation, g_lr.tensors, base, hf, self.conductor.objective.lambda_hf)
+        return self._passes(activation, g_lr.tensors, None if hr is None else hr.routed.tensors)
 
     def _settings(
         self, t: int, bias2: float, skips: bool = False, width: int = 0, changing: Tensor | None = None

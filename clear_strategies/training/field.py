@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,7 +18,7 @@ from clear_strategies.core.view import View
 from clear_strategies.kernels import per_gaussian
 from clear_strategies.training.mip import NEAR, filter_std
 from rasterizers.geometry import constant_band
-from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats
+from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, summed_vjp
 
 _INITIAL_OPACITY: Final = 0.1
 _NEIGHBOURS: Final = 3  # 3DGS: a point's initial size is the root mean square distance to its 3 nearest neighbours
@@ -183,7 +183,7 @@ class Activation:
         )  # fmt: skip
 
     def vjp(self, g: SplatGradients, k: int, *, detail: bool) -> Grads:
-        """Chain rule through the filter, exp and sigmoid, for cotangent k."""
+        """Chain rule through the filter, exp and sigmoid, for gradient k."""
         d_opacity = g.opacities[k]
         # ∂ log(coefficient) / ∂ log(s) = f² / (s² + f²): the opacity's gradient reaches the scales.
         share = (self.filter_3d[:, None] / self.filtered).square()
@@ -205,21 +205,29 @@ class Activation:
 
 
 class FieldShot:
-    """A rendering of the field; see `gradients.Shot`.
-
-    Attributes:
-        gradients: maps K cotangents to gradients of the rendered splats, before the chain rule of `activation`.
-    """
+    """A rendering of the field; see `gradients.Shot`."""
 
     def __init__(self, rendering: Rendering, activation: Activation, *, detail: bool) -> None:
         self.image, self.means2d, self.visible = rendering.image, rendering.means2d, rendering.visible
-        self.gradients: Callable[[Tensor], SplatGradients] = rendering.vjp
+        self._rendering = rendering
         self.activation = activation
         self._detail = detail
+
+    def gradients(
+        self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
+    ) -> SplatGradients:  # fmt: skip
+        """Of the rendered splats, before the chain rule of `activation`; with `weight` by `rasterizers.interface.summed_vjp`."""
+        return self._rendering.vjp(cotangents) if weight is None else summed_vjp(self._rendering, cotangents, weight)
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
         g = self.gradients(cotangents)
         return [self.activation.vjp(g, k, detail=self._detail) for k in range(len(cotangents))]
+
+    def summed_vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"]) -> list[Grads]:
+        """As `core.gradients.summed`, before the projection's VJP."""
+        g = self.gradients(cotangents, weight)
+        each = [self.activation.vjp(g, k, detail=False) for k in range(len(g.means))]
+        return [*each, Grads({"detail": g.rgb[-1]} if self._detail else {}, screen=g.screen[-1])]
 
 
 def _neighbour_distance(means: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:

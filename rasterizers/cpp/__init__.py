@@ -157,11 +157,26 @@ class CppRendering:
         """One pass for up to three cotangents, with depth or absolute gradients for one; see `WithDepthGradient`."""
         require_cotangents(cotangents, self.image)
         v_alpha, v_depth = (None if x is None else x.contiguous() for x in of_accumulated(self, alpha, depth))
+        absolute = self._frame.empty(len(cotangents), len(self.visible), 2) if absgrad else None
+        return self._gradients(cotangents, v_alpha, v_depth, absolute)
+
+    def summed_vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"]) -> SplatGradients:
+        """One pass for two or three cotangents; see `WithSummedVjp`."""
+        require_cotangents(cotangents, self.image)
+        if len(cotangents) not in (2, 3) or self.image.dtype == torch.float64:
+            return self.vjp(cotangents).summed(weight)
+        return self._gradients(cotangents, weight=weight.detach().to(self.image).contiguous())
+
+    def _gradients(
+        self, cotangents: Tensor, v_alpha: Tensor | None = None, v_depth: Tensor | None = None, absolute: Tensor | None = None,
+        weight: Tensor | None = None,
+    ) -> SplatGradients:  # fmt: skip
         k, n, frame = len(cotangents), len(self.visible), self._frame
-        means, quats, scales, screen, rgb = (frame.empty(k, n, width) for width in (3, 4, 3, 2, 3))
-        opacities, absolute = frame.empty(k, n), frame.empty(k, n, 2) if absgrad else None
+        sums = k if weight is None else k - 1
+        means, quats, scales = (frame.empty(sums, n, width) for width in (3, 4, 3))
+        opacities, screen, rgb = frame.empty(sums, n), frame.empty(k, n, 2), frame.empty(k, n, 3)
         frame.native.vjp(
             self._grid, cotangents.detach().to(self.image).contiguous(), v_alpha, v_depth, *frame.shared,
-            means, quats, scales, opacities, screen, rgb, absolute, frame.threads,
+            means, quats, scales, opacities, screen, rgb, absolute, weight, frame.threads,
         )  # fmt: skip
         return SplatGradients(means, quats, scales, opacities, screen, rgb, frame.basis(), absolute)

@@ -289,15 +289,10 @@ class WarpRendering:
     def vjp(self, cotangents: Float[Tensor, "K H W 3"], *, absgrad: bool = False) -> SplatGradients:
         """One pass for up to three cotangents, with absolute gradients for one; see `Rendering.vjp`."""
         require_cotangents(cotangents, self.image)
-        frame, k, n = self._frame, cotangents.shape[0], self._frame.n
+        frame, k = self._frame, len(cotangents)
         v = cotangents.to(self._image).contiguous()
-        out = means, quats, scales, opacities, screen, rgb = (
-            frame.empty(k, n, 3), frame.empty(k, n, 4), frame.empty(k, n, 3), frame.empty(k, n), frame.empty(k, n, 2),
-            frame.empty(k, n, 3),
-        )  # fmt: skip
-        absolute = frame.empty(k, n, 2) if absgrad else None
-        capacity = padded(self._view.pairs)
-        together = max(1, min(3, ((frame.settings.memory << 20) - capacity * PAIR_BYTES) // (capacity * SUMS_BYTES)))
+        out, together = _empty_gradients(frame, k, k), self._together()
+        absolute = frame.empty(k, frame.n, 2) if absgrad else None
         with on_stream(frame.like.device):
             if absolute is not None:
                 for part in zip(*(x.split(1) for x in (v, *out, absolute)), strict=True):  # type: ignore[no-untyped-call]
@@ -307,9 +302,25 @@ class WarpRendering:
             else:
                 for part in zip(*(torch.split(x, together) for x in (v, *out)), strict=True):
                     self._fill(*part, None)
-            return SplatGradients(means, quats, scales, opacities, screen, rgb, frame.basis(), absolute)
+            return SplatGradients(*out, frame.basis(), absolute)
 
-    def _fill(self, v: Tensor, *out: Tensor | None) -> None:
+    def summed_vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"]) -> SplatGradients:
+        """One pass for two or three cotangents; see `WithSummedVjp`."""
+        require_cotangents(cotangents, self.image)
+        k = len(cotangents)
+        if not 1 < k <= self._together():
+            return self.vjp(cotangents).summed(weight)
+        out = _empty_gradients(self._frame, k - 1, k)
+        with on_stream(self._frame.like.device):
+            self._fill(cotangents.to(self._image).contiguous(), *out, None, weight=weight.to(self._image).contiguous())
+            return SplatGradients(*out, self._frame.basis())
+
+    def _together(self) -> int:
+        """How many cotangents one pass has the memory for."""
+        capacity, memory = padded(self._view.pairs), self._frame.settings.memory << 20
+        return max(1, min(3, (memory - capacity * PAIR_BYTES) // (capacity * SUMS_BYTES)))
+
+    def _fill(self, v: Tensor, *out: Tensor | None, weight: Tensor | None = None) -> None:
         """Fill the gradients for one to three cotangents, the last of them where absolute ones are wanted."""
         absolute = out[-1] is not None
         frame, view, lists, k = self._frame, self._view, self._drawn_from, v.shape[0]
@@ -325,9 +336,16 @@ class WarpRendering:
                 fold(k, absolute), view.pairs, view.counts, view.firsts, lists.splats, view.total, stride, pair_sums
             )
         frame.launch(
-            project_vjp(k, absolute), frame.n, frame.pose, view.grid, frame.cuts, frame.means, frame.quats, frame.scales,
-            view.opacities, frame.slopes, frame.bands > 0, view.ellipses, view.counts, view.firsts, pair_sums, *out,
+            project_vjp(k, absolute, weight is not None), frame.n, frame.pose, view.grid, frame.cuts, frame.means, frame.quats,
+            frame.scales, view.opacities, frame.slopes, frame.bands > 0, view.ellipses, view.counts, view.firsts, pair_sums, *out,
+            weight,
         )  # fmt: skip
+
+
+def _empty_gradients(frame: WarpFrame, j: int, k: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Means, quats, scales, opacities, screen and rgb."""
+    n, empty = frame.n, frame.empty
+    return empty(j, n, 3), empty(j, n, 4), empty(j, n, 3), empty(j, n), empty(k, n, 2), empty(k, n, 3)
 
 
 def _sorted(keys: Tensor, values: Tensor, count: int, bits: int) -> tuple[Tensor, Tensor]:

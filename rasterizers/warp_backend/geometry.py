@@ -71,12 +71,11 @@ class Sums:
 
 @wp.struct
 class GaussianGradient:
-    """The gradients of one Gaussian, with its screen gradient."""
+    """The gradients of one Gaussian."""
 
     mean: wp.vec3
     quat: wp.vec4
     scale: wp.vec3
-    screen: wp.vec2
 
 
 @wp.func
@@ -150,17 +149,19 @@ def footprint_of(g: Geometry, grid: Grid, cuts: Cuts) -> Footprint:
 
 
 @wp.func
+def screen_vjp(f: Footprint, first: wp.vec2) -> wp.vec2:
+    """∂L/∂u = Σ'⁻¹ (Σ q dx, Σ q dy), of the projected centre."""
+    return wp.vec2(f.xx * first[0] + f.xy * first[1], f.xy * first[0] + f.yy * first[1])
+
+
+@wp.func
 def geometry_vjp(
     pose: Pose, grid: Grid, cuts: Cuts, g: Geometry, f: Footprint, scale: wp.vec3, sums: Sums
 ) -> GaussianGradient:
-    """The VJP of the projection. With M the second moments and ρ the compensation:
-
-    ∂L/∂u = Σ'⁻¹ (Σ q dx, Σ q dy),   ∂L/∂T = Σ'⁻¹ M Σ'⁻¹ T + q ∂ log ρ/∂T.
-    """
+    """The VJP of the projection, with M the second moments and ρ the compensation: ∂L/∂T = Σ'⁻¹ M Σ'⁻¹ T + q ∂ log ρ/∂T."""
     out = GaussianGradient()
-    du = f.xx * sums.first[0] + f.xy * sums.first[1]
-    dv = f.xy * sums.first[0] + f.yy * sums.first[1]
-    out.screen = wp.vec2(du, dv)
+    screen = screen_vjp(f, sums.first)
+    du, dv = screen[0], screen[1]
 
     # ∂L/∂T, row by row, with P = Σ'⁻¹ T. The rows of P, (y × n + κ x)/det and (n × x + κ y)/det with the rows x and y of T, have
     # sums without cancellation; products of Σ'⁻¹ and T would lose all digits for a needle.

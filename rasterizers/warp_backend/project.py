@@ -10,7 +10,15 @@ import warp as wp
 from rasterizers import geometry
 from rasterizers.warp_backend.bins import count_tiles, depth_key, reaches_image
 from rasterizers.warp_backend.colour import colour_of
-from rasterizers.warp_backend.geometry import Footprint, Sums, centre_of, footprint_of, geometry_of, geometry_vjp
+from rasterizers.warp_backend.geometry import (
+    Footprint,
+    Sums,
+    centre_of,
+    footprint_of,
+    geometry_of,
+    geometry_vjp,
+    screen_vjp,
+)
 from rasterizers.warp_backend.types import FAR, SEGMENT, SUMS, Cuts, Ellipse, Grid, Pose, width_of
 
 wp.set_module_options({"enable_backward": False})
@@ -192,10 +200,23 @@ def fold(K: int, absolute: bool = False) -> Any:
     return fold
 
 
+@wp.func
+def unclamped(colour: wp.vec3, d_colour: wp.vec3) -> wp.vec3:
+    """∇rgb: where a colour is clamped, the image does not depend on it."""
+    rgb = wp.vec3()
+    for c in range(3):
+        if colour[c] >= -BLACK:
+            rgb[c] = d_colour[c]
+    return rgb
+
+
 @cache
-def project_vjp(K: int, absolute: bool = False) -> Any:
-    """The VJP kernel for K cotangents, with absolute gradients for one."""
+def project_vjp(K: int, absolute: bool = False, summed: bool = False) -> Any:
+    """The VJP kernel for K cotangents, with absolute gradients for one; or with the last added to the one before, see
+    `interface.summed_vjp`.
+    """
     W = SUMS + 3
+    J = K - 1 if summed else K
     PairSums = wp.types.vector(length=width_of(K, absolute), dtype=wp.float32)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -220,15 +241,17 @@ def project_vjp(K: int, absolute: bool = False) -> Any:
         d_screen: wp.array2d[wp.vec2],
         d_rgb: wp.array2d[wp.vec3],
         d_absolute: wp.array2d[wp.vec2],
+        weights: wp.array[wp.float32],
     ) -> None:
         """One thread per Gaussian: adds its pairs' sums in the order of its tiles, and applies the projection's VJP."""
         i = wp.tid()
         if counts[i] == 0:
-            for k in range(K):
+            for k in range(J):
                 d_means[k, i] = wp.vec3(0.0, 0.0, 0.0)
                 d_quats[k, i] = wp.vec4(0.0, 0.0, 0.0, 0.0)
                 d_scales[k, i] = wp.vec3(0.0, 0.0, 0.0)
                 d_opacities[k, i] = 0.0
+            for k in range(K):
                 d_screen[k, i] = wp.vec2(0.0, 0.0)
                 d_rgb[k, i] = wp.vec3(0.0, 0.0, 0.0)
             if wp.static(absolute):
@@ -242,25 +265,30 @@ def project_vjp(K: int, absolute: bool = False) -> Any:
         f = footprint_of(g, grid, cuts)
         colour = ellipses[i].rgb
         for k in range(K):
-            sums = Sums()
-            sums.q = total[W * k]
-            sums.first = wp.vec2(total[W * k + 1], total[W * k + 2])
-            sums.xx = total[W * k + 3]
-            sums.xy = total[W * k + 4]
-            sums.yy = total[W * k + 5]
-            out = geometry_vjp(pose, grid, cuts, g, f, scales[i], sums)
-            rgb = wp.vec3(0.0, 0.0, 0.0)
-            for c in range(3):
-                if colour[c] >= -BLACK:  # where the colour is clamped, the image does not depend on it
-                    rgb[c] = total[W * k + SUMS + c]
-            if has_slopes:
-                out.mean += wp.transpose(slopes[i]) * rgb
-            d_means[k, i] = out.mean
-            d_quats[k, i] = out.quat
-            d_scales[k, i] = out.scale
-            d_opacities[k, i] = sums.q / opacities[i]
-            d_screen[k, i] = out.screen
+            d_screen[k, i] = screen_vjp(f, wp.vec2(total[W * k + 1], total[W * k + 2]))
+        if wp.static(summed):  # the projection is linear in the sums
+            for c in range(W):
+                share = total[W * J + c] * weights[i]
+                total[W * J + c] = share
+                total[W * (J - 1) + c] += share
+        for k in range(K):
+            at = W * k + SUMS
+            rgb = unclamped(colour, wp.vec3(total[at], total[at + 1], total[at + 2]))
             d_rgb[k, i] = rgb
+            if k < J:
+                sums = Sums()
+                sums.q = total[W * k]
+                sums.first = wp.vec2(total[W * k + 1], total[W * k + 2])
+                sums.xx = total[W * k + 3]
+                sums.xy = total[W * k + 4]
+                sums.yy = total[W * k + 5]
+                out = geometry_vjp(pose, grid, cuts, g, f, scales[i], sums)
+                if has_slopes:
+                    out.mean += wp.transpose(slopes[i]) * rgb
+                d_means[k, i] = out.mean
+                d_quats[k, i] = out.quat
+                d_scales[k, i] = out.scale
+                d_opacities[k, i] = sums.q / opacities[i]
         if wp.static(absolute):
             d_absolute[0, i] = wp.vec2(total[W], total[W + 1])
 

@@ -78,8 +78,8 @@ def test_a_gradient_that_is_not_finite_is_named_before_the_step(begun, name, bad
         init(self, *arguments, **options)
         vjp = self.gradients
 
-        def gradients(cotangents):
-            g = vjp(cotangents)
+        def gradients(*cotangents):
+            g = vjp(*cotangents)
             rows = getattr(g, name).clone()
             rows[0, 7] = bad
             return replace(g, **{name: rows})

@@ -20,7 +20,7 @@ from rasterizers.interface import SplatGradients
 from tests.helpers import toy
 
 T = 5  # any iteration between `full` and `decay_from`
-HR_COTANGENTS = {"none": 0, "base": 1, "both": 2}
+HR_LOSSES = ("none", "base", "both")
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "screen", "rgb")
 ALWAYS = WarmupDecay(start=0, full=1, decay_from=10, end=10)
 HALF = replace(ALWAYS, peak=0.5, final=0.5)
@@ -33,12 +33,16 @@ def as_floats(numbers) -> dict[str, float]:
 
 @dataclass
 class Case:
-    """One view's gradients, and two equal fields: one for the readable path, one for the compiled step."""
+    """One view's gradients, and two equal fields: one for the readable path, one for the compiled step.
+
+    Args:
+        hr: of L_base and L_HF. weight: λ_HF m.
+    """
 
     fields: tuple[GaussianField, GaussianField]
     lr: SplatGradients
     hr: SplatGradients
-    m: torch.Tensor | float
+    weight: torch.Tensor
     e: Evidence | None
     z: torch.Tensor | None
 
@@ -46,16 +50,24 @@ class Case:
         """What a compiled step is given: the rendering, g_LR and what comes from HR."""
         shot = object.__new__(FieldShot)
         shot.activation = self.fields[use]._activate(self.z)
-        (lr,), both = gradients_of(self.lr), gradients_of(self.hr)
-        return shot, lr, self._bundle(*(both[k] if k < HR_COTANGENTS[hr] else None for k in (0, 1)))
+        (lr,) = gradients_of(self.lr)
+        of_hr = {"none": [], "base": gradients_of(self.hr)[:1], "both": gradients_of(self.hr.summed(self.weight))}
+        return shot, lr, self._side(of_hr[hr])
 
     def grads(self, use: int, hr: str = "both") -> tuple:
+        """The same for the readable path."""
         a = self.fields[use]._activate(self.z)
-        hf = (a.vjp(self.hr, k, detail=True) if k < HR_COTANGENTS[hr] else None for k in (0, 1))
-        return a.vjp(self.lr, 0, detail=False), self._bundle(*hf)
+        both = self.hr.summed(self.weight)
+        of_hr = {
+            "none": [],
+            "base": [a.vjp(self.hr, 0, detail=False)],
+            "both": [a.vjp(both, 0, detail=False), gradients_of(both)[1]],
+        }
+        return a.vjp(self.lr, 0, detail=False), self._side(of_hr[hr])
 
-    def _bundle(self, base, hf) -> HrSide | None:
-        return None if base is None else HrSide(base, hf, (1, 1), toy.step(evidence=self.e), self.m)
+    def _side(self, of_hr) -> HrSide | None:
+        g, detail, *_ = *of_hr, None, None
+        return None if g is None else HrSide(g, detail, (1, 1), toy.step(evidence=self.e))
 
 
 def readable_merge(conductor, params, g_lr, hr, t) -> tuple:
@@ -122,16 +134,16 @@ def case(n=1000, degree=3, kind="random", seed=0, bands=15, gate=False, evidence
             getattr(s, name).zero_()
     if kind == "round":  # equal axes: rotation gradients are rounding
         lr.quats.mul_(2.0**-30)
-    m = 0.25 + 0.75 * torch.rand(n, generator=g) if evidence else 1.0
+    weight = 0.2 * (0.25 + 0.75 * torch.rand(n, generator=g) if evidence else torch.ones(n))
     e = Evidence(torch.rand(n, generator=g), torch.rand(n, generator=g)) if evidence else None
     z = (torch.rand(n, generator=g) > 0.2).float() / 0.8 if gate else None
-    return Case(fields, lr, hr, m, e, z)
+    return Case(fields, lr, hr, weight, e, z)
 
 
-def conductors(*makers, anchored=None, hf=0.2, λ=HALF) -> tuple[Conductor, Conductor]:
+def conductors(*makers, anchored=None, λ=HALF) -> tuple[Conductor, Conductor]:
     """Two equal conductors; if `anchored` is given, with an anchor that differs a little from that field."""
     makers = [ANCHORING if make is SVS else make for make in makers]
-    both = tuple(Conductor(*(make() for make in makers), objective=Objective(lambda_hr=λ, lambda_hf=hf)) for _ in "ab")
+    both = tuple(Conductor(*(make() for make in makers), objective=Objective(lambda_hr=λ)) for _ in "ab")
     for conductor in both:
         conductor.on_fit_start(3, 0)
         for s in conductor.strategies:

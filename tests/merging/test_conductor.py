@@ -463,6 +463,14 @@ def test_routing_weighs_the_high_frequency_gradient_only(drawn):
     assert "detail" not in updated(drawn, lambda_hf=0.0).grads
 
 
+def test_one_route_for_all_gaussians_is_that_of_each(drawn):
+    one, each = (answering("route", m)() for m in (0.25, torch.full((len(drawn[0]),), 0.25)))
+    g, same, whole = (updated(drawn, *strategies).grads for strategies in ([one], [each], []))
+    for name in g:
+        assert torch.equal(g[name], same[name])
+        assert not torch.equal(g[name], whole[name])
+
+
 def test_two_owners_of_one_question_are_refused_and_the_order_does_not_matter(drawn):
     with pytest.raises(StrategyConflict, match=r"GCO and Halve both implement reconcile\(\) or correct\(\)"):
         Conductor(GCO(), Halve())

@@ -21,8 +21,9 @@ class CppGaussianStep:
     """The gradients of one view's losses, as the rasterizer returns them, and the pass over them.
 
     Args:
-        activation: scales, filtered [N, 3], filter, sigmoid, factor [N], the basis Y [N, bases], and route: m [N], None: 1.
-        lr, base, hf: means, quats, scales, opacities and rgb, for one cotangent each; base and hf may be None.
+        activation: scales, filtered [N, 3], filter, sigmoid, factor [N], and the basis Y [N, bases].
+        lr, hr: means, quats, scales, opacities and rgb of ∇L_LR and of g^HR, which has "detail", too, where f_det learns; hr may
+            be None.
 
     Raises:
         BackendUnavailable: the kernels were not compiled.
@@ -31,15 +32,13 @@ class CppGaussianStep:
 
     def __init__(
         self,
-        activation: Mapping[str, Any],
+        activation: Mapping[str, Tensor],
         lr: Mapping[str, Tensor],
-        base: Mapping[str, Tensor] | None,
-        hf: Mapping[str, Tensor] | None,
-        lambda_hf: float,
+        hr: Mapping[str, Tensor] | None,
     ) -> None:
         kernels: Any = native.module()
         self._n, bases = activation["basis"].shape
-        self._passes = kernels.GaussianStep(dict(activation), lr, base, hf, bases, lambda_hf)
+        self._passes = kernels.GaussianStep(dict(activation), dict(lr), None if hr is None else dict(hr), bases)
 
     def products(self) -> Products:
         table = empty((3, len(CONFLICT_GROUPS), self._n), torch.float64)

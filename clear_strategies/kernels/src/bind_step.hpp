@@ -9,20 +9,19 @@ namespace clear {
 // The gradients of one view, and the pass over them.
 class GaussianStep {
  public:
-  GaussianStep(nb::dict activation, nb::dict lr, nb::object base, nb::object hf, std::int64_t bases, double lambda_hf) {
+  GaussianStep(nb::dict activation, nb::dict lr, nb::object hr, std::int64_t bases) {
     if (bases < 1 || bases > kLanes) throw nb::value_error("the basis must have 1 to 16 columns");
     std::int64_t n = g_.n = std::int64_t(nb::len(nb::object(activation["sigmoid"])));
     g_.bases = int(bases);
-    g_.lambda_hf = float(lambda_hf);
     g_.activation = {tensors_.rows<const float>(activation, "scales", n, 3), tensors_.rows<const float>(activation, "filtered", n, 3),
                      tensors_.rows<const float>(activation, "filter", n, 1), tensors_.rows<const float>(activation, "sigmoid", n, 1),
                      tensors_.rows<const float>(activation, "factor", n, 1)};
     g_.basis = tensors_.rows<const float>(activation, "basis", n, bases);
-    g_.route = tensors_.rows<const float>(activation, "route", n, 1, true);
     g_.lr = gradient(lr);
-    if (!base.is_none()) g_.base = gradient(nb::cast<nb::dict>(base));
-    if (!hf.is_none()) g_.hf = gradient(nb::cast<nb::dict>(hf));
-    if (base.is_none() && !hf.is_none()) throw nb::value_error("hf needs base");
+    if (hr.is_none()) return;
+    nb::dict high = nb::cast<nb::dict>(hr);
+    g_.hr = gradient(high);
+    if (high.contains("detail")) g_.detail = tensors_.rows<const float>(high, "detail", n, 3);
   }
 
   // Writes the inner products of both gradients to `to`, float64 [3, 6, n]; returns `counts`.
@@ -76,7 +75,7 @@ class GaussianStep {
   Tensors tensors_;
 
   void require_hr() const {
-    if (g_.n && !g_.base) throw nb::value_error("there is no HR gradient to reconcile");
+    if (g_.n && !g_.hr) throw nb::value_error("there is no HR gradient to reconcile");
   }
 
   SplatGradient gradient(const nb::dict& t) {
@@ -102,8 +101,8 @@ class GaussianStep {
 
 inline void bind_step(nb::module_& m) {
   nb::class_<GaussianStep>(m, "GaussianStep")
-      .def(nb::init<nb::dict, nb::dict, nb::object, nb::object, std::int64_t, double>(), nb::arg("activation"), nb::arg("lr"),
-           nb::arg("base").none(), nb::arg("hf").none(), nb::arg("bases"), nb::arg("lambda_hf"))
+      .def(nb::init<nb::dict, nb::dict, nb::object, std::int64_t>(), nb::arg("activation"), nb::arg("lr"), nb::arg("hr").none(),
+           nb::arg("bases"))
       .def("products", &GaussianStep::products, nb::arg("to"), nb::arg("threads"))
       .def("dense", &GaussianStep::dense, nb::arg("lr"), nb::arg("hr"), nb::arg("width"), nb::arg("threads"))
       .def("step", &GaussianStep::step, nb::arg("attributes"), nb::arg("weights"), nb::arg("settings"), nb::arg("threads"));

@@ -1,4 +1,4 @@
-// The gradients of a view's three losses with respect to the raw parameters, computed per Gaussian and never stored.
+// The gradients of both scales of a view with respect to the raw parameters, computed per Gaussian and never stored.
 #pragma once
 
 #include "block.hpp"
@@ -20,10 +20,9 @@ struct Gradients {
   std::int64_t n;
   int bases;                     // columns of Y: 1 + active higher bands
   const float* basis;            // Y [N, bases]
-  SplatGradient lr, base, hf;    // base and hf may be absent
+  SplatGradient lr, hr;          // of L_LR, and g^HR, which may be absent
+  const float* detail;           // m λ_HF ∇L_HF of f_det, or null
   Activation activation;
-  const float* route;            // m_i, or null for 1
-  float lambda_hf;
 };
 
 // ∇θ of one loss for sixteen Gaussians. shN's gradient stays in factors: Y ⊗ rgb.
@@ -31,7 +30,7 @@ struct RawGradients {
   Floats means[3], quats[4], scales[3], opacities[1], sh0[3], rgb[3];
 };
 
-// The part of the activations' VJP for sixteen Gaussians that the three losses share.
+// The part of the activations' VJP for sixteen Gaussians that both gradients share.
 struct Activated {
   Floats squares[3], filtered[3], shares[3], sigmoid, factor, opacity, slope;
 };
@@ -76,16 +75,10 @@ CLEAR_INLINE Doubles higher_bands2(const float* basis, int bases, std::int64_t i
   return total;
 }
 
-// g^HR = g_base + λ_HF m g_HF, multiplied in the same order as the conductor does.
-template <int D>
-CLEAR_INLINE void route(Floats (&base)[D], const Floats (&hf)[D], const Floats& m, const Floats& lambda_hf) {
-  for (int d = 0; d < D; ++d) base[d] += hf[d] * m * lambda_hf;  // Eq. 13
-}
-
-// The gradients of sixteen Gaussians for one view; `hr` is g^HR, after routing.
+// The gradients of sixteen Gaussians for one view.
 struct Block {
-  RawGradients lr, hr, hf;
-  Floats m;
+  RawGradients lr, hr;
+  Floats detail[3];
 };
 
 CLEAR_INLINE void load(const Gradients& g, std::int64_t i, int count, Block& b) {
@@ -94,25 +87,16 @@ CLEAR_INLINE void load(const Gradients& g, std::int64_t i, int count, Block& b) 
   Floats Y0[1];
   load_columns(g.basis + g.bases * i, count, Y0, g.bases);
   activation_vjp(g.lr, a, Y0[0], i, count, b.lr);
-  if (!g.base) return;
-  activation_vjp(g.base, a, Y0[0], i, count, b.hr);
-  if (!g.hf) return;
-  activation_vjp(g.hf, a, Y0[0], i, count, b.hf);
-  b.m = g.route ? load_some(g.route + i, count) : Floats(1.0f);
-  route(b.hr.means, b.hf.means, b.m, g.lambda_hf);
-  route(b.hr.quats, b.hf.quats, b.m, g.lambda_hf);
-  route(b.hr.scales, b.hf.scales, b.m, g.lambda_hf);
-  route(b.hr.opacities, b.hf.opacities, b.m, g.lambda_hf);
-  route(b.hr.sh0, b.hf.sh0, b.m, g.lambda_hf);
-  route(b.hr.rgb, b.hf.rgb, b.m, g.lambda_hf);
+  if (g.hr) activation_vjp(g.hr, a, Y0[0], i, count, b.hr);
+  if (g.detail) load_columns(g.detail + 3 * i, count, b.detail);
 }
 
 // Prefetches what `load` reads.
 CLEAR_INLINE void fetch(const Gradients& g, std::int64_t i) {
   const Activation& a = g.activation;
   fetch_rows(a.scales, i, 3), fetch_rows(a.filtered, i, 3), fetch_rows(a.filter, i, 1), fetch_rows(a.sigmoid, i, 1);
-  fetch_rows(a.factor, i, 1), fetch_rows(g.route, i, 1);
-  for (const SplatGradient* loss : {&g.lr, &g.base, &g.hf}) {
+  fetch_rows(a.factor, i, 1), fetch_rows(g.detail, i, 3);
+  for (const SplatGradient* loss : {&g.lr, &g.hr}) {
     fetch_rows(loss->means, i, 3), fetch_rows(loss->quats, i, 4), fetch_rows(loss->scales, i, 3);
     fetch_rows(loss->opacities, i, 1), fetch_rows(loss->rgb, i, 3);
   }

@@ -76,7 +76,7 @@ class ChunkStep {
     std::uint32_t still = s.skips ? still_rows(b, i, rows) : 0;
     std::uint32_t moving = rows & ~still;
     if (moving) {  // still rows beside a moving one step too, which leaves them unchanged
-      if (g.base && s.lambda_hr > 0) merge(b, i, count);
+      if (g.hr && s.lambda_hr > 0) merge(b, i, count);
       step_columns(s.means, b.lr.means, i, count), step_columns(s.quats, b.lr.quats, i, count);
       step_columns(s.scales, b.lr.scales, i, count), step_columns(s.opacities, b.lr.opacities, i, count);
       step_columns(s.sh0, b.lr.sh0, i, count);
@@ -117,10 +117,10 @@ class ChunkStep {
 
   // f_det gets only the routed gradient of L_HF, uncorrected.
   void step_detail(const Block& b, std::int64_t i, int count) const {
-    Floats routed[3] = {0.0f, 0.0f, 0.0f};
-    if (g.hf)
-      for (int d = 0; d < 3; ++d) routed[d] = b.hf.rgb[d] * b.m * Floats(g.lambda_hf) * Floats(s.lambda_hr);
-    step_columns(s.detail, routed, i, count);
+    Floats weighted[3] = {0.0f, 0.0f, 0.0f};
+    if (g.detail)
+      for (int d = 0; d < 3; ++d) weighted[d] = b.detail[d] * Floats(s.lambda_hr);
+    step_columns(s.detail, weighted, i, count);
   }
 
   void step_rows(const Block& b, std::int64_t i, int count, std::uint32_t moving) const {
@@ -170,8 +170,8 @@ class ChunkStep {
   // Still rows: gradients and moments are all 0, so a step would not change them.
   std::uint32_t still_rows(const Block& b, std::int64_t i, std::uint32_t rows) const {
     Floats total = magnitude(b.lr);
-    if (g.base) total += magnitude(b.hr);
-    if (g.hf) total += magnitude(b.hf);
+    if (g.hr) total += magnitude(b.hr);
+    if (g.detail) total += magnitude(b.detail);
     std::uint32_t still = 0;
     for (std::uint32_t rest = (total <= Floats(0.0f)).bits() & rows; rest; rest &= rest - 1) {
       int k = __builtin_ctz(rest);

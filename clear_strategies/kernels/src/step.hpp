@@ -1,7 +1,7 @@
 // The per-Gaussian step of one iteration: a pass for the inner products of both gradients, and, once their weights are known, one
 // that merges and applies Adam.
 //
-// Both compute the gradients from their factors, which is cheaper than storing 59 numbers for each of three losses.
+// Both compute the gradients from their factors, which is cheaper than storing 59 numbers for each of both scales.
 // Sums are taken by chunk of Gaussians and added in the order of the chunks: the same bits for any number of threads.
 #pragma once
 

@@ -132,11 +132,13 @@ void bind_frame(nb::module_& m) {
               Read<T, -1, 3> scales, Read<T, -1, 1, 3> sh0, Rows<T> shN, Write<T, -1, -1, 3> d_means,
               Write<T, -1, -1, 4> d_quats, Write<T, -1, -1, 3> d_scales, Write<T, -1, -1> d_opacities,
               Write<T, -1, -1, 2> d_screen, Write<T, -1, -1, 3> d_rgb, std::optional<Write<T, -1, -1, 2>> d_absgrad,
-              int threads) {
+              std::optional<Read<T, -1>> weight, int threads) {
              Splats<T> splats = splats_of<T>(means, quats, scales, sh0, shN);
-             Gradients<T> out{d_means.data(),  d_quats.data(), d_scales.data(), d_opacities.data(),
-                              d_screen.data(), d_rgb.data(),   d_absgrad ? d_absgrad->data() : nullptr};
              const int K = int(image.shape(0));
+             require(!weight || (std::int64_t(weight->shape(0)) == splats.n && K > 1 && K <= F::kMostCotangents && !depth && !d_absgrad),
+                     "`weight` has one number per Gaussian, and sums two or three cotangents of an image without depth");
+             Gradients<T> out{d_means.data(), d_quats.data(), d_scales.data(), d_opacities.data(), d_screen.data(), d_rgb.data(),
+                              d_absgrad ? d_absgrad->data() : nullptr, weight ? weight->data() : nullptr};
              const Cotangents<T> v{image.data(), alpha ? alpha->data() : nullptr, depth ? depth->data() : nullptr};
              nb::gil_scoped_release release;
              self.vjp(i, K, v, splats, out, threads);
@@ -144,7 +146,7 @@ void bind_frame(nb::module_& m) {
            nb::arg("grid"), tensor("image"), tensor("alpha").none(), tensor("depth").none(), tensor("means"),
            tensor("quats"), tensor("scales"), tensor("sh0"), tensor("shN"), tensor("d_means"), tensor("d_quats"),
            tensor("d_scales"), tensor("d_opacities"), tensor("d_screen"), tensor("d_rgb"), tensor("d_absgrad").none(),
-           nb::arg("threads"))
+           tensor("weight").none(), nb::arg("threads"))
       .def("basis", [](F& self, Read<T, -1, 3> means, Read<T, -1, 4> quats, Read<T, -1, 3> scales,
                        Read<T, -1, 1, 3> sh0, Rows<T> shN, Write<T, -1, -1> out, int threads) {
         Splats<T> splats = splats_of<T>(means, quats, scales, sh0, shN);

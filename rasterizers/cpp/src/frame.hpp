@@ -25,6 +25,8 @@ struct OverBudget : std::runtime_error {
 template <class T>
 class Frame {
  public:
+  static constexpr int kMostCotangents = sizeof(T) == 4 ? 3 : 1;  // of one backward pass; in double, quick to compile instead
+
   Frame(const Settings<T>& settings, const Pose& pose, std::int64_t budget)
       : settings_(settings), pose_(pose), budget_(budget) {}
 
@@ -61,15 +63,16 @@ class Frame {
     }
   }
 
-  // The gradients [K, n, …] for K cotangents.
+  // The gradients [K, n, …] for K cotangents, of which `out.weight` allows two or three in float32.
   void vjp(int i, int K, const Cotangents<T>& v, const Splats<T>& splats, const Gradients<T>& out, int threads) {
     View& view = views_.at(i);
     const std::int64_t pixels = std::int64_t(view.target.grid.width) * view.target.grid.height;
     for (int k = 0; k < K;) {
       const int now = v.depth || out.absgrad ? 1 : std::min(kMostCotangents, K - k);
       const std::int64_t at = k * n_;
-      Gradients<T> part{out.means + 3 * at,  out.quats + 4 * at, out.scales + 3 * at, out.opacities + at,
-                        out.screen + 2 * at, out.rgb + 3 * at,   out.absgrad ? out.absgrad + 2 * at : nullptr};
+      Gradients<T> part{out.means + 3 * at,  out.quats + 4 * at, out.scales + 3 * at,
+                        out.opacities + at,  out.screen + 2 * at, out.rgb + 3 * at,
+                        out.absgrad ? out.absgrad + 2 * at : nullptr, out.weight};
       const Cotangents<T> these{v.image + k * pixels * kColour, v.alpha ? v.alpha + k * pixels : nullptr,
                                 v.depth ? v.depth + k * pixels : nullptr};
       if (v.depth && out.absgrad) vjp_of<1, kColourAndDepth, true>(view, these, splats, part, threads);
@@ -140,7 +143,6 @@ class Frame {
  private:
   // `Bins::pairs`, `where` and `masks`.
   static constexpr std::int64_t kBytesPerPair = 2 * sizeof(std::uint32_t) + sizeof(std::uint64_t);
-  static constexpr int kMostCotangents = sizeof(T) == 4 ? 3 : 1;  // of one backward pass; in double, quick to compile instead
 
   struct View {
     Target<T> target;

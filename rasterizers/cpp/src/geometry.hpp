@@ -146,11 +146,17 @@ struct Footprint {
 template <class T>
 struct LaneGradients {
   using L = Lanes<T>;
-  L mean[3], quat[4], scale[3], opacity, screen[2];
+  L mean[3], quat[4], scale[3], opacity;
 };
 
-// VJP of the projection. q and its moments come from the blocks; M = [[qxx, qxy], [qxy, qyy]]:
-//   ∂L/∂u = Σ'⁻¹ (qx, qy)      ∂L/∂T = Σ'⁻¹ M Σ'⁻¹ T + q ∂ log ρ/∂T, ρ the compensation
+// ∂L/∂u = Σ'⁻¹ (qx, qy), of the projected centre, from the moments of q that the blocks add up.
+template <class T>
+CLEAR_INLINE void screen_vjp(const Footprint<T>& f, const Lanes<T>& qx, const Lanes<T>& qy, Lanes<T> (&out)[2]) {
+  out[0] = f.xx * qx + f.xy * qy;
+  out[1] = f.xy * qx + f.yy * qy;
+}
+
+// VJP of the projection, with M = [[qxx, qxy], [qxy, qyy]]: ∂L/∂T = Σ'⁻¹ M Σ'⁻¹ T + q ∂ log ρ/∂T, ρ the compensation.
 template <class T>
 CLEAR_INLINE void project_vjp(const Pose& pose, const Grid<T>& grid, const Settings<T>& s, const Geometry<T>& g,
                               const Footprint<T>& f, const Vec3<T>& scale, const Lanes<T>& opacity, const Lanes<T>& q,
@@ -159,8 +165,9 @@ CLEAR_INLINE void project_vjp(const Pose& pose, const Grid<T>& grid, const Setti
   using L = Lanes<T>;
   const Rotation<T> W(pose);
   out.opacity = q / opacity;
-  L du = out.screen[0] = f.xx * qx + f.xy * qy;
-  L dv = out.screen[1] = f.xy * qx + f.yy * qy;
+  L screen[2];
+  screen_vjp(f, qx, qy, screen);
+  const L du = screen[0], dv = screen[1];
 
   // ∂L/∂T, with P = Σ'⁻¹ T. The rows of P, (y x n + κ x)/det and (n x x + κ y)/det with the rows x and y of T, have sums
   // without cancellation; products of Σ'⁻¹ and T would lose all digits for a needle.

@@ -7,18 +7,23 @@
 namespace clear {
 
 // The output: the fields of rasterizers.interface.SplatGradients, [K, n, …]; every element is written. `absgrad` may be null.
+// With `weight` [n] the last cotangent counts so often and is added to the one before, see rasterizers.interface.summed_vjp: means,
+// quats, scales and opacities are then [K - 1, n, …].
 template <class T>
 struct Gradients {
   T *means, *quats, *scales, *opacities, *screen, *rgb, *absgrad;
+  const T* weight = nullptr;
 };
 
 // Zeroes the gradients of `count` Gaussians.
 template <class T, int K>
 void clear_gradients(std::int64_t n, std::int64_t first, std::int64_t count, const Gradients<T>& out) {
-  auto zero = [&](T* tensor, int width) {
-    for (int k = 0; k < K; ++k) std::memset(tensor + (k * n + first) * width, 0, sizeof(T) * width * count);
+  auto zero = [&](T* tensor, int width, int rows = K) {
+    for (int k = 0; k < rows; ++k) std::memset(tensor + (k * n + first) * width, 0, sizeof(T) * width * count);
   };
-  zero(out.means, 3), zero(out.quats, 4), zero(out.scales, 3), zero(out.opacities, 1), zero(out.screen, 2), zero(out.rgb, 3);
+  const int sums = out.weight ? K - 1 : K;
+  zero(out.means, 3, sums), zero(out.quats, 4, sums), zero(out.scales, 3, sums), zero(out.opacities, 1, sums);
+  zero(out.screen, 2), zero(out.rgb, 3);
   if (out.absgrad) zero(out.absgrad, 2);
 }
 
@@ -56,8 +61,8 @@ CLEAR_INLINE void fetch_rows(const Splats<T>& splats, const Target<T>& target, c
 // The gradients of a group from its Gaussians' sums, `PairSums` in columns; those of its lanes that are not `touched` are zeros.
 template <class T>
 void project_vjp_group(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, const Target<T>& target,
-                       const Buffer<Slope<T>>& slopes, const Group& group, int K, const Lanes<T>* sums,
-                       std::uint32_t touched, const Gradients<T>& out) {
+                       const Buffer<Slope<T>>& slopes, const Group& group, int K, Lanes<T>* sums, std::uint32_t touched,
+                       const Gradients<T>& out) {
   using L = Lanes<T>;
   const Mask<T> real = Mask<T>::from_bits(touched);
   L mean[3], quat[4], scale[3];
@@ -74,28 +79,39 @@ void project_vjp_group(const Pose& pose, const Settings<T>& s, const Splats<T>& 
     for (int i = 0; i < kLanes; ++i) slope[i] = L::load(slopes[group.rows[i]].numbers);
     transpose(slope);
   }
+  auto keep = [&](auto& columns) {
+    for (L& column : columns) column = where(real, column);
+  };
+  constexpr int width = PairSums<T, 1>::kWidth;
   for (int k = 0; k < K; ++k) {
-    const L* sum = sums + k * PairSums<T, 1>::kWidth;
+    L screen[2];
+    screen_vjp(f, sums[k * width + 1], sums[k * width + 2], screen);
+    keep(screen);
+    store_rows<2>(out.screen + 2 * k * splats.n, group, screen);
+  }
+  if (out.weight) {  // the projection is linear in the sums
+    const L weight = load_row(out.weight, group);
+    L *last = sums + (K - 1) * width, *before = last - width;
+    for (int i = 0; i < width; ++i) before[i] += last[i] *= weight;
+  }
+  for (int k = 0; k < K; ++k) {
+    const L* sum = sums + k * width;
+    const std::int64_t at = k * splats.n;
+    L rgb[3];
+    for (int c = 0; c < 3; ++c) rgb[c] = where(Mask<T>::from_bits(lanes_with_bit(lit, c)), sum[6 + c]);
+    keep(rgb);
+    store_rows<3>(out.rgb + 3 * at, group, rgb);
+    if (out.weight && k == K - 1) break;
     LaneGradients<T> gradient;
     project_vjp(pose, target.grid, s, g, f, scale, opacity, sum[0], sum[1], sum[2], sum[3], sum[4], sum[5], gradient);
-    L rgb[3];
-    for (int c = 0; c < 3; ++c) {
-      rgb[c] = where(Mask<T>::from_bits(lanes_with_bit(lit, c)), sum[6 + c]);
-      if (!splats.bands) continue;
+    for (int c = 0; c < 3 && splats.bands; ++c)
       for (int axis = 0; axis < 3; ++axis) gradient.mean[axis] += slope[3 * c + axis] * rgb[c];
-    }
-    auto keep = [&](auto& columns) {
-      for (L& column : columns) column = where(real, column);
-    };
     L alone[1] = {gradient.opacity};
-    keep(gradient.mean), keep(gradient.quat), keep(gradient.scale), keep(gradient.screen), keep(rgb), keep(alone);
-    const std::int64_t at = k * splats.n;
+    keep(gradient.mean), keep(gradient.quat), keep(gradient.scale), keep(alone);
     store_rows<3>(out.means + 3 * at, group, gradient.mean);
     store_rows<4>(out.quats + 4 * at, group, gradient.quat);
     store_rows<3>(out.scales + 3 * at, group, gradient.scale);
     store_rows<1>(out.opacities + at, group, alone);
-    store_rows<2>(out.screen + 2 * at, group, gradient.screen);
-    store_rows<3>(out.rgb + 3 * at, group, rgb);
     if (out.absgrad) {  // one cotangent
       L sums_of_absolutes[2] = {where(real, sum[6 + kColour]), where(real, sum[7 + kColour])};
       store_rows<2>(out.absgrad, group, sums_of_absolutes);

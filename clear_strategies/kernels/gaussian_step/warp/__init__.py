@@ -7,7 +7,7 @@ package imports Warp; call `rasterizers.warp_runtime.require_warp` first.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from ctypes import sizeof
 from typing import Any, Final, cast
 
@@ -37,7 +37,7 @@ class WarpGaussianStep:
     """The gradients of one view's losses, as the rasterizer returns them, and the pass over them.
 
     Args:
-        activation, lr, base, hf: as for `cpp.CppGaussianStep`, all on one device.
+        activation, lr, hr: as for `cpp.CppGaussianStep`, all on one device.
 
     Raises:
         TypeError, ValueError: a tensor is not float32, contiguous and on that device, or has a wrong shape.
@@ -47,11 +47,9 @@ class WarpGaussianStep:
 
     def __init__(
         self,
-        activation: Mapping[str, Any],
+        activation: Mapping[str, Tensor],
         lr: Mapping[str, Tensor],
-        base: Mapping[str, Tensor] | None,
-        hf: Mapping[str, Tensor] | None,
-        lambda_hf: float,
+        hr: Mapping[str, Tensor] | None,
     ) -> None:
         self._like = activation["basis"]
         self._n, self._bases = self._like.shape
@@ -59,22 +57,17 @@ class WarpGaussianStep:
             raise ValueError(f"the basis must have 1 to 16 columns, got {self._bases}.")
         if 45 * self._n >= 2**31:
             raise ValueError(f"shN is indexed with 32 bits, which {self._n} Gaussians exceed. Set fit.fused=off.")
-        if base is None and hf is not None:
-            raise ValueError("hf needs base, got None.")
-        self._kept = (activation, lr, base, hf)  # kept alive while kernels may read them
-        self._has_base = base is not None
-        view = struct(
-            raw_gradients.View, {}, n=self._n, lambda_hf=lambda_hf,
-            has_base=self._has_base, has_hf=hf is not None, routed=activation["route"] is not None,
-        )  # fmt: skip
-        inputs = {"scales": 3, "filtered": 3, "filter": 1, "sigmoid": 1, "factor": 1, "basis": self._bases, "route": 1}
+        self._kept = (activation, lr, hr)  # kept alive while kernels may read them
+        self._has_hr, high = hr is not None, hr or {}
+        inputs = {"scales": 3, "filtered": 3, "filter": 1, "sigmoid": 1, "factor": 1, "basis": self._bases}
         widths = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "rgb": 3}
         self._gradients = (
-            self._rows(raw_gradients.Activation, activation, inputs, optional=("route",)),
+            self._rows(raw_gradients.Activation, activation, inputs),
             self._rows(raw_gradients.Gradient, lr, widths),
-            self._rows(raw_gradients.Gradient, base or {}, widths if base else {}),
-            self._rows(raw_gradients.Gradient, hf or {}, widths if hf else {}),
-            view,
+            self._rows(
+                raw_gradients.Gradient, high, (widths | {"detail": 3} if "detail" in high else widths) if high else {}
+            ),
+            struct(raw_gradients.View, {}, n=self._n, has_hr=self._has_hr, has_detail="detail" in high),
         )
 
     def products(self) -> Products:
@@ -112,7 +105,7 @@ class WarpGaussianStep:
         if adam_step is None:
             adam_step = written(settings, {name: a.rate for name, a in attributes.items()}, device)
         options = struct(
-            passes.StepOptions, {}, skips=settings.skips, width=settings.width, merges=self._has_base and settings.lambda_hr > 0
+            passes.StepOptions, {}, skips=settings.skips, width=settings.width, merges=self._has_hr and settings.lambda_hr > 0
         )  # fmt: skip
         tables = weight_tables(weights, self._n, device)
         step = (
@@ -125,7 +118,7 @@ class WarpGaussianStep:
         return stills.sum() if settings.skips else 0
 
     def _require_hr(self) -> None:
-        if self._n and not self._has_base:
+        if self._n and not self._has_hr:
             raise ValueError("there is no HR gradient to reconcile.")
 
     @property
@@ -151,23 +144,16 @@ class WarpGaussianStep:
             )  # fmt: skip
         return _attributes[key]
 
-    def _rows(
-        self,
-        kind: Any,
-        tensors: Mapping[str, Tensor | None],
-        widths: Mapping[str, int],
-        optional: Sequence[str] = (),
-    ) -> Any:
+    def _rows(self, kind: Any, tensors: Mapping[str, Tensor], widths: Mapping[str, int]) -> Any:
         """A structure of type `kind` over tensors of n rows with `widths` numbers each, for which it checks them."""
         for name, width in widths.items():
-            if name not in optional or tensors[name] is not None:
-                self._require(name, tensors[name], width)
+            self._require(name, tensors[name], width)
         return struct(kind, tensors)
 
-    def _require(self, name: str, tensor: Tensor | None, width: int) -> None:
+    def _require(self, name: str, tensor: Tensor, width: int) -> None:
         """Check that a tensor has a row of `width` numbers for each Gaussian."""
         device = self._like.device
-        if tensor is None or tensor.dtype is not torch.float32 or tensor.device != device or not tensor.is_contiguous():
+        if tensor.dtype is not torch.float32 or tensor.device != device or not tensor.is_contiguous():
             where = "in the CPU's memory" if device.type == "cpu" else f"on {device}"
             raise TypeError(f"{name} must be a contiguous float32 tensor {where}.")
         if tensor.dim() == 0 or tensor.shape[0] != self._n or tensor.numel() != self._n * width:

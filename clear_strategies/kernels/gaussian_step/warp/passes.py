@@ -20,9 +20,9 @@ from clear_strategies.kernels.gaussian_step.warp.raw_gradients import (
     Gradient,
     RawGradient,
     View,
+    detail_of,
     higher_bands2,
     load,
-    route_of,
     size,
 )
 from clear_strategies.kernels.reconcile.warp_functions import (
@@ -88,13 +88,13 @@ def merged(low: Any, high: Any, w: Weights, group: wp.int32, i: wp.int32, lambda
 
 @wp.kernel
 def compare(
-    activation: Activation, lr: Gradient, base: Gradient, hf: Gradient, view: View,
+    activation: Activation, lr: Gradient, hr: Gradient, view: View,
     table: wp.array2d[wp.float64], counts: wp.array[Counts],
 ) -> None:  # fmt: skip
     block, lane = wp.tid()
     i, tally = block * wp.block_dim() + lane, Counts()
     if i < view.n:
-        g_lr, g_hr, _ = load(activation, lr, base, hf, view, i)
+        g_lr, g_hr = load(activation, lr, hr, view, i)
         p = group_products(g_lr, g_hr, activation, i)
         store(p, table, i)
         tally = counted(p)
@@ -129,10 +129,10 @@ def write_rows(g: RawGradient, basis: wp.array2d[wp.float32], i: wp.int32, to: R
 
 @wp.kernel
 def write_dense(
-    activation: Activation, lr: Gradient, base: Gradient, hf: Gradient, view: View, to_lr: Rows, to_hr: Rows
+    activation: Activation, lr: Gradient, hr: Gradient, view: View, to_lr: Rows, to_hr: Rows
 ) -> None:  # fmt: skip
     i = wp.tid()
-    g_lr, g_hr, _ = load(activation, lr, base, hf, view, i)
+    g_lr, g_hr = load(activation, lr, hr, view, i)
     write_rows(g_lr, activation.basis, i, to_lr)
     write_rows(g_hr, activation.basis, i, to_hr)
 
@@ -141,8 +141,7 @@ def write_dense(
 def step(
     activation: Activation,
     lr: Gradient,
-    base: Gradient,
-    hf: Gradient,
+    hr: Gradient,
     view: View,
     w: Weights,
     options: StepOptions,
@@ -163,8 +162,9 @@ def step(
     adam = adams[0]
     at = block * wp.block_dim() + lane
     i = wp.min(at, view.n - 1)  # lanes beyond the last Gaussian neither count nor write
-    g_lr, g_hr, g_hf = load(activation, lr, base, hf, view, i)
-    still = options.skips and size(g_lr) + size(g_hr) + size(g_hf) <= 0.0
+    g_lr, g_hr = load(activation, lr, hr, view, i)
+    g_detail = detail_of(hr, view, i)
+    still = options.skips and size(g_lr) + size(g_hr) + wp.norm_l1(g_detail) <= 0.0
     still = still and is_still(means, i, 3) and is_still(quats, i, 4) and is_still(scales, i, 3)
     still = still and is_still(opacities, i, 1) and is_still(sh0, i, 3) and is_still(detail, i, 3)
     still = still and is_still(shN, i, options.width)
@@ -177,8 +177,7 @@ def step(
     keep, remove = weight(w.keep, OPACITIES, i), weight(w.remove, OPACITIES, i)
     d_opacity = g_lr.opacity + reconciled(g_hr.opacity, g_lr.opacity, keep, remove) * λ
     d_sh0 = merged(g_lr.sh0, g_hr.sh0, w, SH0, i, λ)
-    # f_det gets only the routed gradient of L_HF, uncorrected
-    d_detail = g_hf.rgb * route_of(activation, view, i) * view.lambda_hf * adam.lambda_hr
+    d_detail = g_detail * adam.lambda_hr  # f_det gets only the routed gradient of L_HF, uncorrected
     d_rgb = merged(g_lr.rgb, g_hr.rgb, w, SHN, i, λ)
 
     count = wp.int32(0)

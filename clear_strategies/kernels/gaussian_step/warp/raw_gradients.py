@@ -1,4 +1,4 @@
-"""The gradients of a view's three losses with respect to the raw parameters, computed per Gaussian and never stored."""
+"""The gradients of both scales of a view with respect to the raw parameters, computed per Gaussian and never stored."""
 
 from __future__ import annotations
 
@@ -7,18 +7,22 @@ import warp as wp
 
 @wp.struct
 class Gradient:
-    """One cotangent's rasterizers.interface.SplatGradients; rgb is the factor beside Y of the colour gradient."""
+    """One cotangent's rasterizers.interface.SplatGradients; rgb is the factor beside Y of the colour gradient.
+
+    `detail`, of HR, is m λ_HF ∇L_HF of f_det.
+    """
 
     means: wp.array[wp.vec3]
     quats: wp.array[wp.vec4]
     scales: wp.array[wp.vec3]
     opacities: wp.array[wp.float32]
     rgb: wp.array[wp.vec3]
+    detail: wp.array[wp.vec3]
 
 
 @wp.struct
 class Activation:
-    """The inputs of the activations' VJP (training.field.Activation), Y, and m unless it is 1."""
+    """The inputs of the activations' VJP (training.field.Activation), and Y."""
 
     scales: wp.array[wp.vec3]
     filtered: wp.array[wp.vec3]
@@ -26,7 +30,6 @@ class Activation:
     sigmoid: wp.array[wp.float32]
     factor: wp.array[wp.float32]
     basis: wp.array2d[wp.float32]
-    route: wp.array[wp.float32]
 
 
 @wp.struct
@@ -34,10 +37,8 @@ class View:
     """How many Gaussians there are, and which gradients are given."""
 
     n: wp.int32
-    has_base: wp.bool
-    has_hf: wp.bool
-    routed: wp.bool
-    lambda_hf: wp.float32
+    has_hr: wp.bool
+    has_detail: wp.bool
 
 
 @wp.struct
@@ -71,39 +72,23 @@ def activation_vjp(g: Gradient, a: Activation, i: wp.int32) -> RawGradient:
 
 
 @wp.func
-def route_of(a: Activation, view: View, i: wp.int32) -> wp.float32:
-    """m_i, or 1."""
-    m = wp.float32(1.0)
-    if view.routed:
-        m = a.route[i]
-    return m
-
-
-@wp.func
-def routed(base: RawGradient, hf: RawGradient, m: wp.float32, lambda_hf: wp.float32) -> RawGradient:
-    """g^HR = g_base + λ_HF m g_HF (Eq. 13), multiplied in the same order as the conductor does."""
-    out = RawGradient()
-    out.means = base.means + hf.means * m * lambda_hf
-    out.quats = base.quats + hf.quats * m * lambda_hf
-    out.scales = base.scales + hf.scales * m * lambda_hf
-    out.opacity = base.opacity + hf.opacity * m * lambda_hf
-    out.sh0 = base.sh0 + hf.sh0 * m * lambda_hf
-    out.rgb = base.rgb + hf.rgb * m * lambda_hf
-    return out
-
-
-@wp.func
 def load(
-    activation: Activation, lr: Gradient, base: Gradient, hf: Gradient, view: View, i: wp.int32
-) -> tuple[RawGradient, RawGradient, RawGradient]:
-    """∇L_LR, g^HR and ∇L_HF of a Gaussian; 0 for those not given."""
-    g_lr, g_hr, g_hf = activation_vjp(lr, activation, i), RawGradient(), RawGradient()
-    if view.has_base:
-        g_hr = activation_vjp(base, activation, i)
-    if view.has_hf:
-        g_hf = activation_vjp(hf, activation, i)
-        g_hr = routed(g_hr, g_hf, route_of(activation, view, i), view.lambda_hf)
-    return g_lr, g_hr, g_hf
+    activation: Activation, lr: Gradient, hr: Gradient, view: View, i: wp.int32
+) -> tuple[RawGradient, RawGradient]:
+    """∇L_LR and g^HR of a Gaussian; 0 for one not given."""
+    g_lr, g_hr = activation_vjp(lr, activation, i), RawGradient()
+    if view.has_hr:
+        g_hr = activation_vjp(hr, activation, i)
+    return g_lr, g_hr
+
+
+@wp.func
+def detail_of(hr: Gradient, view: View, i: wp.int32) -> wp.vec3:
+    """M λ_HF ∇L_HF of f_det, or 0."""
+    g = wp.vec3()
+    if view.has_detail:
+        g = hr.detail[i]
+    return g
 
 
 @wp.func
