@@ -134,7 +134,7 @@ class Attachment:
         self._finish_step()  # where not every optimizer has stepped, or the structure has changed since
         conductor, t, params = self.conductor, self.t, {name: p.detach() for name, p in self.params().items()}
         means = params["means"]
-        conductor.forget_logs()
+        conductor.logs.forget()
         z = conductor.gate(t, self._structure.n)
         if z is not None:
             z = z.to(means)
@@ -308,7 +308,7 @@ class Attachment:
         λ = self.conductor.objective.lambda_hr(self.t)
         losses = {} if pending.hr is None else pending.hr.losses
         shares = conflict_columns(conflict)
-        self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **shares, **self.conductor.uncounted_logs()}
+        self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **shares, **self.conductor.logs.uncounted()}
         if self.counts["merges"] % _LOGGED_EVERY == 0:
             now = self.log
             losses_now = ", ".join(f"L_{name} {now[name]:.4f}" for name in losses) or "no HR"

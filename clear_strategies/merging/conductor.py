@@ -25,15 +25,17 @@ from clear_strategies.kernels import per_gaussian, reconcile
 from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.iteration import HrSide, LossWeights, Merged, Stepper, Update, require_finite_parts
+from clear_strategies.merging.logs import IterationLogs
 from clear_strategies.merging.objective import Losses, Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
+from clear_strategies.merging.told import told
 from clear_strategies.strategies import answers
-from clear_strategies.strategies.base import Logged, ScreenGradients, Strategy, by_class, misspelled, overrides
+from clear_strategies.strategies.base import ScreenGradients, Strategy, by_class, misspelled, overrides
 from rasterizers.interface import Color
 from rasterizers.modes import in_full_precision
 from rasterizers.native import empty_for
 from rasterizers.recording import running
-from rasterizers.told import iteration, unread
+from rasterizers.told import iteration
 
 _log = logging.getLogger(__name__)
 
@@ -62,6 +64,7 @@ class Conductor:
         showing: those that override `extra_views`.
         decorated: whether `prior` has been called, or there are no decorators.
         sr: the prior that `prior` was called with; None before.
+        logs: the scalars that the strategies log.
 
     Raises:
         StrategyConflict: two strategies answer a question that only one may.
@@ -80,7 +83,7 @@ class Conductor:
         self.sr: Any = None
         self.work_log = WorkLog()
         self._hr_cotangents: Tensor | None = None
-        self._logged: list[dict[str, Logged]] = [{} for _ in strategies]  # in this iteration, before Strategy.logs
+        self.logs = IterationLogs(strategies)
         self._owner = dict.fromkeys(_ONE_ANSWER, Strategy())  # its hooks hold where no strategy overrides them
         for hook in _ONE_ANSWER:
             hooks = [hook, *_ALSO_BY.get(hook, ())]
@@ -201,7 +204,7 @@ class Conductor:
                 f"this objective needs the {'HR' if reduced else 'LR'} scale at t={t}, got None. Render what wants_lr "
                 "and wants_hr(t) ask for."
             )
-        self.keep_logs()
+        self.logs.keep()
         with stage("losses LR"):
             low, photo = rendered.image.detach(), self._before_background(view.lr, t, view.background)
             _require_size(view, "HR" if reduced else "LR", low, view.hr.image if reduced else photo.image)
@@ -236,7 +239,7 @@ class Conductor:
             else:
                 grads, conflict = None, stepper.step(params, rendered, g_lr, from_hr, t)
         losses = {} if from_hr is None else from_hr.losses
-        logs = _counted(_named(self.strategies, [s.logs for s in self.strategies]))
+        logs = self.logs.counted_since_kept()
         return Update(step, grads, score, ordinary, conflict, {**l_lr.values, **losses}, logs)
 
     @in_full_precision
@@ -426,53 +429,13 @@ class Conductor:
         s = self._owner[hook]
         return None if type(s) is Strategy else s
 
-    def logs(self) -> dict[str, Number]:
-        """The scalars that the strategies have logged in this iteration: since `forget_logs`."""
-        return _counted(self.uncounted_logs())
-
-    def uncounted_logs(self) -> dict[str, Logged]:
-        """The same as the strategies logged them: some are what computes the scalar. A name that another strategy has logged
-        follows that of the class.
-        """
-        return _named(self.strategies, [kept | s.logs for kept, s in zip(self._logged, self.strategies, strict=True)])
-
-    def keep_logs(self) -> None:
-        """Keep what `Strategy.logs` hold for `logs`, and empty them: then they hold what is logged from now on."""
-        for kept, s in zip(self._logged, self.strategies, strict=True):
-            kept.update(s.logs)
-            s.logs.clear()
-
-    def forget_logs(self) -> None:
-        """Before an iteration: what the strategies log from now on belongs to it."""
-        self.keep_logs()
-        for kept in self._logged:
-            kept.clear()
-
     def _before_background(self, photo: Photo, t: int, behind: Color) -> Photo:
         """The photo before the background of iteration t; a recording is given it so."""
         is_so = photo.transparency is None or running() is not None
         return photo if is_so else photo.over(self.background(t), behind)
 
     def _told(self, view: View) -> View:
-        """The view as strategies are told it in what may be recorded: the images alone are copied before a replay."""
-        if running() is None:
-            return view
-
-        def layer(x: Any, what: str) -> Any:
-            return None if x is None else unread(x, f"the {what} of the view", ("shape", "dtype"))
-
-        def photo(p: Photo) -> Photo:
-            changes = p.transparency is not None and self.owner("background") is not None  # as the background does
-            image = layer(p.image, "transparent image") if changes else p.image
-            camera = unread(p.camera, "the camera of the view", ("width", "height"))
-            return replace(p, camera=camera, image=image, transparency=layer(p.transparency, "transparency"))
-
-        lr, hr = photo(view.lr), photo(view.hr)
-        return View(
-            unread(view.name, "the name of the view"), lr, hr, hr.image if view.hr_is_photo else layer(view.truth, "truth"),
-            unread(view.sr_source, "the sr_source of the view"), layer(view.depth, "depth"),
-            layer(view.disagreement, "disagreement"), view.background,
-        )  # fmt: skip
+        return told(view, over_changing=self.owner("background") is not None)
 
     def _backward_hr(
         self,
@@ -514,17 +477,6 @@ class Conductor:
 def _screen_gradients(lr: Float[Tensor, "N 2"], hr: HrSide, weights: LossWeights) -> ScreenGradients:
     hf = None if hr.detail is None else screen_of(hr.detail)
     return ScreenGradients(lr, *per_gaussian.screens(lr, screen_of(hr.g), hf, hr.size, weights))
-
-
-def _named(strategies: Sequence[Strategy], logged: Sequence[Mapping[str, Logged]]) -> dict[str, Logged]:
-    named: dict[str, Logged] = {}
-    for owner, own in zip(by_class(strategies), logged, strict=True):
-        named |= {f"{owner}.{name}" if name in named else name: x for name, x in own.items()}
-    return named
-
-
-def _counted(logged: Mapping[str, Logged]) -> dict[str, Number]:
-    return {name: x() if callable(x) else x for name, x in logged.items()}
 
 
 def _vjp(

@@ -51,7 +51,7 @@ class RecordedWork:
             counts = {f"skip {k}": count for k, (*_, count) in enumerate(self._skips) if isinstance(count, Tensor)}
             return made, *deferred.gathered({name: x for name, x in row.items() if name not in self._of_t} | counts)
 
-        conductor.keep_logs()
+        conductor.logs.keep()
         try:
             with self._work_log.noted() as self._skips:
                 self._recording = Recording(device, gathered)

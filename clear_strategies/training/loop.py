@@ -43,7 +43,7 @@ EXTRA_LOSS: Final = "loss_extra"
 def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
     """One iteration, in the paper's order."""
     t, θ, conductor, stage = s.t, s.field, s.conductor, s.conductor.work_log.stage
-    conductor.forget_logs()
+    conductor.logs.forget()
     θ.degree = min(s.settings.max_degree, (t - 1) // max(1, s.settings.degree_every))
     view = conductor.skips.view(view_at(s), t)
     needs_hr = not conductor.wants_lr or s.density.collects(t)  # for Î_LR, or for a score
@@ -59,7 +59,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
         restructured = conductor.may_densify(t) and s.density.step(θ, s.optimizer, t, s.resized)
         if s.filter_due() and not restructured and not s.remove_undrawn():  # each recomputes the filter
             s.refilter()
-    s.history.append(_with_logs(_row(s) | row | extra, conductor.logs()))
+    s.history.append(_with_logs(_row(s) | row | extra, conductor.logs.counted()))
     if s.conductor.skips.measured(t) and not (restructured or s.reset_due(t)):
         with stage("training views drawn whole"):
             s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)

@@ -36,7 +36,7 @@ def two_steps(warp_step):
     c, step = started(warp_step)
     conflicts = [as_floats(step.step(c.fields[1].raw(), *c.factors(1), T + i)) for i in range(2)]
     state = [*c.fields[1].raw().values(), *step.optimizer.first.values(), *step.optimizer.second.values()]
-    numbers = as_floats(step.conductor.logs())
+    numbers = as_floats(step.conductor.logs.counted())
     return state, conflicts, numbers, step.conductor.work_log.entries["optimizer rows"].skipped
 
 

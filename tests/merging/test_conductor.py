@@ -273,7 +273,7 @@ class LogsShare(Strategy):
 def test_what_two_strategies_of_one_class_log_is_both_there():
     conductor = Conductor(LogsShare(0.25), LogsShare(0.5))
     conductor.regularized({}, 1)
-    assert conductor.logs() == {"share": 0.25, "LogsShare2.share": 0.5}
+    assert conductor.logs.counted() == {"share": 0.25, "LogsShare2.share": 0.5}
 
 
 def test_a_parameter_that_is_replaced_in_place_of_changed_is_refused():

@@ -92,7 +92,7 @@ def test_the_merged_gradient_is_the_readable_one(passes, setting, kind, caplog):
         expected, conflict, found, found_conflict = both_ways(passes, c, readable, compiled)
         assert_same_gradient(c, expected, found)
         assert repr(as_floats(found_conflict)) == repr(as_floats(conflict))
-        same(as_floats(readable.logs()), as_floats(compiled.logs()))
+        same(as_floats(readable.logs.counted()), as_floats(compiled.logs.counted()))
         assert not caplog.messages
 
 
@@ -108,7 +108,7 @@ def test_beyond_2e_7_of_the_margin_both_paths_decide_the_same(passes, beyond):
     readable, compiled = conductors(GCO)
     both_ways(passes, c, readable, compiled, "base")
     for conductor in (readable, compiled):
-        logs = as_floats(conductor.logs())
+        logs = as_floats(conductor.logs.counted())
         assert [logs[f"corrected_{group}"] for group in ("sh0", "shN")] == [float(beyond < 0)] * 2
 
 
@@ -269,7 +269,7 @@ def test_the_same_bits_for_any_number_of_threads(passes):
             for i in range(3):
                 step.step(c.fields[1].raw(), *c.factors(1), T + i)
             state = [*c.fields[1].raw().values(), *adam.first.values(), *adam.second.values()]
-            states.append((state, repr(as_floats(conductor.logs()))))
+            states.append((state, repr(as_floats(conductor.logs.counted()))))
     finally:
         torch.set_num_threads(threads)
     for state, readings in states[1:]:

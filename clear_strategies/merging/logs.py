@@ -1,0 +1,53 @@
+"""The scalars that the strategies log in an iteration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from clear_strategies.core.deferred import Number
+from clear_strategies.strategies.base import Logged, Strategy, by_class
+
+
+class IterationLogs:
+    """What the strategies have logged since `forget`, also where `Strategy.logs` has been emptied since."""
+
+    def __init__(self, strategies: Sequence[Strategy]) -> None:
+        self._strategies = strategies
+        self._kept: list[dict[str, Logged]] = [{} for _ in strategies]
+
+    def forget(self) -> None:
+        """Before an iteration: what the strategies log from now on belongs to it."""
+        self.keep()
+        for kept in self._kept:
+            kept.clear()
+
+    def keep(self) -> None:
+        """Keep what `Strategy.logs` hold, and empty them: then they hold what is logged from now on."""
+        for kept, s in zip(self._kept, self._strategies, strict=True):
+            kept.update(s.logs)
+            s.logs.clear()
+
+    def uncounted(self) -> dict[str, Logged]:
+        """As the strategies logged them: some are what computes the scalar. A name that another strategy has logged follows that
+        of the class.
+        """
+        return _named(self._strategies, [kept | s.logs for kept, s in zip(self._kept, self._strategies, strict=True)])
+
+    def counted(self) -> dict[str, Number]:
+        """The scalars."""
+        return _counted(self.uncounted())
+
+    def counted_since_kept(self) -> dict[str, Number]:
+        """Those that were logged since `keep`."""
+        return _counted(_named(self._strategies, [s.logs for s in self._strategies]))
+
+
+def _named(strategies: Sequence[Strategy], logged: Sequence[Mapping[str, Logged]]) -> dict[str, Logged]:
+    named: dict[str, Logged] = {}
+    for owner, own in zip(by_class(strategies), logged, strict=True):
+        named |= {f"{owner}.{name}" if name in named else name: x for name, x in own.items()}
+    return named
+
+
+def _counted(logged: Mapping[str, Logged]) -> dict[str, Number]:
+    return {name: x() if callable(x) else x for name, x in logged.items()}
