@@ -243,4 +243,5 @@ def test_the_kernels_compile_for_cuda_on_a_machine_without(ptx_of):
     for k in (1, 2, 3):
         ptx_of(project.fold(k).module)
         ptx_of(project.project_vjp(k).module)
+        ptx_of(project.project_vjp(k, summed=k > 1).module)
         assert ptx_of(blend.blend_vjp(k, 32, True).module, 32).count("shfl.sync") == {1: 12, 2: 20, 3: 28}[k]
