@@ -50,7 +50,7 @@ class Structure:
             return False, step
         if parents is not None and len(parents) != n:
             raise HostError(f"the host says of {len(parents):,} Gaussians which they come from, but has {n:,}.")
-        state = ", ".join(self._conductor.state_dict())
+        state = ", ".join(name for name, rows in self._conductor.state_dict().items() if rows.dim() > 0)
         if parents is not None and (unknown := int((parents < 0).sum())):
             if state:
                 raise HostError(

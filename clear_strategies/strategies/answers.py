@@ -32,10 +32,10 @@ def require_started(s: Strategy, seed: int) -> None:
 def require_state(s: Strategy, params: Mapping[str, Tensor]) -> None:
     n = {len(p) for p in params.values()} if s.state else set()
     for name, rows in s.state.items():
-        if not isinstance(rows, Tensor) or (n and rows.shape[:1] != (*n,)):
+        if not isinstance(rows, Tensor) or (n and rows.dim() > 0 and len(rows) not in n):
             raise AnswerError(
-                f"{type(s).__name__}.state[{name!r}] must be a tensor with a row for each Gaussian, {min(n, default=0)}, got "
-                f"{_shown(rows)}. Other things belong in cache."
+                f"{type(s).__name__}.state[{name!r}] must be a tensor with a row for each Gaussian, {min(n, default=0)}, or "
+                f"without dimensions, got {_shown(rows)}. What can be computed again belongs in cache."
             )
 
 

@@ -57,7 +57,8 @@ class Strategy:
     """A frozen dataclass of settings, plus its state.
 
     Args:
-        state: per-Gaussian tensors [N, …] and nothing else; checkpoints save them, `on_resize` gathers them.
+        state: tensors [N, …] of the Gaussians, which `on_resize` gathers, and tensors without dimensions, numbers of the run;
+            nothing else. Checkpoints save them.
         cache: values that can be computed again (patch maps, keyed by view); never saved.
         logs: scalars of this iteration, see `log`.
 
@@ -180,7 +181,8 @@ class Strategy:
     def on_resize(self, parents: Int[Tensor, " M"]) -> None:
         """After the structure changed: row i of every per-Gaussian tensor now comes from row parents[i]."""
         for name, rows in self.state.items():
-            self.state[name] = gathered(rows, parents)
+            if rows.dim() > 0:
+                self.state[name] = gathered(rows, parents)
 
     def on_fit_end(self) -> None:
         """After the last iteration: release the memory that only training needs."""

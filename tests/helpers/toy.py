@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -10,8 +10,9 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import rasterizers
-from clear_strategies import Conductor, Evidence, ExtraView, Objective, Photo, Step, Strategy, View
+from clear_strategies import Conductor, Evidence, ExtraView, Objective, Photo, Step, Strategy, View, Weights
 from clear_strategies.core import images
+from clear_strategies.core.conflicts import Products
 from clear_strategies.core.points import PointCloud
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
@@ -123,6 +124,18 @@ class Recorder(Strategy):
 
     def on_resize(self, parents: Tensor) -> None:
         self.changes.append(parents)
+
+
+@dataclass(frozen=True)
+class RunningMean(Strategy):
+    """Stores a number of the run."""
+
+    def reconcile(self, products: Products, step: Step | None) -> Weights:
+        return Weights(keep=self.state.get("mean", 1.0))
+
+    def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
+        mean = self.state.setdefault("mean", torch.zeros(()))
+        mean.lerp_(params["means"].square().mean(), 0.1)
 
 
 def started(
