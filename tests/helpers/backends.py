@@ -13,6 +13,7 @@ from torch import Tensor
 import rasterizers
 from rasterizers import BackendUnavailable, Camera, Rasterizer, Rendering, SplatGradients, Splats
 from rasterizers.geometry import SH_C0
+from rasterizers.interface import summed_vjp
 from rasterizers.reference import ReferenceRasterizer
 from rasterizers.testing import gradient_of, pixels_of, scene
 
@@ -149,7 +150,13 @@ def cotangents(k, height, width, seed=0) -> torch.Tensor:
 def everything(rendering, v):
     g = rendering.vjp(v)
     pixels = (pixels_of(rendering), rendering.alpha, rendering.means2d, rendering.visible)
-    return (*pixels, *(gradient_of(g, name) for name in ATTRIBUTES), g.basis)
+    summed = () if len(v) == 1 else _of_sum(summed_vjp(rendering, v, torch.linspace(0, 2, len(g.rgb[0])).to(v)))
+    return (*pixels, *(gradient_of(g, name) for name in ATTRIBUTES), *summed, g.basis)
+
+
+def _of_sum(g):
+    """The tensors of a sum."""
+    return g.means, g.quats, g.scales, g.opacities, g.screen, g.rgb
 
 
 def dense_scene(n=3000):
