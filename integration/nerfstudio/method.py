@@ -7,6 +7,7 @@ The `TrainerConfig` is written out, because splatfacto's cannot be imported whil
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
@@ -173,7 +174,8 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
             CONSOLE.log(
                 f"CLEAR: wrote the LR photos to {config.save_lr}; enlarge them x{config.factor} for pipeline.model.sr."
             )
-        chosen = conductor(config.strategies, *config.overrides, iterations=trainer.config.max_num_iterations)
+        end = trainer._start_step + trainer.config.max_num_iterations  # a resumed training makes as many more
+        chosen = conductor(config.strategies, *config.overrides, iterations=end)
         sr = chosen.prior(prior(config.sr))
         CONSOLE.log(
             f"CLEAR: {', '.join(type(s).__name__ for s in chosen.strategies) or 'no strategy'}; "
@@ -181,14 +183,24 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
         )
         show_in_host()
         end_with_strategies(chosen, self.strategy, "refine_stop_iter", first=0)
-        for group in host.optimizers.optimizers["detail"].param_groups:
+        optimizers = host.optimizers.optimizers
+        self._give_loaded(optimizers)
+        for group in optimizers["detail"].param_groups:
             group["lr"] = chosen.detail.rate
         return attach(
-            self.gauss_params, host.optimizers.optimizers, views_from_datamanager(datamanager, sr, config.factor, self.device),
+            self.gauss_params, optimizers, views_from_datamanager(datamanager, sr, config.factor, self.device),
             chosen,
             strategy=self.strategy, state=self.strategy_state, names=NAMES, seed=trainer.config.machine.seed,
             loss_scale=host.grad_scaler.get_scale,
         )  # fmt: skip
+
+    def _give_loaded(self, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
+        """Have the optimizers step the parameters of a checkpoint, which splatfacto loads into new ones: they hold the old."""
+        for name, (p,) in self.get_gaussian_param_groups().items():
+            optimizer = optimizers[name]
+            (held,) = optimizer.param_groups[0]["params"]
+            if held is not p:
+                optimizer.param_groups[0]["params"], optimizer.state[p] = [p], optimizer.state.pop(held, {})
 
     def _resume(self, step: int) -> None:
         """Continue a resumed training at its iteration."""

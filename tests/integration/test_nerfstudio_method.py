@@ -249,13 +249,26 @@ def test_the_scalars_of_the_iteration_are_among_the_metrics(capture, tmp_path):
     assert 0 <= metrics["clear_corrected"] <= 1
 
 
-def test_a_resumed_training_continues_at_its_iteration(capture, tmp_path):
-    host = trainer(configured(capture, tmp_path, strategies="gco"))
-    before_iteration(host, 7)
-    host.train_iteration(7)
-    before_iteration(host, 8)
-    host.train_iteration(8)
-    assert host.pipeline.model.attached.attachment.t == 10  # the next
+def test_a_resumed_training_trains_on_from_its_iteration_to_the_end_that_it_has(capture, tmp_path, monkeypatch):
+    """nerfstudio's optimizers hold the parameters that loading a checkpoint replaces, and it trains max_num_iterations more."""
+    monkeypatch.setenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "1")  # its checkpoints are from before torch 2.6
+    first = trainer(configured(capture, tmp_path, strategies="svs"))
+    first.train()
+    config = configured(capture, tmp_path / "resumed", strategies="svs")
+    config.load_dir, config.load_scheduler = first.checkpoint_dir, False
+    host = trainer(config)
+    model = host.pipeline.model
+    assert model.strategy.refine_stop_iter == STEPS  # half of the steps of both
+    before = {name: p.detach().clone() for name, p in model.gauss_params.items()}
+    assert all(torch.equal(p, first.pipeline.model.gauss_params[name]) for name, p in before.items())
+    before_iteration(host, STEPS)
+    moments = {name: len(o.state[model.gauss_params[name]]) for name, o in host.optimizers.optimizers.items()}
+    assert set(moments.values()) == {3}
+    host.train_iteration(STEPS)
+    assert not any(torch.equal(p, before[name]) for name, p in model.gauss_params.items())
+    before_iteration(host, STEPS + 1)
+    host.train_iteration(STEPS + 1)
+    assert model.attached.attachment.t == STEPS + 3  # the next
 
 
 def test_accumulated_gradients_are_refused(capture, tmp_path):
