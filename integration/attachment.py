@@ -130,7 +130,16 @@ class Attachment:
         self._farewell = finalize(self, warn_without_hr, conductor, self.counts)
 
     def render_view(self, view: View, render_at: RenderAt) -> Any:
-        """Render a training view at both scales; returns what the host's render function returns at LR."""
+        """Render a training view at both scales; returns what the host's render function returns at LR.
+
+        Raises:
+            HostError: a backward pass is under way.
+        """
+        if current_pass() >= 0:
+            raise HostError(
+                f"{view.name} is rendered inside of a backward pass, as torch.utils.checkpoint does it: HR would be drawn twice, "
+                "and the loss be that of another picture. Checkpoint what comes before the rendering, or after it."
+            )
         self._finish_step()  # where not every optimizer has stepped, or the structure has changed since
         conductor, t, params = self.conductor, self.t, {name: p.detach() for name, p in self.params().items()}
         means = params["means"]

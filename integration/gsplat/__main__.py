@@ -14,6 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
+from torch.optim.optimizer import register_optimizer_step_pre_hook
+
 from clear_strategies.errors import HostError
 from integration import launcher
 from integration.gsplat.simple_trainer import install, photos_of
@@ -31,9 +33,11 @@ def _installed_by_cli(save_lr: Path | None, settings: Settings) -> Iterator[list
     """CLEAR is installed when the script calls `cli`, which is when its `Runner` exists."""
     distributed: Any = importlib.import_module("gsplat.distributed")
     cli, attached = distributed.cli, list[Any]()
+    before_cli = register_optimizer_step_pre_hook(_refuse_to_train)
 
     def cli_with_clear(train: Any, *args: Any, **kwargs: Any) -> Any:
         distributed.cli = cli
+        before_cli.remove()
         runner = getattr(train, "__globals__", {}).get("Runner")
         if runner is None:
             raise HostError(f"{sys.argv[0]} has no Runner, which gsplat's simple_trainer.py has.")
@@ -48,6 +52,14 @@ def _installed_by_cli(save_lr: Path | None, settings: Settings) -> Iterator[list
         yield attached
     finally:
         distributed.cli = cli
+        before_cli.remove()
+
+
+def _refuse_to_train(*_: Any) -> None:
+    raise HostError(
+        f"{sys.argv[0]} trains, but does not call gsplat's cli, as simple_trainer.py does, where CLEAR is installed. Call attach "
+        "in its loop: docs/how-to/each-host.md."
+    )
 
 
 def _save_lr(runner: Any, folder: Path) -> None:

@@ -22,7 +22,16 @@ from integration.attachment import Attachment, random_state_kept
 from integration.autograd_shot import HostOutput, Target
 from integration.densification import require_end, warn_if_score_is_unused
 from integration.detail import sh0_offset
-from integration.gsplat.calls import Rasterization, aliased, drawable, enlarged, host_output, seen_by, with_offset
+from integration.gsplat.calls import (
+    Rasterization,
+    aliased,
+    drawable,
+    enlarged,
+    host_output,
+    require_pinhole,
+    seen_by,
+    with_offset,
+)
 from integration.gsplat.poses import Poses
 from integration.lineage import RowNumbers
 from integration.optimizers import optimizers_of, step_detail
@@ -159,6 +168,7 @@ class Attached:
             view = self._poses.find(call["viewmats"]) if self._found_by_pose else self._named
             if view is None:  # a viewer, a camera without a photo
                 return rasterization(**self._with_detail(call, trained=False))
+            require_pinhole(call, self.attachment.conductor.showing)
 
             def render_at(target: Target, gate: Tensor | None, sized: View) -> HostOutput | Drawable:
                 return self._render(rasterization, call, sized, target, gate)

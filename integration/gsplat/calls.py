@@ -5,7 +5,7 @@ f_det in the colours; and what a call returns, as an `Attachment` needs it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import torch
 from jaxtyping import Bool, Float
@@ -23,12 +23,27 @@ from rasterizers.interface import Camera, Rasterizer
 Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 Call = Mapping[str, Any]
 """The arguments by name."""
+_LENS: Final = (
+    "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs", "lidar_coeffs", "external_distortion_coeffs",
+    "viewmats_rs", "rays",
+)  # fmt: skip
 
 
 def enlarged(call: Call, factor: int) -> dict[str, Any]:
     """With `factor` times as many pixels along an edge, colours alone."""
     Ks = call["Ks"] * call["Ks"].new_tensor([[factor], [factor], [1]])
     return {**call, "Ks": Ks, "width": call["width"] * factor, "height": call["height"] * factor, "render_mode": "RGB"}
+
+
+def require_pinhole(call: Call, showing: Sequence[object]) -> None:
+    """Raise a HostError for other cameras where strategies show pictures between photos, which are warped by pinhole cameras."""
+    model = call.get("camera_model", "pinhole")
+    lens = [name for name in _LENS if call.get(name) is not None] + [f"camera_model={model}"] * (model != "pinhole")
+    if lens and showing:
+        raise HostError(
+            f"{', '.join(type(s).__name__ for s in showing)} must have pinhole cameras, got {', '.join(lens)}. Undistort the "
+            "photos, or leave out the strategy."
+        )
 
 
 def seen_by(call: Call, camera: Camera) -> dict[str, Any]:

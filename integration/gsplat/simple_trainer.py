@@ -17,7 +17,6 @@ from torch import Tensor
 
 from clear_strategies.console import show_in_host
 from clear_strategies.errors import HostError, SettingError
-from clear_strategies.merging.conductor import Conductor
 from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
 from integration.gsplat.attached import Attached, require_bands
@@ -79,7 +78,8 @@ def install(
         require_supported(runner.cfg, runner.world_size)
         require_bands(runner.splats)
         chosen = wanted.conductor(runner.cfg.max_steps)
-        require_pinhole(runner.cfg, chosen, from_stereo=wanted.from_stereo)
+        if wanted.from_stereo:
+            require_pinhole(runner.cfg)
         end_with_strategies(chosen, runner.cfg.strategy, "refine_stop_iter", first=0)
         source, scale = wanted.sr_source(chosen)
         photos = photos_of(runner.trainset, runner.device)
@@ -116,14 +116,12 @@ def require_supported(config: Any, processes: int = 1) -> None:
         raise SettingError(f"CLEAR trains in one process, got {processes}. Set CUDA_VISIBLE_DEVICES to one device.")
 
 
-def require_pinhole(config: Any, conductor: Conductor, *, from_stereo: bool) -> None:
-    """Raise a SettingError for other cameras, which gsplat draws, where views or points are computed between photos."""
+def require_pinhole(config: Any) -> None:
+    """Raise a SettingError for other cameras, which gsplat draws, where points are computed between photos."""
     model = getattr(config, "camera_model", "pinhole")
-    computing = [type(s).__name__ for s in conductor.showing] + ["points=stereo"] * from_stereo
-    if model != "pinhole" and computing:
+    if model != "pinhole":
         raise SettingError(
-            f"camera_model: {' and '.join(computing)} must have pinhole cameras, got {model}. Undistort the photos, or leave "
-            "out what is named."
+            f"camera_model: points=stereo must have pinhole cameras, got {model}. Undistort the photos, or leave points at own."
         )
 
 

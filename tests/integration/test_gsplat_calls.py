@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.utils.checkpoint import checkpoint
 
-from clear_strategies import P2G, SVS, Conductor, RandomBackground, View
+from clear_strategies import P2G, SVS, Conductor, PseudoViews, RandomBackground, View
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.merging.in_place import merge_in_place
 from clear_strategies.schedules import Ramp
@@ -200,6 +201,34 @@ def test_a_compiled_loop_has_the_same_gradients(backend, recwarn):
         gradients.append({name: p.grad for name, p in host.splats.items() if p.grad is not None})
     assert all(torch.equal(g, gradients[1][name]) for name, g in gradients[0].items())
     assert not [warning for warning in recwarn if "ynamo" in str(warning.message)]
+
+
+@pytest.mark.parametrize("reentrant", [True, False])
+def test_a_rendering_that_a_backward_pass_makes_is_refused(reentrant):
+    _, clear, render = started()
+    with pytest.raises(HostError, match="view0 is rendered inside of a backward pass"):
+        checkpoint(lambda _: render(), torch.zeros(1, requires_grad=True), use_reentrant=reentrant).mean().backward()
+    assert not clear.attachment.counts["merges"]
+
+
+@pytest.mark.parametrize(
+    ("strategies", "more", "refused"),
+    [
+        ([PseudoViews()], {"camera_model": "fisheye"}, "camera_model=fisheye"),
+        ([PseudoViews()], {"radial_coeffs": torch.zeros(1, 6)}, "radial_coeffs"),
+        ([PseudoViews()], {"camera_model": "pinhole", "radial_coeffs": None}, ""),
+        ([], {"camera_model": "fisheye"}, ""),
+    ],
+)
+def test_what_is_computed_between_photos_is_refused_for_other_than_pinhole_cameras(strategies, more, refused):
+    @functools.wraps(gsplat_host.rasterization.func)
+    def function(*args, camera_model="pinhole", radial_coeffs=None, **kwargs):
+        return gsplat_host.rasterization(*args, **kwargs)
+
+    _, _, render = started(*strategies, host=Host(toy.scene(20), rasterization=function))
+    message = f"PseudoViews must have pinhole cameras, got {refused}"
+    with pytest.raises(HostError, match=message) if refused else nullcontext():
+        render(**more)
 
 
 def test_a_dropout_inside_of_the_hosts_function_drops_the_same_in_all_renderings_of_a_step():

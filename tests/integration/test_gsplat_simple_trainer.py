@@ -11,7 +11,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from clear_strategies import GCO, Conductor, PseudoViews
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.ply import read_gaussians
@@ -83,17 +82,12 @@ def test_options_that_do_not_work_with_two_scales_are_refused_before_the_first_s
         require_supported(SimpleNamespace(), 2)
 
 
-@pytest.mark.parametrize(
-    ("strategies", "points", "named"), [([PseudoViews()], "own", "PseudoViews"), ([GCO()], "stereo", "points=stereo")]
-)
-def test_what_is_computed_between_photos_is_refused_for_other_than_pinhole_cameras(strategies, points, named):
+def test_points_between_photos_are_refused_for_other_than_pinhole_cameras():
     from integration.gsplat.simple_trainer import require_pinhole
 
-    conductor, stereo = Conductor(*strategies), points == "stereo"
-    with pytest.raises(SettingError, match=f"camera_model: {named} must have pinhole cameras, got fisheye"):
-        require_pinhole(SimpleNamespace(camera_model="fisheye"), conductor, from_stereo=stereo)
-    require_pinhole(SimpleNamespace(camera_model="pinhole"), conductor, from_stereo=stereo)
-    require_pinhole(SimpleNamespace(camera_model="fisheye"), Conductor(GCO()), from_stereo=False)
+    with pytest.raises(SettingError, match="camera_model: points=stereo must have pinhole cameras, got fisheye"):
+        require_pinhole(SimpleNamespace(camera_model="fisheye"))
+    require_pinhole(SimpleNamespace())
 
 
 def test_save_lr_writes_the_photos_as_they_are_trained_on_and_stops(trainer):
@@ -109,6 +103,12 @@ def test_a_script_without_a_runner_that_trains_exits_with_an_error(trainer, capl
     monkeypatch.setattr("tests.integration.test_gsplat_simple_trainer.SCRIPT", script)
     assert trainer.run(trainer.sr) == 2
     assert "has no Runner" in caplog.text
+    trains = "import torch\np = torch.ones(1, requires_grad=True)\np.sum().backward()\ntorch.optim.SGD([p], 0.1).step()"
+    script.write_text(f"{trains}\nopen({str(tmp_path / 'trained')!r}, 'w').close()")
+    assert trainer.run(trainer.sr) == 2
+    assert "trains, but does not call gsplat's cli" in caplog.text
+    assert not (tmp_path / "trained").exists()
+    torch.optim.SGD([torch.ones(1, requires_grad=True)], 0.1).step()  # a later one in the same process
     script.write_text("")
     assert trainer.run(trainer.sr) == 1
     assert "trained without CLEAR" in caplog.text

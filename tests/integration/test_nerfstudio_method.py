@@ -250,7 +250,7 @@ def test_the_scalars_of_the_iteration_are_among_the_metrics(capture, tmp_path):
 
 
 def test_a_resumed_training_trains_on_from_its_iteration_to_the_end_that_it_has(capture, tmp_path, monkeypatch):
-    """nerfstudio's optimizers hold the parameters that loading a checkpoint replaces, and it trains max_num_iterations more."""
+    """Loading a checkpoint replaces the parameters that the optimizers hold; and max_num_iterations more steps are made."""
     monkeypatch.setenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "1")  # its checkpoints are from before torch 2.6
     first = trainer(configured(capture, tmp_path, strategies="svs"))
     first.train()
