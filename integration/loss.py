@@ -18,6 +18,7 @@ from clear_strategies.core.gradients import Grads, Shot
 from clear_strategies.core.view import ExtraView, View
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Update
+from clear_strategies.strategies.base import overrides
 from integration.autograd_shot import AutogradShot, leaves_of
 from integration.densification import ScoreScaler, score_for_host
 
@@ -45,10 +46,13 @@ def joint_loss(
         The loss, and the `Update`: the step for `Conductor.after_step`, densification scores, conflict ratios.
 
     Raises:
-        ValueError: `params` and the renderings do not name the same parameters, or one has no row for each Gaussian.
+        ValueError: `params` and the renderings do not name the same parameters, or one has no row for each Gaussian; f_det shows
+            at LR, or not at HR; a strategy has not started.
     """
     values = {name: p.detach() for name, p in params.items()}
     _require_rows(values)
+    _require_detail(params.get("detail"), lr, hr)
+    _require_started(conductor)
     update = conductor.update(values, lr, hr, view, t)
     objective, λ = conductor.objective, conductor.objective.lambda_hr(t)
     losses = update.losses
@@ -100,6 +104,27 @@ def _require_rows(params: Mapping[str, Tensor]) -> None:
             raise ValueError(
                 f"params[{name!r}] must have a row for each of the {n:,} Gaussians, got {[*p.shape]}. Leave it out: what else "
                 "the rendering depends on gets the gradient of LR."
+            )
+
+
+def _require_detail(detail: Tensor | None, lr: Shot, hr: Shot | None) -> None:
+    if detail is None or not detail.requires_grad:
+        return
+    for shot, shows, remedy in (
+        (lr, False, "lr is drawn with f_det, which renders at HR alone show. Draw it without"),
+        (hr, True, "hr is drawn without f_det, which would learn nothing. Draw it with an offset of the colours by"),
+    ):
+        if shot is None or shot.image.grad_fn is None:
+            continue
+        if any(leaf is detail for leaf in leaves_of(shot.image)) != shows:
+            raise ValueError(f"{remedy} params['detail'].")
+
+
+def _require_started(conductor: Conductor) -> None:
+    for s in conductor.strategies:
+        if s.cache.get("seed") is None and (overrides(s, "on_fit_start") or overrides(s, "on_views")):
+            raise ValueError(
+                f"{type(s).__name__} has not started. Call conductor.on_fit_start(len(views), seed, views=views) before the loop."
             )
 
 

@@ -86,13 +86,13 @@ def test_what_else_the_rendering_depends_on_gets_the_gradient_of_lr():
     host, view, conductor = Host(scene), scene.train[0], Conductor(GCO(), objective=HR_FROM_START)
     exposure, offset = torch.eye(3).requires_grad_(), torch.zeros(1, 1, 3, requires_grad=True)
 
-    def render(camera):
+    def render(camera, detail=None):
         p = host.params | {"sh0": host.params["sh0"] + offset}
-        splats = Splats(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"])
+        splats = Splats(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"], detail)
         shot = autograd.draw(toy.RASTERIZER, splats, camera)
         return AutogradShot(shot.image @ exposure, shot.means2d, shot.visible, host.params)
 
-    lr, hr = render(view.lr.camera), render(view.hr.camera)
+    lr, hr = render(view.lr.camera), render(view.hr.camera, host.params["detail"])
     (3 * joint_loss(conductor, host.params, lr, hr, view, 5)[0]).backward()
     (cotangent,) = conductor.objective.lr(lr.image.detach(), view.lr.image, None).cotangents
     for leaf, expected in zip(
@@ -105,7 +105,7 @@ def test_what_else_the_rendering_depends_on_gets_the_gradient_of_lr():
 def test_parameters_without_a_row_for_each_gaussian_or_of_other_names_are_refused():
     scene = toy.scene(20)
     host, view, conductor = Host(scene), scene.train[0], Conductor(objective=HR_FROM_START)
-    lr, hr = host.render(view.lr.camera), host.render(view.hr.camera)
+    lr, hr = host.render(view.lr.camera, detail=False), host.render(view.hr.camera)
     with pytest.raises(
         ValueError, match=r"params\['pose'\] must have a row for each of the 20 Gaussians, got \[1, 6\]"
     ):
@@ -115,19 +115,33 @@ def test_parameters_without_a_row_for_each_gaussian_or_of_other_names_are_refuse
         joint_loss(conductor, renamed, lr, hr, view, 5)
 
 
+def test_f_det_at_lr_or_not_at_hr_and_a_strategy_that_has_not_started_are_refused():
+    scene = toy.scene(20)
+    host, view, conductor = Host(scene), scene.train[0], Conductor(SVS(), objective=HR_FROM_START)
+    lr, hr = host.render(view.lr.camera, detail=False), host.render(view.hr.camera)
+    with pytest.raises(ValueError, match="SVS has not started"):
+        joint_loss(conductor, host.params, lr, hr, view, 5)
+    conductor.on_fit_start(3, 0)
+    joint_loss(conductor, host.params, lr, hr, view, 5)
+    with pytest.raises(ValueError, match="lr is drawn with f_det"):
+        joint_loss(conductor, host.params, host.render(view.lr.camera), hr, view, 5)
+    with pytest.raises(ValueError, match="hr is drawn without f_det"):
+        joint_loss(conductor, host.params, lr, host.render(view.hr.camera, detail=False), view, 5)
+
+
 def test_a_parameter_of_another_name_is_summed():
     scene = toy.scene(20)
     host, view, conductor = Host(scene), scene.train[0], Conductor(GCO(), objective=HR_FROM_START)
     host.params["tint"] = torch.zeros(20, 3, requires_grad=True)
 
-    def render(camera):
+    def render(camera, detail=0):
         p = host.params
-        offset = p["detail"] + p["tint"]
+        offset = p["tint"] + detail
         splats = Splats(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"], offset)
         shot = autograd.draw(toy.RASTERIZER, splats, camera)
         return AutogradShot(shot.image, shot.means2d, shot.visible, p)
 
-    lr, hr = render(view.lr.camera), render(view.hr.camera)
+    lr, hr = render(view.lr.camera), render(view.hr.camera, host.params["detail"])
     joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
     (g_lr,) = lr.vjp(conductor.objective.lr(lr.image.detach(), view.lr.image, None).cotangents)
     base, hf = hr.vjp(conductor.objective.hr(hr.image.detach(), view.hr.image, None).cotangents)
@@ -137,8 +151,8 @@ def test_a_parameter_of_another_name_is_summed():
 def test_a_rendering_of_another_size_is_refused():
     scene = toy.scene(20)
     host, view = Host(scene), scene.train[0]
-    small = host.render(view.lr.camera)
+    small = host.render(view.lr.camera, detail=False)
     with pytest.raises(
         ValueError, match="view view0: the HR rendering must have the 96x64 pixels of its HR image, got 24x16"
     ):
-        joint_loss(Conductor(objective=HR_FROM_START), host.params, small, small, view, 5)
+        joint_loss(Conductor(objective=HR_FROM_START), host.params, small, host.render(view.lr.camera), view, 5)

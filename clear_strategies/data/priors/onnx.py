@@ -66,7 +66,8 @@ class Onnx:
             network.setInput(lr.permute(2, 0, 1)[None].float().contiguous().numpy())
             out = np.asarray(network.forward())
         except cv2.error as error:
-            problem, remedy = f"cannot run on {width}x{height} ({error.err})", "export it for RGB images of any size"
+            problem = f"cannot run on {width}x{height} in OpenCV {cv2.__version__} ({error.err})"
+            remedy = "export it for RGB images of any size, and install OpenCV 4.11 or later"
             raise DataError(self.path, "network", problem, remedy) from error
         expected = (1, 3, height * factor, width * factor)
         if out.shape != expected:
