@@ -129,12 +129,13 @@ def measure(
             loops[name] = Loop(None if chosen == ALONE else chosen, gaussians, width, device, ours=chosen != name)
         turns = _timed(loops, repeats, device)
         rows, means = [], turns.groupby("loop").mean()
+        memory = (
+            {"peak_mib": torch.cuda.max_memory_allocated() / 2**20} if device == "cuda" else {}
+        )  # of all loops together
         for name, loop in loops.items():
             mean, alone = means.loc[name], means.loc[ALONE]
             clock = "ms" if device == "cuda" else "processor_ms"
-            rows.append(
-                {"loop": name, **mean, "times_alone": mean[clock] / alone[clock], **_counts(loop), **_memory(device)}
-            )
+            rows.append({"loop": name, **mean, "times_alone": mean[clock] / alone[clock], **_counts(loop), **memory})
         results.tables["host"] = pd.DataFrame(rows)
         if device == "cpu":
             results.tables["host_error"] = pd.DataFrame([_error(name) for name in strategies])
@@ -207,11 +208,6 @@ def _rasterization(device: str, *, ours: bool) -> Callable[..., Any]:
     from rasterizers.as_gsplat import rasterization
 
     return rasterization
-
-
-def _memory(device: str) -> dict[str, float]:
-    """MiB that torch has held on the device at most, for all loops together; nothing on the CPU."""
-    return {} if device == "cpu" else {"peak_mib": torch.cuda.max_memory_allocated() / 2**20}
 
 
 def _wait(device: torch.device) -> None:

@@ -43,7 +43,7 @@ class HostSteps:
         self._stepped.clear()
         self._hooks = [
             *(o.register_step_pre_hook(lambda o, given, named: self._before_one(o, *given, *named.values())) for o in distinct),
-            *(o.register_step_post_hook(lambda o, *_: self._after_one(o)) for o in distinct),
+            *(o.register_step_post_hook(lambda o, *_: None if self._extra.stepping else self._after(o)) for o in distinct),
         ]  # fmt: skip
 
     def on_merge(self) -> None:
@@ -85,7 +85,3 @@ class HostSteps:
         if begins:
             has_merged, self._has_merged = self._has_merged, False
             self._begins(has_merged)
-
-    def _after_one(self, optimizer: torch.optim.Optimizer) -> None:
-        if not self._extra.stepping:
-            self._after(optimizer)

@@ -55,7 +55,7 @@ class RowNumbers:
         means = self._means()
         rows = torch.arange(1, len(means) + 1, device=means.device)
         self._numbered = len(means)
-        self._put(rows)
+        self._entries[ROWS] = torch.nn.Parameter(rows, requires_grad=False) if self._as_parameter else rows
         self._unchanged = self._entries[ROWS], self._entries[ROWS]._version
 
     def poll(self) -> Int[Tensor, " M"] | None:
@@ -95,9 +95,6 @@ class RowNumbers:
             del self._entries[ROWS]
         for hook in self._hooks:
             hook.remove()
-
-    def _put(self, rows: Int[Tensor, " N"]) -> None:
-        self._entries[ROWS] = torch.nn.Parameter(rows, requires_grad=False) if self._as_parameter else rows
 
 
 def _leave_out(_: Any, stored: dict[str, Any], prefix: str, *__: Any) -> None:

@@ -97,8 +97,12 @@ class Pending:
 
         for drawing in self.output.shot.drawings:
             drawing.hook.reached = called
+
+        def told(_: Tensor) -> None:  # and the gradient is left as it is
+            called()
+
         for mark in self.output.marks:
-            mark.register_hook(lambda _: _and_nothing(called()))  # type: ignore[no-untyped-call]
+            mark.register_hook(told)  # type: ignore[no-untyped-call]
         centres = self.output.shot.gradient_slot.tensor
         if to_screen and centres.requires_grad:
 
@@ -149,10 +153,6 @@ class Pending:
                 "backward() once; what is only looked at, take by torch.autograd.grad. For a second pass over the same view, "
                 "call the function that was wrapped, its __wrapped__."
             )
-
-
-def _and_nothing(_: object) -> None:
-    """What a hook returns that leaves the gradient as it is."""
 
 
 def current_pass() -> int:

@@ -150,7 +150,10 @@ def initial_points(
     shown, initial = [blackened(photo) for photo in photos], None
     match settings.init:
         case "ply":
-            initial = _cleaned(settings, _from_ply(Path(str(settings.path))), photos, background)
+            points = read_points(path := Path(str(settings.path)))
+            if len(points) == 0:
+                raise DataError(path, "element vertex", "has no points", "give another file, or use another init")
+            initial = _cleaned(settings, points, photos, background)
         case "sfm" if sfm is not None:
             initial = _cleaned(settings, from_sfm(sfm), photos, background)
         case "sfm_train" if sfm is not None:
@@ -238,13 +241,6 @@ def _cleaned(
     elif settings.densify:
         cloud = densify(cloud, photos, settings.stride, background)
     return InitialPoints(cloud)
-
-
-def _from_ply(path: Path) -> PointCloud:
-    cloud = read_points(path)
-    if len(cloud) == 0:
-        raise DataError(path, "element vertex", "has no points", "give another file, or use another init")
-    return cloud
 
 
 def from_sfm(sfm: SfmPoints) -> PointCloud:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -89,10 +89,12 @@ def write_results(
     with kernel_threads(threads()), files.Beside() as beside:
         with work_log.stage("maps"):
             if mapped := spaced(state.views, settings.map_views):
-                with _without_it("maps"):  # their makers are strategies, anyone's
+                try:
                     rendered |= write_maps(
                         folder / "maps", stems, mapped, painter, state.conductor, rasterizer, state.t - 1, beside
                     )
+                except Exception as error:  # of their makers, anyone's strategies: the run is not lost by it
+                    _log.warning("maps: left out, %s: %s", type(error).__name__, one_line(error))
                 write_coverage(folder / _COVERAGE, scene, painter, title, beside)
         memory.release()  # the gradients that the maps are made of: several times the field
         with work_log.stage("evaluate"):
@@ -117,15 +119,6 @@ def write_results(
         ),
     )  # fmt: skip
     return evaluation
-
-
-@contextmanager
-def _without_it(what: str) -> Iterator[None]:
-    """A scope whose error is one line of the log: a run is not lost by it."""
-    try:
-        yield
-    except Exception as error:
-        _log.warning("%s: left out, %s: %s", what, type(error).__name__, one_line(error))
 
 
 def export_ply(path: Path, field: GaussianField, *, antialiased: bool = True, degree: int = 3) -> None:

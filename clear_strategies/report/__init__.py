@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from markupsafe import Markup, escape
 
 from clear_strategies import console, files
 from clear_strategies.commands import path_of
@@ -96,17 +95,9 @@ def _write_page(path: Path, sections: Sequence[Mapping[str, Any]]) -> None:
     from jinja2 import Environment, FileSystemLoader
 
     environment = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True)
-    environment.filters["in_code"] = _in_code
     scenes = [section["title"] for section in sections if "pictures" in section]
     title = f"Report: {', '.join(scenes) if len(scenes) < 4 else f'{len(scenes)} scenes'}"
     files.write_text(path, environment.get_template("page.html.j2").render(title=title, sections=sections))
-
-
-def _in_code(note: str) -> Markup:
-    """A note of the Markdown table as HTML: what stands between backticks is code."""
-    return Markup("").join(
-        Markup("<code>{}</code>").format(part) if i % 2 else escape(part) for i, part in enumerate(note.split("`"))
-    )
 
 
 def _file_names(scenes: Iterable[str]) -> dict[str, str]:

@@ -125,7 +125,8 @@ def collect(folders: Iterable[Path]) -> list[FinishedRun]:
 
 def _told_apart(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
     """The runs with other names for scenes of one name that are not the same: of other photos, or scored on other views."""
-    cameras = {run: _text(run.folder / CAMERAS) for run in runs}
+    files = {run: run.folder / CAMERAS for run in runs}
+    cameras = {run: file.read_text(encoding="utf-8") if file.is_file() else str(file) for run, file in files.items()}
     alike = {run: [other for other in runs if other.scene == run.scene] for run in runs}
     # Where the photos lay; runs that have the same cameras have the same.
     photos = {
@@ -176,10 +177,6 @@ def history(folder: Path) -> pd.DataFrame:
     except (OSError, ValueError) as error:
         _log.warning("%s: its history cannot be drawn (%s).", folder, error)
         return pd.DataFrame()
-
-
-def _text(path: Path) -> str:
-    return path.read_text(encoding="utf-8") if path.is_file() else str(path)
 
 
 def _is_setting(override: str) -> bool:

@@ -147,7 +147,12 @@ class Attached:
                 with recorded() as drawings, kept:
                     result = render(*call.args, **call.kwargs)
                 output = host_output(
-                    result, pinhole, params, gate, drawings, ranks_by_third_column=self._ranks_by_absgrad
+                    result,
+                    pinhole,
+                    params,
+                    gate,
+                    drawings,
+                    ranks_by_third_column=hasattr(self._model, "xyz_gradient_accum_abs"),
                 )
                 self._warn_of_what_was_not_read(overrides, output)
                 return output
@@ -181,11 +186,6 @@ class Attached:
 
     def _host_params(self) -> dict[str, Tensor]:
         return {name: getattr(self._model, attribute) for name, attribute in _ATTRIBUTES.items()}
-
-    @property
-    def _ranks_by_absgrad(self) -> bool:
-        """Mip-Splatting splits as many Gaussians by the absolute gradient as by the gradient: only its order counts."""
-        return hasattr(self._model, "xyz_gradient_accum_abs")
 
     def _require_pose_of_camera(self, call: Mapping[str, Any]) -> None:
         """InstantSplat's render takes its pose from an argument, not from the camera."""

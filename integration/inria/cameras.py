@@ -76,9 +76,9 @@ def photo_of(camera: Any, device: torch.device | str = "cpu") -> HostPhoto:
     """
     image, mask = camera.original_image.permute(1, 2, 0).detach().to(device), getattr(camera, "alpha_mask", None)
     shown = None if mask is None or bool((mask == 1).all()) else mask[0].to(image)
-    return HostPhoto(
-        _file_name(camera.image_name), image, camera.world_view_transform.T, intrinsics(camera), mask=shown
-    )
+    name = camera.image_name  # some hosts drop the ending, also of a name that contains dots
+    name = name if Path(name).suffix.lower() in SUFFIXES else f"{name}.png"
+    return HostPhoto(name, image, camera.world_view_transform.T, intrinsics(camera), mask=shown)
 
 
 def intrinsics(camera: Any) -> Float[Tensor, "3 3"]:
@@ -88,11 +88,6 @@ def intrinsics(camera: Any) -> Float[Tensor, "3 3"]:
     w, h = camera.image_width / 2, camera.image_height / 2
     fx, fy, cx, cy = projection[0, 0], projection[1, 1], projection[2, 0], projection[2, 1]
     return torch.tensor([[fx * w, 0, (cx + 1) * w], [0, fy * h, (cy + 1) * h], [0, 0, 1]], dtype=torch.float64)
-
-
-def _file_name(image_name: str) -> str:
-    """A name with an image suffix; a suffix is added where the host has dropped it, even if the name contains dots."""
-    return image_name if Path(image_name).suffix.lower() in SUFFIXES else f"{image_name}.png"
 
 
 def enlarged_camera(camera: Any, factor: int) -> Any:

@@ -118,7 +118,8 @@ def host_output(
 
     Args:
         camera: the camera of the photo at this resolution. drawings: see `AutogradShot`.
-        ranks_by_third_column: a third column of "viewspace_points" holds what the host ranks Gaussians by.
+        ranks_by_third_column: a third column of "viewspace_points" holds what the host ranks Gaussians by. Mip-Splatting splits
+            as many by the absolute gradient as by the gradient, so that only its order counts.
 
     Raises:
         HostError: the result has another type, or the image another size.

@@ -80,13 +80,14 @@ def capture(
     listing = model.listing
     kept = usable(listing, model.images, lambda image: paths[image.name], skip_faulty=skip_faulty, scene=root)
     masks = masks_of(folder.parent, paths.values())
-    frames = [
-        Frame.of_photo(
-            _name_below(folder, path := paths[image.name]), path, model.lenses[image.camera], image.pose,
+    frames = []
+    for image in kept:
+        path = paths[image.name]
+        inside = path.relative_to(folder) if path.is_relative_to(folder) else path  # which `sorted_by_name` refuses
+        frames.append(Frame.of_photo(
+            inside.as_posix(), path, model.lenses[image.camera], image.pose,
             upright=upright, background=background, sfm_id=image.id, mask=masks.get(path),
-        )
-        for image in kept
-    ]  # fmt: skip
+        ))  # fmt: skip
     below = model.folder.is_relative_to(root) and model.folder != root
     label = model.folder.relative_to(root).as_posix() if below else model.folder.name
     some_of = f" of its {len(model.images)}" if len(frames) < len(model.images) else ""
@@ -116,8 +117,3 @@ def _sfm_points(model: Model, label: str) -> SfmPoints | None:
     point, image = (torch.from_numpy(np.ascontiguousarray(ids)) for ids in model.points.track.T)
     source = f"COLMAP {label}, {len(means):,} points, triangulated from all {len(model.images)} images"
     return SfmPoints(means, colors, point, image, source)
-
-
-def _name_below(folder: Path, path: Path) -> str:
-    """The name of a photo's frame; a path that is not below the folder stays whole, which `sorted_by_name` refuses."""
-    return (path.relative_to(folder) if path.is_relative_to(folder) else path).as_posix()

@@ -33,12 +33,13 @@ _SIDES: Final = {"train_filenames": "train", "val_filenames": "test", "test_file
 _COEFFICIENTS: Final = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
-class _Lists(msgspec.Struct):
-    """How transforms.json splits its frames."""
+class _Shared(msgspec.Struct):
+    """What a file says of all of its frames: how it splits them, and its points."""
 
     train_filenames: list[str] = []
     val_filenames: list[str] = []
     test_filenames: list[str] = []
+    ply_file_path: str | None = None
 
 
 def recognises(path: Path) -> int:
@@ -70,7 +71,7 @@ def read(
         transforms = [_sized(transform, find) for transform in transforms]
         find = _in_place_of_first(image_folder(folder, images))
     paths = [find(transform.file_path) for transform in transforms]
-    lists = typed(file, content, _Lists)
+    lists = typed(file, content, _Shared)
     splits: dict[Path, str] = {}
     removed = list[str]()
     for key, side in _SIDES.items():
@@ -181,10 +182,6 @@ class Listed(NamedTuple):
     split: str | None
 
 
-class _Points(msgspec.Struct):
-    ply_file_path: str | None = None
-
-
 def transforms_of(path: Path, content: Mapping[str, Any]) -> list[Transform]:
     """The frames of a file's content, which name their images; a frame's own values replace those shared by all."""
     remedy = "give a transforms file"
@@ -223,7 +220,7 @@ def frames_of(
 
 def points_of(file: Path, content: Mapping[str, Any]) -> SfmPoints | None:
     """The points of the PLY file that a file names, if it does."""
-    if not (name := typed(file, content, _Points).ply_file_path):
+    if not (name := typed(file, content, _Shared).ply_file_path):
         return None
     cloud, none = read_points(finder(file.parent)(name)), torch.zeros(0, dtype=torch.long)
     return SfmPoints(cloud.means, cloud.colors, none, none, f"{name}, {len(cloud):,} points without tracks")
