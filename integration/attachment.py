@@ -366,7 +366,10 @@ def _require_supported(conductor: Conductor, accumulation: int) -> None:
         )
     distributed = torch.distributed
     if distributed.is_available() and distributed.is_initialized() and (n := distributed.get_world_size()) > 1:
-        raise SettingError(f"CLEAR trains in one process, got {n}. Start the training without torchrun, on one device.")
+        raise SettingError(
+            f"CLEAR trains in one process, got {n}. Start the training on one device: without torchrun, with "
+            "CUDA_VISIBLE_DEVICES=0, in nerfstudio with machine.num_devices=1."
+        )
 
 
 @contextmanager

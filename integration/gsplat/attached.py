@@ -119,7 +119,7 @@ class Attached:
         self._has_drawn_bands = False  # after a call with spherical harmonics, one without them draws no colours
         self._product: tuple[Tensor, Tensor, Tensor] | None = None  # see `_gated`
         self._trains_detail = detail
-        self._hr_by, self._told_of_hr = hr_by, ""
+        self._hr_by, self._told = hr_by, ""  # what draws HR, and what the log says of it
         self._is_ours = False  # the wrapped function is this package's, see `wrap`
         self._undo = ExitStack()
         stop, threshold = (getattr(strategy, name, None) for name in ("refine_stop_iter", "grow_grad2d"))
@@ -281,16 +281,15 @@ class Attached:
         except (ValueError, BackendUnavailable) as error:
             if self._hr_by != "auto":
                 raise
-            if self._told_of_hr != "host":
-                _log.info("HR and extra views are drawn by the host's own function: %s", error)
-            self._told_of_hr = "host"
+            self._tell(f"the host's own function: {error}")
             return None
-        if self._told_of_hr != backend:
-            _log.info(
-                "HR and extra views are drawn by this package's rasterizer %s, LR by the host's function.", backend
-            )
-        self._told_of_hr = backend
+        self._tell(f"this package's rasterizer {backend}, LR by the host's function.")
         return rasterizer
+
+    def _tell(self, by: str) -> None:
+        if by != self._told:
+            _log.info("HR and extra views are drawn by %s", by)
+        self._told = by
 
     def _gated(self, opacities: Float[Tensor, " N"], gate: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
         """Their product, made once for both scales."""

@@ -75,7 +75,7 @@ def install(
     @functools.wraps(train)
     def train_with_clear(runner: Any) -> Any:
         nonlocal last
-        require_supported(runner.cfg, runner.world_size)
+        require_supported(runner.cfg)
         require_bands(runner.splats)
         chosen = wanted.conductor(runner.cfg.max_steps)
         if wanted.from_stereo:
@@ -106,14 +106,12 @@ def install(
     runner_class.train, runner_class.rasterize_splats = train_with_clear, rasterize_the_view
 
 
-def require_supported(config: Any, processes: int = 1) -> None:
+def require_supported(config: Any) -> None:
     """Raise a SettingError for an option of simple_trainer that does not work with two scales."""
     for name, (needed, why) in _NEEDED.items():
         found = getattr(config, name, needed)
         if found != needed:
             raise SettingError(f"{name}: CLEAR needs {needed}, got {found}: {why}.")
-    if processes > 1:
-        raise SettingError(f"CLEAR trains in one process, got {processes}. Set CUDA_VISIBLE_DEVICES to one device.")
 
 
 def require_pinhole(config: Any) -> None:

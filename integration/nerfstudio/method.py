@@ -158,10 +158,6 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
         from clear_strategies.compose import conductor
 
         config, trainer, datamanager = self.config, host.trainer, host.pipeline.datamanager
-        if trainer.world_size > 1:
-            raise SettingError(
-                f"clear-splatfacto trains in one process, got {trainer.world_size}. Set machine.num_devices=1."
-            )
         if accumulated := {group: n for group, n in trainer.gradient_accumulation_steps.items() if n != 1}:
             raise SettingError(
                 f"gradient_accumulation_steps: clear-splatfacto merges the gradients of one view per step, got {accumulated}. "
