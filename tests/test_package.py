@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from packaging.requirements import Requirement
 
 import clear_strategies
 import clear_strategies as cs
@@ -55,6 +56,22 @@ def test_mypy_checks_a_users_file_against_the_packages_as_they_are_installed(tmp
     environment = os.environ | {"PYTHONPATH": str(tmp_path / "site")}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    ("system", "machine", "named"),
+    [
+        ("linux", "x86_64", {"open3d-cpu", "pycolmap"}),
+        ("linux", "aarch64", set()),
+        ("darwin", "arm64", {"open3d", "pycolmap"}),
+    ],
+)
+def test_the_extras_name_only_what_has_a_wheel_for_the_system(system, machine, named):
+    """Of pycolmap and of both Open3D there is no source on PyPI either: pip would install nothing of [photos] and [dev]."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    wanted = [Requirement(line) for extra in ("open3d", "colmap") for line in extras[extra]]
+    where = {"sys_platform": system, "platform_machine": machine}
+    assert {each.name for each in wanted if each.marker is None or each.marker.evaluate(where)} == named
 
 
 # ---- training from Python: what `train` returns

@@ -304,9 +304,8 @@ def _pycolmap() -> Any:
         with signals.held():
             import pycolmap
     except (ImportError, RuntimeError) as error:  # its own, where a library of the system is missing
-        raise DataError(
-            "data=photos", "pycolmap", f"cannot be imported ({error})", "pip install 'clear-strategies[colmap]'"
-        ) from error
+        remedy = "pip install 'clear-strategies[colmap]'; PyPI has none for Linux on arm64, there give poses of another program"
+        raise DataError("data=photos", "pycolmap", f"cannot be imported ({error})", remedy) from error
     return pycolmap
 
 
