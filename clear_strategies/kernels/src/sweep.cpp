@@ -37,7 +37,6 @@ void draw(const Sweep& s, const Swept& o, float inverse_depth, int row, float* _
   const int width = o.width, height = o.height, n = s.width;
   const float half_width = float(width) / 2.0f, half_height = float(height) / 2.0f;
   const float* __restrict other = o.image;
-#pragma GCC ivdep
   for (int i = 0; i < n; ++i) {
     const float z = Z[i] + dz, u = (X[i] + dx) / (z * half_width) - 1.0f, v = (Y[i] + dy) / (z * half_height) - 1.0f;
     reach[i] = z > 0.0f ? std::max(std::fabs(u), std::fabs(v)) : 1.0f;
