@@ -90,7 +90,7 @@ def test_a_method_is_the_same_whatever_strategies_are_named_before_it():
         printed, measured = (
             tree(composed(f"+method={name}", "skips=none", f"readings={r}")) for r in ("paper", "measured")
         )
-        rates = {key: measured["optim"][key] for key in ("detail_decay", "detail_steps")}
+        rates = {key: measured["optim"][key] for key in ("detail", "detail_decay", "detail_steps")}
         assert {**printed, "optim": {**printed["optim"], **rates}} == measured, name
 
 
