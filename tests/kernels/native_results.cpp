@@ -75,10 +75,10 @@ struct Loss {
 void stepped(const Weights& weights, ProductTable products_of) {
   const std::vector<float> scales = numbers(3 * n, 0.1f, 0.2f), filtered = numbers(3 * n, 0.1f, 0.3f), filter = numbers(n, 0.1f, 0.2f);
   const std::vector<float> sigmoid = numbers(n, 0.9f, 0.5f), factor = numbers(n, 0.5f, 0.7f);
-  const std::vector<float> basis = numbers(bases * n), route = numbers(n);
-  const Loss lr, base, hf;
-  const Gradients g{n, bases, basis.data(), lr.rows(), base.rows(), hf.rows(),
-                    {scales.data(), filtered.data(), filter.data(), sigmoid.data(), factor.data()}, route.data(), 0.5f};
+  const std::vector<float> basis = numbers(bases * n), detail = numbers(3 * n);
+  const Loss lr, hr;
+  const Gradients g{n, bases, basis.data(), lr.rows(), hr.rows(), detail.data(),
+                    {scales.data(), filtered.data(), filter.data(), sigmoid.data(), factor.data()}};
   print("conflicts of a step", products(g, products_of, threads));
   Step s;
   s.adam = {0.9f, 0.999f, 0.1f, 0.001f, 10.0f, 1e-15f};
