@@ -21,6 +21,9 @@ from torch.utils._pytree import tree_leaves
 R = TypeVar("R")
 T = TypeVar("T")
 
+_CACHED: Final = 0.25
+"""Of the free memory: as much may be cached when a recording begins."""
+
 
 class Recording(Generic[T]):
     """What `work` did on the device. It is done once while it is recorded, and again by each `replay`.
@@ -40,6 +43,7 @@ class Recording(Generic[T]):
     """
 
     def __init__(self, device: torch.device, work: Callable[[], T]) -> None:
+        _make_room(device)
         self._stream = _side_stream(device)
         self._pool = torch.cuda.graph_pool_handle()  # one for all graphs, since they run in order
         self._parts: list[tuple[Callable[[], None], Callable[[], bool]]] = []
@@ -55,7 +59,6 @@ class Recording(Generic[T]):
             except BaseException:
                 with suppress(Exception):  # a capture that failed is ended by an error, too
                     self._ends.close()
-                _failed.append(self._graph)
                 raise
 
     def pause(self, read: Callable[[], R], holds: Callable[[], bool]) -> R:
@@ -91,7 +94,7 @@ class Recording(Generic[T]):
 
         graph, stream, ends = cast(Any, torch.cuda.CUDAGraph()), warp_stream(self._stream), self._ends
         self._graph = graph
-        ends.callback(graph.capture_end)  # before anything can fail
+        ends.enter_context(_captured_by(graph, self._pool, self._stream.device.index))  # before anything can fail
         graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
         ends.callback(lambda: self._watch.kept.append(wp.capture_end(stream=stream)))
         wp.capture_begin(stream=stream, external=True)  # else the memory of Warp's sort would leak
@@ -104,7 +107,37 @@ class Recording(Generic[T]):
 
 
 _failed: Final[list[Any]] = []
-"""Graphs whose capture failed. Torch's allocator does not forget those that CUDA ended by an error, and asks them later."""
+"""Graphs whose capture CUDA has ended by an error. Torch's allocator of pinned memory asks them later, whose they are."""
+
+
+@contextmanager
+def _captured_by(graph: Any, pool: Any, device: int) -> Iterator[None]:
+    """A scope that ends the graph's capture. Where CUDA ends it by an error, torch goes on as within the capture: its allocator
+    keeps what is cached, also where memory runs out, `torch.cuda.empty_cache` and random numbers raise. This undoes that.
+    """
+    generator: Any = torch.cuda.default_generators[device]
+    before = generator.clone_state()
+    try:
+        yield
+    finally:
+        try:
+            graph.capture_end()
+        except BaseException:
+            _failed.append(graph)
+            with suppress(AttributeError, RuntimeError):  # torch before 2.8; the allocator had been told
+                torch._C._cuda_endAllocateToPool(device, pool)
+                torch._C._cuda_releasePool(device, pool)
+            generator.graphsafe_set_state(before)
+            raise
+
+
+def _make_room(device: torch.device) -> None:
+    """Give cached memory back before it runs short. In a capture torch gives none back, and what dropped recordings leave in
+    their pools nothing else can use.
+    """
+    cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    if cached > _CACHED * torch.cuda.mem_get_info(device)[0]:
+        torch.cuda.empty_cache()
 
 
 class _Watch(TorchDispatchMode):  # type: ignore[no-untyped-call]
@@ -125,11 +158,15 @@ class _Watch(TorchDispatchMode):  # type: ignore[no-untyped-call]
         kwargs = kwargs or {}
         if op.overloadpacket is torch.ops.aten._local_scalar_dense and args[0].device.type == self._device:
             raise RuntimeError("recorded work must not read a number from the device.")
-        result = op(*args, **kwargs)
+        given, result = tree_leaves((args, kwargs)), op(*args, **kwargs)
         if not (op.is_view or op._schema.is_mutable):
-            self._own |= {x.untyped_storage().data_ptr() for x in tree_leaves(result) if isinstance(x, Tensor)}
-        self.keep(tree_leaves((args, kwargs)))
+            self._own |= _addresses(tree_leaves(result)) - _addresses(given)  # aten.unsafe_split returns parts of what it is given
+        self.keep(given)
         return result
+
+
+def _addresses(tensors: Iterable[Any]) -> set[int]:
+    return {x.untyped_storage().data_ptr() for x in tensors if isinstance(x, Tensor)}
 
 
 class _Running(threading.local):

@@ -70,18 +70,19 @@ def launch(
     """Launch a kernel with a thread for each index of `dim`, in a scope of `on_stream`.
 
     As `wp.launch`, in a fifth of the host's time, which on CUDA exceeds the kernels': what does not change is recorded once.
+    Without any index the kernel is compiled and loaded, as it must have been before a recording.
 
     Args:
         arguments: numbers, structures of `struct`, and tensors or None for the kernel's arrays, see `array`.
         block: threads per block. together: a block for each index of `dim`, as of `wp.launch_tiled`.
     """
     size = (*dim, block) if together else tuple(dim)
-    if 0 in size:
-        return
     key = kernel, device, block
     recorded = _recorded.launches.get(key)
     if recorded is None:
         recorded = _recorded.launches[key] = _Launch(kernel, device, block)
+    if 0 in size:
+        return
     recorded.prepare(size, arguments).launch()
     if (recording := running()) is not None:
         recording.launched(arguments)

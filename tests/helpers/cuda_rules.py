@@ -7,7 +7,7 @@ name it is the CUDA runtime. What it refuses in a capture makes that capture inv
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 
@@ -17,7 +17,8 @@ class Act:
 
     Args:
         what: "pool", "begin", "end" and "replay" of a graph; "warp stream", "warp begin" and "warp end"; "wait" for another
-            stream; "work", "allocate", "sort", "read", "send" and "pin".
+            stream; "work", "allocate", "sort", "read", "send" and "pin"; "load" of a kernel's module; "random" numbers of the
+            device's own generator; "empty": `torch.cuda.empty_cache`.
         on: the stream. graph: whose pool, beginning, end or replay it is. other: the stream that is waited for.
         freed: the graph reads memory that is no more. by_warp: memory is Warp's, not torch's.
     """
@@ -30,14 +31,34 @@ class Act:
     by_warp: bool = False
 
 
+ROOM: Final = 64
+"""Pools of graphs that the device has memory for."""
+
+
 @dataclass
 class State:
-    """Torch's default stream, the graph that is being captured, whether Warp knows of that, and whether it has begun."""
+    """What the device, torch and Warp remember.
+
+    Args:
+        legacy: torch's default stream. capture: the graph that is being captured.
+        warp_knows: whether Warp knows of that; warp_runs: whether it has begun.
+        underway: the pools that torch's allocator allocates from, `captures_underway` in c10/cuda/CUDACachingAllocator.cpp.
+        seeds: whether torch's generator takes its next numbers for those of a capture.
+        living, cached: pools with graphs, and those whose graphs are no more.
+    """
 
     legacy: Any
     capture: Any = None
     warp_knows: bool = False
     warp_runs: bool = False
+    underway: list[Any] = field(default_factory=list)
+    seeds: bool = False
+    living: int = 0
+    cached: int = 0
+
+    def drop(self) -> None:
+        """A pool's graphs are no more. Its memory stays cached, for nobody else."""
+        self.living, self.cached = self.living - 1, self.cached + 1
 
     def captures(self, stream: Any) -> bool:
         return self.capture is not None and self.capture.stream is stream
@@ -143,6 +164,32 @@ def sending_numbers_of_python(a: Act, s: State) -> bool:
 def allocating_outside_the_pool(a: Act, s: State) -> bool:
     """Operation not permitted when stream is capturing: cudaMalloc, by Warp or by torch on a stream that is not captured."""
     return a.what == "allocate" and s.capture is not None and (a.by_warp or not s.captures(a.on))
+
+
+@check
+def allocating_beside_what_is_cached(a: Act, s: State) -> bool:
+    """CUDA out of memory: torch gives cached memory back only where no capture is underway (alloc_block in its allocator)."""
+    return a.what == "allocate" and s.capture is not None and s.living + s.cached > ROOM
+
+
+@check
+def emptying_the_cache_in_a_capture(a: Act, s: State) -> bool:
+    """captures_underway.empty() INTERNAL ASSERT FAILED (torch, also after a capture that CUDA has ended by an error: see
+    CUDAGraph::capture_end, whose endAllocateToPool comes after the check of cudaStreamEndCapture)."""
+    return a.what == "empty" and bool(s.underway)
+
+
+@check
+def random_numbers_after_a_failed_capture(a: Act, s: State) -> bool:
+    """Offset increment outside graph capture encountered unexpectedly (torch: a capture that CUDA has ended by an error leaves
+    the generator as within it; torch 2.13 has a state for each capture)."""
+    return a.what == "random" and s.capture is None and s.seeds
+
+
+@rule
+def loading_a_module(a: Act, s: State) -> bool:
+    """Operation not permitted when stream is capturing: cuModuleLoadData, by drivers before CUDA 12.3 (Warp's capture_begin)."""
+    return a.what == "load" and s.capture is not None
 
 
 @rule

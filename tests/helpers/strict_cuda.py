@@ -22,10 +22,12 @@ from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_mod
 from torch.utils._pytree import tree_leaves, tree_map
 
 from rasterizers.interface import BackendUnavailable
-from tests.helpers.cuda_rules import CHECKS, RULES, Act, State
+from tests.helpers.cuda_rules import CHECKS, ROOM, RULES, Act, State
 
-Pool = dict[int, torch.Tensor]
-"""Memory of graphs, by address. None of it is used a second time."""
+class Pool(dict[int, torch.Tensor]):
+    """Memory of graphs, by address. None of it is used a second time."""
+
+    used = False
 
 
 @dataclass(eq=False)
@@ -33,6 +35,7 @@ class Stream:
     """A `torch.cuda.Stream`."""
 
     cuda: StrictCuda
+    device = torch.device("cpu", 0)
 
     def wait_stream(self, other: Stream) -> None:
         self.cuda.ask("wait", on=self, other=other)
@@ -61,6 +64,20 @@ class StrictCuda:
         else:
             graph.calls.append((call, tree_map(graph.reference, arguments)))
 
+    def free(self, device: Any = None) -> tuple[int, int]:
+        """`torch.cuda.mem_get_info`, in pools."""
+        return max(0, ROOM - self.state.living - self.state.cached), ROOM
+
+    def empty_cache(self) -> None:
+        self.ask("empty")
+        self.state.cached = 0
+
+    def end_allocate(self, device: int, pool: Pool) -> None:
+        """`torch._C._cuda_endAllocateToPool`."""
+        if all(x is not pool for x in self.state.underway):
+            raise RuntimeError("endAllocatePool: not currently recording to mempool_id")
+        self.state.underway = [x for x in self.state.underway if x is not pool]
+
     @contextlib.contextmanager
     def using(self, stream: Stream) -> Iterator[None]:
         """`torch.cuda.stream`."""
@@ -78,20 +95,25 @@ class Graph:
         self.cuda, self.stream = cuda, cuda.current
         self.captured = self.invalid = False
         self.calls: list[tuple[Callable[..., Any], Any]] = []
-        self.pooled: Pool = {}
-        self.on_host: Pool = {}  # what a generator of the CPU has drawn meanwhile, which may be read
+        self.pooled = Pool()
+        self.on_host: dict[int, torch.Tensor] = {}  # what a generator of the CPU has drawn meanwhile, which may be read
 
     def capture_begin(self, pool: Pool | None = None, capture_error_mode: str = "global") -> None:
         self.cuda.ask("begin", graph=self)
-        self.pooled = {} if pool is None else pool
-        self.stream, self.cuda.state.capture = self.cuda.current, self
+        self.pooled, state = Pool() if pool is None else pool, self.cuda.state
+        if not self.pooled.used:
+            self.pooled.used, state.living = True, state.living + 1
+            weakref.finalize(self.pooled, state.drop)
+        self.stream, state.capture, state.seeds = self.cuda.current, self, True
+        state.underway.append(self.pooled)
 
     def capture_end(self) -> None:
         self.cuda.ask("end", graph=self)
         self.cuda.state.capture = None
         if self.invalid:
             raise RuntimeError("Operation failed due to a previous error during capture.")
-        self.captured = True
+        self.cuda.end_allocate(0, self.pooled)
+        self.cuda.state.seeds, self.captured = False, True
 
     def pool(self) -> Pool:
         self.cuda.ask("pool", graph=self)
@@ -135,6 +157,8 @@ class _Operations(TorchDispatchMode):
 
     def __torch_dispatch__(self, op: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         cuda, graph, kwargs = self.cuda, self.cuda.state.capture, kwargs or {}
+        if torch.Tag.nondeterministic_seeded in op.tags and kwargs.get("generator") is None:
+            cuda.ask("random")
         if graph is None:
             return op(*args, **kwargs)
         if kwargs.get("generator") is not None:
@@ -160,7 +184,7 @@ class _Operations(TorchDispatchMode):
         for x in made:
             if _address(x) not in theirs:
                 graph.pooled[_address(x)] = x.detach().fill_(torch.nan if x.is_floating_point() else 0)
-        if not name.startswith(("empty", "new_empty")):
+        if not name.startswith(("empty", "new_empty", "unsafe_split")):  # whose results are not written, or views
             cuda.do(partial(_write_anew, op), made, args, kwargs)
         return result
 
@@ -194,6 +218,19 @@ class _Functions(TorchFunctionMode):
         if act is not None and not (graph is not None and _address(args[0]) in graph.on_host):
             self.cuda.ask(act)
         return args[0] if act == "pin" else func(*args, **(kwargs or {}))
+
+
+class _Generator:
+    """One of `torch.cuda.default_generators`, or its state."""
+
+    def __init__(self, state: State) -> None:
+        self._state, self._seeds = state, state.seeds
+
+    def clone_state(self) -> _Generator:
+        return _Generator(self._state)
+
+    def graphsafe_set_state(self, other: _Generator) -> None:
+        self._state.seeds = other._seeds
 
 
 class _Elsewhere:
@@ -239,7 +276,8 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     from rasterizers import recording, replayed, replays, warp_runtime
     from rasterizers.warp_backend import frame, settings
 
-    cuda, autograd = StrictCuda(), _Elsewhere()
+    cuda, autograd, loaded = StrictCuda(), _Elsewhere(), set[Any]()
+    construct, state = warp_runtime._Launch.__init__, cuda.state
     sort, prepare, allocate, init = wp.utils.radix_sort_pairs, warp_runtime._Launch.prepare, wp.empty, wp.init
 
     def initialises() -> None:
@@ -263,6 +301,12 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         arrays = [wp.array(ptr=x.ptr, shape=x.shape, dtype=x.dtype, device=x.device) for x in (keys, values)]
         cuda.do(lambda: sort(*arrays, count, end_bit=end_bit))
 
+    def constructed(launcher: Any, kernel: Any, device: Any, block: int) -> None:
+        if (kernel, block) not in loaded:
+            cuda.ask("load")
+            loaded.add((kernel, block))
+        construct(launcher, kernel, device, block)
+
     def prepared(launcher: Any, size: Any, arguments: Any) -> Any:
         def launch() -> None:
             cuda.ask("work")
@@ -284,15 +328,19 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     patches: dict[Any, dict[str, Any]] = {
         torch.cuda: {
             "CUDAGraph": partial(Graph, cuda), "stream": cuda.using, "current_stream": lambda device: cuda.current,
-            "graph_pool_handle": dict, "synchronize": lambda device=None: cuda.ask("read"),
+            "graph_pool_handle": Pool, "synchronize": lambda device=None: cuda.ask("read"),
+            "memory_reserved": lambda device=None: state.living + state.cached, "mem_get_info": cuda.free,
+            "memory_allocated": lambda device=None: state.living, "empty_cache": cuda.empty_cache,
+            "default_generators": (_Generator(state),),
         },
+        torch._C: {"_cuda_endAllocateToPool": cuda.end_allocate, "_cuda_releasePool": lambda device, pool: None},
         wp: {
             "init": initialises, "stream_from_torch": warp_stream, "capture_begin": warp_begins, "capture_end": warp_ends,
             "empty": allocates,
         },
         torch.autograd: {name: autograd.does(getattr(torch.autograd, name)) for name in ("backward", "grad")},
         wp.utils: {"radix_sort_pairs": sorts},
-        warp_runtime._Launch: {"prepare": prepared},
+        warp_runtime._Launch: {"__init__": constructed, "prepare": prepared},
         recording: {"_side_stream": cache(lambda device: Stream(cuda))},
         deferred: {"is_immediate": lambda x: False},
         native: {"available": lambda: False},
@@ -302,7 +350,8 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         reconcile: {"_for_device": lambda device: warp_merge},
         rasterizers.native: {"empty": on_no_cpu},
         frame: {"DEFERRED_COUNTS": {"cpu": True}},
-        **{m: {"sent": sends} for m in (warp_runtime, settings)},
+        settings: {"sent": sends},
+        warp_runtime: {"sent": sends, "_recorded": warp_runtime._Recorded()},
     }  # fmt: skip
     for owner, values in patches.items():
         for name, value in values.items():

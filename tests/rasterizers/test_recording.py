@@ -15,7 +15,8 @@ from torch.utils._python_dispatch import _disable_current_modes
 from rasterizers.recording import Recording, on_side_stream, running
 from tests.helpers import toy
 from tests.helpers.backends import cotangents, everything, moved, needs, require_same_bits
-from tests.helpers.cuda_rules import RULES
+from rasterizers.warp_runtime import launch
+from tests.helpers.cuda_rules import ROOM, RULES
 from tests.helpers.strict_cuda import Graph, Stream, StrictCuda
 
 wp: Any = pytest.importorskip("warp")
@@ -68,6 +69,22 @@ def test_a_recording_keeps_what_it_reads(recorded_on):
     assert recorded.replay()
     del recorded
     assert x() is None
+
+
+def test_a_recording_keeps_memory_of_which_an_operation_returns_a_part(recorded_on):
+    def record():
+        x = torch.arange(2.0, device=recorded_on)
+        return Recording(recorded_on, lambda: torch.unsafe_chunk(x, 2)[1] + 1)
+
+    recorded = record()
+    assert recorded.replay()
+    assert recorded.result.item() == 2
+
+
+def test_memory_of_recordings_that_were_dropped_is_given_back_before_it_runs_short(strict_cuda):
+    for _ in range(2 * ROOM):
+        Recording(CPU, lambda: torch.zeros(1))
+    assert strict_cuda.state.cached <= ROOM / 4
 
 
 def test_a_rendering_is_replayed_for_another_camera_background_and_number_of_pairs(recorded_on):
@@ -140,6 +157,28 @@ def after_a_failure(cuda, x):
     x.add_(1)
 
 
+def after_a_failed_end(act):
+    def example(cuda, x):
+        graph = cuda.state.capture
+        for fails in (x.tolist, graph.capture_end):
+            with suppress(RuntimeError):
+                fails()
+        act(cuda, x)
+
+    return example
+
+
+def with_a_full_cache(cuda, x):
+    cuda.state.cached = ROOM
+    x.clone()
+
+
+@wp.kernel
+def doubled(x: wp.array(dtype=wp.float32)):
+    i = wp.tid()
+    x[i] = 2.0 * x[i]
+
+
 def on_the_default_stream(act):
     def example(cuda, x):
         with torch.cuda.stream(cuda.state.legacy):
@@ -169,6 +208,12 @@ EXAMPLES: dict[str, list[Callable[[StrictCuda, torch.Tensor], object]]] = {
     "allocating_outside_the_pool": [
         lambda cuda, x: wp.empty(3, device="cpu"), on_the_default_stream(lambda cuda, x: torch.empty(3))
     ],
+    "allocating_beside_what_is_cached": [with_a_full_cache],
+    "emptying_the_cache_in_a_capture": [
+        lambda cuda, x: torch.cuda.empty_cache(), after_a_failed_end(lambda cuda, x: torch.cuda.empty_cache())
+    ],
+    "random_numbers_after_a_failed_capture": [after_a_failed_end(lambda cuda, x: torch.rand(1))],
+    "loading_a_module": [lambda cuda, x: launch(doubled, [1], (x,), CPU)],
     "waiting_for_a_capturing_stream": [lambda cuda, x: cuda.state.legacy.wait_stream(cuda.current)],
     "a_capturing_stream_waiting": [lambda cuda, x: cuda.current.wait_stream(cuda.state.legacy)],
     "work_on_another_stream": [on_the_default_stream(lambda cuda, x: x.add_(1))],
@@ -205,7 +250,8 @@ def test_after_work_that_cannot_be_recorded_live_work_goes_on_and_other_work_is_
     s = strict_cuda.state
     found = s.capture, s.warp_knows, strict_cuda.current, running(), gc.isenabled()
     assert found == (None, False, s.legacy, None, True)
-    x.zero_().add_(1)
+    torch.cuda.empty_cache()
+    x.zero_().add_(torch.rand(1).mul_(0)).add_(1)
     recorded = Recording(CPU, lambda: x + 1)
     x.add_(1)
     assert (recorded.replay(), recorded.result.tolist()) == (True, [3])
