@@ -90,8 +90,11 @@ def that_merge(conductor: Conductor) -> Iterator[Strategy]:
 
 
 def _stored_by(strategy: Strategy) -> Any:
-    """All that the strategy stores beside `state`, to be compared. A tensor that is written in place stays the same."""
-    return [_comparable(x) for name, x in vars(strategy).items() if name not in ("state", "logs")]
+    """All that the strategy stores beside `state`, to be compared, and the numbers in `state` that the host reads, of which a
+    replay would repeat what they were. Another tensor that is written in place stays the same.
+    """
+    of_host = [x.item() for x in strategy.state.values() if x.dim() == 0 and not can_record(x.device)]
+    return of_host + [_comparable(x) for name, x in vars(strategy).items() if name not in ("state", "logs")]
 
 
 def _comparable(x: Any) -> Any:

@@ -15,7 +15,7 @@ from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.density.mcmc import MCMC
-from clear_strategies.merging.replays import LIVE
+from clear_strategies.merging.replays import LIVE, _stored_by
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
 from clear_strategies.training import checkpoint, loop
 from clear_strategies.training.compiled_step import CompiledStep
@@ -385,6 +385,41 @@ def test_what_a_strategy_decides_by_what_it_stores_holds_in_replays_or_they_are_
     else:
         require_one_line(caplog, 13)
         assert "by what it stores" in caplog.text
+
+
+@dataclass(frozen=True)
+class ByMean(cs.Strategy):
+    """Keeps of HR what a running mean says, a number of the run."""
+
+    in_place: bool = True
+
+    def on_fit_start(self, n_views, seed):
+        super().on_fit_start(n_views, seed)
+        self.state["mean"] = torch.ones(())
+
+    def reconcile(self, products, step):
+        return cs.Weights(keep=self.state["mean"].double())
+
+    def after_step(self, params, step):
+        if step.evidence is not None:
+            mean = 0.9 * self.state["mean"] + 0.1 * step.evidence.reliability.mean()
+            self.state["mean"] = self.state["mean"].copy_(mean) if self.in_place else mean
+
+
+@pytest.mark.parametrize("in_place", [True, False])
+def test_a_number_of_the_run_is_read_where_it_lies(in_place):
+    replayed = both(lambda: start(reconciles=ByMean(in_place), density=False, rises_at=2), 12)
+    assert ("replayed" in replayed.conductor.work_log.entries) is in_place
+
+
+def test_a_number_of_the_run_that_the_host_reads_holds_as_what_a_strategy_stores_in_python(monkeypatch):
+    monkeypatch.setattr(replays, "DEVICES", {"cuda"})
+    strategy = ByMean()
+    strategy.on_fit_start(1, 0)
+    before = _stored_by(strategy)
+    assert _stored_by(strategy) == before
+    strategy.state["mean"].mul_(0.5)
+    assert _stored_by(strategy) != before
 
 
 @dataclass(frozen=True)
