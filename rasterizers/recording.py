@@ -43,7 +43,6 @@ class Recording(Generic[T]):
     """
 
     def __init__(self, device: torch.device, work: Callable[[], T]) -> None:
-        _make_room(device)
         self._stream = _side_stream(device)
         self._pool = torch.cuda.graph_pool_handle()  # one for all graphs, since they run in order
         self._parts: list[tuple[Callable[[], None], Callable[[], bool]]] = []
@@ -51,8 +50,9 @@ class Recording(Generic[T]):
         self._watch = _Watch(device.type)
         self._graph: Any = None  # which is being captured, and what ends that
         self._ends = ExitStack()
-        with on_side_stream(device), _without_garbage_collection(), _running_as(self):
+        with _one_at_a_time, on_side_stream(device), _without_garbage_collection(), _running_as(self):
             try:
+                _make_room(device)
                 self._begin()
                 self.result = work()
                 self._end(lambda: True)
@@ -160,7 +160,7 @@ class _Watch(TorchDispatchMode):  # type: ignore[no-untyped-call]
             raise RuntimeError("recorded work must not read a number from the device.")
         given, result = tree_leaves((args, kwargs)), op(*args, **kwargs)
         if not (op.is_view or op._schema.is_mutable):
-            self._own |= _addresses(tree_leaves(result)) - _addresses(given)  # aten.unsafe_split returns parts of what it is given
+            self._own |= _addresses(tree_leaves(result)) - _addresses(given)  # unsafe_split returns what it is given
         self.keep(given)
         return result
 
@@ -170,10 +170,17 @@ def _addresses(tensors: Iterable[Any]) -> set[int]:
 
 
 class _Running(threading.local):
+    """What a thread is recording, and its side streams: work of another thread on one that is captured would be recorded, too."""
+
     recording: Recording[Any] | None = None
+
+    def __init__(self) -> None:
+        self.streams: dict[torch.device, Any] = {}
 
 
 _running: Final = _Running()
+_one_at_a_time: Final = threading.Lock()
+"""Of recordings by several threads, since Warp's list of captures is that of all threads, and so is Python's collector."""
 
 
 def running() -> Recording[Any] | None:
@@ -216,9 +223,11 @@ def on_side_stream(device: torch.device) -> Iterator[None]:
         outer.wait_stream(side)
 
 
-@cache
 def _side_stream(device: torch.device) -> Any:
-    return torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+    """This thread's."""
+    if device not in _running.streams:
+        _running.streams[device] = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+    return _running.streams[device]
 
 
 @cache

@@ -9,8 +9,8 @@ from __future__ import annotations
 import ctypes
 import math
 import threading
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
 from struct import Struct
@@ -83,7 +83,7 @@ def launch(
         recorded = _recorded.launches[key] = _Launch(kernel, device, block)
     if 0 in size:
         return
-    recorded.prepare(size, arguments).launch()
+    recorded.prepare(size, arguments).launch(_recorded.stream)
     if (recording := running()) is not None:
         recording.launched(arguments)
 
@@ -147,7 +147,11 @@ class _Launch:
 
 
 class _Recorded(threading.local):
-    """A thread's launches, by kernel, device and threads per block, and its arrays to be sorted, by length and device."""
+    """A thread's launches, by kernel, device and threads per block, its arrays to be sorted, by length and device, and the stream
+    of `on_stream`.
+    """
+
+    stream: Any = None
 
     def __init__(self) -> None:
         self.launches: dict[tuple[Any, torch.device, int], _Launch] = {}
@@ -155,6 +159,7 @@ class _Recorded(threading.local):
 
 
 _recorded = _Recorded()
+_sorting: Final = threading.Lock()
 _MOST_SHAPES: Final = 256  # the number of Gaussians, and so the shapes, change in a long training
 
 
@@ -176,7 +181,9 @@ def sort_pairs(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
             wp.array(ptr=x.data_ptr(), shape=len(x), dtype=wp.int32, device=device) for x in (keys, values)
         )
     arrays[0].ptr, arrays[1].ptr = keys.data_ptr(), values.data_ptr()
-    wp.utils.radix_sort_pairs(*arrays, count, end_bit=bits)
+    # Warp sorts on its current stream, which is that of all threads.
+    with _sorting, wp.ScopedStream(_recorded.stream, sync_enter=False):
+        wp.utils.radix_sort_pairs(*arrays, count, end_bit=bits)
     if (recording := running()) is not None:
         recording.launched((keys, values))
 
@@ -274,14 +281,12 @@ def _offsets(kind: Any) -> Mapping[str, int]:
     return {name: getattr(kind.ctype, name).offset for name, _ in kind.ctype._fields_}
 
 
-def on_stream(device: torch.device) -> AbstractContextManager[Any]:
-    """A scope in which Warp launches on torch's current stream."""
-    if device.type == "cpu":
-        return nullcontext()
-    import warp as wp
-
-    wp.init()
-    scope: AbstractContextManager[Any] = wp.ScopedStream(
-        warp_stream(torch.cuda.current_stream(device)), sync_enter=False
-    )
-    return scope
+@contextmanager
+def on_stream(device: torch.device) -> Iterator[None]:
+    """A scope in which this thread launches on torch's current stream."""
+    outer, current = _recorded.stream, None if device.type == "cpu" else torch.cuda.current_stream(device)
+    _recorded.stream = None if current is None else warp_stream(current)
+    try:
+        yield
+    finally:
+        _recorded.stream = outer

@@ -333,7 +333,9 @@ class WarpRendering:
         )  # fmt: skip
         for stride in (1, types.SEGMENT):  # without pairs a recording, which folds by both, finds the kernel loaded
             pairs = view.pairs if stride in frame.folds else 0
-            frame.launch(fold(k, absolute), pairs, view.counts, view.firsts, lists.splats, view.total, stride, pair_sums)
+            frame.launch(
+                fold(k, absolute), pairs, view.counts, view.firsts, lists.splats, view.total, stride, pair_sums
+            )
         frame.launch(
             project_vjp(k, absolute, weight is not None), frame.n, frame.pose, view.grid, frame.cuts, frame.means, frame.quats,
             frame.scales, view.opacities, frame.slopes, frame.bands > 0, view.ellipses, view.counts, view.firsts, pair_sums, *out,

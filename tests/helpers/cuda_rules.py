@@ -175,14 +175,16 @@ def allocating_beside_what_is_cached(a: Act, s: State) -> bool:
 @check
 def emptying_the_cache_in_a_capture(a: Act, s: State) -> bool:
     """captures_underway.empty() INTERNAL ASSERT FAILED (torch, also after a capture that CUDA has ended by an error: see
-    CUDAGraph::capture_end, whose endAllocateToPool comes after the check of cudaStreamEndCapture)."""
+    CUDAGraph::capture_end, whose endAllocateToPool comes after the check of cudaStreamEndCapture).
+    """
     return a.what == "empty" and bool(s.underway)
 
 
 @check
 def random_numbers_after_a_failed_capture(a: Act, s: State) -> bool:
     """Offset increment outside graph capture encountered unexpectedly (torch: a capture that CUDA has ended by an error leaves
-    the generator as within it; torch 2.13 has a state for each capture)."""
+    the generator as within it; torch 2.13 has a state for each capture).
+    """
     return a.what == "random" and s.capture is None and s.seeds
 
 

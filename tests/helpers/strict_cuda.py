@@ -24,6 +24,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 from rasterizers.interface import BackendUnavailable
 from tests.helpers.cuda_rules import CHECKS, ROOM, RULES, Act, State
 
+
 class Pool(dict[int, torch.Tensor]):
     """Memory of graphs, by address. None of it is used a second time."""
 
@@ -312,7 +313,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
             cuda.ask("work")
             cuda.do(lambda *given: prepare(launcher, size, given).launch(), *arguments)
 
-        return type("Command", (), {"launch": staticmethod(launch)})
+        return type("Command", (), {"launch": staticmethod(lambda stream: launch())})
 
     def allocates(*args: Any, **kwargs: Any) -> Any:
         cuda.ask("allocate", by_warp=True)

@@ -5,6 +5,7 @@ import re
 import threading
 import weakref
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any
 
@@ -12,10 +13,11 @@ import pytest
 import torch
 from torch.utils._python_dispatch import _disable_current_modes
 
+from rasterizers import recording, warp_runtime
 from rasterizers.recording import Recording, on_side_stream, running
+from rasterizers.warp_runtime import launch
 from tests.helpers import toy
 from tests.helpers.backends import cotangents, everything, moved, needs, require_same_bits
-from rasterizers.warp_runtime import launch
 from tests.helpers.cuda_rules import ROOM, RULES
 from tests.helpers.strict_cuda import Graph, Stream, StrictCuda
 
@@ -117,6 +119,51 @@ def test_the_side_stream_waits_for_earlier_work_and_later_work_for_it(strict_cud
         side, legacy = strict_cuda.current, strict_cuda.state.legacy
         assert waits == [(side, legacy)]
     assert waits == [(side, legacy), (legacy, side)]
+
+
+def in_two_threads(call):
+    with ThreadPoolExecutor(2) as threads:
+        return [*threads.map(lambda _: call(), range(2))]
+
+
+def test_launches_of_two_threads_are_each_on_the_stream_of_its_own(monkeypatch):
+    class Command:
+        def prepare(self, size, arguments):
+            return self
+
+        def launch(self, stream):
+            on.append((threading.get_ident(), stream))
+
+    on: list[tuple[int, int]] = []
+    both_are_here = threading.Barrier(2, timeout=60)
+
+    def launches():
+        with warp_runtime.on_stream(torch.device("cuda")):
+            for _ in range(2):
+                both_are_here.wait()
+                launch(doubled, [1], (), torch.device("cuda"))
+        assert warp_runtime._recorded.stream is None
+
+    monkeypatch.setattr(warp_runtime, "_Launch", lambda *_: Command())
+    monkeypatch.setattr(warp_runtime, "warp_stream", lambda stream: stream)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: threading.get_ident())
+    in_two_threads(launches)
+    assert len({thread for thread, _ in on}) == 2
+    assert all(thread == stream for thread, stream in on)
+
+
+def test_each_thread_records_on_a_stream_of_its_own(monkeypatch):
+    both_are_here = threading.Barrier(2, timeout=60)
+    monkeypatch.setattr(torch.cuda, "Stream", lambda device: object())
+
+    def streams():
+        both_are_here.wait()
+        return [recording._side_stream(CPU) for _ in range(2)]
+
+    first, second = in_two_threads(streams)
+    assert first[0] is first[1]
+    assert second[0] is second[1]
+    assert first[0] is not second[0]
 
 
 def test_a_backward_pass_runs_in_a_thread_of_its_own(recorded_on):
