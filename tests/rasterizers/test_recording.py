@@ -89,6 +89,26 @@ def test_memory_of_recordings_that_were_dropped_is_given_back_before_it_runs_sho
     assert strict_cuda.state.cached <= ROOM / 4
 
 
+def test_memory_of_a_recording_that_was_dropped_is_given_back(recorded_on, monkeypatch):
+    monkeypatch.setattr(recording, "_CACHED", 0.0)
+    reserved = []
+    for _ in range(4):
+        Recording(recorded_on, lambda: torch.zeros(2**24, device=recorded_on))
+        reserved.append(torch.cuda.memory_reserved(recorded_on))
+    assert reserved[1:] == [reserved[1]] * 3
+
+
+def test_where_cuda_ends_a_recording_by_an_error_the_cache_and_random_numbers_are_as_before(recorded_on):
+    x = torch.zeros(2, device=recorded_on)
+    with pytest.raises(RuntimeError):
+        Recording(recorded_on, x.tolist)
+    torch.cuda.empty_cache()
+    x += torch.rand(2, device=recorded_on).floor()
+    recorded = Recording(recorded_on, lambda: x + 1)
+    assert recorded.replay()
+    assert recorded.result.tolist() == [1, 1]
+
+
 def test_a_rendering_is_replayed_for_another_camera_background_and_number_of_pairs(recorded_on):
     import rasterizers
 
