@@ -179,7 +179,7 @@ class _Running(threading.local):
 
 
 _running: Final = _Running()
-_one_at_a_time: Final = threading.Lock()
+_one_at_a_time: Final = threading.RLock()
 """Of recordings by several threads, since Warp's list of captures is that of all threads, and so is Python's collector."""
 
 

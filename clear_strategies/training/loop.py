@@ -262,6 +262,7 @@ def fit(
         saved = save()
         if pending:
             raise Interrupted(foremost(pending), "after the last iteration", saved)
+    state.replays = None  # recordings keep the memory of iterations, which evaluation and pictures need
     state.history_as_floats()
     return state
 

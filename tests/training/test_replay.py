@@ -1,5 +1,6 @@
 """Replayed iterations: the bits of the live ones, and every reason to be live."""
 
+import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -244,6 +245,15 @@ def test_recordings_of_an_earlier_structure_are_dropped():
         found = [kept.do(kind, 1, None, live=lambda: "live", record=recorded) for _ in range(3)]
         assert found == ["replayed" if address else "live", "replayed", "replayed"]
         assert len(made) == address + 1
+
+
+def test_recordings_are_dropped_at_the_end_of_training(monkeypatch):
+    state, made, init = start(density=False, iterations=4), [], Recording.__init__
+    monkeypatch.setattr(Recording, "__init__", lambda self, *args: made.append(weakref.ref(self)) or init(self, *args))
+    state.settings = replace(state.settings, replay=True)
+    loop.fit(state, SCENE.to(DEVICE), rasterizers.load("warp", device=DEVICE.type))
+    assert made
+    assert not [recording for recording in made if recording() is not None]
 
 
 @pytest.mark.parametrize(("lasts", "pays"), [(1, False), (2, False), (3, True), (20, True)])
