@@ -16,7 +16,9 @@ def test_every_command_is_understood_and_a_step_that_fails_or_is_cut_off_stops_n
     programs.mkdir()
     called = f'echo "$(basename $0) $*" >> "{tmp_path}/calls"; echo "the last line"'
     beside = f'case "$*" in *gsplat.cuda*) touch "{tmp_path}/gsplat"; exit ;; esac'  # other steps
-    limited = f'{beside}; echo "$2" >> "{tmp_path}/limits"; shift 2; "$@" || exit; case "$*" in *" host "*) exit 124 ;; esac'
+    limited = (
+        f'{beside}; echo "$2" >> "{tmp_path}/limits"; shift 2; "$@" || exit; case "$*" in *" host "*) exit 124 ;; esac'
+    )
     for name, program in {"python": called, "compute-sanitizer": called, "timeout": limited}.items():
         (programs / name).write_text(f"#!/bin/sh\n{program}\n")
         (programs / name).chmod(0o755)
