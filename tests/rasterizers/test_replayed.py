@@ -11,6 +11,7 @@ from rasterizers import rasterization, replayed
 from rasterizers.recording import Recording
 from tests.helpers import toy
 from tests.helpers.backends import needs
+from tests.helpers.strict_cuda import Stream
 
 pytestmark = needs("warp")
 ANGLES = (0.0, 0.3, -0.2, 0.5)
@@ -87,6 +88,18 @@ def test_a_loop_sees_the_bits_of_live_drawings(recorded_on, replays, background)
 
     both(recorded_on, steps)
     assert len(replays) == 2 * 6 + 1  # the first is live; the backward pass of that which is recorded is a replay, too
+
+
+def test_a_loop_on_a_stream_of_its_own(recorded_on, replays, request):
+    if recorded_on.type == "cuda":
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+    else:
+        stream = Stream(request.getfixturevalue("strict_cuda"))
+    with torch.cuda.stream(stream):
+        both(recorded_on, lambda params, **how: [step(params, angle, **how) for angle in ANGLES])
+    torch.cuda.synchronize()
+    assert replays
 
 
 def test_other_numbers_of_gaussians_bands_sizes_and_pairs(recorded_on, replays):
