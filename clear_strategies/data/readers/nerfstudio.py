@@ -185,7 +185,9 @@ class Listed(NamedTuple):
 def transforms_of(path: Path, content: Mapping[str, Any]) -> list[Transform]:
     """The frames of a file's content, which name their images; a frame's own values replace those shared by all."""
     remedy = "give a transforms file"
-    frames = typed(path, content.get("frames") or None, list[dict[str, Any]], where="frames", remedy=remedy)
+    frames = typed(path, content.get("frames", []), list[dict[str, Any]], where="frames", remedy=remedy)
+    if not frames:
+        raise DataError(path, "frames", "there is none", remedy)
     shared = {name: content[name] for name in Transform.__struct_fields__ if name in content}
     transforms = [typed(path, {**shared, **frame}, Transform, where=f"frames[{i}]") for i, frame in enumerate(frames)]
     if unnamed := [i for i, transform in enumerate(transforms) if not transform.file_path]:

@@ -168,7 +168,7 @@ INPUTS = [
     case("no JSON", "blender", write(TRAIN, b"{'a': 1}"), r"transforms_train\.json: json: is not valid"),
     case("JSON list", "blender", write(TRAIN, b"[]"), r"transforms_train\.json: json: is a list"),
     case("deep JSON", "blender", write(TRAIN, b"[" * 100_000), r"transforms_train\.json: json: .*deep"),
-    case("no frames", "blender", edit(TRAIN, lambda v: v.update(frames=[])), r"transforms_train\.json: frames"),
+    case("no frames", "blender", edit(TRAIN, lambda v: v.update(frames=[])), r"transforms_train\.json: frames: there is none"),
     case("no angle", "blender", edit(TRAIN, lambda v: v.pop("camera_angle_x")), r"fl_x: is missing.*camera_angle_x"),
     case("angle beyond pi", "blender", edit(TRAIN, lambda v: v.update(camera_angle_x=4)), r"camera_angle_x: is 4"),
     case("two frames of one file", "blender", edit_frame(TRAIN, file_path="./train/a"), r"'a' belongs to two"),
