@@ -188,7 +188,7 @@ def _once_each(paths: Sequence[Path]) -> list[Path]:
 
 
 def _key(paths: Sequence[Path], *settings: int) -> str:
-    digest = hashlib.sha256(repr(("upright copies, points of two views, affine, reasons in words", *settings)).encode())
+    digest = hashlib.sha256(repr(("upright copies, points of two views, affine, EXIF on trial", *settings)).encode())
     for path in paths:
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:24]

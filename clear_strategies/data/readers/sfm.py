@@ -1,7 +1,8 @@
 """Structure from motion on the CPU through pycolmap: a sparse model from photos alone, with bounded memory.
 
 COLMAP reads copies of the photos: upright JPEG files, no larger than needed. Photos of the same size and the same focal length in
-EXIF share a camera, whose estimate starts at that focal length.
+EXIF share a camera, whose estimate starts at that focal length. If photos are left without a pose, all are placed again as if
+EXIF said nothing, since programs and adapters write wrong focal lengths, and the model with more photos is used.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from clear_strategies import files, signals
 from clear_strategies.core.images import to_bytes
 from clear_strategies.core.progress import Progress
 from clear_strategies.data.capture import MORE_PHOTOS, NO_PARALLAX, STEP_ASIDE
+from clear_strategies.data.file_names import some
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.errors import DataError
 
@@ -41,11 +43,15 @@ UNPLACED: Final = "unplaced.json"
 """A file in the model's folder: why the pose is unknown, for each photo without one, by its name."""
 _DATABASE: Final = "database.db"
 _COPIES: Final = "copies"
+_WORK: Final = (
+    "[0-9a-f]" * 24 + ".????????"
+)  # folders of runs that estimate poses: the key in the cache, and tempfile's ending
 _FEW_FEATURES: Final = 200  # a photo with fewer shows too little
 _MATCHED: Final = 50  # features in common, from which a pair's relation is trusted
 _NEARLY_ALL: Final = 0.9  # of the pairs
 _TURN: Final = 0.03  # entries by which a map between two photos may differ from a turn's, as distortion makes it
 _LISTED: Final = 3  # photos without a pose in the warning, at most
+_UNKNOWN: Final = 1.2  # a focal length in larger sides of the photo: COLMAP's own first guess
 _DIAGONAL_35MM: Final = math.hypot(36, 24)  # mm
 _LARGE: Final = 1_200_000  # px of a copy, above which its own scale has features enough
 _ENOUGH: Final = 0.25  # of the features that a photo may have
@@ -81,28 +87,41 @@ def reconstruct(root: Path, photos: Mapping[Path, float | None], folder: Path, s
     pycolmap = _pycolmap()
     _require_addresses(root, _threads(settings))
     folder.parent.mkdir(parents=True, exist_ok=True)
+    _sweep(folder.parent)
     count = len(photos)
     _log.info("%s: estimating the poses of %d photos, up to %d features each.", root, count, settings.max_features)
     try:
-        with tempfile.TemporaryDirectory(prefix=f"{folder.name}.", dir=folder.parent) as work:
+        with tempfile.TemporaryDirectory(prefix=f"{folder.name}.", dir=folder.parent) as work, files.hold(Path(work)):
             models = sorted(
                 _map(pycolmap, photos, Path(work), settings), key=lambda m: m.num_reg_images(), reverse=True
             )
-            sizes = [model.num_reg_images() for model in models]
-            require_placed(root, max(sizes, default=0), count)
+            require_placed(root, _most(models), count)
             (result := Path(work) / "result").mkdir()
             models[0].write_binary(str(result))
-            placed = {image.name for image in models[0].images.values()}
+            placed = [{image.name for image in model.images.values()} for model in models]  # a photo may be in several
             names = [path.name for path in photos]
-            files.write_json(result / UNPLACED, _unplaced(pycolmap, Path(work) / _DATABASE, names, placed))
+            files.write_json(result / UNPLACED, _unplaced(pycolmap, Path(work) / _DATABASE, names, placed[0]))
             files.install(result, folder, MODEL)
     except RuntimeError as error:
         raise DataError(root, "poses", f"structure-from-motion failed ({error})", MORE_PHOTOS) from error
-    if len(sizes) > 1:
-        groups = ", ".join(map(str, sizes))
+    groups = [len(group.difference(*placed[:i])) for i, group in enumerate(placed)]
+    if any(groups[1:]):
+        told = ", ".join(str(count) for count in groups if count)
         _log.warning(
-            "%s: the photos fall into groups that nothing connects (%s photos); the largest is used.", root, groups
+            "%s: the photos fall into groups that nothing connects (%s photos); the largest is used.", root, told
         )
+
+
+def _sweep(cache: Path) -> None:
+    """Remove the folders of runs that were killed: the system has freed their locks."""
+    for left in cache.glob(_WORK):
+        try:
+            with files.hold(left):
+                pass
+        except files.HeldError:
+            continue
+        shutil.rmtree(left, ignore_errors=True)
+        _log.debug("%s: removed, a process died while it estimated poses here.", left)
 
 
 def copy_name(index: int) -> str:
@@ -144,22 +163,56 @@ def _map(pycolmap: Any, photos: Mapping[Path, float | None], work: Path, setting
             find(octave=-1)
         _keep_coarsest(pycolmap, database, settings.max_features)
         _match(pycolmap, database, [name for names in groups.values() for name in names], settings.threads)
-        mapping = pycolmap.IncrementalPipelineOptions()
-        mapping.num_threads, mapping.random_seed = settings.threads, settings.seed
-        # COLMAP's thresholds are for hundreds of photos. Of ten photos around a table these place six where those place four.
-        mapping.mapper.init_min_num_inliers, mapping.mapper.init_min_tri_angle = 50, 8.0
-        mapping.mapper.abs_pose_min_num_inliers = 15
-        # Most points of few photos are seen by two photos only. With these points those six poses are four times more exact.
-        mapping.triangulation.ignore_two_view_tracks = False
-        _require_parallax(pycolmap, database, next(iter(photos)).parent)
-        _log.info("placing the photos.")
-        progress, placed = Progress("placing", "photos", count), itertools.count(3)  # after the first two
-        models = pycolmap.incremental_mapping(
-            database, copies, work, options=mapping, next_image_callback=lambda: progress(next(placed))
-        )
+        root = next(iter(photos)).parent
+        _require_parallax(pycolmap, database, root)
+        models = _place(pycolmap, work, count, settings)
+        lengths = sorted({focal for focal in photos.values() if focal is not None})
+        if (placed := _most(models)) < count and lengths:
+            _log.info("%d of %d photos are placed: again, without EXIF's focal length.", placed, count)
+            _forget_focal_lengths(pycolmap, database, settings.threads)
+            free = _place(pycolmap, work, count, settings)
+            if (more := _most(free)) > placed:
+                models, told = free, some([f"{focal:g} mm" for focal in lengths])
+                message = "%s: EXIF's focal length (%s on 35 mm film) is not used: %d of %d photos are placed with it, %d without"
+                _log.warning(message, root, told, placed, count, more)
     finally:
         pycolmap.logging.minloglevel = level
+    return models
+
+
+def _place(pycolmap: Any, work: Path, count: int, settings: SfmSettings) -> list[Any]:
+    """The models that COLMAP makes of the related pairs, those of most photos first."""
+    mapping = pycolmap.IncrementalPipelineOptions()
+    mapping.num_threads, mapping.random_seed = settings.threads, settings.seed
+    # COLMAP's thresholds are for hundreds of photos. Of ten photos around a table these place six where those place four.
+    mapping.mapper.init_min_num_inliers, mapping.mapper.init_min_tri_angle = 50, 8.0
+    mapping.mapper.abs_pose_min_num_inliers = 15
+    # Most points of few photos are seen by two photos only. With these points those six poses are four times more exact.
+    mapping.triangulation.ignore_two_view_tracks = False
+    _log.info("placing the photos.")
+    progress, placed = Progress("placing", "photos", count), itertools.count(3)  # after the first two
+    models = pycolmap.incremental_mapping(
+        work / _DATABASE, work / _COPIES, work, options=mapping, next_image_callback=lambda: progress(next(placed))
+    )
     return list(models.values())
+
+
+def _most(models: Sequence[Any]) -> int:
+    """The photos of the largest model."""
+    return max((model.num_reg_images() for model in models), default=0)
+
+
+def _forget_focal_lengths(pycolmap: Any, database: Path, threads: int) -> None:
+    """Relate the matched pairs anew, with cameras whose focal lengths are unknown."""
+    with pycolmap.Database.open(database) as opened:
+        for camera in opened.read_all_cameras():
+            size = camera.width, camera.height
+            unknown = pycolmap.Camera.create_from_model_id(camera.camera_id, camera.model, _UNKNOWN * max(size), *size)
+            opened.update_camera(unknown)
+        opened.clear_two_view_geometries()
+    options = pycolmap.GeometricVerifierOptions()
+    options.num_threads = threads
+    pycolmap.geometric_verification(database, options)
 
 
 def _find_features(pycolmap: Any, database: Path, groups: _Groups, settings: SfmSettings, *, octave: int) -> int:

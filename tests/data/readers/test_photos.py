@@ -6,15 +6,18 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import ExifTags, Image
 
-from clear_strategies.data.readers import colmap, photos, sfm
+from clear_strategies import files
+from clear_strategies.core.images import to_bytes
+from clear_strategies.data.readers import colmap, demo, photos, sfm
 from clear_strategies.data.readers.sfm import SfmSettings
 from clear_strategies.errors import DataError
 from tests.helpers.captures import largest_turn
@@ -60,6 +63,37 @@ def test_poses_are_those_of_the_ground_truth(shared_data, tmp_path, monkeypatch,
     assert again.unplaced == capture.unplaced
     assert sorted(p.name for p in folder.iterdir()) == [*(frame.name for frame in truth), "z_flat.png"]
     assert len(list((tmp_path / "cache").iterdir())) == 1
+
+
+@pytest.fixture(scope="module")
+def room() -> list[Image.Image]:
+    """Four photos of the demo's room, by a lens of 31 mm on 35 mm film, that overlap."""
+    return [Image.fromarray(to_bytes(frame.load())) for frame in demo.read(width=200, height=150).frames[:4]]
+
+
+def save_photos(folder: Path, pictures: Sequence[Image.Image], *focals: int) -> Path:
+    """Files of photos, with these focal lengths on 35 mm film in EXIF: of each, or of all."""
+    folder.mkdir()
+    for i, (picture, focal) in enumerate(zip(pictures, focals * (len(pictures) // len(focals)), strict=True)):
+        exif = Image.Exif()
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = focal
+        picture.save(folder / f"{i}.jpg", quality=95, exif=exif)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("focals", "told"),
+    [
+        ((31,), ""),
+        ((600,), "(600 mm on 35 mm film) is not used: 0 of 4 photos are placed with it, 4 without"),
+        ((31, 31, 31, 600), ""),
+    ],
+)
+def test_photos_are_placed_whatever_focal_length_exif_claims(room, tmp_path, caplog, focals, told: str) -> None:
+    capture = photos.read(save_photos(tmp_path / "photos", room, *focals), tmp_path / "cache", threads=1)
+    assert len(capture.frames) == 4
+    assert [frame.camera.fx for frame in capture.frames] == pytest.approx([180] * 4, rel=0.1)
+    assert (told in caplog.text) if told else not caplog.text
 
 
 def flat_photos(folder: Path, count: int) -> Path:
@@ -213,7 +247,8 @@ def estimate(tmp_path, monkeypatch):
 
 
 def test_the_largest_of_several_models_is_kept_and_a_full_disk_is_told(tmp_path, estimate, caplog):
-    estimate(lambda *_: [FakeModel("0", "1", "2"), FakeModel("3", "4", "5", "6", "7"), FakeModel("8", "9")])
+    models = FakeModel("0", "1", "2"), FakeModel("3", "4", "5", "6", "7"), FakeModel("3", "4"), FakeModel("2", "8", "9")
+    estimate(lambda *_: models)
     assert (tmp_path / "poses/images.bin").read_text() == "3,4,5,6,7"
     assert "groups that nothing connects (5, 3, 2 photos); the largest is used" in caplog.text
 
@@ -232,6 +267,17 @@ def test_poses_that_another_run_has_estimated_meanwhile_are_kept(tmp_path, estim
 
     estimate(slower)
     assert [(p.name, p.read_text()) for p in tmp_path.glob("poses*/*")] == [("cameras.bin", "of the other run")]
+
+
+def test_folders_of_killed_runs_are_removed_from_the_cache_and_no_others(tmp_path, estimate):
+    killed, works, kept = (tmp_path / name for name in ("0" * 24 + ".a_1bcdef", "1" * 24 + ".a_1bcdef", "my.photos"))
+    for folder in (killed, works, kept):
+        folder.mkdir()
+        (folder / "database.db").touch()
+    with files.hold(works):
+        estimate(lambda *_: [FakeModel("0", "1", "2")])
+    assert sorted(path.name for path in tmp_path.glob("*.*")) == [works.name, kept.name]
+    assert (works / "database.db").exists()
 
 
 def test_the_features_of_a_large_photo_begin_at_its_own_scale(tmp_path: Path) -> None:
