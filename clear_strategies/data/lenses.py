@@ -64,11 +64,9 @@ class Lens:
 
     def resized(self, width: int, height: int, file: Path) -> Lens:
         """The same lens for an image scaled to another size, each axis by its own factor; a DataError where the two sizes differ
-        in their aspect ratio, beyond a pixel of rounding: `file` is another image.
+        in their aspect ratio, beyond a pixel of rounding of the smaller one: `file` is another image.
         """
-        low = max((width - 1) / self.width, (height - 1) / self.height)
-        high = min((width + 1) / self.width, (height + 1) / self.height)
-        if low > high:
+        if abs(width * self.height - height * self.width) > max(width + height, self.width + self.height):
             problem = f"is {width}x{height}, but its camera is for {self.width}x{self.height}: another shape"
             remedy = "use the images that the cameras were estimated from, or a scaled copy of them"
             raise DataError(file, "size", problem, remedy)

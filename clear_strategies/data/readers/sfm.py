@@ -143,7 +143,7 @@ def require_placed(root: Path, placed: int, count: int, least: float = 0.0) -> N
 
 def _map(pycolmap: Any, photos: Mapping[Path, float | None], work: Path, settings: SfmSettings) -> list[Any]:
     """The models that COLMAP's incremental pipeline finds: features, matching of all pairs, mapping."""
-    copies, database, count = work / _COPIES, work / _DATABASE, len(photos)
+    copies, database, count, root = work / _COPIES, work / _DATABASE, len(photos), next(iter(photos)).parent
     level = pycolmap.logging.minloglevel
     # COLMAP's progress is hundreds of lines, and its errors are raised.
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
@@ -154,16 +154,20 @@ def _map(pycolmap: Any, photos: Mapping[Path, float | None], work: Path, setting
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(work.parent))  # COLMAP would end the process
         find = functools.partial(_find_features, pycolmap, database, groups, settings)
         if min(width * height for width, height, _ in groups) <= _LARGE:
-            find(octave=-1)
+            found = find(octave=-1)
         elif (found := find(octave=0)) < _ENOUGH * settings.max_features:
             _log.info(
                 "half of the photos have %d features or fewer: they are found again, in photos enlarged twice.", found
             )
             database.unlink()
-            find(octave=-1)
+            found = find(octave=-1)
+        if found < _FEW_FEATURES:
+            message = (
+                "%s: half of the photos have %d features or fewer: they are small, blurred, dark, or without texture."
+            )
+            _log.warning(message, root, found)
         _keep_coarsest(pycolmap, database, settings.max_features)
         _match(pycolmap, database, [name for names in groups.values() for name in names], settings.threads)
-        root = next(iter(photos)).parent
         _require_parallax(pycolmap, database, root)
         models = _place(pycolmap, work, count, settings)
         lengths = sorted({focal for focal in photos.values() if focal is not None})

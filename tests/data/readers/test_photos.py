@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageFilter
 
 from clear_strategies import files
 from clear_strategies.core.images import to_bytes
@@ -94,6 +94,13 @@ def test_photos_are_placed_whatever_focal_length_exif_claims(room, tmp_path, cap
     assert len(capture.frames) == 4
     assert [frame.camera.fx for frame in capture.frames] == pytest.approx([180] * 4, rel=0.1)
     assert (told in caplog.text) if told else not caplog.text
+
+
+def test_photos_with_too_few_features_are_told_as_such_before_none_is_related(room, tmp_path, caplog) -> None:
+    blurred = [picture.filter(ImageFilter.GaussianBlur(6)) for picture in room]
+    with pytest.raises(DataError, match="could be related"):
+        photos.read(save_photos(tmp_path / "photos", blurred, 31), tmp_path / "cache", threads=1)
+    assert "features or fewer: they are small, blurred, dark, or without texture" in caplog.text
 
 
 def flat_photos(folder: Path, count: int) -> Path:

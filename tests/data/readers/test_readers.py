@@ -119,6 +119,14 @@ def test_distortion_is_removed_and_noted(model: str, tmp_path: Path) -> None:
     assert capture.frames[0].load().shape == (12, 16, 3)
 
 
+@pytest.mark.parametrize(("photo", "copy"), [((9500, 6333), (1600, 1067)), ((1067, 1600), (6333, 9500))])
+def test_a_lens_of_rounded_size_is_that_of_the_photo_and_of_no_other_shape(photo, copy) -> None:
+    lens = Lens(*copy, 1000, 1000, 800, 533).resized(*photo, Path("a.jpg"))
+    assert (lens.width, lens.height) == photo
+    with pytest.raises(DataError, match="another shape"):
+        lens.resized(copy[0] * 102 // 100, copy[1], Path("a.jpg"))
+
+
 def test_the_files_lists_split_the_frames_and_the_rest_is_logged(tmp_path, caplog):
     lists = {"train_filenames": ["images/b.png"], "val_filenames": ["images/a.png"], "test_filenames": []}
     capture = nerfstudio.read(changed(tmp_path, lambda value: value.update(lists)))
