@@ -58,6 +58,10 @@ def overrides(arguments: Sequence[str]) -> list[str]:
         )
     if not path.exists():
         raise SettingError(f"train: {path} is not there. Name the folder of the photos or of the capture.")
+    if others := [word for word in rest if "=" not in word and path_of(word).is_dir()]:
+        raise SettingError(
+            f"train: {others[0]} is a second folder. Put all photos of the scene into one folder, and give that."
+        )
     from clear_strategies.compose import quoted
 
     defaults = {"+strategy=best": CHOOSE_STRATEGIES, f"fit.iterations={_ITERATIONS}": _CHOOSE_ITERATIONS}

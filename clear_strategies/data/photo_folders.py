@@ -81,7 +81,8 @@ def list_images(folder: Path) -> list[Path]:
         return images
     problem, remedy = f"holds no image ({', '.join(SUFFIXES)})", "check the path"
     if inside := folders_of_images(folder):
-        problem, remedy = f"{problem}, but {counted(folder, inside)}", "give one of these folders"
+        problem = f"{problem}, but {counted(folder, inside)}"
+        remedy = "give one of these folders, or put all photos of the scene into one"
     elif other := in_place_of_photos(path for pattern in ("*", *_BELOW) for path in sorted(folder.glob(pattern))):
         problem, remedy = f"{problem}, but {other[0]}", other[1]
     raise DataError(folder, "images", problem, remedy)
