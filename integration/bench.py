@@ -129,9 +129,8 @@ def measure(
             loops[name] = Loop(None if chosen == ALONE else chosen, gaussians, width, device, ours=chosen != name)
         turns = _timed(loops, repeats, device)
         rows, means = [], turns.groupby("loop").mean()
-        memory = (
-            {"peak_mib": torch.cuda.max_memory_allocated() / 2**20} if device == "cuda" else {}
-        )  # of all loops together
+        # Of all loops together.
+        memory = {"peak_mib": torch.cuda.max_memory_allocated() / 2**20} if device == "cuda" else {}
         for name, loop in loops.items():
             mean, alone = means.loc[name], means.loc[ALONE]
             clock = "ms" if device == "cuda" else "processor_ms"

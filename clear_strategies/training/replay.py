@@ -74,12 +74,10 @@ class IterationReplays:
 
     def _kind(self, given: Given) -> Kind:
         s, λ = self._state, self._state.conductor.objective.lambda_hr(given.t)
-        of_density = {
-            name: x for name, x in s.density.state_dict().items() if x.dim() > 0
-        }  # others are made for a checkpoint
-        tables = s.field.raw(), s.optimizer.first, s.optimizer.second, of_density, s.conductor.state_dict()
-        rows = [x for table in tables for x in table.values()]
-        addresses = [x.data_ptr() for x in (s.field.filter_3d, *rows)]
+        tables = s.field.raw(), s.optimizer.first, s.optimizer.second, s.conductor.state_dict()
+        statistics = [x for x in s.density.state_dict().values() if x.dim() > 0]  # others are made for a checkpoint
+        stored = [s.field.filter_3d, *statistics, *(x for table in tables for x in table.values())]
+        addresses = [x.data_ptr() for x in stored]
         facts: list[Any] = [s.field.degree, given.background is None, given.behind, λ > 0]
         if isinstance(given, GivenView):
             facts += [given.gate is None, *given.scales.values(), s.density.collects(given.t)]

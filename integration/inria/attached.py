@@ -146,14 +146,8 @@ class Attached:
                 kept = nullcontext() if target == "lr" else random_state_kept(self._model._xyz.device)
                 with recorded() as drawings, kept:
                     result = render(*call.args, **call.kwargs)
-                output = host_output(
-                    result,
-                    pinhole,
-                    params,
-                    gate,
-                    drawings,
-                    ranks_by_third_column=hasattr(self._model, "xyz_gradient_accum_abs"),
-                )
+                ranks = hasattr(self._model, "xyz_gradient_accum_abs")
+                output = host_output(result, pinhole, params, gate, drawings, ranks_by_third_column=ranks)
                 self._warn_of_what_was_not_read(overrides, output)
                 return output
 

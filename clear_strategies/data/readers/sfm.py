@@ -43,9 +43,8 @@ UNPLACED: Final = "unplaced.json"
 """A file in the model's folder: why the pose is unknown, for each photo without one, by its name."""
 _DATABASE: Final = "database.db"
 _COPIES: Final = "copies"
-_WORK: Final = (
-    "[0-9a-f]" * 24 + ".????????"
-)  # folders of runs that estimate poses: the key in the cache, and tempfile's ending
+_WORK: Final = "[0-9a-f]" * 24 + ".????????"
+"""Folders of runs that estimate poses: the key in the cache, and tempfile's ending."""
 _FEW_FEATURES: Final = 200  # a photo with fewer shows too little
 _MATCHED: Final = 50  # features in common, from which a pair's relation is trusted
 _NEARLY_ALL: Final = 0.9  # of the pairs
@@ -162,10 +161,8 @@ def _map(pycolmap: Any, photos: Mapping[Path, float | None], work: Path, setting
             database.unlink()
             found = find(octave=-1)
         if found < _FEW_FEATURES:
-            message = (
-                "%s: half of the photos have %d features or fewer: they are small, blurred, dark, or without texture."
-            )
-            _log.warning(message, root, found)
+            why = "they are small, blurred, dark, or without texture"
+            _log.warning("%s: half of the photos have %d features or fewer: %s.", root, found, why)
         _keep_coarsest(pycolmap, database, settings.max_features)
         _match(pycolmap, database, [name for names in groups.values() for name in names], settings.threads)
         _require_parallax(pycolmap, database, root)
