@@ -305,9 +305,24 @@ def _text_cameras(path: Path, used: Set[int] | None) -> Iterator[tuple[int, Lens
 
 
 def _text_images(path: Path) -> Iterator[Image]:
-    """A line of each image's pose. Lines of its 2D points, three numbers for each, are not used; some programs leave them out."""
-    said, lines = _lines(path)
-    poses = [(line, text) for line, text in lines if text.strip(_NUMERIC) or len(text.split()) % 3]
+    """A line of an image's pose, and behind it one of its 2D points, which are not used, may be none, or are left out.
+
+    A line that could be either is taken as the number of images in the file's header says.
+    """
+    poses, either = list[tuple[int, str]](), list[tuple[int, str]]()
+    above, (said, lines) = False, _lines(path)  # whether the line above is a pose
+    for line, text in lines:
+        pose = _could_be_pose(text)
+        points = above and len(text.split()) % 3 == 0 and not (pose and text.strip(_NUMERIC))
+        if points and pose:
+            either.append((line, text))
+        elif text.strip() and not points:
+            poses.append((line, text))
+        above = bool(text.strip()) and not points
+    if either and said not in (len(poses), len(poses) + len(either)):
+        raise _damaged(path, f"line {either[0][0]}", "could be an image's pose or the 2D points of the image above")
+    if either and said > len(poses):
+        poses = sorted(poses + either)
     _warn_if_cut(path, said, len(poses))
     for line, text in poses:
         cells = text.split(maxsplit=9)
@@ -316,6 +331,17 @@ def _text_images(path: Path) -> Iterator[Image]:
         number, camera = _numbers(path, line, (cells[0], cells[8]), _whole)
         numbers = _numbers(path, line, cells[1:8], float)
         yield Image(number, tuple(numbers[:4]), tuple(numbers[4:]), camera, cells[9].strip())
+
+
+def _could_be_pose(text: str) -> bool:
+    """Whether a line has an id, a quaternion of a length that is read, the id of a camera and a name where an image has them."""
+    cells = text.split(maxsplit=9)
+    if len(cells) < 10 or not (cells[0].isdecimal() and cells[8].isdecimal()):
+        return False
+    try:
+        return 0.5 < math.hypot(*map(float, cells[1:5])) < 2
+    except ValueError:
+        return False
 
 
 def _text_points(path: Path) -> Iterator[_Point]:
