@@ -119,8 +119,7 @@ class AutogradShot:
         opacities, and the colours by their factors. With `weight` as `core.gradients.summed` makes them.
         """
         if self.drawing is not None:
-            rendering, v = self.drawing.rendering, self._at_drawing(cotangents)
-            return gradients_of(rendering.vjp(v) if weight is None else summed_vjp(rendering, v, weight))
+            return gradients_of(summed_vjp(self.drawing.rendering, self._at_drawing(cotangents), weight))
         each = self._gradients_of_host(cotangents)
         if weight is None:
             return each

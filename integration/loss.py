@@ -51,7 +51,8 @@ def joint_loss(
     """
     values = {name: p.detach() for name, p in params.items()}
     _require_rows(values)
-    _require_detail(params.get("detail"), lr, hr)
+    leaves_of_lr = leaves_of(lr.image)
+    _require_detail(params.get("detail"), leaves_of_lr, hr)
     _require_started(conductor)
     update = conductor.update(values, lr, hr, view, t)
     objective, λ = conductor.objective, conductor.objective.lambda_hr(t)
@@ -65,7 +66,7 @@ def joint_loss(
             f"the renderings must name their parameters as params does; they have no gradient of {', '.join(lost)}."
         )
     trained = [(p, merged[name].to(p)) for name, p in params.items() if name in merged]
-    leaves, gradients = zip(*trained, *_others(conductor, params, lr, view, t), strict=True)
+    leaves, gradients = zip(*trained, *_others(conductor, params, lr, leaves_of_lr, view, t), strict=True)
 
     loss = with_gradients(value, gradients, *leaves)
     if scaler is not None and isinstance(lr, AutogradShot):
@@ -107,17 +108,15 @@ def _require_rows(params: Mapping[str, Tensor]) -> None:
             )
 
 
-def _require_detail(detail: Tensor | None, lr: Shot, hr: Shot | None) -> None:
+def _require_detail(detail: Tensor | None, leaves_of_lr: Sequence[Tensor], hr: Shot | None) -> None:
     if detail is None or not detail.requires_grad:
         return
-    for shot, shows, remedy in (
-        (lr, False, "lr is drawn with f_det, which renders at HR alone show. Draw it without"),
-        (hr, True, "hr is drawn without f_det, which would learn nothing. Draw it with an offset of the colours by"),
-    ):
-        if shot is None or shot.image.grad_fn is None:
-            continue
-        if any(leaf is detail for leaf in leaves_of(shot.image)) != shows:
-            raise ValueError(f"{remedy} params['detail'].")
+    if any(leaf is detail for leaf in leaves_of_lr):
+        raise ValueError("lr is drawn with f_det, which renders at HR alone show. Draw it without params['detail'].")
+    if hr is not None and hr.image.grad_fn is not None and not any(leaf is detail for leaf in leaves_of(hr.image)):
+        raise ValueError(
+            "hr is drawn without f_det, which would learn nothing. Draw it with an offset of the colours by params['detail']."
+        )
 
 
 def _require_started(conductor: Conductor) -> None:
@@ -129,12 +128,12 @@ def _require_started(conductor: Conductor) -> None:
 
 
 def _others(
-    conductor: Conductor, params: Mapping[str, Tensor], lr: Shot, view: View, t: int
-) -> Iterator[tuple[Tensor, Tensor]]:
+    conductor: Conductor, params: Mapping[str, Tensor], lr: Shot, leaves_of_lr: Sequence[Tensor], view: View, t: int
+) -> Iterator[tuple[Tensor, Tensor]]:  # fmt: skip
     """The leaves that the LR rendering depends on besides `params`, each with the gradient of λ_LR L_LR."""
     slot = lr.gradient_slot.tensor if isinstance(lr, AutogradShot) else lr.means2d
     known = {id(slot), *map(id, params.values())}
-    if leaves := [leaf for leaf in leaves_of(lr.image) if id(leaf) not in known]:
+    if leaves := [leaf for leaf in leaves_of_lr if id(leaf) not in known]:
         photo = view.lr.over(conductor.background(t), view.background)
         (cotangent,) = conductor.objective.lr(lr.image.detach(), photo.image, photo.shown).cotangents
         found = torch.autograd.grad(lr.image, leaves, cotangent, retain_graph=True, allow_unused=True)

@@ -302,13 +302,15 @@ class WithSummedVjp(Protocol):
 
 
 def summed_vjp(
-    rendering: Rendering, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"]
+    rendering: Rendering, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None
 ) -> SplatGradients:
     """The gradients of two losses of an image that count as one, the second `weight` times, Gaussian by Gaussian.
 
     Args:
-        cotangents: those of the two losses last, after any others.
+        cotangents: those of the two losses last, after any others. weight: None: nothing is summed, as by `Rendering.vjp`.
     """
+    if weight is None:
+        return rendering.vjp(cotangents)
     of_rendering = getattr(rendering, "summed_vjp", None)
     if of_rendering is None:
         return rendering.vjp(cotangents).summed(weight)

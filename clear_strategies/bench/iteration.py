@@ -161,13 +161,14 @@ def _outputs(
         outputs["render"][scale] = r.image
         image = r.image if given is None else given["render"][scale].to(r.image)
 
-        def vjp(cotangents: Tensor, *weight: Tensor) -> SplatGradients:
+        def vjp(cotangents: Tensor, weight: Tensor | None = None) -> SplatGradients:
             outputs[f"losses {scale}"] = {"cotangents": cotangents.clone()}
-            if weight:
-                outputs["evidence"] = {"weight": weight[0].clone()}
-            v = cotangents if given is None else given[f"losses {scale}"]["cotangents"].to(image)
-            weights = weight if given is None else [given["evidence"]["weight"].to(w) for w in weight]
-            g = summed_vjp(r, v, *weights) if weight else r.vjp(v)
+            if weight is not None:
+                outputs["evidence"] = {"weight": weight.clone()}
+            if given is not None:
+                cotangents = given[f"losses {scale}"]["cotangents"].to(image)
+                weight = None if weight is None else given["evidence"]["weight"].to(weight)
+            g = summed_vjp(r, cotangents, weight)
             outputs[f"backward {scale}"] = {
                 f.name: x.clone() for f in fields(g) if (x := getattr(g, f.name)) is not None
             }

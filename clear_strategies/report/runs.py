@@ -125,8 +125,9 @@ def collect(folders: Iterable[Path]) -> list[FinishedRun]:
 
 def _told_apart(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
     """The runs with other names for scenes of one name that are not the same: of other photos, or scored on other views."""
-    files = {run: run.folder / CAMERAS for run in runs}
-    cameras = {run: file.read_text(encoding="utf-8") if file.is_file() else str(file) for run, file in files.items()}
+    cameras = {
+        run: file.read_text(encoding="utf-8") if (file := run.folder / CAMERAS).is_file() else str(file) for run in runs
+    }
     alike = {run: [other for other in runs if other.scene == run.scene] for run in runs}
     # Where the photos lay; runs that have the same cameras have the same.
     photos = {

@@ -216,8 +216,8 @@ class FieldShot:
     def gradients(
         self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
     ) -> SplatGradients:  # fmt: skip
-        """Of the rendered splats, before the chain rule of `activation`; with `weight` by `rasterizers.interface.summed_vjp`."""
-        return self._rendering.vjp(cotangents) if weight is None else summed_vjp(self._rendering, cotangents, weight)
+        """Of the rendered splats, before the chain rule of `activation`; see `rasterizers.interface.summed_vjp`."""
+        return summed_vjp(self._rendering, cotangents, weight)
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
         g = self.gradients(cotangents)

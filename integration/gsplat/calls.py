@@ -37,9 +37,11 @@ def enlarged(call: Call, factor: int) -> dict[str, Any]:
 
 def require_pinhole(call: Call, showing: Sequence[object]) -> None:
     """Raise a HostError for other cameras where strategies show pictures between photos, which are warped by pinhole cameras."""
+    if not showing:
+        return
     model = call.get("camera_model", "pinhole")
     lens = [name for name in _LENS if call.get(name) is not None] + [f"camera_model={model}"] * (model != "pinhole")
-    if lens and showing:
+    if lens:
         raise HostError(
             f"{', '.join(type(s).__name__ for s in showing)} must have pinhole cameras, got {', '.join(lens)}. Undistort the "
             "photos, or leave out the strategy."

@@ -182,7 +182,7 @@ def _map(pycolmap: Any, photos: Mapping[Path, float | None], work: Path, setting
 
 
 def _place(pycolmap: Any, work: Path, count: int, settings: SfmSettings) -> list[Any]:
-    """The models that COLMAP makes of the related pairs, those of most photos first."""
+    """The models that COLMAP makes of the related pairs."""
     mapping = pycolmap.IncrementalPipelineOptions()
     mapping.num_threads, mapping.random_seed = settings.threads, settings.seed
     # COLMAP's thresholds are for hundreds of photos. Of ten photos around a table these place six where those place four.

@@ -61,13 +61,13 @@ class WarpGaussianStep:
         self._has_hr, high = hr is not None, hr or {}
         inputs = {"scales": 3, "filtered": 3, "filter": 1, "sigmoid": 1, "factor": 1, "basis": self._bases}
         widths = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "rgb": 3}
+        learns_detail = "detail" in high
+        widths_of_hr = widths | {"detail": 3} if learns_detail else widths
         self._gradients = (
             self._rows(raw_gradients.Activation, activation, inputs),
             self._rows(raw_gradients.Gradient, lr, widths),
-            self._rows(
-                raw_gradients.Gradient, high, (widths | {"detail": 3} if "detail" in high else widths) if high else {}
-            ),
-            struct(raw_gradients.View, {}, n=self._n, has_hr=self._has_hr, has_detail="detail" in high),
+            self._rows(raw_gradients.Gradient, high, widths_of_hr if high else {}),
+            struct(raw_gradients.View, {}, n=self._n, has_hr=self._has_hr, has_detail=learns_detail),
         )
 
     def products(self) -> Products:

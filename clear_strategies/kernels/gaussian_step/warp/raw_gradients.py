@@ -84,7 +84,7 @@ def load(
 
 @wp.func
 def detail_of(hr: Gradient, view: View, i: wp.int32) -> wp.vec3:
-    """M λ_HF ∇L_HF of f_det, or 0."""
+    """What f_det learns by, m λ_HF ∇L_HF; 0 where it is not given."""
     g = wp.vec3()
     if view.has_detail:
         g = hr.detail[i]
