@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import resource
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -13,6 +11,8 @@ from typing import Any, Final
 
 import torch
 from torch.overrides import TorchFunctionMode
+
+from clear_strategies.core.work_log import peak_mib
 
 _CPU: Final = torch.device("cpu")
 _WITHOUT_EFFECT: Final = (
@@ -41,7 +41,7 @@ def replace() -> None:
     for name in _WITHOUT_EFFECT:
         setattr(cuda, name, lambda *_, **__: None)
     for name in _MEMORY:
-        setattr(cuda, name, lambda *_, **__: _peak_memory())
+        setattr(cuda, name, lambda *_, **__: peak_mib() << 20)
     for name in _TENSORS:
         setattr(cuda, name, getattr(torch, name))
     cuda.Event, cuda.device = Event, _Device
@@ -143,9 +143,3 @@ class _Device:
 
     def __exit__(self, *_: Any) -> None:
         pass
-
-
-def _peak_memory() -> int:
-    """The most memory that the process has had, in bytes."""
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
