@@ -1,4 +1,4 @@
-"""Modes of torch that a loop may be in, and this package's code must not: `torch.compile` and `torch.autocast`."""
+"""Modes of torch that a loop may be in, and this package's code must not: `torch.compile`, `torch.autocast`, autograd."""
 
 from __future__ import annotations
 
@@ -27,6 +27,13 @@ def in_full_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
             return function(*args, **kwargs)
 
     return called
+
+
+def apart_from_the_loop(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """The function with torch's autocast and autograd off: what it calls runs in the same modes in every loop, and what it stores
+    keeps no graph.
+    """
+    return in_full_precision(torch.no_grad()(function))
 
 
 def uncompiled(function: Callable[_P, _R]) -> Callable[_P, _R]:

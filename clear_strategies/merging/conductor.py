@@ -32,7 +32,7 @@ from clear_strategies.merging.told import told
 from clear_strategies.strategies import answers
 from clear_strategies.strategies.base import ScreenGradients, Strategy, by_class, misspelled, overrides
 from rasterizers.interface import Color
-from rasterizers.modes import in_full_precision
+from rasterizers.modes import apart_from_the_loop
 from rasterizers.native import empty_for
 from rasterizers.recording import running
 from rasterizers.told import iteration
@@ -105,6 +105,7 @@ class Conductor:
             for hook, name in misspelled(type(s)).items():
                 _log.warning("%s.%s() is no hook: nothing calls it. There is %s().", type(s).__name__, name, hook)
 
+    @apart_from_the_loop
     def on_fit_start(
         self, n_views: int, seed: int, device: torch.device | str = "cpu", views: Sequence[View] = ()
     ) -> None:
@@ -136,6 +137,7 @@ class Conductor:
         self.decorated = True
         return prior
 
+    @apart_from_the_loop
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | Float[Tensor, "2 N"] | None:
         """zᵗ, before render; None: every Gaussian takes part."""
         z = self._owner["gate"].gate(t, n)
@@ -169,7 +171,7 @@ class Conductor:
         """Whether the LR render has any use; else Î_LR is the area mean of Î_HR."""
         return self.objective.draws_lr
 
-    @in_full_precision
+    @apart_from_the_loop
     def update(
         self,
         params: Mapping[str, Tensor],
@@ -242,7 +244,7 @@ class Conductor:
         logs = self.logs.counted_since_kept()
         return Update(step, grads, score, ordinary, conflict, {**l_lr.values, **losses}, logs)
 
-    @in_full_precision
+    @apart_from_the_loop
     def hr_gradients(
         self,
         hr: Shot,
@@ -265,6 +267,7 @@ class Conductor:
         step = Step(iteration(t), self._told(view), hr.visible, params=params, looked_up=looked_up)
         return self._backward_hr(hr, view, step, t, vjp or _vjp, apart=apart)[1]
 
+    @apart_from_the_loop
     def extra_views(self, t: int) -> list[ExtraView]:
         """The pictures that the field should match at t besides the view; each gets a step on `extra_loss`."""
         if self.objective.lambda_lr == 0 or not self.showing:
@@ -272,7 +275,7 @@ class Conductor:
         with self.work_log.stage("pictures of extra views"):  # a pseudo view is made when it is first asked for
             return [extra for s in self.showing for extra in answers.extra_views(s, s.extra_views(t))]
 
-    @in_full_precision
+    @apart_from_the_loop
     def extra_loss(self, image: Float[Tensor, "h w 3"], extra: ExtraView, t: int) -> Losses:
         """The LR loss of a render of `extra`, weighted by pixel: its value and its cotangent [1, h, w, 3].  Eq. 4
 
@@ -302,6 +305,7 @@ class Conductor:
             return self.merge_routed(params, g_lr, Grads(), None, t, finite=True)
         return self.merge_routed(params, g_lr, hr.routed, hr.step, t, finite=True)
 
+    @apart_from_the_loop
     def merge_routed(
         self, params: Mapping[str, Tensor], g_lr: Grads, g_hr: Grads, step: Step | None, t: int,
         out: Mapping[str, Tensor] | None = None, lambda_hr: Float[Tensor, " 1"] | None = None, finite: bool = False,
@@ -369,6 +373,7 @@ class Conductor:
                 total = g if not total else total + g
         return total
 
+    @apart_from_the_loop
     def pulls(self, params: Mapping[str, Tensor], t: int) -> bool:
         """Whether a strategy adds a gradient of its own, which moves Gaussians that no view draws."""
         return any(s.regularize(params, t) is not None for s in self.regularizers)
@@ -389,6 +394,7 @@ class Conductor:
         answers.require_score(self._owner["score"], score, len(screen_lr))
         return screen.ordinary if score is None else score, screen.ordinary
 
+    @apart_from_the_loop
     def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
         """After the optimizer steps of an iteration."""
         params = MappingProxyType(params)  # a tensor that was put into it would change nothing
@@ -399,6 +405,7 @@ class Conductor:
     def may_densify(self, t: int) -> bool:
         return all(s.may_densify(t) for s in self.strategies)
 
+    @apart_from_the_loop
     def on_resize(self, parents: Int[Tensor, " M"]) -> None:
         for s in self.strategies:
             s.on_resize(parents)

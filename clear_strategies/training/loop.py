@@ -56,7 +56,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
     conductor.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS
     with stage("density and filter"):
         # clone · split · prune = parents[M]
-        restructured = conductor.may_densify(t) and s.density.step(θ, s.optimizer, t, s.resized)
+        restructured = conductor.may_densify(t) and s.restructure()
         if s.filter_due() and not restructured and not s.remove_undrawn():  # each recomputes the filter
             s.refilter()
     s.history.append(_with_logs(_row(s) | row | extra, conductor.logs.counted()))
@@ -89,7 +89,8 @@ def learn(s: TrainState, rasterizer: Rasterizer, given: GivenView) -> tuple[Upda
             s.optimizer.step(params, u.grads)
             θ.constrain()
     *_, finest = (shot for shot in (lr, hr) if shot is not None)
-    s.density.accumulate(u, finest, t)  # S^dens         Eq. 14
+    if scored:
+        s.density.accumulate(u, finest, t)  # S^dens         Eq. 14
     low = images.area_mean(finest.image, view.factor) if lr is None else lr.image
     photo = view.lr.over(given.background, view.background)
     row: dict[str, Number] = {"psnr_train_lr": psnr_of(low, photo.image, photo.shown)}

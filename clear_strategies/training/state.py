@@ -17,7 +17,7 @@ from clear_strategies.core import deferred
 from clear_strategies.core.finite import is_finite, rows_not_finite
 from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
-from clear_strategies.errors import DataError, DivergedError
+from clear_strategies.errors import AnswerError, DataError, DivergedError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.training.checkpoint import Checkpoint
 from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for
@@ -106,6 +106,9 @@ class TrainState:
         extent = cameras_extent(torch.stack([view.hr.camera.center.float() for view in scene.train]))
         owner = conductor.owner("densifier")
         densifier = None if owner is None else owner.densifier(theta, scene.train, settings.seed)
+        if densifier is not None and not isinstance(densifier, Densifier):
+            rule = f"must give a {Densifier.__module__}.Densifier or None"
+            raise AnswerError(f"{type(owner).__name__}.densifier() {rule}, got {densifier!r:.80}.")
         if densifier is None:
             white = all(c == 1.0 for c in scene.background)
             densifier = density.densifier(
@@ -173,6 +176,27 @@ class TrainState:
         self.density.gather(drawn)
         self.resized(drawn)
         return True
+
+    def restructure(self) -> bool:
+        """Let the densifier do what is due at t; returns whether the structure changed.
+
+        Raises:
+            AnswerError: the densifier did not tell what became of which Gaussian.
+        """
+        n, name, calls = len(self.field), f"{type(self.density).__name__}.step()", list[int]()
+
+        def resized(parents: Int[Tensor, " M"]) -> None:
+            calls.append(len(parents))
+            if len(parents) != len(self.field):
+                rule = f"must call resized(parents) with the {len(self.field):,} rows that the field has then"
+                raise AnswerError(f"{name} {rule}, got {len(parents):,}.")
+            self.resized(parents)
+
+        changed = self.density.step(self.field, self.optimizer, self.t, resized)
+        if not calls and (changed or len(self.field) != n):
+            change = f"a change of structure, here from {n:,} to {len(self.field):,} Gaussians"
+            raise AnswerError(f"{name} must call resized(parents) after {change}.")
+        return bool(calls)
 
     def resized(self, parents: Int[Tensor, " M"]) -> None:
         """Gather what strategies keep per Gaussian, and recompute the filter, after a change of structure: row i comes from row

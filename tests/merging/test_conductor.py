@@ -28,6 +28,7 @@ from clear_strategies.strategies.base import misspelled
 from clear_strategies.testing import CHECKS, ContractError, check_strategy
 from clear_strategies.training import loop
 from clear_strategies.training.field import GaussianField
+from integration import AutogradShot
 from rasterizers import Splats, autograd
 from tests.helpers import short_run, toy
 from tests.helpers.compiled_step_cases import ALWAYS
@@ -151,6 +152,38 @@ class OfFunctions(Strategy):
 def test_the_contract_can_fail(make, message):
     with pytest.raises(ContractError, match=message):
         check_strategy(make)
+
+
+CHANGES = {
+    "the SR image": ("observe", lambda step, hr: step.view.hr.image.clamp_(0.2, 0.8), "an image"),
+    "the render": ("observe", lambda step, hr: hr.image.clamp_(0, 1), "an image"),
+    "photos": ("on_views", lambda views: views[0].lr.image.mul_(0.5), "an image"),
+    "visible": ("observe", lambda step, hr: step.visible.logical_not_(), "a rendering's means2d or visible"),
+    "the statistic": ("score", lambda step, screen: screen.ordinary.mul_(2), "screen.ordinary"),
+    "opacities": ("regularize", lambda params, t: params["opacities"].clamp_(max=4), "a parameter"),
+}
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_the_contract_finds_what_a_hook_changes_in_place(what):
+    hook, change, named = CHANGES[what]
+
+    def changing(*arguments):
+        change(*arguments)  # whose answer is none of the hook's
+
+    with pytest.raises(ContractError, match=f"^{named} was changed in place by a hook"):
+        check_strategy(answering(hook, changing, **({} if hook != "on_views" else {"gate": lambda self, t, n: None})))
+
+
+def test_the_contract_finds_a_parameter_of_other_memory_and_names_a_number_that_is_not_finite():
+    def assigns(params, step):
+        params["means"].data = params["means"] * 0.99
+
+    with pytest.raises(ContractError, match=r"after_step\(\) must change means in place"):
+        check_strategy(answering("after_step", assigns))
+    nowhere = answering("observe", lambda step, hr: Evidence(step.visible / step.visible, step.visible.float()))
+    with pytest.raises(ContractError, match="the evidence of reliability is not finite"):
+        check_strategy(nowhere)
 
 
 def answering(hook, answer, **facts):
@@ -296,6 +329,42 @@ def test_the_contract_shows_poses_in_the_type_that_the_readers_give_them():
         check_strategy(answering("route", by_distance))
 
 
+def test_hooks_run_without_autograd_so_that_state_keeps_no_graph():
+    """In another trainer the rendering that `observe` sees is a part of the graph, and autograd is off in its backward pass."""
+    answers = {"gate": None, "observe": None, "route": 1.0, "reconcile": Weights(), "regularize": None, "score": None}
+    answers |= {"extra_views": (), "after_step": None, "on_views": None, "on_resize": None}
+    on = []
+
+    def hook(name):
+        def asked(self, *arguments):
+            on.extend([name] * torch.is_grad_enabled())
+            if name == "observe":
+                self.state["seen"] = arguments[1].image.mean()
+            return answers[name]
+
+        return asked
+
+    s = type("Asked", (Strategy,), {name: hook(name) for name in answers})()
+    field, view = field_and_view(torch.float32)
+    leaves = {name: p.requires_grad_() for name, p in field.raw().items()}
+    splats = Splats(*(leaves[name] for name in ("means", "quats")), leaves["scales"].exp(), leaves["opacities"].sigmoid(),
+                    leaves["sh0"], leaves["shN"])  # fmt: skip
+    shots = []
+    for photo in (view.lr, view.hr):
+        drawn = autograd.draw(toy.RASTERIZER, splats, photo.camera)
+        shots.append(AutogradShot(drawn.image, drawn.means2d, drawn.visible, leaves))
+    conductor = Conductor(s, objective=Objective(lambda_hr=ALWAYS))
+    conductor.on_fit_start(1, 0, views=[view])
+    conductor.gate(1, len(field))
+    update = conductor.update(field.raw(), *shots, view, 1)
+    conductor.extra_views(1)
+    conductor.after_step(field.raw(), update.step)
+    conductor.on_resize(torch.arange(len(field)))
+    assert shots[1].image.requires_grad
+    assert not s.state["seen"].requires_grad
+    assert not on
+
+
 def test_a_number_of_the_run_is_state_as_rows_are():
     check_strategy(toy.RunningMean)
 
@@ -310,6 +379,16 @@ def test_state_of_other_rows_and_settings_of_taken_names_are_refused():
         match=r"Short.state\['seen'\] must be a tensor with a row for each Gaussian, 30, or without .*, got a tensor \[5\]",
     ):
         Conductor(Short()).after_step({"means": torch.zeros(30, 3)}, toy.step())
+
+    def anchors(self, params, step):
+        self.state.setdefault("anchor", params["means"])
+
+    with pytest.raises(
+        AnswerError, match=r"state\['anchor'\] must be a tensor of its own, got the memory of a parameter"
+    ):
+        Conductor(type("Alias", (Short,), {"after_step": anchors})()).after_step(
+            {"means": torch.zeros(30, 3)}, toy.step()
+        )
     with pytest.raises(TypeError, match="a setting must not be called seed"):
         type("Mine", (Strategy,), {"__annotations__": {"seed": int}})
 

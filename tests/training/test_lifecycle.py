@@ -9,14 +9,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clear_strategies import SVS, Grads, Photo, Update
+from clear_strategies import SVS, Grads, Photo, Strategy, Update
 from clear_strategies.core import deferred
 from clear_strategies.core.points import PointCloud
 from clear_strategies.density.adaptive import Density, DensitySettings
-from clear_strategies.errors import DensityError, DivergedError
+from clear_strategies.errors import AnswerError, DensityError, DivergedError
 from clear_strategies.schedules import scaled
 from clear_strategies.testing import StubShot
-from clear_strategies.training.densifier import cameras_extent
+from clear_strategies.training.densifier import Densifier, cameras_extent
 from clear_strategies.training.evaluation import evaluate
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.loop import iterate
@@ -309,3 +309,65 @@ def test_the_3d_filter_counts_what_the_rasterizer_of_the_run_draws():
     expected = toy.started(of=scene).field.filter_3d / 1024
     assert torch.allclose(toy.started(of=tiny, near=0.01 / 1024).field.filter_3d, expected)
     assert not toy.started(of=tiny).field.filter_3d.any()  # the default draws nothing of it
+
+
+class Doubles(Densifier):
+    """The shortest of somebody else: copies each Gaussian once, and keeps sums of the scores."""
+
+    name, settings = "doubling", None
+
+    def __init__(self, n, told=lambda parents: parents, gathers=lambda parents: parents):
+        self.sums, self.told, self.gathers = torch.zeros(n), told, gathers
+
+    def collects(self, t):
+        return t < 4
+
+    def accumulate(self, update, shot, t):
+        self.sums += update.score
+
+    def step(self, field, optimizer, t, resized):
+        if t != 2:
+            return False
+        parents = torch.arange(len(field)).repeat(2)
+        field.take(self.gathers(parents))
+        optimizer.take(parents, torch.arange(len(parents)) >= len(parents) // 2)
+        self.sums = self.sums[parents]
+        if (told := self.told(parents)) is not None:
+            resized(told)
+        return True
+
+
+def brings(make):
+    """A strategy with this densifier."""
+    strategy = type("Brings", (Strategy,), {"densifier": lambda self, field, views, seed: make(len(field))})
+    return short_run.start((), more=[strategy()])
+
+
+def test_a_densifier_of_ones_own_gets_the_scores_that_it_collects():
+    state = brings(Doubles)
+    n = len(state.field)
+    while state.t <= 6:
+        iterate(state, toy.RASTERIZER)
+    assert len(state.field) == len(state.density.sums) == 2 * n
+    assert bool(state.density.sums.any())
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda n: Doubles(n, told=lambda parents: None),
+            "resized.parents. after a change of structure, here from 16 to 32",
+        ),
+        (lambda n: Doubles(n, told=lambda parents: parents[1:]), "resized.parents. with the 32 rows .* got 31"),
+        (lambda n: Doubles(n, gathers=lambda parents: parents[:16]), "resized.parents. with the 16 rows .* got 32"),
+    ],
+    ids=["untold", "other parents", "another field"],
+)
+def test_a_densifier_that_leaves_others_behind_is_refused(make, message):
+    state = brings(make)
+    iterate(state, toy.RASTERIZER)
+    with pytest.raises(AnswerError, match=rf"Doubles.step\(\) must call {message}"):
+        iterate(state, toy.RASTERIZER)
+    with pytest.raises(AnswerError, match=r"Brings.densifier\(\) must give a .*Densifier or None, got 16"):
+        brings(lambda n: n)
