@@ -83,7 +83,7 @@ def check_what_is_shown_is_left_alone(make: Make) -> None:
     """What a strategy is shown is not changed in place: others read it, and photos are shown again."""
     lr, hr, view, params = _situation(0)
     evidence = _evidence()
-    shown = {
+    shown: dict[str, list[Any]] = {
         "a gradient": [x for shot in (lr, hr) for g in shot.gradients for x in (*g.values(), screen_of(g))],
         "an image": [view.lr.image, view.hr.image, lr.image, hr.image],
         "a rendering's means2d or visible": [x for shot in (lr, hr) for x in (shot.means2d, shot.visible)],
@@ -100,9 +100,7 @@ def check_what_is_shown_is_left_alone(make: Make) -> None:
         shown["screen.ordinary"], before["screen.ordinary"] = [update.ordinary], [alone.ordinary]
         for what, tensors in shown.items():
             same = all(map(torch.equal, tensors, before[what]))
-            require(
-                same, f"{what} was changed in place by a hook; only after_step() changes parameters, and nothing else"
-            )
+            require(same, f"{what} was changed in place by a hook; only after_step() may change parameters")
 
 
 def check_answers_have_their_shapes(make: Make) -> None:

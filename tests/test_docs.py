@@ -26,7 +26,9 @@ from clear_strategies import Conductor, options
 from clear_strategies.commands import train
 from clear_strategies.files import write_text
 from clear_strategies.options import CONF
-from tests.helpers import command_line, documented
+from clear_strategies.training import loop
+from tests.helpers import command_line, documented, short_run, toy
+from tests.helpers.compiled_step_cases import ALWAYS
 from tests.helpers.configs import jobs_of, loader
 from tests.helpers.pages import DOCS, OURS, PAGES, ROOT, blocks, commands, loaded, name
 
@@ -92,7 +94,7 @@ def require_composable(arguments: list[str]) -> None:
 
 
 def require_conductor(config: DictConfig) -> None:
-    targets = [str(node.get("_target_")) for node in config.strategies.values()]
+    targets = [str(node.get("_target_")) for node in (config.objective, *config.strategies.values())]
     if all(target.startswith(OURS) for target in targets):
         objective, *strategies = (
             instantiate(node, _convert_="object") for node in (config.objective, *config.strategies.values())
@@ -151,6 +153,20 @@ def test_the_notebook_runs_and_has_saved_what_it_shows(run_block):
     assert found == pytest.approx(scores, abs=0.01)
     assert {name: rows.shape[1:] for name, rows in run.splats.items()} == {name: n[1:] for name, n in shapes.items()}
     assert len(run.splats["means"]) == pytest.approx(shapes["means"][0], rel=0.05)
+
+
+def test_the_guides_loss_and_densifier_train_as_they_say(run_block):
+    found = {}
+    for block in blocks(DOCS / "how-to" / "own-strategy.md", "python"):
+        if "WithSpectrum" in block or "ByBudget" in block:
+            found |= vars(run_block(block))
+    state = short_run.start((), more=[found["Compact"](), found["Budget"](budget=30, every=2, stop=12)])
+    state.conductor.objective = found["WithSpectrum"](lambda_hr=ALWAYS)
+    n = len(state.field)
+    while state.t <= 12:
+        loop.iterate(state, toy.RASTERIZER)
+    assert (n, len(state.field)) == (16, 30)
+    assert all(row["loss_spectrum"] > 0 for row in state.history_as_floats())
 
 
 def test_the_guides_reader_reads_a_folder_and_is_chosen_for_it(tmp_path, monkeypatch):
@@ -222,7 +238,7 @@ def follow(lines: list[list[str]], folder: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("page", dict.fromkeys(guide for guide, _ in FOLLOWED.values()), ids=name)
 def test_commands_of_the_guides_run(page, tmp_path):
-    (tmp_path / f"{documented.PACKAGE}.py").write_text("".join(blocks(page, "python")[:1]))
+    (tmp_path / f"{documented.PACKAGE}.py").write_text("\n".join(blocks(page, "python")))
     follow([words for guide, words in FOLLOWED.values() if guide == page], tmp_path)
 
 

@@ -37,12 +37,14 @@ class Densifier:
         return True
 
     def accumulate(self, update: Update, shot: Shot, t: int) -> None:
-        """Accumulate the scores of iteration t; `shot` is the rendering that they belong to."""
+        """Accumulate the scores of iteration t, where `collects(t)`; `shot` is the rendering that they belong to."""
 
     def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
         """Do what is due at t, after the optimizer's step; returns whether the structure changed.
 
         Args:
+            field: its rows change by `take(parents)`, its parameters in place, as `field.opacities.data`.
+            optimizer: its rows change by `take(parents, fresh)`; fresh rows start without momentum.
             resized: called with parents[M] once field and optimizer have been gathered; row i of everything else per
                 Gaussian now comes from row parents[i].
         """
