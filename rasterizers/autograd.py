@@ -158,6 +158,11 @@ def render(
     Args:
         replays: the drawing may be a replay, and a backward pass follows.
     """
+    if torch._C._functorch.peek_interpreter_stack() is not None:
+        raise NotImplementedError(
+            "the transforms of torch.func (grad, vmap, jvp …) do not pass through a rasterizer. Use torch.autograd.grad, one "
+            "drawing at a time."
+        )
     if depth:
         require_depth(rasterizer)
     with torch.no_grad():

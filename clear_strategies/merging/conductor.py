@@ -464,6 +464,9 @@ class Conductor:
             self._hr_cotangents = losses.cotangents
         require_finite_losses(_where(view, t), losses.values, {"the SR image": sr.image, "the HR render": hr.image})
         of_hr, λ_hf = losses.cotangents, self.objective.lambda_hf
+        if len(of_hr) != 1 + (λ_hf > 0):
+            rule = f"must give {1 + (λ_hf > 0)} cotangents, of L_base{' and of L_HF' * (λ_hf > 0)}, got {len(of_hr)}"
+            raise ValueError(f"{type(self.objective).__name__}.hr() {rule}. Add another loss to one of them.")
         if not apart and len(of_hr) == 2:
             of_hr = torch.add(of_hr[:1], of_hr[1:], alpha=λ_hf)
         with stage("evidence"):

@@ -70,6 +70,10 @@ def test_ssim_is_the_mean_that_scikit_image_computes_inside():
         data_range=1.0, channel_axis=2,
     )  # fmt: skip
     assert float(reference.ssim(*framed).value) == pytest.approx(float(theirs.mean()), abs=1e-9)
+    for ssim in (losses.ssim, reference.ssim):
+        for inset in (-1, 40):  # of 80 rows
+            with pytest.raises(ValueError, match="no window lies so far inside"):
+                ssim(*(z.float() for z in framed), inset)
 
 
 def sky(height=96, width=90):

@@ -512,6 +512,18 @@ def test_cotangents_take_the_memory_of_earlier_ones_of_their_shape_alone(drawn):
         assert (again.data_ptr() == held.data_ptr()) == reused
 
 
+def test_an_objective_of_ones_own_gives_a_cotangent_for_each_loss(drawn):
+    class Third(Objective):
+        def hr(self, image, target, shown=None, reuse=None):
+            losses = super().hr(image, target, shown, reuse)
+            return losses._replace(cotangents=torch.cat((losses.cotangents, losses.cotangents[:1])))
+
+    field, view, lr, hr = drawn
+    for hf, rule in ((0.2, "2 cotangents, of L_base and of L_HF, got 3"), (0.0, "1 cotangents, of L_base, got 2")):
+        with pytest.raises(ValueError, match=rf"Third.hr\(\) must give {rule}"):
+            Conductor(objective=Third(lambda_hr=ALWAYS, lambda_hf=hf)).update(field.raw(), lr, hr, view, 5)
+
+
 def test_a_scale_that_the_objective_needs_is_asked_for_and_hr_only_while_it_has_a_use(drawn):
     field, view, lr, hr = drawn
     with pytest.raises(ValueError, match="needs the HR scale"):

@@ -158,6 +158,20 @@ def test_losses_of_depth_and_of_gradients_and_splats_changed_in_place_are_refuse
         image.sum().backward()
 
 
+@pytest.mark.parametrize("transform", [torch.func.grad, torch.func.vmap, torch.func.hessian])
+def test_a_transform_of_torch_func_is_refused_by_name(transform):
+    splats = scene(5)
+
+    def red(shift):
+        moved = replace(splats, means=splats.means + shift.sum())
+        return autograd.draw(rasterizers.load("auto"), moved, camera(20, 16)).image[..., 0].mean()
+
+    shift = torch.zeros(3)
+    assert red(shift) > 0
+    with pytest.raises(NotImplementedError, match=r"torch\.func .* do not pass through a rasterizer"):
+        transform(red)(shift)
+
+
 def test_gsplats_function_has_our_rasterizers_gradients_of_the_centres_too():
     """The expected depth is the fourth channel of its images."""
     view, splats = camera(40, 30), replace(leaves(scene(60, dtype=torch.float64)), rgb_offset=None)

@@ -78,7 +78,10 @@ def photometric(
 def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], inset: int = 0) -> LossAndGradient:
     """The mean SSIM of the windows about pixels at least `inset` from the border, with its gradient with respect to x.
 
-    On the CPU in C++ where that supports the images, else in torch.
+    On the CPU in C++ where that supports the images, else in torch. Both images must be finite everywhere.
+
+    Raises:
+        ValueError: there is no such pixel.
     """
     if not (native.available() and supported(DEVICES["cpp"], x, y)):
         return reference.ssim(x, y, inset)

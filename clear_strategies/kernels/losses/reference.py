@@ -53,6 +53,8 @@ def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], inset: int = 0) -
     Computed in float64, because E[x²] - E[x]² in float32 loses the variance of flat regions. For evaluation use
     `outputs.metrics`, which follows scikit-image.
     """
+    if not 0 <= 2 * inset < min(x.shape[:2]):
+        raise ValueError("no window lies so far inside the images.")  # as C++ does
     X, Y = x.double().movedim(-1, 0), y.double().movedim(-1, 0)
     mu_x, mu_y, e_xx, e_yy, e_xy = _window_mean(torch.stack((X, Y, X * X, Y * Y, X * Y)))
     A1, A2 = 2 * mu_x * mu_y + _C1, 2 * (e_xy - mu_x * mu_y) + _C2
