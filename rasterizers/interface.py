@@ -238,7 +238,8 @@ class Rendering(Protocol):
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
         """The gradients of the splats for K gradients of the image (cotangents), in one pass where the backend can.
 
-        Backends may read the splats' tensors again: call this before they are changed in place.
+        Backends may read the splats' tensors again: call this before they are changed in place. Autograd may be off, here and
+        where it was drawn.
         """
         ...
 

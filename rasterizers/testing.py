@@ -50,10 +50,11 @@ def check_rasterizer(make: Make) -> None:
         check(make)
 
 
+@torch.no_grad()
 def check_gradients_are_finite_differences(make: Make) -> None:
     """The VJP agrees with finite differences along random directions, for every attribute.
 
-    With the trait `depth_gradient` the loss is one of alpha and depth, too.
+    With the trait `depth_gradient` the loss is one of alpha and depth, too. Autograd is off, as where `autograd.draw` draws.
     """
     rasterizer = make(background=(0.2, 0.5, 0.9), **_SMOOTH)
     dtype = _widest(rasterizer)

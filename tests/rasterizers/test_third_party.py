@@ -41,6 +41,14 @@ class ThirdParty(RasterSettings):
         return self.inner.render_scales(jobs, depth=depth)
 
 
+class NeedsAutograd(ThirdParty):
+    """Would fail where `autograd.draw` draws."""
+
+    def __call__(self, splats, camera, *, depth=False):
+        splats.means.clone().requires_grad_().exp().sum().backward()
+        return ThirdParty.__call__(self, splats, camera, depth=depth)
+
+
 class Flat:
     """Draws no depth, and has no argument for it."""
 
@@ -66,6 +74,8 @@ def test_third_parties_rasterizers_pass_the_checks_and_are_refused_where_depth_i
     assert found == ThirdParty(near=0.01, background=(1.0, 1.0, 1.0), lanes_per_pass=4096)
     with caplog.at_level("INFO", "rasterizers"):
         check_rasterizer(Flat)
+    with pytest.raises(RuntimeError, match="does not require grad"):
+        check_rasterizer(NeedsAutograd)
     assert "check_nothing_to_draw_of_depth: not checked, the rasterizer's traits.depth is False" in caplog.text
     splats, camera = scene(5), Camera(torch.eye(4), 40.0, 40.0, 20.0, 15.0, 40, 30)
     assert autograd.draw(Flat(), splats, camera).depth is None
