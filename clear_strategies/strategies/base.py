@@ -160,7 +160,11 @@ class Strategy:
         return None
 
     def score(self, step: Step, screen: ScreenGradients) -> Float[Tensor, " N"] | None:
-        """For densification: where is more structure needed? None: the ordinary statistic.  Eq. 14"""
+        """For densification: where is more structure needed? None: the ordinary statistic.  Eq. 14
+
+        Its order counts, not its unit: as many Gaussians grow as the ordinary statistic lets grow, those of the largest mean over
+        the views that show them (`density.mode=quantile`). In other trainers it is scaled so that as many pass their threshold.
+        """
         return None
 
     def extra_views(self, t: int) -> Sequence[ExtraView]:
