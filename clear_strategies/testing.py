@@ -92,7 +92,7 @@ def check_what_is_shown_is_left_alone(make: Make) -> None:
     }
     before = copy.deepcopy(shown)
     # Then g_HR is the shot's own tensor, and no sum of two.
-    conductor = _conductor(make, lambda_hf=0.0, evidence=evidence, view=view)
+    conductor = _conductor(make, lambda_hf=0.0, evidence=evidence, views=[view])
     for t in range(1, _STEPS):
         conductor.gate(t, _N)
         update = conductor.update(params, lr, hr, view, t)
@@ -127,8 +127,11 @@ def check_answers_have_their_shapes(make: Make) -> None:
 
 
 def check_works_without_hr(make: Make) -> None:
-    """While HR is not rendered the authentic gradient passes, whatever the strategy, and nothing else is asked of the view."""
-    conductor = _conductor(make)
+    """While HR is not rendered the authentic gradient passes, whatever the strategy, and nothing else is asked of the view.
+
+    A loop that loads its views one by one has none at the start.
+    """
+    conductor: Conductor = _without_error("on_views", "where there are no views yet", _conductor, make, views=[])
     for t in range(1, _STEPS):
         lr, _, view, params = _situation(2)
         conductor.gate(t, _N)
@@ -290,18 +293,18 @@ def _evidence() -> Evidence:
 
 
 def _conductor(
-    make: Make, *, lambda_hf: float = 0.2, evidence: Evidence | None = None, view: View | None = None
+    make: Make, *, lambda_hf: float = 0.2, evidence: Evidence | None = None, views: Sequence[View] | None = None
 ) -> Conductor:  # fmt: skip
     """Milestones are compressed, so that every phase falls inside the few steps of a check.
 
     Args:
-        evidence: of another strategy, where this one has none. view: of the training, for `on_views`.
+        evidence: of another strategy, where this one has none. views: of the training, for `on_views`.
     """
     objective = Objective(WarmupDecay(start=0, full=1, decay_from=_STEPS, end=_STEPS), lambda_hf)
     strategy = scaled(make(), _STEPS / 2 / 5_000)
     others = [] if evidence is None or overrides(strategy, "observe") else [_Observes(evidence)]
     conductor = Conductor(strategy, *others, objective=objective)
-    conductor.on_fit_start(3, seed=11, views=[_situation(0)[2] if view is None else view])
+    conductor.on_fit_start(3, seed=11, views=[_situation(0)[2]] if views is None else views)
     return conductor
 
 

@@ -122,6 +122,17 @@ class Resizes(Strategy):
 
 
 @dataclass(frozen=True)
+class NeedsViews(Strategy):
+    """Reads views that another trainer loads later."""
+
+    def on_views(self, views):
+        self.cache["width"] = views[0].lr.camera.width
+
+    def gate(self, t, n):
+        return None
+
+
+@dataclass(frozen=True)
 class Untold(Strategy):
     """Has a summary of what is not prepared."""
 
@@ -144,7 +155,8 @@ class OfFunctions(Strategy):
     [
         (Careless, "changed in place"), (Forgetful, "derive randomness"), (Secretive, "does not continue"),
         (Distrusts, "the evidence was changed in place"),
-        (NeedsHR, "after_step fails in an iteration without HR"), (Fixed, r"Fixed.reconcile\(\) must give .* \[37\]"),
+        (NeedsHR, "after_step fails in an iteration without HR"),
+        (NeedsViews, "on_views fails where there are no views yet"), (Fixed, r"Fixed.reconcile\(\) must give .* \[37\]"),
         (Resizes, "on_resize fails from 30 Gaussians to 30"), (Untold, "summary fails"),
         (OfTensors, "settings cannot be compared"), (OfFunctions, "cannot be sent to another process"),
     ],
