@@ -32,14 +32,15 @@ def require_started(s: Strategy, seed: int) -> None:
 def require_state(s: Strategy, params: Mapping[str, Tensor]) -> None:
     if not s.state:
         return
-    n, memory = {len(p) for p in params.values()}, {p.data_ptr() for p in params.values()}
+    n = {len(p) for p in params.values()}
+    memory = {p.data_ptr() for p in params.values()} - {0}  # of tensors without any
     for name, rows in s.state.items():
         if not isinstance(rows, Tensor) or (n and rows.dim() > 0 and len(rows) not in n):
             raise AnswerError(
                 f"{type(s).__name__}.state[{name!r}] must be a tensor with a row for each Gaussian, {min(n, default=0)}, or "
                 f"without dimensions, got {_shown(rows)}. What can be computed again belongs in cache."
             )
-        if rows.numel() and rows.data_ptr() in memory:  # a resumed run would have a copy
+        if rows.data_ptr() in memory:  # a resumed run would have a copy
             raise AnswerError(
                 f"{type(s).__name__}.state[{name!r}] must be a tensor of its own, got the memory of a parameter, which changes "
                 "with it. Store parameter.clone()."
