@@ -62,7 +62,7 @@ class Strategy:
         cache: values that can be computed again (patch maps, keyed by view); never saved.
         logs: scalars of this iteration, see `log`.
 
-    Randomness must be a function of (seed, t), so that resuming needs no generator state.
+    Randomness must be a function of (seed, t), so that resuming needs no generator state. Hooks run without autograd.
     """
 
     state: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
