@@ -44,7 +44,7 @@ def _version(package: str) -> str | None:
 
 def _processor() -> str:
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
         return platform.processor() or "unknown"
     return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "unknown")
@@ -59,6 +59,7 @@ def _git() -> str:
     described = ("describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+dirty")
     command = ["git", "--no-optional-locks", "-C", str(root), *described]
     try:
-        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()  # noqa: S603
+        ended = subprocess.run(command, capture_output=True, encoding="utf-8", timeout=10, check=True)  # noqa: S603
+        return ended.stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return "unknown"

@@ -56,7 +56,7 @@ def release() -> None:
 def system_bytes(file: str, name: str) -> int | None:
     """An entry of a file of /proc; None where there is none."""
     try:
-        lines = dict(line.split(":", 1) for line in Path(file).read_text().splitlines())
+        lines = dict(line.split(":", 1) for line in Path(file).read_text(encoding="utf-8").splitlines())
         return int(lines[name].split()[0]) * 1024
     except (OSError, KeyError, ValueError):
         return None

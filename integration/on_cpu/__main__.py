@@ -80,7 +80,9 @@ def prepared(script: Path, arguments: Sequence[str] = ()) -> launcher.Host:
         "diff_gaussian_rasterization": diff_gaussian_rasterization, "fused_ssim": fused_ssim,
         "simple_knn": ModuleType("simple_knn"), "simple_knn._C": _knn(renderer),
     }  # fmt: skip
-    draws_with_gsplat = renderer is None or any("gsplat" in file.read_text() for file in renderer.glob("*.py"))
+    draws_with_gsplat = renderer is None or any(
+        "gsplat" in file.read_text(encoding="utf-8") for file in renderer.glob("*.py")
+    )
     if draws_with_gsplat and importlib.util.find_spec("gsplat") is not None:
         gsplat_functions.replace()
     _log.info("CUDA means the CPU here; images are drawn by rasterizer=%s.", rasterizers.fastest("cpu"))
@@ -106,7 +108,7 @@ def _is_of_nerfstudio(script: Path) -> bool:
 def _knn(renderer: Path | None) -> Any:
     """`simple_knn._C` as the sources beside the renderer declare it: in FSGS it returns indices, too."""
     declared = Path() if renderer is None else renderer.parent / "submodules" / "simple-knn" / "spatial.h"
-    indices = declared.is_file() and "std::tuple" in declared.read_text()
+    indices = declared.is_file() and "std::tuple" in declared.read_text(encoding="utf-8")
     return SimpleNamespace(distCUDA2=distances_and_indices if indices else mean_distances)
 
 
