@@ -6,6 +6,8 @@ Each node with a `_target_` is filled with the defaults of what it names. To imp
 from __future__ import annotations
 
 import hashlib
+import re
+import sys
 from collections.abc import Mapping, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
@@ -33,7 +35,9 @@ OPTIONS: Final = "clear_strategies_conf"
 
 READINGS: Final = "readings"
 """The key of a configuration for what `readings=` says of each strategy."""
-_LONGEST_NAME: Final = 200  # bytes of a folder's name; most file systems take 255
+# Bytes of a folder's name: most file systems take 255, and Windows 260 of a whole path.
+_LONGEST_NAME: Final = 80 if sys.platform == "win32" else 200
+_NOT_IN_NAMES: Final = re.compile(r'[<>:"\\|?*\x00-\x1f]|[. ]\Z')  # of Windows
 
 
 def composed_by_hydra(overrides: Sequence[str], config: str) -> DictConfig:
@@ -106,8 +110,9 @@ def _one_folder(name: str) -> str:
     overrides would otherwise lead elsewhere: behind `../..` all jobs share a folder.
     """
     word = name.replace("/", "_")
-    if len(word.encode()) <= _LONGEST_NAME:
+    if len(word.encode()) <= _LONGEST_NAME and not _NOT_IN_NAMES.search(word):
         return word
+    word = _NOT_IN_NAMES.sub("_", word)
     digest = hashlib.sha256(name.encode()).hexdigest()[:8]
     return f"{word.encode()[: _LONGEST_NAME - len(digest) - 1].decode(errors='ignore')}_{digest}"
 
