@@ -25,7 +25,7 @@ _OURS: Final = ("clear_strategies", "rasterizers", "integration")
 _LIBRARIES: Final = (
     "asyncio", "fontTools", "imageio", "kornia", "matplotlib", "PIL", "py", "torch", "trimesh", "viser", "websockets",
 )  # fmt: skip
-_LEFT: Final = (errno.EPIPE, errno.EIO)
+_LEFT: Final = (errno.EPIPE, errno.EIO, errno.EINVAL)  # the last of a pipe of Windows
 _PREFIXES: Final = {logging.WARNING: "warning: ", logging.ERROR: "error: ", logging.CRITICAL: "error: "}
 
 

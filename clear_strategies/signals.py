@@ -34,8 +34,8 @@ class Interrupted(ClearError):
 
 
 TWICE: Final = (signal.SIGINT, signal.SIGTERM)  # a second one acts at once
-# The terminal was closed, or its connection lost: the system sends several of them.
-_HANGUPS: Final = tuple(getattr(signal, name) for name in ("SIGHUP",) if hasattr(signal, name))
+# The terminal was closed, or its connection lost: the system sends several of them. SIGBREAK: that of Windows, and Ctrl-Break.
+_HANGUPS: Final = tuple(getattr(signal, name) for name in ("SIGHUP", "SIGBREAK") if hasattr(signal, name))
 STOPS: Final = (*TWICE, *_HANGUPS)
 """Signals that end a run, which saves before."""
 # A cluster announces the end of a job with these, if the job's launcher has set a handler.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import socket
-import threading
+import time
 import webbrowser
 from collections.abc import Sequence
 from contextlib import suppress
@@ -44,7 +44,8 @@ def main(arguments: Sequence[str]) -> None:
     if not options.no_browser:
         webbrowser.open(viewer.address)
     with suppress(KeyboardInterrupt):
-        threading.Event().wait()
+        while True:
+            time.sleep(3600)  # on Windows, Ctrl-C ends no other wait
     viewer.close()
 
 

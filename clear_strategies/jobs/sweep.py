@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import re
 import signal
+import sys
 from collections.abc import Iterator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
@@ -133,6 +134,7 @@ def stop_workers(signum: int, frame: FrameType | None) -> None:
     while frame is not None:
         frame.f_locals.get("job_overrides", []).clear()
         frame = frame.f_back
-    for worker in workers:
-        with suppress(ProcessLookupError):
-            os.kill(worker.pid, signum)  # type: ignore[arg-type]
+    if sys.platform != "win32":  # whose console has told them; `kill` would end them before they have saved
+        for worker in workers:
+            with suppress(ProcessLookupError):
+                os.kill(worker.pid, signum)  # type: ignore[arg-type]
