@@ -83,7 +83,8 @@ def main(overrides: Sequence[str] | None = None) -> None:
 
 def readable(word: str) -> str:
     """A word of the command line, its value quoted where Hydra's grammar has no such value, as paths may have any letters, or
-    where it would take a path with a comma for two. A `~` of Hydra's own folders is expanded; `compose.tree` does the others.
+    where it would take a path with a comma for two, or leave out backslashes of one of Windows. A `~` of Hydra's own folders is
+    expanded; `compose.tree` does the others.
     """
     key, equals, value = word.partition("=")
     if not equals:
@@ -99,7 +100,8 @@ def readable(word: str) -> str:
         return f"{key}={quoted(value)}"
     if not chosen.value() and (CONF / (group := chosen.key_or_group)).is_dir():
         raise SettingError(no_option(group, value, [*options(group)]))
-    return f"{key}={quoted(value)}" if "," in value and os.path.exists(value) else word  # noqa: PTH110 - as `is_file`
+    is_path = value.startswith("\\\\") or ({",", "\\"} & {*value} and os.path.exists(value))  # noqa: PTH110 - as `is_file`
+    return f"{key}={quoted(value)}" if is_path else word
 
 
 def _flags_last(arguments: Sequence[str]) -> list[str]:

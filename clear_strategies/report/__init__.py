@@ -23,6 +23,7 @@ import numpy as np
 
 from clear_strategies import console, files
 from clear_strategies.commands import path_of
+from clear_strategies.data.file_names import alike
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.errors import ClearError, DataError
 from clear_strategies.jobs import exit_codes
@@ -105,7 +106,7 @@ def _file_names(scenes: Iterable[str]) -> dict[str, str]:
     words: dict[str, str] = {}
     for scene in dict.fromkeys(scenes):
         word = re.sub(r"\W+", "_", scene).strip("_")[:_LONGEST] or "scene"
-        while word in words.values():
+        while alike(word) in map(alike, words.values()):
             word += "_"
         words[scene] = word
     return words
