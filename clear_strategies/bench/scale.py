@@ -7,11 +7,12 @@ its peak. Photos are those of the demo; of a run of them the processor time coun
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import redirect_stderr, redirect_stdout
 from multiprocessing import get_context
 from typing import Any, Final
 
@@ -20,9 +21,11 @@ import pandas as pd
 import torch
 
 import rasterizers
+from clear_strategies import run
 from clear_strategies.bench import scenes
 from clear_strategies.bench.iteration import TOTAL, Training, view_of
 from clear_strategies.bench.results import Results, interleaved, medians
+from clear_strategies.compose import quoted
 from clear_strategies.core.work_log import peak_mib
 from clear_strategies.errors import DataError
 from clear_strategies.merging.objective import Objective
@@ -47,7 +50,7 @@ def measure(
     sizes += [("pixels", w * w * 3 // 4, _GAUSSIANS, w) for w in sorted(widths)]
     with ProcessPoolExecutor(1, get_context("spawn"), max_tasks_per_child=1) as one:
         rows = [one.submit(_iteration, *size, repeats, torch.get_num_threads()).result() for size in sizes]
-    rows += [row for n in sorted(photos) for row in _run(n, iterations)]
+        rows += [row for n in sorted(photos) for row in _run(one, n, iterations)]
     table = pd.DataFrame(rows, columns=["of", "size", "ms", "mib"])
     steps = np.log(table[["ms", "size"]].astype(float)).groupby(table["of"], sort=False).diff()
     table["exponent"] = steps["ms"] / steps["size"]
@@ -70,18 +73,27 @@ def _iteration(of: str, size: int, gaussians: int, width: int, repeats: int, thr
     return of, size, medians(turns).loc[of, TOTAL], peak_mib()
 
 
-def _run(photos: int, iterations: int) -> list[tuple[Any, ...]]:
+def _run(one: ProcessPoolExecutor, photos: int, iterations: int) -> list[tuple[Any, ...]]:
     """A row for the whole run, and one for each of its stages, as timing.csv has them: of these, time is by the clock."""
     with tempfile.TemporaryDirectory() as folder:
         counts = (f"data.reader.views={photos + 1}", f"data.reader.train={photos}", f"fit.iterations={iterations}")
-        program = [sys.executable, "-m", "clear_strategies.run", *_RUN, *counts, f"hydra.run.dir={folder}/run"]
-        child = subprocess.Popen(program, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # noqa: S603 - this interpreter
-        _, status, used = os.wait4(child.pid, 0)
-        child.returncode = os.waitstatus_to_exitcode(status)
-        if child.returncode:
-            problem = f"its run ended with code {child.returncode}"
-            raise DataError("--photos", str(photos), problem, " ".join(program[1:-1]))
+        words = [*_RUN, *counts, f"hydra.run.dir={quoted(f'{folder}/run')}"]
+        code, seconds = one.submit(_trained, words).result()
+        if code:
+            problem = f"its run ended with code {code}"
+            raise DataError("--photos", str(photos), problem, " ".join(["python -m clear_strategies.run", *words[:-1]]))
         stages = pd.read_csv(f"{folder}/run/timing.csv").query("seconds > 0")
     peak = int(stages["peak_mib"].max())
-    rows: list[tuple[Any, ...]] = [("photos", photos, 1e3 * (used.ru_utime + used.ru_stime), peak)]
+    rows: list[tuple[Any, ...]] = [("photos", photos, 1e3 * seconds, peak)]
     return rows + [(s.stage, photos, 1e3 * s.seconds, s.peak_mib) for s in stages.itertuples()]
+
+
+def _trained(words: Sequence[str]) -> tuple[Any, float]:
+    """The exit code of a run in this process, and the process's processor time, seconds."""
+    sys.argv[1:] = words
+    with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):  # noqa: PTH123
+        try:
+            run.main()
+        except SystemExit as ended:
+            return ended.code, time.process_time()
+    return 0, time.process_time()

@@ -18,10 +18,8 @@ import torch
 from jaxtyping import Shaped
 from torch import Tensor
 
-try:
+if sys.platform != "win32":
     import resource
-except ImportError:  # Windows
-    resource = None  # type: ignore[assignment]
 
 _MIB: Final = 1024 if sys.platform != "darwin" else 1 << 20  # units of ru_maxrss
 _BATCH: Final = 1024  # pairs of events that are kept before those that the device has passed are read
@@ -150,7 +148,10 @@ class WorkLog:
 
 def peak_mib() -> int:
     """The most main memory that the process has held so far, MiB; 0 where the system does not tell."""
-    return 0 if resource is None else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // _MIB
+    if sys.platform == "win32":
+        return 0
+    else:  # noqa: RET505 - as mypy knows platforms
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // _MIB
 
 
 class _Stage:

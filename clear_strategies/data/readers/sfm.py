@@ -16,6 +16,7 @@ import mmap
 import os
 import shutil
 import statistics
+import sys
 import tempfile
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
@@ -258,7 +259,7 @@ def _match(pycolmap: Any, database: Path, copies: Sequence[str], threads: int) -
     progress = Progress("matching", "pairs of photos", total)
     for one, other in itertools.combinations_with_replacement(blocks, 2):
         pairs = list(itertools.combinations(one, 2) if one is other else itertools.product(one, other))
-        pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in pairs))
+        pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8", newline="\n")
         pycolmap.match_image_pairs(
             database, matching_options=options, pairing_options=pairing, device=pycolmap.Device.cpu
         )
@@ -344,7 +345,7 @@ def _threads(settings: SfmSettings) -> int:
 def _require_addresses(root: Path, threads: int) -> None:
     """Refuse where the system limits memory to less than COLMAP takes: its libraries then end the process, or wait for ever."""
     try:
-        if hasattr(mmap, "MAP_PRIVATE"):  # Windows has no such limit
+        if sys.platform != "win32":  # which has no such limit
             mmap.mmap(-1, (threads + 1) * _PER_WORKER, flags=mmap.MAP_PRIVATE, prot=0).close()
     except OSError as error:
         needed = f"COLMAP takes up to {(threads + 1) * _PER_WORKER >> 20} MB of addresses with {threads} thread(s)"
