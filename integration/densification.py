@@ -69,14 +69,14 @@ def _end_of_densification(conductor: Conductor, until: int, first: int) -> int:
     if gaps := sorted({*range(first, end)} - {*allowed}):
         _log.warning(
             "%s forbids densification at %d of the iterations before %d, the first is %d, but the host densifies there: "
-            "only the end can be set from here.", _forbidding(conductor, max(1, gaps[0] - first)), len(gaps), end, gaps[0],
+            "only the end can be set from here.", _forbidding(conductor, gaps[0] - first), len(gaps), end, gaps[0],
         )  # fmt: skip
     return end
 
 
 def _forbidding(conductor: Conductor, t: int) -> str:
-    """The strategies that forbid densification at iteration t."""
-    return ", ".join(type(s).__name__ for s in conductor.strategies if not s.may_densify(t))
+    """The strategies that forbid densification at iteration t, or at the first where t is before it."""
+    return ", ".join(type(s).__name__ for s in conductor.strategies if not s.may_densify(max(1, t)))
 
 
 class ScoreScaler:

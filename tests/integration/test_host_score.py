@@ -201,6 +201,11 @@ def test_it_is_the_first_iteration_after_the_last_that_is_allowed(first, caplog)
     )
 
 
+def test_a_strategy_that_never_allows_it_is_named(caplog):
+    require_end(Conductor(Late(0, 1)), 100, "until", first=0)
+    assert "but Late ends densification at 0" in caplog.text
+
+
 def test_without_such_a_strategy_nothing_changes(caplog):
     settings = SimpleNamespace(until=100)
     end_with_strategies(Conductor(SVS()), settings, "until")
