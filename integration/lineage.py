@@ -17,6 +17,7 @@ from clear_strategies.errors import HostError
 
 ROWS: Final = "clear_rows"
 """Key of the row numbers."""
+_ROUNDING: Final = 0.1  # an average of the same numbers over many steps differs from them by less
 
 
 def is_same(parents: Int[Tensor, " M"], n: int) -> bool:
@@ -25,7 +26,8 @@ def is_same(parents: Int[Tensor, " M"], n: int) -> bool:
 
 
 class RowNumbers:
-    """Row numbers that clone, split, prune, relocation and MCMC's sampling gather, since they gather every entry.
+    """Row numbers that clone, split, prune, relocation and MCMC's sampling gather, since they gather every entry. They are
+    float64, exact up to 2^53, because a loop may treat all its parameters alike, e.g. average them.
 
     Args:
         entries: the host's parameters, which may hold one that is not trained; or other tensors that follow them: the `state` of
@@ -53,7 +55,7 @@ class RowNumbers:
     def restart(self) -> None:
         """Number the rows from 1: 0 is what a host writes that knows no origin, or adds a Gaussian that has none."""
         means = self._means()
-        rows = torch.arange(1, len(means) + 1, device=means.device)
+        rows = torch.arange(1, len(means) + 1, device=means.device, dtype=torch.float64)
         self._numbered = len(means)
         self._entries[ROWS] = torch.nn.Parameter(rows, requires_grad=False) if self._as_parameter else rows
         self._unchanged = self._entries[ROWS], self._entries[ROWS]._version
@@ -63,7 +65,7 @@ class RowNumbers:
         rows are the same.
 
         Raises:
-            HostError: a densifier changed the parameters but not this one.
+            HostError: a densifier changed the parameters but not this one, or the loop has computed with the numbers.
         """
         rows: Tensor = self._entries[ROWS]
         n = len(self._means())
@@ -75,7 +77,12 @@ class RowNumbers:
         of, version = self._unchanged
         if (rows is of and rows._version == version) or len(rows) != n:  # a scene moves Gaussians in place
             return None
-        parents, numbered = rows.detach().long() - 1, self._numbered
+        parents, numbered = rows.detach().round().long() - 1, self._numbered
+        if bool(((rows - parents - 1).abs() > _ROUNDING).any()) or bool(((parents < -1) | (parents >= numbered)).any()):
+            raise HostError(
+                f"the parameter {ROWS} must hold row numbers from 0 to {numbered:,}, but the loop has computed others of them. "
+                f"Leave it out where all parameters are changed: if name != {ROWS!r}, or if p.requires_grad."
+            )
         self.restart()
         return None if is_same(parents, numbered) else parents
 

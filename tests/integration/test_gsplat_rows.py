@@ -1,6 +1,7 @@
 """gsplat's own densifiers with CLEAR attached: which Gaussian came from which, and what follows them."""
 
 import copy
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 
 import pytest
@@ -150,6 +151,25 @@ def test_checkpoints_and_later_loops_know_nothing_of_the_rows():
     assert torch.equal(splats["means"], stored["means"])
     clear.remove()
     assert ROWS not in splats
+
+
+@pytest.mark.parametrize(
+    ("change", "refused"),
+    [(lambda p, mean: p.copy_(mean.mul_(0.999).add_(p, alpha=0.001)), False), (lambda p, _: p.add_(0.3), True),
+     (lambda p, _: p.mul_(2), True)],
+    ids=["an average", "noise", "a scale"],
+)  # fmt: skip
+def test_a_loop_may_average_all_parameters_and_is_refused_where_it_changes_the_rows(change, refused):
+    recorder = toy.Recorder()
+    host, _, render = gsplat_host.started(recorder)
+    with torch.no_grad():
+        means = {name: p.clone() for name, p in host.splats.items()}
+        for _ in range(100):
+            for name, p in host.splats.items():
+                change(p, means[name])
+    with pytest.raises(HostError, match=f"{ROWS} must hold row numbers") if refused else nullcontext():
+        render()
+    assert not recorder.changes
 
 
 @pytest.mark.parametrize("stopped_at", [1, 2, 3])
