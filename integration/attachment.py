@@ -159,6 +159,12 @@ class Attachment:
         output = render_at("lr", z, view)
         if isinstance(output, Drawable):
             raise TypeError("an adapter renders LR by the host's own function, got a Drawable.")
+        if not output.shot.is_in_order:
+            raise HostError(
+                f"{view.name} is rendered with its Gaussians in another order than that of the parameters, so that f_det and "
+                "dropout would go to others. Render them as they are, since the rasterizer sorts by depth itself, or sort the "
+                "parameters."
+            )
         self.counts["LR renders"] += 1
         self._pending = Pending(self.counts["LR renders"], view.name, output, hr, routed)
         self._pending.listen(WeakMethod(self._reached), to_screen=hr is not None and self._hr.is_scored)

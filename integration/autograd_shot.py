@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,9 +14,12 @@ from clear_strategies.core.gradients import Grads, gradients_of, summed
 from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.iteration import HrSide
 from integration.colours import are_joined, is_hooked
-from rasterizers.autograd import Drawing, outer
+from rasterizers.autograd import Drawing, Rendered, outer
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, summed_vjp
+
+_GOLDEN: Final = 0.6180339887498949  # multiples of it modulo 1 lie far apart for rows that are close
+_SAME_CODE: Final = 0.1  # what else a row depends on, e.g. the mean of all, changes the ratio of its gradients a little
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,6 +102,12 @@ class AutogradShot:
     def drawing(self) -> Drawing | None:
         """The only one of `drawings`; None: another rasterizer drew the image, or it was put together of several."""
         return self.drawings[0] if len(self.drawings) == 1 else None
+
+    @property
+    def is_in_order(self) -> bool:
+        """Whether the rasterizer was given the rows in the order of the parameters, see `are_in_order`."""
+        drawn = self.drawn if self.drawing is None else self.drawing.inputs
+        return drawn is None or are_in_order(drawn, self.params)
 
     @property
     def gradient_slot(self) -> ScreenGradientSlot:
@@ -204,20 +213,66 @@ def every_number(g: Grads, params: Mapping[str, Tensor]) -> Grads:
     return Grads({name: torch.zeros_like(p) for name, p in params.items() if name not in known} | known)
 
 
+def are_in_order(drawn: Mapping[str, Tensor], params: Mapping[str, Tensor]) -> bool:
+    """Whether row i of what was drawn is made of row i of the parameters; true of what cannot be asked.
+
+    Rows that pass through unchanged are the memory of the parameter. Others are asked by two cotangents, of which row i is 1 and
+    c_i. A parameter's rows in their order have gradients g and c_i g, in another order g and c_j g.
+    """
+    asked = list[tuple[Tensor, Tensor]]()
+    for name in ("opacities", "scales", "means", "quats", "colors"):
+        x, p = drawn.get(name), params.get("sh0" if name == "colors" else name)
+        if x is None or p is None or x.shape[:1] != p.shape[:1]:
+            continue
+        if x.data_ptr() == p.data_ptr() and x.stride() == p.stride():
+            return True
+        if x.requires_grad and p.requires_grad and not is_hooked(p):
+            asked.append((x, p))
+    answers = set[bool | None]()
+    for x, p in asked:
+        if (answer := _is_in_order(x, p)) is True:
+            return True
+        answers.add(answer)
+    return False not in answers
+
+
+def _is_in_order(x: Tensor, p: Tensor) -> bool | None:
+    """None: x does not depend on p."""
+    code = 1 + (torch.arange(len(x), device=x.device, dtype=torch.float64) * _GOLDEN).frac().to(x.dtype)
+    plain, coded = (
+        torch.autograd.grad(x, p, c, retain_graph=True, allow_unused=True)[0]
+        for c in (torch.ones_like(x), code.view(-1, *[1] * (x.dim() - 1)).expand_as(x))
+    )
+    if plain is None or not bool(plain.any()):
+        return None
+    plain, coded = plain.reshape(len(p), -1), coded.reshape(len(p), -1)
+    off = torch.addcmul(coded, code.to(plain)[:, None], plain, value=-1)
+    return bool((off.abs_().sum(1) <= _SAME_CODE * plain.abs_().sum(1)).all())
+
+
 def _trained(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name: p for name, p in params.items() if p.requires_grad and name != "detail"}
 
 
 def leaves_of(x: Tensor) -> list[Tensor]:
     """The leaves that a tensor depends on."""
-    found, seen, nodes = list[Tensor](), set[Any](), [x.grad_fn]
+    return [leaf for node in _graph(x) if (leaf := getattr(node, "variable", None)) is not None]
+
+
+def cameras_of(x: Tensor) -> list[Camera]:
+    """Those by which this package's rasterizers drew what a tensor depends on."""
+    return [drawn.camera for node in _graph(x) if isinstance(drawn := getattr(node, "rendered", None), Rendered)]
+
+
+def _graph(x: Tensor) -> Iterator[Any]:
+    """The nodes behind a tensor."""
+    seen, nodes = set[Any](), [x.grad_fn]
     while nodes:
         if (node := nodes.pop()) is None or node in seen:
             continue
         seen.add(node)
-        found += [leaf] if (leaf := getattr(node, "variable", None)) is not None else []
+        yield node
         nodes += [before for before, _ in node.next_functions]
-    return found
 
 
 Target = Literal["lr", "hr"] | Camera

@@ -375,3 +375,32 @@ def test_all_renders_are_over_the_background_of_a_strategy_unless_the_loop_has_i
     assert ("RandomBackground has no effect here" in caplog.text) == own_background
     color = None if own_background else torch.tensor(chosen.background(1)).tolist()
     assert [b if b is None else b[0].tolist() for b in backgrounds] == [color] * 3
+
+
+ROWS = torch.randperm(20, generator=torch.Generator().manual_seed(0))
+ORDERS = {
+    "by an index": lambda x: x[ROWS],
+    "by another function": lambda x: x.flip(0),
+    "of the values alone": lambda x: x.detach()[ROWS] if x.dim() < 3 else x[ROWS],
+    "two rows": lambda x: torch.cat((x[1:2], x[:1], x[2:])),
+    "in parts": lambda x: torch.cat((x[:7], x[7:])),
+    "by the rows themselves": lambda x: x[torch.arange(20)],
+    "with the mean of all": lambda x: x - 0.1 * x.mean(0, keepdim=True),
+}
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("function", FUNCTIONS)
+@needs("cpp")
+def test_gaussians_in_another_order_than_the_parameters_are_refused(order, function):
+    host, _, _ = started(host=Host(toy.scene(20), rasterization=FUNCTIONS[function]))
+    for name in ("scales", "sh0"):  # as a loop that makes all of its tensors anew has them
+        host.splats[name].data += torch.rand_like(host.splats[name])
+    draw = lambda *x, **call: host.rasterization(*map(ORDERS[order], x[:5]), *x[5:], **call)  # noqa: E731
+    stays = order in ("in parts", "by the rows themselves", "with the mean of all")
+    with (
+        nullcontext()
+        if stays
+        else pytest.raises(HostError, match="view0 is rendered with its Gaussians in another order")
+    ):
+        gsplat_host.drawn(draw, host.splats, host.photos["view0"].camera)[0].mean().backward()
