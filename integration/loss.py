@@ -19,8 +19,10 @@ from clear_strategies.core.view import ExtraView, View
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Update
 from clear_strategies.strategies.base import overrides
-from integration.autograd_shot import AutogradShot, leaves_of
+from integration.autograd_shot import AutogradShot, cameras_of, leaves_of
 from integration.densification import ScoreScaler, score_for_host
+from integration.views import SAME_POSE
+from rasterizers.interface import Camera
 
 
 def joint_loss(
@@ -47,12 +49,13 @@ def joint_loss(
 
     Raises:
         ValueError: `params` and the renderings do not name the same parameters, or one has no row for each Gaussian; f_det shows
-            at LR, or not at HR; a strategy has not started.
+            at LR, or not at HR; this package drew another training view than `view`; a strategy has not started.
     """
     values = {name: p.detach() for name, p in params.items()}
     _require_rows(values)
     leaves_of_lr = leaves_of(lr.image)
     _require_detail(params.get("detail"), leaves_of_lr, hr)
+    _require_view(conductor, view, lr=lr, hr=hr)
     _require_started(conductor)
     update = conductor.update(values, lr, hr, view, t)
     objective, λ = conductor.objective, conductor.objective.lambda_hr(t)
@@ -117,6 +120,21 @@ def _require_detail(detail: Tensor | None, leaves_of_lr: Sequence[Tensor], hr: S
         raise ValueError(
             "hr is drawn without f_det, which would learn nothing. Draw it with an offset of the colours by params['detail']."
         )
+
+
+def _require_view(conductor: Conductor, view: View, **shots: Shot | None) -> None:
+    """A pose that is that of no view, e.g. since the host optimizes it, is taken."""
+
+    def has_pose(camera: Camera, of: View) -> bool:
+        a, b = (c.world_to_camera.detach().double().cpu() for c in (camera, of.lr.camera))
+        return torch.allclose(a, b, rtol=SAME_POSE, atol=SAME_POSE)
+
+    for name, shot in shots.items():
+        for camera in () if shot is None else cameras_of(shot.image):
+            if not has_pose(camera, view) and (drawn := [v.name for v in conductor.views if has_pose(camera, v)]):
+                raise ValueError(
+                    f"{name} must be drawn by the camera of its view {view.name}, got that of {drawn[0]}. Pass its view."
+                )
 
 
 def _require_started(conductor: Conductor) -> None:

@@ -27,6 +27,8 @@ from clear_strategies.merging.conductor import Conductor
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
+SAME_POSE: Final = 1e-3
+"""Largest difference between the entries of two poses of one camera."""
 _SHOWN: Final = 0.5  # a mask above it shows its pixel
 _OVERSHOOT: Final = 0.5  # of a network's images outside of [0, 1] at edges
 

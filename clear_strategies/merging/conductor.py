@@ -64,6 +64,7 @@ class Conductor:
         showing: those that override `extra_views`.
         decorated: whether `prior` has been called, or there are no decorators.
         sr: the prior that `prior` was called with; None before.
+        views: that `on_fit_start` was called with.
         logs: the scalars that the strategies log.
 
     Raises:
@@ -82,6 +83,7 @@ class Conductor:
         self.decorated = not self.decorators
         self.sr: Any = None
         self.work_log = WorkLog()
+        self.views: tuple[View, ...] = ()
         self._hr_cotangents: Tensor | None = None
         self.logs = IterationLogs(strategies)
         self._owner = dict.fromkeys(_ONE_ANSWER, Strategy())  # its hooks hold where no strategy overrides them
@@ -114,7 +116,7 @@ class Conductor:
         Args:
             device: of the field. views: all training views, where the caller has them.
         """
-        self.work_log.device = torch.device(device)
+        self.work_log.device, self.views = torch.device(device), tuple(views)
         for s in self.strategies:
             s.on_fit_start(n_views, seed)
             answers.require_started(s, seed)
@@ -125,7 +127,7 @@ class Conductor:
 
     def on_fit_end(self) -> None:
         """Once, after the last iteration."""
-        self._hr_cotangents = None
+        self._hr_cotangents, self.views = None, ()
         for s in self.strategies:
             s.on_fit_end()
 

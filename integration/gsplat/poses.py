@@ -12,8 +12,8 @@ from torch import Tensor
 
 from clear_strategies.core.view import View
 from clear_strategies.errors import HostError
+from integration.views import SAME_POSE
 
-_SAME_POSE: Final = 1e-3  # largest difference between the entries of two poses of one camera
 _POSE_RATIO: Final = 10  # how many times as far the second nearest pose must be, since frames of a video lie close
 
 
@@ -37,7 +37,7 @@ class Poses:
                 "and average."
             )
         distances = np.abs(self._poses - poses).max((1, 2)).tolist()
-        tolerance = _SAME_POSE * max(1.0, float(np.abs(poses).max()))
+        tolerance = SAME_POSE * max(1.0, float(np.abs(poses).max()))
         near = sorted((distance, i) for i, distance in enumerate(distances) if distance <= tolerance)
         if len(near) > 1 and near[1][0] <= _POSE_RATIO * near[0][0]:
             names = " and ".join(self._views[i].name for _, i in near[:2])

@@ -1,5 +1,7 @@
 """`joint_loss` in the smallest host: torch parameters, torch.optim, and a renderer with autograd."""
 
+from contextlib import nullcontext
+
 import pytest
 import torch
 
@@ -156,3 +158,17 @@ def test_a_rendering_of_another_size_is_refused():
         ValueError, match="view view0: the HR rendering must have the 96x64 pixels of its HR image, got 24x16"
     ):
         joint_loss(Conductor(objective=HR_FROM_START), host.params, small, host.render(view.lr.camera), view, 5)
+
+
+@pytest.mark.parametrize("drawn", ["lr", "hr", "a pose of no view"])
+def test_a_rendering_of_another_view_than_the_one_that_is_passed_is_refused(drawn):
+    scene = toy.scene(20)
+    host, conductor = Host(scene), Conductor(objective=HR_FROM_START)
+    view, other = scene.train[:2]
+    conductor.on_fit_start(3, 0, views=scene.train)
+    of = {"lr": view.lr, "hr": view.hr} | {drawn: other.hr if drawn == "hr" else other.lr}
+    lr = host.render(toy.camera(1.2).scaled(0.25) if drawn == "a pose of no view" else of["lr"].camera, detail=False)
+    hr = host.render(of["hr"].camera)
+    message = f"{drawn} must be drawn by the camera of its view {view.name}, got that of {other.name}"
+    with pytest.raises(ValueError, match=message) if drawn in ("lr", "hr") else nullcontext():
+        joint_loss(conductor, host.params, lr, hr, view, 5)
