@@ -72,7 +72,8 @@ class RowNumbers:
         if len(rows) != n and self._as_parameter:
             raise HostError(
                 f"the densifier changed the number of Gaussians from {len(rows):,} to {n:,} without the parameter {ROWS}. It "
-                "must treat every entry of the parameters alike."
+                "must treat every entry of the parameters alike. Where the loop has loaded other Gaussians, remove() and attach "
+                "again."
             )
         of, version = self._unchanged
         if (rows is of and rows._version == version) or len(rows) != n:  # a scene moves Gaussians in place

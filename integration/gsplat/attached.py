@@ -71,7 +71,7 @@ class Attached:
             else "host". Pictures of the two differ by 3e-3 at most, where one blends a contribution of 1/255 and the other not.
 
     Raises:
-        ValueError: there is no view, or a parameter is missing.
+        ValueError: there is no view, a parameter is missing, or f_det is there with another number of rows.
         HostError: a network makes the colours; `params` are attached already.
         SettingError: densification outlasts the anchor; a scheduler exists that an optimizer of all parameters cannot follow.
     """
@@ -109,6 +109,11 @@ class Attached:
         means = params[self._names["means"]]
         if detail and "detail" not in params:
             params["detail"] = torch.nn.Parameter(means.new_zeros(len(means), 3))
+        if "detail" in params and (found := params["detail"].shape) != (len(means), 3):
+            raise ValueError(
+                f"params['detail'] must have 3 numbers for each of the {len(means):,} Gaussians, got {[*found]}. "
+                "If other Gaussians were loaded, delete it there and among the optimizers: attach makes new ones."
+            )
         self._optimizers = optimizers
         self._rows = RowNumbers(
             params if state is None else state, lambda: params[self._names["means"]], as_parameter=state is None

@@ -172,6 +172,25 @@ def test_a_loop_may_average_all_parameters_and_is_refused_where_it_changes_the_r
     assert not recorder.changes
 
 
+def test_a_loop_that_loads_other_gaussians_is_attached_again():
+    host, clear, render = gsplat_host.started()
+    other = Host(toy.scene(23))
+    for name, p in other.splats.items():
+        host.splats[name], host.optimizers[name] = p, other.optimizers[name]
+    with pytest.raises(HostError, match=r"from 20 to 23 without .* remove\(\) and attach again"):
+        render()
+    clear.remove()
+    host.rasterization = other.rasterization
+    with pytest.raises(
+        ValueError, match=r"each of the 23 Gaussians, got \[20, 3\]. If other Gaussians were loaded, delete it"
+    ):
+        gsplat_host.started(host=host)
+    del host.splats["detail"], host.optimizers["detail"]
+    host, clear, render = gsplat_host.started(host=host)
+    render().mean().backward()
+    assert clear.attachment.counts["merges"] == 1
+
+
 @pytest.mark.parametrize("stopped_at", [1, 2, 3])
 def test_a_resumed_loop_takes_the_anchor_as_if_it_had_not_stopped(stopped_at):
     scene = toy.scene(20)
