@@ -1,4 +1,5 @@
-"""Image files, read and written, and their EXIF blocks. An image that cannot be read exactly is refused.
+"""Image files, read and written, and their EXIF blocks. An image that cannot be read exactly is refused, but one of more than 100
+megapixels is reduced by a whole factor.
 
 The content of a file decides its format. A truncated file is an error, not an image with a grey bottom. 16 bits stay 16 bits.
 Colours of another profile become sRGB, in 8 bits. Alpha is composited over a given background, before anything is resampled, so
@@ -11,6 +12,7 @@ from __future__ import annotations
 import io
 import logging
 import math
+import shlex
 import threading
 import warnings
 from collections.abc import Iterator
@@ -36,12 +38,14 @@ SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".jfif", ".webp", ".tif", ".tiff", "
 _FORMATS: Final = ("PNG", "JPEG", "WEBP", "TIFF")
 _LOSSLESS: Final = ("PNG", "TIFF")
 _HEIF_BRANDS: Final = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1")  # bytes 8 to 12, behind "ftyp"
-_MAX_PIXELS: Final = 100_000_000
+_MAX_PIXELS: Final = 100_000_000  # of what is read, 1.2 GB: of larger photos, the mean of 2x2 or more pixels
+_LARGEST: Final = 500_000_000  # pixels of a file with 8 bits: its header may promise any number
 PNG_LEVEL: Final = 3  # a third of the time of zlib's default, for 5 % more bytes
 _ADOBE_RGB: Final = "R03"  # EXIF's index of interoperability
 _ON_THE_SIDE: Final = (5, 6, 7, 8)
 _SAME_COLOR: Final = 4  # levels of 255 by which makers' sRGB profiles differ
 _PROFILES: Final = threading.Lock()  # several photos are read at once, and each profile is logged once
+_OPENING: Final = threading.Lock()  # Pillow's limit of pixels is one for all threads
 _NCLX_PRIMARIES: Final = (1, 2)  # BT.709's, which are sRGB's, and unknown
 _NCLX_TRANSFER: Final = (1, 2, 6, 13, 14, 15)  # BT.709's in all its names, unknown, and sRGB's
 
@@ -58,7 +62,7 @@ def read_image(
             refuses it. A TIFF is never kept as it is stored, and a PNG of 16 bits never turned: they are refused.
     """
     with _opened(path, turn) as image:
-        sixteen_bits = ";16" in str(getattr(image, "tile", ""))  # the layout in the file, unknown after decoding
+        sixteen_bits = _has_sixteen_bits(image)  # unknown after decoding
         # Pillow forgets the orientation of a TIFF as it decodes it, and decodes a PNG to find its EXIF block.
         orientation = 1 if image.format == "PNG" else _orientation_of(image)
         try:
@@ -94,6 +98,8 @@ def image_size(path: Path, *, turn: bool | None = None) -> tuple[int, int]:
         # Of a turned TIFF some versions of PIL say the upright size.
         if isinstance(image, TiffImagePlugin.TiffImageFile):
             width, height = image.tag_v2[TiffImagePlugin.IMAGEWIDTH], image.tag_v2[TiffImagePlugin.IMAGELENGTH]
+        factor = _factor(width, height)
+        width, height = -(-width // factor), -(-height // factor)
         return (height, width) if turn and _orientation_of(image) in _ON_THE_SIDE else (width, height)
 
 
@@ -143,8 +149,8 @@ def _opened(path: Path, turn: bool | None) -> Iterator[Image.Image]:
     require_regular(path)
     formats = (*_FORMATS, "HEIF") if _is_heif(path) else _FORMATS
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # PIL's warnings: our own size limit follows, and damage fails on decoding
+        with _OPENING, warnings.catch_warnings(), _any_size():
+            warnings.simplefilter("ignore")  # PIL's warnings: damage fails on decoding
             image = Image.open(path, formats=formats)
     except FileNotFoundError as error:
         raise DataError(path, "file", "is not there", "check the path") from error
@@ -155,12 +161,41 @@ def _opened(path: Path, turn: bool | None) -> Iterator[Image.Image]:
         remedy = f"use one of {', '.join(_FORMATS)}, or go on without the file: data.reader.skip_faulty=true"
         raise DataError(path, "file", f"is no readable image ({type(error).__name__})", remedy) from error
     with image:
-        if image.width * image.height > _MAX_PIXELS:
-            problem = f"{image.width}x{image.height} is more than {_MAX_PIXELS:,} pixels"
-            raise DataError(path, "size", problem, "downsample the images before training")
+        if image.width * image.height > (most := _MAX_PIXELS if _has_sixteen_bits(image) else _LARGEST):
+            problem = f"{image.width}x{image.height} is more than {most:,} pixels"
+            raise DataError(path, "size", problem, f"reduce it: mogrify -resize 50% {shlex.quote(str(path))}")
         if turn is None and image.format != "PNG" and (orientation := _orientation_of(image)) != 1:
             raise _turned(path, orientation)
         yield image
+
+
+@contextmanager
+def _any_size() -> Iterator[None]:
+    """Without Pillow's own limit, which 200 megapixels of a phone exceed."""
+    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+    try:
+        yield
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
+
+
+@lru_cache(maxsize=16)  # photos of one size are told once
+def _factor(width: int, height: int) -> int:
+    """By which each side of an image of this size is reduced as it is read."""
+    factor = math.ceil(math.sqrt(width * height / _MAX_PIXELS))
+    if factor > 1:
+        _log.info("photos of %dx%d are read at 1/%d of their width and height.", width, height, factor)
+    return factor
+
+
+def _reduced(image: Image.Image) -> Image.Image:
+    factor = _factor(*image.size)
+    return image if factor == 1 else image.reduce(factor)
+
+
+def _has_sixteen_bits(image: Image.Image) -> bool:
+    """Of an image that is not decoded: the layout in its file."""
+    return ";16" in str(getattr(image, "tile", ""))
 
 
 def _is_heif(path: Path) -> bool:
@@ -214,9 +249,9 @@ def _to_float(path: Path, image: Image.Image, sixteen_bits: bool) -> Float[np.nd
     to_srgb = _to_srgb_of(image)
     if sixteen_bits and to_srgb is None:
         return _read_sixteen_bits(path)
-    pixels = np.array(image.convert("RGBA" if _has_alpha(image) else "RGB"), np.float32) / 255
+    pixels = np.array(_reduced(image.convert("RGBA" if _has_alpha(image) else "RGB")), np.float32) / 255
     if to_srgb is not None:
-        pixels[..., :3] = np.asarray(to_srgb.apply(image.convert(to_srgb.input_mode)), np.float32) / 255
+        pixels[..., :3] = np.asarray(_reduced(to_srgb.apply(image.convert(to_srgb.input_mode))), np.float32) / 255
     return pixels
 
 

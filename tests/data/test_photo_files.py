@@ -65,6 +65,29 @@ def test_sixteen_bit_grey_with_alpha_is_composited(tmp_path: Path) -> None:
     torch.testing.assert_close(photo_files.read_image(path), torch.full((1, 1, 3), 0.2))
 
 
+@pytest.mark.parametrize("mode", ["L", "P", "RGB", "RGBA"])
+def test_a_photo_of_too_many_pixels_is_read_as_their_means_and_its_size_is_that(mode, tmp_path, monkeypatch, caplog):
+    pixels = np.random.default_rng(0).integers(0, 255, (13, 23, 3), dtype=np.uint8)
+    Image.fromarray(pixels).convert(mode).save(tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as image:
+        whole = np.asarray(image.convert("RGB"), np.float32) / 255
+    monkeypatch.setattr(photo_files, "_MAX_PIXELS", 100)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 50)  # Pillow's own, which it refuses twice of
+    photo_files._factor.cache_clear()
+    caplog.set_level("INFO")
+    for _ in range(2):
+        found = photo_files.read_image(tmp_path / "a.png")
+        assert photo_files.image_size(tmp_path / "a.png") == found.shape[1::-1] == (12, 7)
+    expected = torch.from_numpy(whole[:12, :22].reshape(6, 2, 11, 2, 3).mean(axis=(1, 3)))
+    torch.testing.assert_close(found[:6, :11], expected, atol=1 / 255, rtol=0)
+    assert caplog.messages == ["photos of 23x13 are read at 1/2 of their width and height."]
+    assert Image.MAX_IMAGE_PIXELS == 50
+    cv2.imwrite(str(tmp_path / "b.png"), pixels.astype(np.uint16))
+    with pytest.raises(DataError, match="23x13 is more than 100 pixels: reduce it: mogrify -resize 50% .*b.png"):
+        photo_files.image_size(tmp_path / "b.png")
+    photo_files._factor.cache_clear()
+
+
 @pytest.mark.parametrize("ending", ENDINGS)
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_turned_photo_is_read_as_it_is_stored_or_upright(ending: str, orientation: int, tmp_path: Path) -> None:
