@@ -91,10 +91,13 @@ def is_file(path: Path) -> bool:
 
 
 def require_text(names: Iterable[str]) -> None:
-    """Raise a DataError for a name that is not UTF-8, which the JSON files and pages written after training could not hold."""
+    """Raise a DataError for a name that is not UTF-8, which the JSON files and pages written after training could not hold, or has
+    a control character, such as an end of a line.
+    """
     for name in names:
-        if (shown := name.encode(errors="backslashreplace").decode()) != name:
-            raise DataError(shown, "name", "must be UTF-8, has another byte", "rename this folder or photo")
+        if any(unicodedata.category(letter) in ("Cc", "Cs") for letter in name):
+            problem = "must be UTF-8 without control characters, has another byte"
+            raise DataError(repr(name)[1:-1], "name", problem, "rename this folder or photo")
 
 
 def some(names: Sequence[str]) -> str:

@@ -117,9 +117,11 @@ def test_what_can_be_known_is_refused_before_the_long_work(tmp_path: Path, monke
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(DataError, match=r"clear-strategies\[colmap\]"):
         photos.read(folder, tmp_path / "cache")
-    (folder / "0.png").rename(folder / os.fsdecode(b"caf\xe9.png"))
-    with pytest.raises(DataError, match=r"caf\\udce9.png: name: must be UTF-8.*rename"):
-        photos.read(folder, tmp_path / "cache")
+    photo = folder / "0.png"
+    for name, shown in ((os.fsdecode(b"caf\xe9.png"), r"caf\\udce9.png"), ("a\nb.png", r"a\\nb.png")):
+        photo = photo.rename(folder / name)
+        with pytest.raises(DataError, match=f"{shown}: name: must be UTF-8 without control characters.*rename"):
+            photos.read(folder, tmp_path / "cache")
 
 
 def test_a_pycolmap_that_does_not_run_here_is_told_as_one_that_is_not_installed(tmp_path, monkeypatch):
