@@ -35,6 +35,10 @@ OPTIONS: Final = "clear_strategies_conf"
 
 READINGS: Final = "readings"
 """The key of a configuration for what `readings=` says of each strategy."""
+NOT_IN_NAME: Final = CHANGES_NO_RESULT | {"experiment", "data.root", "prior.path"}
+"""What the name of a job's folder leaves out: what changes no result, so that `-v` or fit.viewer=true trains nothing again, and
+where data and SR images lie, which may move: for pictures of another SR model give another hydra.sweep.dir.
+"""
 # Bytes of a folder's name: most file systems take 255, and Windows 260 of a whole path.
 _LONGEST_NAME: Final = 80 if sys.platform == "win32" else 200
 _NOT_IN_NAMES: Final = re.compile(r'[<>:"\\|?*\x00-\x1f]|[. ]\Z')  # of Windows
@@ -105,10 +109,18 @@ def _folder_of(point: EntryPoint) -> str:
     return str(next(iter(spec.submodule_search_locations)))
 
 
-def _one_folder(name: str) -> str:
-    """`${one_folder:name}` in conf/: the name of a job's folder, one word that every file system takes. A path among the
-    overrides would otherwise lead elsewhere: behind `../..` all jobs share a folder.
+def _job_folder(*swept: str, _root_: Any) -> str:
+    """`${job_folder:}` in conf/: the name of a job's folder in a sweep, its overrides, in one word that every file system takes: a
+    path among them would lead elsewhere, and behind `../..` all jobs share a folder.
+
+    Args:
+        swept: keys of `NOT_IN_NAME` in which the jobs of this sweep differ, and which are in it all the same.
     """
+    left_out = {*NOT_IN_NAME}.difference(swept)
+    if _root_.method is not None:
+        left_out.add("strategy")  # it sets them aside
+    named = [word for word in _root_.hydra.overrides.task if word.lstrip("+~").partition("=")[0] not in left_out]
+    name = ",".join(sorted(named)) or "defaults"
     word = name.replace("/", "_")
     if len(word.encode()) <= _LONGEST_NAME and not _NOT_IN_NAMES.search(word):
         return word
@@ -127,11 +139,7 @@ def _reading(*, _node_: Any, _root_: Any) -> Any:
     return defaults_of(_root_.strategies[strategy][TARGET], *field) if read is None else read
 
 
-# `${settings_without_result:more, …}` in conf/: the keys of overrides that do not name a sweep's folders.
-OmegaConf.register_new_resolver(
-    "settings_without_result", lambda *more: [*sorted(CHANGES_NO_RESULT), *more], replace=True
-)
-OmegaConf.register_new_resolver("one_folder", _one_folder, replace=True)
+OmegaConf.register_new_resolver("job_folder", _job_folder, replace=True)
 OmegaConf.register_new_resolver("reading", _reading, replace=True)
 Plugins.instance().register(_ConfSource)
 Plugins.instance().register(_ReadConf)

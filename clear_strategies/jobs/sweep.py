@@ -18,14 +18,16 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from clear_strategies import signals
 from clear_strategies.errors import ClearError, DataError
 from clear_strategies.files import FINISHED, expanded
+from clear_strategies.options import NOT_IN_NAME
 from clear_strategies.settings import absent, missing
 
 # Launchers whose jobs see the folders that the process sees which was started; on the nodes of a cluster there may be others.
@@ -56,16 +58,33 @@ def refusal(config: DictConfig) -> str | None:
         return None  # the jobs tell it, or Hydra, which composes all of them next
 
 
+def name_by_all_that_is_swept(config: DictConfig) -> None:
+    """Have the names of the jobs' folders tell also those settings, else left out, in which the jobs differ.
+
+    Args:
+        config: as of `refusal`.
+    """
+    if OmegaConf.to_container(config.hydra.sweep)["subdir"] != "${job_folder:}":
+        return  # the user names them
+    if swept := NOT_IN_NAME & {word.key_or_group for word in _words(config) if word.is_sweep_override()}:
+        with read_write(config.hydra):
+            config.hydra.overrides.hydra.append(f"hydra.sweep.subdir='${{job_folder:{','.join(sorted(swept))}}}'")
+
+
+def _words(config: DictConfig) -> list[Override]:
+    """The overrides of a sweep, those of its file included."""
+    hydra = config.hydra
+    words = [*(f"{key}={values}" for key, values in (hydra.sweeper.params or {}).items()), *hydra.overrides.task]
+    return OverridesParser.create(GlobalHydra.instance().config_loader()).parse_overrides(words)
+
+
 def _jobs(config: DictConfig) -> Iterator[DictConfig]:
     """The configuration of each job; none where another sweeper than Hydra's own chooses the values."""
-    hydra = config.hydra
-    if hydra.runtime.choices["hydra/sweeper"] != "basic":
+    if config.hydra.runtime.choices["hydra/sweeper"] != "basic":
         return
-    loader = GlobalHydra.instance().config_loader()
-    words = [*(f"{key}={values}" for key, values in (hydra.sweeper.params or {}).items()), *hydra.overrides.task]
-    (jobs,) = BasicSweeper.split_arguments(OverridesParser.create(loader).parse_overrides(words), None)
+    (jobs,) = BasicSweeper.split_arguments(_words(config), None)
     for overrides in jobs:
-        yield loader.load_sweep_config(config, overrides)
+        yield GlobalHydra.instance().config_loader().load_sweep_config(config, overrides)
 
 
 def _lack(config: DictConfig) -> str | None:

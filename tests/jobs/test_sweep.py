@@ -12,18 +12,19 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from omegaconf import OmegaConf
+from hydra.types import RunMode
+from omegaconf import OmegaConf, open_dict
 
 from clear_strategies.files import LOCK, HeldError, hold
 from clear_strategies.hydra_app import FAILED, SweepCallback
 from clear_strategies.jobs import device, sweep
 from clear_strategies.training import checkpoint
 from tests.helpers.command_line import TINY, run, started, stopped_by, wait_for
-from tests.helpers.configs import composed
+from tests.helpers.configs import composed, loader
 from tests.helpers.finished_run import make_run
 
 AUTO = ["fit.resume=auto", *TINY]
-SWEEP = ["-m", "hydra.sweep.dir=all", *AUTO]
+SWEEP = ["-m", "hydra.sweep.dir=all", "hydra.sweep.subdir=${hydra.job.num}", *AUTO]
 DOOR = ["-m", "clear_strategies.run"]
 
 
@@ -101,6 +102,32 @@ def test_a_sweep_whose_jobs_all_lack_the_same_is_refused_once_before_any_of_them
 def test_a_sweep_whose_jobs_do_not_all_lack_the_same_begins(swept, failed, tmp_path):
     result = run(*swept, "hydra.sweep.dir=all", cwd=tmp_path)
     assert f"{failed} job(s) failed" in result.stdout if failed else not result.returncode, result.stdout
+
+
+@pytest.mark.parametrize(
+    ("asked", "folders"),
+    [
+        (["-m"], ["defaults"]),
+        (["fit.seed=0,1", "-m", "fit.verbose=true"], ["fit.seed=0", "fit.seed=1"]),
+        (["+strategy=gco", "fit.threads=1,2"], ["+strategy=gco,fit.threads=1", "+strategy=gco,fit.threads=2"]),
+        (["prior=onnx", "prior.path=../a,b/c"], ["prior.path=.._a,prior=onnx", "prior.path=b_c,prior=onnx"]),
+        (
+            ["experiment=table5", "protocol=scenes", "data.root=a,b", "+method=srgs", "+scene=fern", "fit.seed=0"],
+            [f"+method=srgs,+scene=fern,data.root={root},fit.seed=0,protocol=scenes" for root in "aabbaabb"],
+        ),
+        (["fit.threads=1,2", "hydra.sweep.subdir=${hydra.job.num}"], ["0", "1"]),
+    ],
+)
+def test_the_folders_of_a_sweeps_jobs_are_named_by_all_in_which_they_differ(asked, folders, monkeypatch):
+    monkeypatch.setattr(sweep.GlobalHydra, "instance", lambda: SimpleNamespace(config_loader=loader))
+    config = loader().load_configuration("config", [w for w in asked if w != "-m"], run_mode=RunMode.MULTIRUN)
+    sweep.name_by_all_that_is_swept(config)
+    named = list[str]()
+    for number, job in enumerate(sweep._jobs(config)):
+        with open_dict(job):
+            job.hydra.job.num = number
+        named.append(job.hydra.sweep.subdir)
+    assert sorted(map(str, named)) == sorted(folders)
 
 
 @pytest.mark.slow
@@ -280,7 +307,7 @@ def test_failed_jobs_are_told_where_the_report_cannot_be_written(tmp_path, caplo
     callback, config = (
         SweepCallback(),
         OmegaConf.create(
-            {"hydra": {"sweep": {"dir": str(tmp_path)}, "runtime": {"choices": {"hydra/sweeper": "optuna"}}}}
+            {"hydra": {"sweep": {"dir": str(tmp_path), "subdir": "1"}, "runtime": {"choices": {"hydra/sweeper": "optuna"}}}}
         ),
     )
     make_run(tmp_path / "0")
