@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -48,6 +48,22 @@ _PROFILES: Final = threading.Lock()  # several photos are read at once, and each
 _OPENING: Final = threading.Lock()  # Pillow's limit of pixels is one for all threads
 _NCLX_PRIMARIES: Final = (1, 2)  # BT.709's, which are sRGB's, and unknown
 _NCLX_TRANSFER: Final = (1, 2, 6, 13, 14, 15)  # BT.709's in all its names, unknown, and sRGB's
+_OF_LENS: Final = (
+    ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.LensModel, ExifTags.Base.FocalLength,
+    ExifTags.Base.DigitalZoomRatio,
+)  # fmt: skip
+
+
+class Optics(NamedTuple):
+    """What a photo's EXIF block says of its camera.
+
+    Args:
+        focal_35mm: the focal length on 35 mm film of the same diagonal, mm, where it is known.
+        lens: maker, model, lens, focal length and digital zoom, as they stand there.
+    """
+
+    focal_35mm: float | None
+    lens: tuple[str, ...]
 
 
 def read_image(
@@ -121,15 +137,17 @@ def is_lossy(path: Path) -> bool:
         return image.format not in _LOSSLESS
 
 
-def focal_35mm(path: Path) -> float | None:
-    """The focal length on 35 mm film of the same diagonal, mm, where EXIF says it; cameras also write 0, 0/0, text and tuples."""
+def optics(path: Path) -> Optics:
+    """What the EXIF block says of the camera; the DataErrors as of `read_image`. Cameras also write 0, 0/0, text and tuples."""
     with _opened(path, False) as image:
-        value = _tags(image, ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm, 0)
+        tags = _tags(image, ExifTags.IFD.Exif)
+    value = tags.get(ExifTags.Base.FocalLengthIn35mmFilm, 0)
     try:
         number = float(value[0] if isinstance(value, tuple) else value)
     except (TypeError, ValueError, ZeroDivisionError, IndexError):
-        return None
-    return number if math.isfinite(number) and number > 0 else None
+        number = math.nan
+    focal = number if math.isfinite(number) and number > 0 else None
+    return Optics(focal, tuple(str(tags.get(tag, "")) for tag in _OF_LENS))
 
 
 def write_png(path: Path, image: Float[Tensor, "H W 3"] | Float[Tensor, "H W"]) -> None:

@@ -15,7 +15,7 @@ from clear_strategies.core.checks import require_choice, require_number, require
 from clear_strategies.data.capture import MORE_PHOTOS, Capture
 from clear_strategies.data.file_names import named, require_text, some
 from clear_strategies.data.masks import masks_among
-from clear_strategies.data.photo_files import SUFFIXES, focal_35mm
+from clear_strategies.data.photo_files import SUFFIXES, optics
 from clear_strategies.data.photo_folders import (
     counted,
     folders_of_images,
@@ -108,7 +108,7 @@ def read(
     require_text((name, *(path.name for path in paths)))
     if len(paths) < sfm.FEWEST:
         raise DataError(root, "images", f"there are {len(paths)}, poses need at least {sfm.FEWEST}", MORE_PHOTOS)
-    photos = {path: focal_35mm(path) for path in paths}  # unreadable photos are refused before the long work
+    photos = {path: optics(path) for path in paths}  # unreadable photos are refused before the long work
     precise = len(paths) <= _FEW if precise == "auto" else precise
     folder = base / _key(paths, max_side, max_features, precise, seed)
     if (folder / sfm.MODEL).is_file():
@@ -188,7 +188,7 @@ def _once_each(paths: Sequence[Path]) -> list[Path]:
 
 
 def _key(paths: Sequence[Path], *settings: int) -> str:
-    digest = hashlib.sha256(repr(("upright copies, points of two views, affine, EXIF on trial", *settings)).encode())
+    digest = hashlib.sha256(repr(("upright copies, points of two views, affine, EXIF on trial, a camera for each lens", *settings)).encode())
     for path in paths:
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:24]

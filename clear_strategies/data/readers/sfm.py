@@ -1,8 +1,8 @@
 """Structure from motion on the CPU through pycolmap: a sparse model from photos alone, with bounded memory.
 
-COLMAP reads copies of the photos: upright JPEG files, no larger than needed. Photos of the same size and the same focal length in
-EXIF share a camera, whose estimate starts at that focal length. If photos are left without a pose, all are placed again as if
-EXIF said nothing, since programs and adapters write wrong focal lengths, and the model with more photos is used.
+COLMAP reads copies of the photos: upright JPEG files, no larger than needed. Photos of the same size, whose EXIF blocks say the same
+of the lens, share a camera, whose estimate starts at the focal length there. If photos are left without a pose, all are placed again
+without it, since programs and adapters write wrong focal lengths, and the model with more photos is used.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from clear_strategies.core.images import to_bytes
 from clear_strategies.core.progress import Progress
 from clear_strategies.data.capture import MORE_PHOTOS, NO_PARALLAX, STEP_ASIDE
 from clear_strategies.data.file_names import some
-from clear_strategies.data.photo_files import read_image
+from clear_strategies.data.photo_files import Optics, read_image
 from clear_strategies.errors import DataError
 
 _log = logging.getLogger(__name__)
@@ -60,8 +60,8 @@ _PER_FEATURE, _PER_DATABASE = 320, 8 << 20  # bytes that features, matches and m
 _PER_WORKER: Final = 256 << 20  # addresses that a thread of COLMAP's takes, and COLMAP itself
 _BLOCK: Final = 20  # photos that are matched between two looks: COLMAP indexes their features anew for each block
 
-_Groups = dict[tuple[int, int, float | None], list[str]]
-"""The names of copies by width, height and focal length (pixels of the copy, or None)."""
+_Groups = dict[tuple[int, int, float | None, tuple[str, ...]], list[str]]
+"""The names of copies by width, height, focal length (pixels of the copy, or None) and lens: those of one camera."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +75,11 @@ class SfmSettings:
     seed: int
 
 
-def reconstruct(root: Path, photos: Mapping[Path, float | None], folder: Path, settings: SfmSettings) -> None:
+def reconstruct(root: Path, photos: Mapping[Path, Optics], folder: Path, settings: SfmSettings) -> None:
     """Estimate the poses of these photos, and write the model with most of them to `folder`. Its images have `copy_name`s.
 
     Args:
-        photos: with their focal lengths on 35 mm film, as `focal_35mm` gives them.
+        photos: with what EXIF says of their cameras.
 
     Raises:
         DataError: pycolmap is not installed, memory is limited to too little, or too few photos can be placed.
@@ -141,7 +141,7 @@ def require_placed(root: Path, placed: int, count: int, least: float = 0.0) -> N
     raise DataError(root, "poses", f"{some} of the {count} photos could be related to each other", remedy)
 
 
-def _map(pycolmap: Any, photos: Mapping[Path, float | None], work: Path, settings: SfmSettings) -> list[Any]:
+def _map(pycolmap: Any, photos: Mapping[Path, Optics], work: Path, settings: SfmSettings) -> list[Any]:
     """The models that COLMAP's incremental pipeline finds: features, matching of all pairs, mapping."""
     copies, database, count, root = work / _COPIES, work / _DATABASE, len(photos), next(iter(photos)).parent
     level = pycolmap.logging.minloglevel
@@ -153,7 +153,7 @@ def _map(pycolmap: Any, photos: Mapping[Path, float | None], work: Path, setting
         if shutil.disk_usage(work).free < count * settings.max_features * _PER_FEATURE + _PER_DATABASE:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(work.parent))  # COLMAP would end the process
         find = functools.partial(_find_features, pycolmap, database, groups, settings)
-        if min(width * height for width, height, _ in groups) <= _LARGE:
+        if min(width * height for width, height, *_ in groups) <= _LARGE:
             found = find(octave=-1)
         elif (found := find(octave=0)) < _ENOUGH * settings.max_features:
             _log.info(
@@ -168,7 +168,7 @@ def _map(pycolmap: Any, photos: Mapping[Path, float | None], work: Path, setting
         _match(pycolmap, database, [name for names in groups.values() for name in names], settings.threads)
         _require_parallax(pycolmap, database, root)
         models = _place(pycolmap, work, count, settings)
-        lengths = sorted({focal for focal in photos.values() if focal is not None})
+        lengths = sorted({said.focal_35mm for said in photos.values() if said.focal_35mm is not None})
         if (placed := _most(models)) < count and lengths:
             _log.info("%d of %d photos are placed: again, without EXIF's focal length.", placed, count)
             _forget_focal_lengths(pycolmap, database, settings.threads)
@@ -231,7 +231,7 @@ def _find_features(pycolmap: Any, database: Path, groups: _Groups, settings: Sfm
     _log.info("features of %d photos.", count)
     progress = Progress("features", "photos", count)
     at_once = _PER_THREAD * _threads(settings)
-    for (width, height, focal), names in groups.items():
+    for (width, height, focal, _), names in groups.items():
         reader = pycolmap.ImageReaderOptions()
         if focal is not None:
             reader.camera_params = f"{focal},{width / 2},{height / 2},0"  # of SIMPLE_RADIAL, its default
@@ -322,11 +322,11 @@ def _keep_coarsest(pycolmap: Any, database: Path, most: int) -> None:
             opened.write_descriptors(number, pycolmap.FeatureDescriptors(kind, descriptors))
 
 
-def _write_copies(photos: Mapping[Path, float | None], folder: Path, max_side: int) -> _Groups:
+def _write_copies(photos: Mapping[Path, Optics], folder: Path, max_side: int) -> _Groups:
     """Write copies for COLMAP, no larger than `max_side`."""
     folder.mkdir()
     groups: _Groups = {}
-    for i, (path, focal_35mm) in enumerate(photos.items()):
+    for i, (path, (focal_35mm, lens)) in enumerate(photos.items()):
         image = read_image(path, turn=True)
         height, width = image.shape[:2]
         scale = min(1.0, max_side / max(width, height))
@@ -334,7 +334,7 @@ def _write_copies(photos: Mapping[Path, float | None], folder: Path, max_side: i
         copy = Picture.fromarray(to_bytes(image)).resize(size, Picture.Resampling.LANCZOS)
         copy.save(folder / copy_name(i), quality=95, subsampling=0)
         focal = focal_35mm and round(focal_35mm / _DIAGONAL_35MM * math.hypot(*size), 2)
-        groups.setdefault((*size, focal), []).append(copy_name(i))
+        groups.setdefault((*size, focal, lens), []).append(copy_name(i))
     return groups
 
 

@@ -17,6 +17,7 @@ from PIL import ExifTags, Image, ImageFilter
 
 from clear_strategies import files
 from clear_strategies.core.images import to_bytes
+from clear_strategies.data.photo_files import Optics
 from clear_strategies.data.readers import colmap, demo, photos, sfm
 from clear_strategies.data.readers.sfm import SfmSettings
 from clear_strategies.errors import DataError
@@ -94,6 +95,18 @@ def test_photos_are_placed_whatever_focal_length_exif_claims(room, tmp_path, cap
     assert len(capture.frames) == 4
     assert [frame.camera.fx for frame in capture.frames] == pytest.approx([180] * 4, rel=0.1)
     assert (told in caplog.text) if told else not caplog.text
+
+
+def test_photos_have_one_camera_whose_exif_blocks_say_the_same_of_the_lens(room, tmp_path: Path) -> None:
+    """The last photo is zoomed by the camera's software, with the focal length of the others in EXIF."""
+    zoomed = room[3].resize((200, 150), Image.Resampling.BICUBIC, box=(20, 15, 180, 135))
+    folder = save_photos(tmp_path / "photos", [*room[:3], zoomed], 31)
+    with Image.open(folder / "3.jpg") as image:
+        exif = image.getexif()
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.DigitalZoomRatio] = 1.25
+        zoomed.save(folder / "3.jpg", quality=95, exif=exif)
+    capture = photos.read(folder, tmp_path / "cache", threads=1)
+    assert [frame.camera.fx for frame in capture.frames] == pytest.approx([180, 180, 180, 225], rel=0.1)
 
 
 def test_photos_with_too_few_features_are_told_as_such_before_none_is_related(room, tmp_path, caplog) -> None:
@@ -246,7 +259,7 @@ class FakeModel:
 def estimate(tmp_path, monkeypatch):
     """Estimates the poses of ten photos, with a function in place of COLMAP's pipeline."""
     monkeypatch.setattr(sfm, "_unplaced", lambda *_: {})
-    photos = {tmp_path / f"{i}.jpg": None for i in range(10)}
+    photos = {tmp_path / f"{i}.jpg": Optics(None, ()) for i in range(10)}
 
     def run(mapping):
         monkeypatch.setattr(sfm, "_map", mapping)
@@ -295,7 +308,7 @@ def test_the_features_of_a_large_photo_begin_at_its_own_scale(tmp_path: Path) ->
     for number in range(2):
         picture = Image.fromarray(blobs).resize((320, 240), Image.Resampling.BICUBIC)
         picture.convert("RGB").save(tmp_path / "copies" / sfm.copy_name(number))
-    groups = {(320, 240, None): [sfm.copy_name(0), sfm.copy_name(1)]}
+    groups = {(320, 240, None, ()): [sfm.copy_name(0), sfm.copy_name(1)]}
     settings = SfmSettings(max_side=1600, max_features=8192, precise=False, threads=1, seed=0)
     found = [sfm._find_features(pycolmap, tmp_path / f"{o}.db", groups, settings, octave=o) for o in (0, -1)]
     assert 100 < found[0] < found[1]
