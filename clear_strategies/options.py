@@ -35,7 +35,7 @@ OPTIONS: Final = "clear_strategies_conf"
 
 READINGS: Final = "readings"
 """The key of a configuration for what `readings=` says of each strategy."""
-NOT_IN_NAME: Final = CHANGES_NO_RESULT | {"experiment", "data.root", "prior.path"}
+UNNAMED: Final = CHANGES_NO_RESULT | {"experiment", "data.root", "prior.path"}
 """What the name of a job's folder leaves out: what changes no result, so that `-v` or fit.viewer=true trains nothing again, and
 where data and SR images lie, which may move: for pictures of another SR model give another hydra.sweep.dir.
 """
@@ -110,13 +110,13 @@ def _folder_of(point: EntryPoint) -> str:
 
 
 def _job_folder(*swept: str, _root_: Any) -> str:
-    """`${job_folder:}` in conf/: the name of a job's folder in a sweep, its overrides, in one word that every file system takes: a
-    path among them would lead elsewhere, and behind `../..` all jobs share a folder.
+    """`${job_folder:}` in conf/: the name of a job's folder in a sweep, its overrides, in one word that every file system takes.
+    A path among them would otherwise lead elsewhere: behind `../..` all jobs share a folder.
 
     Args:
-        swept: keys of `NOT_IN_NAME` in which the jobs of this sweep differ, and which are in it all the same.
+        swept: keys of `UNNAMED` in which the jobs of this sweep differ, and which are in it all the same.
     """
-    left_out = {*NOT_IN_NAME}.difference(swept)
+    left_out = {*UNNAMED}.difference(swept)
     if _root_.method is not None:
         left_out.add("strategy")  # it sets them aside
     named = [word for word in _root_.hydra.overrides.task if word.lstrip("+~").partition("=")[0] not in left_out]

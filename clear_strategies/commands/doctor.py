@@ -66,12 +66,13 @@ def _machine(processor: str) -> Iterator[tuple[str, str]]:
     yield "processor", processor
     yield "cores", str(cores())
     yield "disk", f"{shutil.disk_usage('.').free / 1e9:.0f} GB free in this folder"
+    if _is_installed("psutil"):
+        import psutil
+
+        memory = psutil.virtual_memory()
+        yield "memory", f"{memory.available / 2**30:.1f} of {memory.total / 2**30:.1f} GiB free"
     import torch
 
-    from clear_strategies.training.memory import system_bytes
-
-    free, total = (system_bytes("/proc/meminfo", name) or 0 for name in ("MemAvailable", "MemTotal"))
-    yield "memory", f"{free / 2**30:.1f} of {total / 2**30:.1f} GiB free" if total else "unknown"
     yield "instruction set", f"{torch.backends.cpu.get_cpu_capability()} (torch)"
     for i in range(torch.cuda.device_count()):
         free, total = torch.cuda.mem_get_info(i)

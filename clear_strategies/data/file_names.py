@@ -91,8 +91,8 @@ def is_file(path: Path) -> bool:
 
 
 def require_text(names: Iterable[str]) -> None:
-    """Raise a DataError for a name that is not UTF-8, which the JSON files and pages written after training could not hold, or has
-    a control character, such as an end of a line.
+    """Raise a DataError for a name that has a control character, such as an end of a line, or is not UTF-8, which the JSON files
+    and pages written after training could not hold.
     """
     for name in names:
         if any(unicodedata.category(letter) in ("Cc", "Cs") for letter in name):

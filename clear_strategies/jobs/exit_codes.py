@@ -32,7 +32,8 @@ SIGNALS: Final = 128
 # What needs an extra, by its name, and the modules that it brings.
 NEEDED: Final = {
     "train": ("training", (
-        "cv2", "filelock", "jinja2", "kornia", "matplotlib", "msgspec", "pandas", "safetensors", "scipy", "skimage", "tqdm",
+        "cv2", "filelock", "jinja2", "kornia", "matplotlib", "msgspec", "pandas", "psutil", "safetensors", "scipy", "skimage",
+        "tqdm",
     )),
     "view": ("the viewer", ("viser", "nerfview", "splines")),
 }  # fmt: skip

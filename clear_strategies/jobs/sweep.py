@@ -27,7 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 from clear_strategies import signals
 from clear_strategies.errors import ClearError, DataError
 from clear_strategies.files import FINISHED, expanded
-from clear_strategies.options import NOT_IN_NAME
+from clear_strategies.options import UNNAMED
 from clear_strategies.settings import absent, missing
 
 # Launchers whose jobs see the folders that the process sees which was started; on the nodes of a cluster there may be others.
@@ -64,9 +64,10 @@ def name_by_all_that_is_swept(config: DictConfig) -> None:
     Args:
         config: as of `refusal`.
     """
-    if OmegaConf.to_container(config.hydra.sweep)["subdir"] != "${job_folder:}":
+    given: Any = OmegaConf.to_container(config.hydra.sweep)
+    if given["subdir"] != "${job_folder:}":
         return  # the user names them
-    if swept := NOT_IN_NAME & {word.key_or_group for word in _words(config) if word.is_sweep_override()}:
+    if swept := UNNAMED & {word.key_or_group for word in _words(config) if word.is_sweep_override()}:
         with read_write(config.hydra):
             config.hydra.overrides.hydra.append(f"hydra.sweep.subdir='${{job_folder:{','.join(sorted(swept))}}}'")
 

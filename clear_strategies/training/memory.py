@@ -6,9 +6,9 @@ import ctypes
 import gc
 import logging
 import sys
-from pathlib import Path
 from typing import Final
 
+import psutil
 import torch
 
 from clear_strategies.errors import SettingError
@@ -23,23 +23,23 @@ _PIXEL: Final = 168  # bytes of an iteration per pixel of HR: the render, its co
 
 
 def require(state: TrainState, limit: int | None) -> str:
-    """Refuse a run whose first Gaussians do not fit into `limit` MiB (None: what is free on this machine, if that is known), and
-    warn where it cannot grow as far as it may; returns a line for the plan.
+    """Refuse a run whose first Gaussians do not fit into `limit` MiB (None: what is free on this machine), and warn where it
+    cannot grow as far as it may; returns a line for the plan.
     """
     cuda, n, most = state.device.type == "cuda", len(state.field), state.density.cap
-    now = torch.cuda.memory_allocated(state.device) if cuda else system_bytes("/proc/self/status", "VmRSS") or 0
+    now = torch.cuda.memory_allocated(state.device) if cuda else psutil.Process().memory_info().rss
     each = _COPIES * sum(x.nbytes for x in state.field.raw().values()) // n + _GAUSSIAN
     fixed = now + _PIXEL * max(view.hr.image[..., 0].numel() for view in state.views)
     start, grown = ((fixed + each * count) >> 20 for count in (n, most or n))
-    free = torch.cuda.mem_get_info()[0] if cuda else system_bytes("/proc/meminfo", "MemAvailable")
-    allowed = limit if limit is not None else None if free is None else (free + now) >> 20
+    free = torch.cuda.mem_get_info()[0] if cuda else psutil.virtual_memory().available
+    allowed = limit if limit is not None else (free + now) >> 20
     source = "is free on this machine" if limit is None else "fit.memory allows"
-    if allowed is not None and start > allowed:
+    if start > allowed:
         raise SettingError(
             f"fit.memory: {n:,} Gaussians need about {start} MiB, and {allowed} MiB {source}. Raise data.views.shrink, "
             "lower fit.max_degree or data.cloud.max_points, or raise fit.memory."
         )
-    if allowed is not None and grown > allowed:
+    if grown > allowed:
         need = f"{most} Gaussians, the most that there may be, need about {grown} MiB"
         _log.warning("%s, and %d MiB %s.", need, allowed, source)
     return f"about {start} MiB at the start, {each / 1024:.1f} KiB for each further Gaussian"
@@ -51,12 +51,3 @@ def release() -> None:
     native.release()
     if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:  # glibc
         trim(0)
-
-
-def system_bytes(file: str, name: str) -> int | None:
-    """An entry of a file of /proc; None where there is none."""
-    try:
-        lines = dict(line.split(":", 1) for line in Path(file).read_text(encoding="utf-8").splitlines())
-        return int(lines[name].split()[0]) * 1024
-    except (OSError, KeyError, ValueError):
-        return None

@@ -83,7 +83,7 @@ def test_a_photo_of_too_many_pixels_is_read_as_their_means_and_its_size_is_that(
     assert caplog.messages == ["photos of 23x13 are read at 1/2 of their width and height."]
     assert Image.MAX_IMAGE_PIXELS == 50
     cv2.imwrite(str(tmp_path / "b.png"), pixels.astype(np.uint16))
-    with pytest.raises(DataError, match="23x13 is more than 100 pixels: reduce it: mogrify -resize 50% .*b.png"):
+    with pytest.raises(DataError, match=r"23x13 is more than 100 pixels: reduce it: mogrify -resize 50% .*b.png"):
         photo_files.image_size(tmp_path / "b.png")
     photo_files._factor.cache_clear()
 

@@ -307,7 +307,12 @@ def test_failed_jobs_are_told_where_the_report_cannot_be_written(tmp_path, caplo
     callback, config = (
         SweepCallback(),
         OmegaConf.create(
-            {"hydra": {"sweep": {"dir": str(tmp_path), "subdir": "1"}, "runtime": {"choices": {"hydra/sweeper": "optuna"}}}}
+            {
+                "hydra": {
+                    "sweep": {"dir": str(tmp_path), "subdir": "1"},
+                    "runtime": {"choices": {"hydra/sweeper": "optuna"}},
+                }
+            }
         ),
     )
     make_run(tmp_path / "0")

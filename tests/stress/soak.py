@@ -8,12 +8,13 @@ import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
+import psutil
 import torch
 
 from clear_strategies import GCO, P2G, SVS, Conductor, Objective
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.schedules import scaled
-from clear_strategies.training import checkpoint, memory
+from clear_strategies.training import checkpoint
 from clear_strategies.training.evaluation import evaluate
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
@@ -57,7 +58,7 @@ def run(iterations: int) -> list[Row]:
                 evaluate(state, scene, rasterizer, t)
                 checkpoint.save(Path(folder), state.checkpoint({}))
                 gc.collect()
-                resident.append(memory.system_bytes("/proc/self/status", "VmRSS"))
+                resident.append(psutil.Process().memory_info().rss)
                 files.append(len(os.listdir("/proc/self/fd")))  # noqa: PTH208
     settled = len(resident) // 5
     before, after = resident[settled - 1], max(resident[settled:])

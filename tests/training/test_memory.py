@@ -2,7 +2,9 @@
 
 import logging
 import sys
+from types import SimpleNamespace
 
+import psutil
 import pytest
 
 from clear_strategies.errors import SettingError
@@ -17,8 +19,9 @@ MIB = 1 << 20
 @pytest.fixture
 def held(monkeypatch: pytest.MonkeyPatch) -> None:
     """The process holds 100 MiB, and 50 more are free."""
-    sizes = {"VmRSS": 100 * MIB, "MemAvailable": 50 * MIB}
-    monkeypatch.setattr(memory, "system_bytes", lambda _, name: sizes[name])
+    process = SimpleNamespace(memory_info=lambda: SimpleNamespace(rss=100 * MIB))
+    system = SimpleNamespace(available=50 * MIB)
+    monkeypatch.setattr(memory, "psutil", SimpleNamespace(Process=lambda: process, virtual_memory=lambda: system))
 
 
 @pytest.mark.usefixtures("held")
@@ -37,22 +40,20 @@ def test_a_run_whose_start_does_not_fit_is_refused_and_one_that_may_outgrow_the_
     assert "and 150 MiB is free on this machine" in caplog.text
 
 
-def test_the_estimate_holds_the_parameters_and_their_moments_and_the_system_tells_what_is_held(monkeypatch):
+def test_the_estimate_holds_the_parameters_and_their_moments():
     state, n = start(("gco", "p2g", "svs")), 1_000_000
     tables = (state.field.raw(), state.optimizer.state_dict())
     least = sum(x.nbytes for table in tables for x in table.values()) // len(state.field) * n
     state.density.cap = n
     each = float(memory.require(state, 10**6).split("start, ")[1].split()[0])
     assert least < each * 1024 * n < 10 * least
-    assert sys.platform != "linux" or memory.system_bytes("/proc/self/status", "VmRSS") > 0
-    assert memory.system_bytes("/proc/nothing", "VmRSS") is None
 
 
 @needs("cpp")
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.skipif(sys.platform != "linux", reason="of glibc")
 def test_what_the_kernels_keep_for_their_next_use_is_given_back():
     def resident() -> int:
-        return memory.system_bytes("/proc/self/status", "VmRSS")
+        return int(psutil.Process().memory_info().rss)
 
     memory.release()
     before = resident()

@@ -188,7 +188,8 @@ def _once_each(paths: Sequence[Path]) -> list[Path]:
 
 
 def _key(paths: Sequence[Path], *settings: int) -> str:
-    digest = hashlib.sha256(repr(("upright copies, points of two views, affine, EXIF on trial, a camera for each lens", *settings)).encode())
+    version = "upright copies, points of two views, affine, EXIF on trial, a camera for each lens"
+    digest = hashlib.sha256(repr((version, *settings)).encode())
     for path in paths:
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:24]

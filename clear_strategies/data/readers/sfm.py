@@ -1,8 +1,8 @@
 """Structure from motion on the CPU through pycolmap: a sparse model from photos alone, with bounded memory.
 
-COLMAP reads copies of the photos: upright JPEG files, no larger than needed. Photos of the same size, whose EXIF blocks say the same
-of the lens, share a camera, whose estimate starts at the focal length there. If photos are left without a pose, all are placed again
-without it, since programs and adapters write wrong focal lengths, and the model with more photos is used.
+COLMAP reads copies of the photos: upright JPEG files, no larger than needed. Photos of the same size, whose EXIF blocks say the
+same of the lens, share a camera, whose estimate starts at the focal length there. If photos are left without a pose, all are
+placed again without it, since programs and adapters write wrong focal lengths, and the model with more photos is used.
 """
 
 from __future__ import annotations
