@@ -48,7 +48,8 @@ def replacing(path: Path) -> Iterator[Path]:
         yield partial
         partial.replace(path)
     except OSError as error:
-        error.filename = error.filename or str(path)  # a write to a full disk names no file
+        if str(error.filename or partial) == str(partial):  # a write to a full disk names no file
+            error.filename = str(path)
         raise
     finally:
         partial.unlink(missing_ok=True)  # exists only after an exception or Ctrl-C

@@ -10,6 +10,7 @@ from __future__ import annotations
 import atexit
 import gc
 import logging
+import signal
 import sys
 from importlib import import_module
 
@@ -32,6 +33,8 @@ def main() -> None:
             raise
         sys.stderr.write(f"{ending.message}\n")  # logging is set up for jobs only
         sys.exit(ending.code)
+    finally:
+        signals.handle(signal.SIG_DFL)  # else one more Ctrl-C shows a traceback of Python's own end
 
 
 if __name__ == "__main__":

@@ -102,7 +102,7 @@ def held() -> Iterator[None]:
             signal.raise_signal(signum)
 
 
-def handle(handler: Callable[[int, FrameType | None], object]) -> None:
+def handle(handler: Callable[[int, FrameType | None], object] | signal.Handlers) -> None:
     """Set a handler of `STOPS`; SIGHUP stays ignored where it is."""
     for signum in STOPS:
         if signal.getsignal(signum) is not signal.SIG_IGN:

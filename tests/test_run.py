@@ -168,6 +168,13 @@ def test_the_exit_codes_of_a_whole_process(tmp_path):
     assert (unwritable.returncode, said.count("\n"), "/proc/run" in said) == (3, 1, True), said
 
 
+def test_a_signal_at_pythons_own_end_says_nothing(tmp_path):
+    """As an impatient second Ctrl-C."""
+    code = "import atexit, signal\natexit.register(signal.raise_signal, signal.SIGINT)\n"
+    ended = run("--version", cwd=tmp_path, code=f"{code}from clear_strategies.run import main\nmain()")
+    assert (ended.stdout[:16], ended.stderr) == ("clear-strategies", "")
+
+
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_while_data_is_prepared_is_one_line(stop, tmp_path):
     (tmp_path / "slow.py").write_text(

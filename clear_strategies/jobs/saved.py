@@ -148,9 +148,8 @@ def _ply_in(folder: Path, path: Path) -> Path:
     """The PLY file of a run's folder, or of a model's of Inria's 3DGS."""
     last = sorted(folder.glob(f"point_cloud/iteration_*/{PLY}"), key=lambda p: len(p.parent.name))
     if (ply := next((p for p in reversed([folder / PLY, *last]) if p.is_file()), None)) is None:
-        raise DataError(
-            path, "run", "has neither a checkpoint nor a point_cloud.ply", "give a run's folder or a PLY file"
-        )
+        problem = "has neither a checkpoint nor a point_cloud.ply" if path.exists() else "is not there"
+        raise DataError(path, "run", problem, "give a run's folder or a PLY file")
     return ply
 
 

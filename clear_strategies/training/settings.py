@@ -40,7 +40,7 @@ class FitSettings:
             folder. If the run is finished, train nothing; if it has checkpoints, continue from the newest one; else start
             from the beginning.
         overwrite: train even where a run has been in the folder, whose checkpoints and results are then removed. Else this is
-            refused, unless `resume` is set.
+            refused, unless `resume` is set. Not with resume=auto, which experiments have.
         device: cpu or cuda: where field, views and optimizer are. None: cuda if torch finds it and the rasterizer draws
             there, else cpu. A run may be resumed on another device; its bits then differ.
         threads: number of threads of torch and the kernels. None: all cores, divided by the jobs that run at once (joblib).
@@ -80,6 +80,8 @@ class FitSettings:
         if self.fused not in get_args(FusedMode):
             rule = f"must be one of {', '.join(get_args(FusedMode))}"
             refuse("fused", rule, self.fused, "in a YAML file, off is quoted")
+        if self.overwrite and self.resume == "auto":
+            refuse("overwrite", "must be false where resume=auto goes on with the run", self.overwrite, "fit.resume=null")
 
     @property
     def stretch(self) -> float:

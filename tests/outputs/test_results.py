@@ -186,6 +186,9 @@ def test_processes_of_one_number_folders_and_long_names_are_no_error(tmp_path: P
     files.write_text(target, "ω̃ = 2")
     assert target.read_text(encoding="utf-8") == "ω̃ = 2"
     assert list(target.parent.iterdir()) == [target]
+    with pytest.raises(OSError, match="No such file") as failed, files.replacing(target) as partial:
+        partial.read_bytes()
+    assert failed.value.filename == str(target)  # not the part, which is gone
 
 
 def test_json_has_null_where_a_number_is_not_finite(tmp_path: Path) -> None:
