@@ -89,6 +89,8 @@ def readable(word: str) -> str:
     key, equals, value = word.partition("=")
     if not equals:
         return word
+    if key in ("hydra.run.dir", "hydra.sweep.dir") and not value:  # as of a variable that is not set
+        raise SettingError(f"{key}: must be a folder, got nothing: {key}=.")
     if word.startswith("-"):
         return f"{key}={files.expanded(value)}"
     if key.lstrip("+").startswith("hydra."):

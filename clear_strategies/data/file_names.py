@@ -96,8 +96,8 @@ def require_text(names: Iterable[str]) -> None:
     """
     for name in names:
         if any(unicodedata.category(letter) in ("Cc", "Cs") for letter in name):
-            problem = "must be UTF-8 without control characters, has another byte"
-            raise DataError(repr(name)[1:-1], "name", problem, "rename this folder or photo")
+            shown, rule = repr(name)[1:-1], "must be UTF-8 without control characters"
+            raise DataError(shown, "name", rule, "rename this folder or photo")
 
 
 def some(names: Sequence[str]) -> str:

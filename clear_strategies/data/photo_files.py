@@ -114,7 +114,7 @@ def image_size(path: Path, *, turn: bool | None = None) -> tuple[int, int]:
         # Of a turned TIFF some versions of PIL say the upright size.
         if isinstance(image, TiffImagePlugin.TiffImageFile):
             width, height = image.tag_v2[TiffImagePlugin.IMAGEWIDTH], image.tag_v2[TiffImagePlugin.IMAGELENGTH]
-        factor = _factor(width, height)
+        factor = _factor(width * height)
         width, height = -(-width // factor), -(-height // factor)
         return (height, width) if turn and _orientation_of(image) in _ON_THE_SIDE else (width, height)
 
@@ -167,9 +167,13 @@ def _opened(path: Path, turn: bool | None) -> Iterator[Image.Image]:
     require_regular(path)
     formats = (*_FORMATS, "HEIF") if _is_heif(path) else _FORMATS
     try:
-        with _OPENING, warnings.catch_warnings(), _any_size():
+        with _OPENING, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # PIL's warnings: damage fails on decoding
-            image = Image.open(path, formats=formats)
+            limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # 200 megapixels of a phone exceed it
+            try:
+                image = Image.open(path, formats=formats)
+            finally:
+                Image.MAX_IMAGE_PIXELS = limit
     except FileNotFoundError as error:
         raise DataError(path, "file", "is not there", "check the path") from error
     except Exception as error:  # PIL raises many types of error on damaged headers
@@ -187,27 +191,17 @@ def _opened(path: Path, turn: bool | None) -> Iterator[Image.Image]:
         yield image
 
 
-@contextmanager
-def _any_size() -> Iterator[None]:
-    """Without Pillow's own limit, which 200 megapixels of a phone exceed."""
-    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-    try:
-        yield
-    finally:
-        Image.MAX_IMAGE_PIXELS = limit
-
-
 @lru_cache(maxsize=16)  # photos of one size are told once
-def _factor(width: int, height: int) -> int:
-    """By which each side of an image of this size is reduced as it is read."""
-    factor = math.ceil(math.sqrt(width * height / _MAX_PIXELS))
+def _factor(pixels: int) -> int:
+    """By which each side of an image of so many pixels is reduced as it is read."""
+    factor = math.ceil(math.sqrt(pixels / _MAX_PIXELS))
     if factor > 1:
-        _log.info("photos of %dx%d are read at 1/%d of their width and height.", width, height, factor)
+        _log.info("photos of %d megapixels are read at 1/%d of their width and height.", pixels // 10**6, factor)
     return factor
 
 
 def _reduced(image: Image.Image) -> Image.Image:
-    factor = _factor(*image.size)
+    factor = _factor(image.width * image.height)
     return image if factor == 1 else image.reduce(factor)
 
 

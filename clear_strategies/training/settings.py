@@ -81,7 +81,9 @@ class FitSettings:
             rule = f"must be one of {', '.join(get_args(FusedMode))}"
             refuse("fused", rule, self.fused, "in a YAML file, off is quoted")
         if self.overwrite and self.resume == "auto":
-            refuse("overwrite", "must be false where resume=auto goes on with the run", self.overwrite, "fit.resume=null")
+            refuse(
+                "overwrite", "must be false where resume=auto goes on with the run", self.overwrite, "fit.resume=null"
+            )
 
     @property
     def stretch(self) -> float:
