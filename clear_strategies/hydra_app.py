@@ -197,10 +197,10 @@ class SweepCallback(Callback):
         if refusal := sweep.refusal(config):
             _log.error("%s", refusal)  # of an error that a callback raises Hydra makes a warning
             sys.exit(exit_codes.UNUSABLE)
-        sweep.name_by_all_that_is_swept(config)
         signals.handle(sweep.stop_workers)
         for note in Path(config.hydra.sweep.dir).rglob(f"*{FAILED}"):  # of an earlier sweep
             note.unlink()
+        sweep.name_by_all_that_is_swept(config)
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         if sweep.stopped:

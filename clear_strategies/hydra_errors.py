@@ -93,7 +93,7 @@ def not_composed(error: Exception, overrides: Sequence[str], config: str) -> Set
     parent, _, name = key.rpartition(".")
     beside = {".".join(k.split(".")[: key.count(".") + 1]) for k in flat(known) if k.startswith(f"{parent}.")}
     value = next((o.partition("=")[2] for o in overrides if _key(o) == key), "")
-    if (CONF / name / f"{value.partition(',')[0]}.yaml").is_file():  # an option, as data.scene=fern
+    if value.partition(",")[0] in options(name):  # as data.scene=fern
         remedy = f"Did you mean +{name}={value}?"
     elif has_parameter(str(flat(known).get(f"{parent}.{TARGET}")), name):
         # of the user's own class, named by an override or a file

@@ -117,7 +117,7 @@ def _job_folder(*swept: str, _root_: Any) -> str:
         swept: keys of `UNNAMED` in which the jobs of this sweep differ, and which are in it all the same.
     """
     left_out = {*UNNAMED}.difference(swept)
-    if _root_.method is not None:
+    if _root_.get("method") is not None:
         left_out.add("strategy")  # it sets them aside
     named = [word for word in _root_.hydra.overrides.task if word.lstrip("+~").partition("=")[0] not in left_out]
     name = ",".join(sorted(named)) or "defaults"
