@@ -1,4 +1,5 @@
-"""HR and extra views drawn by this package's rasterizer, whatever draws the host's LR; on CUDA recorded and replayed.
+"""HR and extra views, which an iteration takes gradients of besides the host's own rendering. The host's function draws them, or
+this package's rasterizer, whatever draws LR; what it draws is on CUDA recorded and replayed.
 
 A host gives its rasterizer activated tensors, which a `Drawable` holds. What is made of them is one work: render, losses, both
 cotangents in one pass, evidence, routing. A recording reads copies of them, since a host makes new ones in each step. From there
@@ -8,6 +9,7 @@ the gradients go on to the parameters through the host's own graph, which stays 
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, cast
@@ -23,11 +25,12 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide
 from clear_strategies.merging.replays import RecordedWork, replays_on, why_strategies_are_not_recorded
 from integration.autograd_shot import AutogradShot, HostOutput, Target, every_number, to_parameters
+from integration.views import enlarged_mask
 from rasterizers.autograd import BackwardHook, Drawing
 from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer, Recordable, can_be_recorded, over
 from rasterizers.modes import in_full_precision
-from rasterizers.replays import Kind, Recorded, copied, write
+from rasterizers.replays import Kind, copied, write
 
 _log = logging.getLogger(__name__)
 
@@ -110,45 +113,71 @@ class _Given:
         return AutogradShot(image, r.means2d, r.visible, asked.params, drawings=(drawing,), mask=self.mask)
 
 
-_Work = Callable[[_Given, bool], tuple[Any, dict[str, Number]]]
+_Made = tuple[Any, dict[str, Number]]
+_Work = Callable[[_Given, bool], _Made]
 """Work on what is given, and whether it is being recorded. It returns what it makes, and its numbers."""
 
 
-class _Recorded(Recorded[_Given, tuple[Any, dict[str, Number]]]):
-    """The recording of one kind of work, and the tensors from which it reads what it is given."""
-
-    _work: RecordedWork
-
-    def __init__(self, conductor: Conductor, rasterizer: Recordable, given: _Given, work: _Work) -> None:
-        own, self._rasterizer = given.copied(), rasterizer
-        self._own = own.tensors(rasterizer)
-        self._work = RecordedWork(given.background.device, conductor, lambda: work(own, True))
-
-    def _write(self, given: _Given) -> None:
-        write(self._own, given.tensors(self._rasterizer))
-
-    def outcome(self, _: _Given) -> tuple[Any, dict[str, Number]]:
-        """See `Recorded`."""
-        return self._work.outcome()
-
-
-class OwnDrawing:
-    """Draws HR and extra views for one training of a host.
+class HrDrawing:
+    """HR and extra views, drawn by the host's function or by this package's rasterizer, as the adapter asks for.
 
     Args:
-        device: of the Gaussians. On CUDA the work is recorded and replayed.
+        device: of the Gaussians. On CUDA the work on what this package draws is recorded and replayed.
+        masks, reads_score: see `Attachment`. counts: `Attachment.counts`, to which this adds.
+
+    Attributes:
+        is_scored: whether a strategy has a densification score, and the host's densifier reads it.
     """
 
-    def __init__(self, conductor: Conductor, device: torch.device) -> None:
-        self._conductor = conductor
+    def __init__(
+        self, conductor: Conductor, device: torch.device, masks: Mapping[str, Tensor], counts: Counter[str], *, reads_score: bool
+    ) -> None:  # fmt: skip
+        self._conductor, self._masks, self._counts = conductor, masks, counts
+        self.is_scored = reads_score and conductor.owner("score") is not None
         self._replays = replays_on(device, conductor.work_log, "the replay of HR")
         if self._replays is not None and (reason := next(why_strategies_are_not_recorded(conductor), None)) is not None:
             self._replays = None
             _log.info("HR is not replayed: %s.", reason)
 
+    def wanted(self, t: int) -> bool:
+        """Whether HR takes part at t. Where the host's densifier reads its score, no iteration is skipped."""
+        conductor = self._conductor
+        scores = self.is_scored and conductor.may_densify(t)
+        return conductor.wants_hr(t) and (scores or not conductor.skips.leaves_out_hr(t, conductor.work_log))
+
+    def hr(
+        self, view: View, t: int, gate: Float[Tensor, " N"] | None, render_at: RenderAt, params: Mapping[str, Tensor]
+    ) -> tuple[HrSide, Grads | None]:
+        """The gradients of HR, and the same of the raw parameters where HR takes part in the merge."""
+        self._counts["HR renders"] += 1
+        conductor, mask, drawn = self._conductor, self._masks.get(view.name), render_at("hr", gate, view)
+        merges = conductor.objective.lambda_hr(t) > 0
+        fine = None if mask is None else enlarged_mask(mask.to(params["means"]), view.factor)[..., None]
+        if isinstance(drawn, Drawable):
+            hr, routed = self._own_hr(drawn, view, t, fine)
+            return hr, routed if merges else None
+        shot = drawn.shot
+        if len(shot.drawings) > 1:
+            self._count_parts(len(shot.drawings))
+        if fine is not None:
+            shot = replace(shot, image=shot.image * fine.to(shot.image))
+        apart = shot.drawing is not None or "detail" in shot.params
+        hr = conductor.hr_gradients(shot, view, t, AutogradShot.gradients, apart=apart, params=params)
+        return hr, shot.routed(hr) if merges else None
+
+    def extra_view(self, extra: ExtraView, view: View, t: int, render_at: RenderAt) -> Grads:
+        """The gradient of an extra view, which is drawn without a gate and without f_det."""
+        drawn = render_at(extra.photo.camera, None, view)
+        if isinstance(drawn, Drawable):
+            return self._own_extra_view(drawn, extra, t)
+        (g,) = drawn.shot.vjp(self._conductor.extra_loss(drawn.shot.image, extra, t).cotangents)
+        return g
+
     @in_full_precision
     @torch.no_grad()
-    def hr(self, asked: Drawable, view: View, t: int, mask: Float[Tensor, "H W 1"] | None) -> tuple[HrSide, Grads]:
+    def _own_hr(
+        self, asked: Drawable, view: View, t: int, mask: Float[Tensor, "H W 1"] | None
+    ) -> tuple[HrSide, Grads]:  # fmt: skip
         """Draw the view at HR, compare it with the SR image, and route the gradients. Returns what HR gives, and g^HR of the raw
         parameters.
         """
@@ -173,7 +202,7 @@ class OwnDrawing:
 
     @in_full_precision
     @torch.no_grad()
-    def extra_view(self, asked: Drawable, extra: ExtraView, t: int) -> Grads:
+    def _own_extra_view(self, asked: Drawable, extra: ExtraView, t: int) -> Grads:
         """The gradient of `Conductor.extra_loss`, a number for each of the raw parameters."""
         conductor = self._conductor
         photo = extra.photo.over(conductor.background(t), extra.background)
@@ -194,17 +223,30 @@ class OwnDrawing:
         hr = self._conductor.hr_gradients(given.shot(asked), view, t, AutogradShot.gradients, looked_up=given.known)
         return hr, hr.g if asked.offset is None else hr.routed
 
-    def _done(
-        self, asked: Drawable, given: _Given, t: int, facts: tuple[Any, ...], work: _Work
-    ) -> tuple[Any, dict[str, Number]]:
+    def _done(self, asked: Drawable, given: _Given, t: int, facts: tuple[Any, ...], work: _Work) -> _Made:
         """The work, live or by a replay."""
-        rasterizer = asked.rasterizer
+        conductor, rasterizer = self._conductor, asked.rasterizer
         if self._replays is None or not can_be_recorded(rasterizer):
             return work(given, False)
-        asked_of = (self._conductor.owner(hook) for hook in ("observe", "route"))
+        asked_of = (conductor.owner(hook) for hook in ("observe", "route"))
         state = [rows.data_ptr() for s in asked_of if s is not None for rows in s.state.values()]
         kind = Kind((len(asked.drawn["means"]), *state), given.shapes, (rasterizer, *facts))
-        return self._replays.do(
-            kind, t, given,
-            live=lambda: work(given, False), record=lambda: _Recorded(self._conductor, rasterizer, given, work),
-        )  # fmt: skip
+
+        def record() -> RecordedWork[_Given, _Made]:
+            own = given.copied()
+            tensors = own.tensors(rasterizer)
+            return RecordedWork(
+                given.background.device, conductor, lambda: work(own, True),
+                write=lambda given: write(tensors, given.tensors(rasterizer)), outcome=lambda _, made, row: (made, row),
+            )  # fmt: skip
+
+        return self._replays.do(kind, t, given, live=lambda: work(given, False), record=record)
+
+    def _count_parts(self, n: int) -> None:
+        self._counts["HR renders in parts"] += 1
+        if self._counts["HR renders in parts"] == 1:
+            _log.info(
+                "The host calls its rasterizer %d times for one rendering, so each of the two HR gradients needs a backward "
+                "pass of its own: with 46,000 Gaussians a step takes 1.4 times as long. Call it under torch.no_grad() for "
+                "what is only looked at, and outside of the wrapped function for what only the LR loss needs.", n,
+            )  # fmt: skip

@@ -19,7 +19,7 @@ from clear_strategies.core.step import Step
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Merged
 from clear_strategies.merging.replays import RecordedWork, replays_on, that_merge
-from rasterizers.replays import Kind, Recorded, write
+from rasterizers.replays import Kind, write
 from rasterizers.told import iteration, unread
 
 _FINITE: Final = "finite"
@@ -55,38 +55,32 @@ class _Given:
         return _Given(self.params, _copied(self.lr), _copied(self.hr), own, self.out)
 
 
-class _Recorded(Recorded[_Given, Merged]):
-    """The recording of one kind of merge, and the tensors from which it reads what it is given."""
+def _recorded(conductor: Conductor, given: _Given) -> RecordedWork[_Given, Merged]:
+    own, first, lambda_hr = given.copied(), next(iter(given.out.values())), conductor.objective.lambda_hr
+    tensors, λ = [*own.tensors.values()], first.new_empty(1)
+    λ_now = -1.0  # which is on the device
 
-    _work: RecordedWork
+    def work() -> tuple[list[Tensor], dict[str, Number]]:
+        step = replace(own.step, t=iteration(given.step.t))
+        out = {name: torch.empty_like(x, memory_format=torch.contiguous_format) for name, x in given.out.items()}
+        merged = conductor.merge_routed(own.params, own.lr, own.hr, step, given.step.t, out, λ)
+        conflict = {f"{_CONFLICT}{group}": share for group, share in merged.conflict.items()}
+        return [*out.values()], {_FINITE: merged.finite, **conflict}
 
-    def __init__(self, conductor: Conductor, given: _Given) -> None:
-        own, first = given.copied(), next(iter(given.out.values()))
-        self._own, self._lambda_hr = [*own.tensors.values()], conductor.objective.lambda_hr
-        self._λ, self._λ_now = first.new_empty(1), -1.0  # on the device
+    def write_own(given: _Given) -> None:
+        nonlocal λ_now
+        write(tensors, [*given.tensors.values()])
+        if (now := lambda_hr(given.step.t)) != λ_now:
+            λ_now = now
+            λ.fill_(now)
 
-        def work() -> tuple[list[Tensor], dict[str, Number]]:
-            step = replace(own.step, t=iteration(given.step.t))
-            out = {name: torch.empty_like(x, memory_format=torch.contiguous_format) for name, x in given.out.items()}
-            merged = conductor.merge_routed(own.params, own.lr, own.hr, step, given.step.t, out, self._λ)
-            conflict = {f"{_CONFLICT}{group}": share for group, share in merged.conflict.items()}
-            return [*out.values()], {_FINITE: merged.finite, **conflict}
-
-        self._write(given)
-        self._work = RecordedWork(first.device, conductor, work, that_merge(conductor))
-
-    def outcome(self, given: _Given) -> Merged:
-        """See `Recorded`."""
-        made, row = self._work.outcome()
+    def outcome(given: _Given, made: list[Tensor], row: dict[str, Number]) -> Merged:
         write([*given.out.values()], made)
         conflict = {name.removeprefix(_CONFLICT): x for name, x in row.items() if name.startswith(_CONFLICT)}
         return Merged(Grads(given.out), conflict, row[_FINITE])
 
-    def _write(self, given: _Given) -> None:
-        write(self._own, [*given.tensors.values()])
-        if (λ := self._lambda_hr(given.step.t)) != self._λ_now:
-            self._λ_now = λ
-            self._λ.fill_(λ)
+    write_own(given)
+    return RecordedWork(first.device, conductor, work, write_own, outcome, that_merge(conductor))
 
 
 class ReplayedMerge:
@@ -112,7 +106,7 @@ class ReplayedMerge:
         if self._replays is None or step is None or not g_hr.tensors or conductor.objective.lambda_hr(t) == 0:
             return live()
         given = _Given(params, g_lr, g_hr, step, out)
-        return self._replays.do(self._kind(given), t, given, live=live, record=lambda: _Recorded(conductor, given))
+        return self._replays.do(self._kind(given), t, given, live=live, record=lambda: _recorded(conductor, given))
 
     def _kind(self, given: _Given) -> Kind:
         asked = self._conductor.owner("reconcile"), *self._conductor.regularizers

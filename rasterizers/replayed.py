@@ -23,7 +23,7 @@ from rasterizers.checks import drawing
 from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, WithRadii, can_be_recorded, over
 from rasterizers.recording import Recording, on_side_stream, running
-from rasterizers.replays import Kind, Recorded, Replays, can_record, write
+from rasterizers.replays import Kind, Replays, can_record, write
 
 _BLACK: Final = (0.0, 0.0, 0.0)
 _GRADIENTS: Final = tuple(f.name for f in fields(SplatGradients) if f.name != "absgrad")
@@ -64,15 +64,12 @@ class _Asked:
         return drawing(self.rasterizer, self.depth)(self.inputs.splats(), self.camera)
 
 
-class _RecordedDrawing(Recorded[_Asked, Rendering]):
-    """The recordings of both passes of one kind of drawing, and the tensors from which they read what they are given.
+class _RecordedDrawing:
+    """A `Recorded` of both passes of one kind of drawing.
 
     Attributes:
         turn: how often it has been drawn.
     """
-
-    _work: Recording[tuple[Rendering, list[Tensor | None]]]
-    _back: Recording[list[Tensor | None]]
 
     def __init__(self, asked: _Asked) -> None:
         device, camera = asked.inputs.means.device, replace(asked.camera)  # its numbers become those of others
@@ -95,24 +92,30 @@ class _RecordedDrawing(Recorded[_Asked, Rendering]):
         with on_side_stream(device):  # live, which also compiles the kernels of the backward pass
             rendering, live = forward()
             live += backward(rendering)
-        self._work = Recording(device, forward)
-        self._back = Recording(device, lambda: backward(self._work.result[0]))
-        _require_same_bits([*self._work.result[1], *self._back.result], live)
+        self._forward = Recording(device, forward)
+        self._backward = Recording(device, lambda: backward(self._forward.result[0]))
+        _require_same_bits([*self._forward.result[1], *self._backward.result], live)
+
+    def holds_at(self, t: int) -> bool:
+        """See `Recorded`."""
+        return self._forward.holds_at(t)
+
+    def replay(self, given: _Asked) -> bool:
+        """See `Recorded`."""
+        write(self._own, given.read)
+        return self._forward.replay()
 
     def outcome(self, given: _Asked) -> Rendering:
         """See `Recorded`."""
         self.turn += 1
-        rendering, made = self._work.result
+        rendering, made = self._forward.result
         return _Replayed(self, given, self.turn, rendering, _copied(made))
 
     def vjp(self, cotangents: Float[Tensor, "1 H W 3"]) -> SplatGradients:
         """Of what was drawn last."""
         self._cotangent.copy_(cotangents)
-        self._back.replay()
-        return SplatGradients(*_copied(self._back.result))
-
-    def _write(self, given: _Asked) -> None:
-        write(self._own, given.read)
+        self._backward.replay()
+        return SplatGradients(*_copied(self._backward.result))
 
 
 class _Replayed:

@@ -8,10 +8,9 @@ recording or a replay, all that follows is live.
 from __future__ import annotations
 
 import logging
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Generic, Protocol, TypeVar
+from typing import Any, Final, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -30,7 +29,7 @@ _MOST_TURNS: Final = 8  # recordings made anew that have not paid off
 _PAYS_AFTER: Final = 2  # replays
 
 T = TypeVar("T")
-G = TypeVar("G")
+T_co = TypeVar("T_co", covariant=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,35 +52,22 @@ def can_record(device: torch.device) -> bool:
     return device.type in DEVICES
 
 
-class Work(Protocol):
-    """A `Recording`, or what has one."""
-
-    def holds_at(self, t: int) -> bool: ...
-
-    def replay(self) -> bool: ...
-
-
-class Recorded(ABC, Generic[G, T]):
+class Recorded(Protocol[T_co]):
     """A recording of one kind of work, which reads what it is given from tensors of its own."""
-
-    _work: Work
 
     def holds_at(self, t: int) -> bool:
         """Whether what Python has decided by the iteration, as a strategy may, is the same at t."""
-        return self._work.holds_at(t)
+        ...
 
-    def replay(self, given: G) -> bool:
-        """Do the work; False where the recording does not hold for it, before anything has changed."""
-        self._write(given)
-        return self._work.replay()
+    def replay(self, given: Any) -> bool:
+        """Write what the work is given to where it reads it, and do it; False where the recording does not hold for it, before
+        anything has changed.
+        """
+        ...
 
-    @abstractmethod
-    def _write(self, given: G) -> None:
-        """Write what the work is given to where the recorded one reads it."""
-
-    @abstractmethod
-    def outcome(self, given: G) -> T:
+    def outcome(self, given: Any) -> T_co:
         """What the work has made."""
+        ...
 
 
 class Replays:
@@ -102,7 +88,7 @@ class Replays:
         self._turns = 0.0  # how often a recording did not hold at its iteration, less what the replays since have saved
         self._failed = False
 
-    def do(self, kind: Kind, t: int, given: Any, *, live: Callable[[], T], record: Callable[[], Recorded[Any, T]]) -> T:
+    def do(self, kind: Kind, t: int, given: Any, *, live: Callable[[], T], record: Callable[[], Recorded[T]]) -> T:
         """Do the work: by a replay, while it is recorded, or live."""
         if self._failed:
             return self._live(live, _FAILED)

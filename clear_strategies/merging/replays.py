@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -21,22 +21,29 @@ from rasterizers.recording import Recording
 from rasterizers.replays import Replays, can_record
 from rasterizers.told import Guarded
 
+G = TypeVar("G")
+T = TypeVar("T")
+
 LIVE: Final = "live in place of a replay"
 """The work log's entry for work that was not replayed, by the reason. It has no runs, so that none seem saved."""
 
 
-class RecordedWork:
-    """A recording of work, what it has skipped, its numbers for the history, and what strategies log in it.
+class RecordedWork(Generic[G, T]):
+    """A `Recorded`, with what the work has skipped, its numbers for the history, and what strategies log in it.
 
     Args:
         work: returns what it makes, and numbers by name. See `Recording`.
+        write: writes what a replay is given to where the work reads it.
+        outcome: what the replay returns, of what it was given, of what the work has made, whose tensors the next replay
+            overwrites, and of its numbers, copied.
         asked: strategies that the work asks. It holds while they store what they stored before it.
     """
 
     def __init__(
         self, device: torch.device, conductor: Conductor, work: Callable[[], tuple[Any, Mapping[str, Number]]],
-        asked: Iterable[Strategy] = (),
+        write: Callable[[G], None], outcome: Callable[[G, Any, dict[str, Number]], T], asked: Iterable[Strategy] = (),
     ) -> None:  # fmt: skip
+        self._write, self._outcome = write, outcome
         self._work_log, self._strategies, self._asked = conductor.work_log, conductor.strategies, [*asked]
         self._stored = [*map(_stored_by, self._asked)]  # before the work, which may change it
         self._of_t: dict[str, Any] = {}  # numbers that Python has made of the iteration
@@ -60,19 +67,18 @@ class RecordedWork:
                 s.logs.clear()  # of the recording's tensors
 
     def holds_at(self, t: int) -> bool:
-        """See `rasterizers.recording.Recording`."""
+        """See `Recorded`."""
         self._t = t
         return self._stored == [*map(_stored_by, self._asked)] and self._recording.holds_at(t)
 
-    def replay(self) -> bool:
-        """See `rasterizers.recording.Recording`."""
+    def replay(self, given: G) -> bool:
+        """See `Recorded`."""
+        self._write(given)
         with self._work_log.stage("replayed"):
             return self._recording.replay()
 
-    def outcome(self) -> tuple[Any, dict[str, Number]]:
-        """What the work has made, whose tensors the next replay overwrites, and its numbers, copied. The strategies have then
-        logged theirs.
-        """
+    def outcome(self, given: G) -> T:
+        """See `Recorded`. The strategies have then logged what the work logs."""
         made, numbers, row_of = self._recording.result
         row: dict[str, Number] = row_of(numbers.clone()) | {name: x.at(self._t) for name, x in self._of_t.items()}
         for k, (name, reason, count) in enumerate(self._skips):
@@ -81,7 +87,7 @@ class RecordedWork:
             self._work_log.skip(name, reason, counted.vector[counted.k].long() if on_device else count)  # type: ignore[union-attr]
         for k, (s, name) in enumerate(self._logged):
             s.logs[name] = row.pop(f"log {k}")
-        return made, row
+        return self._outcome(given, made, row)
 
 
 def that_merge(conductor: Conductor) -> Iterator[Strategy]:

@@ -30,8 +30,7 @@ from clear_strategies.strategies.sr_stage import SRStage
 from clear_strategies.training import checkpoint
 from clear_strategies.training.clock import Clock
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
-from clear_strategies.training.given import Given, GivenExtra, GivenView, L
-from clear_strategies.training.replay import replays_for
+from clear_strategies.training.replay import GivenExtra, GivenView, learned, replays_for
 from clear_strategies.training.state import TrainState
 from rasterizers import native
 from rasterizers.interface import Camera, Color, Rasterizer, over
@@ -50,7 +49,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
     hr_due = conductor.wants_hr(t) and (needs_hr or not conductor.skips.leaves_out_hr(t, conductor.work_log))
     scales = {"lr": conductor.wants_lr and conductor.skips.lr_due(view, hr_due, conductor.work_log), "hr": hr_due}
     z, background = conductor.gate(t, len(θ)), conductor.background(t)  # zᵗ             Eq. 15       SVS
-    u, row = _learned(s, rasterizer, GivenView(t, view, scales, z, background), learn)
+    u, row = learned(s, rasterizer, GivenView(t, view, scales, z, background), learn)
     begin_sr_stage(s, over(rasterizer, background))
     extra = extra_steps(s, rasterizer, conductor.extra_views(t), background)
     conductor.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS
@@ -66,15 +65,10 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
     s.advance()
 
 
-def _learned(s: TrainState, rasterizer: Rasterizer, given: Given, learn: Callable[..., L]) -> L:
-    """What `learn` returns for the iteration, or a replay of it."""
-    return learn(s, rasterizer, given) if s.replays is None else s.replays.learn(given, learn)
-
-
 def learn(s: TrainState, rasterizer: Rasterizer, given: GivenView) -> tuple[Update, dict[str, Number]]:
     """What an iteration does with its view: render, compare, step on the merged gradient, and accumulate statistics.
 
-    It can be recorded where `Replays` say so: then nothing here reads a number from the device.
+    It can be recorded, see `replays_for`: then nothing here reads a number from the device.
     """
     t, view, θ, conductor, stage = given.t, given.view, s.field, s.conductor, s.conductor.work_log.stage
     with stage(f"render {' + '.join(scale.upper() for scale, wanted in given.scales.items() if wanted)}"):
@@ -143,7 +137,7 @@ def extra_steps(
     row: dict[str, Number] = {}
     for extra in extra_views:
         steps = s.optimizer.steps
-        row |= _learned(s, rasterizer, GivenExtra(s.t, extra, background), learn_extra)[1]
+        row |= learned(s, rasterizer, GivenExtra(s.t, extra, background), learn_extra)[1]
         s.optimizer.steps = steps  # the learning rates follow the iteration
     return row
 

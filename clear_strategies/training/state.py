@@ -23,12 +23,12 @@ from clear_strategies.training.checkpoint import Checkpoint
 from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for
 from clear_strategies.training.densifier import Densifier, DensifierSettings, cameras_extent
 from clear_strategies.training.field import GaussianField
-from clear_strategies.training.given import Replayer
 from clear_strategies.training.history import History
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
 from clear_strategies.training.settings import FitSettings
 from rasterizers.interface import RasterSettings
+from rasterizers.replays import Replays
 
 _log = logging.getLogger(__name__)
 
@@ -65,7 +65,7 @@ class TrainState:
         rules: by which the rasterizer draws.
         history: one row per iteration; read it by `history_as_floats`, since on a device its numbers are deferred.
         photos: the scene's `colours`, those of test views included, by which a resumed run knows its photos.
-        replays: where iterations are replayed (`fit.replay`); no checkpoint needs them.
+        replays: the recordings of iterations where they are replayed (`fit.replay`); no checkpoint needs them.
     """
 
     field: GaussianField
@@ -80,7 +80,7 @@ class TrainState:
     history: History = field(default_factory=History)
     compiled_step: CompiledStep | None = None
     photos: Mapping[str, Tensor] = field(default_factory=dict)
-    replays: Replayer | None = None
+    replays: Replays | None = None
 
     @classmethod
     def start(
