@@ -237,7 +237,7 @@ class HrDrawing:
             tensors = own.tensors(rasterizer)
             return RecordedWork(
                 given.background.device, conductor, lambda: work(own, True),
-                write=lambda given: write(tensors, given.tensors(rasterizer)), outcome=lambda _, made, row: (made, row),
+                write=lambda new: write(tensors, new.tensors(rasterizer)), outcome=lambda _, made, row: (made, row),
             )  # fmt: skip
 
         return self._replays.do(kind, t, given, live=lambda: work(given, False), record=record)

@@ -56,6 +56,7 @@ class _Given:
 
 
 def _recorded(conductor: Conductor, given: _Given) -> RecordedWork[_Given, Merged]:
+    """The recording of one kind of merge, which reads what it is given from tensors of its own."""
     own, first, lambda_hr = given.copied(), next(iter(given.out.values())), conductor.objective.lambda_hr
     tensors, λ = [*own.tensors.values()], first.new_empty(1)
     λ_now = -1.0  # which is on the device
@@ -67,20 +68,20 @@ def _recorded(conductor: Conductor, given: _Given) -> RecordedWork[_Given, Merge
         conflict = {f"{_CONFLICT}{group}": share for group, share in merged.conflict.items()}
         return [*out.values()], {_FINITE: merged.finite, **conflict}
 
-    def write_own(given: _Given) -> None:
+    def write_own(new: _Given) -> None:
         nonlocal λ_now
-        write(tensors, [*given.tensors.values()])
-        if (now := lambda_hr(given.step.t)) != λ_now:
-            λ_now = now
-            λ.fill_(now)
+        write(tensors, [*new.tensors.values()])
+        if (λ_new := lambda_hr(new.step.t)) != λ_now:
+            λ_now = λ_new
+            λ.fill_(λ_new)
 
-    def outcome(given: _Given, made: list[Tensor], row: dict[str, Number]) -> Merged:
-        write([*given.out.values()], made)
+    def outcome(new: _Given, made: list[Tensor], row: dict[str, Number]) -> Merged:
+        write([*new.out.values()], made)
         conflict = {name.removeprefix(_CONFLICT): x for name, x in row.items() if name.startswith(_CONFLICT)}
-        return Merged(Grads(given.out), conflict, row[_FINITE])
+        return Merged(Grads(new.out), conflict, row[_FINITE])
 
     write_own(given)
-    return RecordedWork(first.device, conductor, work, write_own, outcome, that_merge(conductor))
+    return RecordedWork(first.device, conductor, work, write=write_own, outcome=outcome, asked=that_merge(conductor))
 
 
 class ReplayedMerge:

@@ -50,7 +50,7 @@ class Recording(Generic[T]):
         self._watch = _Watch(device.type)
         self._graph: Any = None  # which is being captured, and what ends that
         self._ends = ExitStack()
-        with _one_at_a_time, on_side_stream(device), _without_garbage_collection(), _running_as(self):
+        with _one_at_a_time, on_side_stream(device), _running_as(self):
             try:
                 _make_room(device)
                 self._begin()
@@ -190,22 +190,15 @@ def running() -> Recording[Any] | None:
 
 @contextmanager
 def _running_as(recording: Recording[Any]) -> Iterator[None]:
+    """A scope without Python's collector: what that frees may be memory or an event of CUDA, and so end a capture."""
+    collects = gc.isenabled()
+    gc.disable()
     _running.recording = recording
     try:
         yield
     finally:
         _running.recording = None
-
-
-@contextmanager
-def _without_garbage_collection() -> Iterator[None]:
-    """What the collector frees may be memory or an event of CUDA, and so end a capture."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
+        if collects:
             gc.enable()
 
 

@@ -31,16 +31,16 @@ _GRADIENTS: Final = tuple(f.name for f in fields(SplatGradients) if f.name != "a
 
 def draw(rasterizer: Rasterizer, inputs: Inputs, camera: Camera, *, depth: bool) -> Rendering:
     """A drawing of the inputs, which have no graph: by a replay where it can be one."""
-    device, asked = inputs.means.device, _Asked(rasterizer, inputs, camera, depth)
+    device, given = inputs.means.device, _Given(rasterizer, inputs, camera, depth)
     if not (can_record(device) and can_be_recorded(rasterizer)) or running() is not None:
-        return asked.live()
+        return given.live()
     if device not in _threads.drawings:
         _threads.drawings[device] = _Drawings(device)
-    return _threads.drawings[device].draw(asked)
+    return _threads.drawings[device].draw(given)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Asked:
+class _Given:
     """What a drawing is made of; see `draw`."""
 
     rasterizer: Any
@@ -55,7 +55,7 @@ class _Asked:
         return Kind((len(self.inputs.means),), (*shapes, size), (_over_black(self.rasterizer), self.depth))
 
     @property
-    def read(self) -> list[Tensor | None]:
+    def tensors(self) -> list[Tensor | None]:
         """All tensors that the work reads."""
         r, device = self.rasterizer, self.inputs.means.device
         return [*self.inputs, *r.numbers_of(self.camera, device), r.background_on(device)]
@@ -71,13 +71,13 @@ class _RecordedDrawing:
         turn: how often it has been drawn.
     """
 
-    def __init__(self, asked: _Asked) -> None:
-        device, camera = asked.inputs.means.device, replace(asked.camera)  # its numbers become those of others
-        background = asked.rasterizer.background_on(device).clone()
+    def __init__(self, given: _Given) -> None:
+        device, camera = given.inputs.means.device, replace(given.camera)  # its numbers become those of others
+        background = given.rasterizer.background_on(device).clone()
         own = replace(
-            asked, rasterizer=asked.rasterizer.over_changing(background), inputs=asked.inputs.copied(), camera=camera
+            given, rasterizer=given.rasterizer.over_changing(background), inputs=given.inputs.copied(), camera=camera
         )
-        self._own = own.read
+        self._own = own.tensors
         self._cotangent = background.new_ones(1, camera.height, camera.width, 3)
         self.turn = 0
 
@@ -100,12 +100,12 @@ class _RecordedDrawing:
         """See `Recorded`."""
         return self._forward.holds_at(t)
 
-    def replay(self, given: _Asked) -> bool:
+    def replay(self, given: _Given) -> bool:
         """See `Recorded`."""
-        write(self._own, given.read)
+        write(self._own, given.tensors)
         return self._forward.replay()
 
-    def outcome(self, given: _Asked) -> Rendering:
+    def outcome(self, given: _Given) -> Rendering:
         """See `Recorded`."""
         self.turn += 1
         rendering, made = self._forward.result
@@ -121,22 +121,22 @@ class _RecordedDrawing:
 class _Replayed:
     """A `Rendering` by a replay."""
 
-    def __init__(self, of: _RecordedDrawing, asked: _Asked, turn: int, last: Rendering, made: Sequence[Any]) -> None:
+    def __init__(self, of: _RecordedDrawing, given: _Given, turn: int, last: Rendering, made: Sequence[Any]) -> None:
         self.image, self.alpha, self.depth, self.means2d, self.visible = made
-        self._of, self._asked, self._turn, self._recorded = of, asked, turn, last
+        self._of, self._given, self._turn, self._recorded = of, given, turn, last
         self.awaits_backward = True
 
     @property
     def radii(self) -> Int[Tensor, "N 2"]:
         """See `WithRadii`."""
-        return cast(WithRadii, self._recorded if self._is_last else self._asked.live()).radii
+        return cast(WithRadii, self._recorded if self._is_last else self._given.live()).radii
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"], **more: Any) -> SplatGradients:
         """See `Rendering.vjp`, `WithAbsgrad` and `WithDepthGradient`."""
         self.awaits_backward = False
         if self._is_last and len(cotangents) == 1 and not more:
             return self._of.vjp(cotangents)
-        gradients: SplatGradients = cast(Any, self._asked.live()).vjp(cotangents, **more)
+        gradients: SplatGradients = cast(Any, self._given.live()).vjp(cotangents, **more)
         return gradients
 
     @property
@@ -152,13 +152,13 @@ class _Drawings:
         self._last: dict[Kind, weakref.ref[_Replayed]] = {}
         self._count = 0
 
-    def draw(self, asked: _Asked) -> Rendering:
-        kind = asked.kind
+    def draw(self, given: _Given) -> Rendering:
+        kind = given.kind
         last = self._last[kind]() if kind in self._last else None
         if last is not None and last.awaits_backward:
-            return asked.live()
+            return given.live()
         self._count += 1
-        drawn = self._replays.do(kind, self._count, asked, live=asked.live, record=lambda: _RecordedDrawing(asked))
+        drawn = self._replays.do(kind, self._count, given, live=given.live, record=lambda: _RecordedDrawing(given))
         if isinstance(drawn, _Replayed):
             self._last = {k: one for k, one in self._last.items() if one() is not None} | {kind: weakref.ref(drawn)}
         return drawn

@@ -40,7 +40,7 @@ class RecordedWork(Generic[G, T]):
     """
 
     def __init__(
-        self, device: torch.device, conductor: Conductor, work: Callable[[], tuple[Any, Mapping[str, Number]]],
+        self, device: torch.device, conductor: Conductor, work: Callable[[], tuple[Any, Mapping[str, Number]]], *,
         write: Callable[[G], None], outcome: Callable[[G, Any, dict[str, Number]], T], asked: Iterable[Strategy] = (),
     ) -> None:  # fmt: skip
         self._write, self._outcome = write, outcome

@@ -24,7 +24,7 @@ from clear_strategies.merging.iteration import Update
 from clear_strategies.merging.replays import LIVE, RecordedWork, that_merge, why_strategies_are_not_recorded
 from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.state import TrainState
-from rasterizers.interface import Color, Rasterizer, Recordable, over
+from rasterizers.interface import Color, Rasterizer, Recordable, can_be_recorded, over
 from rasterizers.replays import Kind, Replays, copied, write
 
 _log = logging.getLogger(__name__)
@@ -117,7 +117,7 @@ def learned(
 
 
 def _why_not(s: TrainState, rasterizer: Rasterizer) -> Iterator[str]:
-    if not isinstance(rasterizer, Recordable):
+    if not can_be_recorded(rasterizer):
         yield f"{type(rasterizer).__name__} cannot be recorded; rasterizer=warp can"
     if s.compiled_step is None or not s.compiled_step.records:
         yield "the per-Gaussian step is not that of Warp"
@@ -149,22 +149,24 @@ def _recorded(
     """The recording of one kind of iteration, which reads what it is given from tensors of its own."""
     own, background = _copied(s, given), copied(_behind(s, rasterizer, given))
     drawn_by = rasterizer if background is None else rasterizer.over_changing(background)
-    tensors = [*_read_of(s, rasterizer, own), background]
+    tensors = [*_tensors_of(s, rasterizer, own), background]
     step = cast(CompiledStep, s.compiled_step)
 
-    def write_own(given: Given) -> None:
-        write(tensors, [*_read_of(s, rasterizer, given), _behind(s, rasterizer, given)])
-        step.count(given.t)
+    def write_own(new: Given) -> None:
+        write(tensors, [*_tensors_of(s, rasterizer, new), _behind(s, rasterizer, new)])
+        step.count(new.t)
 
-    def outcome(given: Given, update: Update | None, row: dict[str, Number]) -> Any:
-        if isinstance(given, GivenView) and update is not None:
+    def outcome(new: Given, update: Update | None, row: dict[str, Number]) -> Any:
+        if isinstance(new, GivenView) and update is not None:
             # A strategy may store its tensors, which the next replay overwrites.
-            update = replace(update, step=replace(update.step.copied(), t=given.t, view=given.view))
+            update = replace(update, step=replace(update.step.copied(), t=new.t, view=new.view))
         return update, row
 
     write_own(given)
     asked = that_merge(s.conductor) if isinstance(given, GivenView) else ()
-    return RecordedWork(s.device, s.conductor, lambda: learn(s, drawn_by, own), write_own, outcome, asked)
+    return RecordedWork(
+        s.device, s.conductor, lambda: learn(s, drawn_by, own), write=write_own, outcome=outcome, asked=asked
+    )
 
 
 def _copied(s: TrainState, given: Given) -> Given:
@@ -191,13 +193,13 @@ def _behind(s: TrainState, rasterizer: Recordable, given: Given) -> Tensor | Non
     return cast(Recordable, over(rasterizer, given.background)).background_on(s.device)
 
 
-def _read_of(s: TrainState, rasterizer: Recordable, given: Given) -> list[Tensor | None]:
+def _tensors_of(s: TrainState, rasterizer: Recordable, given: Given) -> list[Tensor | None]:
     """All other tensors that an iteration reads of what it is given."""
-    read: list[Tensor | None] = []
+    tensors: list[Tensor | None] = []
     for photo in given.photos:
         image = photo.over(given.background, given.behind).image
-        read += [image, photo.shown, *rasterizer.numbers_of(photo.camera, s.device)]
+        tensors += [image, photo.shown, *rasterizer.numbers_of(photo.camera, s.device)]
     if isinstance(given, GivenExtra):
-        return [*read, given.extra.weight]
+        return [*tensors, given.extra.weight]
     looked_up = s.conductor.looked_up(given.view) if given.looked_up is None else given.looked_up
-    return [*read, given.gate, looked_up]
+    return [*tensors, given.gate, looked_up]
