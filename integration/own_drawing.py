@@ -114,8 +114,8 @@ class _Given:
 
 
 _Made = tuple[Any, dict[str, Number]]
-_Work = Callable[[_Given, bool], _Made]
-"""Work on what is given, and whether it is being recorded. It returns what it makes, and its numbers."""
+_Work = Callable[[_Given], _Made]
+"""Work on what is given, or on a recording's copy of it. It returns what it makes, and its numbers."""
 
 
 class HrDrawing:
@@ -186,9 +186,10 @@ class HrDrawing:
         known = None if self._replays is None else conductor.looked_up(view)
         given = _Given(asked.inputs, asked.background, asked.camera, photo, known, mask)
 
-        def work(given: _Given, recorded: bool) -> tuple[tuple[HrSide, Grads], dict[str, Number]]:
-            made = self._compared(given, asked, replace(view, hr=given.photo) if recorded else view, t)
-            return made, {**made[0].losses}
+        def work(given: _Given) -> tuple[tuple[HrSide, Grads], dict[str, Number]]:
+            shown = view if given.photo is photo else replace(view, hr=given.photo)
+            hr = conductor.hr_gradients(given.shot(asked), shown, t, AutogradShot.gradients, looked_up=given.known)
+            return (hr, hr.g if asked.offset is None else hr.routed), {**hr.losses}  # Eq. 9, 10, 12, 13
 
         (hr, g), losses = self._done(asked, given, t, ("hr", view.factor), work)
         params = {name: p.detach() for name, p in asked.params.items()}
@@ -208,7 +209,7 @@ class HrDrawing:
         photo = extra.photo.over(conductor.background(t), extra.background)
         given = _Given(asked.inputs, asked.background, asked.camera, photo, extra.weight, None)
 
-        def work(given: _Given, recorded: bool) -> tuple[Grads, dict[str, Number]]:
+        def work(given: _Given) -> tuple[Grads, dict[str, Number]]:
             shot = given.shot(asked)
             shown = replace(extra, photo=given.photo, weight=cast(Tensor, given.known))
             (g,) = shot.gradients(conductor.extra_loss(shot.image, shown, t).cotangents)
@@ -218,16 +219,11 @@ class HrDrawing:
         found = every_number(to_parameters(g, asked.drawn, asked.params), asked.params)
         return Grads({name: x.clone() for name, x in found.items()})  # some are those that the next replay overwrites
 
-    def _compared(self, given: _Given, asked: Drawable, view: View, t: int) -> tuple[HrSide, Grads]:
-        """The HR side, and g^HR of what was drawn, with f_det's.  Eq. 9, 10, 12, 13"""
-        hr = self._conductor.hr_gradients(given.shot(asked), view, t, AutogradShot.gradients, looked_up=given.known)
-        return hr, hr.g if asked.offset is None else hr.routed
-
     def _done(self, asked: Drawable, given: _Given, t: int, facts: tuple[Any, ...], work: _Work) -> _Made:
         """The work, live or by a replay."""
         conductor, rasterizer = self._conductor, asked.rasterizer
         if self._replays is None or not can_be_recorded(rasterizer):
-            return work(given, False)
+            return work(given)
         asked_of = (conductor.owner(hook) for hook in ("observe", "route"))
         state = [rows.data_ptr() for s in asked_of if s is not None for rows in s.state.values()]
         kind = Kind((len(asked.drawn["means"]), *state), given.shapes, (rasterizer, *facts))
@@ -236,11 +232,11 @@ class HrDrawing:
             own = given.copied()
             tensors = own.tensors(rasterizer)
             return RecordedWork(
-                given.background.device, conductor, lambda: work(own, True),
+                given.background.device, conductor, lambda: work(own),
                 write=lambda new: write(tensors, new.tensors(rasterizer)), outcome=lambda _, made, row: (made, row),
             )  # fmt: skip
 
-        return self._replays.do(kind, t, given, live=lambda: work(given, False), record=record)
+        return self._replays.do(kind, t, given, live=lambda: work(given), record=record)
 
     def _count_parts(self, n: int) -> None:
         self._counts["HR renders in parts"] += 1

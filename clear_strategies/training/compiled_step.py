@@ -41,8 +41,6 @@ FusedMode = Literal["auto", "off"]
 GaussianPass = Callable[..., kernel.GaussianStep]
 """`gaussian_step.cpp.CppGaussianStep`, or another class of its signature."""
 
-_AS_IT_IS: Final = Weights()
-_NOTHING: Final[Mapping[str, Tensor]] = {}
 _LIMITS: Final = {"opacities": LOGIT_LIMIT, "scales": LOG_SCALE_LIMIT}
 
 
@@ -158,7 +156,7 @@ class CompiledStep:
 
     def step_extra(self, params: Mapping[str, Tensor], shot: FieldShot, g_lr: Grads, t: int) -> None:
         """Step on this gradient alone: nothing is regularized."""
-        self._apply(self._gaussians(shot.activation, g_lr, None), params, g_lr, t)
+        self._apply(self._gaussians(shot.activation, g_lr, None), params, g_lr, t, Weights(), {}, {}, decays=False)
 
     def _apply(
         self,
@@ -166,11 +164,11 @@ class CompiledStep:
         params: Mapping[str, Tensor],
         g_lr: Grads,
         t: int,
-        weights: Weights = _AS_IT_IS,
-        given: Mapping[str, Tensor] = _NOTHING,
-        plus: Mapping[str, Tensor] = _NOTHING,
+        weights: Weights,
+        given: Mapping[str, Tensor],
+        plus: Mapping[str, Tensor],
         *,
-        decays: bool = False,
+        decays: bool,
     ) -> None:
         """Merge and step.
 
