@@ -110,8 +110,7 @@ def _folder_of(point: EntryPoint) -> str:
 
 
 def _job_folder(*swept: str, _root_: Any) -> str:
-    """`${job_folder:}` in conf/: the name of a job's folder in a sweep, its overrides, in one word that every file system takes.
-    A path among them would otherwise lead elsewhere: behind `../..` all jobs share a folder.
+    """`${job_folder:}` in conf/: the name of a job's folder in a sweep, its overrides.
 
     Args:
         swept: keys of `UNNAMED` in which the jobs of this sweep differ, and which are in it all the same.
@@ -120,7 +119,13 @@ def _job_folder(*swept: str, _root_: Any) -> str:
     if _root_.get("method") is not None:
         left_out.add("strategy")  # it sets them aside
     named = [word for word in _root_.hydra.overrides.task if word.lstrip("+~").partition("=")[0] not in left_out]
-    name = ",".join(sorted(named)) or "defaults"
+    return _one_folder(",".join(sorted(named)) or "defaults")
+
+
+def _one_folder(name: str) -> str:
+    """The name as one word that every file system takes. A path in it would otherwise lead elsewhere: behind `../..` all jobs
+    share a folder.
+    """
     word = name.replace("/", "_")
     if len(word.encode()) <= _LONGEST_NAME and not _NOT_IN_NAMES.search(word):
         return word
