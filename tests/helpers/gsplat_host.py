@@ -56,6 +56,14 @@ class Host:
     def render(self, camera, step=0):
         return drawn(self.rasterization, self.splats, camera, sh_degree=self.degree(step), **self.call)
 
+    def step(self):
+        for optimizer in self.optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad()
+
+    def gradients(self):
+        return {name: p.grad for name, p in self.splats.items() if p.grad is not None}
+
     def train(self, names, between=lambda: None):
         """The order of gsplat's simple_trainer: backward, step, densify."""
         for step, name in enumerate(names):

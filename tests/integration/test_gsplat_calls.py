@@ -125,22 +125,6 @@ def test_the_detail_feature_is_trained_in_a_loop_that_tells_every_optimizer_what
     assert float(host.splats["detail"].detach().abs().max()) > 0
 
 
-@pytest.mark.parametrize("asked", ["means", "shN"])
-def test_gradients_that_a_loop_asks_for_beside_its_backward_pass_leave_the_merge_to_it(asked):
-    merged = []
-    for asks in (False, True):
-        host, clear, render = started()
-        for i in range(2):  # the second with gradients of the first, which are not zeroed
-            image = render(i)
-            if asks:
-                (asked_for,) = torch.autograd.grad(image.square().mean(), host.splats[asked], retain_graph=True)
-                assert asked_for.any()
-            image.mean().backward()
-        merged.append({name: p.grad for name, p in host.splats.items() if p.grad is not None})
-        assert clear.attachment.counts["merges"] == 2
-    assert all(torch.equal(g, merged[1][name]) for name, g in merged[0].items())
-
-
 @pytest.mark.parametrize("penalty", [0.0, 1e-3])
 def test_the_gradient_of_the_colours_comes_by_its_factors_but_where_a_hook_looks_at_it(penalty, monkeypatch):
     by_factors = []
@@ -160,7 +144,7 @@ def test_the_gradient_of_the_colours_comes_by_its_factors_but_where_a_hook_looks
         for i in range(2):  # the second with gradients of the first, which are not zeroed
             (render(i).mean() + penalty * host.splats["shN"].square().sum()).backward()
         assert len(seen) == (4 if hooked else 0)  # of LR and of HR
-        merged.append({name: p.grad for name, p in host.splats.items() if p.grad is not None})
+        merged.append(host.gradients())
     assert by_factors == [True, True, False, False]
     assert all(torch.allclose(g, merged[1][name], rtol=1e-5, atol=1e-9) for name, g in merged[0].items())
 
@@ -198,7 +182,7 @@ def test_a_compiled_loop_has_the_same_gradients(backend, recwarn):
         for t in range(10):
             loss(t % 3).backward()
         assert clear.attachment.counts["merges"] == 10
-        gradients.append({name: p.grad for name, p in host.splats.items() if p.grad is not None})
+        gradients.append(host.gradients())
     assert all(torch.equal(g, gradients[1][name]) for name, g in gradients[0].items())
     assert not [warning for warning in recwarn if "ynamo" in str(warning.message)]
 
@@ -278,7 +262,7 @@ def test_a_square_picture_that_a_host_turns_has_the_gradients_of_what_was_drawn(
         scene = replace(made, train=tuple(cropped(view, 8) for view in made.train))
         host, _, render = started(host=Host(scene, rasterization=turned), scene=scene)
         render().square().mean().backward()
-        gradients.append({name: p.grad for name, p in host.splats.items() if p.grad is not None})
+        gradients.append(host.gradients())
     for name, g in gradients[0].items():
         assert torch.allclose(gradients[1][name], g, rtol=1e-3, atol=1e-6 * float(g.abs().max()) + 1e-9), name
 
@@ -314,7 +298,7 @@ def test_a_host_that_draws_twice_for_one_rendering_has_the_same_gradients_and_is
         host, clear, render = started(host=Host(toy.scene(20), rasterization=rasterization))
         for i in range(2):
             render(i).mean().backward()
-        gradients.append({name: p.grad for name, p in host.splats.items() if p.grad is not None})
+        gradients.append(host.gradients())
     assert caplog.text.count("The host calls its rasterizer 2 times for one rendering") == (0 if looked_at else 1)
     assert clear.attachment.counts["HR renders in parts"] == (0 if looked_at else 2)
     for name, g in gradients[0].items():

@@ -55,9 +55,7 @@ def test_extra_views_are_stepped_on_by_optimizers_that_are_made_anew_and_it_is_t
         if i == 3:
             host.optimizers.update(separate(host.splats))
         render(i % 3).mean().backward()
-        for optimizer in host.optimizers.values():
-            optimizer.step()
-            optimizer.zero_grad()
+        host.step()
     assert clear.attachment.counts["extra views"] == 20
     unknown = torch.optim.Adam([p for p in host.splats.values() if p.requires_grad])
     assert "no effect" not in caplog.text
@@ -312,9 +310,7 @@ def test_what_a_loop_computes_before_it_renders_is_of_what_strategies_have_left(
         )[0]
         (image.mean() + 0 * regularizer).backward()
         faded = p["opacities"].detach().clone()
-        for optimizer in host.optimizers.values():
-            optimizer.step()
-            optimizer.zero_grad()
+        host.step()
         assert torch.equal(seen[-1], faded)
         assert float((p["opacities"] - faded).max()) < -0.05  # a tenth of the opacity, and Adam's step
     assert clear.attachment.t == 4
@@ -322,15 +318,13 @@ def test_what_a_loop_computes_before_it_renders_is_of_what_strategies_have_left(
 
 
 def test_frozen_parameters_stay_as_they_are():
-    host, clear, render = started(FadingOpacity(rate=0.1), GCO())
-    for name in ("opacities", "detail"):
+    host, clear, render = started(FadingOpacity(rate=0.1), GCO(), toy.ShowsDark())
+    before = {name: host.splats[name].detach().clone() for name in ("means", "opacities", "detail")}
+    for name in before:
         host.splats[name].requires_grad_(False)
-    before = {name: host.splats[name].detach().clone() for name in ("opacities", "detail")}
     for i in range(3):
         render(i).mean().backward()
-        for optimizer in host.optimizers.values():
-            optimizer.step()
-            optimizer.zero_grad()
+        host.step()
     assert not [name for name, x in before.items() if not torch.equal(x, host.splats[name])]
     clear.remove()
 
@@ -341,7 +335,7 @@ def test_gradients_in_autocast_are_those_outside_of_it():
         with context:
             render().mean().backward()
         clear.remove()
-        return {name: p.grad for name, p in host.splats.items() if p.grad is not None}
+        return host.gradients()
 
     expected, found = merged(nullcontext()), merged(torch.autocast("cpu", torch.bfloat16))
     for name, g in expected.items():

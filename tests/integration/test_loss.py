@@ -108,9 +108,7 @@ def test_parameters_without_a_row_for_each_gaussian_or_of_other_names_are_refuse
     scene = toy.scene(20)
     host, view, conductor = Host(scene), scene.train[0], Conductor(objective=HR_FROM_START)
     lr, hr = host.render(view.lr.camera, detail=False), host.render(view.hr.camera)
-    with pytest.raises(
-        ValueError, match=r"params\['pose'\] must have a row for each of the 20 Gaussians, got \[1, 6\]"
-    ):
+    with pytest.raises(ValueError, match=r"params\['pose'\] must have a row for each of the 20 .*, got \[1, 6\]"):
         joint_loss(conductor, host.params | {"pose": torch.zeros(1, 6)}, lr, hr, view, 5)
     renamed = {("xyz" if name == "scales" else name): p for name, p in host.params.items()}
     with pytest.raises(ValueError, match="they have no gradient of xyz"):
@@ -154,9 +152,7 @@ def test_a_rendering_of_another_size_is_refused():
     scene = toy.scene(20)
     host, view = Host(scene), scene.train[0]
     small = host.render(view.lr.camera, detail=False)
-    with pytest.raises(
-        ValueError, match="view view0: the HR rendering must have the 96x64 pixels of its HR image, got 24x16"
-    ):
+    with pytest.raises(ValueError, match=r"view view0: the HR rendering must have the 96x64 .*, got 24x16"):
         joint_loss(Conductor(objective=HR_FROM_START), host.params, small, host.render(view.lr.camera), view, 5)
 
 

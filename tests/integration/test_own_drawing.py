@@ -225,26 +225,6 @@ def test_replays_of_hr_and_of_extra_views_have_the_bits_of_live_ones(monkeypatch
     assert runs > 9
 
 
-@dataclass(frozen=True)
-class Alternates(cs.Strategy):
-    """Keeps half of HR in every fourth iteration, by a count of its own, and moves opacities by what it was given before."""
-
-    def reconcile(self, products, step):
-        count = self.cache["count"] = self.cache.get("count", 0) + 1
-        return cs.Weights(keep=0.5 if count % 4 == 0 else 1.0)
-
-    def after_step(self, params, step):
-        if (last := self.cache.get("last")) is not None:
-            params["opacities"].add_(0.1 * (step.evidence.reliability - last))
-        self.cache["last"] = step.evidence.reliability
-
-
-@needs_warp
-def test_what_a_strategy_stores_in_python_is_what_it_stores_live(monkeypatch, scene):
-    monkeypatch.setattr("tests.integration.test_own_drawing.everything", lambda: [Alternates(), cs.P2G()])
-    both(monkeypatch, scene=scene, steps=9)
-
-
 def masked(scene):
     """The mask of the first photo alone."""
     mask = torch.ones_like(scene.train[0].lr.image[..., 0])
