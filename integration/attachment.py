@@ -11,7 +11,7 @@ One training iteration:
 4. After the host's optimizer has stepped, it steps once more on the gradient of each extra view. Once all optimizers have
    stepped, the strategies do what they do after a step.
 
-HR and extra views are in own_drawing.py, the merge in host_merge.py, the optimizers' steps in host_steps.py, changes of the
+HR and extra views are in hr_drawing.py, the merge in host_merge.py, the optimizers' steps in host_steps.py, changes of the
 structure in structure.py, and the lines of the log at the start in announcement.py.
 
 The merge runs at the end of `backward()`, not in an optimizer hook. Gradient clipping therefore sees the merged gradient,
@@ -44,7 +44,7 @@ from integration.announcement import announce, warn_without_hr
 from integration.extra_steps import ExtraSteps
 from integration.host_merge import HostMerge
 from integration.host_steps import HostSteps
-from integration.own_drawing import Drawable, HrDrawing, RenderAt
+from integration.hr_drawing import Drawable, HrDrawing, RenderAt
 from integration.pending import BackwardPass, Pending, current_pass, why_nothing_was_merged
 from integration.structure import Structure
 from integration.views import require_unique

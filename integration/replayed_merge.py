@@ -18,7 +18,7 @@ from clear_strategies.core.gradients import Colour, Grads
 from clear_strategies.core.step import Step
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Merged
-from clear_strategies.merging.replays import RecordedWork, replays_on, that_merge
+from clear_strategies.merging.recorded_work import RecordedWork, replays_on, that_merge
 from rasterizers.replays import Kind, write
 from rasterizers.told import iteration, unread
 

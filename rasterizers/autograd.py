@@ -1,7 +1,8 @@
 """Rasterizers as differentiable torch functions.
 
 `draw` returns a rendering that is part of the autograd graph; `as_gsplat.rasterization` does so with gsplat's signature. Each
-backward pass handles one cotangent; `Rendering.vjp` handles several, and `recorded` gives it to callers of code that draws.
+backward pass handles one cotangent; `Rendering.vjp` handles several, and `collected_drawings` gives it to
+callers of code that draws.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rasterizers import replayed
+from rasterizers import replayed_drawing
 from rasterizers.ahead import draw_or_take, is_drawing_ahead
 from rasterizers.checks import require_absgrad, require_depth
 from rasterizers.inputs import Inputs
@@ -27,7 +28,7 @@ from rasterizers.modes import in_full_precision, uncompiled
 from rasterizers.native import empty_for
 from rasterizers.pose import pose_gradient
 
-__all__ = ["BackwardHook", "Drawing", "Drawn", "TakeColours", "draw", "outer", "recorded"]
+__all__ = ["BackwardHook", "Drawing", "Drawn", "TakeColours", "collected_drawings", "draw", "outer"]
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -82,28 +83,28 @@ class Drawing:
     hook: BackwardHook
 
 
-class _Recordings(threading.local):
+class _Collecting(threading.local):
     """The lists that the drawings of this thread are added to, the innermost last."""
 
     def __init__(self) -> None:
         self.running: list[list[Drawing]] = []
 
 
-_recordings: Final = _Recordings()
+_collecting: Final = _Collecting()
 
 
 @contextmanager
-def recorded() -> Iterator[list[Drawing]]:
+def collected_drawings() -> Iterator[list[Drawing]]:
     """What this thread draws with gradients inside, by any code. Its VJP takes several cotangents in one pass and stops at what
     was drawn.
     """
     drawings: list[Drawing] = []
-    outer = _recordings.running
-    _recordings.running = [*outer, drawings]
+    outer = _collecting.running
+    _collecting.running = [*outer, drawings]
     try:
         yield drawings
     finally:
-        _recordings.running = outer
+        _collecting.running = outer
 
 
 @uncompiled
@@ -167,7 +168,7 @@ def render(
         require_depth(rasterizer)
     with torch.no_grad():
         if replays and not is_drawing_ahead():
-            rendering = replayed.draw(rasterizer, inputs.drawn(bands), camera, depth=depth)
+            rendering = replayed_drawing.draw(rasterizer, inputs.drawn(bands), camera, depth=depth)
         else:
             rendering = draw_or_take(rasterizer, inputs.splats(bands), camera, depth=depth)
     return Rendered(rendering, rasterizer, camera, bands)
@@ -193,7 +194,7 @@ def in_graph(
     image, alpha, visible, depth = _Draw.apply(  # type: ignore[no-untyped-call]
         rendered, rows, hook, absgrad, pose, means2d, *inputs
     )
-    for drawings in _recordings.running if image.grad_fn is not None else ():
+    for drawings in _collecting.running if image.grad_fn is not None else ():
         drawings.append(
             Drawing(rendered.rendering, {k: x for k, x in inputs._asdict().items() if k != "rgb_offset"}, image, hook)
         )

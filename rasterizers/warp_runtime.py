@@ -69,7 +69,7 @@ def launch(
 ) -> None:  # fmt: skip
     """Launch a kernel with a thread for each index of `dim`, in a scope of `on_stream`.
 
-    As `wp.launch`, in a fifth of the host's time, which on CUDA exceeds the kernels': what does not change is recorded once.
+    As `wp.launch`, in a fifth of the host's time, which on CUDA exceeds the kernels': what does not change is made once.
     Without any index the kernel is compiled and loaded, as it must have been before a recording.
 
     Args:
@@ -78,12 +78,12 @@ def launch(
     """
     size = (*dim, block) if together else tuple(dim)
     key = kernel, device, block
-    recorded = _recorded.launches.get(key)
-    if recorded is None:
-        recorded = _recorded.launches[key] = _Launch(kernel, device, block)
+    kept = _kept.launches.get(key)
+    if kept is None:
+        kept = _kept.launches[key] = _Launch(kernel, device, block)
     if 0 in size:
         return
-    recorded.prepare(size, arguments).launch(_recorded.stream)
+    kept.prepare(size, arguments).launch(_kept.stream)
     if (recording := running()) is not None:
         recording.launched(arguments)
 
@@ -146,7 +146,7 @@ class _Launch:
             command.params_addr[0] = ctypes.addressof(bounds)
 
 
-class _Recorded(threading.local):
+class _Kept(threading.local):
     """A thread's launches, by kernel, device and threads per block, its arrays to be sorted, by length and device, and the stream
     of `on_stream`.
     """
@@ -158,7 +158,7 @@ class _Recorded(threading.local):
         self.sorts: dict[tuple[int, torch.device], tuple[Any, ...]] = {}
 
 
-_recorded = _Recorded()
+_kept = _Kept()
 _sorting: Final = threading.Lock()
 _MOST_SHAPES: Final = 256  # the number of Gaussians, and so the shapes, change in a long training
 
@@ -172,17 +172,17 @@ def sort_pairs(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
     import warp as wp
 
     key = len(keys), keys.device
-    arrays = _recorded.sorts.get(key)
+    arrays = _kept.sorts.get(key)
     if arrays is None:
-        if len(_recorded.sorts) >= _MOST_SHAPES:
-            _recorded.sorts.clear()
+        if len(_kept.sorts) >= _MOST_SHAPES:
+            _kept.sorts.clear()
         device = wp.device_from_torch(keys.device)
-        arrays = _recorded.sorts[key] = tuple(
+        arrays = _kept.sorts[key] = tuple(
             wp.array(ptr=x.data_ptr(), shape=len(x), dtype=wp.int32, device=device) for x in (keys, values)
         )
     arrays[0].ptr, arrays[1].ptr = keys.data_ptr(), values.data_ptr()
     # Warp sorts on its current stream, which is that of all threads.
-    with _sorting, wp.ScopedStream(_recorded.stream, sync_enter=False):
+    with _sorting, wp.ScopedStream(_kept.stream, sync_enter=False):
         wp.utils.radix_sort_pairs(*arrays, count, end_bit=bits)
     if (recording := running()) is not None:
         recording.launched((keys, values))
@@ -284,9 +284,9 @@ def _offsets(kind: Any) -> Mapping[str, int]:
 @contextmanager
 def on_stream(device: torch.device) -> Iterator[None]:
     """A scope in which this thread launches on torch's current stream."""
-    outer, current = _recorded.stream, None if device.type == "cpu" else torch.cuda.current_stream(device)
-    _recorded.stream = None if current is None else warp_stream(current)
+    outer, current = _kept.stream, None if device.type == "cpu" else torch.cuda.current_stream(device)
+    _kept.stream = None if current is None else warp_stream(current)
     try:
         yield
     finally:
-        _recorded.stream = outer
+        _kept.stream = outer

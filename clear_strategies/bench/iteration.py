@@ -34,7 +34,7 @@ from clear_strategies.training.field import GaussianField
 from clear_strategies.training.loop import iterate, kernel_threads
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
-from clear_strategies.training.replay import replays_for
+from clear_strategies.training.replayed_iteration import replays_for
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import PRESETS, Camera, Rasterizer, Recordable, Rendering, SplatGradients, Splats, summed_vjp

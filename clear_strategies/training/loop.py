@@ -30,7 +30,7 @@ from clear_strategies.strategies.sr_stage import SRStage
 from clear_strategies.training import checkpoint
 from clear_strategies.training.clock import Clock
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
-from clear_strategies.training.replay import GivenExtra, GivenView, learned, replays_for
+from clear_strategies.training.replayed_iteration import GivenExtra, GivenView, learned, replays_for
 from clear_strategies.training.state import TrainState
 from rasterizers import native
 from rasterizers.interface import Camera, Color, Rasterizer, over

@@ -33,9 +33,9 @@ from integration.gsplat.calls import (
     with_offset,
 )
 from integration.gsplat.poses import Poses
+from integration.hr_drawing import Drawable
 from integration.lineage import RowNumbers
 from integration.optimizers import optimizers_of, step_detail
-from integration.own_drawing import Drawable
 from integration.replacing import replace_everywhere
 from rasterizers.ahead import drawing_ahead
 from rasterizers.as_gsplat import rasterizer_of

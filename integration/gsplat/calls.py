@@ -14,9 +14,9 @@ from torch import Tensor
 from clear_strategies.errors import HostError
 from clear_strategies.geometry.projection import intrinsics
 from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot
-from integration.own_drawing import Drawable
+from integration.hr_drawing import Drawable
 from rasterizers.as_gsplat import cameras_of
-from rasterizers.autograd import recorded
+from rasterizers.autograd import collected_drawings
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, Rasterizer
 
@@ -105,7 +105,7 @@ def host_output(
     Raises:
         HostError: the function does not return what gsplat's does.
     """
-    with recorded() as drawings:
+    with collected_drawings() as drawings:
         result = rasterization(**call)
     if len(result) != 3:
         raise HostError(

@@ -25,7 +25,7 @@ from integration.inria.model_proxy import Overrides, host_output, proxy
 from integration.inria.rows import CarriedRows
 from integration.replacing import replace_everywhere, replace_methods, replaced_attribute
 from integration.views import SuperResolve, sr_source
-from rasterizers.autograd import recorded
+from rasterizers.autograd import collected_drawings
 from rasterizers.interface import Camera
 from rasterizers.modes import uncompiled
 
@@ -144,7 +144,7 @@ class Attached:
                 call = signature.bind(camera, proxy(self._model, overrides), *args, **kwargs)
                 call.arguments |= self._bg_color(call.arguments.get("bg_color"))
                 kept = nullcontext() if target == "lr" else random_state_kept(self._model._xyz.device)
-                with recorded() as drawings, kept:
+                with collected_drawings() as drawings, kept:
                     result = render(*call.args, **call.kwargs)
                 ranks = hasattr(self._model, "xyz_gradient_accum_abs")
                 output = host_output(result, pinhole, params, gate, drawings, ranks_by_third_column=ranks)

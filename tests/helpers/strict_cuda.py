@@ -274,7 +274,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     from clear_strategies.kernels import native, reconcile
     from clear_strategies.kernels.per_gaussian import dispatch
     from clear_strategies.kernels.reconcile import warp as warp_merge
-    from rasterizers import recording, replayed, replays, warp_runtime
+    from rasterizers import recording, replayed_drawing, replays, warp_runtime
     from rasterizers.warp_backend import frame, settings
 
     cuda, autograd, loaded = StrictCuda(), _Elsewhere(), set[Any]()
@@ -347,12 +347,12 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         native: {"available": lambda: False},
         dispatch: {"DEVICES": {"cpu"}},
         replays: {"DEVICES": {"cpu"}},
-        replayed: {"_threads": replayed._Threads()},
+        replayed_drawing: {"_threads": replayed_drawing._Threads()},
         reconcile: {"_for_device": lambda device: warp_merge},
         rasterizers.native: {"empty": on_no_cpu},
         frame: {"DEFERRED_COUNTS": {"cpu": True}},
         settings: {"sent": sends},
-        warp_runtime: {"sent": sends, "_recorded": warp_runtime._Recorded()},
+        warp_runtime: {"sent": sends, "_kept": warp_runtime._Kept()},
     }  # fmt: skip
     for owner, values in patches.items():
         for name, value in values.items():

@@ -20,7 +20,7 @@ from tests.helpers.backends import needs
 from tests.helpers.gsplat_host import Host, started
 from tests.helpers.host_parts import HR_FROM_START, WITHOUT_HR
 from tests.helpers.loops import FUNCTIONS
-from tests.training.test_replay import cropped
+from tests.training.test_replayed_iteration import cropped
 
 
 def with_detail():

@@ -53,10 +53,10 @@ def drawn_in(splats):
 
 
 @pytest.mark.parametrize("inside", [0, 1])
-def test_a_recording_has_what_is_drawn_inside_of_it_and_ends_alone(inside):
+def test_what_is_drawn_inside_is_collected_and_ends_alone(inside):
     splats = leaves(scene(20))
-    with autograd.recorded() as outer:
-        with autograd.recorded() as inner:
+    with autograd.collected_drawings() as outer:
+        with autograd.collected_drawings() as inner:
             for _ in range(inside):
                 drawn_in(splats)
         drawn_in(splats)
@@ -64,11 +64,11 @@ def test_a_recording_has_what_is_drawn_inside_of_it_and_ends_alone(inside):
     assert (len(outer), len(inner)) == (1 + inside, inside)
 
 
-def test_a_thread_records_its_own_drawings():
+def test_a_thread_collects_its_own_drawings():
     splats, both, seen = leaves(scene(20)), threading.Barrier(2), []
 
     def work():
-        with autograd.recorded() as drawings:
+        with autograd.collected_drawings() as drawings:
             both.wait()
             drawn_in(splats)
             both.wait()

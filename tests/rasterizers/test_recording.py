@@ -162,7 +162,7 @@ def test_launches_of_two_threads_are_each_on_the_stream_of_its_own(monkeypatch):
             for _ in range(2):
                 both_are_here.wait()
                 launch(doubled, [1], (), torch.device("cuda"))
-        assert warp_runtime._recorded.stream is None
+        assert warp_runtime._kept.stream is None
 
     monkeypatch.setattr(warp_runtime, "_Launch", lambda *_: Command())
     monkeypatch.setattr(warp_runtime, "warp_stream", lambda stream: stream)

@@ -23,7 +23,7 @@ from clear_strategies.core.gradients import Grads
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide
-from clear_strategies.merging.replays import RecordedWork, replays_on, why_strategies_are_not_recorded
+from clear_strategies.merging.recorded_work import RecordedWork, replays_on, why_strategies_are_not_recorded
 from integration.autograd_shot import AutogradShot, HostOutput, Target, every_number, to_parameters
 from integration.views import enlarged_mask
 from rasterizers.autograd import BackwardHook, Drawing

@@ -21,7 +21,7 @@ from clear_strategies.core.deferred import Number
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.kernels import losses
 from clear_strategies.merging.iteration import Update
-from clear_strategies.merging.replays import LIVE, RecordedWork, that_merge, why_strategies_are_not_recorded
+from clear_strategies.merging.recorded_work import LIVE, RecordedWork, that_merge, why_strategies_are_not_recorded
 from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Color, Rasterizer, Recordable, can_be_recorded, over

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import TypeCheckError
 
 from clear_strategies.geometry.projection import intrinsics
-from rasterizers import rasterization, replayed
+from rasterizers import rasterization, replayed_drawing
 from rasterizers.recording import Recording
 from tests.helpers import toy
 from tests.helpers.backends import needs
@@ -22,7 +22,7 @@ def replays(monkeypatch):
     """How often a pass of a drawing was replayed."""
     counted, replay = [], Recording.replay
     monkeypatch.setattr(Recording, "replay", lambda self: counted.append(self) or replay(self))
-    monkeypatch.setattr(replayed, "_threads", replayed._Threads())
+    monkeypatch.setattr(replayed_drawing, "_threads", replayed_drawing._Threads())
     return counted
 
 
@@ -181,7 +181,7 @@ def test_where_a_recording_fails_drawings_are_live_from_then_on_and_one_line_say
     def fails(*_):
         raise RuntimeError("no capture here\nand a second line")
 
-    monkeypatch.setattr(replayed, "Recording", fails)
+    monkeypatch.setattr(replayed_drawing, "Recording", fails)
     both(recorded_on, lambda params, **how: [step(params, angle, **how) for angle in ANGLES])
     assert caplog.text.count("the replay of drawings ends at") == 1
     assert "no capture here" in caplog.text
@@ -199,7 +199,7 @@ def test_a_recording_with_other_bits_than_a_live_drawing_is_not_used(recorded_on
             if len(made) == which + 1:
                 (self.result if which else self.result[1])[0].view(-1)[0] += 1
 
-    monkeypatch.setattr(replayed, "Recording", Wrong)
+    monkeypatch.setattr(replayed_drawing, "Recording", Wrong)
     both(recorded_on, lambda params, **how: [step(params, angle, **how) for angle in ANGLES])
     assert caplog.text.count("a replay has other bits than a live drawing of the same splats") == 1
     assert len(made) == 2

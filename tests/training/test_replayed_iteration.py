@@ -16,13 +16,13 @@ from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.density.mcmc import MCMC
-from clear_strategies.merging.replays import LIVE, _stored_by
+from clear_strategies.merging.recorded_work import LIVE, _stored_by
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
 from clear_strategies.training import checkpoint, loop
 from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
-from clear_strategies.training.replay import replays_for
+from clear_strategies.training.replayed_iteration import replays_for
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from rasterizers import replays
@@ -41,7 +41,7 @@ FAILED = "a recording failed"
 @pytest.fixture(autouse=True)
 def device(recorded_on, monkeypatch) -> None:
     """Live iterations, too, run as on CUDA."""
-    monkeypatch.setattr("tests.training.test_replay.DEVICE", recorded_on)
+    monkeypatch.setattr("tests.training.test_replayed_iteration.DEVICE", recorded_on)
 
 
 DEVICE = torch.device("cpu")

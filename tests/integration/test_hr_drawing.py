@@ -10,10 +10,10 @@ import clear_strategies as cs
 import rasterizers
 from clear_strategies import Conductor
 from clear_strategies.core.view import ExtraView
-from clear_strategies.merging.replays import LIVE
+from clear_strategies.merging.recorded_work import LIVE
 from clear_strategies.merging.skips import Skips
 from clear_strategies.schedules import Ramp, WarmupDecay
-from integration import own_drawing
+from integration import hr_drawing
 from rasterizers import replays
 from rasterizers.recording import running
 from tests.helpers import toy
@@ -316,7 +316,7 @@ def test_replays_over_densification_resets_evaluation_and_resuming(monkeypatch, 
 
 @needs_warp
 @pytest.mark.parametrize(
-    ("owner", "name", "what"), [(own_drawing.AutogradShot, "gradients", "HR"), (cs.GCO, "reconcile", "the merge")]
+    ("owner", "name", "what"), [(hr_drawing.AutogradShot, "gradients", "HR"), (cs.GCO, "reconcile", "the merge")]
 )
 def test_what_cannot_be_recorded_is_live_and_one_line_says_why(owner, name, what, monkeypatch, scene, caplog):
     original = getattr(owner, name)
