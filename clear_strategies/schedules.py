@@ -25,7 +25,7 @@ Shape = Literal["linear", "constant"]
 
 def milestone(default: int, *, least: int = 0) -> Any:
     """A dataclass field that holds an iteration number of a 10,000-iteration run; `scaled` stretches it, to no less than
-    `least`.
+    `least` unless it is 0.
     """
     return field(default=default, metadata={_MILESTONE: least})
 
@@ -38,7 +38,7 @@ def scaled(settings: Settings, factor: float) -> Settings:
             continue
         value = getattr(settings, f.name)
         if _MILESTONE in f.metadata:
-            changes[f.name] = max(f.metadata[_MILESTONE], round(value * factor))
+            changes[f.name] = max(f.metadata[_MILESTONE], round(value * factor)) if value else value
         elif is_dataclass(value) and not isinstance(value, type):
             changes[f.name] = scaled(value, factor)
     return replace(settings, **changes)  # type: ignore[type-var]

@@ -2,6 +2,7 @@
 
 import pytest
 
+from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay, milestones, scaled
 
@@ -25,3 +26,8 @@ def test_milestones_stretch_with_the_run_and_nothing_else_does():
     assert (short.lambda_hf, short.lambda_hr.final) == (0.2, 0.1)
     assert [short.lambda_hr(t // 10) for t in (500, 1750, 7500)] == pytest.approx([0, 0.5, 0.55])
     assert scaled(Ramp(), 0.5).full == 5000
+
+
+@pytest.mark.parametrize(("of_10_000", "of_100"), [(3_000, 92), (0, 0)])
+def test_opacities_are_not_reset_again_before_they_can_have_returned(of_10_000, of_100):
+    assert scaled(DensitySettings(reset_every=of_10_000), 0.01).reset_every == of_100

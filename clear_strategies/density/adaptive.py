@@ -31,6 +31,7 @@ _log = logging.getLogger(__name__)
 _CHILDREN: Final = 2  # a split Gaussian becomes two …
 _SHRINK: Final = 0.8 * _CHILDREN  # … each smaller by this factor
 _RESET_OPACITY: Final = 0.01
+_RETURN: Final = 92  # steps of Adam at 3DGS's rate, 0.05, from the logit of 0.01 to that of 1/2
 _FEWEST_ROUNDS: Final = 10
 
 
@@ -49,8 +50,8 @@ class DensitySettings:
         clone_below: share of the scene's extent; smaller Gaussians are cloned, larger ones are split.
         prune_opacity: Gaussians of lower opacity are removed.
         prune_world: Gaussians larger than this share of the extent are removed; None: never.
-        reset_every: iterations between opacity resets to 0.01; 0: never. White backgrounds get one more reset at `start`
-            (F14).
+        reset_every: iterations between opacity resets to 0.01, stretched to no less than 92, in which an opacity can return to
+            1/2; 0: never. White backgrounds get one more reset at `start` (F14).
         max_gaussians: the cap; a warning says when it binds.
         min_gaussians: pruning to fewer is an error.
     """
@@ -61,7 +62,7 @@ class DensitySettings:
     start: int = milestone(500)
     stop: int = milestone(5_000)
     statistics_from: int = milestone(500)
-    reset_every: int = milestone(3_000)
+    reset_every: int = milestone(3_000, least=_RETURN)
     every: int = 100
     clone_below: float = 0.01
     prune_opacity: float = 0.005
