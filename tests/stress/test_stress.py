@@ -100,7 +100,7 @@ def test_altered_bits_and_cut_files_are_refused(tmp_path: Path) -> None:
     faults.integrity(tmp_path, 500).require()
 
 
-@pytest.mark.parametrize("given", bad_inputs.inputs(), ids=lambda given: given.id)
+@pytest.mark.parametrize("given", list(bad_inputs.inputs()), ids=lambda given: given.id)
 def test_a_bad_input_is_refused_in_one_line(given: BadInput, tmp_path: Path) -> None:
     assert bad_inputs.problem(given, tmp_path) is None
 
