@@ -46,7 +46,7 @@ from integration.host_merge import HostMerge
 from integration.host_steps import HostSteps
 from integration.hr_drawing import Drawable, HrDrawing, RenderAt
 from integration.pending import BackwardPass, Pending, current_pass, why_nothing_was_merged
-from integration.structure import Structure
+from integration.structure import resized
 from integration.views import require_unique
 from rasterizers.autograd import TakeColours
 from rasterizers.interface import Color
@@ -109,13 +109,13 @@ class Attachment:
         self.t, self.passes = 1, 0
         self.counts: Counter[str] = Counter()
         self.removed = False
-        n, device = len(params()["means"]), params()["means"].device
-        self._structure = Structure(conductor, n, poll_parents, remedy, restart_parents)
+        self._poll_parents, self._restart_parents, self._remedy = poll_parents, restart_parents, remedy
+        self._n, device = len(params()["means"]), params()["means"].device
         self._hr = HrDrawing(conductor, device, masks or {}, self.counts, reads_score=reads_score)
         self._pending: Pending | None = None  # the last rendering
         self._pass: BackwardPass | None = None  # the last one that has reached a rendering
         self._merging = HostMerge(
-            conductor, device, threshold=threshold, loss_scale=loss_scale, accumulation=accumulation
+            conductor, device, threshold=threshold, loss_scale=loss_scale, accumulation=accumulation, counts=self.counts
         )
         self._step: Step | None = None  # of the rendering, until `after_step`
         self._extra = ExtraSteps(params)
@@ -143,7 +143,7 @@ class Attachment:
         conductor, t, params = self.conductor, self.t, {name: p.detach() for name, p in self.params().items()}
         means = params["means"]
         conductor.logs.forget()
-        z = conductor.gate(t, self._structure.n)
+        z = conductor.gate(t, self._n)
         if z is not None:
             z = z.to(means)
         hr = routed = None
@@ -192,7 +192,8 @@ class Attachment:
         """Continue from a state; the host has loaded its parameters already."""
         self.t, self.passes = int(state["t"]), int(state["passes"])
         self.conductor.load_state_dict(state["strategies"])
-        self._structure.restart(len(self.params()["means"]))
+        self._restart_parents()
+        self._n = len(self.params()["means"])
         if (view := self._views.get(state.get("view") or "")) is not None:  # its `after_step` is still to come
             rows = {name: x.to(self.params()["means"].device) for name, x in state.get("step", {}).items()}
             evidence = Evidence(rows["reliability"], rows["demand"]) if "demand" in rows else None
@@ -266,8 +267,10 @@ class Attachment:
 
     def _follow_structure(self, n: int) -> None:
         """The host has N Gaussians now."""
-        has_changed, self._step = self._structure.follow(n, self._step)
-        if has_changed:
+        parents = self._poll_parents()
+        if parents is not None or n != self._n:
+            self._step = resized(self.conductor, self._step, self._n, n, parents, self._remedy)
+            self._n = n
             self.counts["structure changes"] += 1
 
     def _is_waiting(self) -> bool:
@@ -308,17 +311,14 @@ class Attachment:
             pending.output = pending.hr = pending.routed = None
 
     def _merge(self, pending: Pending, done: BackwardPass, names: Sequence[str]) -> None:
-        first, scale = not pending.merged, self._merging.scale()
-        conflict = self._merging.merge(pending, done, names, self.t, scale)
+        first = not pending.merged
+        conflict = self._merging.merge(pending, done, names, self.t)
         if first and self.passes == 0 and not self._steps.has_begun:
             self._warn_of_accumulation([done.before[name] for name in names if name in done.before])
         self._steps.on_merge()
-        self.counts["merges"] += 1
         if not first:
             return
         self.passes += 1
-        if self._merging.write_score(pending, done, self.t, scale):
-            self.counts["scores written"] += 1
         λ = self.conductor.objective.lambda_hr(self.t)
         losses = {} if pending.hr is None else pending.hr.losses
         shares = conflict_columns(conflict)
@@ -326,7 +326,7 @@ class Attachment:
         if self.counts["merges"] % _LOGGED_EVERY == 0:
             now = self.log
             losses_now = ", ".join(f"L_{name} {now[name]:.4f}" for name in losses) or "no HR"
-            _log.info("t=%d: %s, lambda_HR %.3f, %s Gaussians.", self.t, losses_now, λ, f"{self._structure.n:,}")
+            _log.info("t=%d: %s, lambda_HR %.3f, %s Gaussians.", self.t, losses_now, λ, f"{self._n:,}")
 
     def _warn_of_accumulation(self, before: Sequence[Tensor]) -> None:
         """Tell once that a step sums more passes than `accumulation` names.
@@ -334,7 +334,7 @@ class Attachment:
         Args:
             before: the gradients to which the first of `accumulation` passes has added.
         """
-        if self._has_told_of_accumulation or not self.counts["merges"] or not any(bool(g.any()) for g in before):
+        if self._has_told_of_accumulation or self.counts["merges"] == 1 or not any(bool(g.any()) for g in before):
             return
         self._has_told_of_accumulation = True
         _log.warning(

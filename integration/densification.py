@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Final
 
 import torch
@@ -14,7 +14,7 @@ from clear_strategies.core.gradients import screen_norm, to_ndc
 from clear_strategies.density.threshold import count_passing, topk_threshold
 from clear_strategies.errors import SettingError
 from clear_strategies.merging.conductor import Conductor
-from integration.autograd_shot import AutogradShot, ScreenGradientSlot
+from integration.autograd_shot import ScreenGradientSlot
 
 _log = logging.getLogger(__name__)
 _VIEWS_PER_FIT: Final = 10  # sorting N scores at every view would cost more than a fresher factor gains
@@ -153,34 +153,6 @@ def score_for_host(
             return None
         ordinary = screen_norm(to_ndc(absgrad / loss_scale, slot.size))
     return score if score is ordinary or scaler is None else scaler(score, ordinary, visible)
-
-
-def write_score(
-    shot: AutogradShot,
-    screen_gradient: Tensor,
-    scores: Callable[[Float[Tensor, "N 2"]], tuple[Float[Tensor, " N"], Float[Tensor, " N"]]],
-    scaler: ScoreScaler | None,
-    loss_scale: float = 1.0,
-) -> bool:
-    """Write the score where the host's densifier reads the screen gradient; False: it does not read it, or there is no score.
-
-    Args:
-        screen_gradient: of the LR loss, as the slot of `shot` has it, without `loss_scale`.
-        scores: `Conductor.scores` of this iteration.
-        loss_scale: the factor that the slot's own gradients carry.
-    """
-    slot = shot.gradient_slot
-    if not (slot.tensor.is_leaf or slot.tensor.retains_grad) or slot.tensor.grad is None:
-        return False
-    screen_lr = to_ndc(slot.per_gaussian(screen_gradient, len(shot.visible)), slot.size)
-    score, ordinary = scores(screen_lr)
-    if score is ordinary:  # without a strategy's score, the statistic that the host's threshold is meant for stays
-        return False
-    statistic = torch.linalg.vector_norm(screen_lr, dim=-1)  # the host's own
-    written = score_for_host(slot, score, statistic, shot.visible, scaler, loss_scale)
-    if written is not None:
-        slot.write(loss_scale * written)
-    return written is not None
 
 
 def warn_if_score_is_unused(conductor: Conductor, densifier: Any, threshold: float | None) -> None:

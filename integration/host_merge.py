@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
@@ -9,10 +10,13 @@ import torch
 from torch import Tensor
 
 from clear_strategies.core.deferred import Number
+from clear_strategies.core.gradients import to_ndc
 from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.in_place import merge_in_place
-from integration.densification import ScoreScaler, write_score
+from clear_strategies.merging.iteration import HrSide
+from integration.autograd_shot import AutogradShot
+from integration.densification import ScoreScaler, score_for_host
 from integration.detail import Fading
 from integration.pending import BackwardPass, Pending
 from integration.replayed_merge import ReplayedMerge
@@ -23,7 +27,7 @@ class HostMerge:
 
     Args:
         device: of the Gaussians.
-        threshold, loss_scale, accumulation: see `Attachment`.
+        threshold, loss_scale, accumulation: see `Attachment`. counts: `Attachment.counts`, to which this adds.
 
     Attributes:
         scaler: of the densification score; None: the score is not scaled.
@@ -32,26 +36,18 @@ class HostMerge:
 
     def __init__(
         self, conductor: Conductor, device: torch.device, *, threshold: float | None, loss_scale: Callable[[], float] | None,
-        accumulation: int,
+        accumulation: int, counts: Counter[str],
     ) -> None:  # fmt: skip
         self._conductor, self._loss_scale, self._accumulation = conductor, loss_scale, accumulation
+        self._counts = counts
         self.scaler = None if threshold is None else ScoreScaler(threshold)
         self.fading = Fading(conductor.detail, accumulation)
         self._merge_in_place: Callable[..., Mapping[str, Number]] = partial(
             merge_in_place, conductor, merge=ReplayedMerge(conductor, device)
         )
 
-    def scale(self) -> float:
-        """The factor of the gradients of one pass. A gradient scaler's waits for the device."""
-        return (1.0 if self._loss_scale is None else self._loss_scale()) / self._accumulation
-
-    def merge(
-        self, pending: Pending, done: BackwardPass, names: Sequence[str], t: int, scale: float
-    ) -> Mapping[str, Number]:
-        """Merge the gradients of these parameters, and of f_det with the first of the rendering.
-
-        Args:
-            scale: of this pass.
+    def merge(self, pending: Pending, done: BackwardPass, names: Sequence[str], t: int) -> Mapping[str, Number]:
+        """Merge the gradients of these parameters; with the first of the rendering, merge that of f_det and write the score.
 
         Returns:
             The conflict ratios by group, before correction.
@@ -60,18 +56,18 @@ class HostMerge:
             HostError: a gradient is sparse.
             DivergedError: a merged gradient is not finite, and no gradient scaler would skip the step.
         """
-        params, hr = {name: done.params[name] for name in names}, pending.hr
+        params, hr, first = {name: done.params[name] for name in names}, pending.hr, not pending.merged
+        # Of the gradients of this pass; a gradient scaler's waits for the device.
+        scale = (1.0 if self._loss_scale is None else self._loss_scale()) / self._accumulation
         for name, p in params.items():
             if p.grad is not None and p.grad.is_sparse:
                 raise HostError(
                     f"{name}.grad is sparse, but the gradients of all Gaussians are merged. In gsplat: "
                     "rasterization(sparse_grad=False)."
                 )
-            if (
-                p.grad is not None and p.grad.requires_grad
-            ):  # of create_graph=True, of which the merged gradient is no part
-                p.grad = p.grad.detach()
-        detail = None if pending.merged else done.params.get("detail")
+            if p.grad is not None and p.grad.requires_grad:
+                p.grad = p.grad.detach()  # of create_graph=True, of which the merged gradient is no part
+        detail = done.params.get("detail") if first else None
         if detail is not None and detail.requires_grad:
             params["detail"] = detail
             if detail.grad is not None:  # what the host has given it stays
@@ -83,15 +79,25 @@ class HostMerge:
         if "detail" in params:
             self._finish_detail(params.pop("detail"), params, t, by_hf=hr is not None and hr.detail is not None)
         pending.merged.update(names or ("detail",))
+        self._counts["merges"] += 1
+        if first and hr is not None and pending.output is not None and done.task in pending.screen:
+            self._write_score(pending.output.shot, pending.screen[done.task], hr, t, scale)
         return conflict
 
-    def write_score(self, pending: Pending, done: BackwardPass, t: int, scale: float) -> bool:
-        """Write the densification score of the rendering; False: the host's densifier does not read it, or there is none."""
-        screen, hr = pending.screen.get(done.task), pending.hr
-        if screen is None or pending.output is None or hr is None:
-            return False
-        scores = partial(self._conductor.scores, hr=hr, weights=self._conductor.objective.weights(t))
-        return write_score(pending.output.shot, screen / scale, scores, self.scaler, scale)
+    def _write_score(self, shot: AutogradShot, screen: Tensor, hr: HrSide, t: int, scale: float) -> None:
+        """Write the score where the host's densifier reads the screen gradient, if it does and a strategy has one."""
+        slot = shot.gradient_slot
+        if not (slot.tensor.is_leaf or slot.tensor.retains_grad) or slot.tensor.grad is None:
+            return
+        screen_lr = to_ndc(slot.per_gaussian(screen / scale, len(shot.visible)), slot.size)
+        score, ordinary = self._conductor.scores(screen_lr, hr, self._conductor.objective.weights(t))
+        if score is ordinary:  # without a strategy's score, the statistic that the host's threshold is meant for stays
+            return
+        statistic = torch.linalg.vector_norm(screen_lr, dim=-1)  # the host's own
+        written = score_for_host(slot, score, statistic, shot.visible, self.scaler, scale)
+        if written is not None:
+            slot.write(scale * written)
+            self._counts["scores written"] += 1
 
     def _finish_detail(self, detail: Tensor, others: Mapping[str, Tensor], t: int, *, by_hf: bool) -> None:
         """After the merge of f_det, which the host's optimizer steps as the others."""

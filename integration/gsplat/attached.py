@@ -32,10 +32,10 @@ from integration.gsplat.calls import (
     seen_by,
     with_offset,
 )
+from integration.gsplat.optimizers import optimizers_of, step_detail
 from integration.gsplat.poses import Poses
+from integration.gsplat.rows import RowNumbers
 from integration.hr_drawing import Drawable
-from integration.lineage import RowNumbers
-from integration.optimizers import optimizers_of, step_detail
 from integration.replacing import replace_everywhere
 from rasterizers.ahead import drawing_ahead
 from rasterizers.as_gsplat import rasterizer_of

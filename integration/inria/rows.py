@@ -17,8 +17,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from integration.lineage import is_same
 from integration.replacing import replace_methods
+from integration.structure import is_same
 
 _log = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.training.field import GaussianField
 from integration.gsplat import attach
-from integration.lineage import ROWS
+from integration.gsplat.rows import ROWS
 from rasterizers import autograd
 from tests.helpers import toy
 from tests.helpers.host_parts import HR_FROM_START, photometric

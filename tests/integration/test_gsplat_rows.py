@@ -11,7 +11,7 @@ from clear_strategies import GCO, P2G, SVS, Conductor, SplatSuRe, Strategy, Weig
 from clear_strategies.schedules import Ramp
 from integration import HostError
 from integration.gsplat import attach
-from integration.lineage import ROWS
+from integration.gsplat.rows import ROWS
 from tests.helpers import gsplat_host, toy
 from tests.helpers.gsplat_host import Host
 from tests.helpers.host_parts import HR_FROM_START

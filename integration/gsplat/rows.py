@@ -1,8 +1,4 @@
-"""Which Gaussian came from which.
-
-Hosts that gather every entry of their parameters carry row numbers among them, see `RowNumbers`. 3DGS's GaussianModel names the
-rows that it keeps, see inria/rows.py.
-"""
+"""Which Gaussian came from which in hosts that gather every entry of their parameters: row numbers among these."""
 
 from __future__ import annotations
 
@@ -14,15 +10,11 @@ from jaxtyping import Int
 from torch import Tensor
 
 from clear_strategies.errors import HostError
+from integration.structure import is_same
 
 ROWS: Final = "clear_rows"
 """Key of the row numbers."""
 _ROUNDING: Final = 0.1  # an average of the same numbers over many steps differs from them by less
-
-
-def is_same(parents: Int[Tensor, " M"], n: int) -> bool:
-    """Whether the M rows are the N rows that they come from, in the same order."""
-    return len(parents) == n and bool((parents == torch.arange(n, device=parents.device)).all())
 
 
 class RowNumbers:
