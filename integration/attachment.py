@@ -24,7 +24,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any, Final
 from weakref import WeakMethod, finalize
 
@@ -80,6 +80,7 @@ class Attachment:
         passes: its backward passes so far.
         counts: how often each kind of work was done.
         removed: whether `remove` was called.
+        undo: what `remove` undoes of an adapter's changes to its host.
     """
 
     def __init__(
@@ -108,7 +109,7 @@ class Attachment:
         self._own_background = own_background
         self.t, self.passes = 1, 0
         self.counts: Counter[str] = Counter()
-        self.removed = False
+        self.removed, self.undo = False, ExitStack()
         self._poll_parents, self._restart_parents, self._remedy = poll_parents, restart_parents, remedy
         self._n, device = len(params()["means"]), params()["means"].device
         self._hr = HrDrawing(conductor, device, masks or {}, self.counts, reads_score=reads_score)
@@ -118,7 +119,7 @@ class Attachment:
             conductor, device, threshold=threshold, loss_scale=loss_scale, accumulation=accumulation, counts=self.counts
         )
         self._step: Step | None = None  # of the rendering, until `after_step`
-        self._extra = ExtraSteps(params)
+        self._extra = ExtraSteps()
         self._has_told_of_accumulation = False
         self._logged: dict[str, deferred.Number | Callable[[], deferred.Number]] = {}
         self._steps = HostSteps(
@@ -154,7 +155,9 @@ class Attachment:
         if self.passes == 0:  # one step of the host, however many passes it accumulates
             self._extra.forget()
             if extra_views := conductor.extra_views(t):
-                self._extra.take(extra_views, lambda extra: self._hr.extra_view(extra, view, t, render_at))
+                self._extra.take(
+                    self.params(), [self._hr.extra_view(extra, view, t, render_at) for extra in extra_views]
+                )
         output = render_at("lr", z, view)
         if isinstance(output, Drawable):
             raise TypeError("an adapter renders LR by the host's own function, got a Drawable.")
@@ -211,12 +214,13 @@ class Attachment:
         return deferred.resolve([{name: x() if callable(x) else x for name, x in self._logged.items()}])[0]
 
     def remove(self) -> None:
-        """Stop: the host's renderings pass through, and the gradients of one that is still pending stay unmerged."""
+        """Restore the host: its renderings pass through, and the gradients of one that is still pending stay unmerged."""
         self.removed, self._pending, self._pass = True, None, None
         self.hook([])
         self._extra.forget()
         self.conductor.on_fit_end()
         self._farewell()
+        self.undo.close()
 
     def _step_begins(self, has_merged: bool) -> None:
         """Refuse a first step in which no strategy takes part, and tell of a later one."""

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from clear_strategies.core.gradients import Grads
-from clear_strategies.core.view import ExtraView
 
 _log = logging.getLogger(__name__)
 
@@ -20,29 +19,25 @@ _PATIENCE: Final = 10  # iterations with extra views, one after the other, of wh
 
 
 class ExtraSteps:
-    """Takes the gradient of each extra view before the host's step, and steps on it after that.
+    """Stores the gradient of each extra view before the host's step, and steps on it after that.
 
     Both scales of the training view and its extra views are rendered from the same parameters, because a host may have
     computed its activations before it calls its renderer.
-
-    Args:
-        params: returns the leaves that the host optimizes.
 
     Attributes:
         stepping: whether a step on an extra view is under way, so that hooks on the host's steps do not count it.
     """
 
-    def __init__(self, params: Callable[[], Mapping[str, Tensor]]) -> None:
-        self._params = params
-        self._gradients: list[Grads] = []
+    def __init__(self) -> None:
+        self._gradients: Sequence[Grads] = ()
         self._rendered: Mapping[str, Tensor] = {}  # what they are gradients of
         self.stepping = False
         self._has_stepped, self._unused = False, 0  # on those of this iteration; iterations since the last that did
 
-    def take(self, extra_views: Sequence[ExtraView], gradient: Callable[[ExtraView], Grads]) -> None:
-        """Take the gradient of each extra view, which is rendered without a gate and without f_det."""
-        self._rendered = {name: p for name, p in self._params().items() if name != "detail"}
-        self._gradients += [gradient(extra) for extra in extra_views]
+    def take(self, params: Mapping[str, Tensor], gradients: Sequence[Grads]) -> None:
+        """Those of the extra views of this iteration, with respect to these leaves of the host."""
+        self._gradients = gradients
+        self._rendered = {name: p for name, p in params.items() if name != "detail"}
 
     @torch.no_grad()
     def step(self, optimizer: torch.optim.Optimizer) -> int:
@@ -86,7 +81,7 @@ class ExtraSteps:
                     "extra views have no effect: they were rendered in %d iterations, and no optimizer that was passed stepped "
                     "on them. Pass those that the loop steps, and put new ones in the same dictionary.", _PATIENCE,
                 )  # fmt: skip
-        self._gradients, self._rendered, self._has_stepped = [], {}, False
+        self._gradients, self._rendered, self._has_stepped = (), {}, False
 
 
 @cache

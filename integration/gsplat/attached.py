@@ -6,7 +6,7 @@ import functools
 import inspect
 import logging
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, Final
 from weakref import WeakSet
 
@@ -70,6 +70,9 @@ class Attached:
             of this package; "auto": on CUDA "warp", whose work is recorded and replayed, where it draws what the call asks for,
             else "host". Pictures of the two differ by 3e-3 at most, where one blends a contribution of 1/255 and the other not.
 
+    Attributes:
+        views: as they were given.
+
     Raises:
         ValueError: there is no view, a parameter is missing, or f_det is there with another number of rows.
         HostError: a network makes the colours; `params` are attached already.
@@ -118,7 +121,7 @@ class Attached:
         self._rows = RowNumbers(
             params if state is None else state, lambda: params[self._names["means"]], as_parameter=state is None
         )
-        self._poses = Poses(views)
+        self.views, self._poses = tuple(views), Poses(views)
         self._found_by_pose = True  # else renderings are those of `_named`, see `rendering`
         self._named: View | None = None
         self._has_drawn_bands = False  # after a call with spherical harmonics, one without them draws no colours
@@ -126,7 +129,6 @@ class Attached:
         self._trains_detail = detail
         self._hr_by, self._told = hr_by, ""  # what draws HR, and what the log says of it
         self._is_ours = False  # the wrapped function is this package's, see `wrap`
-        self._undo = ExitStack()
         stop, threshold = (getattr(strategy, name, None) for name in ("refine_stop_iter", "grow_grad2d"))
         require_end(conductor, stop, "refine_stop_iter", first=0)
         warn_if_score_is_unused(conductor, strategy, threshold)
@@ -135,6 +137,7 @@ class Attached:
             poll_parents=self._rows.poll, restart_parents=self._rows.restart, threshold=threshold, masks=masks,
             own_background=own_background, reads_score=threshold is not None, remedy=self._rows.remedy, iterations=iterations,
         )  # fmt: skip
+        self.attachment.undo.callback(self._rows.remove)
         self._follow_optimizers()
         _MADE.add(self)
 
@@ -200,7 +203,7 @@ class Attached:
     def replace_everywhere(self, rasterization: Rasterization) -> Rasterization:
         """Replace the function by its wrapped version in every loaded module, under any name; `remove` undoes it."""
         wrapped = self.wrap(rasterization)
-        self._undo.callback(replace_everywhere(rasterization, wrapped))
+        self.attachment.undo.callback(replace_everywhere(rasterization, wrapped))
         return wrapped
 
     @torch.no_grad()
@@ -214,8 +217,6 @@ class Attached:
     def remove(self) -> None:
         """Restore the loop; f_det stays a parameter, see `fold_detail`."""
         self.attachment.remove()
-        self._undo.close()
-        self._rows.remove()
 
     def _follow_optimizers(self) -> None:
         """Hook those that the host has now."""

@@ -7,8 +7,7 @@ import functools
 import inspect
 import logging
 import sys
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -16,7 +15,9 @@ import torch
 from torch import Tensor
 
 from clear_strategies.console import show_in_host
+from clear_strategies.core.view import View
 from clear_strategies.errors import HostError, SettingError
+from clear_strategies.merging.conductor import Conductor
 from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
 from integration.gsplat.attached import Attached, require_bands
@@ -70,7 +71,7 @@ def install(
     if wanted.from_stereo:
         start_from_stereo(runner_class)
     train, rasterize_splats = runner_class.train, runner_class.rasterize_splats
-    last: _Installed | None = None  # of the last Runner, whose evaluation may come after its training
+    last: Attached | None = None  # of the last Runner, whose evaluation may come after its training
 
     @functools.wraps(train)
     def train_with_clear(runner: Any) -> Any:
@@ -85,12 +86,13 @@ def install(
         photos = photos_of(runner.trainset, runner.device)
         masks = {photo.name: photo.mask for photo in photos if photo.mask is not None}
         if last is not None:
-            last.finish()
+            last.fold_detail()
+            last.remove()
         views = [photo.view(source, scale) for photo in photos]
-        runner.clear = last = _Installed(runner, views, masks, chosen, wanted)
-        installed(last.attached)
+        runner.clear = last = _attach(runner, views, masks, chosen, wanted)
+        installed(last)
         result = train(runner)
-        _log.info("%s.", last.attached.attachment.summary())
+        _log.info("%s.", last.attachment.summary())
         return result
 
     @functools.wraps(rasterize_splats)
@@ -100,7 +102,7 @@ def install(
         clear = getattr(runner, "clear", None)
         if clear is None or image_ids is None or not torch.is_grad_enabled():
             return rasterize_splats(runner, *args, **kwargs)
-        with clear.attached.rendering(clear.views[int(image_ids)]):
+        with clear.rendering(clear.views[int(image_ids)]):
             return rasterize_splats(runner, *args, **kwargs)
 
     runner_class.train, runner_class.rasterize_splats = train_with_clear, rasterize_the_view
@@ -123,39 +125,31 @@ def require_pinhole(config: Any) -> None:
         )
 
 
-class _Installed:
-    """CLEAR in one Runner; its files hold f_base + f_det."""
+def _attach(
+    runner: Any, views: Sequence[View], masks: Mapping[str, Tensor], chosen: Conductor, wanted: Settings
+) -> Attached:
+    """CLEAR in one Runner, whose files hold f_base + f_det."""
+    splats = runner.splats
+    attached = Attached(
+        splats, runner.optimizers, views, chosen, strategy=runner.cfg.strategy, seed=wanted.seed, masks=masks,
+        state=getattr(getattr(runner, "scene", None), "signal", None), iterations=runner.cfg.max_steps, hr_by=wanted.hr_by,
+        accumulation=wanted.accumulation,
+    )  # fmt: skip
+    attached.replace_everywhere(sys.modules["gsplat.rendering"].rasterization)
+    splats.register_state_dict_post_hook(_fold)
+    if (export := getattr(sys.modules["gsplat"], "export_splats", None)) is not None:
 
-    def __init__(self, runner: Any, views: Any, masks: Any, chosen: Any, wanted: Settings) -> None:
-        rendering = sys.modules["gsplat.rendering"]
-        self.views, self._splats = views, runner.splats
-        self.attached = Attached(
-            runner.splats, runner.optimizers, views, chosen, strategy=runner.cfg.strategy, seed=wanted.seed, masks=masks,
-            state=getattr(getattr(runner, "scene", None), "signal", None), iterations=runner.cfg.max_steps, hr_by=wanted.hr_by,
-            accumulation=wanted.accumulation,
-        )  # fmt: skip
-        self.attached.replace_everywhere(rendering.rasterization)
-        self._undo = ExitStack()
-        export = getattr(sys.modules["gsplat"], "export_splats", None)
-        if export is not None:
-            with_detail = functools.wraps(export)(functools.partial(self._export, export))
-            self._undo.callback(replace_everywhere(export, with_detail))
-        runner.splats.register_state_dict_post_hook(_fold)
+        @functools.wraps(export)
+        def export_with_detail(*args: Any, **kwargs: Any) -> Any:
+            if "sh0" not in kwargs:
+                raise HostError("export_splats must be called with sh0=…, as simple_trainer does.")
+            sh0, detail = kwargs["sh0"], splats["detail"]
+            if len(sh0) == len(detail):
+                kwargs["sh0"] = sh0.detach() + sh0_offset(detail.detach(), sh0)
+            return export(*args, **kwargs)
 
-    def finish(self) -> None:
-        """Leave its splats as they are drawn, and gsplat's functions to the next Runner."""
-        self.attached.fold_detail()
-        self.attached.remove()
-        self._undo.close()
-
-    def _export(self, export: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        """`export_splats` of the trained splats, with f_det in their constant band."""
-        if "sh0" not in kwargs:
-            raise HostError("export_splats must be called with sh0=…, as simple_trainer does.")
-        sh0, detail = kwargs["sh0"], self._splats["detail"]
-        if len(sh0) == len(detail):
-            kwargs["sh0"] = sh0.detach() + sh0_offset(detail.detach(), sh0)
-        return export(*args, **kwargs)
+        attached.attachment.undo.callback(replace_everywhere(export, export_with_detail))
+    return attached
 
 
 def _fold(_: Any, stored: dict[str, Any], prefix: str, *__: Any) -> None:

@@ -6,7 +6,7 @@ import functools
 import inspect
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, Final
 
@@ -102,8 +102,9 @@ class Attached:
             poll_parents=self.detail.poll_parents, own_background=own_background, accumulation=accumulation,
             remedy="Nothing has their colour and rotation. End densification first.",
         )  # fmt: skip
-        self._undo = ExitStack()
-        self._undo.callback(replace_methods(gaussians, {
+        undo = self.attachment.undo
+        undo.callback(self._rows.remove)
+        undo.callback(replace_methods(gaussians, {
             **dict.fromkeys(_SAVERS, self._save_with_detail), "compute_3D_filter": self._compute_filter_at_hr,
             "training_setup": self._training_setup, "relocate_gs": self._relocate,
         }))  # fmt: skip
@@ -161,7 +162,7 @@ class Attached:
     def replace_everywhere(self, render: Callable[..., Any]) -> Callable[..., Any]:
         """Replace the function by its wrapped version in every loaded module, under any name; `remove` undoes it."""
         wrapped = self.wrap(render)
-        self._undo.callback(replace_everywhere(render, wrapped))
+        self.attachment.undo.callback(replace_everywhere(render, wrapped))
         return wrapped
 
     @torch.no_grad()
@@ -173,10 +174,8 @@ class Attached:
     def remove(self) -> None:
         """Restore the loop; f_det is no longer shown, see `fold_detail`."""
         self.attachment.remove()
-        self._rows.remove()
         for hook in self._hooks:
             hook.remove()
-        self._undo.close()
 
     def _host_params(self) -> dict[str, Tensor]:
         return {name: getattr(self._model, attribute) for name, attribute in _ATTRIBUTES.items()}

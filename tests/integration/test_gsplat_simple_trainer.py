@@ -143,10 +143,10 @@ def test_a_second_runner_in_one_process_trains_too(trainer, monkeypatch):
         runner = runner_class(0, 0, 1, simple_trainer.Config(str(trainer.folder / name)))
         runner.train()
         drawn.append(torch.load(trainer.folder / name / "image.pt"))
-        assert runner.clear.attached.attachment.counts["merges"] == 8
+        assert runner.clear.attachment.counts["merges"] == 8
     assert torch.equal(*drawn)
     copied = copy.deepcopy(runner.splats)
     assert torch.equal(copied.state_dict()["sh0"], runner.splats.state_dict()["sh0"])  # f_base + f_det
     assert len(pickle.dumps(copied)) < 50_000  # without the photos
-    runner.clear.finish()
+    runner.clear.remove()
     assert not hasattr(gsplat.export_splats, "__wrapped__")  # else the splats of every Runner stay in memory
