@@ -147,17 +147,16 @@ class Attachment:
         z = conductor.gate(t, self._n)
         if z is not None:
             z = z.to(means)
+        apart = _random_state_kept(means.device)(render_at)
         hr = routed = None
         if self._hr.wanted(t):
             view = conductor.skips.view(view, t)
-            hr, routed = self._hr.hr(view, t, z, render_at, params)
+            hr, routed = self._hr.hr(view, t, z, apart, params)
         self._step = Step(t, view, params=params) if hr is None else hr.step
         if self.passes == 0:  # one step of the host, however many passes it accumulates
             self._extra.forget()
             if extra_views := conductor.extra_views(t):
-                self._extra.take(
-                    self.params(), [self._hr.extra_view(extra, view, t, render_at) for extra in extra_views]
-                )
+                self._extra.take(self.params(), [self._hr.extra_view(extra, view, t, apart) for extra in extra_views])
         output = render_at("lr", z, view)
         if isinstance(output, Drawable):
             raise TypeError("an adapter renders LR by the host's own function, got a Drawable.")
@@ -382,9 +381,7 @@ def _require_supported(conductor: Conductor, accumulation: int) -> None:
 
 
 @contextmanager
-def random_state_kept(device: torch.device) -> Iterator[None]:
-    """Restore torch's random generators after a host has drawn HR or an extra view, so that a dropout inside its function drops
-    the same at LR.
-    """
+def _random_state_kept(device: torch.device) -> Iterator[None]:
+    """Restore torch's random generators after HR or an extra view is drawn: a dropout of the host drops the same at LR."""
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
         yield

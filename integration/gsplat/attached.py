@@ -18,7 +18,7 @@ from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.core.view import View
 from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
-from integration.attachment import Attachment, random_state_kept
+from integration.attachment import Attachment
 from integration.autograd_shot import HostOutput, Target
 from integration.densification import require_end, warn_if_score_is_unused
 from integration.detail import sh0_offset
@@ -272,10 +272,7 @@ class Attached:
         if own is not None:
             return drawable(own, call, params, target if isinstance(target, Camera) else None)
         call, aliases = (call, ()) if self._is_ours else aliased(call)
-        if target == "lr":
-            return host_output(rasterization, call, params, gate, aliases)
-        with random_state_kept(call["means"].device):
-            return host_output(rasterization, call, params, gate)
+        return host_output(rasterization, call, params, gate, aliases if target == "lr" else ())
 
     def _own_rasterizer(self, call: Mapping[str, Any]) -> Rasterizer | None:
         """What draws HR and extra views in place of the host's function; None: nothing does. The log says once, which."""

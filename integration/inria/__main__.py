@@ -11,7 +11,7 @@ import importlib
 import logging
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,7 +21,7 @@ from clear_strategies.errors import HostError
 from integration import launcher
 from integration.inria.cameras import photo_of
 from integration.inria.from_options import install
-from integration.replacing import replace_everywhere
+from integration.replacing import replace_everywhere, replaced_attribute
 from integration.settings import Settings
 from integration.views import no_stereo, save_photos
 
@@ -46,7 +46,6 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
     if render is None:
         raise HostError("gaussian_renderer has no function render, which it has in 3DGS.")
     of = scene.GaussianModel
-    setups = {name: getattr(of, name) for name in dir(of) if name.startswith(_SETUP)}
     scenes, models, attached = list[Any](), list[Any](), list[Any]()
 
     @functools.wraps(init)
@@ -71,6 +70,7 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
             if settings.from_stereo and setup.__name__ != _SETUP:
                 raise no_stereo(f"the script calls {setup.__name__}, whose arguments belong to its own points")
             attached.append(install(gaussians, scenes[-1], opt, settings))
+            undo.callback(attached[-1].remove)
             return result
 
         return setup_and_install
@@ -84,21 +84,14 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
             )
         return render(camera, gaussians, *args, **kwargs)
 
-    restore = replace_everywhere(render, render_unless_unknown)
-    scene.Scene.__init__ = init_and_remember
-    for name, setup in setups.items():
-        setattr(of, name, installing(setup))
-    try:
+    with ExitStack() as undo:
+        undo.callback(replace_everywhere(render, render_unless_unknown))
+        undo.enter_context(replaced_attribute(scene.Scene, "__init__", init_and_remember))
+        for name in [name for name in dir(of) if name.startswith(_SETUP)]:
+            undo.enter_context(replaced_attribute(of, name, installing(getattr(of, name))))
         yield attached
         for each in attached:
             _log.info("%s.", each.attachment.summary())
-    finally:
-        scene.Scene.__init__ = init
-        for name, setup in setups.items():
-            setattr(of, name, setup)
-        for each in reversed(attached):
-            each.remove()
-        restore()
 
 
 HOST: Final = launcher.Host(

@@ -6,7 +6,6 @@ import functools
 import inspect
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +15,7 @@ from torch import Tensor
 from clear_strategies.core.view import View
 from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
-from integration.attachment import Attachment, random_state_kept
+from integration.attachment import Attachment
 from integration.autograd_shot import HostOutput, Target
 from integration.densification import require_end, warn_if_score_is_unused
 from integration.inria.cameras import HostViews, enlarged_camera, replaced_camera
@@ -144,8 +143,7 @@ class Attached:
                 overrides = Overrides(gate, params.get("detail"))
                 call = signature.bind(camera, proxy(self._model, overrides), *args, **kwargs)
                 call.arguments |= self._bg_color(call.arguments.get("bg_color"))
-                kept = nullcontext() if target == "lr" else random_state_kept(self._model._xyz.device)
-                with collected_drawings() as drawings, kept:
+                with collected_drawings() as drawings:
                     result = render(*call.args, **call.kwargs)
                 ranks = hasattr(self._model, "xyz_gradient_accum_abs")
                 output = host_output(result, pinhole, params, gate, drawings, ranks_by_third_column=ranks)

@@ -50,13 +50,12 @@ class HostViews:
             raise SettingError(
                 "cameras: at least one training camera is needed, got none. Pass scene.getTrainCameras()."
             )
-        names = [camera.image_name for camera in cameras]
-        require_unique(names)
+        require_unique(camera.image_name for camera in cameras)
         self.factor = factor
         photos = [photo_of(camera, device) for camera in cameras]
         self.all = tuple(photo.view(sr, factor) for photo in photos)
         self.masks = {photo.name: photo.mask for photo in photos if photo.mask is not None}
-        self._by_name: dict[str, tuple[Any, View]] = dict(zip(names, zip(cameras, self.all, strict=True), strict=True))
+        self._by_name = {camera.image_name: (camera, view) for camera, view in zip(cameras, self.all, strict=True)}
 
     def find(self, camera: Any) -> View | None:
         """The view of a training camera, or of a copy: a camera of the same name and pose. None: it is another camera."""
