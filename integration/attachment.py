@@ -11,8 +11,9 @@ One training iteration:
 4. After the host's optimizer has stepped, it steps once more on the gradient of each extra view. Once all optimizers have
    stepped, the strategies do what they do after a step.
 
-HR and extra views are in hr_drawing.py, the merge in host_merge.py, the optimizers' steps in host_steps.py, changes of the
-structure in structure.py, and the lines of the log at the start in announcement.py.
+HR and extra views are in hr_drawing.py, what waits for `backward()` in pending.py, the merge in host_merge.py, the optimizers'
+steps in host_steps.py and extra_steps.py, changes of the structure in structure.py, and the first lines of the log in
+announcement.py.
 
 The merge runs at the end of `backward()`, not in an optimizer hook. Gradient clipping therefore sees the merged gradient,
 optimizers other than `torch.optim.Optimizer` work, and so do hosts that densify before the step (3DGS) as well as hosts
@@ -109,7 +110,8 @@ class Attachment:
         self._own_background = own_background
         self.t, self.passes = 1, 0
         self.counts: Counter[str] = Counter()
-        self.removed, self.undo = False, ExitStack()
+        self.removed = False
+        self.undo = ExitStack()
         self._poll_parents, self._restart_parents, self._remedy = poll_parents, restart_parents, remedy
         self._n, device = len(params()["means"]), params()["means"].device
         self._hr = HrDrawing(conductor, device, masks or {}, self.counts, reads_score=reads_score)
@@ -288,9 +290,7 @@ class Attachment:
             self._pass = now = BackwardPass(current_pass(), self.params())
             torch.autograd.Variable._execution_engine.queue_callback(lambda: self._on_backward_end(now))
         self._pass.renderings.add(nth)
-        params = self._pass.params
-        whole = not self._pending.may_take_factors(params)
-        return None if whole else self._pass.take
+        return self._pass.take if self._pending.may_take_factors(self._pass.params) else None
 
     @torch.no_grad()
     def _on_backward_end(self, done: BackwardPass) -> None:

@@ -121,7 +121,8 @@ class Attached:
         self._rows = RowNumbers(
             params if state is None else state, lambda: params[self._names["means"]], as_parameter=state is None
         )
-        self.views, self._poses = tuple(views), Poses(views)
+        self.views = tuple(views)
+        self._poses = Poses(views)
         self._found_by_pose = True  # else renderings are those of `_named`, see `rendering`
         self._named: View | None = None
         self._has_drawn_bands = False  # after a call with spherical harmonics, one without them draws no colours

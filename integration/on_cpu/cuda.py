@@ -7,6 +7,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any, Final
 
 import torch
@@ -44,7 +45,7 @@ def replace() -> None:
         setattr(cuda, name, lambda *_, **__: peak_mib() << 20)
     for name in _TENSORS:
         setattr(cuda, name, getattr(torch, name))
-    cuda.Event, cuda.device = Event, _Device
+    cuda.Event, cuda.device = Event, nullcontext
     cuda.current_device = lambda: 0
     cuda.get_device_name = lambda *_: "CPU"
 
@@ -130,16 +131,3 @@ class Event:
 
     def wait(self, *_: Any) -> None:
         """The same."""
-
-
-class _Device:
-    """`with torch.cuda.device(0):`."""
-
-    def __init__(self, _: Any) -> None:
-        pass
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, *_: Any) -> None:
-        pass
