@@ -18,7 +18,7 @@ def named(text: str) -> set[str]:
     return set(re.findall(r"`([^`]+)`", text))
 
 
-def floors() -> dict[str, tuple[set[str], set[str]]]:
+def layers() -> dict[str, tuple[set[str], set[str]]]:
     """The folders of clear_strategies/ from the bottom: what each may import, and the heavy libraries that it may use."""
     found: dict[str, tuple[set[str], set[str]]] = {}
     for line in PAGE.split("| folder or file |")[1].split("\n\n")[0].splitlines()[2:]:
@@ -28,9 +28,10 @@ def floors() -> dict[str, tuple[set[str], set[str]]]:
     return found
 
 
-FLOORS = floors()
-DOORS = {
-    door: named(own) for door, own in re.findall(r"`(\w+)`(?: \((.*?)\))?", PAGE.split("The doors")[1].split("\n\n")[0])
+LAYERS = layers()
+ENTRY_POINTS = {
+    entry: named(own)
+    for entry, own in re.findall(r"`(\w+)`(?: \((.*?)\))?", PAGE.split("The entry points")[1].split("\n\n")[0])
 }
 
 HEAVY = {"cv2", "kornia", "open3d", "PIL", "warp", "gsplat", "hydra", "omegaconf"}
@@ -75,27 +76,29 @@ def unit(path: Path) -> str:
 def test_imports_point_down():
     for path in modules("clear_strategies"):
         me = unit(path)
-        if me == "__init__" or me in DOORS:
+        if me == "__init__" or me in ENTRY_POINTS:
             continue
         for name in imports(path):
             parts = name.split(".")
             if parts[0] != "clear_strategies" or len(parts) == 1:
                 continue
-            assert parts[1] == me or parts[1] in FLOORS[me][0], f"{path} imports {name}"
+            assert parts[1] == me or parts[1] in LAYERS[me][0], f"{path} imports {name}"
             if me == parts[1] == "strategies" and path.stem != "__init__":
-                assert parts[2] in (path.stem, "base"), f"strategies are mutually blind, but {path.stem} imports {name}"
+                assert parts[2] in (path.stem, "base"), (
+                    f"strategies must not import each other, but {path.stem} imports {name}"
+                )
 
 
-def test_every_module_stands_on_a_floor_or_is_a_door():
+def test_every_module_is_in_a_layer_or_an_entry_point():
     units = {unit(path) for path in modules("clear_strategies")} - {"__init__"}
-    assert units == FLOORS.keys() | DOORS.keys()
+    assert units == LAYERS.keys() | ENTRY_POINTS.keys()
 
 
-def test_a_floor_imports_lower_floors_only():
+def test_a_layer_imports_lower_layers_only():
     """So there is no circle between folders."""
     below: set[str] = set()
-    for folder, (allowed, _) in FLOORS.items():
-        assert allowed <= below, f"{folder} stands below {allowed - below}"
+    for folder, (allowed, _) in LAYERS.items():
+        assert allowed <= below, f"{folder} is below {allowed - below}"
         below.add(folder)
 
 
@@ -118,10 +121,10 @@ def test_no_files_import_each_other():
         require_no_circle({"a": {"b"}, "b": {"c"}, "c": {"a"}})
 
 
-def test_heavy_libraries_stay_in_their_rooms():
+def test_heavy_libraries_are_imported_only_where_the_table_names_them():
     for path in modules("clear_strategies"):
         me = unit(path)
-        allowed = DOORS[me] if me in DOORS else FLOORS[me][1] if me in FLOORS else set()
+        allowed = ENTRY_POINTS[me] if me in ENTRY_POINTS else LAYERS[me][1] if me in LAYERS else set()
         wrong = {name.split(".")[0] for name in imports(path)} & HEAVY - allowed
         assert not wrong, f"{path} imports {wrong}"
 
