@@ -33,7 +33,7 @@ def announce(conductor: Conductor, views: Sequence[View], *, own_background: boo
             "%s has no effect: the views were made without it. Make them with sr=conductor.prior(sr).",
             ", ".join(getattr(getattr(d, "func", d), "__name__", str(d)) for d in conductor.decorators),
         )
-    for phrase in conductor.skips.descriptions(views, in_host=True):
+    for phrase in conductor.skips.descriptions(views, uses_hr=conductor.uses_hr, in_host=True):
         _log.info("Skipped: %s.", phrase)
     for hook, reason in {
         "densifier": "keeps its own density control",
@@ -44,7 +44,10 @@ def announce(conductor: Conductor, views: Sequence[View], *, own_background: boo
     for stage in (s for s in conductor.strategies if isinstance(s, SRStage)):
         _log.info("%s has no effect here: the host draws no picture for it.", type(stage).__name__)
     if not conductor.strategies:
-        _log.info("no strategy is attached: both losses are summed, as in the paper's baseline.")
+        summed = (
+            "both losses are summed, as in the paper's baseline" if conductor.uses_hr else "the host trains as alone"
+        )
+        _log.info("no strategy is attached: %s.", summed)
 
 
 def warn_without_hr(conductor: Conductor, counts: Mapping[str, int]) -> None:

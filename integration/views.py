@@ -220,8 +220,7 @@ def sr_source(
         sr = Images(str(sr), suffix)
     if sr is not None:
         return conductor.prior(sr), factor
-    λ = conductor.objective.lambda_hr
-    if λ.peak > 0 or λ.final > 0 or conductor.owner("observe") is not None:
+    if conductor.uses_hr:
         raise SettingError(
             "sr: must be the folder of the SR images, got None, but HR is used. Pass the folder, or set objective=lr_only "
             "and leave P2G out."

@@ -169,6 +169,12 @@ class Conductor:
         return False
 
     @property
+    def uses_hr(self) -> bool:
+        """Whether HR has any use in some iteration, see `wants_hr`."""
+        λ = self.objective.lambda_hr
+        return λ.peak > 0 or λ.final > 0 or not self.wants_lr or self.owner("score") is not None
+
+    @property
     def wants_lr(self) -> bool:
         """Whether the LR render has any use; else Î_LR is the area mean of Î_HR."""
         return self.objective.draws_lr

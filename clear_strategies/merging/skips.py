@@ -72,20 +72,22 @@ class SkipPolicy:
         self.skips = skips if skips is not None else Skips()
         self._coarse: dict[str, View] = {}
 
-    def descriptions(self, views: Sequence[View], *, in_host: bool = False) -> list[str]:
+    def descriptions(self, views: Sequence[View], *, uses_hr: bool = True, in_host: bool = False) -> list[str]:
         """A phrase for each skip that is on, for the plan; a warning for one that has no effect.
 
         Args:
+            uses_hr: there is work on HR to leave out.
             in_host: the iterations are a host's, so that none is left out.
         """
         s, phrases = self.skips, []
-        if s.coarse_until > 0 and not any(map(_halves, views)):
+        if uses_hr and s.coarse_until > 0 and not any(map(_halves, views)):
             _log.warning(
-                "skips.coarse_until has no effect: SR images are halved only where data.views.sr_scale is even."
+                "skips.coarse_until has no effect: SR images are halved only where %s is even.",
+                "factor" if in_host else "data.views.sr_scale",
             )
-        elif s.coarse_until > 0:
+        elif uses_hr and s.coarse_until > 0:
             phrases.append(f"HR at half its size until iteration {s.coarse_until}")
-        if s.hr_every > 1 and s.coarse_until > 0:
+        if uses_hr and s.hr_every > 1 and s.coarse_until > 0:
             phrases.append(
                 f"HR in one of {s.hr_every} iterations until iteration {s.coarse_until}, and in each whose scores "
                 "densification reads"

@@ -133,7 +133,7 @@ def _skipped(state: TrainState) -> Iterator[str]:
         yield f"HR scale until iteration {hr.start} (lambda_HR = 0)"
     if state.mip.variance == 0:
         yield "3D filter (variance 0)"
-    yield from state.conductor.skips.descriptions(state.views)
+    yield from state.conductor.skips.descriptions(state.views, uses_hr=state.conductor.uses_hr)
 
 
 def _marks(state: TrainState) -> dict[str, int]:

@@ -2,6 +2,7 @@
 
 import functools
 from contextlib import nullcontext
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -293,6 +294,25 @@ def test_a_loop_that_ends_before_hr_takes_part_is_told(caplog):
     attached(Host(scene), scene, composed_conductor("gco", iterations=120), iterations=120)
     assert "HR takes part from step 7 on" in caplog.text
     assert "the loop has" not in caplog.text
+
+
+@pytest.mark.parametrize("factor", [1, 4])
+def test_a_loop_without_hr_is_told_of_no_work_on_it(factor, caplog):
+    caplog.set_level("INFO")
+    scene = toy.scene(20)
+    views = [replace(view, hr=view.hr.reduced(view.factor // factor)) for view in scene.train]
+    for strategies, said in [
+        ("baseline", ["no strategy is attached: the host trains as alone."]),
+        ("fading_opacity", []),
+    ]:
+        host = Host(scene)
+        caplog.clear()
+        attach(host.splats, host.optimizers, views, composed_conductor(strategies, "objective=lr_only", iterations=120))
+        assert [text for text in caplog.messages if not text.startswith("FadingOpacity: ")] == said
+    host = Host(scene)
+    attach(host.splats, host.optimizers, views, composed_conductor("gco", iterations=120))
+    assert ("SR images are halved only where factor is even" in caplog.text) == (factor == 1)
+    assert ("Skipped: HR at half its size" in caplog.text) == (factor == 4)
 
 
 @pytest.mark.parametrize("activation", [torch.nn.functional.softplus, torch.sigmoid])

@@ -551,6 +551,10 @@ def test_a_scale_that_the_objective_needs_is_asked_for_and_hr_only_while_it_has_
     assert [scoring.wants_hr(t) for t in (5, 6, 10, 11)] == [False, True, True, True]
     never = Conductor(objective=Objective(lambda_hr=WarmupDecay(peak=0, final=0)))
     assert not any(never.wants_hr(t) for t in range(0, 10_000, 100))
+    assert [c.uses_hr for c in (plain, scoring, never)] == [True, True, False]
+    assert all(
+        Conductor(*s, objective=replace(never.objective, lr_from=f)).uses_hr for s, f in [([P2G()], "lr"), ([], "hr")]
+    )
 
 
 def test_routing_weighs_the_high_frequency_gradient_only(drawn):
