@@ -44,7 +44,8 @@ class ScreenGradientSlot:
 
     def per_gaussian(self, gradient: Tensor, n: int) -> Float[Tensor, "N 2"]:
         """∇_u of all N Gaussians in 1/pixel, from a gradient of the tensor."""
-        g = gradient.reshape(-1, gradient.shape[-1])[:, :2] * gradient.new_tensor(self.to_pixels)
+        columns = gradient.reshape(-1, gradient.shape[-1]).T
+        g = torch.stack([column * factor for column, factor in zip(columns, self.to_pixels, strict=False)], 1)
         return g if self.rows is None else g.new_zeros(n, 2).index_add_(0, self.rows, g)
 
     def absgrad(self, n: int) -> Float[Tensor, "N 2"] | None:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from rasterizers.interface import Camera, Color
+from rasterizers.warp_runtime import color_on
 
 SMALLEST: Final = 12
 """Pixels on each side of what can be scored: GMSD halves the image, and SSIM needs room for its window."""
@@ -58,8 +59,8 @@ class Photo:
         """The photo before `color` in place of `background`, as far as it is transparent, and then opaque; itself for None."""
         if color is None or self.transparency is None:
             return self
-        change = self.image.new_tensor(color) - self.image.new_tensor(background)
-        image = (self.image + self.transparency[..., None] * change).clamp(0, 1)
+        before, behind = (color_on(c, self.image.device, self.image.dtype)[0] for c in (background, color))
+        image = (self.image + self.transparency[..., None] * (behind - before)).clamp(0, 1)
         return replace(self, image=image, transparency=None)
 
     def factor_to(self, max_pixels: int) -> int:

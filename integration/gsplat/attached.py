@@ -41,6 +41,7 @@ from rasterizers.ahead import drawing_ahead
 from rasterizers.as_gsplat import rasterizer_of
 from rasterizers.interface import BackendUnavailable, Camera, Rasterizer
 from rasterizers.modes import uncompiled
+from rasterizers.warp_runtime import color_on
 
 _log = logging.getLogger(__name__)
 
@@ -306,7 +307,7 @@ class Attached:
         color = self.attachment.background
         if color is None or call.get("backgrounds") is not None:
             return {}
-        return {"backgrounds": call["means"].new_tensor(color)[None]}
+        return {"backgrounds": color_on(color, call["means"].device, call["means"].dtype)}
 
     def _with_detail(self, arguments: Mapping[str, Any], *, trained: bool) -> dict[str, Any]:
         """The same call with colours f_base + f_det; f_det gets a gradient only if it is trained by the rendering."""

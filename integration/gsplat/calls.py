@@ -31,7 +31,7 @@ _LENS: Final = (
 
 def enlarged(call: Call, factor: int) -> dict[str, Any]:
     """With `factor` times as many pixels along an edge, colours alone."""
-    Ks = call["Ks"] * call["Ks"].new_tensor([[factor], [factor], [1]])
+    Ks = torch.cat((call["Ks"][..., :2, :] * factor, call["Ks"][..., 2:, :]), -2)
     return {**call, "Ks": Ks, "width": call["width"] * factor, "height": call["height"] * factor, "render_mode": "RGB"}
 
 

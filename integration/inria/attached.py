@@ -27,6 +27,7 @@ from integration.views import SuperResolve, sr_source
 from rasterizers.autograd import collected_drawings
 from rasterizers.interface import Camera
 from rasterizers.modes import uncompiled
+from rasterizers.warp_runtime import color_on
 
 _log = logging.getLogger(__name__)
 
@@ -219,7 +220,7 @@ class Attached:
             self._black = not bool(own.any())
             if not self._black:
                 _log.warning("the background stays as it is: strategies choose another only in place of a black one.")
-        return {"bg_color": own.new_tensor(color)} if self._black else {}
+        return {"bg_color": color_on(color, own.device, own.dtype)[0]} if self._black else {}
 
     def _relocate(self, original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """3dgs-mcmc has a threshold of the gradient among its options, but reads opacities alone."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import Final
 
 import torch
@@ -12,7 +11,7 @@ from torch import Tensor
 
 from rasterizers.checks import Backend, require_device
 from rasterizers.interface import Camera, Color, Traits
-from rasterizers.warp_runtime import require_warp, sent
+from rasterizers.warp_runtime import color_on, require_warp
 
 TILE: Final = 8
 """Edge of the tiles that Gaussians are listed for, px."""
@@ -79,7 +78,7 @@ class WarpSettings(Backend):
         return copied
 
     def background_on(self, device: torch.device) -> Float[Tensor, "1 3"]:
-        return _color_on(self.background, device) if self.changing is None else self.changing
+        return color_on(self.background, device) if self.changing is None else self.changing
 
     def capacity(self, camera: Camera) -> int:
         """The number of pairs to allocate for an image of this size before they are counted; -1: it is the first one."""
@@ -93,11 +92,6 @@ class WarpSettings(Backend):
     def allows(self, pairs: int) -> bool:
         """Whether the lists of this many pairs, which are counted in 32 bits, fit the budget."""
         return mebibytes(pairs) <= self.memory and pairs < 2**31
-
-
-@lru_cache(maxsize=64)
-def _color_on(color: Color, device: torch.device) -> Float[Tensor, "1 3"]:
-    return sent(torch.tensor([color], dtype=torch.float32), device)
 
 
 def padded(count: int) -> int:

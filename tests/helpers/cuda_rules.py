@@ -44,6 +44,7 @@ class State:
         warp_knows: whether Warp knows of that; warp_runs: whether it has begun.
         underway: the pools that torch's allocator allocates from, `captures_underway` in c10/cuda/CUDACachingAllocator.cpp.
         seeds: whether torch's generator takes its next numbers for those of a capture.
+        no_waits: whether torch is to refuse what waits for the device.
         living, cached: pools with graphs, and those whose graphs are no more.
     """
 
@@ -53,6 +54,7 @@ class State:
     warp_runs: bool = False
     underway: list[Any] = field(default_factory=list)
     seeds: bool = False
+    no_waits: bool = False
     living: int = 0
     cached: int = 0
 
@@ -152,6 +154,14 @@ def waiting_for_the_device(a: Act, s: State) -> bool:
 def pinning_memory(a: Act, s: State) -> bool:
     """Operation not permitted when stream is capturing: cudaHostAlloc, in the modes global and thread_local."""
     return a.what == "pin" and s.capture is not None
+
+
+@check
+def sending_where_waits_are_refused(a: Act, s: State) -> bool:
+    """called a synchronizing CUDA operation (torch, after `set_sync_debug_mode("error")`): a copy from memory that is not pinned, as
+    of `new_tensor`. Reads, which torch then refuses, too, are not known here outside of a capture: much is on the host.
+    """
+    return a.what == "send" and s.no_waits
 
 
 @rule

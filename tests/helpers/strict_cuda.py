@@ -73,6 +73,10 @@ class StrictCuda:
         self.ask("empty")
         self.state.cached = 0
 
+    def set_sync_debug_mode(self, mode: str) -> None:
+        """`torch.cuda.set_sync_debug_mode`."""
+        self.state.no_waits = mode == "error"
+
     def end_allocate(self, device: int, pool: Pool) -> None:
         """`torch._C._cuda_endAllocateToPool`."""
         if all(x is not pool for x in self.state.underway):
@@ -208,6 +212,7 @@ class _Functions(TorchFunctionMode):
 
     ACTS: Final = {
         torch.Tensor.tolist: "read", torch.Tensor.numpy: "read", torch.Tensor.cpu: "read", torch.Tensor.pin_memory: "pin",
+        torch.Tensor.new_tensor: "send",
     }  # fmt: skip
 
     def __init__(self, cuda: StrictCuda) -> None:
@@ -275,7 +280,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     from clear_strategies.kernels.per_gaussian import dispatch
     from clear_strategies.kernels.reconcile import warp as warp_merge
     from rasterizers import recording, replayed_drawing, replays, warp_runtime
-    from rasterizers.warp_backend import frame, settings
+    from rasterizers.warp_backend import frame
 
     cuda, autograd, loaded = StrictCuda(), _Elsewhere(), set[Any]()
     construct, state = warp_runtime._Launch.__init__, cuda.state
@@ -332,6 +337,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
             "graph_pool_handle": Pool, "synchronize": lambda device=None: cuda.ask("read"),
             "memory_reserved": lambda device=None: state.living + state.cached, "mem_get_info": cuda.free,
             "memory_allocated": lambda device=None: state.living, "empty_cache": cuda.empty_cache,
+            "set_sync_debug_mode": cuda.set_sync_debug_mode,
             "default_generators": (_Generator(state),),
         },
         torch._C: {"_cuda_endAllocateToPool": cuda.end_allocate, "_cuda_releasePool": lambda device, pool: None},
@@ -351,7 +357,6 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         reconcile: {"_for_device": lambda device: warp_merge},
         rasterizers.native: {"empty": on_no_cpu},
         frame: {"DEFERRED_COUNTS": {"cpu": True}},
-        settings: {"sent": sends},
         warp_runtime: {"sent": sends, "_kept": warp_runtime._Kept()},
     }  # fmt: skip
     for owner, values in patches.items():

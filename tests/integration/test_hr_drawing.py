@@ -268,6 +268,20 @@ def test_what_differs_between_steps_is_copied_or_makes_their_work_of_two_kinds(m
 
 
 @needs_warp
+def test_a_step_sends_no_number_that_the_host_waits_for(strict_cuda):
+    """Of a loop that densifies by P2G's score, with extra views, masks and random backgrounds behind transparent photos."""
+    strategies = pytest.importorskip("gsplat.strategy")
+    scene, names = transparent(toy.scene(20)), [view.name for view in SCENE.train]
+    host = Host(scene, rasterization=drawn_by("warp"), strategy=strategies.DefaultStrategy(refine_stop_iter=99))
+    conductor = Conductor(*everything(), cs.RandomBackground(), objective=WARP)
+    clear = attached(host, scene, conductor, strategy=host.strategy, hr_by="warp")
+    after = iter(["default"] * 2 + ["error"] * 6)
+    host.train([names[i % len(names)] for i in range(8)], between=lambda: torch.cuda.set_sync_debug_mode(next(after)))
+    assert clear.attachment.counts["scores written"] == clear.attachment.counts["HR renders"] == 8
+    assert clear.attachment.counts["extra views"] == 2 * 8
+
+
+@needs_warp
 def test_replays_over_densification_resets_evaluation_and_resuming(monkeypatch, recorded_on):
     strategies = pytest.importorskip("gsplat.strategy")
     scene = toy.scene(40).to(recorded_on)

@@ -271,6 +271,9 @@ EXAMPLES: dict[str, list[Callable[[StrictCuda, torch.Tensor], object]]] = {
         lambda cuda, x: torch.cuda.synchronize(),
     ],
     "pinning_memory": [lambda cuda, x: x.pin_memory()],
+    "sending_where_waits_are_refused": [
+        lambda cuda, x: [torch.cuda.set_sync_debug_mode("error"), x.new_tensor(2.0)]
+    ],
     "sending_numbers_of_python": [lambda cuda, x: torch.tensor([1.0]), lambda cuda, x: x.new_tensor(2.0)],
     "allocating_outside_the_pool": [
         lambda cuda, x: wp.empty(3, device="cpu"), on_the_default_stream(lambda cuda, x: torch.empty(3))
