@@ -92,5 +92,7 @@ def _parameters(step: Callable[..., Any]) -> frozenset[str]:
 def _step(optimizer: torch.optim.Optimizer, rows: Tensor) -> None:
     """One step of all rows. An Adam of visible Gaussians takes which move, 3DGS's SparseGaussianAdam also how many there are."""
     parameters = _parameters(type(optimizer).step)
-    known: dict[str, Any] = {"visibility": torch.ones(len(rows), dtype=torch.bool, device=rows.device), "N": len(rows)}
-    optimizer.step(**{name: value for name, value in known.items() if name in parameters})
+    known: dict[str, Any] = {"N": len(rows)} if "N" in parameters else {}
+    if "visibility" in parameters:
+        known["visibility"] = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
+    optimizer.step(**known)

@@ -8,6 +8,7 @@ recording or a replay, all that follows is live.
 from __future__ import annotations
 
 import logging
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol, TypeVar
@@ -142,12 +143,14 @@ def copied(x: Tensor | None) -> Tensor | None:
 
 
 def write(own: Sequence[Tensor | None], given: Sequence[Tensor | None]) -> None:
-    """Write what work is given to where the recorded one reads it: tensors of one layout by one kernel."""
-    pairs = [(x, y) for x, y in zip(own, given, strict=True) if x is not None and y is not None]
-    alike = [(x, y) for x, y in pairs if x.dtype == y.dtype == torch.float32 and x.stride() == y.stride()]
-    together = {id(x) for x, _ in alike}
-    if alike:
-        torch._foreach_copy_([x for x, _ in alike], [y for _, y in alike])
-    for x, y in pairs:
-        if id(x) not in together:
+    """Write what work is given to where the recorded one reads it: tensors of one type and layout by one kernel."""
+    alike = defaultdict[torch.dtype, list[tuple[Tensor, Tensor]]](list)
+    for x, y in zip(own, given, strict=True):
+        if x is None or y is None:
+            continue
+        if x.dtype == y.dtype and x.stride() == y.stride():
+            alike[x.dtype].append((x, y))
+        else:
             x.copy_(y)
+    for pairs in alike.values():
+        torch._foreach_copy_([x for x, _ in pairs], [y for _, y in pairs])

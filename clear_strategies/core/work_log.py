@@ -81,7 +81,7 @@ class WorkLog:
         elif (name, reason) in self._counted:
             self._counted[name, reason] += count
         else:
-            self._counted[name, reason] = count.to(torch.int64, copy=True)  # the caller may overwrite its tensor
+            self._counted[name, reason] = count.to(torch.float64, copy=True)  # the caller may overwrite its tensor
 
     @contextmanager
     def noted(self) -> Iterator[list[tuple[str, str, int | Tensor]]]:

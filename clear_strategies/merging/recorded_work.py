@@ -83,8 +83,9 @@ class RecordedWork(Generic[G, T]):
         row: dict[str, Number] = row_of(numbers.clone()) | {name: x.at(self._t) for name, x in self._of_t.items()}
         for k, (name, reason, count) in enumerate(self._skips):
             counted = row.pop(f"skip {k}", None)
-            on_device = isinstance(counted, deferred.Element)
-            self._work_log.skip(name, reason, counted.vector[counted.k].long() if on_device else count)  # type: ignore[union-attr]
+            self._work_log.skip(
+                name, reason, counted.vector[counted.k] if isinstance(counted, deferred.Element) else count
+            )
         for k, (s, name) in enumerate(self._logged):
             s.logs[name] = row.pop(f"log {k}")
         return self._outcome(given, made, row)

@@ -262,7 +262,7 @@ class Attached:
         else:
             params.pop("detail", None)
         if isinstance(target, Camera):
-            call = seen_by(call, target)
+            call = seen_by(call, target) if own is None else call
         else:
             expected = view.hr.camera if target == "hr" else view.lr.camera
             if (call["width"], call["height"]) != (expected.width, expected.height):

@@ -158,8 +158,8 @@ def pinning_memory(a: Act, s: State) -> bool:
 
 @check
 def sending_where_waits_are_refused(a: Act, s: State) -> bool:
-    """called a synchronizing CUDA operation (torch, after `set_sync_debug_mode("error")`): a copy from memory that is not pinned, as
-    of `new_tensor`. Reads, which torch then refuses, too, are not known here outside of a capture: much is on the host.
+    """Called a synchronizing CUDA operation: a copy from memory that is not pinned, as of `new_tensor` (torch, after
+    `set_sync_debug_mode("error")`; of reads outside of a capture it is not known here which are of the device).
     """
     return a.what == "send" and s.no_waits
 

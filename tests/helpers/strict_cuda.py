@@ -12,12 +12,11 @@ import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, partial, wraps
 from typing import Any, Final
 
 import pytest
 import torch
-from torch.overrides import TorchFunctionMode, _get_current_function_mode_stack
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes, _get_current_dispatch_mode_stack
 from torch.utils._pytree import tree_leaves, tree_map
 
@@ -207,23 +206,20 @@ def _write_anew(op: Any, made: list[torch.Tensor], args: Any, kwargs: Any) -> No
         tensor.copy_(value)
 
 
-class _Functions(TorchFunctionMode):
-    """What torch does on a CPU without an operation."""
+_ACTS: Final = {"tolist": "read", "numpy": "read", "cpu": "read", "pin_memory": "pin", "new_tensor": "send"}
 
-    ACTS: Final = {
-        torch.Tensor.tolist: "read", torch.Tensor.numpy: "read", torch.Tensor.cpu: "read", torch.Tensor.pin_memory: "pin",
-        torch.Tensor.new_tensor: "send",
-    }  # fmt: skip
 
-    def __init__(self, cuda: StrictCuda) -> None:
-        super().__init__()
-        self.cuda = cuda
+def _asks(cuda: StrictCuda, name: str, act: str) -> Callable[..., Any]:
+    """A method of tensors that does on a CPU without an operation what it does on CUDA, for all threads."""
+    method = getattr(torch.Tensor, name)
 
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        act, graph = self.ACTS.get(func), self.cuda.state.capture
-        if act is not None and not (graph is not None and _address(args[0]) in graph.on_host):
-            self.cuda.ask(act)
-        return args[0] if act == "pin" else func(*args, **(kwargs or {}))
+    @wraps(method)
+    def asked(x: torch.Tensor, *args: Any, **kwargs: Any) -> Any:
+        if (graph := cuda.state.capture) is None or _address(x) not in graph.on_host:
+            cuda.ask(act)
+        return x if act == "pin" else method(x, *args, **kwargs)
+
+    return asked
 
 
 class _Generator:
@@ -250,10 +246,7 @@ class _Elsewhere:
         def call(*args: Any, **kwargs: Any) -> Any:
             if threading.get_ident() == self._ident:
                 return function(*args, **kwargs)
-            modes = [
-                *_get_current_function_mode_stack(),
-                *_get_current_dispatch_mode_stack(),
-            ]  # autograd takes these along
+            modes = _get_current_dispatch_mode_stack()  # autograd takes these along, and no modes of functions
             return self._thread.submit(self._within, modes, partial(function, *args, **kwargs)).result()
 
         return call
@@ -340,6 +333,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
             "set_sync_debug_mode": cuda.set_sync_debug_mode,
             "default_generators": (_Generator(state),),
         },
+        torch.Tensor: {name: _asks(cuda, name, act) for name, act in _ACTS.items()},
         torch._C: {"_cuda_endAllocateToPool": cuda.end_allocate, "_cuda_releasePool": lambda device, pool: None},
         wp: {
             "init": initialises, "stream_from_torch": warp_stream, "capture_begin": warp_begins, "capture_end": warp_ends,
@@ -362,5 +356,5 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     for owner, values in patches.items():
         for name, value in values.items():
             monkeypatch.setattr(owner, name, value)
-    with contextlib.closing(autograd), _Functions(cuda), _Operations(cuda):
+    with contextlib.closing(autograd), _Operations(cuda):
         yield cuda

@@ -9,6 +9,7 @@ from jaxtyping import TypeCheckError
 from clear_strategies.geometry.projection import intrinsics
 from rasterizers import rasterization, replayed_drawing
 from rasterizers.recording import Recording
+from rasterizers.replays import write
 from tests.helpers import toy
 from tests.helpers.backends import needs
 from tests.helpers.strict_cuda import Stream
@@ -221,3 +222,12 @@ def test_each_thread_has_drawings_of_its_own(recorded_on, replays):
         thread.join()
     for one in found:
         require_same(one, expected)
+
+
+def test_what_work_is_given_is_written_by_one_kernel_for_each_type():
+    zeros = [torch.zeros(n, dtype=kind) for kind in (torch.float32, torch.uint8) for n in (2, 3, 4)]
+    own, given = [*zeros, None, torch.zeros(2, 3)], [*map(torch.ones_like, zeros), None, torch.ones(3, 2).T]
+    with toy.Operations() as done:
+        write(own, given)
+    assert done.count == {"_foreach_copy_": 2, "copy_": 1}
+    assert all(bool(x.all()) for x in own if x is not None)
