@@ -125,17 +125,18 @@ def _require_detail(detail: Tensor | None, leaves_of_lr: Sequence[Tensor], hr: S
 def _require_view(conductor: Conductor, view: View, **shots: Shot | None) -> None:
     """A pose that is that of no view, e.g. since the host optimizes it, is taken."""
 
-    def has_pose(camera: Camera, of: View) -> bool:
-        if camera.world_to_camera is of.lr.camera.world_to_camera:  # nothing is read from the device
-            return True
-        a, b = (c.world_to_camera.detach().double().cpu() for c in (camera, of.lr.camera))
-        return torch.allclose(a, b, rtol=SAME_POSE, atol=SAME_POSE)
+    def with_pose(camera: Camera, views: Sequence[View]) -> list[View]:
+        if not views or camera.world_to_camera is views[0].lr.camera.world_to_camera:  # nothing is read from the device
+            return [*views[:1]]
+        poses = torch.stack([v.lr.camera.world_to_camera.detach() for v in views]).double().cpu()
+        same = torch.isclose(camera.world_to_camera.detach().double().cpu(), poses, rtol=SAME_POSE, atol=SAME_POSE)
+        return [v for v, is_same in zip(views, same.flatten(1).all(1).tolist(), strict=True) if is_same]
 
     for name, shot in shots.items():
         for camera in () if shot is None else cameras_of(shot.image):
-            if not has_pose(camera, view) and (drawn := [v.name for v in conductor.views if has_pose(camera, v)]):
+            if not with_pose(camera, [view]) and (drawn := with_pose(camera, conductor.views)):
                 raise ValueError(
-                    f"{name} must be drawn by the camera of its view {view.name}, got that of {drawn[0]}. Pass its view."
+                    f"{name} must be drawn by the camera of its view {view.name}, got that of {drawn[0].name}. Pass its view."
                 )
 
 
