@@ -92,7 +92,9 @@ def _parameters(step: Callable[..., Any]) -> frozenset[str]:
 def _step(optimizer: torch.optim.Optimizer, rows: Tensor) -> None:
     """One step of all rows. An Adam of visible Gaussians takes which move, 3DGS's SparseGaussianAdam also how many there are."""
     parameters = _parameters(type(optimizer).step)
-    known: dict[str, Any] = {"N": len(rows)} if "N" in parameters else {}
+    known: dict[str, Any] = {}
     if "visibility" in parameters:
         known["visibility"] = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
+    if "N" in parameters:
+        known["N"] = len(rows)
     optimizer.step(**known)
