@@ -11,17 +11,17 @@ import math
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cache, lru_cache
+from functools import cache
 from itertools import pairwise
 from struct import Struct
 from typing import Any, Final
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from rasterizers.interface import BackendUnavailable, Color
+from rasterizers.interface import BackendUnavailable
 from rasterizers.recording import running, warp_stream
+from rasterizers.sending import sent
 
 
 def require_warp(what: str, device: str, otherwise: str) -> None:
@@ -256,17 +256,6 @@ def struct(kind: Any, rows: Mapping[str, Tensor | None], **values: Any) -> Any:
 def on_device(structure: Any, device: torch.device) -> Tensor:
     """A structure without arrays as an array of one, in a tensor of its bytes."""
     return sent(torch.frombuffer(bytearray(structure), dtype=torch.uint8)[None], device)
-
-
-def sent(numbers: Tensor, device: torch.device) -> Tensor:
-    """A small tensor on the device; the host does not wait for it."""
-    return numbers.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else numbers
-
-
-@lru_cache(maxsize=64)
-def color_on(color: Color, device: torch.device, dtype: torch.dtype = torch.float32) -> Float[Tensor, "1 3"]:
-    """A colour on the device, to read; the host does not wait for it."""
-    return sent(torch.tensor([color], dtype=dtype, device="cpu"), device)
 
 
 _MOST_STRUCTURES: Final = 1024

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from rasterizers.interface import Camera, Color
-from rasterizers.warp_runtime import color_on
+from rasterizers.sending import color_on
 
 SMALLEST: Final = 12
 """Pixels on each side of what can be scored: GMSD halves the image, and SSIM needs room for its window."""

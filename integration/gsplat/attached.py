@@ -41,7 +41,7 @@ from rasterizers.ahead import drawing_ahead
 from rasterizers.as_gsplat import rasterizer_of
 from rasterizers.interface import BackendUnavailable, Camera, Rasterizer
 from rasterizers.modes import uncompiled
-from rasterizers.warp_runtime import color_on
+from rasterizers.sending import color_on
 
 _log = logging.getLogger(__name__)
 

@@ -27,7 +27,7 @@ from integration.views import SuperResolve, sr_source
 from rasterizers.autograd import collected_drawings
 from rasterizers.interface import Camera
 from rasterizers.modes import uncompiled
-from rasterizers.warp_runtime import color_on
+from rasterizers.sending import color_on
 
 _log = logging.getLogger(__name__)
 

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from rasterizers.checks import Backend, require_device
 from rasterizers.interface import Camera, Color, Traits
-from rasterizers.warp_runtime import color_on, require_warp
+from rasterizers.sending import color_on
+from rasterizers.warp_runtime import require_warp
 
 TILE: Final = 8
 """Edge of the tiles that Gaussians are listed for, px."""

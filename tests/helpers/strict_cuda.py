@@ -272,7 +272,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     from clear_strategies.kernels import native, reconcile
     from clear_strategies.kernels.per_gaussian import dispatch
     from clear_strategies.kernels.reconcile import warp as warp_merge
-    from rasterizers import recording, replayed_drawing, replays, warp_runtime
+    from rasterizers import recording, replayed_drawing, replays, sending, warp_runtime
     from rasterizers.warp_backend import frame
 
     cuda, autograd, loaded = StrictCuda(), _Elsewhere(), set[Any]()
@@ -351,6 +351,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         reconcile: {"_for_device": lambda device: warp_merge},
         rasterizers.native: {"empty": on_no_cpu},
         frame: {"DEFERRED_COUNTS": {"cpu": True}},
+        sending: {"sent": sends},
         warp_runtime: {"sent": sends, "_kept": warp_runtime._Kept()},
     }  # fmt: skip
     for owner, values in patches.items():
