@@ -21,6 +21,7 @@ from clear_strategies.jobs import exit_codes
 def main() -> None:
     """The command line: a subcommand, or Hydra's."""
     atexit.register(gc.freeze)  # else Python looks through all of torch's objects before it ends, for 0.3 s
+    atexit.register(signals.handle, signal.SIG_DFL)  # else one more Ctrl-C shows a traceback of Python's own end
     logging.captureWarnings(True)  # of libraries: they are for run.log
     console.steady()
     signals.handle(signals.stop)  # else the system ends us at once, and joblib's workers go on without us
@@ -33,8 +34,6 @@ def main() -> None:
             raise
         sys.stderr.write(f"{ending.message}\n")  # logging is set up for jobs only
         sys.exit(ending.code)
-    finally:
-        signals.handle(signal.SIG_DFL)  # else one more Ctrl-C shows a traceback of Python's own end
 
 
 if __name__ == "__main__":

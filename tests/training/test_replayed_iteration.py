@@ -495,7 +495,7 @@ def fails(*_: object) -> None:
     raise ValueError("of no kind that is expected\nand a second line")
 
 
-@pytest.mark.parametrize("fault", [torch.Tensor.tolist, fails], ids=["reads numbers", "an error of another kind"])
+@pytest.mark.parametrize("fault", [lambda x: x.tolist(), fails], ids=["reads numbers", "an error of another kind"])
 def test_what_cannot_be_recorded_is_live_from_then_on_and_one_line_says_why(fault, monkeypatch, caplog):
     """tests/rasterizers/test_recording.py has everything that cannot be recorded."""
     learn = loop.learn
