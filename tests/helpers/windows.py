@@ -18,6 +18,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Iterator
+from contextlib import suppress
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
@@ -194,10 +195,8 @@ def _held() -> Iterator[str]:
     """The files that this process and those that it has started hold open, or map."""
     tasks = Path("/proc/self/task").glob("*/children")
     for pid in ("self", *(child for task in tasks for child in task.read_text(encoding="utf-8").split())):
-        for entry in os.scandir(f"/proc/{pid}/fd"):
-            try:
-                if stat.S_ISREG(entry.stat().st_mode):
-                    yield str(Path(entry.path).readlink())
-            except OSError:  # closed meanwhile
-                continue
+        for link in Path(f"/proc/{pid}/fd").glob("*"):
+            with suppress(OSError):  # closed or ended meanwhile
+                if stat.S_ISREG(link.stat().st_mode):
+                    yield str(link.readlink())
     yield from re.findall(r" (/.*)$", Path("/proc/self/maps").read_text(encoding="utf-8"), re.MULTILINE)
