@@ -193,8 +193,11 @@ def _require_free(path: str | None) -> None:
 
 def _held() -> Iterator[str]:
     """The files that this process and those that it has started hold open, or map."""
-    tasks = Path("/proc/self/task").glob("*/children")
-    for pid in ("self", *(child for task in tasks for child in task.read_text(encoding="utf-8").split())):
+    pids = ["self"]
+    for task in Path("/proc/self/task").glob("*/children"):
+        with suppress(OSError):  # the thread has ended meanwhile
+            pids += task.read_text(encoding="utf-8").split()
+    for pid in pids:
         for link in Path(f"/proc/{pid}/fd").glob("*"):
             with suppress(OSError):  # closed or ended meanwhile
                 if stat.S_ISREG(link.stat().st_mode):
