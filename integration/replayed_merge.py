@@ -19,8 +19,8 @@ from clear_strategies.core.step import Step
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Merged
 from clear_strategies.merging.recorded_work import RecordedWork, replays_on, that_merge
+from rasterizers.guards import iteration, unread
 from rasterizers.replays import Kind, write
-from rasterizers.told import iteration, unread
 
 _FINITE: Final = "finite"
 _CONFLICT: Final = "conflict of "

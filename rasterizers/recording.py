@@ -35,7 +35,7 @@ class Recording(Generic[T]):
 
     Attributes:
         result: what `work` returned. Its tensors receive new values in every replay.
-        guards: conditions on the iteration under which a replay holds, see `rasterizers.told`.
+        guards: conditions on the iteration under which a replay holds, see `rasterizers.guards`.
 
     Raises:
         RuntimeError: `work` does what cannot be recorded. Live work can go on: the capture has been ended, and of the part

@@ -24,18 +24,18 @@ from clear_strategies.errors import StrategyConflict
 from clear_strategies.kernels import per_gaussian, reconcile
 from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.detail import DetailRates
+from clear_strategies.merging.guarded_view import guarded
 from clear_strategies.merging.iteration import HrSide, LossWeights, Merged, Stepper, Update, require_finite_parts
 from clear_strategies.merging.logs import IterationLogs
 from clear_strategies.merging.objective import Losses, Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
-from clear_strategies.merging.told import told
 from clear_strategies.strategies import answers
 from clear_strategies.strategies.base import ScreenGradients, Strategy, by_class, misspelled, overrides
+from rasterizers.guards import iteration
 from rasterizers.interface import Color
 from rasterizers.modes import apart_from_the_loop
 from rasterizers.native import empty_for
 from rasterizers.recording import running
-from rasterizers.told import iteration
 
 _log = logging.getLogger(__name__)
 
@@ -450,7 +450,7 @@ class Conductor:
         return photo if is_so else photo.over(self.background(t), behind)
 
     def _told(self, view: View) -> View:
-        return told(view, over_changing=self.owner("background") is not None)
+        return guarded(view, over_changing=self.owner("background") is not None)
 
     def _backward_hr(
         self,

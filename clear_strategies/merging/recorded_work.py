@@ -17,9 +17,9 @@ from clear_strategies.core.deferred import Number
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.strategies.base import Strategy, describes, overrides
+from rasterizers.guards import Guarded
 from rasterizers.recording import Recording
 from rasterizers.replays import Replays, can_record
-from rasterizers.told import Guarded
 
 G = TypeVar("G")
 T = TypeVar("T")

@@ -319,7 +319,7 @@ NO_GUARD = (
 
 @pytest.mark.parametrize("reads", NO_GUARD)
 def test_a_strategy_that_reads_the_iteration_or_the_view_is_live(reads, caplog):
-    """tests/rasterizers/test_told.py has more ways to read them."""
+    """tests/rasterizers/test_guards.py has more ways to read them."""
     replayed = both(lambda: start(reconciles=ByTime(reads), density=False, rises_at=2), 16)
     assert live_in(replayed)[FAILED] >= 2
     assert "must not read the" in caplog.text or "decides by the iteration" in caplog.text

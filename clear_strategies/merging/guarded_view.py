@@ -1,4 +1,4 @@
-"""The view as strategies are told it in work that may be recorded."""
+"""The view as strategies see it in work that may be recorded."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from dataclasses import replace
 from typing import Any
 
 from clear_strategies.core.view import Photo, View
+from rasterizers.guards import unread
 from rasterizers.recording import running
-from rasterizers.told import unread
 
 
-def told(view: View, *, over_changing: bool) -> View:
+def guarded(view: View, *, over_changing: bool) -> View:
     """The view. In a recording its images alone may be read, which are copied before a replay.
 
     Args:

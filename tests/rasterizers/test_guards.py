@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from rasterizers.told import Guarded, Unread, iteration, unread
+from rasterizers.guards import Guarded, Unread, iteration, unread
 
 READS = {
     "as a number": float,

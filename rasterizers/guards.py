@@ -1,4 +1,4 @@
-"""What recorded work is told and a replay would be told otherwise: the iteration, and a view's name and camera.
+"""What another replay has otherwise, as recorded work is given it: the iteration, and a view's name and camera.
 
 A replay repeats what Python has decided by them. Decisions by the iteration become guards of the recording, which does not hold
 where one of them would be another one. Anything else that is read of them ends the recording by an error.
