@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 from collections.abc import Callable
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -151,8 +152,13 @@ def started(*arguments: str, disk: Path, until: Callable[[], bool]) -> subproces
     command, env = windows.program(*arguments, disk=disk)
     with (disk / "said").open("w") as said:
         process = subprocess.Popen(command, cwd=disk, env=env, stdout=said, stderr=said, start_new_session=True)
-    wait_for(lambda: until() or process.poll() is not None)
-    assert process.poll() is None, (disk / "said").read_text()
+    try:
+        wait_for(lambda: until() or process.poll() is not None)
+        assert process.poll() is None, (disk / "said").read_text()
+    except AssertionError:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        raise
     return process
 
 
