@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -255,25 +255,26 @@ def _trained(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name: p for name, p in params.items() if p.requires_grad and name != "detail"}
 
 
-def leaves_of(x: Tensor) -> list[Tensor]:
-    """The leaves that a tensor depends on."""
-    return [leaf for node in _graph(x) if (leaf := getattr(node, "variable", None)) is not None]
+class Graph(NamedTuple):
+    """What a tensor was computed from: the leaves, and the cameras by which this package's rasterizers drew."""
+
+    leaves: list[Tensor]
+    cameras: list[Camera]
 
 
-def cameras_of(x: Tensor) -> list[Camera]:
-    """Those by which this package's rasterizers drew what a tensor depends on."""
-    return [drawn.camera for node in _graph(x) if isinstance(drawn := getattr(node, "rendered", None), Rendered)]
-
-
-def _graph(x: Tensor) -> Iterator[Any]:
-    """The nodes behind a tensor."""
-    seen, nodes = set[Any](), [x.grad_fn]
+def graph_of(x: Tensor) -> Graph:
+    """The leaves and cameras behind a tensor, in one walk."""
+    graph, seen, nodes = Graph([], []), set[Any](), [x.grad_fn]
     while nodes:
         if (node := nodes.pop()) is None or node in seen:
             continue
         seen.add(node)
-        yield node
+        if (leaf := getattr(node, "variable", None)) is not None:
+            graph.leaves.append(leaf)
+        elif isinstance(drawn := getattr(node, "rendered", None), Rendered):
+            graph.cameras.append(drawn.camera)
         nodes += [before for before, _ in node.next_functions]
+    return graph
 
 
 Target = Literal["lr", "hr"] | Camera

@@ -19,7 +19,7 @@ from clear_strategies.core.view import ExtraView, View
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Update
 from clear_strategies.strategies.base import overrides
-from integration.autograd_shot import AutogradShot, cameras_of, leaves_of
+from integration.autograd_shot import AutogradShot, Graph, graph_of
 from integration.densification import ScoreScaler, score_for_host
 from integration.views import SAME_POSE
 from rasterizers.interface import Camera
@@ -53,9 +53,9 @@ def joint_loss(
     """
     values = {name: p.detach() for name, p in params.items()}
     _require_rows(values)
-    leaves_of_lr = leaves_of(lr.image)
-    _require_detail(params.get("detail"), leaves_of_lr, hr)
-    _require_view(conductor, view, lr=lr, hr=hr)
+    of_lr, of_hr = graph_of(lr.image), graph_of(hr.image) if hr is not None and hr.image.grad_fn is not None else None
+    _require_detail(params.get("detail"), of_lr, of_hr)
+    _require_view(conductor, view, lr=of_lr, hr=of_hr)
     _require_started(conductor)
     update = conductor.update(values, lr, hr, view, t)
     objective, λ = conductor.objective, conductor.objective.lambda_hr(t)
@@ -69,7 +69,7 @@ def joint_loss(
             f"the renderings must name their parameters as params does; they have no gradient of {', '.join(lost)}."
         )
     trained = [(p, merged[name].to(p)) for name, p in params.items() if name in merged]
-    leaves, gradients = zip(*trained, *_others(conductor, params, lr, leaves_of_lr, view, t), strict=True)
+    leaves, gradients = zip(*trained, *_others(conductor, params, lr, of_lr.leaves, view, t), strict=True)
 
     loss = with_gradients(value, gradients, *leaves)
     if scaler is not None and isinstance(lr, AutogradShot):
@@ -111,18 +111,18 @@ def _require_rows(params: Mapping[str, Tensor]) -> None:
             )
 
 
-def _require_detail(detail: Tensor | None, leaves_of_lr: Sequence[Tensor], hr: Shot | None) -> None:
+def _require_detail(detail: Tensor | None, lr: Graph, hr: Graph | None) -> None:
     if detail is None or not detail.requires_grad:
         return
-    if any(leaf is detail for leaf in leaves_of_lr):
+    if any(leaf is detail for leaf in lr.leaves):
         raise ValueError("lr is drawn with f_det, which renders at HR alone show. Draw it without params['detail'].")
-    if hr is not None and hr.image.grad_fn is not None and not any(leaf is detail for leaf in leaves_of(hr.image)):
+    if hr is not None and not any(leaf is detail for leaf in hr.leaves):
         raise ValueError(
             "hr is drawn without f_det, which would learn nothing. Draw it with an offset of the colours by params['detail']."
         )
 
 
-def _require_view(conductor: Conductor, view: View, **shots: Shot | None) -> None:
+def _require_view(conductor: Conductor, view: View, **graphs: Graph | None) -> None:
     """A pose that is that of no view, e.g. since the host optimizes it, is taken."""
 
     def with_pose(camera: Camera, views: Sequence[View]) -> list[View]:
@@ -132,8 +132,8 @@ def _require_view(conductor: Conductor, view: View, **shots: Shot | None) -> Non
         same = torch.isclose(camera.world_to_camera.detach().double().cpu(), poses, rtol=SAME_POSE, atol=SAME_POSE)
         return [v for v, is_same in zip(views, same.flatten(1).all(1).tolist(), strict=True) if is_same]
 
-    for name, shot in shots.items():
-        for camera in () if shot is None else cameras_of(shot.image):
+    for name, graph in graphs.items():
+        for camera in () if graph is None else graph.cameras:
             if not with_pose(camera, [view]) and (drawn := with_pose(camera, conductor.views)):
                 raise ValueError(
                     f"{name} must be drawn by the camera of its view {view.name}, got that of {drawn[0].name}. Pass its view."
