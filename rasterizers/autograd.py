@@ -1,8 +1,8 @@
 """Rasterizers as differentiable torch functions.
 
 `draw` returns a rendering that is part of the autograd graph; `as_gsplat.rasterization` does so with gsplat's signature. Each
-backward pass handles one cotangent; `Rendering.vjp` handles several, and `collected_drawings` gives it to
-callers of code that draws.
+backward pass handles one cotangent; `Rendering.vjp` handles several, and `collected_drawings` gives it
+to callers of code that draws.
 """
 
 from __future__ import annotations
