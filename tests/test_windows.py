@@ -67,6 +67,21 @@ def test_the_stand_in_refuses_what_windows_refuses(tmp_path):
     assert result.stdout.split() == [*REFUSED.values(), *["-"] * len(ALLOWED)]
 
 
+def test_a_program_that_begins_is_given_no_file_that_is_open(tmp_path):
+    code = (
+        "import subprocess\n"
+        "from concurrent.futures import ThreadPoolExecutor\n"
+        "from pathlib import Path\n"
+        "from clear_strategies import files\n"
+        "with ThreadPoolExecutor(1) as thread:\n"
+        "    programs = thread.submit(lambda: [subprocess.run(['true']) for _ in range(100)])\n"
+        "    while not programs.done():\n"
+        "        files.write_bytes(Path('written'), b'.')\n"
+    )
+    result = windows.run("-c", code, disk=tmp_path)
+    assert result.returncode == 0, result.stderr
+
+
 RUNS = """
 import signal
 from clear_strategies import hydra_app

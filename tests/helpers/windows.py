@@ -193,13 +193,16 @@ def _require_free(path: str | None) -> None:
 
 def _held() -> Iterator[str]:
     """The files that this process and those that it has started hold open, or map."""
-    pids = ["self"]
+    pids, own = ["self"], Path("/proc/self/cmdline").read_bytes()
     for task in Path("/proc/self/task").glob("*/children"):
         with suppress(OSError):  # the thread has ended meanwhile
             pids += task.read_text(encoding="utf-8").split()
     for pid in pids:
-        for link in Path(f"/proc/{pid}/fd").glob("*"):
-            with suppress(OSError):  # closed or ended meanwhile
-                if stat.S_ISREG(link.stat().st_mode):
-                    yield str(link.readlink())
+        with suppress(OSError):  # ended meanwhile
+            if pid != "self" and Path(f"/proc/{pid}/cmdline").read_bytes() in (b"", own):
+                continue  # between fork and exec it has this process's files, of which a program of Windows is given none
+            for link in Path(f"/proc/{pid}/fd").glob("*"):
+                with suppress(OSError):  # closed meanwhile
+                    if stat.S_ISREG(link.stat().st_mode):
+                        yield str(link.readlink())
     yield from re.findall(r" (/.*)$", Path("/proc/self/maps").read_text(encoding="utf-8"), re.MULTILINE)
