@@ -217,13 +217,16 @@ def test_a_job_that_submitit_preempts_is_handed_in_again_and_resumed(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("stop", [signal.SIGTERM, signal.SIGHUP])
 def test_a_stopped_joblib_sweep_saves_its_running_jobs_begins_no_other_and_leaves_no_worker(stop, tmp_path):
-    sweep = [*SWEEP, *JOBLIB, "+strategy=baseline,gco,p2g", "fit.iterations=100_000", "fit.checkpoint_every=0"]
+    sweep = [*SWEEP, *JOBLIB, "+strategy=baseline,gco,p2g", "fit.iterations=100_000", "fit.checkpoint_every=10"]
     process = started(*DOOR, *sweep, cwd=tmp_path, said=tmp_path / "said", session=True)
-    wait_for(lambda: all((tmp_path / "all" / job / "cameras.json").exists() for job in ("0", "1")))
+    running = [tmp_path / "all" / job for job in ("0", "1")]
+    wait_for(lambda: all(checkpoint.saved(folder / "checkpoints") for folder in running))  # they train
     process.send_signal(stop)
     assert process.wait() == 128 + stop, (tmp_path / "said").read_text()
-    saved = [bool(checkpoint.saved(tmp_path / "all" / job / "checkpoints")) for job in ("0", "1")]
-    assert (saved, (tmp_path / "all" / "2").exists()) == ([True, True], False)
+    for folder in running:
+        told = rf"stopped by {stop.name} before iteration (\d+)\. Go on with fit\.resume=\S+/step_0*\1\.safetensors\."
+        assert re.search(told, (folder / "run.log").read_text())
+    assert not (tmp_path / "all" / "2").exists()
 
     def gone() -> bool:
         try:
@@ -232,7 +235,7 @@ def test_a_stopped_joblib_sweep_saves_its_running_jobs_begins_no_other_and_leave
             return True
         return False
 
-    wait_for(gone, 30, "the workers to end")
+    wait_for(gone, what="the workers to end")
     assert "Traceback" not in (tmp_path / "said").read_text()
 
 
