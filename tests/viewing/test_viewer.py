@@ -9,6 +9,7 @@ import time
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from urllib.request import urlopen
 
 import msgspec
@@ -29,6 +30,7 @@ from tests.helpers import toy, wall
 from tests.helpers.command_line import TINY, run
 
 SERVER = "clear_strategies.viewing.server"
+PATIENCE = 120  # seconds, on a machine that is busy
 CAMERA = toy.camera(0.2)
 POSE = np.linalg.inv(CAMERA.world_to_camera.double().numpy())
 FOV = 2 * math.atan(CAMERA.height / 2 / CAMERA.fy)
@@ -111,8 +113,8 @@ def test_a_viewer_is_there_while_a_run_trains_and_draws_between_two_iterations_a
     viewers, drawn = [], threading.Event()
     opened = server.SplatViewer
 
-    def remembered(*arguments, **options):
-        viewers.append(opened(*arguments, **options))
+    def remembered(*arguments, **options):  # at a port that no other test's viewer takes once it is free
+        viewers.append(opened(*arguments, **options, port=0))
         return viewers[-1]
 
     monkeypatch.setattr(server, "SplatViewer", remembered)
@@ -124,16 +126,16 @@ def test_a_viewer_is_there_while_a_run_trains_and_draws_between_two_iterations_a
 
     with server.watched(splat.painter, numbered(splat), "toy") as after_step:
         after_step(1)
-        assert b"<html" in urlopen(viewers[0].address, timeout=20).read()  # noqa: S310 - our own address
+        assert b"<html" in urlopen(viewers[0].address, timeout=PATIENCE).read()  # noqa: S310 - our own address
         threading.Thread(target=draw).start()
         assert not drawn.wait(0.2)  # an iteration is under way
         monkeypatch.setattr(viewers[0].server, "get_clients", lambda: {0: None})
-        monkeypatch.setattr(server, "_TURN", 0.5)
-        after_step(2)
+        with monkeypatch.context() as patched:  # its turn lasts until it has drawn
+            patched.setattr(server, "time", SimpleNamespace(monotonic=time.monotonic, sleep=lambda _: drawn.wait(60)))
+            after_step(2)
         assert drawn.is_set()
-        viewers[0].state = "paused"
+        viewers[0].state, began = "paused", time.monotonic()
         threading.Timer(0.3, lambda: setattr(viewers[0], "state", "training")).start()
-        began = time.monotonic()
         after_step(3)
         assert time.monotonic() - began > 0.25
         viewers[0].state = "paused"
@@ -142,7 +144,7 @@ def test_a_viewer_is_there_while_a_run_trains_and_draws_between_two_iterations_a
             after_step(4)  # a paused run is saved, too
         assert pending == [signal.SIGTERM]
     with pytest.raises(OSError, match="refused"):
-        urlopen(viewers[0].address, timeout=20)  # noqa: S310
+        urlopen(viewers[0].address, timeout=PATIENCE)  # noqa: S310
 
 
 class Browser:
@@ -172,10 +174,10 @@ class Browser:
     def slide(self, handle, value) -> None:
         self.send("GuiUpdateMessage", uuid=handle._impl.uuid, updates={"value": value})
 
-    def train_until(self, condition, seconds: float = 20) -> None:
+    def train_until(self, condition) -> None:
         began = time.monotonic()
         while not condition():
-            assert time.monotonic() < began + seconds, "the viewer has stopped"
+            assert time.monotonic() < began + PATIENCE, "the viewer has stopped"
             self.after_step(next(self.steps))
             time.sleep(0.005)
 
