@@ -35,6 +35,11 @@ def pytest_collection_finish() -> None:
     sys.dont_write_bytecode = True
 
 
+def pytest_runtest_setup() -> None:
+    """What a test draws without a generator does not depend on the tests before it, which are others in each worker."""
+    torch.manual_seed(0)
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The real scenes beside a developer's checkout; tests that need them skip where they are absent."""

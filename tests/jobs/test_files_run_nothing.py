@@ -267,6 +267,7 @@ def test_a_run_with_classes_that_the_users_command_names_is_resumed(tmp_path, ca
         resume.restore(start(()), SCENE, checkpoint.load(tmp_path), tmp_path, other)
 
 
-def test_hydras_flag_that_unpickles_a_file_is_refused(tmp_path) -> None:
+def test_hydras_flag_that_unpickles_a_file_is_refused(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")  # `main` sets it: undone afterwards
     with pytest.raises(SettingError, match="--experimental-rerun: there is no such flag"):
         main([f"--experimental-rerun={tmp_path}/config.pickle"])

@@ -15,6 +15,7 @@ import torch
 from hydra.types import RunMode
 from omegaconf import OmegaConf, open_dict
 
+from clear_strategies import signals
 from clear_strategies.files import LOCK, HeldError, hold
 from clear_strategies.hydra_app import FAILED, SweepCallback
 from clear_strategies.jobs import device, sweep
@@ -79,7 +80,8 @@ LLFF = ["-m", "data=llff", "+strategy=clear,gco"]
         (LLFF, "data.path: is needed and missing. Add data.path=…."),
         ([*LLFF, "data.path=gone/fern,gone/horns"], "gone: data.path: is not there: correct the path"),
         (["-m", "+strategy=clear,gco", "prior=onnx", "prior.path=gone"], "gone: prior.path: is not there: correct the path"),
-        (["experiment=table1", "data.root=gone"], "gone: data.path: is not there: correct the path"),
+        (["experiment=table1", "data.root=gone", "+method=srgs", "fit.seed=0"],
+         "gone: data.path: is not there: correct the path"),
     ],
 )  # fmt: skip
 def test_a_sweep_whose_jobs_all_lack_the_same_is_refused_once_before_any_of_them_starts(sweep, reason, tmp_path):
@@ -278,6 +280,7 @@ def test_a_stopped_sweep_composes_none_of_its_remaining_jobs(monkeypatch):
 
         return run
 
+    monkeypatch.setattr(launcher, "configure_log", lambda *_: None)  # of this process
     monkeypatch.setattr(launcher, "Parallel", parallel)
     monkeypatch.setattr(sweep.multiprocessing, "active_children", lambda: [SimpleNamespace(pid=2**22 + 1)])
     monkeypatch.setattr(sweep.signal, "signal", lambda *_: None)
@@ -306,7 +309,8 @@ def test_a_clusters_announcement_saves_before_its_handler_acts(tmp_path):
     assert process.wait() == 91, (tmp_path / "said").read_text()
 
 
-def test_failed_jobs_are_told_where_the_report_cannot_be_written(tmp_path, caplog):
+def test_failed_jobs_are_told_where_the_report_cannot_be_written(tmp_path, caplog, monkeypatch):
+    monkeypatch.setattr(signals, "handle", lambda _: None)  # else this process keeps the handlers of a sweep
     callback, config = (
         SweepCallback(),
         OmegaConf.create(
