@@ -65,7 +65,7 @@ def test_what_is_drawn_inside_is_collected_and_ends_alone(inside):
 
 
 def test_a_thread_collects_its_own_drawings():
-    splats, both, seen = leaves(scene(20)), threading.Barrier(2), []
+    splats, both, seen = leaves(scene(20)), threading.Barrier(2, timeout=60), []
 
     def work():
         with autograd.collected_drawings() as drawings:
