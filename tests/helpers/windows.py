@@ -59,7 +59,7 @@ def program(*arguments: str, disk: Path) -> tuple[list[str], dict[str, str]]:
 def run(*arguments: str, disk: Path) -> subprocess.CompletedProcess[str]:
     """The program to its end."""
     command, env = program(*arguments, disk=disk)
-    return subprocess.run(command, check=False, cwd=disk, env=env, capture_output=True, encoding="cp1252", timeout=120)
+    return subprocess.run(command, check=False, cwd=disk, env=env, capture_output=True, encoding="cp1252", timeout=600)
 
 
 def begin() -> None:
