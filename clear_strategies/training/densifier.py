@@ -46,7 +46,8 @@ class Densifier:
             field: its rows change by `take(parents)`, its parameters in place, as `field.opacities.data`.
             optimizer: its rows change by `take(parents, fresh)`; fresh rows start without momentum.
             resized: called with parents[M] once field and optimizer have been gathered; row i of everything else per
-                Gaussian now comes from row parents[i].
+                Gaussian now comes from row parents[i]. A densifier that moves a Gaussian to another gathers, too, though their
+                number stays: what strategies and optimizer store follows the rows.
         """
         raise NotImplementedError
 

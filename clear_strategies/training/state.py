@@ -181,22 +181,43 @@ class TrainState:
         """Let the densifier do what is due at t; returns whether the structure changed.
 
         Raises:
-            AnswerError: the densifier did not tell what became of which Gaussian.
+            AnswerError: the densifier did not tell what became of which Gaussian. That one row has become another is seen on a
+                CPU alone.
         """
         n, name, calls = len(self.field), f"{type(self.density).__name__}.step()", list[int]()
+        colours = self.field.sh0.data.clone() if self.device.type == "cpu" else None  # by which a Gaussian is known
 
         def resized(parents: Int[Tensor, " M"]) -> None:
+            nonlocal colours
             calls.append(len(parents))
             if len(parents) != len(self.field):
                 rule = f"must call resized(parents) with the {len(self.field):,} rows that the field has then"
                 raise AnswerError(f"{name} {rule}, got {len(parents):,}.")
             self.resized(parents)
+            colours = None if colours is None else colours[parents]
 
         changed = self.density.step(self.field, self.optimizer, self.t, resized)
         if not calls and (changed or len(self.field) != n):
             change = f"a change of structure, here from {n:,} to {len(self.field):,} Gaussians"
             raise AnswerError(f"{name} must call resized(parents) after {change}.")
+        if colours is not None and (moved := self._moved(colours)) is not None:
+            row, parent = moved
+            rule = "must call resized(parents) where it moves Gaussians, too, after gathering field and optimizer by parents"
+            raise AnswerError(f"{name} {rule}: row {row} is now a copy of row {parent}, so parents[{row}] is {parent}.")
         return bool(calls)
+
+    def _moved(self, colours: Float[Tensor, "N 1 3"]) -> tuple[int, int] | None:
+        """A row that has become a copy of another, and that one; None: there is none.
+
+        Args:
+            colours: of the Gaussian that is said to be in each row.
+        """
+        now, quats = self.field.sh0.data, self.field.quats.data
+        if torch.equal(now, colours):
+            return None
+        row = int((now != colours).flatten(1).any(1).nonzero()[0])
+        same = (colours == now[row]).flatten(1).all(1) & (quats == quats[row]).all(1)  # a colour alone may be another's
+        return (row, int(same.nonzero()[0])) if bool(same.any()) else None
 
     def resized(self, parents: Int[Tensor, " M"]) -> None:
         """Gather what strategies keep per Gaussian, and recompute the filter, after a change of structure: row i comes from row
@@ -263,12 +284,11 @@ class TrainState:
             for key, x in rows.items():
                 if x.dtype != here.dtype or tuple(x.shape) != (n, *here.shape[1:]):
                     raise ValueError(f"{key} is {x.dtype} {tuple(x.shape)}, not {here.dtype} {(n, *here.shape[1:])}")
-        statistics = {
-            name: x for name, x in tables.get("density", {}).items() if name in ("score", "ordinary", "count")
-        }
-        per_row = (field["filter_3d"], *statistics.values())
-        if any(tuple(x.shape) != (n,) for x in per_row):
-            raise ValueError(f"filter_3d or a statistic has not one number for each of {n} Gaussians")
+        found = {"filter_3d": field["filter_3d"], **tables.get("density", {})}
+        for name, here in {"filter_3d": self.field.filter_3d, **self.density.state_dict()}.items():
+            shape = (n, *here.shape[1:])
+            if len(here.shape) and len(here) == len(self.field) and tuple(found[name].shape) != shape:
+                raise ValueError(f"{name} is {tuple(found[name].shape)}, not {shape}, a row for each Gaussian")
 
     def require_finite(self) -> None:
         """Raise a DivergedError for the first parameter or moment of Adam that is not finite; reads the device."""
