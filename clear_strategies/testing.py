@@ -9,10 +9,11 @@ Each check raises `ContractError` with what was expected and what was found.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from multiprocessing.reduction import ForkingPickler
-from typing import Any, Final
+from pathlib import Path
+from typing import Any, Final, cast
 
 import torch
 from jaxtyping import Bool, Float
@@ -29,6 +30,11 @@ from clear_strategies.merging.iteration import Update
 from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import WarmupDecay, scaled
 from clear_strategies.strategies.base import Strategy, overrides
+from clear_strategies.training.field import GaussianField
+from clear_strategies.training.mip import MipFilter
+from clear_strategies.training.optim import Adam, LearningRates
+from clear_strategies.training.settings import FitSettings
+from clear_strategies.training.state import TrainState
 from rasterizers.interface import Camera
 from rasterizers.testing import ContractError, require
 
@@ -113,12 +119,14 @@ def check_answers_have_their_shapes(make: Make) -> None:
         update = conductor.update(params, lr, hr, view, t)
         for name, gradient in _grads(update).items():
             require(bool(gradient.isfinite().all()), f"the gradient of {name} is not finite")
-        if update.evidence is not None:
-            for q in (update.evidence.reliability, update.evidence.demand):
+        if (e := update.step.evidence) is not None:
+            for q in (e.reliability, e.demand):
                 require(bool(((q >= 0) & (q <= 1)).all()), "evidence must lie in [0, 1]")
         if (router := conductor.owner("route")) is not None:
             require(bool((torch.as_tensor(router.route(update.step)) >= 0).all()), "route() must give numbers >= 0")
         deferred.read([*update.logs.values()])
+        _without_error("draw", f"at t={t}", conductor.draw, t, params["means"], _enlarged)
+        conductor.extra_views(t)
         memory = {name: p.data_ptr() for name, p in params.items()}
         conductor.after_step(params, update.step)
         for name, p in params.items():
@@ -189,6 +197,18 @@ def check_goes_on_with_another_number_of_gaussians(make: Make) -> None:
         )
 
 
+def check_densifier_takes_everything_along(make: Make) -> None:
+    """A densifier of its own gathers field and optimizer alike and says how, keeps to its cap, is reproducible, and goes on from
+    its `state_dict`.
+    """
+    trace, again = ([*_densified(make)] for _ in range(2))
+    for a, b in zip(trace, again, strict=True):
+        require(torch.equal(a, b), "two runs of a densifier with one seed differ; derive randomness from (seed, t)")
+    for cut in range(2, _STEPS) if trace else ():
+        for a, b in zip(trace, _densified(make, cut), strict=True):
+            require(torch.equal(a, b), f"cut before t={cut}: a densifier's state_dict() does not continue the run")
+
+
 def check_facts_can_be_asked(make: Make) -> None:
     """`summary` and `without_effect` give a text or None; the plan of a run has them."""
     conductor = _conductor(make)
@@ -220,6 +240,7 @@ CHECKS: Final[Sequence[Callable[[Make], None]]] = (
     check_state_is_all_there_is,
     check_state_follows_its_gaussians,
     check_goes_on_with_another_number_of_gaussians,
+    check_densifier_takes_everything_along,
     check_facts_can_be_asked,
     check_can_be_copied,
 )
@@ -293,16 +314,19 @@ def _evidence() -> Evidence:
 
 
 def _conductor(
-    make: Make, *, lambda_hf: float = 0.2, evidence: Evidence | None = None, views: Sequence[View] | None = None
+    make: Make, *, lambda_hf: float = 0.2, evidence: Evidence | None = None, views: Sequence[View] | None = None,
+    others: Sequence[Strategy] = (),
 ) -> Conductor:  # fmt: skip
     """Milestones are compressed, so that every phase falls inside the few steps of a check.
 
     Args:
         evidence: of another strategy, where this one has none. views: of the training, for `on_views`.
+        others: that take part besides.
     """
     objective = Objective(WarmupDecay(start=0, full=1, decay_from=_STEPS, end=_STEPS), lambda_hf)
     strategy = scaled(make(), _STEPS / 2 / 5_000)
-    others = [] if evidence is None or overrides(strategy, "observe") else [_Observes(evidence)]
+    if evidence is not None and not overrides(strategy, "observe"):
+        others = [*others, _Observes(evidence)]
     conductor = Conductor(strategy, *others, objective=objective)
     conductor.on_fit_start(3, seed=11, views=[_situation(0)[2]] if views is None else views)
     return conductor
@@ -323,6 +347,60 @@ def _trace(conductor: Conductor, start: int, stop: int, n: int = _N) -> Any:
             yield from (extra.photo.image, extra.weight)
         conductor.after_step(params, update.step)
         yield from params.values()
+
+
+@dataclass(frozen=True)
+class _Rows(Strategy):
+    """Knows after a change of structure from which row each comes."""
+
+    def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
+        self.state["row"] = torch.arange(float(len(params["means"])))
+
+
+def _densified(make: Make, cut: int = 0) -> Iterator[Tensor]:
+    """All parameters after each iteration of a run that is resumed before t=cut; nothing where the trainer densifies."""
+    state = _begun(make)
+    while state is not None and state.t < _STEPS:
+        if state.t == cut:
+            saved, state = state.checkpoint({}), cast(TrainState, _begun(make))
+            state.restore(saved, Path("checkpoint"))
+        t, field, density, conductor = state.t, state.field, state.density, state.conductor
+        lr, hr, view, _ = _situation(100 + t, len(field))
+        update = conductor.update(field.raw(), lr, hr, view, t)
+        state.optimizer.step(field.raw(), _grads(update))
+        if density.collects(t):
+            _without_error("a densifier's accumulate", f"at t={t}", density.accumulate, update, hr, t)
+        conductor.after_step(field.raw(), update.step)
+        state.optimizer.first["opacities"].copy_(torch.arange(1, len(field) + 1))
+        if conductor.may_densify(t):
+            _without_error("a densifier's step", f"at t={t}", state.restructure)
+        momentum, n = state.optimizer.first["opacities"], len(field)
+        came_from = conductor.state_dict()["_Rows.row"]
+        follows = len(momentum) == n and bool(((momentum == came_from + 1) | (momentum == 0)).all())
+        require(follows, f"a densifier's step must gather the optimizer as the field, by optimizer.take(…), at t={t}")
+        most = n if density.cap is None else max(density.cap, _N)
+        require(n <= most, f"a densifier's cap is {density.cap}, but the field has {n} Gaussians at t={t}")
+        state.advance()
+        yield from (p.clone() for p in field.raw().values())
+
+
+def _begun(make: Make) -> TrainState | None:
+    """A run before its first iteration; None where the strategy brings no densifier."""
+    view, g = _situation(0)[2], torch.Generator().manual_seed(0)
+    conductor = _conductor(make, others=[_Rows()], views=[view])
+    if (owner := conductor.owner("densifier")) is None:
+        return None
+    field = GaussianField(random_params(_N, g))
+    density = _without_error("densifier", "at the start", owner.densifier, field, [view], 11)
+    if density is None:
+        return None
+    optimizer = Adam(field.raw(), LearningRates(), 1.0)
+    return TrainState(field, conductor, optimizer, density, FitSettings(), MipFilter(), (view,))
+
+
+def _enlarged(camera: Camera, factor: int) -> Photo:
+    large = camera.scaled(factor)
+    return Photo(large, torch.full((large.height, large.width, 3), 0.5))
 
 
 def _grads(update: Update) -> Grads:

@@ -9,7 +9,6 @@ from typing import Final
 from clear_strategies.core.view import View
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.strategies.base import overrides
-from clear_strategies.strategies.sr_stage import SRStage
 
 _log = logging.getLogger(__name__)
 _STRETCH: Final = "Make the conductor for the length of the loop: conductor(…, iterations=…)."
@@ -37,12 +36,11 @@ def announce(conductor: Conductor, views: Sequence[View], *, own_background: boo
         _log.info("Skipped: %s.", phrase)
     for hook, reason in {
         "densifier": "keeps its own density control",
+        "draw": "draws no picture for it",
         **({"background": "chooses its background itself"} if own_background else {}),
     }.items():
         for owner in (s for s in conductor.strategies if overrides(s, hook)):
             _log.info("%s has no effect here: the host %s.", type(owner).__name__, reason)
-    for stage in (s for s in conductor.strategies if isinstance(s, SRStage)):
-        _log.info("%s has no effect here: the host draws no picture for it.", type(stage).__name__)
     if not conductor.strategies:
         summed = (
             "both losses are summed, as in the paper's baseline" if conductor.uses_hr else "the host trains as alone"

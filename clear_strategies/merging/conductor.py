@@ -30,9 +30,9 @@ from clear_strategies.merging.logs import IterationLogs
 from clear_strategies.merging.objective import Losses, Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
 from clear_strategies.strategies import answers
-from clear_strategies.strategies.base import ScreenGradients, Strategy, by_class, misspelled, overrides
+from clear_strategies.strategies.base import LAMBDA_HR, ScreenGradients, Strategy, by_class, misspelled, overrides
 from rasterizers.guards import iteration
-from rasterizers.interface import Color
+from rasterizers.interface import Camera, Color
 from rasterizers.modes import apart_from_the_loop
 from rasterizers.native import empty_for
 from rasterizers.recording import running
@@ -100,7 +100,7 @@ class Conductor:
                 self._owner[hook] = owners[0]
         self.regularizers = [s for s in strategies if overrides(s, "regularize")]
         self.showing = [s for s in strategies if overrides(s, "extra_views")]
-        others = ("regularize", "extra_views", "may_densify", "after_step")
+        others = ("regularize", "draw", "extra_views", "may_densify", "after_step")
         for s in strategies:
             if not any(overrides(s, hook) for hook in (*_ONE_ANSWER, "correct", *others)):
                 _log.warning("%s implements no hook; it has no effect.", type(s).__name__)
@@ -121,6 +121,7 @@ class Conductor:
             s.on_fit_start(n_views, seed)
             answers.require_started(s, seed)
             s.to(device)
+            s.cache[LAMBDA_HR] = self.objective.lambda_hr
             if overrides(s, "on_views"):
                 with self.work_log.stage("views prepared"):
                     s.on_views(views)
@@ -274,6 +275,12 @@ class Conductor:
         apart = apart or self.owner("route") is not None or self.owner("score") is not None
         step = Step(iteration(t), self._told(view), hr.visible, params=params, looked_up=looked_up)
         return self._backward_hr(hr, view, step, t, vjp or _vjp, apart=apart)[1]
+
+    @apart_from_the_loop
+    def draw(self, t: int, means: Float[Tensor, "N 3"], enlarged: Callable[[Camera, int], Photo]) -> None:
+        """Let the strategies draw what the field shows, before `extra_views`."""
+        for s in self.strategies:
+            s.draw(t, means, enlarged)
 
     @apart_from_the_loop
     def extra_views(self, t: int) -> list[ExtraView]:

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from clear_strategies.core import deferred
 from clear_strategies.core.deferred import Number, Scalar
-from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.step import Step
@@ -83,11 +82,6 @@ class Update:
     conflict: Mapping[str, Number] = field(default_factory=dict)
     losses: Mapping[str, Scalar] = field(default_factory=dict)
     logs: Mapping[str, Number] = field(default_factory=dict)
-
-    @property
-    def evidence(self) -> Evidence | None:
-        """The answer of `observe`; None without HR."""
-        return self.step.evidence
 
 
 @runtime_checkable

@@ -23,15 +23,17 @@ from clear_strategies.core.deferred import Deferred, Element, Number
 from clear_strategies.core.evidence import Evidence, PatchMaps
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, Shot, gathered
 from clear_strategies.core.step import Step
-from clear_strategies.core.view import ExtraView, View
+from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.errors import AnswerError
 from clear_strategies.kernels import reconcile
-from rasterizers.interface import Color
+from rasterizers.interface import Camera, Color
 from rasterizers.native import empty_for
 
 _DEVICE, _SEED = "device", "seed"  # in the cache
+LAMBDA_HR: Final = "lambda_hr"
+"""In the cache: the schedule of the run's objective, from `on_fit_start` on."""
 _ALIKE: Final = 0.85  # "regularise" to "regularize" 0.9, "densify" to "densifier" 0.75
-_OWN_NAMES: Final = {"state", "cache", "logs", "device", "seed"}
+_OWN_NAMES: Final = {"state", "cache", "logs", "device", "seed", "lambda_hr"}
 
 Logged = Number | Callable[[], Number]
 """A scalar, or what computes it."""
@@ -76,7 +78,18 @@ class Strategy:
                 f"{cls.__name__}: a setting must not be called {min(taken)}, which every strategy has already."
             )
 
-    # ---- hooks: the trainer or the host calls them in this order ----------------------------------------------------
+    # ---- hooks, in the order in which this trainer calls them --------------------------------------------------------
+
+    def densifier(self, field: Any, views: Sequence[View], seed: int) -> Any:
+        """Once, before the first iteration: what clones, moves and prunes Gaussians in place of the trainer's own density
+        control, a `clear_strategies.training.densifier.Densifier`; None: the trainer does.
+
+        Args:
+            field: the initial Gaussians, a `clear_strategies.training.field.GaussianField`. Other trainers never call this hook,
+                since they keep their own density control.
+            views: all training views.
+        """
+        return None
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
         """Start a run, or resume one. Overriders call `super()`."""
@@ -91,17 +104,6 @@ class Strategy:
         Args:
             views: on the device of the field; empty where the training loop does not have them all at the start.
         """
-
-    def densifier(self, field: Any, views: Sequence[View], seed: int) -> Any:
-        """Once, before the first iteration: what clones, moves and prunes Gaussians in place of the trainer's own density
-        control, a `clear_strategies.training.densifier.Densifier`; None: the trainer does.
-
-        Args:
-            field: the initial Gaussians, a `clear_strategies.training.field.GaussianField`. Other trainers never call this hook,
-                since they keep their own density control.
-            views: all training views.
-        """
-        return None
 
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | Float[Tensor, "2 N"] | None:
         """Before render: which Gaussians take part? z >= 0 multiplies the opacity; None: all of them.  Eq. 15
@@ -125,6 +127,14 @@ class Strategy:
     def route(self, step: Step) -> float | Float[Tensor, " N"]:
         """How much of its high-frequency gradient does each Gaussian get? m >= 0; 1: all of it.  Eq. 12"""
         return 1.0
+
+    def score(self, step: Step, screen: ScreenGradients) -> Float[Tensor, " N"] | None:
+        """For densification: where is more structure needed? None: the ordinary statistic.  Eq. 14
+
+        Its order counts, not its unit: as many Gaussians grow as the ordinary statistic lets grow, those of the largest mean over
+        the views that show them (`density.mode=quantile`). In other trainers it is scaled so that as many pass their threshold.
+        """
+        return None
 
     def reconcile(self, products: Products, step: Step | None) -> Weights:
         """How to reconcile both gradients? ĝ_HR = keep · g_HR - remove · g_LR; g_LR is never changed.  Eq. 6, 7, 11
@@ -159,13 +169,14 @@ class Strategy:
         """Before the optimizer step: a gradient to add. Several strategies may answer.  Eq. 16"""
         return None
 
-    def score(self, step: Step, screen: ScreenGradients) -> Float[Tensor, " N"] | None:
-        """For densification: where is more structure needed? None: the ordinary statistic.  Eq. 14
+    def draw(self, t: int, means: Float[Tensor, "N 3"], enlarged: Callable[[Camera, int], Photo]) -> None:
+        """Before the extra views of t: draw what the field shows, e.g. to make extra views of it. Other trainers never call this
+        hook.
 
-        Its order counts, not its unit: as many Gaussians grow as the ordinary statistic lets grow, those of the largest mean over
-        the views that show them (`density.mode=quantile`). In other trainers it is scaled so that as many pass their threshold.
+        Args:
+            means: of the field. enlarged: what the field shows by a camera, without f_det, a whole number of times as large by
+                the network of the prior; by bicubic interpolation where the prior has none.
         """
-        return None
 
     def extra_views(self, t: int) -> Sequence[ExtraView]:
         """Which other pictures should the field match at t? Several strategies may answer.
@@ -175,12 +186,12 @@ class Strategy:
         """
         return ()
 
+    def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
+        """After the optimizer steps of an iteration: update `state`, e.g. take the anchor, or change `params` in place."""
+
     def may_densify(self, t: int) -> bool:
         """May the structure change at t? All strategies must agree."""
         return True
-
-    def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
-        """After the optimizer steps of an iteration: update `state`, e.g. take the anchor, or change `params` in place."""
 
     def on_resize(self, parents: Int[Tensor, " M"]) -> None:
         """After the structure changed: row i of every per-Gaussian tensor now comes from row parents[i]."""
@@ -244,6 +255,10 @@ class Strategy:
         """The device of the field."""
         device: torch.device = self.cache.get(_DEVICE, torch.device("cpu"))
         return device
+
+    def lambda_hr(self, t: int) -> float:
+        """λ_HR(t) of the run's objective; 0 before the run starts."""
+        return self.cache[LAMBDA_HR](t) if LAMBDA_HR in self.cache else 0.0
 
     @property
     def seed(self) -> int:

@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SRStage(Strategy):
-    """HR pictures in a second stage. It has an effect in this package's trainer alone, which calls `begin`.
+    """HR pictures in a second stage. It has an effect in this package's trainer alone, which calls `draw`.
 
     A run that is resumed in its second stage draws its pictures anew, and says so: its bits differ from an uninterrupted run's.
 
@@ -55,12 +55,8 @@ class SRStage(Strategy):
     def on_views(self, views: Sequence[View]) -> None:
         self.cache["views"] = views
 
-    def begin(self, t: int, means: Float[Tensor, "N 3"], enlarged: Callable[[Camera, int], Photo]) -> None:
-        """Draw the pictures beside the training cameras, where t is the first iteration of the second stage.
-
-        Args:
-            means: of the field. enlarged: what the field shows by an LR camera, a given number of times as large.
-        """
+    def draw(self, t: int, means: Float[Tensor, "N 3"], enlarged: Callable[[Camera, int], Photo]) -> None:
+        """Draw the pictures beside the training cameras, where t is the first iteration of the second stage."""
         views: Sequence[View] = self.cache.get("views", ())
         if t <= self.start or not views or "pictures" in self.cache:
             return
@@ -74,7 +70,7 @@ class SRStage(Strategy):
             pictures.append(enlarged(camera, view.factor))
 
     def extra_views(self, t: int) -> Sequence[ExtraView]:
-        """After `begin` one picture at HR: a function of (seed, t) and of the field at the end of the first stage."""
+        """After `draw` one picture at HR: a function of (seed, t) and of the field at the end of the first stage."""
         if "pictures" not in self.cache:
             return ()
         views: Sequence[View] = self.cache["views"]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,7 +26,6 @@ from clear_strategies.errors import AnswerError, DivergedError
 from clear_strategies.merging.iteration import Update, require_finite_parts
 from clear_strategies.merging.skips import PLATEAU_LOSS
 from clear_strategies.signals import Interrupted, deferred_signals, foremost
-from clear_strategies.strategies.sr_stage import SRStage
 from clear_strategies.training import checkpoint
 from clear_strategies.training.clock import Clock
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
@@ -50,7 +49,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
     scales = {"lr": conductor.wants_lr and conductor.skips.lr_due(view, hr_due, conductor.work_log), "hr": hr_due}
     z, background = conductor.gate(t, len(θ)), conductor.background(t)  # zᵗ             Eq. 15       SVS
     u, row = learned(s, rasterizer, GivenView(t, view, scales, z, background), learn)
-    begin_sr_stage(s, over(rasterizer, background))
+    conductor.draw(t, θ.means.data, partial(enlarged, s, over(rasterizer, background)))
     extra = extra_steps(s, rasterizer, conductor.extra_views(t), background)
     conductor.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS
     with stage("density and filter"):
@@ -104,19 +103,13 @@ def _order_of_views(seed: int, epoch: int, n: int) -> list[int]:
     return order
 
 
-def begin_sr_stage(s: TrainState, rasterizer: Rasterizer) -> None:
-    """Let `SRStage` draw what the field shows, enlarged by the network of the run's prior; by bicubic without one."""
-
-    def enlarged(camera: Camera, factor: int) -> Photo:
-        with s.conductor.work_log.stage("pictures drawn"):
-            image = s.field.render(rasterizer, camera, detail=False)
-            network = network_of(s.conductor.sr) or Bicubic()
-            large = network("a drawn picture", images.quantize(image.cpu()), factor)
-        return Photo(camera.scaled(factor), large.to(image.device))
-
-    for strategy in s.conductor.strategies:
-        if isinstance(strategy, SRStage):
-            strategy.begin(s.t, s.field.means.data, enlarged)
+def enlarged(s: TrainState, rasterizer: Rasterizer, camera: Camera, factor: int) -> Photo:
+    """What the field shows, see `Strategy.draw`."""
+    with s.conductor.work_log.stage("pictures drawn"):
+        image = s.field.render(rasterizer, camera, detail=False)
+        network = network_of(s.conductor.sr) or Bicubic()
+        large = network("a drawn picture", images.quantize(image.cpu()), factor) if factor > 1 else image
+    return Photo(camera.scaled(factor), large.to(image.device))
 
 
 def extra_steps(

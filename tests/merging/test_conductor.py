@@ -27,6 +27,7 @@ from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.base import misspelled
 from clear_strategies.testing import CHECKS, ContractError, check_strategy
 from clear_strategies.training import loop
+from clear_strategies.training.densifier import Densifier
 from clear_strategies.training.field import GaussianField
 from integration import AutogradShot
 from rasterizers import Splats, autograd
@@ -375,6 +376,69 @@ def test_hooks_run_without_autograd_so_that_state_keeps_no_graph():
     assert shots[1].image.requires_grad
     assert not s.state["seen"].requires_grad
     assert not on
+
+
+class Swaps(Densifier):
+    """Moves one Gaussian a step onto the last."""
+
+    name, settings = "swaps", None
+
+    def __init__(self, *faults):
+        self.faults, self.count = faults, 0
+
+    def step(self, field, optimizer, t, resized):
+        self.count += 1
+        parents = torch.arange(len(field))
+        parents[torch.randint(3, (1,)) if "random" in self.faults else self.count] = len(field) - 1
+        field.take(parents)
+        if "optimizer" not in self.faults:
+            optimizer.take(parents, parents == len(field) - 1)
+        resized(torch.arange(len(field)) if "told" in self.faults else parents)
+        return True
+
+    def state_dict(self):
+        return {} if "saved" in self.faults else {"count": torch.tensor(self.count)}
+
+    def load_state_dict(self, tensors):
+        self.count = int(tensors.get("count", 0))
+
+
+def test_a_strategy_knows_the_weight_of_hr():
+    @dataclass(frozen=True)
+    class Balanced(Strategy):
+        """0.25 l + 0.5 h, whatever λ_HR."""
+
+        def reconcile(self, products, step):
+            λ = self.lambda_hr(step.t)
+            return Weights(keep=0.5 / λ, remove=0.75 / λ)
+
+    field, view = field_and_view(torch.float32)
+    lr, hr = field.render_scales(toy.RASTERIZER, view)
+    assert Balanced().lambda_hr(5) == 0
+    objective = Objective(WarmupDecay(start=0, full=10, decay_from=10, end=10), lambda_hf=0.0, kernels="torch")
+    (g_lr,) = lr.vjp(objective.lr(lr.image, view.lr.image).cotangents)
+    (g_hr,) = hr.vjp(objective.hr(hr.image, view.hr.image).cotangents)
+    for t in (2, 7):
+        conductor = Conductor(Balanced(), objective=objective)
+        conductor.on_fit_start(1, 0)
+        merged = conductor.update(field.raw(), lr, hr, view, t).grads
+        assert torch.allclose(merged["means"], 0.25 * g_lr["means"] + 0.5 * g_hr["means"], atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ("told", "Swaps.step.. must call resized.parents. where it moves Gaussians"),
+        ("optimizer", "step must gather the optimizer as the field"),
+        ("random", "two runs of a densifier with one seed differ"),
+        ("saved", "cut before t=2: a densifier's state_dict.. does not continue"),
+    ],
+)
+def test_the_contract_of_a_densifier(fault, message):
+    (check,) = (c for c in CHECKS if c.__name__ == "check_densifier_takes_everything_along")
+    check(answering("densifier", lambda field, views, seed: Swaps()))
+    with pytest.raises((AnswerError, ContractError), match=message):
+        check(answering("densifier", lambda field, views, seed: Swaps(fault)))
 
 
 def test_a_number_of_the_run_is_state_as_rows_are():

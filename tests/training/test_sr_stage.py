@@ -1,12 +1,12 @@
 """Methods of two stages: the Shuffle Split, and what the second stage trains on."""
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pandas as pd
 import torch
 
-from clear_strategies import Conductor, ExtraView, Objective, Photo, SRStage
+from clear_strategies import Conductor, ExtraView, Objective, Photo, SRStage, Strategy
 from clear_strategies.core import images
 from clear_strategies.density.shuffle import ShuffleSettings
 from clear_strategies.outputs import results
@@ -66,7 +66,7 @@ def test_sr_images_and_enlarged_pictures_of_the_first_stage_come_in_turn(caplog)
 
     shown = []
     for t in range(1, 15):
-        stage.begin(t, SCENE.cloud.means, enlarged)
+        stage.draw(t, SCENE.cloud.means, enlarged)
         shown.append(stage.extra_views(t))
     assert [len(views) for views in shown] == [0] * 4 + [1] * 10
     assert len(seen) == 5  # drawn once, at LR
@@ -78,7 +78,7 @@ def test_sr_images_and_enlarged_pictures_of_the_first_stage_come_in_turn(caplog)
         assert extra.photo.camera.width == SCENE.train[0].hr.camera.width
     assert not caplog.records
     with caplog.at_level(logging.WARNING):
-        staged(SRStage(start=4, count=5)).begin(9, SCENE.cloud.means, enlarged)
+        staged(SRStage(start=4, count=5)).draw(9, SCENE.cloud.means, enlarged)
     assert "draws its pictures at t=9, not at t=5" in caplog.text
 
 
@@ -92,6 +92,22 @@ def test_the_trainer_draws_what_the_field_shows_and_steps_on_it():
         image = images.area_mean(photo.image, SCENE.train[0].factor)
         exact = toy.RASTERIZER(before[3], photo.camera.scaled(1 / SCENE.train[0].factor)).image
         assert float((image - exact).abs().mean()) < 0.05
+
+
+def test_any_strategy_draws_the_field_by_a_camera_of_its_own_before_its_extra_views():
+    @dataclass(frozen=True)
+    class Remembers(Strategy):
+        def draw(self, t, means, enlarged):
+            self.cache[t] = [enlarged(SCENE.test[0].lr.camera, factor) for factor in (1, 2)]
+
+        def extra_views(self, t):
+            plain, large = (photo.image for photo in self.cache[t])
+            assert torch.allclose(images.upsample(images.quantize(plain), 2), large, atol=0.01)
+            return [ExtraView(self.cache[t][0], torch.ones(plain.shape[:2]))]
+
+    state = start((), more=[Remembers()])
+    iterate(state, toy.RASTERIZER)
+    assert state.history[0][EXTRA_LOSS] < 0.01  # it shows itself
 
 
 def test_a_robust_picture_counts_less_where_the_field_contradicts_it():
