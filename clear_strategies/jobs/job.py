@@ -201,7 +201,7 @@ class _Job:
             evaluation = results.write_results(
                 self.folder, scene, state, drawing.rasterizer, painter, self.chosen, backend=drawing.name,
                 down=self.settings.data.views.downsample, seconds=before + training, config=self.compared,
-                antialiased=drawing.rules.antialiased,
+                antialiased=drawing.rules.antialiased, own=self.settings.metrics,
             )  # fmt: skip
         return evaluation, training
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +24,7 @@ class JobSettings(ConductorSettings):
     """The whole of conf/config.yaml, as objects.
 
     Args:
+        metrics: by name what else the renders are scored by, each called with an image and the truth, [H, W, 3] in [0, 1].
         method: which baseline of the papers' tables this is, for the plan and the tables; set by +method=NAME.
     """
 
@@ -34,6 +35,7 @@ class JobSettings(ConductorSettings):
     optim: LearningRates
     fit: FitSettings = field(default_factory=FitSettings)
     mip: MipFilter = field(default_factory=MipFilter)
+    metrics: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
     method: str | None = None
 
     def __post_init__(self) -> None:

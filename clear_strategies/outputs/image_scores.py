@@ -11,16 +11,19 @@ On photographs of six real scenes each of the four ranks the truth first, then a
 Only PSNR, SSIM and GMSD respond to a shift by two pixels: blur ignores where contrast is. Noise on a blurred image brings
 blur back to 0 while GMSD rises, so read the two together.
 
+A run may add metrics of its own (`metrics.*`), which need one.
+
 Only shown pixels count: where a mask hides one of the truth's, the image is taken to have it, and PSNR, SSIM and GMSD are of the
 others.
 """
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Final
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -28,8 +31,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core.view import SMALLEST
+from clear_strategies.errors import one_line
 from clear_strategies.kernels import native
 from rasterizers.native import threads
+
+_log = logging.getLogger(__name__)
+
+Metric = Callable[[Tensor, Tensor], Any]
+"""A number, or a tensor of one, from an image and the truth."""
 
 PSNR_CAP: Final = 100.0  # dB, the PSNR of identical images
 _GMSD_C: Final = 170 / 255**2
@@ -38,12 +47,17 @@ _LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
 
 @dataclass(frozen=True, slots=True)
 class ImageScores:
-    """PSNR in dB, at most `PSNR_CAP`, and SSIM: more is better. GMSD: less is better. Blur: closer to 0 is better."""
+    """PSNR in dB, at most `PSNR_CAP`, and SSIM: more is better. GMSD: less is better. Blur: closer to 0 is better.
+
+    Args:
+        own: of the run's own metrics, by name.
+    """
 
     psnr: float
     ssim: float
     gmsd: float
     blur: float
+    own: Mapping[str, float] = field(default_factory=dict)
 
 
 class Truth:
@@ -51,13 +65,20 @@ class Truth:
 
     Args:
         shown: False at pixels that do not count: there an image is taken to be right. One at least is shown. None: all are.
+        own: metrics by name: of an image and the truth, both [H, W, 3] in [0, 1] on the CPU. One that raises has no number.
     """
 
-    def __init__(self, image: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None = None) -> None:
+    def __init__(
+        self,
+        image: Float[Tensor, "H W 3"],
+        shown: Bool[Tensor, "H W"] | None = None,
+        own: Mapping[str, Metric] | None = None,
+    ) -> None:
         if min(image.shape[:2]) < SMALLEST:
             raise ValueError(f"images must be at least {SMALLEST} pixels on each side, got {tuple(image.shape)}.")
         self.image = image.detach().clamp(0, 1).cpu()
         self.shown = None if shown is None or bool(shown.all()) else shown.cpu()
+        self.own = own or {}
         grey = _grey(self.image)
         self.edges, self.blur = _gradient_at_half_size(grey), _blur(grey)
 
@@ -67,7 +88,7 @@ class Truth:
             sizes = f"{tuple(image.shape)} and {tuple(self.image.shape)}"
             raise ValueError(f"images must have the same size, got {sizes}.")
         if not bool(image.isfinite().all()):
-            return ImageScores(math.nan, math.nan, math.nan, math.nan)
+            return ImageScores(math.nan, math.nan, math.nan, math.nan, dict.fromkeys(self.own, math.nan))
         image = image.detach().clamp(0, 1).cpu()
         if self.shown is not None:
             image = torch.where(self.shown[..., None], image, self.image)
@@ -76,14 +97,26 @@ class Truth:
         psnr = min(PSNR_CAP, 10 * math.log10(1 / mse)) if mse > 0 else PSNR_CAP
         grey = _grey(image)
         gmsd = _gmsd(_gradient_at_half_size(grey), self.edges, self.shown)
-        return ImageScores(psnr, _ssim(image, self.image, self.shown), gmsd, _blur(grey) - self.blur)
+        own = {name: _measured(name, metric, image, self.image) for name, metric in self.own.items()}
+        return ImageScores(psnr, _ssim(image, self.image, self.shown), gmsd, _blur(grey) - self.blur, own)
 
 
 def mean_scores(scores: Sequence[ImageScores]) -> ImageScores | None:
     """The mean of each number; None for an empty sequence."""
     if not scores:
         return None
-    return ImageScores(*(sum(getattr(s, f.name) for s in scores) / len(scores) for f in fields(ImageScores)))
+    *four, _ = (f.name for f in fields(ImageScores))
+    own = {name: sum(s.own[name] for s in scores) / len(scores) for name in scores[0].own}
+    return ImageScores(*(sum(getattr(s, name) for s in scores) / len(scores) for name in four), own)
+
+
+@torch.no_grad()  # of each thread its own
+def _measured(name: str, metric: Metric, image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> float:
+    try:
+        return float(metric(image, truth))
+    except Exception as error:  # anyone's; the run is not lost by it
+        _log.warning("metrics.%s: left out, %s: %s", name, type(error).__name__, one_line(error))
+        return math.nan
 
 
 def _ssim(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None) -> float:

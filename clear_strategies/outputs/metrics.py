@@ -12,6 +12,7 @@ metrics.json: {"scene", "method", "strategies", "overrides", "seed", "iterations
 - "against" says what they are compared with: "HR photos"; "LR photos", after D, where the HR photos are unknown; "HR and
   LR photos" where that differs between views.
 - The training TABLE has another key, "of": the number of training views, of which at most 50 are scored.
+- The scores are "psnr", "ssim", "gmsd" and "blur", and where the run has metrics of its own, "own": {name: number}.
 - A number that is not finite is null.
 """
 
@@ -39,7 +40,7 @@ from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.strict_json import Count, Positive, plain_settings, read_object, typed
 from clear_strategies.outputs.figures import spaced
-from clear_strategies.outputs.image_scores import ImageScores, Truth, mean_scores
+from clear_strategies.outputs.image_scores import ImageScores, Metric, Truth, mean_scores
 from rasterizers.native import threads
 
 _log = logging.getLogger(__name__)
@@ -65,10 +66,12 @@ class Scores(msgspec.Struct):
     ssim: float | None
     gmsd: float | None
     blur: float | None
+    own: dict[str, float | None] = msgspec.field(default_factory=dict)
 
     @property
     def numbers(self) -> ImageScores:
-        return ImageScores(*map(as_float, msgspec.structs.astuple(self)))
+        *four, own = msgspec.structs.astuple(self)
+        return ImageScores(*map(as_float, four), {name: as_float(x) for name, x in own.items()})
 
 
 class Part(msgspec.Struct):
@@ -143,12 +146,16 @@ class Evaluation:
 
 
 def evaluate(
-    scene: Scene, render: Callable[[View], Float[Tensor, "H W 3"]], *, down: DownKernel = "bicubic"
-) -> Evaluation:
+    scene: Scene, render: Callable[[View], Float[Tensor, "H W 3"]], *, down: DownKernel = "bicubic",
+    own: Mapping[str, Metric] | None = None,
+) -> Evaluation:  # fmt: skip
     """Render and score the views, of many training views a sample. Pixels that a mask hides do not count. Views are scored
     while the next ones are rendered, each by one thread: scikit-image uses one.
 
     Where the HR photo is unknown, D of the render is compared with the LR photo.
+
+    Args:
+        own: as of `Truth`; they are called in several threads.
     """
     renders: dict[str, Tensor] = {}
     tables: dict[str, Table] = {"test": {}, "train": {}}
@@ -171,7 +178,7 @@ def evaluate(
                 _log.warning("%s: its render is not finite and has no scores.", view.name)
             if view.name in kept:
                 renders[view.name] = image
-            scored.append((tables[part], view.name, scorers.submit(_scores_of, view, image, down)))
+            scored.append((tables[part], view.name, scorers.submit(_scores_of, view, image, down, own)))
             if len(scored) > n:  # so that not all renders are held
                 take()
         while scored:
@@ -191,11 +198,15 @@ def to_json(evaluation: Evaluation, **facts: Any) -> dict[str, Any]:
         means = {image: evaluation.mean(part, image) for image in shown}
         content[part] = {
             "against": evaluation.against[part],
-            "views": {view: {image: asdict(s) for image, s in row.items()} for view, row in table.items()},
-            "mean": {image: asdict(mean) for image, mean in means.items() if mean is not None},
+            "views": {view: {image: _in_file(s) for image, s in row.items()} for view, row in table.items()},
+            "mean": {image: _in_file(mean) for image, mean in means.items() if mean is not None},
         }
     content["train"]["of"] = evaluation.train_views
     return content
+
+
+def _in_file(scores: ImageScores) -> dict[str, Any]:
+    return {name: x for name, x in asdict(scores).items() if x != {}}
 
 
 def _against(views: Sequence[View]) -> str:
@@ -203,7 +214,9 @@ def _against(views: Sequence[View]) -> str:
     return f"{' and '.join(sorted(kinds))} photos" if kinds else "nothing"
 
 
-def _scores_of(view: View, image: Float[Tensor, "H W 3"], down: DownKernel) -> dict[str, ImageScores]:
+def _scores_of(
+    view: View, image: Float[Tensor, "H W 3"], down: DownKernel, own: Mapping[str, Metric] | None
+) -> dict[str, ImageScores]:
     """The scores of the view's images."""
     truth, mask, scored = view.truth, view.hr.shown, {"ours": image}
     if truth is None:
@@ -213,7 +226,7 @@ def _scores_of(view: View, image: Float[Tensor, "H W 3"], down: DownKernel) -> d
         scored = {name: images.downsample(i, view.factor, down) for name, i in scored.items()}
     elif not view.hr_is_photo:  # else no SR has a part
         scored |= {"bicubic": images.upsample(view.lr.image, view.factor), "prior": view.hr.image}
-    against = Truth(truth, mask)
+    against = Truth(truth, mask, own)
     return {name: against.score(image) for name, image in scored.items()}
 
 
@@ -263,4 +276,5 @@ def _rows(part: str, evaluation: Evaluation) -> Iterator[tuple[str, str]]:
 
 
 def _numbers(m: ImageScores) -> str:
-    return f"PSNR {m.psnr:6.2f} dB   SSIM {m.ssim:7.4f}   GMSD {m.gmsd:7.4f}   blur {m.blur:+.4f}"
+    own = "".join(f"   {name} {x:7.4f}" for name, x in m.own.items())
+    return f"PSNR {m.psnr:6.2f} dB   SSIM {m.ssim:7.4f}   GMSD {m.gmsd:7.4f}   blur {m.blur:+.4f}{own}"

@@ -25,6 +25,7 @@ from clear_strategies.data.view_names import file_stems
 from clear_strategies.errors import DataError, SettingError, one_line
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.figures import SheetRow, spaced, write_contact_sheet, write_curves
+from clear_strategies.outputs.image_scores import Metric
 from clear_strategies.outputs.maps import MAPS, write_coverage, write_maps
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.plan import Chosen
@@ -64,7 +65,7 @@ _TRAINED_ON: Final = (
 
 def write_results(
     folder: Path, scene: Scene, state: TrainState, rasterizer: Rasterizer, painter: Painter, chosen: Chosen, *, backend: str,
-    down: DownKernel, seconds: float, config: Mapping[str, Any], antialiased: bool,
+    down: DownKernel, seconds: float, config: Mapping[str, Any], antialiased: bool, own: Mapping[str, Metric] | None = None,
 ) -> Evaluation:  # fmt: skip
     """Evaluate a finished run and write its files; returns its scores.
 
@@ -73,6 +74,7 @@ def write_results(
         painter: of the state's field, for depth and video.
         down: D, by which the LR images were made.
         antialiased: the rasterizer compensates opacities, see `RasterSettings`.
+        own: metrics, see `image_scores.Truth`.
     """
     import pandas as pd  # here, as those whose settings are refused need not wait for it
 
@@ -98,7 +100,7 @@ def write_results(
                 write_coverage(folder / _COVERAGE, scene, painter, title, beside)
         memory.release()  # the gradients that the maps are made of: several times the field
         with work_log.stage("evaluate"):
-            evaluation = metrics.evaluate(scene, render, down=down)
+            evaluation = metrics.evaluate(scene, render, down=down, own=own)
         for name, image in evaluation.renders.items():
             beside(write_png, folder / "renders" / f"{stems[name]}.png", image)
         beside(_write_sheet, folder, scene, stems, evaluation, title)

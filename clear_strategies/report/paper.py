@@ -11,13 +11,13 @@ from typing import Final
 
 import pandas as pd
 
-from clear_strategies.report.runs import FinishedRun
+from clear_strategies.report.runs import OWN, FinishedRun
 from clear_strategies.report.table import in_all, label
 
 NUMBERS: Final = Path(__file__).with_name("paper.csv")
 NOTE: Final = (
     "The columns named paper are the paper's, means over all its scenes at its sizes; ours are means over the scenes that ran. "
-    "A dash: not computed, as LPIPS, or not printed."
+    "A dash: not computed, as LPIPS without metrics.lpips, or not printed."
 )
 # What a run's protocol or scene (conf/protocol, conf/scene) is a part of.
 _DATA: Final[Mapping[str, str]] = {
@@ -54,7 +54,13 @@ def _beside(printed: pd.DataFrame, runs: Sequence[FinishedRun]) -> pd.DataFrame:
         scene: in_all([run.settings for run in runs if run.scene == scene]) for scene in {run.scene for run in runs}
     }
     records = [
-        {"row": _row(run), "label": label("", run.settings, shared[run.scene]), "scene": run.scene, **run.numbers}
+        {
+            "row": _row(run),
+            "label": label("", run.settings, shared[run.scene]),
+            "scene": run.scene,
+            **run.numbers,
+            "lpips": run.numbers.get(f"{OWN}lpips"),
+        }
         for run in runs
     ]
     by_scene = pd.DataFrame(records).groupby(["row", "label", "scene"], sort=False).mean(numeric_only=True)

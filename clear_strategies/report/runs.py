@@ -21,6 +21,8 @@ from clear_strategies.viewing.cameras import FILE as CAMERAS
 
 _log = logging.getLogger(__name__)
 
+OWN: Final = "metrics."
+"""Before the name of a metric of the run's own."""
 _HYDRA: Final = ".hydra"
 _SEED: Final = "fit.seed="
 # The overrides that name a run; the others are its settings.
@@ -43,8 +45,9 @@ class FinishedRun:
         protocol: the option of conf/protocol or conf/scene that it is of; None: of neither.
         settings: the other overrides, without the seed and those that change no result; then those of files in which runs differ
             that are alike in all that was said. See `_each_setting`.
-        numbers: mean scores of the test views, or of the training views where there are no test views; "bicubic", "prior":
-            PSNR of these images; conflict, gaussians, seconds. NaN where unknown.
+        numbers: mean scores of the test views, or of the training views where there are no test views, those of the run's own
+            metrics as "metrics.<name>"; "bicubic", "prior": PSNR of these images; conflict, gaussians, seconds. NaN where
+            unknown.
         views: whose scores they are. config: every setting, by its dotted key.
     """
 
@@ -76,6 +79,8 @@ class FinishedRun:
         marks += [] if part is content.test else ["training views"]
         marks += [f"against {part.against}"] if "LR" in part.against else []
         psnr = {image: scores.numbers.psnr for image, scores in part.mean.items()}
+        ours = asdict(part.mean["ours"].numbers)
+        own = {f"{OWN}{name}": x for name, x in ours.pop("own").items()}
         return cls(
             folder=folder,
             scene=content.scene + (f" ({', '.join(marks)})" if marks else ""),
@@ -85,7 +90,8 @@ class FinishedRun:
             settings=tuple(filter(_is_setting, overrides)),
             seed=content.seed,
             numbers={
-                **asdict(part.mean["ours"].numbers),
+                **ours,
+                **own,
                 **{image: psnr.get(image, math.nan) for image in ("bicubic", "prior")},
                 "conflict": metrics.as_float(content.conflict.get("gaussian")),
                 "gaussians": content.gaussians,

@@ -15,7 +15,7 @@ from typing import Any, Final
 import pandas as pd
 
 from clear_strategies.outputs.metrics import NOTE
-from clear_strategies.report.runs import FinishedRun
+from clear_strategies.report.runs import OWN, FinishedRun
 
 _log = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ def compare(runs: Sequence[FinishedRun]) -> pd.DataFrame:
 def layout(table: pd.DataFrame) -> pd.DataFrame:
     """The rows of `compare` as text, without the columns that are empty throughout."""
     cells: dict[str, Sequence[str]] = {"scene": list(table["scene"]), "method": list(table["method"])}
-    for quantity, (header, form) in _QUANTITIES.items():
+    for quantity, (header, form) in _quantities(table).items():
         cells[header] = _numbers(table[quantity], table[f"{quantity}_std"], form)
         if quantity == "psnr":
             delta = _numbers(table["psnr_delta"], table["psnr_delta_error"], "+.2f")
@@ -62,6 +62,12 @@ def layout(table: pd.DataFrame) -> pd.DataFrame:
             cells["best"] = _numbers(table["psnr_best"], None, form)
     cells["seed"] = list(table["seeds"])
     return pd.DataFrame({name: column for name, column in cells.items() if any(column)})
+
+
+def _quantities(table: pd.DataFrame) -> dict[str, tuple[str, str]]:
+    """`_QUANTITIES`, and the metrics of the runs' own."""
+    own = [name for name in table if name.startswith(OWN) and not name.endswith("_std")]
+    return {**_QUANTITIES, **{name: (name, ".4f") for name in own}}
 
 
 def notes(table: pd.DataFrame, runs: Sequence[FinishedRun]) -> list[str]:
@@ -161,7 +167,7 @@ def _summary(single: pd.DataFrame) -> pd.DataFrame:
         if of_method["psnr"].isna().any():
             _log.warning("%s: runs without a finite PSNR are left out of its mean.", row)
     table["seeds"] = groups["seed"].agg(lambda seeds: ", ".join(map(str, sorted(set(seeds)))))
-    for quantity in _QUANTITIES:
+    for quantity in _quantities(single):
         table[quantity], table[f"{quantity}_std"] = groups[quantity].mean(), groups[quantity].std()
     table["psnr_best"] = groups["psnr"].max().where(groups["psnr"].count() > 1)
     return table.join(_differences(single, "key", table["psnr"])).reset_index(drop=True)
@@ -179,7 +185,9 @@ def _of_all_scenes(single: pd.DataFrame, title: str) -> pd.DataFrame:
 def _average(single: pd.DataFrame, title: str) -> pd.DataFrame:
     """A row for each method, each of which all scenes have."""
     scenes = single["scene"].nunique()
-    means = single.groupby(["identity", "scene"], sort=False)[[*_QUANTITIES]].mean().groupby("identity", sort=False)
+    means = (
+        single.groupby(["identity", "scene"], sort=False)[[*_quantities(single)]].mean().groupby("identity", sort=False)
+    )
     # A quantity that one scene lacks has no average.
     table = means.mean().where(means.count() == scenes).assign(average=True, runs=0, seeds="", scene=title)
     shared = in_all([identity.split("\n")[1:] for identity in table.index])

@@ -103,6 +103,27 @@ def test_a_render_that_is_not_finite_has_a_warning_and_null_in_the_file(tmp_path
     assert (content["scene"], content["seed"]) == ("made up", 3)
 
 
+def test_metrics_of_ones_own_are_in_the_file_and_the_last_lines_and_one_that_raises_loses_nothing_else(
+    tmp_path, caplog
+):
+    shown = torch.ones(12, 16, dtype=torch.bool)
+    shown[:, 10:] = False
+    a = view("a", torch.full((48, 64, 3), 0.5))
+    own = {"off": lambda image, truth: (image - truth).abs().mean(), "broken": lambda image, truth: image.lpips}
+    content = scene((), (a.hiding(shown), replace(a, name="b")))
+    evaluation = metrics.evaluate(content, lambda view: torch.full((48, 64, 3), 0.75), own=own)
+    means = [evaluation.test[name]["ours"].own["off"] for name in "ab"]
+    assert means == pytest.approx([0.25 * 10 / 16, 0.25])
+    assert "metrics.broken: left out, AttributeError: " in caplog.text
+    facts = {"scene": "s", "strategies": [], "seed": 0, "iterations": 1, "gaussians": 1, "seconds": 1, "conflict": {},
+             "synthetic_prior": False, "provenance": {}}  # fmt: skip
+    files.write_json(tmp_path / "metrics.json", metrics.to_json(evaluation, **facts))
+    scores = metrics.read(tmp_path / "metrics.json", "").test.mean["ours"].numbers
+    assert scores.own["off"] == pytest.approx(sum(means) / 2)
+    assert math.isnan(scores.own["broken"])
+    assert "blur +0.0000   off  0.2031   broken     nan" in describe(Path("run"), evaluation, 1.0, {})
+
+
 # ---- the table of scores at the end of a run
 OURS, BICUBIC = ImageScores(23.5, 0.7, 0.1, 0.01), ImageScores(22.0, 0.5, 0.16, 0.2)
 TABLE: Table = {"view": {"ours": OURS, "bicubic": BICUBIC, "prior": BICUBIC}}
@@ -146,6 +167,11 @@ def test_what_is_missing_has_no_row_and_no_note() -> None:
 # ---- the four numbers: by hand, against other implementations, and on photographs that everyone would rank alike
 def score(image: Tensor, truth: Tensor, shown: Tensor | None = None) -> ImageScores:
     return Truth(truth, shown).score(image)
+
+
+def four(scores: ImageScores) -> tuple[float, ...]:
+    *numbers, _ = astuple(scores)
+    return tuple(numbers)
 
 
 def grey(level: float, height: int = 16, width: int = 16) -> Tensor:
@@ -203,7 +229,7 @@ def test_gmsd_of_one_edge_by_hand_and_as_opencv_has_it(photograph: Tensor) -> No
 @settings(max_examples=15, deadline=None)
 def test_exchanging_image_and_truth_changes_nothing_but_the_sign_of_blur(seed: int) -> None:
     there, back = score(noise(seed), noise(seed + 1)), score(noise(seed + 1), noise(seed))
-    assert astuple(there) == pytest.approx(astuple(replace(back, blur=-back.blur)), abs=1e-7)  # SSIM is in float32
+    assert four(there) == pytest.approx(four(replace(back, blur=-back.blur)), abs=1e-7)  # SSIM is in float32
 
 
 @pytest.mark.parametrize("poison", [math.nan, math.inf])
@@ -211,7 +237,7 @@ def test_an_image_that_is_not_finite_has_no_score(poison: float) -> None:
     image = noise(0)
     image[3, 4, 1] = poison
     scores = score(image, noise(0))
-    assert all(map(math.isnan, astuple(scores)))
+    assert all(map(math.isnan, four(scores)))
 
 
 def test_images_of_different_or_tiny_size_are_refused() -> None:
@@ -255,4 +281,4 @@ def test_hidden_pixels_do_not_count(photograph: Tensor) -> None:
     assert masked.psnr == pytest.approx(alone.psnr, abs=1e-4)
     assert masked.ssim == pytest.approx(alone.ssim, abs=0.01)
     assert masked.gmsd == pytest.approx(alone.gmsd, abs=0.01)
-    assert astuple(score(image, photograph, torch.ones_like(shown))) == astuple(score(image, photograph))
+    assert four(score(image, photograph, torch.ones_like(shown))) == four(score(image, photograph))

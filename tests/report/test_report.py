@@ -257,6 +257,22 @@ def test_averages_are_means_of_scene_means_with_paired_differences(tmp_path: Pat
     assert (line["PSNR (dB) ↑"], line["Δ"]) == ("25.50", "+2.00 ± 1.00")
 
 
+def test_metrics_of_ones_own_have_columns_and_averages_and_lpips_stands_beside_the_papers(tmp_path: Path) -> None:
+    for scene, lpips in (("fern", 0.25), ("horns", 0.375)):
+        for seed in (0, 1):
+            mean = {"ours": {**scores(20.0), "own": {"lpips": lpips + seed / 8, "lost": None}}}
+            test = {"against": "HR photos", "views": {"view.png": mean}, "mean": mean}
+            folder = make_run(tmp_path / f"{scene}{seed}", "+strategy=gco", seed=seed, scene=scene, test=test)
+            files.write_text(folder / ".hydra" / "hydra.yaml", f"  runtime:\n    choices:\n      scene: {scene}\n")
+    make_run(tmp_path / "without", "+strategy=svs", scene="fern")
+    lines = cells(table_of(tmp_path))
+    assert [line["metrics.lpips"] for line in lines] == ["0.3125 ± 0.0884", "", "0.4375 ± 0.0884", "0.3750"]
+    assert "metrics.lost" not in lines[0]
+    text = report.write(report.collect([tmp_path]), tmp_path)
+    (row,) = (row for row in cells(text.partition("LLFF, beside")[2]) if row["method"] == "+ GCO")
+    assert row["LPIPS"] == "0.375"
+
+
 def test_scenes_with_different_data_settings_are_averaged(tmp_path: Path) -> None:
     for scene, shrink in (("fern", 2), ("horns", 4)):
         for job, strategy in enumerate(("baseline", "gco")):
