@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any, Final, cast
@@ -369,7 +369,8 @@ def _densified(make: Make, cut: int = 0) -> Iterator[Tensor]:
         update = conductor.update(field.raw(), lr, hr, view, t)
         state.optimizer.step(field.raw(), _grads(update))
         if density.collects(t):
-            _without_error("a densifier's accumulate", f"at t={t}", density.accumulate, update, hr, t)
+            stepped = replace(update, grads=None)  # as of the compiled step
+            _without_error("a densifier's accumulate", f"at t={t}", density.accumulate, stepped, hr, t)
         conductor.after_step(field.raw(), update.step)
         state.optimizer.first["opacities"].copy_(torch.arange(1, len(field) + 1))
         if conductor.may_densify(t):

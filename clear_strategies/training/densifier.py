@@ -37,7 +37,11 @@ class Densifier:
         return True
 
     def accumulate(self, update: Update, shot: Shot, t: int) -> None:
-        """Accumulate the scores of iteration t, where `collects(t)`; `shot` is the rendering that they belong to."""
+        """Accumulate the scores of iteration t, where `collects(t)`; `shot` is the rendering that they belong to.
+
+        Args:
+            update: without `grads`, since the compiled step leaves none.
+        """
 
     def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
         """Do what is due at t, after the optimizer's step; returns whether the structure changed.
