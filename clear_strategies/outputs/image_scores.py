@@ -57,7 +57,7 @@ class ImageScores:
     ssim: float
     gmsd: float
     blur: float
-    own: Mapping[str, float] = field(default_factory=dict)
+    own: Mapping[str, float] = field(default_factory=dict, kw_only=True)
 
 
 class Truth:
@@ -88,7 +88,7 @@ class Truth:
             sizes = f"{tuple(image.shape)} and {tuple(self.image.shape)}"
             raise ValueError(f"images must have the same size, got {sizes}.")
         if not bool(image.isfinite().all()):
-            return ImageScores(math.nan, math.nan, math.nan, math.nan, dict.fromkeys(self.own, math.nan))
+            return ImageScores(math.nan, math.nan, math.nan, math.nan, own=dict.fromkeys(self.own, math.nan))
         image = image.detach().clamp(0, 1).cpu()
         if self.shown is not None:
             image = torch.where(self.shown[..., None], image, self.image)
@@ -98,7 +98,7 @@ class Truth:
         grey = _grey(image)
         gmsd = _gmsd(_gradient_at_half_size(grey), self.edges, self.shown)
         own = {name: _measured(name, metric, image, self.image) for name, metric in self.own.items()}
-        return ImageScores(psnr, _ssim(image, self.image, self.shown), gmsd, _blur(grey) - self.blur, own)
+        return ImageScores(psnr, _ssim(image, self.image, self.shown), gmsd, _blur(grey) - self.blur, own=own)
 
 
 def mean_scores(scores: Sequence[ImageScores]) -> ImageScores | None:
@@ -107,7 +107,7 @@ def mean_scores(scores: Sequence[ImageScores]) -> ImageScores | None:
         return None
     *four, _ = (f.name for f in fields(ImageScores))
     own = {name: sum(s.own[name] for s in scores) / len(scores) for name in scores[0].own}
-    return ImageScores(*(sum(getattr(s, name) for s in scores) / len(scores) for name in four), own)
+    return ImageScores(*(sum(getattr(s, name) for s in scores) / len(scores) for name in four), own=own)
 
 
 @torch.no_grad()  # of each thread its own

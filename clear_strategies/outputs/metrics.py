@@ -71,7 +71,7 @@ class Scores(msgspec.Struct):
     @property
     def numbers(self) -> ImageScores:
         *four, own = msgspec.structs.astuple(self)
-        return ImageScores(*map(as_float, four), {name: as_float(x) for name, x in own.items()})
+        return ImageScores(*map(as_float, four), own={name: as_float(x) for name, x in own.items()})
 
 
 class Part(msgspec.Struct):

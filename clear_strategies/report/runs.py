@@ -192,7 +192,7 @@ def _is_setting(override: str) -> bool:
     named_elsewhere = (
         override.startswith((_SEED, _METHOD, _STRATEGY)) or _PATH.fullmatch(key) or OF_STRATEGY.fullmatch(key)
     )
-    return not (named_elsewhere or key.startswith("hydra") or key in CHANGES_NO_RESULT)
+    return not (named_elsewhere or key.startswith(("hydra", OWN)) or key in CHANGES_NO_RESULT)
 
 
 def _job(folder: Path) -> int:

@@ -66,7 +66,7 @@ def layout(table: pd.DataFrame) -> pd.DataFrame:
 
 def _quantities(table: pd.DataFrame) -> dict[str, tuple[str, str]]:
     """`_QUANTITIES`, and the metrics of the runs' own."""
-    own = [name for name in table if name.startswith(OWN) and not name.endswith("_std")]
+    own = [name for name in map(str, table) if name.startswith(OWN) and not name.endswith("_std")]
     return {**_QUANTITIES, **{name: (name, ".4f") for name in own}}
 
 

@@ -258,7 +258,8 @@ class Strategy:
 
     def lambda_hr(self, t: int) -> float:
         """λ_HR(t) of the run's objective; 0 before the run starts."""
-        return self.cache[LAMBDA_HR](t) if LAMBDA_HR in self.cache else 0.0
+        schedule: Callable[[int], float] | None = self.cache.get(LAMBDA_HR)
+        return 0.0 if schedule is None else schedule(t)
 
     @property
     def seed(self) -> int:

@@ -262,7 +262,8 @@ def test_metrics_of_ones_own_have_columns_and_averages_and_lpips_stands_beside_t
         for seed in (0, 1):
             mean = {"ours": {**scores(20.0), "own": {"lpips": lpips + seed / 8, "lost": None}}}
             test = {"against": "HR photos", "views": {"view.png": mean}, "mean": mean}
-            folder = make_run(tmp_path / f"{scene}{seed}", "+strategy=gco", seed=seed, scene=scene, test=test)
+            settings = ["+strategy=gco", *["+metrics.lpips._target_=lpips.Net"] * seed]
+            folder = make_run(tmp_path / f"{scene}{seed}", *settings, seed=seed, scene=scene, test=test)
             files.write_text(folder / ".hydra" / "hydra.yaml", f"  runtime:\n    choices:\n      scene: {scene}\n")
     make_run(tmp_path / "without", "+strategy=svs", scene="fern")
     lines = cells(table_of(tmp_path))
