@@ -12,8 +12,7 @@ One training iteration:
    stepped, the strategies do what they do after a step.
 
 HR and extra views are in hr_drawing.py, what waits for `backward()` in pending.py, the merge in host_merge.py, the optimizers'
-steps in host_steps.py and extra_steps.py, changes of the structure in structure.py, and the first lines of the log in
-announcement.py.
+steps in host_steps.py, changes of the structure in structure.py, and the first lines of the log in announcement.py.
 
 The merge runs at the end of `backward()`, not in an optimizer hook. Gradient clipping therefore sees the merged gradient,
 optimizers other than `torch.optim.Optimizer` work, and so do hosts that densify before the step (3DGS) as well as hosts
@@ -24,8 +23,8 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from typing import Any, Final
 from weakref import WeakMethod, finalize
 
@@ -34,6 +33,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from clear_strategies.core import deferred
+from clear_strategies.core.checks import require_whole
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import conflict_columns
 from clear_strategies.core.step import Step
@@ -42,7 +42,6 @@ from clear_strategies.data.scene import require_shown
 from clear_strategies.errors import HostError, SettingError
 from clear_strategies.merging.conductor import Conductor
 from integration.announcement import announce, warn_without_hr
-from integration.extra_steps import ExtraSteps
 from integration.host_merge import HostMerge
 from integration.host_steps import HostSteps
 from integration.hr_drawing import Drawable, HrDrawing, RenderAt
@@ -121,12 +120,12 @@ class Attachment:
             conductor, device, threshold=threshold, loss_scale=loss_scale, accumulation=accumulation, counts=self.counts
         )
         self._step: Step | None = None  # of the rendering, until `after_step`
-        self._extra = ExtraSteps()
         self._has_told_of_accumulation = False
         self._logged: dict[str, deferred.Number | Callable[[], deferred.Number]] = {}
         self._steps = HostSteps(
-            self._extra, is_waiting=self._is_waiting, begins=self._step_begins, after=self._after_step_of
-        )
+            is_waiting=lambda: self._pending is not None and self._pending.output is not None,
+            begins=self._step_begins, after=self._after_optimizer, counts=self.counts,
+        )  # fmt: skip
         conductor.on_fit_start(len(views), seed, device, views)
         announce(conductor, views, own_background=own_background, iterations=iterations)
         self._farewell = finalize(self, warn_without_hr, conductor, self.counts)
@@ -149,16 +148,16 @@ class Attachment:
         z = conductor.gate(t, self._n)
         if z is not None:
             z = z.to(means)
-        apart = _random_state_kept(means.device)(render_at)
+        # Torch's random numbers are those before, after HR or an extra view: a dropout of the host drops the same at LR.
+        apart = torch.random.fork_rng([means.device] if means.device.type == "cuda" else [])(render_at)
         hr = routed = None
         if self._hr.wanted(t):
             view = conductor.skips.view(view, t)
             hr, routed = self._hr.hr(view, t, z, apart, params)
         self._step = Step(t, view, params=params) if hr is None else hr.step
         if self.passes == 0:  # one step of the host, however many passes it accumulates
-            self._extra.forget()
-            if extra_views := conductor.extra_views(t):
-                self._extra.take(self.params(), [self._hr.extra_view(extra, view, t, apart) for extra in extra_views])
+            extra_views = conductor.extra_views(t)
+            self._steps.follow_by(self.params(), (self._hr.extra_view(x, view, t, apart) for x in extra_views))
         output = render_at("lr", z, view)
         if isinstance(output, Drawable):
             raise TypeError("an adapter renders LR by the host's own function, got a Drawable.")
@@ -218,7 +217,7 @@ class Attachment:
         """Restore the host: its renderings pass through, and the gradients of one that is still pending stay unmerged."""
         self.removed, self._pending, self._pass = True, None, None
         self.hook([])
-        self._extra.forget()
+        self._steps.follow_by({}, [])
         self.conductor.on_fit_end()
         self._farewell()
         self.undo.close()
@@ -241,13 +240,11 @@ class Attachment:
                 cause, ", ".join(trained) or "nothing", remedy,
             )  # fmt: skip
 
-    def _after_step_of(self, optimizer: torch.optim.Optimizer) -> None:
-        """Step on extra views; and once all optimizers have stepped, let the strategies do so: what the loop computes of the
-        parameters from then on, before it renders, is of what they have left. In the iteration in which densification ends they
-        wait for the next rendering, since a host may densify in it, and an anchor is taken after that.
+    def _after_optimizer(self) -> None:
+        """Once all optimizers have stepped, the strategies do what they do after a step: what the loop computes of the parameters
+        from then on, before it renders, is of what they have left. In the iteration in which densification ends they wait for the
+        next rendering, since a host may densify in it, and an anchor is taken after that.
         """
-        if steps := self._extra.step(optimizer):
-            self.counts["extra views"] += steps
         may_densify = self.conductor.may_densify
         if self._steps.is_complete and may_densify(self.t) == may_densify(max(1, self.t - 1)):
             self._finish_step()
@@ -278,10 +275,6 @@ class Attachment:
             self._n = n
             self.counts["structure changes"] += 1
 
-    def _is_waiting(self) -> bool:
-        """Whether a rendering waits for its backward pass."""
-        return self._pending is not None and self._pending.output is not None
-
     def _reached(self, nth: int) -> TakeColours | None:
         """A backward pass of the host has reached the nth rendering, but no parameter yet."""
         if self.removed or self._pending is None:
@@ -306,10 +299,9 @@ class Attachment:
         pending.require_alone(done)
         using = [type(s).__name__ for s in map(self.conductor.owner, ("reconcile", "score")) if s is not None]
         pending.require_first(accumulated, " and ".join(using))
-        if names := [name for name in accumulated if name not in pending.merged]:
+        names = [name for name in accumulated if name not in pending.merged]
+        if names or not (trained or pending.merged):
             self._merge(pending, done, names)
-        elif not trained and not pending.merged:
-            self._merge(pending, done, [])
         if pending.merged >= trained:
             pending.output = pending.hr = pending.routed = None
 
@@ -365,8 +357,7 @@ def _rows_of(step: Step | None) -> dict[str, Tensor]:
 
 def _require_supported(conductor: Conductor, accumulation: int) -> None:
     """Raise a SettingError for what no host can do."""
-    if accumulation < 1:
-        raise SettingError(f"accumulation: must be at least 1 backward pass per step, got {accumulation}.")
+    require_whole("accumulation", accumulation, least=1)
     if not conductor.wants_lr:
         raise SettingError(
             "objective: a host renders LR itself, so lambda_lr must be > 0 and lr_from must be lr, got "
@@ -378,10 +369,3 @@ def _require_supported(conductor: Conductor, accumulation: int) -> None:
             f"CLEAR trains in one process, got {n}. Start the training on one device: without torchrun, with "
             "CUDA_VISIBLE_DEVICES=0, in nerfstudio with machine.num_devices=1."
         )
-
-
-@contextmanager
-def _random_state_kept(device: torch.device) -> Iterator[None]:
-    """Restore torch's random generators after HR or an extra view is drawn: a dropout of the host drops the same at LR."""
-    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
-        yield

@@ -1,36 +1,53 @@
-"""The steps of a host's optimizers: when one of the host begins and ends."""
+"""The steps of a host's optimizers: when one of the host begins and ends, and those on extra views, pictures that strategies want
+the field to match besides the training view.
+
+Both scales of the training view and its extra views are rendered from the same parameters, because a host may have computed its
+activations before it calls its renderer. So the gradient of each extra view waits until the host has stepped.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+import inspect
+import logging
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache
+from typing import Any, Final
 
 import torch
+from torch import Tensor
 
+from clear_strategies.core.gradients import Grads
 from clear_strategies.errors import HostError
-from integration.extra_steps import ExtraSteps
 from integration.pending import current_pass
+
+_log = logging.getLogger(__name__)
+
+_PATIENCE: Final = 10  # iterations with extra views, one after the other, of which none made a step, before a warning
 
 
 class HostSteps:
-    """Hooks on the host's optimizers. One step of the host is each optimizer once.
+    """Hooks on the host's optimizers. One step of the host is each optimizer once, and then once for each extra view.
 
     Args:
-        extra: the steps on extra views, which follow those of each optimizer.
         is_waiting: whether a rendering waits for its backward pass.
         begins: called when a step of the host begins, with whether gradients were merged since the one before.
-        after: called after an optimizer's own step.
+        after: called after an optimizer's own step, and its steps on extra views.
+        counts: `Attachment.counts`, to which this adds.
     """
 
     def __init__(
-        self, extra: ExtraSteps, *, is_waiting: Callable[[], bool], begins: Callable[[bool], None],
-        after: Callable[[torch.optim.Optimizer], None],
+        self, *, is_waiting: Callable[[], bool], begins: Callable[[bool], None], after: Callable[[], None], counts: Counter[str]
     ) -> None:  # fmt: skip
-        self._extra, self._is_waiting, self._begins, self._after = extra, is_waiting, begins, after
+        self._is_waiting, self._begins, self._after, self._counts = is_waiting, begins, after, counts
         self._hooks: list[Any] = []
         self._hooked: list[torch.optim.Optimizer] = []
         self._stepped: set[int] = set()  # the optimizers that have made this step
         self._has_merged = False  # since the last step
+        self._extra: list[Grads] = []
+        self._rendered: Mapping[str, Tensor] = {}  # what they are gradients of
+        self._steps_on_extra = False  # now, which is no step of the host
+        self._has_stepped, self._unused = False, 0  # on those of this iteration; iterations since the last that did
 
     def hook(self, optimizers: Sequence[torch.optim.Optimizer]) -> None:
         """Hook the steps of these, and no longer those of earlier ones. Others than torch's have no hooks."""
@@ -43,7 +60,7 @@ class HostSteps:
         self._stepped.clear()
         self._hooks = [
             *(o.register_step_pre_hook(lambda o, given, named: self._before_one(o, *given, *named.values())) for o in distinct),
-            *(o.register_step_post_hook(lambda o, *_: None if self._extra.stepping else self._after(o)) for o in distinct),
+            *(o.register_step_post_hook(lambda o, *_: self._after_one(o)) for o in distinct),
         ]  # fmt: skip
 
     def on_merge(self) -> None:
@@ -61,12 +78,30 @@ class HostSteps:
         """Whether all have."""
         return len(self._stepped) == len(self._hooked)
 
+    def follow_by(self, params: Mapping[str, Tensor], gradients: Iterable[Grads]) -> None:
+        """The gradients of the extra views of this iteration, with respect to these leaves of the host, in place of those of the
+        one before, stepped on or not. Warn where they no longer are.
+
+        Args:
+            gradients: made one by one, once the memory of those before is free.
+        """
+        if self._extra:
+            self._unused = 0 if self._has_stepped else self._unused + 1
+            if self._unused == _PATIENCE:
+                _log.warning(
+                    "extra views have no effect: they were rendered in %d iterations, and no optimizer that was passed stepped "
+                    "on them. Pass those that the loop steps, and put new ones in the same dictionary.", _PATIENCE,
+                )  # fmt: skip
+        self._extra, self._has_stepped = [], False
+        self._extra += gradients
+        self._rendered = {name: p for name, p in params.items() if name != "detail"}
+
     def _before_one(self, optimizer: torch.optim.Optimizer, *given: Any) -> None:
         """
         Args:
             given: what `step` was called with.
         """
-        if self._extra.stepping:
+        if self._steps_on_extra:
             return
         if any(callable(x) for x in given):
             raise HostError(
@@ -85,3 +120,58 @@ class HostSteps:
         if begins:
             has_merged, self._has_merged = self._has_merged, False
             self._begins(has_merged)
+
+    def _after_one(self, optimizer: torch.optim.Optimizer) -> None:
+        if self._steps_on_extra:
+            return
+        if self._extra:
+            self._step_on_extra(optimizer)
+        self._after()
+
+    @torch.no_grad()
+    def _step_on_extra(self, optimizer: torch.optim.Optimizer) -> None:
+        """One step of this optimizer for each extra view; those of the positions are counted.
+
+        An optimizer whose parameters were replaced after the views were rendered makes none (3DGS densifies before it steps).
+        """
+        stepped = [p for group in optimizer.param_groups for p in group["params"]]
+        ids = {id(p) for p in stepped}
+        params = {name: p for name, p in self._rendered.items() if id(p) in ids and p.requires_grad}
+        if not params:
+            return
+        before, self._steps_on_extra = [p.grad for p in stepped], True
+        scale = getattr(optimizer, "grad_scale", None)  # an AMP gradient scaler's, which a fused optimizer divides by
+        if scale is not None:  # gradients of extra views are not scaled
+            optimizer.grad_scale = None  # type: ignore[attr-defined]
+        try:
+            for grads in self._extra:
+                for p in stepped:
+                    p.grad = None
+                for name, p in params.items():
+                    p.grad = grads[name].to(p)
+                _step(optimizer, next(iter(params.values())))
+        finally:
+            self._steps_on_extra = False
+            if scale is not None:
+                optimizer.grad_scale = scale  # type: ignore[attr-defined]
+            for p, grad in zip(stepped, before, strict=True):
+                p.grad = grad
+        self._has_stepped = True
+        if "means" in params:
+            self._counts["extra views"] += len(self._extra)
+
+
+@cache
+def _parameters(step: Callable[..., Any]) -> frozenset[str]:
+    return frozenset(inspect.signature(step).parameters)
+
+
+def _step(optimizer: torch.optim.Optimizer, rows: Tensor) -> None:
+    """One step of all rows. An Adam of visible Gaussians takes which move, 3DGS's SparseGaussianAdam also how many there are."""
+    parameters = _parameters(type(optimizer).step)
+    known: dict[str, Any] = {}
+    if "visibility" in parameters:
+        known["visibility"] = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
+    if "N" in parameters:
+        known["N"] = len(rows)
+    optimizer.step(**known)
