@@ -22,21 +22,12 @@ from integration.attachment import Attachment
 from integration.autograd_shot import HostOutput, Target
 from integration.densification import require_end, warn_if_score_is_unused
 from integration.detail import sh0_offset
-from integration.gsplat.calls import (
-    Rasterization,
-    aliased,
-    drawable,
-    enlarged,
-    host_output,
-    require_pinhole,
-    seen_by,
-    with_offset,
-)
+from integration.gsplat import calls
+from integration.gsplat.calls import Rasterization
 from integration.gsplat.optimizers import optimizers_of, step_detail
-from integration.gsplat.poses import Poses
 from integration.gsplat.rows import RowNumbers
 from integration.hr_drawing import Drawable
-from integration.replacing import replace_everywhere
+from integration.replacing import replace_everywhere, replaced_attribute
 from rasterizers.ahead import drawing_ahead
 from rasterizers.as_gsplat import rasterizer_of
 from rasterizers.interface import BackendUnavailable, Camera, Rasterizer
@@ -123,9 +114,8 @@ class Attached:
             params if state is None else state, lambda: params[self._names["means"]], as_parameter=state is None
         )
         self.views = tuple(views)
-        self._poses = Poses(views)
-        self._found_by_pose = True  # else renderings are those of `_named`, see `rendering`
-        self._named: View | None = None
+        self._poses = calls.Poses(views)
+        self._named: tuple[View | None] | None = None  # see `rendering`; None: a view is found by its pose
         self._has_drawn_bands = False  # after a call with spherical harmonics, one without them draws no colours
         self._product: tuple[Tensor, Tensor, Tensor] | None = None  # see `_gated`
         self._trains_detail = detail
@@ -175,10 +165,10 @@ class Attached:
                 return rasterization(**call)
             if not torch.is_grad_enabled():
                 return rasterization(**self._with_detail(call, trained=False))
-            view = self._poses.find(call["viewmats"]) if self._found_by_pose else self._named
+            view = self._poses.find(call["viewmats"]) if self._named is None else self._named[0]
             if view is None:  # a viewer, a camera without a photo
                 return rasterization(**self._with_detail(call, trained=False))
-            require_pinhole(call, self.attachment.conductor.showing)
+            calls.require_pinhole(call, self.attachment.conductor.showing)
 
             def render_at(target: Target, gate: Tensor | None, sized: View) -> HostOutput | Drawable:
                 return self._render(rasterization, call, sized, target, gate)
@@ -195,12 +185,8 @@ class Attached:
         """Renderings with gradients are those of this view, whatever their pose (pose optimization, pose noise); None: of no
         training view, e.g. a second pass for normals, which f_det is then not added to.
         """
-        before = self._named, self._found_by_pose
-        self._named, self._found_by_pose = view, False
-        try:
+        with replaced_attribute(self, "_named", (view,)):
             yield
-        finally:
-            self._named, self._found_by_pose = before
 
     def replace_everywhere(self, rasterization: Rasterization) -> Rasterization:
         """Replace the function by its wrapped version in every loaded module, under any name; `remove` undoes it."""
@@ -241,8 +227,7 @@ class Attached:
         self._has_drawn_bands |= as_bands
         if "RGB" not in call.get("render_mode", "RGB") or call["colors"].shape[-1] != 3:
             return False
-        of_no_photo = self._named is None and not self._found_by_pose
-        return as_bands or not (self._has_drawn_bands or of_no_photo)
+        return as_bands or not (self._has_drawn_bands or self._named == (None,))
 
     def _render(
         self, rasterization: Rasterization, arguments: Mapping[str, Any], view: View, target: Target, gate: Tensor | None
@@ -257,12 +242,12 @@ class Attached:
             call["opacities"] = self._gated(call["opacities"], gate)
         own = None if target == "lr" else self._own_rasterizer(call)
         if target == "hr":
-            call = enlarged(self._with_detail(call, trained=True) if own is None else call, view.factor)
+            call = calls.enlarged(self._with_detail(call, trained=True) if own is None else call, view.factor)
             call |= {"packed": False} if self._is_ours else {}  # nobody reads its `info`
         else:
             params.pop("detail", None)
         if isinstance(target, Camera):
-            call = seen_by(call, target) if own is None else call
+            call = calls.seen_by(call, target) if own is None else call
         else:
             expected = view.hr.camera if target == "hr" else view.lr.camera
             if (call["width"], call["height"]) != (expected.width, expected.height):
@@ -272,29 +257,27 @@ class Attached:
                     "num_downscales=0), cut a crop out of the picture of the whole photo, and evaluate without gradients."
                 )
         if own is not None:
-            return drawable(own, call, params, target if isinstance(target, Camera) else None)
-        call, aliases = (call, ()) if self._is_ours else aliased(call)
-        return host_output(rasterization, call, params, gate, aliases if target == "lr" else ())
+            return calls.drawable(own, call, params, target if isinstance(target, Camera) else None)
+        call, aliases = (call, ()) if self._is_ours else calls.aliased(call)
+        return calls.host_output(rasterization, call, params, gate, aliases if target == "lr" else ())
 
     def _own_rasterizer(self, call: Mapping[str, Any]) -> Rasterizer | None:
         """What draws HR and extra views in place of the host's function; None: nothing does. The log says once, which."""
         if self._hr_by == "host" or (self._hr_by == "auto" and call["means"].device.type != "cuda"):
             return None
         backend = "warp" if self._hr_by == "auto" else self._hr_by
+        rasterizer = None
         try:
             rasterizer = rasterizer_of(call, backend)
+            by = f"this package's rasterizer {backend}, LR by the host's function."
         except (ValueError, BackendUnavailable) as error:
             if self._hr_by != "auto":
                 raise
-            self._tell(f"the host's own function: {error}")
-            return None
-        self._tell(f"this package's rasterizer {backend}, LR by the host's function.")
-        return rasterizer
-
-    def _tell(self, by: str) -> None:
+            by = f"the host's own function: {error}"
         if by != self._told:
             _log.info("HR and extra views are drawn by %s", by)
-        self._told = by
+            self._told = by
+        return rasterizer
 
     def _gated(self, opacities: Float[Tensor, " N"], gate: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
         """Their product, made once for both scales."""
@@ -314,7 +297,7 @@ class Attached:
         detail = self._params.get("detail")
         if detail is None or len(arguments["means"]) != len(detail):
             return dict(arguments)  # only a part of the scene is rendered, and it is unknown which
-        return with_offset(arguments, detail if trained else detail.detach(), is_ours=self._is_ours)
+        return calls.with_offset(arguments, detail if trained else detail.detach(), is_ours=self._is_ours)
 
 
 attach = Attached

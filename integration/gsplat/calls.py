@@ -1,5 +1,5 @@
-"""Calls of gsplat's `rasterization`, by the names of its parameters: the same call at another size, from another camera, or with
-f_det in the colours; and what a call returns, as an `Attachment` needs it.
+"""Calls of gsplat's `rasterization`, by the names of its parameters: which view one draws; the same call at another size, from
+another camera, or with f_det in the colours; and what a call returns, as an `Attachment` needs it.
 """
 
 from __future__ import annotations
@@ -7,14 +7,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies.core.view import View
 from clear_strategies.errors import HostError
 from clear_strategies.geometry.projection import intrinsics
 from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot
 from integration.hr_drawing import Drawable
+from integration.views import SAME_POSE
 from rasterizers.as_gsplat import cameras_of
 from rasterizers.autograd import collected_drawings
 from rasterizers.geometry import SH_C0
@@ -27,6 +30,35 @@ _LENS: Final = (
     "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs", "lidar_coeffs", "external_distortion_coeffs",
     "viewmats_rs", "rays",
 )  # fmt: skip
+_POSE_RATIO: Final = 10  # how many times as far the second nearest pose must be, since frames of a video lie close
+
+
+class Poses:
+    """The poses of the training views, by which the view of a call is found where the loop does not name it."""
+
+    def __init__(self, views: Sequence[View]) -> None:
+        self._views = tuple(views)
+        self._poses = torch.stack([view.lr.camera.world_to_camera for view in views]).double().cpu().numpy()
+
+    def find(self, viewmats: Float[Tensor, "*C 4 4"]) -> View | None:
+        """The view of this pose; None: it is none of a training view.
+
+        Raises:
+            HostError: there are several poses, or two views have this one.
+        """
+        poses = viewmats.detach().reshape(-1, 4, 4).cpu().numpy()  # compared in numpy: a step has few torch operations
+        if len(poses) != 1:
+            raise HostError(
+                f"only one view per step is supported, got {len(poses)}. Set batch_size=1, or call joint_loss for each view "
+                "and average."
+            )
+        distances = np.abs(self._poses - poses).max((1, 2)).tolist()
+        tolerance = SAME_POSE * max(1.0, float(np.abs(poses).max()))
+        near = sorted((distance, i) for i, distance in enumerate(distances) if distance <= tolerance)
+        if len(near) > 1 and near[1][0] <= _POSE_RATIO * near[0][0]:
+            names = " and ".join(self._views[i].name for _, i in near[:2])
+            raise HostError(f"{names} have the same pose. Say which is rendered: with clear.rendering(view): …")
+        return self._views[near[0][1]] if near else None
 
 
 def enlarged(call: Call, factor: int) -> dict[str, Any]:
@@ -119,12 +151,13 @@ def host_output(
     if len(drawings) == 1:  # what the gate drops is not visible in it
         means2d, visible = drawings[0].rendering.means2d, drawings[0].rendering.visible
     else:
-        visible = _visible(info["radii"], packed)
+        radii: Tensor = info["radii"]
+        has_two = radii.dim() == (2 if packed else 3)  # of each Gaussian, since gsplat 1.5
+        visible = (radii > 0).all(-1) if has_two else radii > 0
         if gate is not None:
             kept = (gate > 0)[rows] if rows is not None else gate > 0
             visible = visible & kept
-            radii = info["radii"]
-            info["radii"] = radii * kept.view(*kept.shape, *[1] * (radii.dim() - (1 if packed else 2))).to(radii)
+            info["radii"] = radii * (kept[:, None] if has_two else kept).to(radii)
         visible = visible.reshape(-1)
         if rows is not None:
             means2d = means2d.new_zeros(n, 2).index_copy_(0, rows, means2d)
@@ -135,9 +168,3 @@ def host_output(
     slot = ScreenGradientSlot(info["means2d"], size, rows=rows)
     shot = AutogradShot(image, means2d, visible, params, slot, drawn, drawings)
     return HostOutput(shot, (renders, alphas, info), marks)
-
-
-def _visible(radii: Tensor, packed: bool) -> Bool[Tensor, "*shape"]:
-    """Gaussians with positive radii: one number per Gaussian in gsplat 1.4, two in 1.5."""
-    two_radii = radii.dim() == (2 if packed else 3)
-    return (radii > 0).all(-1) if two_radii else radii > 0

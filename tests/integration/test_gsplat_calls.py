@@ -13,7 +13,7 @@ from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.merging.in_place import merge_in_place
 from clear_strategies.schedules import Ramp
 from integration import HostError
-from integration.gsplat.poses import Poses
+from integration.gsplat.calls import Poses
 from rasterizers import autograd
 from tests.helpers import gsplat_host, toy
 from tests.helpers.backends import needs
