@@ -6,16 +6,18 @@ import argparse
 import logging
 import runpy
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from clear_strategies import console
 from clear_strategies.commands import path_of
 from clear_strategies.errors import ClearError, DataError
+from integration.replacing import replaced_attribute
 from integration.settings import Settings
+from integration.views import HostPhoto, save_photos
 
 _log = logging.getLogger(__name__)
 
@@ -36,7 +38,7 @@ class Host:
     otherwise: str
 
 
-def main(module: str, host: Host, arguments: Sequence[str] | None) -> int:
+def main(module: str, host: Host, arguments: Sequence[str] | None = None) -> int:
     """The program `python -m <module> [options] script [its arguments]`; returns its exit status."""
     return run(parser(module, f"Run {host.script} with CLEAR.").parse_args(arguments), lambda: host)
 
@@ -97,6 +99,12 @@ def run(options: argparse.Namespace, prepared: Callable[[], Host]) -> int:
     return 1
 
 
+def save_lr(photos: Iterable[HostPhoto], folder: Path) -> NoReturn:
+    """What `--save-lr` does in place of training."""
+    save_photos(photos, folder)
+    raise SystemExit(0)
+
+
 def _settings(options: argparse.Namespace) -> Settings:
     """The settings of `install`; what it would refuse is refused here, before the host loads its scene.
 
@@ -113,9 +121,8 @@ def _settings(options: argparse.Namespace) -> Settings:
 @contextmanager
 def _as_script(script: Path, arguments: Sequence[str]) -> Iterator[None]:
     """`sys.argv` and `sys.path` as in `python script …`."""
-    before = sys.argv, list(sys.path)
-    sys.argv, sys.path[:0] = [str(script), *arguments], [str(script.parent.resolve())]
-    try:
+    with (
+        replaced_attribute(sys, "argv", [str(script), *arguments]),
+        replaced_attribute(sys, "path", [str(script.parent.resolve()), *sys.path]),
+    ):
         yield
-    finally:
-        sys.argv, sys.path[:] = before

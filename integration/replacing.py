@@ -1,38 +1,44 @@
-"""Functions and attributes in place of a host's own."""
+"""Functions and attributes in place of a host's own, inside a context."""
 
 from __future__ import annotations
 
 import functools
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 
-def replace_everywhere(original: Callable[..., Any], replacement: Callable[..., Any]) -> Callable[[], None]:
-    """Replace a function in all loaded modules, under any name; returns what undoes it.
+@contextmanager
+def replaced_attribute(owner: Any, name: str, value: Any) -> Iterator[None]:
+    """The attribute has another value."""
+    original = getattr(owner, name)
+    setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        setattr(owner, name, original)
+
+
+@contextmanager
+def replaced_everywhere(original: Callable[..., Any], replacement: Callable[..., Any]) -> Iterator[None]:
+    """A function is another one in all loaded modules, under any name.
 
     Functions that a module binds later, or holds in another object, are not found; an `Attachment` raises an error if
     its host then renders with the original.
     """
-    places = [
-        (module, name)
-        for module in list(sys.modules.values())
-        for name, value in list(getattr(module, "__dict__", {}).items())
-        if value is original
-    ]
-
-    def put(function: Callable[..., Any]) -> None:
-        for module, name in places:
-            setattr(module, name, function)
-
-    put(replacement)
-    return functools.partial(put, original)
+    with ExitStack() as undo:
+        for module in list(sys.modules.values()):
+            for name, value in list(getattr(module, "__dict__", {}).items()):
+                if value is original:
+                    undo.enter_context(replaced_attribute(module, name, replacement))
+        yield
 
 
-def replace_methods(owner: Any, replacements: Mapping[str, Callable[..., Any]]) -> Callable[[], None]:
-    """Replace methods of one object; returns what undoes it. Each replacement gets the original as its first argument. Copies and
-    pickles of the object have its own methods.
+@contextmanager
+def replaced_methods(owner: Any, replacements: Mapping[str, Callable[..., Any]]) -> Iterator[None]:
+    """Methods of one object are others, each of which gets the original as its first argument. Copies and pickles of the object
+    have its own methods.
 
     Args:
         replacements: by the name of the method. Those that the object does not have are left out.
@@ -42,12 +48,11 @@ def replace_methods(owner: Any, replacements: Mapping[str, Callable[..., Any]]) 
         original = getattr(owner, name)
         named = functools.wraps(original, updated=())  # the attributes of a method that was replaced before are its own
         setattr(owner, name, named(_Method(replacements[name], owner, name)))
-
-    def undo() -> None:
+    try:
+        yield
+    finally:
         for name in names:
             vars(owner).pop(name, None)
-
-    return undo
 
 
 class _Method:
@@ -60,14 +65,3 @@ class _Method:
 
     def __reduce__(self) -> Any:
         return getattr, self._own
-
-
-@contextmanager
-def replaced_attribute(owner: Any, name: str, value: Any) -> Iterator[None]:
-    """The attribute has another value inside the context."""
-    original = getattr(owner, name)
-    setattr(owner, name, value)
-    try:
-        yield
-    finally:
-        setattr(owner, name, original)

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,40 +20,31 @@ from torch.optim.optimizer import register_optimizer_step_pre_hook
 from clear_strategies.errors import HostError
 from integration import launcher
 from integration.gsplat.simple_trainer import install, photos_of
+from integration.replacing import replaced_attribute
 from integration.settings import Settings
-from integration.views import save_photos
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run simple_trainer.py with CLEAR; returns the exit status."""
-    return launcher.main("integration.gsplat", HOST, arguments)
 
 
 @contextmanager
 def _installed_by_cli(save_lr: Path | None, settings: Settings) -> Iterator[list[Any]]:
     """CLEAR is installed when the script calls `cli`, which is when its `Runner` exists."""
     distributed: Any = importlib.import_module("gsplat.distributed")
-    cli, attached = distributed.cli, list[Any]()
-    before_cli = register_optimizer_step_pre_hook(_refuse_to_train)
+    cli, attached, undo = distributed.cli, list[Any](), ExitStack()
 
     def cli_with_clear(train: Any, *args: Any, **kwargs: Any) -> Any:
-        distributed.cli = cli
-        before_cli.remove()
+        undo.close()
         runner = getattr(train, "__globals__", {}).get("Runner")
         if runner is None:
             raise HostError(f"{sys.argv[0]} has no Runner, which gsplat's simple_trainer.py has.")
         if save_lr is not None:
-            runner.train = lambda self: _save_lr(self, save_lr)
+            runner.train = lambda self: launcher.save_lr(photos_of(self.trainset), save_lr)
         else:
             install(runner, settings, installed=attached.append)
         return cli(train, *args, **kwargs)
 
-    distributed.cli = cli_with_clear
-    try:
+    with undo:
+        undo.callback(register_optimizer_step_pre_hook(_refuse_to_train).remove)
+        undo.enter_context(replaced_attribute(distributed, "cli", cli_with_clear))
         yield attached
-    finally:
-        distributed.cli = cli
-        before_cli.remove()
 
 
 def _refuse_to_train(*_: Any) -> None:
@@ -62,12 +54,8 @@ def _refuse_to_train(*_: Any) -> None:
     )
 
 
-def _save_lr(runner: Any, folder: Path) -> None:
-    save_photos(photos_of(runner.trainset), folder)
-    raise SystemExit(0)
-
-
 HOST: Final = launcher.Host("gsplat's simple_trainer.py", _installed_by_cli, "no Runner was trained")
+main: Final = partial(launcher.main, "integration.gsplat", HOST)
 
 if __name__ == "__main__":
     sys.exit(main())

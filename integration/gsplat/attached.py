@@ -27,7 +27,7 @@ from integration.gsplat.calls import Rasterization
 from integration.gsplat.optimizers import optimizers_of, step_detail
 from integration.gsplat.rows import RowNumbers
 from integration.hr_drawing import Drawable
-from integration.replacing import replace_everywhere, replaced_attribute
+from integration.replacing import replaced_attribute, replaced_everywhere
 from rasterizers.ahead import drawing_ahead
 from rasterizers.as_gsplat import rasterizer_of
 from rasterizers.interface import BackendUnavailable, Camera, Rasterizer
@@ -191,7 +191,7 @@ class Attached:
     def replace_everywhere(self, rasterization: Rasterization) -> Rasterization:
         """Replace the function by its wrapped version in every loaded module, under any name; `remove` undoes it."""
         wrapped = self.wrap(rasterization)
-        self.attachment.undo.callback(replace_everywhere(rasterization, wrapped))
+        self.attachment.undo.enter_context(replaced_everywhere(rasterization, wrapped))
         return wrapped
 
     @torch.no_grad()

@@ -21,7 +21,7 @@ from clear_strategies.merging.conductor import Conductor
 from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
 from integration.gsplat.attached import Attached, require_bands
-from integration.replacing import replace_everywhere
+from integration.replacing import replaced_everywhere
 from integration.settings import Settings
 from integration.views import HostPhoto, no_stereo, stereo_points
 
@@ -41,6 +41,9 @@ _NEEDED: Final = {
     "data_type": ("colmap", "other datasets have other cameras"),
 }
 """Fields of the trainer's Config: what CLEAR needs, and why."""
+_NEEDED_BY_STEREO: Final = {
+    "camera_model": ("pinhole", "points=stereo is between such photos; undistort them, or leave points at own"),
+}
 _CREATE: Final = "create_splats_with_optimizers"
 
 
@@ -76,11 +79,9 @@ def install(
     @functools.wraps(train)
     def train_with_clear(runner: Any) -> Any:
         nonlocal last
-        require_supported(runner.cfg)
+        require_supported(runner.cfg, from_stereo=wanted.from_stereo)
         require_bands(runner.splats)
         chosen = wanted.conductor(runner.cfg.max_steps)
-        if wanted.from_stereo:
-            require_pinhole(runner.cfg)
         end_with_strategies(chosen, runner.cfg.strategy, "refine_stop_iter", first=0)
         source, scale = wanted.sr_source(chosen)
         photos = photos_of(runner.trainset, runner.device)
@@ -108,21 +109,12 @@ def install(
     runner_class.train, runner_class.rasterize_splats = train_with_clear, rasterize_the_view
 
 
-def require_supported(config: Any) -> None:
-    """Raise a SettingError for an option of simple_trainer that does not work with two scales."""
-    for name, (needed, why) in _NEEDED.items():
+def require_supported(config: Any, *, from_stereo: bool) -> None:
+    """Raise a SettingError for an option of simple_trainer that does not work with two scales, or with points between photos."""
+    for name, (needed, why) in (_NEEDED | (_NEEDED_BY_STEREO if from_stereo else {})).items():
         found = getattr(config, name, needed)
         if found != needed:
             raise SettingError(f"{name}: CLEAR needs {needed}, got {found}: {why}.")
-
-
-def require_pinhole(config: Any) -> None:
-    """Raise a SettingError for other cameras, which gsplat draws, where points are computed between photos."""
-    model = getattr(config, "camera_model", "pinhole")
-    if model != "pinhole":
-        raise SettingError(
-            f"camera_model: points=stereo must have pinhole cameras, got {model}. Undistort the photos, or leave points at own."
-        )
 
 
 def _attach(
@@ -148,7 +140,7 @@ def _attach(
                 kwargs["sh0"] = sh0.detach() + sh0_offset(detail.detach(), sh0)
             return export(*args, **kwargs)
 
-        attached.attachment.undo.callback(replace_everywhere(export, export_with_detail))
+        attached.attachment.undo.enter_context(replaced_everywhere(export, export_with_detail))
     return attached
 
 

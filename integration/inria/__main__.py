@@ -10,7 +10,7 @@ import functools
 import importlib
 import logging
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -21,18 +21,13 @@ from clear_strategies.errors import HostError
 from integration import launcher
 from integration.inria.cameras import photo_of
 from integration.inria.from_options import install
-from integration.replacing import replace_everywhere, replaced_attribute
+from integration.replacing import replaced_attribute, replaced_everywhere
 from integration.settings import Settings
-from integration.views import no_stereo, save_photos
+from integration.views import no_stereo
 
 _log = logging.getLogger("integration.inria")  # __name__ is "__main__" here
 _SETUP: Final = "training_setup"
 _BY_HAND: Final = "Put the line install(gaussians, scene, opt, …) into the script instead."
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a train.py with CLEAR; returns the exit status."""
-    return launcher.main("integration.inria", HOST, arguments)
 
 
 @contextmanager
@@ -65,8 +60,7 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
                     f"{setup.__name__} was called before a Scene was made, so the training cameras are unknown. {_BY_HAND}"
                 )
             if save_lr is not None:
-                save_photos(map(photo_of, scenes[-1].getTrainCameras()), save_lr)
-                raise SystemExit(0)
+                launcher.save_lr(map(photo_of, scenes[-1].getTrainCameras()), save_lr)
             if settings.from_stereo and setup.__name__ != _SETUP:
                 raise no_stereo(f"the script calls {setup.__name__}, whose arguments belong to its own points")
             attached.append(install(gaussians, scenes[-1], opt, settings))
@@ -85,7 +79,7 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
         return render(camera, gaussians, *args, **kwargs)
 
     with ExitStack() as undo:
-        undo.callback(replace_everywhere(render, render_unless_unknown))
+        undo.enter_context(replaced_everywhere(render, render_unless_unknown))
         undo.enter_context(replaced_attribute(scene.Scene, "__init__", init_and_remember))
         for name in [name for name in dir(of) if name.startswith(_SETUP)]:
             undo.enter_context(replaced_attribute(of, name, installing(getattr(of, name))))
@@ -99,6 +93,7 @@ HOST: Final = launcher.Host(
     _installed_by_training_setup,
     "it called no GaussianModel.training_setup, or made no step",
 )
+main: Final = functools.partial(launcher.main, "integration.inria", HOST)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -18,11 +18,12 @@ from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment
 from integration.autograd_shot import HostOutput, Target
 from integration.densification import require_end, warn_if_score_is_unused
+from integration.detail import sh0_offset
 from integration.inria.cameras import HostViews, enlarged_camera, replaced_camera
 from integration.inria.detail import DetailFeature
 from integration.inria.model_proxy import Overrides, host_output, proxy
 from integration.inria.rows import CarriedRows
-from integration.replacing import replace_everywhere, replace_methods, replaced_attribute
+from integration.replacing import replaced_attribute, replaced_everywhere, replaced_methods
 from integration.views import SuperResolve, sr_source
 from rasterizers.autograd import collected_drawings
 from rasterizers.interface import Camera
@@ -104,7 +105,7 @@ class Attached:
         )  # fmt: skip
         undo = self.attachment.undo
         undo.callback(self._rows.remove)
-        undo.callback(replace_methods(gaussians, {
+        undo.enter_context(replaced_methods(gaussians, {
             **dict.fromkeys(_SAVERS, self._save_with_detail), "compute_3D_filter": self._compute_filter_at_hr,
             "training_setup": self._training_setup, "relocate_gs": self._relocate,
         }))  # fmt: skip
@@ -161,13 +162,13 @@ class Attached:
     def replace_everywhere(self, render: Callable[..., Any]) -> Callable[..., Any]:
         """Replace the function by its wrapped version in every loaded module, under any name; `remove` undoes it."""
         wrapped = self.wrap(render)
-        self.attachment.undo.callback(replace_everywhere(render, wrapped))
+        self.attachment.undo.enter_context(replaced_everywhere(render, wrapped))
         return wrapped
 
     @torch.no_grad()
     def fold_detail(self) -> None:
         """Add f_det to the constant band of the colours and set it to 0."""
-        self._model._features_dc += self.detail.offset(self._model._features_dc)
+        self._model._features_dc += sh0_offset(self.detail.value, self._model._features_dc)
         self.detail.value.zero_()
 
     def remove(self) -> None:
@@ -267,7 +268,7 @@ class Attached:
     def _save_with_detail(self, save: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """`save_ply` with f_det in the colours of the file."""
         trained = self._model._features_dc
-        shown = torch.nn.Parameter(trained.detach() + self.detail.offset(trained))
+        shown = torch.nn.Parameter(trained.detach() + sh0_offset(self.detail.value.detach(), trained))
         with replaced_attribute(self._model, "_features_dc", shown):
             return save(*args, **kwargs)
 

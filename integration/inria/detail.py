@@ -11,8 +11,9 @@ from torch import Tensor
 
 from clear_strategies.errors import HostError
 from clear_strategies.merging.detail import DetailRates
-from integration.detail import detail_adam, sh0_offset
+from integration.detail import detail_adam
 from integration.inria.rows import CarriedRows, Change
+from integration.structure import composed
 
 
 class DetailFeature:
@@ -37,10 +38,6 @@ class DetailFeature:
         """f_det, one row per Gaussian of the host."""
         self._follow_host()
         return self._value
-
-    def offset(self, sh0: Float[Tensor, "N ..."]) -> Float[Tensor, "N ..."]:
-        """f_det as an offset of the constant SH band."""
-        return sh0_offset(self.value.detach(), sh0)
 
     def poll_parents(self) -> Int[Tensor, " M"] | None:
         """parents[M] of the changes since the last call, -1 where there is none; None: there were no changes."""
@@ -85,9 +82,7 @@ class DetailFeature:
         change = self._rows.poll()
         if change is not None:
             self._gather(change)
-            earlier = self._parents
-            parents = change.parents if earlier is None else earlier[change.parents.clamp_min(0)]
-            self._parents = torch.where(change.parents < 0, -1, parents)
+            self._parents = change.parents if self._parents is None else composed(change.parents, self._parents)
         if len(now := self._means()) != len(self._value):
             raise HostError(
                 f"the host changed the number of Gaussians from {len(self._value):,} to {len(now):,} inside its parameters. A "

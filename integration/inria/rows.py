@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -17,8 +18,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from integration.replacing import replace_methods
-from integration.structure import is_same
+from integration.replacing import replaced_methods
+from integration.structure import composed, is_same
 
 _log = logging.getLogger(__name__)
 
@@ -59,11 +60,12 @@ class CarriedRows:
 
     def __init__(self, model: Any, params: Callable[[], Mapping[str, Tensor]]) -> None:
         self._model, self._params, self._warned = model, params, False
-        self._undo = replace_methods(model, {
+        self._undo = ExitStack()
+        self._undo.enter_context(replaced_methods(model, {
             "_prune_optimizer": functools.partial(_hooked, self._keep),
             "cat_tensors_to_optimizer": functools.partial(_hooked, self._append),
             "relocate_gs": self._relocate,
-        })  # fmt: skip
+        }))  # fmt: skip
         self.restart()
 
     def restart(self) -> None:
@@ -93,7 +95,7 @@ class CarriedRows:
 
     def remove(self) -> None:
         """Give the model its own methods back."""
-        self._undo()
+        self._undo.close()
 
     def _compared(self) -> dict[str, Tensor]:
         params = self._params()
@@ -112,7 +114,7 @@ class CarriedRows:
         if len(self._parents) != len(now["means"]) or any(name not in tensors for name in _GROUPS.values()):
             return
         nearest = _nearest_copied(now, {name: tensors[_GROUPS[name]] for name in _COMPARED})
-        self._parents = torch.cat((self._parents, self._parents_of(nearest)))
+        self._parents = torch.cat((self._parents, composed(nearest, self._parents)))
         self._fresh = torch.cat((self._fresh, torch.ones_like(nearest, dtype=torch.bool)))
 
     def _relocate(self, relocate_gs: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
@@ -122,13 +124,9 @@ class CarriedRows:
         change = find_change(before, self._compared())
         if change is not None and len(self._parents) == len(before["means"]) == len(change.parents):
             self._carried = True
-            self._parents = self._parents_of(change.parents)
+            self._parents = composed(change.parents, self._parents)
             self._fresh |= change.parents != torch.arange(len(self._fresh), device=self._fresh.device)
         return result
-
-    def _parents_of(self, rows: Int[Tensor, " M"]) -> Int[Tensor, " M"]:
-        """What these current rows come from; -1, no row, stays."""
-        return torch.where(rows < 0, -1, self._parents[rows.clamp_min(0)]) if len(self._parents) else rows
 
 
 def _hooked(hook: Callable[[Any], None], method: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:

@@ -86,11 +86,13 @@ def test_several_processes_are_refused_before_the_first_step(trainer, caplog, mo
 
 
 def test_points_between_photos_are_refused_for_other_than_pinhole_cameras():
-    from integration.gsplat.simple_trainer import require_pinhole
+    from integration.gsplat.simple_trainer import require_supported
 
-    with pytest.raises(SettingError, match="camera_model: points=stereo must have pinhole cameras, got fisheye"):
-        require_pinhole(SimpleNamespace(camera_model="fisheye"))
-    require_pinhole(SimpleNamespace())
+    fisheye = SimpleNamespace(camera_model="fisheye")
+    with pytest.raises(SettingError, match="camera_model: CLEAR needs pinhole, got fisheye: points=stereo"):
+        require_supported(fisheye, from_stereo=True)
+    require_supported(fisheye, from_stereo=False)
+    require_supported(SimpleNamespace(), from_stereo=True)
 
 
 def test_save_lr_writes_the_photos_as_they_are_trained_on_and_stops(trainer):
