@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import get_args
 
 from clear_strategies.core.checks import require_choice
+from clear_strategies.data.priors import Images
+from clear_strategies.errors import SettingError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.schedules import REFERENCE_ITERATIONS
-from integration.views import Points, SuperResolve, sr_source
+from integration.views import Points, SuperResolve
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,5 +62,18 @@ class Settings:
         return conductor(self.strategies, *self.overrides, iterations=iterations)
 
     def sr_source(self, conductor: Conductor) -> tuple[SuperResolve, int]:
-        """See `views.sr_source`."""
-        return sr_source(self.sr, conductor, self.factor, self.suffix)
+        """What makes the SR images, with the conductor's decorators around it, and their factor. Without SR images the "HR" view
+        is the LR view.
+
+        Raises:
+            SettingError: there are no SR images, but the objective or a strategy needs them.
+        """
+        if self.sr is not None:
+            sr = Images(str(self.sr), self.suffix) if isinstance(self.sr, str | Path) else self.sr
+            return conductor.prior(sr), self.factor
+        if conductor.uses_hr:
+            raise SettingError(
+                "sr: must be the folder of the SR images, got None, but HR is used. Pass the folder, or set objective=lr_only "
+                "and leave P2G out."
+            )
+        return lambda name, image, factor: image, 1

@@ -20,10 +20,9 @@ from clear_strategies.core.points import MAX_POINTS, PointCloud
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.priors.interface import super_resolved
 from clear_strategies.data.view_names import write_pngs
-from clear_strategies.errors import DataError, HostError, SettingError
+from clear_strategies.errors import DataError, HostError
 from clear_strategies.geometry import stereo
 from clear_strategies.geometry.projection import intrinsics
-from clear_strategies.merging.conductor import Conductor
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
@@ -200,32 +199,6 @@ def save_photos(photos: Iterable[HostPhoto], folder: Path | str) -> None:
 def enlarged_mask(mask: Float[Tensor, "h w"], factor: int) -> Float[Tensor, "H W"]:
     """The mask at HR: every HR pixel has the value of the LR pixel that it lies in."""
     return mask.repeat_interleave(factor, 0).repeat_interleave(factor, 1)
-
-
-def sr_source(
-    sr: SuperResolve | str | Path | None, conductor: Conductor, factor: int, suffix: str = ""
-) -> tuple[SuperResolve, int]:
-    """What makes the SR images, with the conductor's decorators around it, and their factor. Without SR images the "HR" view
-    is the LR view.
-
-    Args:
-        sr: the folder of the SR images, or a function that makes them. suffix: what the SR tool appended to the names there.
-
-    Raises:
-        SettingError: there are no SR images, but the objective or a strategy needs them.
-    """
-    if isinstance(sr, str | Path):
-        from clear_strategies.data.priors import Images
-
-        sr = Images(str(sr), suffix)
-    if sr is not None:
-        return conductor.prior(sr), factor
-    if conductor.uses_hr:
-        raise SettingError(
-            "sr: must be the folder of the SR images, got None, but HR is used. Pass the folder, or set objective=lr_only "
-            "and leave P2G out."
-        )
-    return lambda name, image, factor: image, 1
 
 
 def no_stereo(problem: str) -> HostError:

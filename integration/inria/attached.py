@@ -24,7 +24,8 @@ from integration.inria.detail import DetailFeature
 from integration.inria.model_proxy import Overrides, host_output, proxy
 from integration.inria.rows import CarriedRows
 from integration.replacing import replaced_attribute, replaced_everywhere, replaced_methods
-from integration.views import SuperResolve, sr_source
+from integration.settings import Settings
+from integration.views import SuperResolve
 from rasterizers.autograd import collected_drawings
 from rasterizers.interface import Camera
 from rasterizers.modes import uncompiled
@@ -93,7 +94,9 @@ class Attached:
             raise HostError("these gaussians are attached already; remove() the attachment that did it first.")
         require_end(conductor, densify_until, "densify_until_iter")
         self._model = gaussians
-        self.views = HostViews(cameras, *sr_source(sr, conductor, factor, suffix), gaussians._xyz.device)
+        self.views = HostViews(
+            cameras, *Settings(sr=sr, suffix=suffix, factor=factor).sr_source(conductor), gaussians._xyz.device
+        )
         warn_if_score_is_unused(conductor, gaussians, threshold)
         self._rows = CarriedRows(gaussians, self._host_params)
         self.detail, self._trains_detail = DetailFeature(lambda: gaussians._xyz, self._rows, conductor.detail), detail
