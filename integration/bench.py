@@ -7,14 +7,14 @@ other work on the machine slows all of them alike.
 
 from __future__ import annotations
 
+import importlib
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import pandas as pd
 import torch
-from torch import Tensor
 from torch.nn import functional as F
 from torch.utils._python_dispatch import TorchDispatchMode
 from tqdm import tqdm
@@ -27,6 +27,7 @@ from clear_strategies.data.priors import Bicubic
 from clear_strategies.geometry import stereo
 from integration.examples.demo import load_demo, splats_with_optimizers
 from integration.gsplat import attach
+from integration.host_merge import HostMerge
 from integration.views import view
 from rasterizers import native
 
@@ -66,15 +67,16 @@ class Loop:
         self.splats = {name: torch.nn.Parameter(p.detach().to(device, dtype)) for name, p in splats.items()}
         self.optimizers = {name: torch.optim.Adam([p], lr=1e-9, eps=1e-15) for name, p in self.splats.items()}
         self.photos, self.viewmats, self.Ks = (x.to(device, dtype) for x in (photos, demo.viewmats, Ks))
-        self.draw, self.merge, self.t = _rasterization(device, ours=ours), None, 0
+        function = importlib.import_module("gsplat" if device == "cuda" and not ours else "rasterizers.as_gsplat")
+        self.draw, self.merging, self.t = function.rasterization, 0.0, 0  # merging: seconds of all merges
         if strategies is not None:
             name, *overrides = strategies.split()
             chosen = conductor(name, *overrides, iterations=_ITERATIONS)
             sr = chosen.prior(Bicubic())
             views = [view(*x, sr=sr) for x in zip(demo.names, self.photos, self.viewmats, self.Ks, strict=True)]
             attached = attach(self.splats, self.optimizers, views, chosen)
-            self.draw, self.merge = attached.wrap(self.draw), _TimedMerge(attached.attachment._merging._merge_in_place)
-            attached.attachment.t, attached.attachment._merging._merge_in_place = _FROM, self.merge
+            self.draw, attached.attachment.t = attached.wrap(self.draw), _FROM
+            self._time(attached.attachment._merging)
 
     def backward(self) -> None:
         """Render the next photo and take the gradients."""
@@ -94,21 +96,19 @@ class Loop:
             optimizer.step()
             optimizer.zero_grad()
 
-
-class _TimedMerge:
-    """The merge, and the seconds that it has taken: of the processor, on a device by the wall clock."""
-
-    def __init__(self, merge: Callable[..., Mapping[str, Number]]) -> None:
-        self._merge, self.seconds = merge, 0.0
-
-    def __call__(self, params: Mapping[str, Tensor], *arguments: Any, **keywords: Any) -> Mapping[str, Number]:
-        device = params["means"].device
+    def _time(self, host_merge: HostMerge) -> None:
+        """Sum up the seconds of its merges: of the processor, on a device by the wall clock."""
+        device, merge = self.photos.device, host_merge.merge
         clock = time.perf_counter if device.type == "cuda" else time.process_time
-        began = clock()
-        result = self._merge(params, *arguments, **keywords)
-        _wait(device)
-        self.seconds += clock() - began
-        return result
+
+        def timed(*arguments: Any, **keywords: Any) -> Mapping[str, Number]:
+            began = clock()
+            result = merge(*arguments, **keywords)
+            _wait(device)
+            self.merging += clock() - began
+            return result
+
+        host_merge.merge = timed  # type: ignore[method-assign]
 
 
 def measure(
@@ -151,17 +151,15 @@ def _timed(loops: Mapping[str, Loop], repeats: int, device: str) -> pd.DataFrame
     rows = []
     for turn in tqdm(range(-_WARM_UPS, repeats + repeats % 2), desc="steps", unit="turn", leave=False):
         for name, loop in loops.items():
-            before = 0.0 if loop.merge is None else loop.merge.seconds
             _wait(torch.device(device))
-            began, began_processor = time.perf_counter(), time.process_time()
+            before = time.perf_counter(), time.process_time(), loop.merging
             loop.step()
             _wait(torch.device(device))
-            ms, processor_ms = (
-                1e3 * (a - b) for a, b in ((time.perf_counter(), began), (time.process_time(), began_processor))
-            )
-            merging = 0.0 if loop.merge is None else loop.merge.seconds - before
-            rows.append({"turn": turn, "loop": name, "ms": ms, "processor_ms": processor_ms, "merge_ms": 1e3 * merging})
-    return pd.DataFrame(rows).query("turn >= 0").drop(columns=["turn"])
+            after = time.perf_counter(), time.process_time(), loop.merging
+            if turn >= 0:
+                ms = [1e3 * (b - a) for a, b in zip(before, after, strict=True)]
+                rows.append({"loop": name, **dict(zip(("ms", "processor_ms", "merge_ms"), ms, strict=True))})
+    return pd.DataFrame(rows)
 
 
 class _Operations(TorchDispatchMode):  # type: ignore[no-untyped-call]
@@ -188,25 +186,11 @@ def _counts(loop: Loop) -> dict[str, float]:
 
 def _error(strategies: str) -> dict[str, Any]:
     """The relative L2 error of the merged gradient of the first step against the same loop in float64, by attribute."""
-    gradients = []
-    for dtype in (torch.float32, torch.float64):
-        loop = Loop(strategies, _IN_FLOAT64, 64, "cpu", dtype)
+    loops = [Loop(strategies, _IN_FLOAT64, 64, "cpu", dtype) for dtype in (torch.float32, torch.float64)]
+    for loop in loops:
         loop.backward()
-        gradients.append({name: p.grad.double() for name, p in loop.splats.items() if p.grad is not None})
-    pairs: list[tuple[str, Tensor, Tensor]] = [
-        (name, gradients[0][name], exact) for name, exact in gradients[1].items()
-    ]
-    return {"loop": strategies} | {name: relative(g, exact) for name, g, exact in pairs if exact.any()}
-
-
-def _rasterization(device: str, *, ours: bool) -> Callable[..., Any]:
-    if device == "cuda" and not ours:
-        from gsplat import rasterization as cuda_rasterization
-
-        return cuda_rasterization  # type: ignore[no-any-return]
-    from rasterizers.as_gsplat import rasterization
-
-    return rasterization
+    found, exact = ({name: p.grad.double() for name, p in x.splats.items() if p.grad is not None} for x in loops)
+    return {"loop": strategies} | {name: relative(found[name], g) for name, g in exact.items() if g.any()}
 
 
 def _wait(device: torch.device) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -42,9 +41,7 @@ class HostMerge:
         self._counts = counts
         self.scaler = None if threshold is None else ScoreScaler(threshold)
         self.fading = Fading(conductor.detail, accumulation)
-        self._merge_in_place: Callable[..., Mapping[str, Number]] = partial(
-            merge_in_place, conductor, merge=ReplayedMerge(conductor, device)
-        )
+        self._replayed = ReplayedMerge(conductor, device)
 
     def merge(self, pending: Pending, done: BackwardPass, names: Sequence[str], t: int) -> Mapping[str, Number]:
         """Merge the gradients of these parameters; with the first of the rendering, merge that of f_det and write the score.
@@ -72,9 +69,9 @@ class HostMerge:
             params["detail"] = detail
             if detail.grad is not None:  # what the host has given it stays
                 done.before["detail"] = detail.grad
-        conflict = self._merge_in_place(
-            params, pending.routed_of(names, done.params), None if hr is None else hr.step, t, before=done.before,
-            lr_colour=done.colour, scale=scale, must_be_finite=self._loss_scale is None,
+        conflict = merge_in_place(
+            self._conductor, params, pending.routed_of(names, done.params), None if hr is None else hr.step, t,
+            before=done.before, lr_colour=done.colour, scale=scale, must_be_finite=self._loss_scale is None, merge=self._replayed,
         )  # fmt: skip
         if "detail" in params:
             self._finish_detail(params.pop("detail"), params, t, by_hf=hr is not None and hr.detail is not None)
