@@ -122,13 +122,9 @@ def _given(arguments: Sequence[str]) -> Iterator[str]:
 
 def _require_strategies(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Options of the strategies would do nothing without them."""
-    given = [
-        f.name
-        for f in fields(Settings)
-        if hasattr(options, f.name) and getattr(options, f.name) != parser.get_default(f.name)
-    ]
-    if given or options.save_lr:
-        parser.error(f"--{(given or ['save-lr'])[0]} has no effect without --strategies, e.g. --strategies best.")
+    for name in (*(f.name for f in fields(Settings)), "save_lr"):
+        if getattr(options, name, None) != parser.get_default(name):
+            parser.error(f"--{name.replace('_', '-')} has no effect without --strategies, e.g. --strategies best.")
 
 
 if __name__ == "__main__":

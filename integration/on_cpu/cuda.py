@@ -35,19 +35,19 @@ def replace() -> None:
     _replace(threading.Thread, "start", _started_with_it)
     if "fork" in multiprocessing.get_all_start_methods():  # a process that is started anew has none of this
         multiprocessing.set_start_method("fork", force=True)
-    _replace(torch, "load", _loaded_on_cpu)
+    _replace(torch, "load", lambda load: lambda file, map_location=None, *args, **kwargs: load(
+        file, "cpu" if map_location is None else _on_cpu(map_location), *args, **kwargs
+    ))  # fmt: skip
     for name in ("set_default_device", "set_default_tensor_type"):
         _replace(torch, name, lambda function: lambda kind: function(_on_cpu(kind)))
-    cuda: Any = torch.cuda
-    for name in _WITHOUT_EFFECT:
-        setattr(cuda, name, lambda *_, **__: None)
-    for name in _MEMORY:
-        setattr(cuda, name, lambda *_, **__: peak_mib() << 20)
-    for name in _TENSORS:
-        setattr(cuda, name, getattr(torch, name))
-    cuda.Event, cuda.device = Event, nullcontext
-    cuda.current_device = lambda: 0
-    cuda.get_device_name = lambda *_: "CPU"
+    ours = {
+        **{name: lambda *_, **__: None for name in _WITHOUT_EFFECT},  # each its own: dynamo refuses one by two names
+        **{name: lambda *_, **__: peak_mib() << 20 for name in _MEMORY},
+        **{name: getattr(torch, name) for name in _TENSORS},
+        "Event": Event, "device": nullcontext, "current_device": lambda: 0, "get_device_name": lambda *_: "CPU",
+    }  # fmt: skip
+    for name, value in ours.items():
+        setattr(torch.cuda, name, value)
 
 
 def _replace(owner: Any, name: str, make: Callable[[Any], Any]) -> None:
@@ -101,21 +101,13 @@ def _started_with_it(start: Callable[[threading.Thread], None]) -> Callable[[thr
     return started
 
 
-def _loaded_on_cpu(load: Callable[..., Any]) -> Callable[..., Any]:
-    def loaded(file: Any, map_location: Any = None, *args: Any, **kwargs: Any) -> Any:
-        return load(file, "cpu" if map_location is None else _on_cpu(map_location), *args, **kwargs)
-
-    return loaded
-
-
 class Event:
-    """`torch.cuda.Event` by the clock."""
+    """`torch.cuda.Event` by the clock. Nothing runs behind the program's back, so that all of it is done, always."""
 
     def __init__(self, *_: Any, **__: Any) -> None:
         self._time = 0.0
 
     def record(self, *_: Any) -> None:
-        """The event is now."""
         self._time = time.perf_counter()
 
     def elapsed_time(self, other: Event) -> float:
@@ -123,11 +115,9 @@ class Event:
         return 1_000 * (other._time - self._time)
 
     def query(self) -> bool:
-        """Whether what was called before it is done."""
         return True
 
-    def synchronize(self) -> None:
-        """Nothing runs behind the program's back."""
+    def synchronize(self, *_: Any) -> None:
+        pass
 
-    def wait(self, *_: Any) -> None:
-        """The same."""
+    wait = synchronize

@@ -28,9 +28,10 @@ from torch.utils.checkpoint import checkpoint
 import rasterizers
 from clear_strategies.errors import HostError
 from rasterizers import autograd
-from rasterizers.geometry import constant_band, depths, low_and_span
+from rasterizers.geometry import constant_band, depths
+from rasterizers.gsplat_picture import CameraView
 from rasterizers.inputs import Inputs
-from rasterizers.interface import Camera, Rasterizer, Splats, over
+from rasterizers.interface import Camera, Rasterizer, Splats
 from rasterizers.reference.projection import footprints
 
 _NEAR: Final = 0.2  # what 3DGS draws begins at this depth
@@ -106,22 +107,11 @@ class GaussianRasterizationSettings(NamedTuple):
         cx, cy = (float((projection[2, i] + 1) * size / 2) for i, size in enumerate((width, height)))
         return Camera(view.T.contiguous(), width / 2 / self.tanfovx, height / 2 / self.tanfovy, cx, cy, width, height)
 
-    @property
-    def kernel(self) -> float:
-        """The variance of the 2D kernel, px²."""
-        return _KERNEL if self.kernel_size is None else float(self.kernel_size)
-
-    def rasterizer(self) -> Rasterizer:
-        """One that draws over black."""
-        return _loaded(self.kernel, self.kernel_size is not None or bool(self.antialiasing))
-
 
 GaussianRasterizationSettings.__new__ = _refusing(GaussianRasterizationSettings.__new__)  # type: ignore[method-assign]
 
 
-@functools.lru_cache(maxsize=8)
-def _loaded(kernel: float, antialiased: bool) -> Rasterizer:
-    return rasterizers.load(rasterizers.fastest("cpu"), near=_NEAR, kernel=kernel, antialiased=antialiased)
+_load: Final = functools.lru_cache(maxsize=8)(rasterizers.load)
 
 
 class GaussianRasterizer(torch.nn.Module):
@@ -171,42 +161,49 @@ class GaussianRasterizer(torch.nn.Module):
                 "shapes must be given as scales and rotations; cov3D_precomp (--compute_cov3D_python) needs the CUDA "
                 "rasterizer."
             )
-        s = self.raster_settings
-        camera, rasterizer = s.camera(), s.rasterizer()
-        shapes = _Shapes(means3D, rotations, scales * s.scale_modifier, opacities[:, 0])
-        absgrad = None if s.kernel_size is None else torch.zeros_like(means3D[:, :2], requires_grad=False)
-        low, span, bands, behind = 0.0, 1.0, 1, s.bg.tolist()
-        if shs is not None and colors_precomp is None:
-            colors, bands = shs, (s.sh_degree + 1) ** 2
-        elif colors_precomp is not None and shs is None:
-            low, span = low_and_span(colors_precomp, behind)
-            colors = constant_band((colors_precomp - low) / span)
-        else:
+        if (shs is None) == (colors_precomp is None):
             raise ValueError("exactly one of shs and colors_precomp must be given.")
-        red, green, blue = ((x - low) / span for x in behind)
-        inputs = Inputs(*shapes, colors, None)
-        rendered = autograd.render(over(rasterizer, (red, green, blue)), inputs, bands, camera, depth=False)
-        centres = _InNdc.apply(means2D, rendered.rendering.means2d, absgrad, camera)  # type: ignore[no-untyped-call]
-        drawn = autograd.in_graph(rendered, inputs, centres, absgrad=absgrad)
-        image = drawn.image.permute(2, 0, 1).contiguous()
-        image = image if (low, span) == (0.0, 1.0) else low + span * image
-        radii = _radii(drawn.visible, shapes, camera, s.kernel)
+        s = self.raster_settings
+        camera, kernel = s.camera(), _KERNEL if s.kernel_size is None else float(s.kernel_size)
+        antialiased = s.kernel_size is not None or bool(s.antialiasing)
+        rasterizer = _load(rasterizers.fastest("cpu"), near=_NEAR, kernel=kernel, antialiased=antialiased)
+        colors, degree = (colors_precomp, None) if shs is None else (shs, s.sh_degree)
+        inputs = Inputs(means3D, rotations, scales * s.scale_modifier, opacities[:, 0], cast(Tensor, colors), None)
+        pose = camera.world_to_camera
+        view = CameraView(rasterizer, camera, pose, inputs, degree, s.bg.detach(), "RGB", replays=False)
+        parts = view.parts()
+        drawn = parts[0].rendered.rendering
+        absgrad = None if s.kernel_size is None else torch.zeros_like(drawn.means2d)
+        centres = drawn.means2d + _in_pixels(means2D, camera, absgrad)
+        image, alpha = view.picture(parts, centres, None, absgrad)
+        image = image.permute(2, 0, 1).contiguous()
+        radii = _radii(drawn.visible, inputs, camera, kernel)
         if s.antialiasing is None and s.confidence is None:
             return image, radii
-        z = depths(means3D, camera.world_to_camera.to(means3D))[:, None].clamp_min(_NEAR)
-        depth = _sum(rasterizer, camera, shapes, z if s.antialiasing is None else 1 / z)
-        return (image, radii, depth) if s.confidence is None else (image, radii, depth, drawn.alpha[None])
+        z = depths(means3D, pose.to(means3D))[:, None].clamp_min(_NEAR)
+        depth = _sum(rasterizer, camera, inputs, z if s.antialiasing is None else 1 / z)
+        return (image, radii, depth) if s.confidence is None else (image, radii, depth, alpha[None])
 
 
-class _Shapes(NamedTuple):
-    means: Tensor
-    rotations: Tensor
-    scales: Tensor
-    opacities: Tensor
+def _in_pixels(
+    points: Float[Tensor, "N C"], camera: Camera, absgrad: Float[Tensor, "N 2"] | None
+) -> Float[Tensor, "N 2"]:
+    """0, whose gradient goes to the points, in NDC; and into their third column the sum of `absgrad`, which is used up."""
+    half = points.new_tensor((camera.width / 2, camera.height / 2))
+    offset = points - points.detach()
+    if absgrad is not None and offset.requires_grad:
+
+        def with_absolute(gradient: Tensor) -> Tensor:
+            both = torch.cat((gradient[:, :2], (absgrad @ half)[:, None]), 1)
+            absgrad.zero_()
+            return both
+
+        offset.register_hook(with_absolute)  # type: ignore[no-untyped-call]
+    return offset[:, :2] * half
 
 
 def _sum(
-    rasterizer: Rasterizer, camera: Camera, shapes: _Shapes, values: Float[Tensor, "N 1"]
+    rasterizer: Rasterizer, camera: Camera, inputs: Inputs, values: Float[Tensor, "N 1"]
 ) -> Float[Tensor, "1 H W"]:
     """Σ w · value of a pixel's Gaussians.
 
@@ -214,45 +211,25 @@ def _sum(
     image in one pass where the image is the only drawing.
     """
 
-    def drawn(values: Tensor, *shapes: Tensor) -> Tensor:
+    def drawn(values: Tensor, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> Tensor:
         colors = constant_band(values.expand(-1, 3))
-        splats = Splats(*_Shapes(*shapes), colors, colors[:, 1:])
+        splats = Splats(means, quats, scales, opacities, colors, colors[:, 1:])
         return autograd.draw(rasterizer, splats, camera, colors=colors).image[..., 0][None]
 
+    shapes = inputs[:4]
     if torch.is_grad_enabled() and any(x.requires_grad for x in shapes):
         return cast(Tensor, checkpoint(drawn, values, *shapes, use_reentrant=True, preserve_rng_state=False))
     return drawn(values, *shapes)
 
 
 @torch.no_grad()
-def _radii(visible: Bool[Tensor, " N"], shapes: _Shapes, camera: Camera, kernel: float) -> Int[Tensor, " N"]:
+def _radii(visible: Bool[Tensor, " N"], inputs: Inputs, camera: Camera, kernel: float) -> Int[Tensor, " N"]:
     """Three standard deviations along the longer axis, in pixels; 0: not visible."""
     rows = visible.nonzero()[:, 0]
-    f = footprints(shapes.means[rows], shapes.rotations[rows], shapes.scales[rows], camera, kernel)
+    f = footprints(inputs.means[rows], inputs.quats[rows], inputs.scales[rows], camera, kernel)
     a, c = f.deviations.square().unbind(-1)
     middle, determinant = (a + c) / 2, c / f.conics[:, 0]
     longest = middle + (middle * middle - determinant).clamp_min(0.1).sqrt()  # the eigenvalue as 3DGS bounds it
     radii = torch.zeros(len(visible), dtype=torch.int32)
     radii[rows] = (3 * longest.sqrt()).ceil().int()
     return radii
-
-
-class _InNdc(torch.autograd.Function):
-    """The projected centres. Their gradient goes to the host's tensor, in NDC, and behind it the sum of `absgrad`, which is used
-    up.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, points: Tensor, centres: Tensor, absgrad: Tensor | None, camera: Camera) -> Tensor:
-        ctx.half, ctx.columns, ctx.absgrad = (camera.width / 2, camera.height / 2), points.shape[1], absgrad
-        return centres.clone()
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Any:
-        half = gradient.new_tensor(ctx.half)
-        ndc = gradient.new_zeros(len(gradient), ctx.columns)
-        ndc[:, :2] = gradient * half
-        if ctx.absgrad is not None:
-            ndc[:, 2] = ctx.absgrad @ half
-            ctx.absgrad.zero_()
-        return ndc, None, None, None

@@ -21,25 +21,21 @@ from clear_strategies.errors import HostError
 def replace() -> None:
     """Replace `rasterization` and gsplat's CUDA functions; one that is not here raises `HostError` where it is called."""
     sys.modules["gsplat.cuda._backend"] = cast(Any, SimpleNamespace(_C=None))  # nothing compiled is loaded, or built
-    gsplat, rendering, distributed, relocation_of, ops, wrapper = (
+    everywhere: list[Any] = [
         importlib.import_module(f"gsplat{name}")
         for name in ("", ".rendering", ".distributed", ".relocation", ".strategy.ops", ".cuda._wrapper")
-    )
-    everything: Any = (gsplat, rendering, distributed, relocation_of, ops, wrapper)
-    in_torch = importlib.import_module("gsplat.cuda._torch_impl")
+    ]
+    gsplat, rendering, *_ = everywhere
+    version = tuple(map(int, gsplat.__version__.split(".")[:2]))
     for name, ours in {
-        "rasterization": rasterization_like(rendering.rasterization, one_radius=_version(gsplat) < (1, 5)),
-        "quat_scale_to_covar_preci": in_torch._quat_scale_to_covar_preci,
+        "rasterization": rasterization_like(rendering.rasterization, one_radius=version < (1, 5)),
+        "quat_scale_to_covar_preci": importlib.import_module("gsplat.cuda._torch_impl")._quat_scale_to_covar_preci,
         "_make_lazy_cuda_func": function,
         "cli": lambda train, config, verbose=False: train(0, 0, 1, config),
     }.items():
-        for module in everything:
+        for module in everywhere:
             if hasattr(module, name):
                 setattr(module, name, ours)
-
-
-def _version(gsplat: Any) -> tuple[int, ...]:
-    return tuple(int(part) for part in gsplat.__version__.split(".")[:2])
 
 
 def rasterization_like(theirs: Callable[..., Any], *, one_radius: bool) -> Callable[..., Any]:
@@ -83,16 +79,9 @@ def _relocation(
 
 @torch.no_grad()
 def _adam(
-    param: Tensor,
-    grad: Tensor,
-    mean: Tensor,
-    square: Tensor,
-    valid: Bool[Tensor, " N"],
-    lr: float,
-    beta1: float,
-    beta2: float,
+    param: Tensor, grad: Tensor, mean: Tensor, square: Tensor, valid: Bool[Tensor, " N"], lr: float, beta1: float, beta2: float,
     eps: float,
-) -> None:
+) -> None:  # fmt: skip
     """A step of gsplat's `SelectiveAdam`: of the valid rows alone, without bias correction."""
     rows = valid.nonzero()[:, 0]
     mean[rows] = beta1 * mean[rows] + (1 - beta1) * grad[rows]
