@@ -4,19 +4,15 @@ nerfstudio finds `clear_splatfacto` by this package's entry point, or by the var
 is imported only when that name is read.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from integration.nerfstudio.method import clear_splatfacto
-
-__all__ = ["clear_splatfacto"]
+import importlib
+from typing import Any
 
 
 def __getattr__(name: str) -> Any:
-    if name == "clear_splatfacto":
-        from integration.nerfstudio.method import clear_splatfacto
+    if name != "clear_splatfacto":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    # It reads the methods of its plugins, this one among them, when its own are defined.
+    importlib.import_module("nerfstudio.configs.method_configs")
+    from integration.nerfstudio.method import specification
 
-        return clear_splatfacto
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return specification()

@@ -1,29 +1,23 @@
 """`clear-splatfacto`: splatfacto with the strategies attached; its trainer and viewer are nerfstudio's own.
 
-    ns-train clear-splatfacto --data scene --pipeline.model.sr scene/sr
-
-The `TrainerConfig` is written out, because splatfacto's cannot be imported while nerfstudio collects its methods.
+ns-train clear-splatfacto --data scene --pipeline.model.sr scene/sr
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
 import torch
 from jaxtyping import Float
-from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.engine.optimizers import AdamOptimizerConfig
-from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
-from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models import splatfacto
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
-from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
@@ -212,39 +206,19 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
             self.attached = None
 
 
-def _adam(lr: float, lr_final: float | None = None) -> dict[str, Any]:
-    """The optimizer of splatfacto's group; its rate is constant, or decays to `lr_final` at 30,000 steps."""
-    decay = None if lr_final is None else ExponentialDecaySchedulerConfig(lr_final=lr_final, max_steps=30_000)
-    return {"optimizer": AdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": decay}
+@cache
+def specification() -> MethodSpecification:
+    """The method as nerfstudio's registry expects it: splatfacto's trainer, optimizers and data parser, with our data manager and
+    model, and an optimizer of f_det. Its methods must be there, see `integration.nerfstudio`.
+    """
+    from nerfstudio.configs.method_configs import method_configs
 
-
-clear_splatfacto: Final = MethodSpecification(
-    config=TrainerConfig(
-        method_name="clear-splatfacto",
-        steps_per_eval_image=100,
-        steps_per_eval_batch=0,
-        steps_per_save=2_000,
-        steps_per_eval_all_images=1_000,
-        max_num_iterations=30_000,
-        mixed_precision=False,
-        pipeline=VanillaPipelineConfig(
-            datamanager=ClearDatamanagerConfig(
-                dataparser=NerfstudioDataParserConfig(load_3D_points=True), cache_images_type="uint8"
-            ),
-            model=ClearSplatfactoModelConfig(),
-        ),
-        optimizers={
-            "means": _adam(1.6e-4, 1.6e-6),
-            "features_dc": _adam(2.5e-3),
-            "features_rest": _adam(2.5e-3 / 20),
-            "detail": _adam(2.5e-3),
-            "opacities": _adam(5e-2),
-            "scales": _adam(5e-3),
-            "quats": _adam(1e-3),
-        },
-        viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
-        vis="viewer",
-    ),
-    description="splatfacto on LR photos and SR images, merged by CLEAR's strategies",
-)
-"""The method as nerfstudio's registry expects it."""
+    config = deepcopy(method_configs["splatfacto"])
+    theirs = config.pipeline.datamanager
+    config.method_name = "clear-splatfacto"
+    config.pipeline.datamanager = ClearDatamanagerConfig(
+        dataparser=theirs.dataparser, cache_images_type=theirs.cache_images_type
+    )
+    config.pipeline.model = ClearSplatfactoModelConfig()
+    config.optimizers["detail"] = deepcopy(config.optimizers["features_dc"])  # at another rate, see `_attach`
+    return MethodSpecification(config, "splatfacto on LR photos and SR images, merged by CLEAR's strategies")
