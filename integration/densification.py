@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from clear_strategies.core.checks import require_whole
 from clear_strategies.core.gradients import screen_norm, to_ndc
 from clear_strategies.density.threshold import count_passing, topk_threshold
 from clear_strategies.errors import SettingError
@@ -96,8 +97,7 @@ class ScoreScaler:
     def __init__(self, threshold: float, half_life: int = 100) -> None:
         if not threshold > 0:
             raise SettingError(f"threshold: the host's densification threshold must be > 0, got {threshold}.")
-        if half_life < 1:
-            raise SettingError(f"half_life: must be at least 1 view, got {half_life}.")
+        require_whole("half_life", half_life, least=1)
         self.threshold, self.factor = threshold, 1.0
         self._decay = 0.5 ** (1 / half_life)
         self._sums: Float[Tensor, "3 N"] | None = None

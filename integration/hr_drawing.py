@@ -157,8 +157,14 @@ class HrDrawing:
             hr, routed = self._own_hr(drawn, view, t, fine)
             return hr, routed if merges else None
         shot = drawn.shot
-        if len(shot.drawings) > 1:
-            self._count_parts(len(shot.drawings))
+        if (n := len(shot.drawings)) > 1:
+            self._counts["HR renders in parts"] += 1
+            if self._counts["HR renders in parts"] == 1:
+                _log.info(
+                    "The host calls its rasterizer %d times for one rendering, so each of the two HR gradients needs a backward "
+                    "pass of its own: with 46,000 Gaussians a step takes 1.4 times as long. Call it under torch.no_grad() for "
+                    "what is only looked at, and outside of the wrapped function for what only the LR loss needs.", n,
+                )  # fmt: skip
         if fine is not None:
             shot = replace(shot, image=shot.image * fine.to(shot.image))
         apart = shot.drawing is not None or "detail" in shot.params
@@ -237,12 +243,3 @@ class HrDrawing:
             )  # fmt: skip
 
         return self._replays.do(kind, t, given, live=lambda: work(given), record=record)
-
-    def _count_parts(self, n: int) -> None:
-        self._counts["HR renders in parts"] += 1
-        if self._counts["HR renders in parts"] == 1:
-            _log.info(
-                "The host calls its rasterizer %d times for one rendering, so each of the two HR gradients needs a backward "
-                "pass of its own: with 46,000 Gaussians a step takes 1.4 times as long. Call it under torch.no_grad() for "
-                "what is only looked at, and outside of the wrapped function for what only the LR loss needs.", n,
-            )  # fmt: skip
