@@ -341,11 +341,11 @@ def test_repeated_losses_have_the_same_bits(loss):
 @needs("warp")
 @pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
 def test_blocks_of_many_threads_agree_with_one_thread(blocks_of, loss):
-    from clear_strategies.kernels.losses.warp import launches
+    from clear_strategies.kernels.losses import warp
 
     x, y = rough(photo(15, 90), 0.1)
     alone = loss(x, y, "warp")
-    blocks_of(launches.LANES, launches.LANES["cuda"])
+    blocks_of(warp.LANES, warp.LANES["cuda"])
     together = loss(x, y, "warp")
     assert float(together.value) == pytest.approx(float(alone.value), rel=1e-6)
     assert torch.allclose(together.gradient, alone.gradient, rtol=1e-5, atol=1e-6 * float(alone.gradient.abs().max()))
@@ -354,9 +354,8 @@ def test_blocks_of_many_threads_agree_with_one_thread(blocks_of, loss):
 @pytest.mark.slow
 @needs("warp")
 def test_the_kernels_compile_for_cuda_on_a_machine_without(ptx_of):
-    from clear_strategies.kernels.losses.warp import haar, launches, similarity, sums
+    from clear_strategies.kernels.losses.warp import LANES, haar, similarity, sums
 
-    lanes = launches.LANES["cuda"]
-    by_lanes = (similarity.similarity, similarity.gradient, haar.details, sums.absolute, sums.total)
-    for kernel in (haar.low_part, *(make(lanes) for make in by_lanes)):
+    lanes = LANES["cuda"]
+    for kernel in (haar.details, sums.total, similarity.similarity(lanes), similarity.gradient(lanes)):
         assert ".local" not in ptx_of(kernel.module, lanes)  # no spills: rows of numbers are in registers

@@ -135,9 +135,7 @@ def test_the_noise_of_mcmc(by_warp):
 def test_the_kernels_compile_for_cuda_on_a_machine_without(ptx_of):
     from clear_strategies.kernels.per_gaussian import warp
 
-    ptx_of(warp._activate.module)
-    for kernel in (warp._look_up, warp._evidence_score):
-        ptx_of(kernel(warp.LANES["cuda"]).module, warp.LANES["cuda"])
+    ptx_of(warp._activate.module, warp.LANES["cuda"])  # the module of all kernels
 
 
 def test_other_tensors_take_torch(monkeypatch):

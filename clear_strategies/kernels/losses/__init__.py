@@ -19,7 +19,7 @@ from torch import Tensor
 from clear_strategies.errors import SettingError
 from clear_strategies.kernels import native
 from clear_strategies.kernels.losses import cpp, reference
-from clear_strategies.kernels.losses.images import DEVICES, image_pair, supported
+from clear_strategies.kernels.losses.images import DEVICES, supported
 from clear_strategies.kernels.losses.reference import LossAndGradient
 from rasterizers.warp_runtime import require_warp, runs_warp
 
@@ -68,11 +68,8 @@ def photometric(
 
     With λ = 0 no SSIM is computed.
     """
-    kernels = _chosen(kernels, x, y)
-    if kernels == "torch":
-        return reference.photometric(x, y, lambda_ssim, out)
-    images = image_pair(DEVICES[kernels], x, y, out)
-    return LossAndGradient(_compiled(kernels, x).photometric(images, 1 - lambda_ssim, lambda_ssim), images.gradient)
+    loss: LossAndGradient = _chosen(kernels, x, y).photometric(x, y, lambda_ssim, out)
+    return loss
 
 
 def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], inset: int = 0) -> LossAndGradient:
@@ -83,10 +80,8 @@ def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], inset: int = 0) -
     Raises:
         ValueError: there is no such pixel.
     """
-    if not (native.available() and supported(DEVICES["cpp"], x, y)):
-        return reference.ssim(x, y, inset)
-    images = image_pair(DEVICES["cpp"], x, y, None)
-    return LossAndGradient(1 + cpp.photometric(images, 0.0, -1.0, inset), images.gradient)
+    in_cpp = native.available() and supported(DEVICES["cpp"], x, y)
+    return (cpp if in_cpp else reference).ssim(x, y, inset)
 
 
 def haar_l1(
@@ -100,19 +95,17 @@ def haar_l1(
     """Mean absolute difference of Haar details, averaged over levels, with its gradient, written into `out` if given."""
     if levels < 1:
         raise ValueError(f"levels must be at least 1, got {levels}.")
-    kernels = _chosen(kernels, x, y)
-    if kernels == "torch":
-        return reference.haar_l1(x, y, levels, out)
-    images = image_pair(DEVICES[kernels], x, y, out)
-    return LossAndGradient(_compiled(kernels, x).haar_l1(images, levels), images.gradient)
+    loss: LossAndGradient = _chosen(kernels, x, y).haar_l1(x, y, levels, out)
+    return loss
 
 
-def _chosen(kernels: Choice, x: Tensor, y: Tensor) -> Choice:
+def _chosen(kernels: Choice, x: Tensor, y: Tensor) -> ModuleType:
+    """The implementation, a module with the functions of `reference`."""
     require(kernels)
     if kernels == "auto":
         kernels = _fastest(x, y)
     _log_once(f"cpp, for {native.module().isa}" if kernels == "cpp" else kernels)
-    return kernels
+    return _warp(x.device.type) if kernels == "warp" else cpp if kernels == "cpp" else reference
 
 
 def _fastest(x: Tensor, y: Tensor) -> Choice:
@@ -120,16 +113,12 @@ def _fastest(x: Tensor, y: Tensor) -> Choice:
     return fastest if fastest != "torch" and supported(DEVICES[fastest], x, y) else "torch"
 
 
-def _compiled(kernels: Choice, x: Tensor) -> ModuleType:
-    return cpp if kernels == "cpp" else _warp(x.device.type)
-
-
 @cache
 def _warp(device: str) -> ModuleType:
     require_warp("kernels=warp", device, "kernels=torch runs here")
-    from clear_strategies.kernels.losses.warp import launches
+    from clear_strategies.kernels.losses import warp
 
-    return launches
+    return warp
 
 
 @cache

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any, Final
 
 import torch
@@ -57,37 +56,33 @@ def activate(
     n = len(logits)
     scales, filtered = log_scales.new_empty(2, n, 3).unbind()
     rest = logits.new_empty(4, n).unbind()
-    _per_gaussian(_activate, n, log_scales, logits, filters, gate, scales, filtered, *rest)
+    _launch(_activate, n, log_scales, logits, filters, gate, scales, filtered, *rest)
     return scales, filtered, *rest
 
 
-@cache
-def _look_up(lanes: int) -> Any:
-    @wp.kernel(module="unique", enable_backward=False)
-    def look_up(
-        maps: wp.array3d[wp.float32],
-        centers: wp.array[wp.vec2],
-        visible: wp.array[wp.bool],
-        patch: wp.float32,
-        reliability: wp.array[wp.float32],
-        demand: wp.array[wp.float32],
-        parts: wp.array[wp.vec3d],
-    ) -> None:
-        block, lane = wp.tid()
-        i = block * lanes + lane
-        share = wp.vec3d()
-        if i < visible.shape[0]:
-            q, a = wp.float32(0.0), wp.float32(0.0)
-            if visible[i]:
-                column = wp.clamp(wp.int32(centers[i][0] / patch), 0, maps.shape[2] - 1)
-                row = wp.clamp(wp.int32(centers[i][1] / patch), 0, maps.shape[1] - 1)
-                q, a = wp.float32(maps[0, row, column]), wp.float32(maps[1, row, column])
-                share = wp.vec3d(wp.float64(1.0), wp.float64(q), wp.float64(q * a))
-            reliability[i] = q
-            demand[i] = a
-        wp.tile_store(parts, wp.tile_sum(wp.tile(share, preserve_type=True)), offset=(block,))
-
-    return look_up
+@wp.kernel
+def _look_up(
+    maps: wp.array3d[wp.float32],
+    centers: wp.array[wp.vec2],
+    visible: wp.array[wp.bool],
+    patch: wp.float32,
+    reliability: wp.array[wp.float32],
+    demand: wp.array[wp.float32],
+    parts: wp.array[wp.vec3d],
+) -> None:
+    block, lane = wp.tid()
+    i = block * wp.block_dim() + lane
+    share = wp.vec3d()
+    if i < visible.shape[0]:
+        q, a = wp.float32(0.0), wp.float32(0.0)
+        if visible[i]:
+            column = wp.clamp(wp.int32(centers[i][0] / patch), 0, maps.shape[2] - 1)
+            row = wp.clamp(wp.int32(centers[i][1] / patch), 0, maps.shape[1] - 1)
+            q, a = wp.float32(maps[0, row, column]), wp.float32(maps[1, row, column])
+            share = wp.vec3d(wp.float64(1.0), wp.float64(q), wp.float64(q * a))
+        reliability[i] = q
+        demand[i] = a
+    wp.tile_store(parts, wp.tile_sum(wp.tile(share, preserve_type=True)), offset=(block,))
 
 
 def evidence(
@@ -95,7 +90,7 @@ def evidence(
 ) -> Evidence:
     q, a = maps.new_empty(2, len(centers)).unbind()
     parts = _parts(q, 3)
-    _blocks(_look_up, len(parts), maps, centers.detach(), visible, patch, q, a, parts)
+    _launch(_look_up, len(parts), maps, centers.detach(), visible, patch, q, a, parts, together=True)
     return Evidence(q, a, parts.sum(0))
 
 
@@ -121,7 +116,7 @@ def route(e: Evidence, visible: Bool[Tensor, " N"], floor: float, normalize: boo
     m, sums = torch.empty_like(e.reliability), e.sums
     if sums is None:  # the evidence is not that of `evidence` above
         sums = torch.stack([x.sum(dtype=torch.float64) for x in (visible, e.reliability, e.weight)])
-    _per_gaussian(_route, len(m), e.reliability, e.demand, sums[None], floor, normalize, m)
+    _launch(_route, len(m), e.reliability, e.demand, sums[None], floor, normalize, m)
     return m
 
 
@@ -168,31 +163,27 @@ def screens(
     found, ordinary = base.new_empty(1 if hf is None else 2, len(base), 2), base.new_empty(len(base))
     numbers, changing = ((0.0, 0.0), weights) if isinstance(weights, Tensor) else (weights, None)
     halves = [pixels / 2 for pixels in size]
-    _per_gaussian(_screens, len(base), lr, base, hf, *halves, *numbers, changing, found, ordinary)
+    _launch(_screens, len(base), lr, base, hf, *halves, *numbers, changing, found, ordinary)
     return found[0], None if hf is None else found[1], ordinary
 
 
-@cache
-def _evidence_score(lanes: int) -> Any:
-    @wp.kernel(module="unique", enable_backward=False)
-    def evidence_score(
-        reliability: wp.array[wp.float32],
-        demand: wp.array[wp.float32],
-        hf: wp.array[wp.vec2],
-        ordinary: wp.array[wp.float32],
-        score: wp.array[wp.float32],
-        parts: wp.array[wp.vec2d],
-    ) -> None:
-        block, lane = wp.tid()
-        i = block * lanes + lane
-        share = wp.vec2d()
-        if i < score.shape[0]:
-            S = reliability[i] * demand[i] * norm(hf[i])  # Eq. 14
-            score[i] = S
-            share = wp.vec2d(wp.float64(ordinary[i]), wp.float64(S))
-        wp.tile_store(parts, wp.tile_sum(wp.tile(share, preserve_type=True)), offset=(block,))
-
-    return evidence_score
+@wp.kernel
+def _evidence_score(
+    reliability: wp.array[wp.float32],
+    demand: wp.array[wp.float32],
+    hf: wp.array[wp.vec2],
+    ordinary: wp.array[wp.float32],
+    score: wp.array[wp.float32],
+    parts: wp.array[wp.vec2d],
+) -> None:
+    block, lane = wp.tid()
+    i = block * wp.block_dim() + lane
+    share = wp.vec2d()
+    if i < score.shape[0]:
+        S = reliability[i] * demand[i] * norm(hf[i])  # Eq. 14
+        score[i] = S
+        share = wp.vec2d(wp.float64(ordinary[i]), wp.float64(S))
+    wp.tile_store(parts, wp.tile_sum(wp.tile(share, preserve_type=True)), offset=(block,))
 
 
 @wp.kernel
@@ -208,9 +199,9 @@ def evidence_score(
 ) -> Float[Tensor, " N"]:
     n = len(ordinary)
     score, parts = ordinary.new_empty(n), _parts(ordinary, 2)
-    _blocks(_evidence_score, len(parts), e.reliability, e.demand, hf, ordinary, score, parts)
+    _launch(_evidence_score, len(parts), e.reliability, e.demand, hf, ordinary, score, parts, together=True)
     if joined:
-        _per_gaussian(_joined, n, ordinary, parts.sum(0)[None], score)
+        _launch(_joined, n, ordinary, parts.sum(0)[None], score)
     return score
 
 
@@ -239,7 +230,7 @@ def _accumulate(
 def accumulate(
     visible: Bool[Tensor, " N"], score: Tensor, ordinary: Tensor, totals: tuple[Tensor, Tensor, Tensor], largest: bool
 ) -> None:
-    _per_gaussian(_accumulate, len(visible), visible, score, ordinary, largest, *totals)
+    _launch(_accumulate, len(visible), visible, score, ordinary, largest, *totals)
 
 
 @wp.kernel
@@ -277,7 +268,7 @@ def wander(
     strength: float,
 ) -> None:
     typical = log_scales.amax(-1).median().view(1)
-    _per_gaussian(_wander, len(rows), quats, log_scales, gate, rows, eta, typical, strength, means)
+    _launch(_wander, len(rows), quats, log_scales, gate, rows, eta, typical, strength, means)
 
 
 def _parts(like: Tensor, width: int) -> Float[Tensor, "blocks width"]:
@@ -285,15 +276,8 @@ def _parts(like: Tensor, width: int) -> Float[Tensor, "blocks width"]:
     return like.new_empty(-(-len(like) // LANES[like.device.type]), width, dtype=torch.float64)
 
 
-def _per_gaussian(kernel: Any, n: int, *arguments: Any) -> None:
+def _launch(kernel: Any, n: int, *arguments: Any, together: bool = False) -> None:
+    """Launch n threads or, if `together`, n blocks of `LANES`."""
     device = next(x.device for x in arguments if isinstance(x, Tensor))
     with on_stream(device):
-        launch(kernel, [n], arguments, device)
-
-
-def _blocks(kernel: Any, blocks: int, *arguments: Any) -> None:
-    """Launch a kernel of blocks that sum; `kernel` makes it for a number of threads per block."""
-    device = next(x.device for x in arguments if isinstance(x, Tensor))
-    lanes = LANES[device.type]
-    with on_stream(device):
-        launch(kernel(lanes), [blocks], arguments, device, block=lanes, together=True)
+        launch(kernel, [n], arguments, device, block=LANES[device.type], together=together)

@@ -6,9 +6,6 @@ A level turns a block (a b; c d) of x - y into its low part (a+b+c+d)/2, the inp
 
 from __future__ import annotations
 
-from functools import cache
-from typing import Any
-
 import warp as wp
 
 from clear_strategies.kernels.losses.warp.sums import sign
@@ -39,49 +36,43 @@ def low_part(x: wp.array2d[wp.vec3], y: wp.array2d[wp.vec3], first: wp.bool, low
     low[i, j] = 0.5 * (a + b + c + d)
 
 
-@cache
-def details(lanes: int) -> Any:
-    """The kernel for weight · Σ |details| + <above, low part>, with `lanes` threads per row of blocks.
-
-    It writes the gradient, and the row's part of the first sum. The last level has no `above`.
+@wp.kernel
+def details(
+    x: wp.array2d[wp.vec3],
+    y: wp.array2d[wp.vec3],
+    first: wp.bool,
+    above: wp.array2d[wp.vec3],
+    last: wp.bool,
+    weight: wp.float64,
+    out: wp.array2d[wp.vec3],
+    parts: wp.array[wp.float64],
+) -> None:
+    """Weight · Σ |details| + <above, low part>, a block of threads per row of blocks: writes the gradient, and the row's part of
+    the first sum. The last level has no `above`.
     """
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def details(
-        x: wp.array2d[wp.vec3],
-        y: wp.array2d[wp.vec3],
-        first: wp.bool,
-        above: wp.array2d[wp.vec3],
-        last: wp.bool,
-        weight: wp.float64,
-        out: wp.array2d[wp.vec3],
-        parts: wp.array[wp.float64],
-    ) -> None:
-        i, lane = wp.tid()
-        step = 0.5 * wp.float32(weight)
-        share = wp.float64(0.0)
-        for j in range(lane, (x.shape[1] + 1) / 2, lanes):
-            a, b = pixel(x, y, first, 2 * i, 2 * j), pixel(x, y, first, 2 * i, 2 * j + 1)
-            c, d = pixel(x, y, first, 2 * i + 1, 2 * j), pixel(x, y, first, 2 * i + 1, 2 * j + 1)
-            horizontal, vertical, diagonal = a - b + c - d, a + b - c - d, a - b - c + d  # doubled
-            share += wp.float64(wp.norm_l1(horizontal) + wp.norm_l1(vertical) + wp.norm_l1(diagonal))
-            h, v, hv = step * signs(horizontal), step * signs(vertical), step * signs(diagonal)
-            low = wp.vec3(0.0, 0.0, 0.0)
-            if not last:
-                low = 0.5 * above[i, j]
-            a, b, c, d = low + h + v + hv, low - h + v - hv, low + h - v - hv, low - h - v + hv
-            has_right, has_lower = 2 * j + 1 < x.shape[1], 2 * i + 1 < x.shape[0]
-            if not has_right:
-                a, c = a + b, c + d
-            if not has_lower:
-                a, b = a + c, b + d
-            out[2 * i, 2 * j] = a
-            if has_right:
-                out[2 * i, 2 * j + 1] = b
-            if has_lower:
-                out[2 * i + 1, 2 * j] = c
-            if has_right and has_lower:
-                out[2 * i + 1, 2 * j + 1] = d
-        wp.tile_store(parts, wp.tile_sum(wp.tile(wp.float64(0.5) * weight * share)), offset=(i,))
-
-    return details
+    i, lane = wp.tid()
+    step = 0.5 * wp.float32(weight)
+    share = wp.float64(0.0)
+    for j in range(lane, (x.shape[1] + 1) / 2, wp.block_dim()):
+        a, b = pixel(x, y, first, 2 * i, 2 * j), pixel(x, y, first, 2 * i, 2 * j + 1)
+        c, d = pixel(x, y, first, 2 * i + 1, 2 * j), pixel(x, y, first, 2 * i + 1, 2 * j + 1)
+        horizontal, vertical, diagonal = a - b + c - d, a + b - c - d, a - b - c + d  # doubled
+        share += wp.float64(wp.norm_l1(horizontal) + wp.norm_l1(vertical) + wp.norm_l1(diagonal))
+        h, v, hv = step * signs(horizontal), step * signs(vertical), step * signs(diagonal)
+        low = wp.vec3(0.0, 0.0, 0.0)
+        if not last:
+            low = 0.5 * above[i, j]
+        a, b, c, d = low + h + v + hv, low - h + v - hv, low + h - v - hv, low - h - v + hv
+        has_right, has_lower = 2 * j + 1 < x.shape[1], 2 * i + 1 < x.shape[0]
+        if not has_right:
+            a, c = a + b, c + d
+        if not has_lower:
+            a, b = a + c, b + d
+        out[2 * i, 2 * j] = a
+        if has_right:
+            out[2 * i, 2 * j + 1] = b
+        if has_lower:
+            out[2 * i + 1, 2 * j] = c
+        if has_right and has_lower:
+            out[2 * i + 1, 2 * j + 1] = d
+    wp.tile_store(parts, wp.tile_sum(wp.tile(wp.float64(0.5) * weight * share)), offset=(i,))
