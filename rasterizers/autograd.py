@@ -7,9 +7,9 @@ to callers of code that draws.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Final, NamedTuple, ParamSpec, TypeVar, cast
@@ -21,7 +21,7 @@ from torch.autograd.function import once_differentiable
 
 from rasterizers import replayed_drawing
 from rasterizers.ahead import draw_or_take, is_drawing_ahead
-from rasterizers.checks import require_absgrad, require_depth
+from rasterizers.checks import require_trait
 from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, over
 from rasterizers.modes import in_full_precision, uncompiled
@@ -83,14 +83,8 @@ class Drawing:
     hook: BackwardHook
 
 
-class _Collecting(threading.local):
-    """The lists that the drawings of this thread are added to, the innermost last."""
-
-    def __init__(self) -> None:
-        self.running: list[list[Drawing]] = []
-
-
-_collecting: Final = _Collecting()
+_collecting: Final = ContextVar[tuple[list[Drawing], ...]]("collecting", default=())
+"""The lists that the drawings of this thread are added to, the innermost last."""
 
 
 @contextmanager
@@ -99,12 +93,11 @@ def collected_drawings() -> Iterator[list[Drawing]]:
     was drawn.
     """
     drawings: list[Drawing] = []
-    outer = _collecting.running
-    _collecting.running = [*outer, drawings]
+    before = _collecting.set((*_collecting.get(), drawings))
     try:
         yield drawings
     finally:
-        _collecting.running = outer
+        _collecting.reset(before)
 
 
 @uncompiled
@@ -165,7 +158,7 @@ def render(
             "drawing at a time."
         )
     if depth:
-        require_depth(rasterizer)
+        require_trait(rasterizer, "depth")
     with torch.no_grad():
         if replays and not is_drawing_ahead():
             rendering = replayed_drawing.draw(rasterizer, inputs.drawn(bands), camera, depth=depth)
@@ -190,11 +183,11 @@ def in_graph(
     """
     hook = BackwardHook()
     if absgrad is not None:
-        require_absgrad(rendered.rasterizer)
+        require_trait(rendered.rasterizer, "absgrad")
     image, alpha, visible, depth = _Draw.apply(  # type: ignore[no-untyped-call]
         rendered, rows, hook, absgrad, pose, means2d, *inputs
     )
-    for drawings in _collecting.running if image.grad_fn is not None else ():
+    for drawings in _collecting.get() if image.grad_fn is not None else ():
         drawings.append(
             Drawing(rendered.rendering, {k: x for k, x in inputs._asdict().items() if k != "rgb_offset"}, image, hook)
         )

@@ -132,20 +132,17 @@ def of_accumulated(
     return d_A if alpha is None else d_A + alpha, d_D
 
 
-def require_depth(rasterizer: Rasterizer) -> None:
-    """Raise a ValueError for a rasterizer that draws no depth."""
-    if not rasterizer.traits.depth:
-        raise ValueError(
-            f"{type(rasterizer).__name__} draws no depth (its traits.depth is False); cpp, torch, warp and gsplat do."
-        )
+_WITH: Final = {
+    "depth": ("draws no depth", "cpp, torch, warp and gsplat do"),
+    "absgrad": ("has no absolute gradients", "cpp, torch and warp do"),
+}
 
 
-def require_absgrad(rasterizer: Rasterizer) -> None:
-    """Raise a ValueError for a rasterizer that has no absolute gradients."""
-    if not rasterizer.traits.absgrad:
-        raise ValueError(
-            f"{type(rasterizer).__name__} has no absolute gradients (its traits.absgrad is False); cpp, torch and warp do."
-        )
+def require_trait(rasterizer: Rasterizer, name: str) -> None:
+    """Raise a ValueError for a rasterizer without the trait "depth" or "absgrad"."""
+    if not getattr(rasterizer.traits, name):
+        lacks, others = _WITH[name]
+        raise ValueError(f"{type(rasterizer).__name__} {lacks} (its traits.{name} is False); {others}.")
 
 
 def packed_rows(sh: Float[Tensor, "N B 3"]) -> Float[Tensor, "N B 3"]:

@@ -43,16 +43,15 @@ def require_warp(what: str, device: str, otherwise: str) -> None:
         ) from error
     # Warp would print a greeting and a line per compilation to stdout, which belongs to the application.
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-    if device == "cuda" and not torch.cuda.is_available():
-        raise BackendUnavailable(
-            f"{what} cannot run on CUDA: torch finds no CUDA device. Install NVIDIA's driver and a torch built for CUDA; "
-            f"{otherwise}."
-        )
-    if device == "cuda" and wp.get_cuda_device_count() == 0:
-        raise BackendUnavailable(
-            f"{what} cannot run on CUDA: torch finds a CUDA device, Warp does not. Update NVIDIA's driver or warp-lang; "
-            f"{otherwise}."
-        )
+    if device != "cuda":
+        return
+    missing = None
+    if not torch.cuda.is_available():
+        missing = "torch finds no CUDA device. Install NVIDIA's driver and a torch built for CUDA"
+    elif wp.get_cuda_device_count() == 0:
+        missing = "torch finds a CUDA device, Warp does not. Update NVIDIA's driver or warp-lang"
+    if missing:
+        raise BackendUnavailable(f"{what} cannot run on CUDA: {missing}; {otherwise}.")
 
 
 @cache

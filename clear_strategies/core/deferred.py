@@ -104,7 +104,7 @@ def gathered(row: Mapping[str, Number]) -> tuple[Float[Tensor, " K"], Callable[[
 
 def resolve(rows: Sequence[dict[str, Number]]) -> Sequence[dict[str, float]]:
     """Turn every number of the rows into a float, in place. Rows before a resolved one are resolved already."""
-    unread = list(takewhile(_is_unread, reversed(rows)))
+    unread = list(takewhile(lambda row: any(isinstance(x, _UNREAD) for x in row.values()), reversed(rows)))
     values = iter(read([x for row in unread for x in row.values()]))
     for row in unread:
         for name in row:
@@ -148,7 +148,3 @@ def _transferred(tensors: Sequence[Tensor]) -> dict[int, Sequence[float]]:
     joined = torch.cat([torch.cat([x.view(-1) for x in alike]).double() for alike in by_type.values()])
     values = iter(joined.tolist())
     return {id(x): [*islice(values, x.numel())] for alike in by_type.values() for x in alike}
-
-
-def _is_unread(row: Mapping[str, Number]) -> bool:
-    return any(isinstance(x, _UNREAD) for x in row.values())

@@ -24,8 +24,15 @@ from clear_strategies.errors import StrategyConflict
 from clear_strategies.kernels import per_gaussian, reconcile
 from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.detail import DetailRates
-from clear_strategies.merging.guarded_view import guarded
-from clear_strategies.merging.iteration import HrSide, LossWeights, Merged, Stepper, Update, require_finite_parts
+from clear_strategies.merging.iteration import (
+    HrSide,
+    LossWeights,
+    Merged,
+    Stepper,
+    Update,
+    guarded,
+    require_finite_parts,
+)
 from clear_strategies.merging.logs import IterationLogs
 from clear_strategies.merging.objective import Losses, Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
@@ -236,7 +243,7 @@ class Conductor:
             g_mean, from_hr = self._backward_hr(hr, view, drawn, t, vjp, through_mean)
             g_lr = g_mean if reduced else g_lr
         step = Step(iteration(t), self._told(view), params=params) if from_hr is None else from_hr.step
-        with stage("strategies" if stepper is None else stepper.stage):
+        with stage("strategies" if stepper is None else "per-Gaussian pass"):
             score = ordinary = None
             if scored:
                 weights = (o if stepper is None else stepper).weights(t)
@@ -404,7 +411,8 @@ class Conductor:
         if hr is None:
             ordinary = screen_norm(screen_lr)
             return ordinary, ordinary
-        screen = _screen_gradients(screen_lr, hr, weights)
+        hf = None if hr.detail is None else screen_of(hr.detail)
+        screen = ScreenGradients(screen_lr, *per_gaussian.screens(screen_lr, screen_of(hr.g), hf, hr.size, weights))
         score = self._owner["score"].score(hr.step, screen)
         answers.require_score(self._owner["score"], score, len(screen_lr))
         return screen.ordinary if score is None else score, screen.ordinary
@@ -497,11 +505,6 @@ class Conductor:
             else:
                 *of_lr, g, detail = vjp(hr, both, _rows_of(m, n, hr.image) * λ_hf)  # g^HR        Eq. 13
         return of_lr[0] if of_lr else None, HrSide(g.without_detail(), detail, _size(hr.image), step, m, losses.values)
-
-
-def _screen_gradients(lr: Float[Tensor, "N 2"], hr: HrSide, weights: LossWeights) -> ScreenGradients:
-    hf = None if hr.detail is None else screen_of(hr.detail)
-    return ScreenGradients(lr, *per_gaussian.screens(lr, screen_of(hr.g), hf, hr.size, weights))
 
 
 def _vjp(

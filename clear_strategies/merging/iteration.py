@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Float
@@ -14,7 +14,10 @@ from clear_strategies.core.deferred import Number, Scalar
 from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.step import Step
+from clear_strategies.core.view import Photo, View
 from clear_strategies.kernels import native
+from rasterizers.guards import unread
+from rasterizers.recording import running
 
 LossWeights = tuple[float, float] | Tensor
 """λ_HR(t) and λ_HR(t) λ_HF: two numbers, or a tensor of them on the device, [2]."""
@@ -88,11 +91,6 @@ class Update:
 class Stepper(Protocol):
     """Merges and steps in one pass: the same arithmetic as `Conductor.merge` and the optimizer, with no gradient left."""
 
-    @property
-    def stage(self) -> str:
-        """The stage of the work log that the pass is timed as."""
-        ...
-
     def vjp(
         self, shot: Any, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
     ) -> Sequence[Grads]:  # fmt: skip
@@ -127,3 +125,28 @@ def require_finite_parts(where: str, g_lr: Grads, hr: HrSide | None) -> None:
     if not native.all_finite([x for tensors in parts.values() for x in tensors.values()]):
         for part, tensors in parts.items():
             require_finite(f"{where}: {part}", tensors)
+
+
+def guarded(view: View, *, over_changing: bool) -> View:
+    """The view as strategies see it. In a recording its images alone may be read, which are copied before a replay.
+
+    Args:
+        over_changing: a strategy chooses the background, so that an image with transparency is another one in each replay.
+    """
+    if running() is None:
+        return view
+
+    def layer(x: Any, what: str) -> Any:
+        return None if x is None else unread(x, f"the {what} of the view", ("shape", "dtype"))
+
+    def photo(p: Photo) -> Photo:
+        image = layer(p.image, "transparent image") if over_changing and p.transparency is not None else p.image
+        camera = unread(p.camera, "the camera of the view", ("width", "height"))
+        return replace(p, camera=camera, image=image, transparency=layer(p.transparency, "transparency"))
+
+    lr, hr = photo(view.lr), photo(view.hr)
+    return View(
+        unread(view.name, "the name of the view"), lr, hr, hr.image if view.hr_is_photo else layer(view.truth, "truth"),
+        unread(view.sr_source, "the sr_source of the view"), layer(view.depth, "depth"),
+        layer(view.disagreement, "disagreement"), view.background,
+    )  # fmt: skip

@@ -91,23 +91,20 @@ class CompiledStep:
     Args:
         skips: for tests: False visits every row. The result has the same bits.
         passes: what computes; None: what runs on the device of the optimizer's moments.
-    """
 
-    stage: Final = "per-Gaussian pass"
+    Attributes:
+        records: whether a step can be part of a recording.
+    """
 
     def __init__(
         self, conductor: Conductor, optimizer: Adam, *, skips: bool = True, passes: GaussianPass | None = None
     ) -> None:
         self.conductor, self.optimizer, self.skips = conductor, optimizer, skips
         self._passes = gaussian_pass(optimizer) if passes is None else passes
+        self.records = getattr(self._passes, "records", False)
         self._numbers: Tensor | None = None  # see `_recorded_numbers`
         self._examined: tuple[int, int] | None = None
         self._quiet = False
-
-    @property
-    def records(self) -> bool:
-        """Whether a step can be part of a recording."""
-        return getattr(self._passes, "records", False)
 
     def vjp(
         self, shot: FieldShot, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None

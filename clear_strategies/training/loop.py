@@ -137,7 +137,7 @@ def extra_steps(
 
 def learn_extra(s: TrainState, rasterizer: Rasterizer, given: GivenExtra) -> tuple[None, dict[str, Number]]:
     """What an iteration does with an extra view. It can be recorded as `learn`."""
-    θ, extra, where = s.field, given.extra, f"t={given.t}, an extra view"
+    θ, extra, where = s.field, given.view, f"t={given.t}, an extra view"
     with s.conductor.work_log.stage("extra views"):
         shot = θ.shot(over(rasterizer, given.background), extra.photo.camera)
         losses = s.conductor.extra_loss(shot.image, extra, given.t)

@@ -55,11 +55,6 @@ class GivenView:
         """The photos that the iteration compares renderings with: LR, and HR where it is drawn."""
         return [self.view.lr, self.view.hr] if self.scales["hr"] else [self.view.lr]
 
-    @property
-    def behind(self) -> Color:
-        """The background of the photos."""
-        return self.view.background
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GivenExtra:
@@ -70,18 +65,13 @@ class GivenExtra:
     """
 
     t: int
-    extra: ExtraView
+    view: ExtraView
     background: Color | None
 
     @property
     def photos(self) -> Sequence[Photo]:
         """As of `GivenView`."""
-        return [self.extra.photo]
-
-    @property
-    def behind(self) -> Color:
-        """As of `GivenView`."""
-        return self.extra.background
+        return [self.view.photo]
 
 
 Given = GivenView | GivenExtra
@@ -133,12 +123,12 @@ def _kind(s: TrainState, given: Given) -> Kind:
     statistics = [x for x in s.density.state_dict().values() if x.dim() > 0]  # others are made for a checkpoint
     stored = [s.field.filter_3d, *statistics, *(x for table in tables for x in table.values())]
     addresses = [x.data_ptr() for x in stored]
-    facts: list[Any] = [s.field.degree, given.background is None, given.behind, λ > 0]
+    facts: list[Any] = [s.field.degree, given.background is None, given.view.background, λ > 0]
     if isinstance(given, GivenView):
         facts += [given.gate is None, *given.scales.values(), s.density.collects(given.t)]
         facts += [x is None for x in (given.view.depth, given.view.disagreement, given.view.truth)]
     else:
-        facts.append(given.extra.robust)
+        facts.append(given.view.robust)
     shapes = [(photo.image.shape, photo.shown is None, photo.transparency is None) for photo in given.photos]
     return Kind((len(s.field), *addresses), tuple(shapes), tuple(facts))
 
@@ -171,14 +161,14 @@ def _recorded(
 
 def _copied(s: TrainState, given: Given) -> Given:
     """The same with tensors and cameras of its own, and photos before the background of the iteration."""
-    images = (p.over(given.background, given.behind).image.clone() for p in given.photos)
+    images = (p.over(given.background, given.view.background).image.clone() for p in given.photos)
     photos = [
         Photo(replace(p.camera), image, copied(p.shown), p.transparency)
         for p, image in zip(given.photos, images, strict=True)
     ]
     if isinstance(given, GivenExtra):
-        extra = replace(given.extra, photo=photos[0], weight=given.extra.weight.clone())
-        return replace(given, extra=extra, background=None)
+        extra = replace(given.view, photo=photos[0], weight=given.view.weight.clone())
+        return replace(given, view=extra, background=None)
     lr, hr, *_ = [*photos, given.view.hr]  # where HR is not drawn, its size alone is read
     truth = hr.image if given.view.hr_is_photo else given.view.truth
     view = replace(given.view, lr=lr, hr=hr, truth=truth)
@@ -197,9 +187,9 @@ def _tensors_of(s: TrainState, rasterizer: Recordable, given: Given) -> list[Ten
     """All other tensors that an iteration reads of what it is given."""
     tensors: list[Tensor | None] = []
     for photo in given.photos:
-        image = photo.over(given.background, given.behind).image
+        image = photo.over(given.background, given.view.background).image
         tensors += [image, photo.shown, *rasterizer.numbers_of(photo.camera, s.device)]
     if isinstance(given, GivenExtra):
-        return [*tensors, given.extra.weight]
+        return [*tensors, given.view.weight]
     looked_up = s.conductor.looked_up(given.view) if given.looked_up is None else given.looked_up
     return [*tensors, given.gate, looked_up]

@@ -217,14 +217,10 @@ def _monomials(tile: int, like: Tensor) -> Float[Tensor, "P 6"]:
 # These are ten times faster on a CPU than torch.where with a scalar.
 def _cut_below(x: Tensor, limit: float) -> Tensor:
     """X where x >= limit, else 0."""
-    return F.threshold(x, _just_below(limit, x.dtype), 0.0)
+    at = torch.tensor(limit, dtype=x.dtype, device="cpu")
+    return F.threshold(x, float(torch.nextafter(at, torch.full_like(at, -math.inf))), 0.0)
 
 
 def _at_least(x: Tensor, limit: float) -> Tensor:
     """1 where x >= limit, else 0."""
     return (x >= limit).to(x.dtype)
-
-
-def _just_below(limit: float, dtype: torch.dtype) -> float:
-    at = torch.tensor(limit, dtype=dtype, device="cpu")
-    return float(torch.nextafter(at, torch.tensor(-math.inf, dtype=dtype, device="cpu")))

@@ -90,7 +90,8 @@ def list_tiles(projection: Projection, grid: TileGrid) -> TileLists:
     means, half = projection.means2d.detach()[rows], projection.half_extents[rows]
     first, last = _tile_range(means - half, grid), _tile_range(means + half, grid)
     spans = (last - first + 1).clamp_min(0)
-    touches = (projection.power_max[rows] > 0) & _overlaps(means, half, grid)
+    inside = ((means + half > 0) & (means - half < means.new_tensor((grid.width, grid.height)))).all(-1)
+    touches = (projection.power_max[rows] > 0) & inside
     counts = torch.where(touches, spans[:, 0] * spans[:, 1], 0)
 
     # Expand Gaussian by Gaussian, in depth order: pair j is the k-th tile of its Gaussian's box.
@@ -113,11 +114,6 @@ def _tile_range(corner: Float[Tensor, "M 2"], grid: TileGrid) -> Int[Tensor, "M 
     limit = corner.new_tensor((grid.columns - 1, grid.rows - 1))
     # Clamped as float, because a huge splat's corner does not fit an integer.
     return (corner / grid.tile).floor().clamp(min=torch.zeros_like(limit), max=limit).long()
-
-
-def _overlaps(means: Tensor, half: Tensor, grid: TileGrid) -> Bool[Tensor, " M"]:
-    size = means.new_tensor((grid.width, grid.height))
-    return ((means + half > 0) & (means - half < size)).all(-1)
 
 
 def _ellipse_reaches(

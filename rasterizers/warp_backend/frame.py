@@ -26,12 +26,11 @@ from rasterizers.checks import packed_rows, require_cotangents, require_finite, 
 from rasterizers.geometry import tangent_limits
 from rasterizers.interface import Camera, SplatGradients, Splats
 from rasterizers.recording import running
-from rasterizers.warp_backend import types
+from rasterizers.warp_backend import PAIR_BYTES, SUMS_BYTES, TILE, WarpRasterizer, mebibytes, padded, types
 from rasterizers.warp_backend.bins import find_tiles, list_pairs
 from rasterizers.warp_backend.blend import blend, blend_pieces, blend_vjp
 from rasterizers.warp_backend.colour import basis
 from rasterizers.warp_backend.project import fold, project, project_vjp, radii
-from rasterizers.warp_backend.settings import PAIR_BYTES, SUMS_BYTES, TILE, WarpSettings, mebibytes, padded
 from rasterizers.warp_runtime import launch, on_device, on_stream, sort_pairs
 
 _ELLIPSE: Final = ctypes.sizeof(cast(Any, types.Ellipse).ctype) // 4
@@ -82,7 +81,7 @@ class _Lists(NamedTuple):
 class WarpFrame:
     """One depth order for several pixel grids, and the tensors that the VJP reads again."""
 
-    def __init__(self, settings: WarpSettings, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> None:
+    def __init__(self, settings: WarpRasterizer, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> None:
         splats, camera = jobs[0]
         for job, _ in jobs:
             require_splats(job, settings.traits)
@@ -188,7 +187,7 @@ class WarpFrame:
         for nth, view in enumerate(self.views):
             self.launch(
                 project, self.n, self.pose, view.grid, self.cuts, self.means, self.quats, self.scales, view.opacities, self.sh0,
-                self.shN, view.offsets is not None, view.offsets, nth == 0, keys, places, self.colours, self.slopes, self.depths,
+                self.shN, view.offsets, nth == 0, keys, places, self.colours, self.slopes, self.depths,
                 view.ellipses, view.means2d, view.visible, view.counts, self.totals[len(self.views) :],
             )  # fmt: skip
         return keys, places
@@ -291,17 +290,15 @@ class WarpRendering:
         require_cotangents(cotangents, self.image)
         frame, k = self._frame, len(cotangents)
         v = cotangents.to(self._image).contiguous()
-        out, together = _empty_gradients(frame, k, k), self._together()
+        out, together = _empty_gradients(frame, k, k), 1 if absgrad else self._together()
         absolute = frame.empty(k, frame.n, 2) if absgrad else None
         with on_stream(frame.like.device):
-            if absolute is not None:
-                for part in zip(*(x.split(1) for x in (v, *out, absolute)), strict=True):  # type: ignore[no-untyped-call]
-                    self._fill(*part)
-            elif k <= together:
-                self._fill(v, *out, None)
+            if k <= together:
+                self._fill(v, *out, absolute)
             else:
-                for part in zip(*(torch.split(x, together) for x in (v, *out)), strict=True):
-                    self._fill(*part, None)
+                for first in range(0, k, together):
+                    at = slice(first, first + together)
+                    self._fill(v[at], *(x[at] for x in out), None if absolute is None else absolute[at])
             return SplatGradients(*out, frame.basis(), absolute)
 
     def summed_vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"]) -> SplatGradients:
@@ -338,7 +335,7 @@ class WarpRendering:
             )
         frame.launch(
             project_vjp(k, absolute, weight is not None), frame.n, frame.pose, view.grid, frame.cuts, frame.means, frame.quats,
-            frame.scales, view.opacities, frame.slopes, frame.bands > 0, view.ellipses, view.counts, view.firsts, pair_sums, *out,
+            frame.scales, view.opacities, frame.slopes, view.ellipses, view.counts, view.firsts, pair_sums, *out,
             weight,
         )  # fmt: skip
 
@@ -384,15 +381,11 @@ class CameraNumbers(NamedTuple):
     grid: Tensor
 
 
+@lru_cache(maxsize=1024)
 def numbers_of(camera: Camera, device: torch.device) -> CameraNumbers:
     """Those of this camera object. The device of tensors has a number, which "cuda" lacks."""
     if str(device) == "cuda":
-        device = torch.device("cuda", torch.cuda.current_device())
-    return _numbers_of(camera, device)
-
-
-@lru_cache(maxsize=1024)
-def _numbers_of(camera: Camera, device: torch.device) -> CameraNumbers:
+        return numbers_of(camera, torch.device("cuda", torch.cuda.current_device()))
     pose, world = types.Pose(), camera.world_to_camera.double()
     rotation = world[:3, :3].flatten().tolist()
     pose.rotation, pose.exact_rotation = wp.mat33(*rotation), wp.mat33d(*rotation)
@@ -410,7 +403,7 @@ def _numbers_of(camera: Camera, device: torch.device) -> CameraNumbers:
 
 
 @lru_cache(maxsize=1024)
-def _cuts_struct(settings: WarpSettings) -> Any:
+def _cuts_struct(settings: WarpRasterizer) -> Any:
     cuts = types.Cuts()
     cuts.kernel, cuts.near, cuts.antialiased = settings.kernel, settings.near, settings.antialiased
     cuts.near_bits = int.from_bytes(struct.pack("<d", settings.near), "little")

@@ -71,7 +71,6 @@ def project(
     opacities: wp.array[wp.float32],
     sh0: wp.array[wp.vec3],
     shN: wp.array2d[wp.vec3],
-    has_offsets: wp.bool,
     offsets: wp.array[wp.vec3],
     first: wp.bool,
     keys: wp.array[wp.int32],
@@ -127,7 +126,7 @@ def project(
                         if depths.shape[0] > 0:
                             depths[i] = wp.float32(centre.z)
                     ellipse.rgb = colours[i]
-                    if has_offsets:
+                    if offsets.shape[0] > 0:
                         ellipse.rgb += offsets[i]
                     ellipses[i] = ellipse
                     all_finite = all_finite and wp.isfinite(ellipse.rgb)
@@ -229,7 +228,6 @@ def project_vjp(K: int, absolute: bool = False, summed: bool = False) -> Any:
         scales: wp.array[wp.vec3],
         opacities: wp.array[wp.float32],
         slopes: wp.array[wp.mat33],
-        has_slopes: wp.bool,
         ellipses: wp.array[Ellipse],
         counts: wp.array[wp.int32],
         firsts: wp.array[wp.int32],
@@ -283,7 +281,7 @@ def project_vjp(K: int, absolute: bool = False, summed: bool = False) -> Any:
                 sums.xy = total[W * k + 4]
                 sums.yy = total[W * k + 5]
                 out = geometry_vjp(pose, grid, cuts, g, f, scales[i], sums)
-                if has_slopes:
+                if slopes.shape[0] > 0:
                     out.mean += wp.transpose(slopes[i]) * rgb
                 d_means[k, i] = out.mean
                 d_quats[k, i] = out.quat

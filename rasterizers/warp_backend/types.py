@@ -6,14 +6,14 @@ from typing import Final
 
 import warp as wp
 
-from rasterizers.warp_backend import settings
+from rasterizers import warp_backend
 
 wp.set_module_options({"enable_backward": False})
 
-TILE: Final = wp.constant(settings.TILE)
-PIXELS: Final = wp.constant(settings.TILE**2)
+TILE: Final = wp.constant(warp_backend.TILE)
+PIXELS: Final = wp.constant(warp_backend.TILE**2)
 """Pixels of a tile."""
-SEGMENT: Final = wp.constant(settings.SEGMENT)
+SEGMENT: Final = wp.constant(warp_backend.SEGMENT)
 SUMS: Final = wp.constant(6)
 """Sums of a pair for one cotangent before those of the colour: q = ∂L/∂(log alpha) and its moments."""
 

@@ -118,11 +118,11 @@ ADAM = {"lr": 1e-3, "eps": 1e-15}
 
 def unrecorded(*args, **call):
     """This package's rasterization as CLEAR sees gsplat's own: by no drawing that it knows."""
-    running, autograd._collecting.running = autograd._collecting.running, []
+    collecting = autograd._collecting.set(())
     try:
         return autograd.rasterization(*args, **call)
     finally:
-        autograd._collecting.running = running
+        autograd._collecting.reset(collecting)
 
 
 def gsplats(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **call):

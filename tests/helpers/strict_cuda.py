@@ -269,8 +269,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
 
     import rasterizers.native
     from clear_strategies.core import deferred
-    from clear_strategies.kernels import native, reconcile
-    from clear_strategies.kernels.per_gaussian import dispatch
+    from clear_strategies.kernels import native, per_gaussian, reconcile
     from clear_strategies.kernels.reconcile import warp as warp_merge
     from rasterizers import recording, replayed_drawing, replays, sending, warp_runtime
     from rasterizers.warp_backend import frame
@@ -345,7 +344,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         recording: {"_side_stream": cache(lambda device: Stream(cuda))},
         deferred: {"is_immediate": lambda x: False},
         native: {"available": lambda: False},
-        dispatch: {"DEVICES": {"cpu"}},
+        per_gaussian: {"DEVICES": {"cpu"}},
         replays: {"DEVICES": {"cpu"}},
         replayed_drawing: {"_threads": replayed_drawing._Threads()},
         reconcile: {"_for_device": lambda device: warp_merge},

@@ -11,7 +11,8 @@ from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import Grads, to_ndc
 from clear_strategies.core.step import Step
 from clear_strategies.density.adaptive import DensitySettings
-from clear_strategies.kernels.per_gaussian import activate, dispatch, evidence_score, route, wander
+from clear_strategies.kernels import per_gaussian
+from clear_strategies.kernels.per_gaussian import activate, evidence_score, route, wander
 from clear_strategies.merging.iteration import HrSide, Update
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
@@ -27,9 +28,9 @@ def by_warp(request, monkeypatch, blocks_of):
     from clear_strategies.kernels.per_gaussian import warp
 
     def both(function):
-        monkeypatch.setattr(dispatch.native, "available", lambda: False)  # not C++
+        monkeypatch.setattr(per_gaussian.native, "available", lambda: False)  # not C++
         expected = function()
-        monkeypatch.setattr(dispatch, "DEVICES", {"cpu"})
+        monkeypatch.setattr(per_gaussian, "DEVICES", {"cpu"})
         if request.param > 1:
             blocks_of(warp.LANES, request.param)
         return function(), expected
@@ -142,10 +143,10 @@ def test_other_tensors_take_torch(monkeypatch):
     from clear_strategies.kernels.per_gaussian import warp
 
     monkeypatch.setattr(warp, "activate", lambda *_: "Warp's")
-    monkeypatch.setattr(dispatch.native, "available", lambda: False)  # not C++
+    monkeypatch.setattr(per_gaussian.native, "available", lambda: False)  # not C++
     x = [torch.zeros(1, 3), torch.zeros(1), torch.zeros(1)]
     assert activate(*x, None) != "Warp's"
-    monkeypatch.setattr(dispatch, "DEVICES", {"cpu"})
+    monkeypatch.setattr(per_gaussian, "DEVICES", {"cpu"})
     assert activate(*x, None) == "Warp's"
     assert activate(*x, torch.zeros(1, dtype=torch.float64)) != "Warp's"
 

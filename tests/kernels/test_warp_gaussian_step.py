@@ -87,7 +87,6 @@ def test_the_host_does_not_wait_for_the_device(warp_step, monkeypatch):
 def test_the_kernels_compile_for_cuda_on_a_machine_without(warp_step, ptx_of):
     from clear_strategies.kernels.reconcile import warp as reconcile
 
-    ptx_of(warp_step.adam.write.module)
     assert "fma.rn.f32" not in ptx_of(reconcile.compare.module, reconcile._LANES["cuda"])
     assembly = ptx_of(warp_step.passes.step.module, warp_step.LANES["cuda"])  # the module of all kernels
     assert ".local" not in assembly  # no spills: a thread's numbers are in registers

@@ -52,26 +52,26 @@ def test_the_last_dimension_of_an_array_goes_through_several_of_a_tensor():
 @installed
 def test_numbers_of_another_type_than_a_kernel_reads_are_refused():
     """After those of the right type, whose description is kept."""
-    from clear_strategies.kernels.gaussian_step.warp import adam
+    from clear_strategies.kernels.gaussian_step.warp import passes
     from rasterizers.warp_runtime import struct
 
-    struct(adam.Attribute, {"p": torch.rand(5, 3)}, width=3)
+    struct(passes.Attribute, {"p": torch.rand(5, 3)}, width=3)
     with pytest.raises(TypeError, match="reads numbers of type float32, got float64: cast the tensor"):
-        struct(adam.Attribute, {"p": torch.rand(5, 3, dtype=torch.float64)}, width=3)
+        struct(passes.Attribute, {"p": torch.rand(5, 3, dtype=torch.float64)}, width=3)
 
 
 @installed
 def test_structures_of_the_same_shapes_have_their_own_addresses():
-    from clear_strategies.kernels.gaussian_step.warp import adam
+    from clear_strategies.kernels.gaussian_step.warp import passes
     from rasterizers.warp_runtime import struct
 
     p, m, longer = torch.rand(5, 3), torch.rand(5, 3), torch.rand(6, 3)
-    made = [struct(adam.Attribute, {"p": x, "m": y, "v": None}, width=3) for x, y in ((p, m), (m, p), (longer, m))]
+    made = [struct(passes.Attribute, {"p": x, "m": y, "v": None}, width=3) for x, y in ((p, m), (m, p), (longer, m))]
     assert [(s.p.data, s.m.data, s.v.data) for s in made] == [
         (x.data_ptr(), y.data_ptr(), 0) for x, y in ((p, m), (m, p), (longer, m))
     ]
     assert [s.p.shape[0] for s in made] == [15, 15, 18]
-    assert [struct(adam.Attribute, {"p": p}, width=k).width for k in (3, 4, 3)] == [3, 4, 3]
+    assert [struct(passes.Attribute, {"p": p}, width=k).width for k in (3, 4, 3)] == [3, 4, 3]
 
 
 @installed
@@ -177,8 +177,7 @@ def test_long_lists_and_large_gaussians_are_summed_in_short_chains():
     pairs has a block for each segment of them, and the others go through what is left of a tile or a Gaussian.
     """
     from clear_strategies.bench import scenes
-    from rasterizers.warp_backend import frame, project
-    from rasterizers.warp_backend.settings import SEGMENT
+    from rasterizers.warp_backend import SEGMENT, frame, project
 
     tails = scenes.load("tails")
     v = cotangents(1, tails.camera.height, tails.camera.width)

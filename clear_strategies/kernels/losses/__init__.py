@@ -80,8 +80,9 @@ def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], inset: int = 0) -
     Raises:
         ValueError: there is no such pixel.
     """
-    in_cpp = native.available() and supported(DEVICES["cpp"], x, y)
-    return (cpp if in_cpp else reference).ssim(x, y, inset)
+    if native.available() and supported(DEVICES["cpp"], x, y):
+        return cpp.ssim(x, y, inset)
+    return reference.ssim(x, y, inset)
 
 
 def haar_l1(

@@ -1,21 +1,69 @@
 """What an iteration computes for each Gaussian beside its renderings and its step.
 
 `reference` specifies it in torch. `warp` computes the same on CUDA, in a few kernels where torch launches one for each operation,
-and `cpp` on a CPU what torch takes long for; `dispatch` chooses. tests/kernels/test_per_gaussian.py compares.
+and `cpp` on a CPU what torch takes long for: functions of the same names and arguments, of which one is chosen here.
+tests/kernels/test_per_gaussian.py compares.
 """
 
-from clear_strategies.kernels.per_gaussian.reference import (
-    accumulate,
-    activate,
-    evidence,
-    evidence_score,
-    lift,
-    nearest_depths,
-    route,
-    screens,
-    wander,
-)  # fmt: skip
+from __future__ import annotations
 
-__all__ = [
-    "accumulate", "activate", "evidence", "evidence_score", "lift", "nearest_depths", "route", "screens", "wander",
-]  # fmt: skip
+from collections.abc import Callable, Sequence
+from functools import wraps
+from types import ModuleType
+from typing import Final, ParamSpec, TypeVar
+
+import torch
+from torch import Tensor
+
+from clear_strategies.core.evidence import Evidence
+from clear_strategies.kernels import native
+from clear_strategies.kernels.per_gaussian import cpp, reference
+from rasterizers.warp_runtime import runs_warp
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+DEVICES: Final = {"cuda"}
+"""Where Warp's kernels are used; tests add the CPU."""
+
+
+def _fastest(function: Callable[P, T]) -> Callable[P, T]:
+    """C++ or Warp computes it where they have a function of that name, and take the tensors among the arguments."""
+
+    @wraps(function)
+    def chosen(*args: P.args, **kwargs: P.kwargs) -> T:
+        kernels = _kernels([x for arg in args for x in _tensors(arg)])
+        fastest: Callable[P, T] = getattr(kernels, function.__name__, function)
+        return fastest(*args, **kwargs)
+
+    return chosen
+
+
+def _tensors(argument: object) -> Sequence[Tensor]:
+    if isinstance(argument, Evidence):  # a strategy's, of any type
+        return argument.reliability, argument.demand
+    return [argument] if isinstance(argument, Tensor) else []
+
+
+def _kernels(given: Sequence[Tensor]) -> ModuleType | None:
+    """C++ for contiguous tensors on a CPU, Warp on CUDA, both for float32; None: torch."""
+    if any(x.is_floating_point() and x.dtype != torch.float32 for x in given):
+        return None
+    if native.available() and all(x.device.type == "cpu" and x.is_contiguous() for x in given):
+        return cpp
+    if all(x.device.type in DEVICES for x in given) and runs_warp(given[0].device.type):
+        from clear_strategies.kernels.per_gaussian import warp
+
+        return warp
+    return None
+
+
+accumulate = _fastest(reference.accumulate)
+activate = _fastest(reference.activate)
+evidence = _fastest(reference.evidence)
+evidence_score = _fastest(reference.evidence_score)
+lift = _fastest(reference.lift)
+nearest_depths = _fastest(reference.nearest_depths)
+route = _fastest(reference.route)
+screens = _fastest(reference.screens)
+wander = _fastest(reference.wander)

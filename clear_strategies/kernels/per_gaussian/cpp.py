@@ -7,6 +7,7 @@ from typing import Any
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from clear_strategies.core.evidence import Evidence
 from clear_strategies.kernels import native
 from rasterizers.native import empty, threads
 
@@ -32,6 +33,12 @@ def lift(
     lifted = patch_maps.new_empty(len(patch_maps), len(centers))
     native.module().lift(patch_maps, centers.detach(), visible, patch, lifted, threads())
     return lifted
+
+
+def evidence(
+    maps: Float[Tensor, "2 ph pw"], centers: Float[Tensor, "N 2"], visible: Bool[Tensor, " N"], patch: float
+) -> Evidence:
+    return Evidence(*lift(maps, centers, visible, patch))
 
 
 def wander(*arguments: Any) -> None:

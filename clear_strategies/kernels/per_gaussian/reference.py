@@ -8,11 +8,9 @@ from torch import Tensor
 
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import screen_norm, to_ndc
-from clear_strategies.kernels.per_gaussian.dispatch import compiled
 from rasterizers.geometry import rotation_matrix
 
 
-@compiled
 def activate(
     log_scales: Float[Tensor, "N 3"],
     logits: Float[Tensor, " N"],
@@ -35,7 +33,6 @@ def activate(
     return scales, filtered, sigmoid, coefficient, factor, factor * sigmoid
 
 
-@compiled
 def nearest_depths(means: Float[Tensor, "N 3"], cameras: Float[Tensor, "V 20"], near: float) -> Float[Tensor, " N"]:
     """The smallest depth beyond `near` among the cameras that see each centre; infinite where none does.
 
@@ -52,7 +49,6 @@ def nearest_depths(means: Float[Tensor, "N 3"], cameras: Float[Tensor, "V 20"], 
     return z_min
 
 
-@compiled
 def lift(
     patch_maps: Float[Tensor, "C ph pw"], centers: Float[Tensor, "N 2"], visible: Bool[Tensor, " N"], patch: float
 ) -> Float[Tensor, "C N"]:
@@ -70,7 +66,6 @@ def lift(
     return patch_maps.flatten(1).index_select(1, row * width + column) * visible
 
 
-@compiled
 def evidence(
     maps: Float[Tensor, "2 ph pw"], centers: Float[Tensor, "N 2"], visible: Bool[Tensor, " N"], patch: float
 ) -> Evidence:
@@ -78,7 +73,6 @@ def evidence(
     return Evidence(*lift(maps, centers, visible, patch))
 
 
-@compiled
 def route(e: Evidence, visible: Bool[Tensor, " N"], floor: float, normalize: bool) -> Float[Tensor, " N"]:
     """m_i, over its mean where `normalize`; undefined for invisible Gaussians.  Eq. 12"""
     m = floor + (1 - floor) * e.weight
@@ -88,7 +82,6 @@ def route(e: Evidence, visible: Bool[Tensor, " N"], floor: float, normalize: boo
     return m / mean.clamp_min(torch.finfo(m.dtype).tiny)
 
 
-@compiled
 def screens(
     lr: Float[Tensor, "N 2"],
     base: Float[Tensor, "N 2"],
@@ -110,7 +103,6 @@ def screens(
     return base, hf, screen_norm(total)
 
 
-@compiled
 def evidence_score(
     e: Evidence, hf: Float[Tensor, "N 2"], ordinary: Float[Tensor, " N"], joined: bool
 ) -> Float[Tensor, " N"]:
@@ -119,7 +111,6 @@ def evidence_score(
     return ordinary + S * (ordinary.mean() / S.mean().clamp_min(torch.finfo(S.dtype).tiny)) if joined else S
 
 
-@compiled
 def accumulate(
     visible: Bool[Tensor, " N"],
     score: Float[Tensor, " N"],
@@ -141,7 +132,6 @@ def accumulate(
     totals[2].add_(seen)
 
 
-@compiled
 def wander(
     means: Float[Tensor, "N 3"],
     quats: Float[Tensor, "N 4"],

@@ -1,7 +1,8 @@
 """Products and apply in Warp, for CUDA; the same kernels run on a CPU, to check them. Counts stay on the device.
 
-`compare` has one thread per Gaussian, `combine` one per number, so that neighbouring threads write neighbouring memory. Importing
-this module imports Warp; call `rasterizers.warp_runtime.require_warp` first.
+`compare` has one thread per Gaussian, `combine` one per number, so that neighbouring threads write neighbouring memory. Products
+are in float64, where no product of two floats over- or underflows. `kernels.gaussian_step.warp` shares the first half of this
+file. Importing it imports Warp; call `rasterizers.warp_runtime.require_warp` first.
 """
 
 from __future__ import annotations
@@ -13,34 +14,108 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from clear_strategies.core import conflicts
-from clear_strategies.core.deferred import Number, scalar
-from clear_strategies.core.gradients import Grads
-from clear_strategies.kernels.reconcile.tables import FIRST_BANDS, contiguous, row_width, weight_tables
-from clear_strategies.kernels.reconcile.warp_functions import (
-    MEANS,
-    OPACITIES,
-    QUATS,
-    SCALES,
-    SH0,
-    SHN,
-    Counts,
-    Products,
-    Weights,
-    counted,
-    product_table,
-    products_of,
-    reconciled,
-    store,
-    weight,
-    weights_of,
-)
+from clear_strategies.core import conflicts, deferred
+from clear_strategies.core.deferred import Number
+from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads
+from clear_strategies.kernels.reconcile.tables import FIRST_BANDS, WeightTable, contiguous, row_width, weight_tables
 from rasterizers.warp_runtime import launch, on_stream, struct
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 _LANES: Final = {"cuda": 128, "cpu": 1}  # threads per block; on a CPU, Warp's blocks have one
 _ORDER: Final = ("means", "quats", "scales", "opacities", "sh0", "shN", "detail")
+
+
+GROUPS: Final = wp.constant(len(CONFLICT_GROUPS))
+MEANS, SH0, SHN, OPACITIES, SCALES, QUATS = map(wp.constant, range(GROUPS))  # as in CONFLICT_GROUPS
+
+Products: Final[Any] = wp.types.matrix(shape=(GROUPS, 3), dtype=wp.float64)
+"""⟨l, h⟩, ‖l‖², ‖h‖² of one Gaussian, a row for each group."""
+COUNTS: Final = 14
+Counts: Final[Any] = wp.types.vector(length=COUNTS, dtype=wp.int32)
+"""Comparable and opposed Gaussians, [7] each: of the groups, and of the whole Gaussian."""
+
+
+@wp.struct
+class Weight:
+    """A weight of each Gaussian and group."""
+
+    number: wp.float64  # of all, where there are no rows
+    rows: wp.array[wp.float64]
+    stride: wp.int32  # from one group to the next
+    has_rows: wp.bool
+
+
+@wp.struct
+class Weights:
+    """ĝ_HR = keep · g_HR - remove · g_LR."""
+
+    keep: Weight
+    remove: Weight
+
+
+def weights_of(tables: Sequence[WeightTable]) -> Any:
+    """The weights as kernels take them."""
+    keep, remove = (
+        struct(Weight, {"rows": rows}, number=number, stride=stride, has_rows=rows is not None)
+        for number, rows, stride in tables
+    )
+    return struct(Weights, {}, keep=keep, remove=remove)
+
+
+def product_table(like: Tensor, n: int, blocks: int) -> tuple[Tensor, Tensor]:
+    """What a kernel writes products and counts to, [18, N] and [blocks, 14]."""
+    return like.new_empty(3 * GROUPS, n, dtype=torch.float64), like.new_empty(blocks, COUNTS, dtype=torch.int32)
+
+
+def products_of(names: Sequence[str], table: Tensor, counts: Tensor) -> conflicts.Products:
+    """What the kernel has written."""
+    sums = deferred.elements(counts.sum(0))
+    dot, l2, h2 = (x.T for x in table.view(3, GROUPS, -1))
+    return conflicts.Products(names, dot, l2, h2, sums[:7], sums[7:])
+
+
+@wp.func
+def weight(w: Weight, group: wp.int32, i: wp.int32) -> wp.float64:
+    if w.has_rows:
+        return w.rows[group * w.stride + i]
+    return w.number
+
+
+@wp.func
+def reconciled(high: wp.float32, low: wp.float32, keep: wp.float64, remove: wp.float64) -> wp.float32:
+    """ĝ_HR (Eq. 7), with the bits of g_HR where keep is 1 and remove is 0."""
+    return wp.float32(wp.float64(high) * keep - wp.float64(low) * remove)
+
+
+@wp.func
+def compared_and_opposed(products: wp.vec3d) -> wp.vec2i:
+    """Whether neither gradient is zero, and whether their cosine is below 0, too; 0 or 1."""
+    zero = wp.float64(0.0)
+    comparable = wp.where(products[1] > zero and products[2] > zero, 1, 0)
+    return wp.vec2i(comparable, wp.where(products[0] < zero, comparable, 0))
+
+
+@wp.func
+def counted(p: Products) -> Counts:
+    """What one Gaussian adds to the counts."""
+    tally, whole = Counts(), wp.vec3d()
+    for k in range(GROUPS):
+        found = compared_and_opposed(p[k])
+        tally[k] = found[0]
+        tally[GROUPS + 1 + k] = found[1]
+        whole += p[k]
+    found = compared_and_opposed(whole)
+    tally[GROUPS] = found[0]
+    tally[2 * GROUPS + 1] = found[1]
+    return tally
+
+
+@wp.func
+def store(p: Products, table: wp.array2d[wp.float64], i: wp.int32) -> None:
+    for k in range(GROUPS):
+        for c in range(3):
+            table[GROUPS * c + k, i] = p[k, c]
 
 
 @wp.struct
@@ -216,7 +291,7 @@ def apply(
     with on_stream(device):
         combined = *rows, options, weights_of(tables), changing, finite
         launch(combine, [n, sum(row.width for row in rows)], combined, device, block=_LANES[device.type])
-    return scalar(finite[0])
+    return deferred.scalar(finite[0])
 
 
 def _options(n: int, lr: Grads, hr: Grads, lambda_hr: float = 1.0, keeps_lr: bool = True) -> Any:

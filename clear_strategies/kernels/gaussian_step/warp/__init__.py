@@ -18,15 +18,15 @@ from torch import Tensor
 from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.gradients import CONFLICT_GROUPS
 from clear_strategies.kernels.gaussian_step import Attribute, StepSettings
-from clear_strategies.kernels.gaussian_step.warp import adam, passes, raw_gradients
+from clear_strategies.kernels.gaussian_step.warp import passes
 from clear_strategies.kernels.reconcile.tables import weight_tables
-from clear_strategies.kernels.reconcile.warp_functions import product_table, products_of, weights_of
+from clear_strategies.kernels.reconcile.warp import product_table, products_of, weights_of
 from rasterizers.warp_runtime import launch, on_stream, struct
 
 LANES: Final = {"cuda": 128, "cpu": 1}
 """Threads per block; on a CPU, Warp's blocks have one."""
 
-_STEP: Final = cast(Any, adam.AdamStep).ctype
+_STEP: Final = cast(Any, passes.AdamStep).ctype
 _BYTES: Final = 4  # of each of its numbers
 _WIDTHS: Final = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "sh0": 3, "detail": 3}
 _MOST_ATTRIBUTES: Final = 256
@@ -64,10 +64,10 @@ class WarpGaussianStep:
         learns_detail = "detail" in high
         widths_of_hr = widths | {"detail": 3} if learns_detail else widths
         self._gradients = (
-            self._rows(raw_gradients.Activation, activation, inputs),
-            self._rows(raw_gradients.Gradient, lr, widths),
-            self._rows(raw_gradients.Gradient, high, widths_of_hr if high else {}),
-            struct(raw_gradients.View, {}, n=self._n, has_hr=self._has_hr, has_detail=learns_detail),
+            self._rows(passes.Activation, activation, inputs),
+            self._rows(passes.Gradient, lr, widths),
+            self._rows(passes.Gradient, high, widths_of_hr if high else {}),
+            struct(passes.View, {}, n=self._n, has_hr=self._has_hr, has_detail=learns_detail),
         )
 
     def products(self) -> Products:
@@ -139,7 +139,7 @@ class WarpGaussianStep:
             if len(_attributes) >= _MOST_ATTRIBUTES:
                 _attributes.clear()
             _attributes[key] = struct(
-                adam.Attribute, tensors, width=width, given=a.hr is not None, added=a.plus is not None,
+                passes.Attribute, tensors, width=width, given=a.hr is not None, added=a.plus is not None,
                 bounded=a.keep != 1 or a.limit != math.inf, keep=a.keep, limit=a.limit,
             )  # fmt: skip
         return _attributes[key]
@@ -163,19 +163,19 @@ class WarpGaussianStep:
 def written(
     s: StepSettings, rates: Mapping[str, float], device: torch.device, *, lambda_hf: float = 0.0, out: Tensor | None = None
 ) -> Tensor:  # fmt: skip
-    """The numbers of a step on the device, as a row of `adam.AdamStep`; written into `out` where it is given.
+    """The numbers of a step on the device, as a row of `passes.AdamStep`; written into `out` where it is given.
 
     Args:
         rates: each attribute's, see `Attribute`. lambda_hf: λ_HR λ_HF.
     """
     out = torch.empty(1, sizeof(_STEP) // _BYTES, device=device) if out is None else out
     numbers = struct(
-        adam.AdamStep, {}, rates=struct(adam.Rates, {}, **{name: -rate for name, rate in rates.items()}), beta1=s.beta1,
+        passes.AdamStep, {}, rates=struct(passes.Rates, {}, **{name: -rate for name, rate in rates.items()}), beta1=s.beta1,
         beta2=s.beta2, gain1=1 - s.beta1, gain2=1 - s.beta2, per_bias2=1 / s.bias2, eps=s.eps, lambda_hr=s.lambda_hr,
         lambda_hf=lambda_hf,
     )  # fmt: skip
     with on_stream(device):
-        launch(adam.write, [1], (numbers, out), device)
+        launch(passes.write, [1], (numbers, out), device, block=LANES[device.type])
     return out
 
 

@@ -4,8 +4,8 @@ this for the rows of shN; `write_dense` writes both gradients.
 They use one thread per Gaussian, `step_bands` one per number, because shN has three quarters of all numbers and neighbouring
 threads then access neighbouring memory. `step` passes it a table of colours: the merged gradient of shN is Y ⊗ colour.
 
-Products and sums round as in torch (no contraction). Blocks sum their counts, and torch sums over the blocks: every sum has a
-fixed order.
+Both gradients with respect to the raw parameters are computed per Gaussian and never stored. Products and sums round as in torch
+(no contraction). Blocks sum their counts, and torch sums over the blocks: every sum has a fixed order.
 """
 
 from __future__ import annotations
@@ -14,18 +14,7 @@ from typing import Any
 
 import warp as wp
 
-from clear_strategies.kernels.gaussian_step.warp.adam import AdamStep, Attribute, is_still, step_number
-from clear_strategies.kernels.gaussian_step.warp.raw_gradients import (
-    Activation,
-    Gradient,
-    RawGradient,
-    View,
-    detail_of,
-    higher_bands2,
-    load,
-    size,
-)
-from clear_strategies.kernels.reconcile.warp_functions import (
+from clear_strategies.kernels.reconcile.warp import (
     MEANS,
     OPACITIES,
     QUATS,
@@ -42,6 +31,202 @@ from clear_strategies.kernels.reconcile.warp_functions import (
 )
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.struct
+class Gradient:
+    """One cotangent's rasterizers.interface.SplatGradients; rgb is the factor beside Y of the colour gradient.
+
+    `detail`, of HR, is m λ_HF ∇L_HF of f_det.
+    """
+
+    means: wp.array[wp.vec3]
+    quats: wp.array[wp.vec4]
+    scales: wp.array[wp.vec3]
+    opacities: wp.array[wp.float32]
+    rgb: wp.array[wp.vec3]
+    detail: wp.array[wp.vec3]
+
+
+@wp.struct
+class Activation:
+    """The inputs of the activations' VJP (training.field.Activation), and Y."""
+
+    scales: wp.array[wp.vec3]
+    filtered: wp.array[wp.vec3]
+    filter: wp.array[wp.float32]
+    sigmoid: wp.array[wp.float32]
+    factor: wp.array[wp.float32]
+    basis: wp.array2d[wp.float32]
+
+
+@wp.struct
+class View:
+    """How many Gaussians there are, and which gradients are given."""
+
+    n: wp.int32
+    has_hr: wp.bool
+    has_detail: wp.bool
+
+
+@wp.struct
+class RawGradient:
+    """∇θ of one loss for one Gaussian. shN's gradient stays in factors: Y ⊗ rgb."""
+
+    means: wp.vec3
+    quats: wp.vec4
+    scales: wp.vec3
+    opacity: wp.float32
+    sh0: wp.vec3
+    rgb: wp.vec3
+
+
+@wp.func
+def activation_vjp(g: Gradient, a: Activation, i: wp.int32) -> RawGradient:
+    """The VJP of the 3D filter, exp and sigmoid. Same operations as training.field.Activation.vjp."""
+    out = RawGradient()
+    scales, filtered, reach = a.scales[i], a.filtered[i], a.filter[i]
+    factor, sigmoid, d_opacity = a.factor[i], a.sigmoid[i], g.opacities[i]
+    share = wp.vec3(reach / filtered[0], reach / filtered[1], reach / filtered[2])
+    share = wp.cw_mul(share, share)  # log(coefficient) grows with log(s) by f² / (s² + f²)
+    along = wp.cw_div(wp.cw_mul(g.scales[i], wp.cw_mul(scales, scales)), filtered)
+    out.means = g.means[i]
+    out.quats = g.quats[i]
+    out.scales = along + d_opacity * (factor * sigmoid) * share
+    out.opacity = d_opacity * factor * sigmoid * (1.0 - sigmoid)
+    out.rgb = g.rgb[i]
+    out.sh0 = a.basis[i, 0] * out.rgb
+    return out
+
+
+@wp.func
+def load(
+    activation: Activation, lr: Gradient, hr: Gradient, view: View, i: wp.int32
+) -> tuple[RawGradient, RawGradient]:
+    """∇L_LR and g^HR of a Gaussian; 0 for one not given."""
+    g_lr, g_hr = activation_vjp(lr, activation, i), RawGradient()
+    if view.has_hr:
+        g_hr = activation_vjp(hr, activation, i)
+    return g_lr, g_hr
+
+
+@wp.func
+def detail_of(hr: Gradient, view: View, i: wp.int32) -> wp.vec3:
+    """What f_det learns by, m λ_HF ∇L_HF; 0 where it is not given."""
+    g = wp.vec3()
+    if view.has_detail:
+        g = hr.detail[i]
+    return g
+
+
+@wp.func
+def higher_bands2(a: Activation, i: wp.int32) -> wp.float64:
+    """‖Y‖² over the higher bands, for ⟨Y ⊗ a, Y ⊗ b⟩ = ‖Y‖² ⟨a, b⟩."""
+    total = wp.float64(0.0)
+    for k in range(1, a.basis.shape[1]):
+        y = wp.float64(a.basis[i, k])
+        total += y * y
+    return total
+
+
+@wp.func
+def size(g: RawGradient) -> wp.float32:
+    """A norm that is 0 only if the gradient is 0; sh0 follows rgb."""
+    shape = wp.norm_l1(g.means) + wp.norm_l1(g.quats) + wp.norm_l1(g.scales)
+    return shape + wp.abs(g.opacity) + wp.norm_l1(g.rgb)
+
+
+@wp.struct
+class Rates:
+    """Of each attribute, - learning rate / bias of the first moment."""
+
+    means: wp.float32
+    quats: wp.float32
+    scales: wp.float32
+    opacities: wp.float32
+    sh0: wp.float32
+    shN: wp.float32  # noqa: N815 - gsplat's name
+    detail: wp.float32
+
+
+@wp.struct
+class AdamStep:
+    """What changes from step to step, and the settings that all attributes share."""
+
+    rates: Rates
+
+    beta1: wp.float32
+    beta2: wp.float32
+    gain1: wp.float32  # 1 - β
+    gain2: wp.float32
+    per_bias2: wp.float32  # 1 / bias of the second moment
+    eps: wp.float32
+    lambda_hr: wp.float32
+    lambda_hf: wp.float32  # λ_HR λ_HF, next to it; no kernel here reads it
+
+
+@wp.struct
+class Attribute:
+    """A parameter tensor with its moments, row-major, what is added to its gradient, and its limits."""
+
+    p: wp.array[wp.float32]
+    m: wp.array[wp.float32]
+    v: wp.array[wp.float32]
+    hr: wp.array[wp.float32]  # ĝ_HR where a strategy has computed it
+    plus: wp.array[wp.float32]
+    width: wp.int32
+    given: wp.bool  # there is `hr`
+    added: wp.bool  # there is `plus`
+    bounded: wp.bool  # a row that takes no step may still decay or be clamped
+    keep: wp.float32  # factor of the decay per step (f_det), 1: none
+    limit: wp.float32
+
+
+@wp.kernel
+def write(values: AdamStep, out: wp.array[AdamStep]) -> None:
+    out[0] = values
+
+
+@wp.func
+def step_number(
+    adam: AdamStep, a: Attribute, rate: wp.float32, at: wp.int32, gradient: wp.float32, moves: wp.bool
+) -> None:
+    """Decay, step and clamp one number; with `moves` False only decay and clamp it. As `training.optim.Adam`, but that the
+    division by the second moment's bias is a multiplication here.
+    """
+    if not (moves or a.bounded):
+        return
+    p = a.p[at]
+    g = gradient
+    if a.given:
+        g += a.hr[at] * adam.lambda_hr
+    if a.added:
+        g += a.plus[at]
+    after = p * a.keep
+    if moves:
+        m = g * adam.gain1 + a.m[at] * adam.beta1
+        v = g * adam.gain2 * g + a.v[at] * adam.beta2
+        a.m[at] = m
+        a.v[at] = v
+        after += m * rate / (wp.sqrt(v * adam.per_bias2) + adam.eps)
+    if after > a.limit:  # False for NaN, which stays
+        after = a.limit
+    elif after < -a.limit:
+        after = -a.limit
+    a.p[at] = after
+
+
+@wp.func
+def is_still(a: Attribute, i: wp.int32, width: wp.int32) -> wp.bool:
+    """Whether a row to which the losses give nothing would stay as it is: both moments and what is added are 0."""
+    for at in range(a.width * i, a.width * i + width):
+        if a.m[at] != 0.0 or a.v[at] != 0.0:
+            return False
+        if a.given and a.hr[at] != 0.0:
+            return False
+        if a.added and a.plus[at] != 0.0:
+            return False
+    return True
 
 
 @wp.struct
