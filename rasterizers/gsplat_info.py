@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rasterizers.autograd import Rendered, stacked
 from rasterizers.inputs import Inputs
-from rasterizers.interface import RasterSettings, WithRadii
+from rasterizers.interface import RasterSettings, WithTraits
 from rasterizers.modes import in_full_precision
 from rasterizers.reference.projection import footprints
 
@@ -34,7 +34,7 @@ def info_of_all(
     means2d = means2d.view(*lead, *means2d.shape[1:]).requires_grad_(learns)
 
     def radii() -> dict[str, Tensor]:
-        found = stacked([cast(WithRadii, rendering).radii for rendering in renderings])
+        found = stacked([cast(WithTraits, rendering).radii for rendering in renderings])
         return {"radii": found.view(*lead, *found.shape[1:])}
 
     def ellipses() -> dict[str, Tensor]:

@@ -221,7 +221,7 @@ class Rendering(Protocol):
 
         E = Σ wᵢ zᵢ / Σ wᵢ with the blending weights wᵢ = Tᵢ αᵢ and the depths zᵢ of the centres along the camera's axis: "ED"
         in gsplat's terms, the accumulated depth "D" divided by alpha. It is 0 where nothing is drawn. Where alpha is small it
-        is that of a few faint Gaussians. `WithDepthGradient` has its gradient.
+        is that of a few faint Gaussians. `WithTraits.vjp` has its gradient.
         """
         ...
 
@@ -253,10 +253,9 @@ class Traits:
         dtypes: the types that the splats' tensors may have.
         native_threads: it computes on the threads of `rasterizers.native`, not on torch's.
         depth: it draws expected depth. Without this trait nobody passes the argument `depth`, so its methods may lack it.
-        absgrad: its renderings are `WithAbsgrad`.
-        depth_gradient: its renderings are `WithDepthGradient`. Without this trait alpha's gradient takes a second image, and
-            depth has none.
-        radii: its renderings are `WithRadii`.
+        absgrad: `WithTraits.vjp` takes this argument.
+        depth_gradient: it takes alpha and depth. Without this trait alpha's gradient takes a second image, and depth has none.
+        radii: its renderings have `WithTraits.radii`.
     """
 
     devices: frozenset[str]
@@ -268,37 +267,41 @@ class Traits:
     radii: bool = False
 
 
-class WithAbsgrad(Protocol):
-    """A rendering of a backend with the trait `absgrad`."""
-
-    def vjp(self, cotangents: Float[Tensor, "K H W 3"], *, absgrad: bool = False) -> SplatGradients:
-        """See `Rendering.vjp`; with `SplatGradients.absgrad`."""
-        ...
-
-
-class WithDepthGradient(Protocol):
-    """A rendering of a backend with the trait `depth_gradient`."""
+class WithTraits(Rendering, Protocol):
+    """All that a rendering may have besides; `Traits` says what of it a backend's have."""
 
     def vjp(
         self,
         cotangents: Float[Tensor, "K H W 3"],
         *,
+        absgrad: bool = False,
         alpha: Float[Tensor, "K H W"] | None = None,
         depth: Float[Tensor, "K H W"] | None = None,
     ) -> SplatGradients:
-        """See `Rendering.vjp`; the same K losses have these gradients of `Rendering.alpha` and of `Rendering.depth`; None: 0.
+        """See `Rendering.vjp`.
+
+        Args:
+            absgrad: with `SplatGradients.absgrad`, for the trait of this name.
+            alpha, depth: gradients of `Rendering.alpha` and of `Rendering.depth` of the same K losses, for the trait
+                `depth_gradient`; None: 0.
 
         Raises:
             ValueError: `depth` is given for a rendering that was drawn without it.
         """
         ...
 
-
-class WithSummedVjp(Protocol):
-    """A rendering that sums before its projection's VJP what `SplatGradients.summed` sums after it."""
-
     def summed_vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"]) -> SplatGradients:
-        """See the function of this name."""
+        """See the function of this name, which looks for this method: a backend may sum before its projection's VJP what
+        `SplatGradients.summed` sums after it.
+        """
+        ...
+
+    @property
+    def radii(self) -> Int[Tensor, "N 2"]:
+        """Half the box of each Gaussian, px, rounded up; 0 for those that are not visible. For the trait of this name.
+
+        As in gsplat it reaches to where alpha falls below `alpha_min`, at most 3.33 standard deviations.
+        """
         ...
 
 
@@ -312,22 +315,9 @@ def summed_vjp(
     """
     if weight is None:
         return rendering.vjp(cotangents)
-    of_rendering = getattr(rendering, "summed_vjp", None)
-    if of_rendering is None:
-        return rendering.vjp(cotangents).summed(weight)
-    return cast(WithSummedVjp, rendering).summed_vjp(cotangents, weight)
-
-
-class WithRadii(Protocol):
-    """A rendering of a backend with the trait `radii`."""
-
-    @property
-    def radii(self) -> Int[Tensor, "N 2"]:
-        """Half the box of each Gaussian, px, rounded up; 0 for those that are not visible.
-
-        As in gsplat it reaches to where alpha falls below `alpha_min`, at most 3.33 standard deviations.
-        """
-        ...
+    if hasattr(rendering, "summed_vjp"):
+        return cast(WithTraits, rendering).summed_vjp(cotangents, weight)
+    return rendering.vjp(cotangents).summed(weight)
 
 
 @runtime_checkable

@@ -21,9 +21,9 @@ from torch import Tensor
 
 from rasterizers.checks import drawing
 from rasterizers.inputs import Inputs
-from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, WithRadii, can_be_recorded, over
+from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, WithTraits, can_be_recorded, over
 from rasterizers.recording import Recording, on_side_stream, running
-from rasterizers.replays import Kind, Replays, can_record, write
+from rasterizers.replays import Kind, Recorded, Replays, can_record, write
 
 _BLACK: Final = (0.0, 0.0, 0.0)
 _GRADIENTS: Final = tuple(f.name for f in fields(SplatGradients) if f.name != "absgrad")
@@ -64,8 +64,8 @@ class _Given:
         return drawing(self.rasterizer, self.depth)(self.inputs.splats(), self.camera)
 
 
-class _RecordedDrawing:
-    """A `Recorded` of both passes of one kind of drawing.
+class _RecordedDrawing(Recorded[_Given, Rendering]):
+    """Both passes of one kind of drawing.
 
     Attributes:
         turn: how often it has been drawn.
@@ -77,7 +77,7 @@ class _RecordedDrawing:
         own = replace(
             given, rasterizer=given.rasterizer.over_changing(background), inputs=given.inputs.copied(), camera=camera
         )
-        self._own = own.tensors
+        tensors = own.tensors
         self._cotangent = background.new_ones(1, camera.height, camera.width, 3)
         self.turn = 0
 
@@ -92,23 +92,14 @@ class _RecordedDrawing:
         with on_side_stream(device):  # live, which also compiles the kernels of the backward pass
             rendering, live = forward()
             live += backward(rendering)
-        self._forward = Recording(device, forward)
-        self._backward = Recording(device, lambda: backward(self._forward.result[0]))
-        _require_same_bits([*self._forward.result[1], *self._backward.result], live)
-
-    def holds_at(self, t: int) -> bool:
-        """See `Recorded`."""
-        return self._forward.holds_at(t)
-
-    def replay(self, given: _Given) -> bool:
-        """See `Recorded`."""
-        write(self._own, given.tensors)
-        return self._forward.replay()
+        super().__init__(Recording(device, forward), lambda given: write(tensors, given.tensors))
+        rendering, made = self._recording.result
+        self._backward = Recording(device, lambda: backward(rendering))
+        _require_same_bits([*made, *self._backward.result], live)
 
     def outcome(self, given: _Given) -> Rendering:
-        """See `Recorded`."""
         self.turn += 1
-        rendering, made = self._forward.result
+        rendering, made = self._recording.result
         return _Replayed(self, given, self.turn, rendering, _copied(made))
 
     def vjp(self, cotangents: Float[Tensor, "1 H W 3"]) -> SplatGradients:
@@ -128,11 +119,11 @@ class _Replayed:
 
     @property
     def radii(self) -> Int[Tensor, "N 2"]:
-        """See `WithRadii`."""
-        return cast(WithRadii, self._recorded if self._is_last else self._given.live()).radii
+        """See `WithTraits`."""
+        return cast(WithTraits, self._recorded if self._is_last else self._given.live()).radii
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"], **more: Any) -> SplatGradients:
-        """See `Rendering.vjp`, `WithAbsgrad` and `WithDepthGradient`."""
+        """See `WithTraits`."""
         self.awaits_backward = False
         if self._is_last and len(cotangents) == 1 and not more:
             return self._of.vjp(cotangents)

@@ -11,12 +11,12 @@ import logging
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 import torch
 from torch import Tensor
 
-from rasterizers.recording import on_side_stream
+from rasterizers.recording import Recording, on_side_stream
 
 _log = logging.getLogger(__name__)
 
@@ -29,8 +29,8 @@ _MOST_KINDS: Final = 8  # a recording keeps the memory of its work
 _MOST_TURNS: Final = 8  # recordings made anew that have not paid off
 _PAYS_AFTER: Final = 2  # replays
 
+G = TypeVar("G")
 T = TypeVar("T")
-T_co = TypeVar("T_co", covariant=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,22 +53,28 @@ def can_record(device: torch.device) -> bool:
     return device.type in DEVICES
 
 
-class Recorded(Protocol[T_co]):
-    """A recording of one kind of work, which reads what it is given from tensors of its own."""
+class Recorded(Generic[G, T]):
+    """Work of one kind, which reads what it is given from tensors of its own.
+
+    Args:
+        recording: of the work. write: writes what a replay is given to where the work reads it.
+    """
+
+    def __init__(self, recording: Recording[Any], write: Callable[[G], None]) -> None:
+        self._recording, self._write = recording, write
 
     def holds_at(self, t: int) -> bool:
         """Whether what Python has decided by the iteration, as a strategy may, is the same at t."""
-        ...
+        return self._recording.holds_at(t)
 
-    def replay(self, given: Any) -> bool:
-        """Write what the work is given to where it reads it, and do it; False where the recording does not hold for it, before
-        anything has changed.
-        """
-        ...
+    def replay(self, given: G) -> bool:
+        """Do the work with what it is given; False where the recording does not hold for it, before anything has changed."""
+        self._write(given)
+        return self._recording.replay()
 
-    def outcome(self, given: Any) -> T_co:
+    def outcome(self, given: G) -> T:
         """What the work has made."""
-        ...
+        raise NotImplementedError
 
 
 class Replays:
@@ -89,7 +95,7 @@ class Replays:
         self._turns = 0.0  # how often a recording did not hold at its iteration, less what the replays since have saved
         self._failed = False
 
-    def do(self, kind: Kind, t: int, given: Any, *, live: Callable[[], T], record: Callable[[], Recorded[T]]) -> T:
+    def do(self, kind: Kind, t: int, given: Any, *, live: Callable[[], T], record: Callable[[], Recorded[Any, T]]) -> T:
         """Do the work: by a replay, while it is recorded, or live."""
         if self._failed:
             return self._live(live, _FAILED)

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final, TypeVar
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.strategies.base import Strategy, describes, overrides
 from rasterizers.guards import Guarded
 from rasterizers.recording import Recording
-from rasterizers.replays import Replays, can_record
+from rasterizers.replays import Recorded, Replays, can_record
 
 G = TypeVar("G")
 T = TypeVar("T")
@@ -28,8 +28,8 @@ LIVE: Final = "live in place of a replay"
 """The work log's entry for work that was not replayed, by the reason. It has no runs, so that none seem saved."""
 
 
-class RecordedWork(Generic[G, T]):
-    """A `Recorded`, with what the work has skipped, its numbers for the history, and what strategies log in it.
+class RecordedWork(Recorded[G, T]):
+    """Recorded work, with what it has skipped, its numbers for the history, and what strategies log in it.
 
     Args:
         work: returns what it makes, and numbers by name. See `Recording`.
@@ -43,7 +43,7 @@ class RecordedWork(Generic[G, T]):
         self, device: torch.device, conductor: Conductor, work: Callable[[], tuple[Any, Mapping[str, Number]]], *,
         write: Callable[[G], None], outcome: Callable[[G, Any, dict[str, Number]], T], asked: Iterable[Strategy] = (),
     ) -> None:  # fmt: skip
-        self._write, self._outcome = write, outcome
+        self._outcome = outcome
         self._work_log, self._strategies, self._asked = conductor.work_log, conductor.strategies, [*asked]
         self._stored = [*map(_stored_by, self._asked)]  # before the work, which may change it
         self._of_t: dict[str, Any] = {}  # numbers that Python has made of the iteration
@@ -61,24 +61,22 @@ class RecordedWork(Generic[G, T]):
         conductor.logs.keep()
         try:
             with self._work_log.noted() as self._skips:
-                self._recording = Recording(device, gathered)
+                super().__init__(Recording(device, gathered), write)
         finally:
             for s in self._strategies:
                 s.logs.clear()  # of the recording's tensors
 
     def holds_at(self, t: int) -> bool:
-        """See `Recorded`."""
         self._t = t
-        return self._stored == [*map(_stored_by, self._asked)] and self._recording.holds_at(t)
+        return self._stored == [*map(_stored_by, self._asked)] and super().holds_at(t)
 
     def replay(self, given: G) -> bool:
-        """See `Recorded`."""
         self._write(given)
         with self._work_log.stage("replayed"):
             return self._recording.replay()
 
     def outcome(self, given: G) -> T:
-        """See `Recorded`. The strategies have then logged what the work logs."""
+        """What the work has made. The strategies have then logged what the work logs."""
         made, numbers, row_of = self._recording.result
         row: dict[str, Number] = row_of(numbers.clone()) | {name: x.at(self._t) for name, x in self._of_t.items()}
         for k, (name, reason, count) in enumerate(self._skips):

@@ -12,7 +12,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, TypeVar, cast
 
 from torch import Tensor
@@ -21,7 +20,7 @@ from clear_strategies.core.deferred import Number
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.kernels import losses
 from clear_strategies.merging.iteration import Update
-from clear_strategies.merging.recorded_work import LIVE, RecordedWork, that_merge, why_strategies_are_not_recorded
+from clear_strategies.merging.recorded_work import RecordedWork, replays_on, that_merge, why_strategies_are_not_recorded
 from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Color, Rasterizer, Recordable, can_be_recorded, over
@@ -83,7 +82,7 @@ def replays_for(s: TrainState, rasterizer: Rasterizer) -> Replays | None:
     """
     reason = next(_why_not(s, rasterizer), None)
     if reason is None:
-        return Replays(s.device, "fit.replay", partial(s.conductor.work_log.skip, LIVE))
+        return replays_on(s.device, s.conductor.work_log, "fit.replay")
     _log.log(logging.WARNING if s.settings.replay else logging.INFO, "Iterations are not replayed: %s.", reason)
     return None
 

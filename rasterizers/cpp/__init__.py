@@ -141,7 +141,7 @@ class CppRendering:
 
     @property
     def radii(self) -> Int[Tensor, "N 2"]:
-        """See `WithRadii`."""
+        """See `WithTraits`."""
         out = torch.empty(len(self.visible), 2, dtype=torch.int32, device="cpu")
         self._frame.native.radii(self._grid, out, self._frame.threads)
         return out
@@ -154,14 +154,14 @@ class CppRendering:
         alpha: Float[Tensor, "K H W"] | None = None,
         depth: Float[Tensor, "K H W"] | None = None,
     ) -> SplatGradients:
-        """One pass for up to three cotangents, with depth or absolute gradients for one; see `WithDepthGradient`."""
+        """One pass for up to three cotangents, with depth or absolute gradients for one; see `WithTraits`."""
         require_cotangents(cotangents, self.image)
         v_alpha, v_depth = (None if x is None else x.contiguous() for x in of_accumulated(self, alpha, depth))
         absolute = self._frame.empty(len(cotangents), len(self.visible), 2) if absgrad else None
         return self._gradients(cotangents, v_alpha, v_depth, absolute)
 
     def summed_vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"]) -> SplatGradients:
-        """One pass for two or three cotangents; see `WithSummedVjp`."""
+        """One pass for two or three cotangents; see `WithTraits`."""
         require_cotangents(cotangents, self.image)
         if len(cotangents) not in (2, 3) or self.image.dtype == torch.float64:
             return self.vjp(cotangents).summed(weight)

@@ -83,7 +83,7 @@ class ReferenceRendering:
         alpha: Float[Tensor, "K H W"] | None = None,
         depth: Float[Tensor, "K H W"] | None = None,
     ) -> SplatGradients:
-        """One pass for all K; see `WithDepthGradient`."""
+        """One pass for all K; see `WithTraits`."""
         require_cotangents(cotangents, self.image)
         v_alpha, v_depth = of_accumulated(self, alpha, depth)
         channels = cotangents if v_depth is None else torch.cat((cotangents, v_depth[..., None]), -1)

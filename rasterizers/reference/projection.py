@@ -103,7 +103,7 @@ class Footprints(NamedTuple):
 
     @torch.no_grad()
     def radii(self, opacities: Float[Tensor, " M"], alpha_min: float) -> Float[Tensor, "M 2"]:
-        """As `WithRadii.radii`, of Gaussians that are all visible."""
+        """As `WithTraits.radii`, of Gaussians that are all visible."""
         reach = (2 * (opacities / alpha_min).log()).clamp_min(0).sqrt().clamp_max(REACH)
         return (reach[:, None] * self.deviations).ceil().clamp_min(1)
 

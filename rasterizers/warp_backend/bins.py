@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import warp as wp
 
-from rasterizers.warp_backend.types import FAR, TILE, Cuts, Ellipse, Grid
+from rasterizers.warp_backend import TILE
+from rasterizers.warp_backend.types import FAR, Cuts, Ellipse, Grid
 
 wp.set_module_options({"enable_backward": False})
 
-SLACK = wp.constant(2e-3)  # px, margin for rounding: an unnecessary pair only costs time
+SLACK = 2e-3  # px, margin for rounding: an unnecessary pair only costs time
 
 
 @wp.func

@@ -26,7 +26,7 @@ from rasterizers.checks import packed_rows, require_cotangents, require_finite, 
 from rasterizers.geometry import tangent_limits
 from rasterizers.interface import Camera, SplatGradients, Splats
 from rasterizers.recording import running
-from rasterizers.warp_backend import PAIR_BYTES, SUMS_BYTES, TILE, WarpRasterizer, mebibytes, padded, types
+from rasterizers.warp_backend import PAIR_BYTES, SEGMENT, SUMS_BYTES, TILE, WarpRasterizer, mebibytes, padded, types
 from rasterizers.warp_backend.bins import find_tiles, list_pairs
 from rasterizers.warp_backend.blend import blend, blend_pieces, blend_vjp
 from rasterizers.warp_backend.colour import basis
@@ -142,7 +142,7 @@ class WarpFrame:
         if self.resolved:
             return
         *pairs, not_finite, is_long, is_longer = self._read()
-        self.folds = (1,) * (recorded or is_long) + (types.SEGMENT,) * (recorded or is_longer)
+        self.folds = (1,) * (recorded or is_long) + (SEGMENT,) * (recorded or is_longer)
         if not_finite:
             for splats, _ in self.jobs:
                 require_finite(splats)
@@ -249,7 +249,7 @@ class WarpRendering:
 
     @property
     def radii(self) -> Int[Tensor, "N 2"]:
-        """See `WithRadii`."""
+        """See `WithTraits`."""
         frame, view = self._frame, self._view
         out = frame.empty(frame.n, 2, dtype=torch.int32)
         with on_stream(frame.like.device):
@@ -271,7 +271,7 @@ class WarpRendering:
     def _blend(self) -> None:
         frame, view, lists = self._frame, self._view, self._view.lists
         self._drawn_from = lists
-        n_tiles, segments = view.columns * view.rows_of_tiles, -(-view.capacity // types.SEGMENT)
+        n_tiles, segments = view.columns * view.rows_of_tiles, -(-view.capacity // SEGMENT)
         pieces = self._marks = frame.empty(segments + n_tiles, types.PIXELS, 4)
         sums = frame.empty(segments + n_tiles, types.PIXELS, 2) if view.has_depth else None
         lanes = TILE_LANES[frame.settings.device]
@@ -302,7 +302,7 @@ class WarpRendering:
             return SplatGradients(*out, frame.basis(), absolute)
 
     def summed_vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"]) -> SplatGradients:
-        """One pass for two or three cotangents; see `WithSummedVjp`."""
+        """One pass for two or three cotangents; see `WithTraits`."""
         require_cotangents(cotangents, self.image)
         k = len(cotangents)
         if not 1 < k <= self._together():
@@ -325,10 +325,10 @@ class WarpRendering:
         lanes = LANES[frame.settings.device]
         kernel = blend_vjp(k, lanes, frame.settings.device == "cuda", absolute)
         frame.launch_blocks(
-            kernel, -(-view.pairs // types.SEGMENT), lanes, view.grid, frame.cuts, frame.background, view.ellipses, lists.tiles,
+            kernel, -(-view.pairs // SEGMENT), lanes, view.grid, frame.cuts, frame.background, view.ellipses, lists.tiles,
             lists.gaussians, lists.places, lists.ends, self._transmittance, self._ended, self._marks, v, view.total, pair_sums,
         )  # fmt: skip
-        for stride in (1, types.SEGMENT):  # without pairs a recording, which folds by both, finds the kernel loaded
+        for stride in (1, SEGMENT):  # without pairs a recording, which folds by both, finds the kernel loaded
             pairs = view.pairs if stride in frame.folds else 0
             frame.launch(
                 fold(k, absolute), pairs, view.counts, view.firsts, lists.splats, view.total, stride, pair_sums

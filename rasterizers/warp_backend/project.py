@@ -7,7 +7,8 @@ from typing import Any
 
 import warp as wp
 
-from rasterizers import geometry
+from rasterizers.geometry import BLACK, REACH
+from rasterizers.warp_backend import SEGMENT
 from rasterizers.warp_backend.bins import count_tiles, depth_key, reaches_image
 from rasterizers.warp_backend.colour import colour_of
 from rasterizers.warp_backend.geometry import (
@@ -19,13 +20,11 @@ from rasterizers.warp_backend.geometry import (
     geometry_vjp,
     screen_vjp,
 )
-from rasterizers.warp_backend.types import FAR, SEGMENT, SUMS, Cuts, Ellipse, Grid, Pose, width_of
+from rasterizers.warp_backend.types import FAR, SUMS, Cuts, Ellipse, Grid, Pose, width_of
 
 wp.set_module_options({"enable_backward": False})
 
-BLACK = wp.constant(geometry.BLACK)
-REACH = wp.constant(geometry.REACH)
-HUGE = wp.constant(1e30)  # such an ellipse, of 1e-15 px, covers no pixel centre, and the square would overflow
+HUGE = 1e30  # such an ellipse, of 1e-15 px, covers no pixel centre, and the square would overflow
 
 
 @wp.func
@@ -146,7 +145,7 @@ def radii(
     visible: wp.array[wp.bool],
     out: wp.array2d[wp.int32],
 ) -> None:
-    """One thread per Gaussian; see `WithRadii`."""
+    """One thread per Gaussian; see `WithTraits`."""
     i = wp.tid()
     out[i, 0] = 0
     out[i, 1] = 0

@@ -6,24 +6,22 @@ from typing import Final
 
 import warp as wp
 
-from rasterizers import warp_backend
+from rasterizers.warp_backend import TILE
 
 wp.set_module_options({"enable_backward": False})
 
-TILE: Final = wp.constant(warp_backend.TILE)
-PIXELS: Final = wp.constant(warp_backend.TILE**2)
+PIXELS: Final = TILE**2
 """Pixels of a tile."""
-SEGMENT: Final = wp.constant(warp_backend.SEGMENT)
-SUMS: Final = wp.constant(6)
+SUMS: Final = 6
 """Sums of a pair for one cotangent before those of the colour: q = ∂L/∂(log alpha) and its moments."""
 
 
 def width_of(K: int, absolute: bool) -> int:
     """Sums of a pair: for each of K cotangents `SUMS` and three of the colour, and two of absolute gradients."""
-    return (int(SUMS) + 3) * K + 2 * absolute
+    return (SUMS + 3) * K + 2 * absolute
 
 
-FAR: Final = wp.constant(2**31 - 1)
+FAR: Final = 2**31 - 1
 """The depth key of a Gaussian that is not drawn."""
 
 
