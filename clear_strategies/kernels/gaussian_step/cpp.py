@@ -31,10 +31,7 @@ class CppGaussianStep:
     """
 
     def __init__(
-        self,
-        activation: Mapping[str, Tensor],
-        lr: Mapping[str, Tensor],
-        hr: Mapping[str, Tensor] | None,
+        self, activation: Mapping[str, Tensor], lr: Mapping[str, Tensor], hr: Mapping[str, Tensor] | None
     ) -> None:
         kernels: Any = native.module()
         self._n, bases = activation["basis"].shape

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import torch
 import warp as wp
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core.evidence import Evidence
@@ -154,12 +154,8 @@ def _screens(
 
 
 def screens(
-    lr: Float[Tensor, "N 2"],
-    base: Float[Tensor, "N 2"],
-    hf: Float[Tensor, "N 2"] | None,
-    size: tuple[int, int],
-    weights: tuple[float, float] | Float[Tensor, " 2"],
-) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N 2"] | None, Float[Tensor, " N"]]:
+    lr: Tensor, base: Tensor, hf: Tensor | None, size: tuple[int, int], weights: tuple[float, float] | Tensor
+) -> tuple[Tensor, Tensor | None, Tensor]:
     found, ordinary = base.new_empty(1 if hf is None else 2, len(base), 2), base.new_empty(len(base))
     numbers, changing = ((0.0, 0.0), weights) if isinstance(weights, Tensor) else (weights, None)
     halves = [pixels / 2 for pixels in size]
@@ -259,13 +255,7 @@ def _wander(
 
 
 def wander(
-    means: Tensor,
-    quats: Tensor,
-    log_scales: Tensor,
-    gate: Tensor,
-    rows: Int[Tensor, " K"],
-    eta: Tensor,
-    strength: float,
+    means: Tensor, quats: Tensor, log_scales: Tensor, gate: Tensor, rows: Tensor, eta: Tensor, strength: float
 ) -> None:
     typical = log_scales.amax(-1).median().view(1)
     _launch(_wander, len(rows), quats, log_scales, gate, rows, eta, typical, strength, means)

@@ -30,14 +30,9 @@ def products(lr: Grads, hr: Grads, names: Sequence[str]) -> Products:
 
 
 def apply(
-    out: Mapping[str, Tensor],
-    lr: Grads,
-    hr: Grads,
-    weights: Weights,
-    lambda_hr: float | Tensor,
-    plus: Grads,
+    out: Mapping[str, Tensor], lr: Grads, hr: Grads, weights: Weights, lambda_hr: float | Tensor, plus: Grads,
     keeps_lr: bool,
-) -> Number:
+) -> Number:  # fmt: skip
     """See `kernels.reconcile.apply`."""
     first = next(iter(out.values()))
     tables = weight_tables(weights, len(first), first.device)

@@ -271,14 +271,9 @@ def products(lr: Grads, hr: Grads, names: Sequence[str]) -> conflicts.Products:
 
 
 def apply(
-    out: Mapping[str, Tensor],
-    lr: Grads,
-    hr: Grads,
-    weights: conflicts.Weights,
-    lambda_hr: float | Tensor,
-    plus: Grads,
+    out: Mapping[str, Tensor], lr: Grads, hr: Grads, weights: conflicts.Weights, lambda_hr: float | Tensor, plus: Grads,
     keeps_lr: bool,
-) -> Number:
+) -> Number:  # fmt: skip
     """See `kernels.reconcile.apply`."""
     lr, hr, plus, like = contiguous(lr), contiguous(hr), contiguous(plus), next(iter(out.values()))
     n, device = len(like), like.device

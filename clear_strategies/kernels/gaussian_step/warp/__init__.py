@@ -46,10 +46,7 @@ class WarpGaussianStep:
     records: Final = True
 
     def __init__(
-        self,
-        activation: Mapping[str, Tensor],
-        lr: Mapping[str, Tensor],
-        hr: Mapping[str, Tensor] | None,
+        self, activation: Mapping[str, Tensor], lr: Mapping[str, Tensor], hr: Mapping[str, Tensor] | None
     ) -> None:
         self._like = activation["basis"]
         self._n, self._bases = self._like.shape
