@@ -122,7 +122,7 @@ def _kind(s: TrainState, given: Given) -> Kind:
     statistics = [x for x in s.density.state_dict().values() if x.dim() > 0]  # others are made for a checkpoint
     stored = [s.field.filter_3d, *statistics, *(x for table in tables for x in table.values())]
     addresses = [x.data_ptr() for x in stored]
-    facts: list[Any] = [s.field.degree, given.background is None, given.view.background, λ > 0]
+    facts: list[Any] = [s.field.degree, given.view.background, λ > 0]
     if isinstance(given, GivenView):
         facts += [given.gate is None, *given.scales.values(), s.density.collects(given.t)]
         facts += [x is None for x in (given.view.depth, given.view.disagreement, given.view.truth)]
@@ -136,8 +136,8 @@ def _recorded(
     s: TrainState, rasterizer: Recordable, given: Given, learn: Callable[[TrainState, Rasterizer, Any], L]
 ) -> RecordedWork[Given, L]:
     """The recording of one kind of iteration, which reads what it is given from tensors of its own."""
-    own, background = _copied(s, given), copied(_behind(s, rasterizer, given))
-    drawn_by = rasterizer if background is None else rasterizer.over_changing(background)
+    own, background = _copied(s, given), _behind(s, rasterizer, given).clone()
+    drawn_by = rasterizer.over_changing(background)
     tensors = [*_tensors_of(s, rasterizer, own), background]
     step = cast(CompiledStep, s.compiled_step)
 
@@ -175,10 +175,8 @@ def _copied(s: TrainState, given: Given) -> Given:
     return replace(given, view=view, gate=copied(given.gate), background=None, looked_up=looked_up)
 
 
-def _behind(s: TrainState, rasterizer: Recordable, given: Given) -> Tensor | None:
-    """The background that an iteration has in place of the scene's."""
-    if given.background is None:
-        return None
+def _behind(s: TrainState, rasterizer: Recordable, given: Given) -> Tensor:
+    """The background of the iteration, or the scene's own."""
     return cast(Recordable, over(rasterizer, given.background)).background_on(s.device)
 
 

@@ -67,7 +67,7 @@ class ReferenceRendering:
         self._grid = grid = TileGrid(camera.width, camera.height, _TILE)
         self._projection = projection = project(splats, camera, settings, depth=depth)
         lists = list_tiles(projection, grid)
-        self.means2d: Float[Tensor, "N 2"] = projection.scatter(projection.means2d.detach())
+        self.means2d: Float[Tensor, "N 2"] = projection.scatter(projection.footprints.means2d.detach())
         self.visible: Bool[Tensor, " N"] = projection.scatter(lists.visible)
         tiles, transmittance, self._passes = blend(projection.table(), lists, grid, settings, settings.lanes)
         pixels = grid.to_image(tiles)

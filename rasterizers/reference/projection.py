@@ -21,71 +21,6 @@ from rasterizers.interface import Camera, RasterSettings, SplatGradients, Splats
 MEAN, CONIC, OPACITY, RGB, DEPTH = slice(0, 2), slice(2, 5), slice(5, 6), slice(6, 9), slice(9, 10)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Projection:
-    """M of N Gaussians projected onto the image, with the autograd graph of the projection.
-
-    Args:
-        rows: which of the N splats each row is.
-        means2d: centre, px. conics: (A, B, C) of ½(A dx² + 2B dx dy + C dy²), 1/px².
-        opacities: after the Mip compensation.
-        half_extents: half the bounding box of the region where alpha may reach alpha_min, px.
-        power_max: the exponent at which alpha has fallen to alpha_min.
-        leaves: copies of the splats' rows (means, quats, scales, opacities), the inputs of the graph.
-        raw_rgb: colour before its clamp at 0. basis: Y of this view's directions.
-        draws_depth: the table has the column of depths.
-    """
-
-    n_splats: int
-    rows: Int[Tensor, " M"]
-    means2d: Float[Tensor, "M 2"]
-    conics: Float[Tensor, "M 3"]
-    opacities: Float[Tensor, " M"]
-    rgb: Float[Tensor, "M 3"]
-    depths: Float[Tensor, " M"]
-    half_extents: Float[Tensor, "M 2"]
-    power_max: Float[Tensor, " M"]
-    leaves: tuple[Tensor, Tensor, Tensor, Tensor]
-    raw_rgb: Float[Tensor, "M 3"]
-    basis: Float[Tensor, "M B1"]
-    draws_depth: bool
-
-    def table(self) -> Float[Tensor, "M1 W"]:
-        """The columns that blending reads, plus an empty row that pads the tile lists."""
-        columns = (self.means2d, self.conics, self.opacities, self.rgb)
-        table = torch.column_stack([x.detach() for x in ((*columns, self.depths) if self.draws_depth else columns)])
-        return torch.cat((table, table.new_zeros(1, table.shape[1])))
-
-    def scatter(self, values: Tensor) -> Tensor:
-        """The values at their rows among all N splats; zeros (or False) elsewhere."""
-        out = values.new_zeros(self.n_splats, *values.shape[1:])
-        out[self.rows] = values
-        return out
-
-    def vjp(
-        self, table_gradients: Float[Tensor, "K M1 W"], absgrad: Float[Tensor, "K M1 2"] | None = None
-    ) -> SplatGradients:
-        """The splats' gradients from those of the table."""
-        outputs = (self.means2d, self.conics, self.opacities, self.rgb, self.depths)
-        inputs = (*self.leaves, self.raw_rgb)
-        by_cotangent = []
-        for g in table_gradients[:, : self.rows.shape[0]]:
-            parts = [g[:, columns] for columns in (MEAN, CONIC, OPACITY, RGB, DEPTH)][: 5 if self.draws_depth else 4]
-            cotangents = [part.reshape(x.shape) for part, x in zip(parts, outputs, strict=False)]
-            gradients = torch.autograd.grad(
-                outputs[: len(parts)], inputs, cotangents, retain_graph=True, materialize_grads=True
-            )
-            moved = (g != 0).any(1)  # 0 times the derivative of an ellipse far below a pixel, which overflows, is NaN
-            rows = [x.where(moved.view(-1, *[1] * (x.dim() - 1)), 0) for x in gradients]
-            by_cotangent.append([*rows, g[:, MEAN]])
-        means, quats, scales, opacities, rgb, screen = (
-            torch.stack([self.scatter(g) for g in attribute]) for attribute in zip(*by_cotangent, strict=True)
-        )
-        if absgrad is not None:
-            absgrad = torch.stack([self.scatter(g[: self.rows.shape[0]]) for g in absgrad])
-        return SplatGradients(means, quats, scales, opacities, screen, rgb, self.scatter(self.basis), absgrad)
-
-
 class Footprints(NamedTuple):
     """What M Gaussians cover of an image, in the order of their rows.
 
@@ -106,6 +41,71 @@ class Footprints(NamedTuple):
         """As `WithTraits.radii`, of Gaussians that are all visible."""
         reach = (2 * (opacities / alpha_min).log()).clamp_min(0).sqrt().clamp_max(REACH)
         return (reach[:, None] * self.deviations).ceil().clamp_min(1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Projection:
+    """M of N Gaussians projected onto the image, with the autograd graph of the projection.
+
+    Args:
+        rows: which of the N splats each row is.
+        opacities: after the Mip compensation.
+        half_extents: half the bounding box of the region where alpha may reach alpha_min, px.
+        power_max: the exponent at which alpha has fallen to alpha_min.
+        leaves: copies of the splats' rows (means, quats, scales, opacities), the inputs of the graph.
+        raw_rgb: colour before its clamp at 0. basis: Y of this view's directions.
+        draws_depth: the table has the column of depths.
+    """
+
+    n_splats: int
+    rows: Int[Tensor, " M"]
+    footprints: Footprints
+    opacities: Float[Tensor, " M"]
+    rgb: Float[Tensor, "M 3"]
+    half_extents: Float[Tensor, "M 2"]
+    power_max: Float[Tensor, " M"]
+    leaves: tuple[Tensor, Tensor, Tensor, Tensor]
+    raw_rgb: Float[Tensor, "M 3"]
+    basis: Float[Tensor, "M B1"]
+    draws_depth: bool
+
+    @property
+    def _columns(self) -> list[Tensor]:
+        f = self.footprints
+        return [f.means2d, f.conics, self.opacities, self.rgb, *([f.depths] if self.draws_depth else [])]
+
+    def table(self) -> Float[Tensor, "M1 W"]:
+        """The columns that blending reads, plus an empty row that pads the tile lists."""
+        table = torch.column_stack([x.detach() for x in self._columns])
+        return torch.cat((table, table.new_zeros(1, table.shape[1])))
+
+    def scatter(self, values: Tensor) -> Tensor:
+        """The values at their rows among all N splats; zeros (or False) elsewhere."""
+        out = values.new_zeros(self.n_splats, *values.shape[1:])
+        out[self.rows] = values
+        return out
+
+    def vjp(
+        self, table_gradients: Float[Tensor, "K M1 W"], absgrad: Float[Tensor, "K M1 2"] | None = None
+    ) -> SplatGradients:
+        """The splats' gradients from those of the table."""
+        inputs = (*self.leaves, self.raw_rgb)
+        by_cotangent = []
+        for g in table_gradients[:, : self.rows.shape[0]]:
+            parts = zip((MEAN, CONIC, OPACITY, RGB, DEPTH), self._columns, strict=False)
+            cotangents = [g[:, columns].reshape(x.shape) for columns, x in parts]
+            gradients = torch.autograd.grad(
+                self._columns, inputs, cotangents, retain_graph=True, materialize_grads=True
+            )
+            moved = (g != 0).any(1)  # 0 times the derivative of an ellipse far below a pixel, which overflows, is NaN
+            rows = [x.where(moved.view(-1, *[1] * (x.dim() - 1)), 0) for x in gradients]
+            by_cotangent.append([*rows, g[:, MEAN]])
+        means, quats, scales, opacities, rgb, screen = (
+            torch.stack([self.scatter(g) for g in attribute]) for attribute in zip(*by_cotangent, strict=True)
+        )
+        if absgrad is not None:
+            absgrad = torch.stack([self.scatter(g[: self.rows.shape[0]]) for g in absgrad])
+        return SplatGradients(means, quats, scales, opacities, screen, rgb, self.scatter(self.basis), absgrad)
 
 
 def footprints(
@@ -170,21 +170,7 @@ def project(splats: Splats, camera: Camera, settings: RasterSettings, *, depth: 
         # alpha >= alpha_min  <=>  exponent <= power_max, with a margin; `blend` applies the exact cut-off per pixel.
         power_max = (opacities / settings.alpha_min).log() * (1 + 1e-3) + 1e-3
         half = torch.sqrt(2 * power_max.clamp_min(0))[:, None] * f.deviations
-    return Projection(
-        len(splats),
-        rows,
-        f.means2d,
-        f.conics,
-        opacities,
-        rgb,
-        f.depths,
-        half,
-        power_max,
-        leaves,
-        raw_rgb,
-        basis.detach(),
-        depth,
-    )
+    return Projection(len(splats), rows, f, opacities, rgb, half, power_max, leaves, raw_rgb, basis.detach(), depth)
 
 
 def _candidates(splats: Splats, camera: Camera, settings: RasterSettings) -> Int[Tensor, " M"]:

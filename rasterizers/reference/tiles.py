@@ -86,8 +86,8 @@ class TileLists:
 def list_tiles(projection: Projection, grid: TileGrid) -> TileLists:
     """Pair each projected Gaussian with the tiles its ellipse of alpha >= alpha_min may reach."""
     n_tiles = grid.rows * grid.columns
-    rows = torch.argsort(projection.depths, stable=True)
-    means, half = projection.means2d.detach()[rows], projection.half_extents[rows]
+    rows = torch.argsort(projection.footprints.depths, stable=True)
+    means, half = projection.footprints.means2d.detach()[rows], projection.half_extents[rows]
     first, last = _tile_range(means - half, grid), _tile_range(means + half, grid)
     spans = (last - first + 1).clamp_min(0)
     inside = ((means + half > 0) & (means - half < means.new_tensor((grid.width, grid.height)))).all(-1)
@@ -124,8 +124,8 @@ def _ellipse_reaches(
     A convex quadratic has its minimum over a box at its centre if that is inside, else on one of the (at most two) sides
     that face the centre; on a side it is at the clamped vertex of a parabola.
     """
-    u, v = projection.means2d.detach()[row].unbind(-1)
-    A, B, C = projection.conics.detach()[row].unbind(-1)
+    u, v = projection.footprints.means2d.detach()[row].unbind(-1)
+    A, B, C = projection.footprints.conics.detach()[row].unbind(-1)
     left, top = tile_x * grid.tile + 0.5 - u, tile_y * grid.tile + 0.5 - v
     # The tiles of the last column and row may extend beyond the image, where there are no pixels.
     right = torch.minimum(left + grid.tile - 1, grid.width - 0.5 - u)
