@@ -23,9 +23,6 @@ CONFLICT_GROUPS: Final = ("means", "sh0", "shN", "opacities", "scales", "quats")
 """The paper's six: position, base appearance, higher-order appearance, opacity, scale, rotation."""
 
 
-_DRAWN: Final = ("means", "quats", "scales", "opacities")
-
-
 class Colour(NamedTuple):
     """A gradient of the spherical harmonics by its factors, Y ⊗ ∇rgb: three numbers a Gaussian and those of Y in place of 48.
 
@@ -102,7 +99,7 @@ def gradients_of(g: SplatGradients) -> list[Grads]:
     rows = (g.means, g.quats, g.scales, g.opacities, g.rgb[:n], g.screen[:n])
     each = [
         Grads(
-            {name: x.contiguous() for name, x in zip(_DRAWN, drawn, strict=True)},
+            {name: x.contiguous() for name, x in zip(PARAMETERS, drawn, strict=False)},
             colour=Colour(rgb.contiguous(), basis), screen=screen,
         )
         for *drawn, rgb, screen in zip(*(x.unbind() for x in rows), strict=True)

@@ -29,15 +29,15 @@ def ssim(x: Tensor, y: Tensor, inset: int = 0) -> LossAndGradient:
 
 def haar_l1(x: Tensor, y: Tensor, levels: int = 1, out: Tensor | None = None) -> LossAndGradient:
     """See `losses.haar_l1`."""
-    images = image_pair(DEVICES["cpp"], x, y, out)
-    return _loss(native.module().haar_l1(*images, levels, threads()), images.gradient)
+    x, y, gradient = image_pair(DEVICES["cpp"], x, y, out)
+    return _loss(native.module().haar_l1(x, y, gradient, levels, threads()), gradient)
 
 
 def _weighted(x: Tensor, y: Tensor, l1: float, dssim: float, inset: int, out: Tensor | None = None) -> LossAndGradient:
     """The value l1 · mean |x - y| + dssim · (1 - SSIM); with dssim = 0 no SSIM is computed."""
-    images = image_pair(DEVICES["cpp"], x, y, out)
-    l1_mean, dissimilarity = native.module().photometric(*images, l1, dssim, inset, threads())
-    return _loss(l1 * l1_mean + dssim * dissimilarity, images.gradient)
+    x, y, gradient = image_pair(DEVICES["cpp"], x, y, out)
+    l1_mean, dissimilarity = native.module().photometric(x, y, gradient, l1, dssim, inset, threads())
+    return _loss(l1 * l1_mean + dssim * dissimilarity, gradient)
 
 
 def _loss(value: float, gradient: Tensor) -> LossAndGradient:

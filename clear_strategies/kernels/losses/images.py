@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Final, NamedTuple
+from typing import Final
 
 import torch
 from torch import Tensor
@@ -11,14 +11,6 @@ from torch import Tensor
 DEVICES: Final = {"cpp": ("cpu",), "warp": ("cuda", "cpu")}
 """Where the kernels of each compiled implementation run."""
 _IN_WORDS: Final = {"cpu": "the CPU", "cuda": "CUDA"}
-
-
-class ImagePair(NamedTuple):
-    """Two images, contiguous and detached, and the tensor that receives the gradient."""
-
-    x: Tensor
-    y: Tensor
-    gradient: Tensor
 
 
 def supported(devices: Collection[str], *images: Tensor) -> bool:
@@ -34,8 +26,8 @@ def supported(devices: Collection[str], *images: Tensor) -> bool:
     )
 
 
-def image_pair(devices: Collection[str], x: Tensor, y: Tensor, out: Tensor | None) -> ImagePair:
-    """The images as kernels for `devices` read them.
+def image_pair(devices: Collection[str], x: Tensor, y: Tensor, out: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """The images as kernels for `devices` read them, contiguous and detached, and the tensor that receives the gradient.
 
     Raises:
         TypeError: an image is not float32, or not on such a device, or not on the same device as x.
@@ -59,4 +51,4 @@ def image_pair(devices: Collection[str], x: Tensor, y: Tensor, out: Tensor | Non
     gradient = torch.empty_like(x, memory_format=torch.contiguous_format, requires_grad=False) if out is None else out
     if not gradient.is_contiguous():
         raise ValueError(f"out must be contiguous, got strides {gradient.stride()}.")
-    return ImagePair(x.detach().contiguous(), y.detach().contiguous(), gradient)
+    return x.detach().contiguous(), y.detach().contiguous(), gradient
