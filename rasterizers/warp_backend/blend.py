@@ -22,8 +22,8 @@ from typing import Any, Final
 
 import warp as wp
 
-from rasterizers.warp_backend import SEGMENT, TILE
 from rasterizers.warp_backend.bins import exponent
+from rasterizers.warp_backend.settings import SEGMENT, TILE
 from rasterizers.warp_backend.types import PIXELS, SUMS, Cuts, Ellipse, Grid, width_of
 
 wp.set_module_options({"enable_backward": False})

@@ -26,11 +26,12 @@ from rasterizers.checks import packed_rows, require_cotangents, require_finite, 
 from rasterizers.geometry import tangent_limits
 from rasterizers.interface import Camera, SplatGradients, Splats
 from rasterizers.recording import running
-from rasterizers.warp_backend import PAIR_BYTES, SEGMENT, SUMS_BYTES, TILE, WarpRasterizer, mebibytes, padded, types
+from rasterizers.warp_backend import types
 from rasterizers.warp_backend.bins import find_tiles, list_pairs
 from rasterizers.warp_backend.blend import blend, blend_pieces, blend_vjp
 from rasterizers.warp_backend.colour import basis
 from rasterizers.warp_backend.project import fold, project, project_vjp, radii
+from rasterizers.warp_backend.settings import PAIR_BYTES, SEGMENT, SUMS_BYTES, TILE, WarpSettings, mebibytes, padded
 from rasterizers.warp_runtime import launch, on_device, on_stream, sort_pairs
 
 _ELLIPSE: Final = ctypes.sizeof(cast(Any, types.Ellipse).ctype) // 4
@@ -81,7 +82,7 @@ class _Lists(NamedTuple):
 class WarpFrame:
     """One depth order for several pixel grids, and the tensors that the VJP reads again."""
 
-    def __init__(self, settings: WarpRasterizer, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> None:
+    def __init__(self, settings: WarpSettings, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> None:
         splats, camera = jobs[0]
         for job, _ in jobs:
             require_splats(job, settings.traits)
@@ -403,7 +404,7 @@ def numbers_of(camera: Camera, device: torch.device) -> CameraNumbers:
 
 
 @lru_cache(maxsize=1024)
-def _cuts_struct(settings: WarpRasterizer) -> Any:
+def _cuts_struct(settings: WarpSettings) -> Any:
     cuts = types.Cuts()
     cuts.kernel, cuts.near, cuts.antialiased = settings.kernel, settings.near, settings.antialiased
     cuts.near_bits = int.from_bytes(struct.pack("<d", settings.near), "little")

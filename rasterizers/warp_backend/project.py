@@ -8,7 +8,6 @@ from typing import Any
 import warp as wp
 
 from rasterizers.geometry import BLACK, REACH
-from rasterizers.warp_backend import SEGMENT
 from rasterizers.warp_backend.bins import count_tiles, depth_key, reaches_image
 from rasterizers.warp_backend.colour import colour_of
 from rasterizers.warp_backend.geometry import (
@@ -20,6 +19,7 @@ from rasterizers.warp_backend.geometry import (
     geometry_vjp,
     screen_vjp,
 )
+from rasterizers.warp_backend.settings import SEGMENT
 from rasterizers.warp_backend.types import FAR, SUMS, Cuts, Ellipse, Grid, Pose, width_of
 
 wp.set_module_options({"enable_backward": False})

@@ -6,7 +6,7 @@ from typing import Final
 
 import warp as wp
 
-from rasterizers.warp_backend import TILE
+from rasterizers.warp_backend.settings import TILE
 
 wp.set_module_options({"enable_backward": False})
 

@@ -177,7 +177,8 @@ def test_long_lists_and_large_gaussians_are_summed_in_short_chains():
     pairs has a block for each segment of them, and the others go through what is left of a tile or a Gaussian.
     """
     from clear_strategies.bench import scenes
-    from rasterizers.warp_backend import SEGMENT, frame, project
+    from rasterizers.warp_backend import frame, project
+    from rasterizers.warp_backend.settings import SEGMENT
 
     tails = scenes.load("tails")
     v = cotangents(1, tails.camera.height, tails.camera.width)
