@@ -503,7 +503,8 @@ class Conductor:
             if len(of_hr) == 1:
                 *of_lr, g, detail = *vjp(hr, both), None
             else:
-                *of_lr, g, detail = vjp(hr, both, _rows_of(m, n, hr.image) * λ_hf)  # g^HR        Eq. 13
+                rows = m.to(hr.image.dtype) if isinstance(m, Tensor) else hr.image.new_full((n,), float(m))
+                *of_lr, g, detail = vjp(hr, both, rows * λ_hf)  # g^HR        Eq. 13
         return of_lr[0] if of_lr else None, HrSide(g.without_detail(), detail, _size(hr.image), step, m, losses.values)
 
 
@@ -515,10 +516,6 @@ def _vjp(
         return shot.vjp(cotangents)
     of_shot = getattr(shot, "summed_vjp", None)
     return summed(shot.vjp(cotangents), weight) if of_shot is None else of_shot(cotangents, weight)
-
-
-def _rows_of(m: float | Tensor, n: int, image: Tensor) -> Float[Tensor, " N"]:
-    return m.to(image.dtype) if isinstance(m, Tensor) else image.new_full((n,), float(m))
 
 
 def _require_size(view: View, scale: str, render: Tensor, image: Tensor) -> None:

@@ -52,8 +52,4 @@ def psnr_of(image: Tensor, target: Tensor, shown: Tensor | None) -> Number:
     """dB, of the shown pixels."""
     squared = image.clamp(0, 1).sub_(target).square_()
     mse = squared.mean() if shown is None else (squared.mean(2) * shown).sum() / shown.sum().clamp_min(1)
-    return deferred.defer(_decibels, deferred.scalar(mse))
-
-
-def _decibels(mse: float) -> float:
-    return -10 * math.log10(max(mse, 1e-10))
+    return deferred.defer(lambda mse: -10 * math.log10(max(mse, 1e-10)), deferred.scalar(mse))

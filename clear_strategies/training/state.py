@@ -278,10 +278,8 @@ class TrainState:
             raise ValueError(f"t={saved.t} and degree={saved.facts['degree']:g} do not occur in it")
         field, n = tables["field"], len(tables["field"]["means"])
         for name, here in self.field.raw().items():
-            rows = {name: field[name]} | {
-                f"{m}.{name}": tables["optimizer"][f"{m}.{name}"] for m in ("first", "second")
-            }
-            for key, x in rows.items():
+            for table, key in (("field", name), ("optimizer", f"first.{name}"), ("optimizer", f"second.{name}")):
+                x = tables[table][key]
                 if x.dtype != here.dtype or tuple(x.shape) != (n, *here.shape[1:]):
                     raise ValueError(f"{key} is {x.dtype} {tuple(x.shape)}, not {here.dtype} {(n, *here.shape[1:])}")
         found = {"filter_3d": field["filter_3d"], **tables.get("density", {})}

@@ -41,6 +41,5 @@ def _weighted(x: Tensor, y: Tensor, l1: float, dssim: float, inset: int, out: Te
 
 
 def _loss(value: float, gradient: Tensor) -> LossAndGradient:
-    return LossAndGradient(
-        torch.from_numpy(np.asarray(value, np.float32)), gradient
-    )  # `torch.tensor` is an operation of its own
+    scalar = torch.from_numpy(np.asarray(value, np.float32))  # `torch.tensor` is an operation of its own
+    return LossAndGradient(scalar, gradient)
