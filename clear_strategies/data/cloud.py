@@ -12,13 +12,11 @@ from pathlib import Path
 from typing import Final, Literal, NamedTuple, get_args
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from clear_strategies.core.checks import refuse, require_choice, require_number, require_whole
 from clear_strategies.core.points import MAX_POINTS, PointCloud
 from clear_strategies.core.view import DepthMap, Photo
-from clear_strategies.data.capture import SfmPoints
+from clear_strategies.data.capture import BLACK, SfmPoints
 from clear_strategies.data.ply import read_points
 from clear_strategies.errors import DataError
 from clear_strategies.geometry.cameras import common_box
@@ -168,8 +166,16 @@ def initial_points(
             known = _sfm_of_training_views(settings, sfm, train_ids) if sfm_is_train else None
             if settings.init == "auto" and sfm is not None and not sfm_is_train:
                 _log.debug("init: auto does not use the scene's own points, because test views were used for them.")
+            features = triangulate(shown, settings.triangulation) if known is None else known
             shown_hr = [blackened(photo) for photo in hr]
-            initial = _from_depth(settings, shown, shown_hr, hr_is_photo, known, background)
+            initial = _from_depth(settings, shown, shown_hr, hr_is_photo, features, background)
+            if initial is None and len(features) >= settings.enough:
+                initial = _cleaned(settings, features, shown, background)
+            if initial is None:
+                message = "init: auto chose random points: the training LR images give only %d (data.cloud.enough: %d)."
+                _log.warning(message, len(features), settings.enough)
+            elif settings.init == "auto":
+                _log.debug("init: auto chose %s.", initial.cloud.source)
     cloud, depths = initial or InitialPoints(random_cloud(photos, settings.random_points, seed, settings.box))
     if settings.voxel is not None:
         cloud = averaged_in_voxels(cloud, settings.voxel)
@@ -191,43 +197,38 @@ def _sfm_of_training_views(
 
 def _from_depth(
     settings: CloudSettings,
-    photos: Sequence[Photo],
+    lr: Sequence[Photo],
     hr: Sequence[Photo],
     hr_is_photo: bool,
-    features: PointCloud | None,
+    features: PointCloud,
     background: Color | None,
 ) -> InitialPoints | None:
-    """init=stereo and auto: points of depth maps; where there is no depth, auto takes features, or None if these are too few."""
-    features = triangulate(photos, settings.triangulation) if features is None else features
-    few = hr_is_photo or len(photos) <= _FEW_PHOTOS
-    compares_hr = settings.compare == "hr" or (settings.compare == "auto" and few)
-    found = stereo_depths(
-        photos,
-        hr if compares_hr else (),
-        features.means,
-        settings.stereo,
-        hr_is_photo=hr_is_photo,
-        background=background,
-    )
+    """init=stereo and auto: points of the depth of `lr` or `hr` (`CloudSettings.compare`); with auto, None if it is unknown."""
+    stereo, photos, finer = settings.stereo, lr, 1.0
+    few = hr_is_photo or len(lr) <= _FEW_PHOTOS
+    compared = hr if settings.compare == "hr" or (settings.compare == "auto" and few) else ()
+    if compared and hr_is_photo:
+        reduced = [photo.reduced(photo.factor_to(stereo.max_pixels)) for photo in hr]
+        if (ratio := reduced[0].camera.width / lr[0].camera.width) > 1:
+            stereo, photos, finer = stereo.finer(ratio), reduced, ratio
+    maps = depth_maps(photos, features.means, stereo, background)
+    if compared and not hr_is_photo and not cut_out(lr, background or BLACK):
+        factor = hr[0].camera.width // lr[0].camera.width
+        least = max(photo.factor_to(stereo.max_pixels) for photo in hr)
+        by = next((factor // k for k in range(least, factor) if factor % k == 0), 1)
+        if by > 1:
+            images = [photo.reduced(factor // by) for photo in hr]
+            finest = depth_maps(images, features.means, stereo.finer(by), background)
+            maps = [map_lr.completed_by(map_sr.reduced(by)) for map_lr, map_sr in zip(maps, finest, strict=True)]
     cloud = stereo_cloud(
-        features, found.photos, found.maps, found.settings, background=background, fill=settings.densify is not False,
-        stride=round(found.finer * settings.stride),  # completed points stay as few as at LR
+        features, photos, maps, stereo, background=background, fill=settings.densify is not False,
+        stride=round(finer * settings.stride),  # completed points stay as few as at LR
         outlier_neighbours=settings.outlier_neighbours, outlier_ratio=settings.outlier_ratio,
     )  # fmt: skip
-    if cloud is not None:
-        initial = InitialPoints(cloud, found.maps)
-    elif settings.init == "stereo":
-        none = f"stereo confirms no depth in any of the {len(photos)} training LR images"
+    if cloud is None and settings.init == "stereo":
+        none = f"stereo confirms no depth in any of the {len(lr)} training LR images"
         raise DataError("scene", "points", none, "use init=triangulated or random, or closer views")
-    else:
-        if len(features) < settings.enough:
-            message = "init: auto chose random points: the training LR images give only %d (data.cloud.enough: %d)."
-            _log.warning(message, len(features), settings.enough)
-            return None
-        initial = _cleaned(settings, features, photos, background)
-    if settings.init == "auto":
-        _log.debug("init: auto chose %s.", initial.cloud.source)
-    return initial
+    return None if cloud is None else InitialPoints(cloud, tuple(maps))
 
 
 def _cleaned(
@@ -276,45 +277,3 @@ def random_cloud(photos: Sequence[Photo], count: int, seed: int, box: float | No
     # Equal colours would give all points equal colour gradients.
     colors = 0.5 + (torch.rand(count, 3, generator=g) - 0.5) * 0.1
     return PointCloud(means, colors, f"random: {count:,} points in {where}")
-
-
-class Depths(NamedTuple):
-    """Photos and their depth maps; the settings for a cloud of them, and their size as a multiple of LR."""
-
-    photos: Sequence[Photo]
-    maps: tuple[DepthMap, ...]
-    settings: StereoSettings
-    finer: float = 1.0
-
-
-def stereo_depths(
-    lr: Sequence[Photo],
-    hr: Sequence[Photo],
-    points: Float[Tensor, "N 3"],
-    settings: StereoSettings,
-    *,
-    hr_is_photo: bool,
-    background: Color | None = None,
-) -> Depths:
-    """Depth from HR, reduced to at most `settings.max_pixels`, where that is larger than LR; else from LR.
-
-    Args:
-        hr: the same views at HR; empty: LR is compared.
-        points, background: as in `clear_strategies.geometry.depth_maps`.
-        hr_is_photo: the HR images are photos, not SR images.
-    """
-    if hr and hr_is_photo:
-        photos = [photo.reduced(photo.factor_to(settings.max_pixels)) for photo in hr]
-        if (finer := photos[0].camera.width / lr[0].camera.width) > 1:
-            of_hr = settings.finer(finer)
-            return Depths(photos, tuple(depth_maps(photos, points, of_hr, background)), of_hr, finer)
-    maps = depth_maps(lr, points, settings, background)
-    if hr and not hr_is_photo and not cut_out(lr, background or (0.0, 0.0, 0.0)):
-        factor = hr[0].camera.width // lr[0].camera.width
-        least = max(photo.factor_to(settings.max_pixels) for photo in hr)
-        by = next((factor // k for k in range(least, factor) if factor % k == 0), 1)
-        if by > 1:
-            images = [photo.reduced(factor // by) for photo in hr]
-            finest = depth_maps(images, points, settings.finer(by), background)
-            maps = [map_lr.completed_by(map_sr.reduced(by)) for map_lr, map_sr in zip(maps, finest, strict=True)]
-    return Depths(lr, tuple(maps), settings)
