@@ -15,7 +15,7 @@ from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.cameras import partners
-from clear_strategies.geometry.projection import back_project, on_surface, sample_colors
+from clear_strategies.geometry.projection import back_project, project, sample_colors, seen_pixels
 
 _TOLERANCE: Final = 0.02  # relative difference of depth up to which two photos show the same surface
 _UNCLIPPED: Final = (0.05, 0.92)  # darker, a ratio is that of noise; lighter, the photo may have been clipped
@@ -52,8 +52,10 @@ def _ratio(photo: Photo, depth: DepthMap, other: Photo, other_depth: DepthMap) -
     """The median of log(photo / other) over the surfaces that both show, and how many pixels show one, by channel."""
     rows, columns = torch.nonzero(depth.known, as_tuple=True)
     surface = back_project(photo.camera, torch.stack((columns, rows), dim=1) + 0.5, depth.depth[rows, columns])
-    shared, pixels = on_surface(other.camera, other_depth.depth, surface, _TOLERANCE)
-    colors, other_colors = photo.image[rows[shared], columns[shared]], sample_colors(other.image, pixels[shared])
+    shared, row, column, z = seen_pixels(other.camera, surface)
+    shared[shared.clone()] = (other_depth.depth[row, column] / z - 1).abs() <= _TOLERANCE  # False where it is unknown
+    pixels = project(other.camera, surface)[0][shared]
+    colors, other_colors = photo.image[rows[shared], columns[shared]], sample_colors(other.image, pixels)
     low, high = _UNCLIPPED
     usable = (colors > low) & (colors < high) & (other_colors > low) & (other_colors < high)
     medians, counts = torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)

@@ -57,18 +57,6 @@ def times_seen(
     return count
 
 
-def on_surface(
-    camera: Camera, depth: Float[Tensor, "h w"], points: Float[Tensor, "N 3"], tolerance: float
-) -> tuple[Bool[Tensor, " N"], Float[Tensor, "N 2"]]:
-    """(whether each point's depth differs from `depth`, nan or 0 where it is unknown, by at most `tolerance`, relatively; the
-    pixels that the points project to).
-    """
-    pixels, z = project(camera, points)
-    seen = inside(pixels[:, 0], pixels[:, 1], z, camera.width, camera.height)
-    column, row = torch.where(seen[:, None], pixels, 0.0).long().unbind(dim=1)
-    return seen & ((depth[row, column] / z - 1).abs() <= tolerance), pixels
-
-
 def back_project(camera: Camera, pixels: Float[Tensor, "G 2"], depth: Float[Tensor, " G"]) -> Float[Tensor, "G 3"]:
     """The points at these depths (z, world units) behind these pixels."""
     pose = camera.world_to_camera.double().cpu()
