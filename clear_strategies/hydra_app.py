@@ -23,6 +23,7 @@ from typing import Any, Final
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import ChoiceSweep
 from hydra.errors import ConfigCompositionException, HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
@@ -32,7 +33,7 @@ from clear_strategies.compose import quoted, require_each_once
 from clear_strategies.errors import ClearError, SettingError
 from clear_strategies.hydra_errors import no_option, not_composed
 from clear_strategies.jobs import exit_codes, sweep
-from clear_strategies.options import CONF, options
+from clear_strategies.options import CONF, options, sweeps
 
 _log = logging.getLogger(__name__)
 
@@ -100,8 +101,20 @@ def readable(word: str) -> str:
         chosen = OverridesParser.create().parse_override(word)
     except HydraException:
         return f"{key}={quoted(value)}"
-    if not chosen.value() and (CONF / (group := chosen.key_or_group)).is_dir():
-        raise SettingError(no_option(group, value, [*options(group)]))
+    values, group = chosen.value(), chosen.key_or_group
+    each = values.list if isinstance(values, ChoiceSweep) else [values]
+    if not all(each) and (CONF / group).is_dir():
+        raise SettingError(no_option(group, "null" if None in each else value, [*options(group)]))
+    if group == "experiment" and len(each) > 1 and any(isinstance(name, str) and sweeps(name) for name in each):
+        alone = ", ".join(f"experiment={name}" for name in each)
+        raise SettingError(
+            f"{word}: an experiment that sweeps settings of its own runs alone. Start each by itself: {alone}."
+        )
+    if group == "hydra.job.chdir" and values:
+        raise SettingError(
+            f"{word}: relative paths are those of the folder where the command was started. Leave it out; hydra.run.dir=FOLDER "
+            "is where a run writes."
+        )
     is_path = value.startswith("\\\\") or ({",", "\\"} & {*value} and os.path.exists(value))  # noqa: PTH110 - as `is_file`
     return f"{key}={quoted(value)}" if is_path else word
 

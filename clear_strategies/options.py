@@ -58,10 +58,22 @@ def composed_by_hydra(overrides: Sequence[str], config: str) -> DictConfig:
 
 def strategies_of(option: str) -> list[str]:
     """The strategies that an option of conf/strategy consists of, those of the options that it names included."""
-    file = CONF / "strategy" / f"{option}.yaml"
-    content: Any = OmegaConf.to_container(OmegaConf.load(file)) if file.is_file() else {}
-    parts = [part for part in content.get("defaults", []) if isinstance(part, str) and not part.startswith(("/", "_"))]
+    _, parts = _content_and_parts("strategy", option)
     return [strategy for part in parts for strategy in strategies_of(part)] or [option]
+
+
+def sweeps(experiment: str) -> bool:
+    """Whether an option of conf/experiment, or one that it consists of, names settings that are swept."""
+    content, parts = _content_and_parts("experiment", experiment)
+    return bool("sweeper" in content.get("hydra", {})) or any(map(sweeps, parts))
+
+
+def _content_and_parts(group: str, option: str) -> tuple[dict[str, Any], list[str]]:
+    """What the file of an option says, nothing where there is none, and the options of the same group that it begins with."""
+    file = CONF / group / f"{option}.yaml"
+    content: Any = OmegaConf.to_container(OmegaConf.load(file)) if file.is_file() else {}
+    parts = [part for part in content.get("defaults", []) if isinstance(part, str)]
+    return content, [part for part in parts if part != "_self_" and not part.startswith("/")]
 
 
 def options(group: str) -> dict[str, Mapping[str, Any]]:

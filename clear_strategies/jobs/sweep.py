@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
@@ -43,7 +44,7 @@ def in_sweep() -> bool:
 
 
 def refusal(config: DictConfig) -> str | None:
-    """Why every job of a sweep would fail: the value, folder or file that all of them lack; None where one may not fail.
+    """Why a sweep cannot begin: a job stands in it twice, or all jobs lack a value, folder or file; None where it can.
 
     Jobs are composed until one lacks nothing, or something else than the first.
 
@@ -51,6 +52,12 @@ def refusal(config: DictConfig) -> str | None:
         config: of the sweep, as Hydra gives it to callbacks.
     """
     try:
+        jobs = Counter(map(tuple, _overrides_of_jobs(config)))
+        if _are_named_by_us(config) and (twice := next((job for job, count in jobs.items() if count > 1), None)):
+            return (
+                f"{' '.join(twice)}: stands twice in this sweep, and has one folder. Name each value once; "
+                "hydra.sweep.subdir='${hydra.job.num}' gives each job a folder of its own."
+            )
         lacks = map(_lack, _jobs(config))
         first = next(lacks, None)
         return first if first and all(lack == first for lack in lacks) else None
@@ -64,12 +71,17 @@ def name_by_all_that_is_swept(config: DictConfig) -> None:
     Args:
         config: as of `refusal`.
     """
-    given: Any = OmegaConf.to_container(config.hydra.sweep)
-    if given["subdir"] != "${job_folder:}":
-        return  # the user names them
-    if swept := UNNAMED & {word.key_or_group for word in _words(config) if word.is_sweep_override()}:
+    if _are_named_by_us(config) and (
+        swept := UNNAMED & {word.key_or_group for word in _words(config) if word.is_sweep_override()}
+    ):
         with read_write(config.hydra):
             config.hydra.overrides.hydra.append(f"hydra.sweep.subdir='${{job_folder:{','.join(sorted(swept))}}}'")
+
+
+def _are_named_by_us(config: DictConfig) -> bool:
+    """Whether the folders of the jobs are named by their overrides."""
+    given: Any = OmegaConf.to_container(config.hydra.sweep)
+    return bool(given["subdir"] == "${job_folder:}")
 
 
 def _words(config: DictConfig) -> list[Override]:
@@ -79,12 +91,17 @@ def _words(config: DictConfig) -> list[Override]:
     return OverridesParser.create(GlobalHydra.instance().config_loader()).parse_overrides(words)
 
 
-def _jobs(config: DictConfig) -> Iterator[DictConfig]:
-    """The configuration of each job; none where another sweeper than Hydra's own chooses the values."""
+def _overrides_of_jobs(config: DictConfig) -> list[list[str]]:
+    """The overrides of each job; none where another sweeper than Hydra's own chooses the values."""
     if config.hydra.runtime.choices["hydra/sweeper"] != "basic":
-        return
+        return []
     (jobs,) = BasicSweeper.split_arguments(_words(config), None)
-    for overrides in jobs:
+    return jobs
+
+
+def _jobs(config: DictConfig) -> Iterator[DictConfig]:
+    """The configuration of each of them."""
+    for overrides in _overrides_of_jobs(config):
         yield GlobalHydra.instance().config_loader().load_sweep_config(config, overrides)
 
 
