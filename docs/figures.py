@@ -139,16 +139,16 @@ def conflict(folder: Path) -> None:
 
 
 def training_time(folder: Path) -> None:
-    """PSNR of the test views against processor seconds of training, of one stage and of two."""
+    """PSNR of the test views against CPU seconds of training, of one stage and of two."""
     rows = table("training_time")
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     figure, all_axes = plt.subplots(1, len(scenes), figsize=(7, 2.4), squeeze=False)
     for axes, scene in zip(all_axes[0], scenes, strict=True):
         for method in dict.fromkeys(row["method"] for row in rows):
             of_run = [row for row in rows if (row["scene"], row["method"]) == (scene, method)]
-            seconds, psnr = ([float(row[key]) for row in of_run] for key in ("processor seconds", "PSNR (dB)"))
+            seconds, psnr = ([float(row[key]) for row in of_run] for key in ("CPU seconds", "PSNR (dB)"))
             axes.plot(seconds, psnr, marker=".", label=method)
-        axes.set(title=scene, xlabel="processor seconds")
+        axes.set(title=scene, xlabel="CPU seconds")
     all_axes[0][0].set_ylabel("PSNR of the test views, dB")
     all_axes[0][0].legend()
     save(figure, folder / "evidence_training_time.svg")

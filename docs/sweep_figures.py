@@ -19,7 +19,7 @@ from clear_strategies.report.runs import FinishedRun
 
 
 def write_training_time(runs: Sequence[FinishedRun], csv: Path) -> str:
-    """Write the CSV file of experiment=training_time: PSNR of the test views over processor seconds of training.
+    """Write the CSV file of experiment=training_time: PSNR of the test views over CPU seconds of training.
 
     Returns:
         A Markdown table: the seconds of each stage, and those until a method is as good as the worst at its end.
@@ -30,21 +30,19 @@ def write_training_time(runs: Sequence[FinishedRun], csv: Path) -> str:
         history = table_of(run, "history.csv", "t", "psnr_test", "processor_seconds")
         probed = history.dropna(subset="psnr_test")
         seconds, psnr = probed["processor_seconds"].round(1), probed["psnr_test"].round(3)
-        tables.append(
-            pd.DataFrame({"scene": run.scene, "method": name, "processor seconds": seconds, "PSNR (dB)": psnr})
-        )
+        tables.append(pd.DataFrame({"scene": run.scene, "method": name, "CPU seconds": seconds, "PSNR (dB)": psnr}))
         iterations = table_of(run, "timing.csv", "stage", "runs").set_index("stage")["runs"]
         whole = history["processor_seconds"].iloc[-1]
         first = history[history["t"] <= iterations.get("first stage", 0)]["processor_seconds"].max()
         stages[run.scene, name] = [whole] if pd.isna(first) else [first, whole - first]
     table = pd.concat(tables)
     table.to_csv(csv, index=False)
-    lines = ["| scene | method | processor seconds | PSNR (dB) | seconds to equal PSNR |", "|---|---|---|---|---|"]
+    lines = ["| scene | method | CPU seconds | PSNR (dB) | seconds to equal PSNR |", "|---|---|---|---|---|"]
     for scene, of_scene in table.groupby("scene", sort=False):
         curves = of_scene.groupby("method", sort=False)
         equal = curves["PSNR (dB)"].max().min()
         for method, curve in curves:
-            seconds, psnr = curve["processor seconds"], curve["PSNR (dB)"]
+            seconds, psnr = curve["CPU seconds"], curve["PSNR (dB)"]
             until, took = seconds[psnr >= equal].iloc[0], " + ".join(f"{s:.0f}" for s in stages[scene, method])
             lines.append(f"| {scene} | {method} | {took} | {psnr.iloc[-1]:.2f} | {until:.0f}, to {equal:.2f} dB |")
     return "\n".join(lines) + "\n"

@@ -1,7 +1,7 @@
 """How time and memory grow: an iteration with Gaussians and with pixels, a whole run with photos.
 
 The exponent p of a row is that of time ~ size^p from the row before: 1 is linear. Each row is a process of its own, and MiB is
-its peak. Photos are those of the demo; of a run of them the processor time counts.
+its peak. Photos are those of the demo; of a run of them the CPU time counts.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def _run(one: ProcessPoolExecutor, photos: int, iterations: int) -> list[tuple[A
 
 
 def _trained(words: Sequence[str]) -> tuple[Any, float]:
-    """The exit code of a run in this process, and the process's processor time, seconds."""
+    """The exit code of a run in this process, and the process's CPU time, seconds."""
     sys.argv[1:] = words
     with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):  # noqa: PTH123
         try:

@@ -9,7 +9,7 @@ from typing import Final
 
 WALL: Final = "seconds"
 PROCESSOR: Final = "processor_seconds"
-"""Columns of the history. On a busy machine processor seconds are the better measure."""
+"""Columns of the history. On a busy machine CPU seconds are the better measure."""
 
 
 class Clock:
