@@ -161,7 +161,10 @@ def test_the_guides_loss_and_densifier_train_as_they_say(run_block):
         if "WithSpectrum" in block or "ByBudget" in block:
             found |= vars(run_block(block))
     state = short_run.start((), more=[found["Compact"](), found["Budget"](budget=30, every=2, stop=12)])
-    state.conductor.objective = found["WithSpectrum"](lambda_hr=ALWAYS)
+    objective = state.conductor.objective = found["WithSpectrum"](lambda_hr=ALWAYS)
+    shown = torch.arange(16 * 16).view(16, 16) % 3 > 0
+    hidden = objective.hr(*torch.rand(2, 16, 16, 3), shown=shown).cotangents[0][~shown]
+    assert not hidden.any()
     n = len(state.field)
     while state.t <= 12:
         loop.iterate(state, toy.RASTERIZER)
