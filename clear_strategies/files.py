@@ -8,6 +8,7 @@ import secrets
 import shutil
 import stat
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -46,13 +47,27 @@ def replacing(path: Path) -> Iterator[Path]:
     partial = path.with_name(f".{path.stem[:_KEPT]}.{secrets.token_hex(4)}{_PARTIAL}{path.suffix}")
     try:
         yield partial
-        partial.replace(path)
+        _patiently(partial.replace, path)
     except OSError as error:
         if str(error.filename or partial) == str(partial):  # a write to a full disk names no file
             error.filename = str(path)
         raise
     finally:
         partial.unlink(missing_ok=True)  # exists only after an exception or Ctrl-C
+
+
+def _patiently(rename: Callable[[Path], Path], target: Path) -> None:
+    """Rename to the target; on Windows again for a second, since a virus scanner may hold a file that was just written."""
+    given_up = time.monotonic() + 1
+    while True:
+        try:
+            rename(target)
+            return
+        except PermissionError:
+            waits = sys.platform == "win32" and time.monotonic() < given_up
+            if not waits:
+                raise
+            time.sleep(0.02)
 
 
 def flush(path: Path) -> None:
@@ -78,7 +93,7 @@ def install(complete: Path, folder: Path, last: str) -> None:
     if not (folder / last).is_file():
         shutil.rmtree(folder, ignore_errors=True)
     try:
-        complete.rename(folder)
+        _patiently(complete.rename, folder)
     except OSError:
         if not (folder / last).is_file():
             raise

@@ -4,6 +4,8 @@ import csv
 import json
 import math
 import sys
+import time
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -189,6 +191,27 @@ def test_processes_of_one_number_folders_and_long_names_are_no_error(tmp_path: P
     with pytest.raises(OSError, match="No such file") as failed, files.replacing(target) as partial:
         partial.read_bytes()
     assert failed.value.filename == str(target)  # not the part, which is gone
+
+
+@pytest.mark.parametrize("held_for", [0.1, 30])
+@pytest.mark.parametrize("system", ["win32", "linux"])
+def test_a_file_that_a_virus_scanner_holds_is_replaced_as_soon_as_it_lets_go(held_for, system, tmp_path, monkeypatch):
+    target, replace_file = tmp_path / "a.json", Path.replace
+    freed = time.monotonic() + held_for
+
+    def held(self: Path, to: Path) -> Path:
+        if time.monotonic() < freed:
+            raise PermissionError(13, "Access is denied", str(self))
+        return replace_file(self, to)
+
+    files.write_text(target, "old")
+    monkeypatch.setattr(files.Path, "replace", held)
+    monkeypatch.setattr(files.sys, "platform", system)
+    waits = system == "win32" and held_for < 1
+    with nullcontext() if waits else pytest.raises(PermissionError, match=r"a\.json"):
+        files.write_text(target, "new")
+    assert target.read_text() == ("new" if waits else "old")
+    assert names(tmp_path) == {"a.json"}
 
 
 def test_json_has_null_where_a_number_is_not_finite(tmp_path: Path) -> None:
