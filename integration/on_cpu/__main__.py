@@ -45,6 +45,8 @@ REFUSED: Final = {
     "use_confidence": "leave it out",
 }
 """Options of trainers, or single values of them, that need CUDA; and what to do instead."""
+_RETURNS_INDICES: Final = re.compile(r"std::tuple|\w, *\w+ *= *distCUDA2\(")
+"""Of FSGS's distCUDA2: its declaration, or a call of it."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -106,9 +108,12 @@ def _is_of_nerfstudio(script: Path) -> bool:
 
 
 def _knn(renderer: Path | None) -> Any:
-    """`simple_knn._C` as the sources beside the renderer declare it: in FSGS it returns indices, too."""
-    declared = Path() if renderer is None else renderer.parent / "submodules" / "simple-knn" / "spatial.h"
-    indices = declared.is_file() and "std::tuple" in declared.read_text(encoding="utf-8")
+    """`simple_knn._C` as the sources beside the renderer declare it, or call it, where its submodules are not there: in FSGS it
+    returns indices, too.
+    """
+    root = Path() if renderer is None else renderer.parent
+    sources = (root / "submodules" / "simple-knn" / "spatial.h", root / "scene" / "gaussian_model.py")
+    indices = any(_RETURNS_INDICES.search(file.read_text(encoding="utf-8")) for file in sources if file.is_file())
     return SimpleNamespace(distCUDA2=distances_and_indices if indices else mean_distances)
 
 

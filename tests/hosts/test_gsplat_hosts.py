@@ -3,7 +3,8 @@
     CLEAR_HOSTS=FOLDER python -m pytest tests/hosts
 
 FOLDER holds checkouts named gsplat-1.5.3 and gsplat-1.6.0; nothing is fetched, and those that are not there are skipped. What
-their examples/requirements.txt lists must be installed, but for the packages that CUDA compiles; COLMAP's pycolmap is for 1.6.0.
+their examples/requirements.txt lists must be installed, but for the packages that CUDA compiles; for 1.6.0 also COLMAP's pycolmap
+and piexif.
 """
 
 import re

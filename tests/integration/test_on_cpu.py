@@ -13,7 +13,7 @@ from safetensors.torch import load_file
 
 from clear_strategies.errors import HostError
 from integration.on_cpu import diff_gaussian_rasterization, gsplat_functions
-from integration.on_cpu.__main__ import REFUSED, _OwnRasterizers
+from integration.on_cpu.__main__ import REFUSED, _knn, _OwnRasterizers
 from integration.on_cpu.diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
 from integration.on_cpu.fused_ssim import fused_ssim
 from integration.on_cpu.simple_knn import distances_and_indices, mean_distances
@@ -215,6 +215,27 @@ def test_before_gsplat_1_5_a_gaussian_has_one_radius(packed):
     )
     assert one["radii"].shape == one["means2d"].shape[:-1]
     assert torch.equal(one["radii"], two["radii"].amax(-1))
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "returns_indices"),
+    [
+        (
+            "submodules/simple-knn/spatial.h",
+            "std::tuple<torch::Tensor, torch::Tensor> distCUDA2(const torch::Tensor&);",
+            True,
+        ),
+        ("submodules/simple-knn/spatial.h", "torch::Tensor distCUDA2(const torch::Tensor& points);", False),
+        ("scene/gaussian_model.py", "dist, nearest_indices = distCUDA2(self.get_xyz)", True),
+        ("scene/gaussian_model.py", "dist2 = torch.clamp_min(distCUDA2(points), 0.0000001)", False),
+    ],
+)
+def test_distances_come_with_indices_where_a_fork_has_them_also_without_its_submodules(
+    file, text, returns_indices, tmp_path
+):
+    (tmp_path / file).parent.mkdir(parents=True)
+    (tmp_path / file).write_text(text)
+    assert isinstance(_knn(tmp_path / "gaussian_renderer").distCUDA2(torch.rand(9, 3)), tuple) == returns_indices
 
 
 # ---- the launcher
