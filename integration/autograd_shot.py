@@ -14,6 +14,7 @@ from clear_strategies.core.gradients import Grads, gradients_of, summed
 from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.iteration import HrSide
 from integration.colours import are_joined, is_hooked
+from integration.structure import rows_drawn
 from rasterizers.autograd import Drawing, Rendered, outer
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, summed_vjp
@@ -215,10 +216,11 @@ def every_number(g: Grads, params: Mapping[str, Tensor]) -> Grads:
 
 
 def are_in_order(drawn: Mapping[str, Tensor], params: Mapping[str, Tensor]) -> bool:
-    """Whether row i of what was drawn is made of row i of the parameters; true of what cannot be asked.
+    """Whether row i of what was drawn is made of row i of the parameters.
 
     Rows that pass through unchanged are the memory of the parameter. Others are asked by two cotangents, of which row i is 1 and
-    c_i. A parameter's rows in their order have gradients g and c_i g, in another order g and c_j g.
+    c_i. A parameter's rows in their order have gradients g and c_i g, in another order g and c_j g. Without any gradient,
+    positions are compared.
     """
     asked = list[tuple[Tensor, Tensor]]()
     for name in ("opacities", "scales", "means", "quats", "colors"):
@@ -234,7 +236,9 @@ def are_in_order(drawn: Mapping[str, Tensor], params: Mapping[str, Tensor]) -> b
         if (answer := _is_in_order(x, p)) is True:
             return True
         answers.add(answer)
-    return False not in answers
+    if asked or "means" not in drawn:
+        return False not in answers
+    return rows_drawn(drawn["means"].detach(), params["means"].detach()) is None
 
 
 def _is_in_order(x: Tensor, p: Tensor) -> bool | None:

@@ -1,14 +1,18 @@
-"""A host's changes of structure, as the strategies hear of them."""
+"""Which Gaussian is which: a host's changes of structure, as the strategies hear of them, and rows found by their values."""
 
 from __future__ import annotations
 
+from typing import Final
+
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.core.step import Step
 from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
+
+_HASH_FACTOR: Final = 0x2545F4914F6CDD1D
 
 
 def is_same(parents: Int[Tensor, " M"], n: int) -> bool:
@@ -52,3 +56,51 @@ def resized(
     parents = parents.clamp_min(0)
     conductor.on_resize(parents)
     return None if step is None else step.resized(parents)
+
+
+def rows_drawn(means: Float[Tensor, "*B M 3"], own: Float[Tensor, "N 3"]) -> Int[Tensor, "*B M"] | None:
+    """Which of our Gaussians a loop draws: for each that it gives its rasterizer, the row of the same position, -1 where there is
+    none. None: those are our rows in their order; or as many, all elsewhere than ours, as a loop has them that moves the scene.
+
+    Args:
+        means: what the rasterizer is given; batches in front are scenes.
+        own: the positions among the parameters.
+    """
+    is_alike = means.shape == own.shape
+    if is_alike and means.data_ptr() == own.data_ptr():
+        return None
+    drawn, known = means.double().reshape(-1, 3), own.double()  # a type that holds those of all
+    if is_alike and torch.equal(drawn, known):
+        return None
+    rows, _ = first_equal(bits(known), bits(drawn))
+    return None if is_alike and bool((rows < 0).all()) else rows.view(means.shape[:-1])
+
+
+def bits(rows: Float[Tensor, "N ..."]) -> Int[Tensor, "N K"]:
+    """Integers that are equal where the rows are equal bit by bit."""
+    flat = rows.detach().flatten(1).contiguous()
+    return flat.view(torch.int64 if flat.dtype == torch.float64 else torch.int32).long()
+
+
+def _hash(bits: Int[Tensor, "N K"]) -> Int[Tensor, " N"]:
+    h = torch.zeros_like(bits[:, 0])
+    for column in bits.unbind(1):
+        h = (h ^ column) * _HASH_FACTOR
+        h = h ^ (h >> 29)
+    return h
+
+
+def first_equal(
+    old: Int[Tensor, "N K"], new: Int[Tensor, "M K"]
+) -> tuple[Int[Tensor, " M"], tuple[Tensor, Tensor, Tensor]]:
+    """The first old row equal to each new row, or -1.
+
+    Also returns an order of the old rows that groups equal rows, and the begin and end of each new row's group in it.
+    """
+    wanted, (keys, order) = _hash(new), _hash(old).sort(stable=True)
+    begin, end = torch.searchsorted(keys, wanted), torch.searchsorted(keys, wanted, right=True)
+    if not len(old):
+        return torch.full_like(begin, -1), (order, begin, end)
+    parents = order[begin.clamp_max(len(old) - 1)]
+    parents[(old[parents] != new).any(1)] = -1
+    return parents, (order, begin, end)

@@ -28,6 +28,7 @@ from integration.gsplat.optimizers import optimizers_of, step_detail
 from integration.gsplat.rows import RowNumbers
 from integration.hr_drawing import Drawable
 from integration.replacing import replaced_attribute, replaced_everywhere
+from integration.structure import rows_drawn
 from rasterizers.ahead import drawing_ahead
 from rasterizers.as_gsplat import rasterizer_of
 from rasterizers.interface import BackendUnavailable, Camera, Rasterizer
@@ -233,6 +234,11 @@ class Attached:
         self, rasterization: Rasterization, arguments: Mapping[str, Any], view: View, target: Target, gate: Tensor | None
     ) -> HostOutput | Drawable:  # fmt: skip
         call, params = {**arguments, **self._background(arguments)}, self.params()
+        if call["means"].dim() > 2:
+            raise HostError(
+                f"{view.name} is rendered with batches of scenes, means {[*call['means'].shape]}. Leave out what is in front of "
+                f"{[*params['means'].shape]}, of all tensors of the call."
+            )
         if len(call["means"]) != len(params["means"]):
             raise HostError(
                 f"{view.name} is rendered with {len(call['means']):,} of {len(params['means']):,} Gaussians, and it is unknown "
@@ -295,9 +301,13 @@ class Attached:
     def _with_detail(self, arguments: Mapping[str, Any], *, trained: bool) -> dict[str, Any]:
         """The same call with colours f_base + f_det; f_det gets a gradient only if it is trained by the rendering."""
         detail = self._params.get("detail")
-        if detail is None or len(arguments["means"]) != len(detail):
-            return dict(arguments)  # only a part of the scene is rendered, and it is unknown which
-        return calls.with_offset(arguments, detail if trained else detail.detach(), is_ours=self._is_ours)
+        if detail is None:
+            return dict(arguments)
+        if not trained:  # a loop may draw a part of the scene, or in another order
+            detail, rows = detail.detach(), rows_drawn(arguments["means"].detach(), self.params()["means"].detach())
+            if rows is not None:
+                detail = detail[rows.clamp_min(0)] * (rows >= 0)[..., None]
+        return calls.with_offset(arguments, detail, is_ours=self._is_ours)
 
 
 attach = Attached

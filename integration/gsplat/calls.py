@@ -89,18 +89,21 @@ def seen_by(call: Call, camera: Camera) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def with_offset(call: Call, detail: Float[Tensor, "N 3"], *, is_ours: bool) -> dict[str, Any]:
+def with_offset(call: Call, detail: Float[Tensor, "*B N 3"], *, is_ours: bool) -> dict[str, Any]:
     """With f_det as an offset of the colours.
 
     Args:
         is_ours: the function is this package's, which takes an offset by itself.
     """
-    colors = call["colors"]
-    if call.get("sh_degree") is None:
-        return {**call, "colors": colors + detail.to(colors)}
-    if is_ours:
+    colors, as_bands = call["colors"], call.get("sh_degree") is not None
+    if is_ours and as_bands:
         return {**call, "rgb_offset": detail}
-    constant = colors[..., :1, :] + (detail[:, None] / SH_C0).to(colors)
+    if detail.dim() > 2:  # of several scenes, whose cameras may have colours of their own
+        cameras = [1] * (colors.dim() - detail.dim() - as_bands)
+        detail = detail.view(*detail.shape[:-2], *cameras, *detail.shape[-2:])
+    if not as_bands:
+        return {**call, "colors": colors + detail.to(colors)}
+    constant = colors[..., :1, :] + (detail[..., None, :] / SH_C0).to(colors)
     return {**call, "colors": torch.cat((constant, colors[..., 1:, :]), -2)}
 
 

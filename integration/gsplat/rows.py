@@ -14,6 +14,7 @@ from integration.structure import is_same
 
 ROWS: Final = "clear_rows"
 """Key of the row numbers."""
+_EXACT: Final = 2  # eps of a type of numbers, times the largest up to which it has all whole ones
 _ROUNDING: Final = 0.1  # an average of the same numbers over many steps differs from them by less
 
 
@@ -57,7 +58,8 @@ class RowNumbers:
         rows are the same.
 
         Raises:
-            HostError: a densifier changed the parameters but not this one, or the loop has computed with the numbers.
+            HostError: a densifier changed the parameters but not this one, or the loop has computed with the numbers or rounded
+                them.
         """
         rows: Tensor = self._entries[ROWS]
         n = len(self._means())
@@ -68,8 +70,17 @@ class RowNumbers:
                 "again."
             )
         of, version = self._unchanged
-        if (rows is of and rows._version == version) or len(rows) != n:  # a scene moves Gaussians in place
+        is_unchanged = rows is of and rows._version == version
+        rounds = rows.dtype.is_floating_point and self._numbered * torch.finfo(rows.dtype).eps > _EXACT
+        if is_unchanged and rounds:
+            self.restart()  # `splats.half()` has converted all parameters
+        if is_unchanged or len(rows) != n:  # a scene moves Gaussians in place
             return None
+        if rounds:
+            raise HostError(
+                f"the parameter {ROWS} must be float64, got {rows.dtype} for {self._numbered:,} row numbers, which that rounds. "
+                "Convert the other parameters alone, or all of them before attach."
+            )
         parents, numbered = rows.detach().round().long() - 1, self._numbered
         if bool(((rows - parents - 1).abs() > _ROUNDING).any()) or bool(((parents < -1) | (parents >= numbered)).any()):
             raise HostError(

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from integration.replacing import replaced_methods
-from integration.structure import composed, is_same
+from integration.structure import bits, composed, first_equal, is_same
 
 _log = logging.getLogger(__name__)
 
@@ -27,7 +27,6 @@ _COPIED: Final = ("quats", "sh0")  # rows that split children keep; some hosts c
 _COMPARED: Final = ("means", *_COPIED)
 _GROUPS: Final = {"means": "xyz", "quats": "rotation", "sh0": "f_dc"}
 """The parameter groups of 3DGS that hold the parameters `_COMPARED`."""
-_HASH_FACTOR: Final = 0x2545F4914F6CDD1D
 _DISTANCES: Final = 1 << 24  # at once, 64 MB: FSGS appends very many Gaussians of one colour
 
 
@@ -142,8 +141,8 @@ def find_change(before: Mapping[str, Tensor], after: Mapping[str, Tensor]) -> Ch
     Equal rows are the same Gaussian. The parent of any other row is the Gaussian with the same rotation and colour, or
     the nearest of several.
     """
-    old, new = (torch.cat([_bits(rows[name]) for name in _COMPARED], 1) for rows in (before, after))
-    parents, _ = _first_equal(old, new)
+    old, new = (torch.cat([bits(rows[name]) for name in _COMPARED], 1) for rows in (before, after))
+    parents, _ = first_equal(old, new)
     moved = (parents < 0).nonzero()[:, 0]
     if len(moved):
         parents[moved] = _nearest_copied(before, {name: after[name][moved] for name in _COMPARED})
@@ -160,13 +159,13 @@ def find_change(before: Mapping[str, Tensor], after: Mapping[str, Tensor]) -> Ch
 def _are_copies(rows: Mapping[str, Tensor], of: Mapping[str, Tensor], parents: Int[Tensor, " M"]) -> bool:
     """Whether each of M rows has the rotation and colour of its parent; a row without a parent (-1) may have any."""
     known = (parents >= 0).nonzero()[:, 0]
-    return all(bool((_bits(rows[name][known]) == _bits(of[name][parents[known]])).all()) for name in _COPIED)
+    return all(bool((bits(rows[name][known]) == bits(of[name][parents[known]])).all()) for name in _COPIED)
 
 
 def _nearest_copied(before: Mapping[str, Tensor], rows: Mapping[str, Tensor]) -> Int[Tensor, " M"]:
     """The Gaussian of the same rotation and colour as each of M rows, the nearest of several; -1: there is none."""
-    old, new = (torch.cat([_bits(params[name]) for name in _COPIED], 1) for params in (before, rows))
-    parents, (order, begin, end) = _first_equal(old, new)
+    old, new = (torch.cat([bits(params[name]) for name in _COPIED], 1) for params in (before, rows))
+    parents, (order, begin, end) = first_equal(old, new)
     ambiguous = (parents >= 0) & (end - begin > 1)
     for first in sorted(set(begin[ambiguous].tolist())):
         children = (ambiguous & (begin == first)).nonzero()[:, 0]
@@ -175,33 +174,3 @@ def _nearest_copied(before: Mapping[str, Tensor], rows: Mapping[str, Tensor]) ->
         for some in children.split(max(1, _DISTANCES // len(candidates))):
             parents[some] = candidates[torch.cdist(rows["means"][some], means).argmin(1)]
     return parents
-
-
-def _bits(rows: Float[Tensor, "N ..."]) -> Int[Tensor, "N K"]:
-    """Integers that are equal where the rows are equal bit by bit."""
-    flat = rows.detach().flatten(1).contiguous()
-    return flat.view(torch.int64 if flat.dtype == torch.float64 else torch.int32).long()
-
-
-def _hash(bits: Int[Tensor, "N K"]) -> Int[Tensor, " N"]:
-    h = torch.zeros_like(bits[:, 0])
-    for column in bits.unbind(1):
-        h = (h ^ column) * _HASH_FACTOR
-        h = h ^ (h >> 29)
-    return h
-
-
-def _first_equal(
-    old: Int[Tensor, "N K"], new: Int[Tensor, "M K"]
-) -> tuple[Int[Tensor, " M"], tuple[Tensor, Tensor, Tensor]]:
-    """The first old row equal to each new row, or -1.
-
-    Also returns an order of the old rows that groups equal rows, and the begin and end of each new row's group in it.
-    """
-    wanted, (keys, order) = _hash(new), _hash(old).sort(stable=True)
-    begin, end = torch.searchsorted(keys, wanted), torch.searchsorted(keys, wanted, right=True)
-    if not len(old):
-        return torch.full_like(begin, -1), (order, begin, end)
-    parents = order[begin.clamp_max(len(old) - 1)]
-    parents[(old[parents] != new).any(1)] = -1
-    return parents, (order, begin, end)

@@ -15,6 +15,7 @@ from clear_strategies.schedules import Ramp
 from integration import HostError
 from integration.gsplat.calls import Poses
 from rasterizers import autograd
+from rasterizers.geometry import SH_C0
 from tests.helpers import gsplat_host, toy
 from tests.helpers.backends import needs
 from tests.helpers.gsplat_host import Host, started
@@ -388,3 +389,60 @@ def test_gaussians_in_another_order_than_the_parameters_are_refused(order, funct
         else pytest.raises(HostError, match="view0 is rendered with its Gaussians in another order")
     ):
         gsplat_host.drawn(draw, host.splats, host.photos["view0"].camera)[0].mean().backward()
+
+
+@pytest.mark.parametrize("grad", [True, False])
+@pytest.mark.parametrize("function", FUNCTIONS)
+@needs("cpp")
+def test_gaussians_that_are_looked_at_have_their_own_detail_feature_in_any_order_part_or_batch(function, grad):
+    """As a viewer draws them that sorts or crops: from a pose of no photo, or without gradients."""
+    host, _, _ = started(host=Host(toy.scene(20), rasterization=FUNCTIONS[function]))
+    plain, camera = FUNCTIONS[function], toy.camera(0.05)
+    splats = {name: p.detach() for name, p in host.splats.items()}
+    splats["detail"][:] = torch.rand(20, 3)
+
+    def seen(draw, rows, splats=splats, **more):
+        return gsplat_host.drawn(draw, {name: p[rows] for name, p in splats.items()}, camera, **more)[0]
+
+    shown = {**splats, "sh0": splats["sh0"] + splats["detail"][:, None] / SH_C0}
+    stranger = {name: torch.cat((p[:7], p[7:9] + 0.25)) for name, p in splats.items()}
+    with torch.set_grad_enabled(grad):
+        for rows in (slice(None), ROWS, slice(7), ROWS[:9]):
+            assert torch.allclose(seen(host.rasterization, rows), seen(plain, rows, shown), atol=1e-6), rows
+        moved = {**splats, "means": splats["means"] + 0.25}
+        assert torch.allclose(
+            seen(host.rasterization, slice(None), moved),
+            seen(plain, slice(None), {**shown, "means": moved["means"]}), atol=1e-6,
+        )  # fmt: skip
+        ours = {
+            **stranger,
+            "sh0": stranger["sh0"] + torch.cat((splats["detail"][:7], torch.zeros(2, 3)))[:, None] / SH_C0,
+        }
+        assert torch.allclose(
+            seen(host.rasterization, slice(None), stranger), seen(plain, slice(None), ours), atol=1e-6
+        )
+
+
+def test_batches_of_scenes_are_looked_at_with_the_detail_feature_and_refused_as_a_photo():
+    host, _, _ = started(host=Host(toy.scene(20), rasterization=autograd.rasterization))
+    host.splats["detail"].data += 0.2
+    camera = host.photos["view0"].camera
+
+    def batched(*tensors, **call):
+        batch = [x[None] if isinstance(x, torch.Tensor) else x for x in tensors]
+        return host.rasterization(*batch, **call)
+
+    with torch.no_grad():
+        one, batch = (gsplat_host.drawn(draw, host.splats, camera)[0] for draw in (host.rasterization, batched))
+    assert torch.equal(batch[0], one)
+    with pytest.raises(
+        HostError, match=r"batches of scenes, means \[1, 20, 3\]. Leave out what is in front of \[20, 3\]"
+    ):
+        gsplat_host.drawn(batched, host.splats, camera)
+
+
+def test_a_photo_drawn_in_another_order_without_gradients_is_refused():
+    host, _, _ = started(host=Host(toy.scene(20), rasterization=FUNCTIONS["another"]))
+    splats = {name: p.detach()[ROWS] for name, p in host.splats.items()}
+    with pytest.raises(HostError, match="view0 is rendered with its Gaussians in another order"):
+        gsplat_host.drawn(host.rasterization, splats, host.photos["view0"].camera)

@@ -288,3 +288,23 @@ def test_gaussians_that_a_host_adds_in_the_step_of_the_anchor_are_there_before_i
             for name, p in host.splats.items():
                 host.splats[name] = torch.nn.Parameter(p.detach()[1:], requires_grad=p.requires_grad)
     assert clear.attachment.conductor.state_dict()["SVS.means"].shape == (19, 3)
+
+
+def test_a_loop_that_converts_all_its_parameters_keeps_the_rows_or_is_refused():
+    """`splats.half()` has whole numbers up to 2,048 alone."""
+    scene, recorder = toy.scene(3_000), toy.Recorder()
+    host, _, render = gsplat_host.started(recorder, scene=scene)
+    for halved_after_a_render in (True, False):
+        for p in host.splats.values():
+            p.data = p.data.half() if p is host.splats[ROWS] else p.data
+        if halved_after_a_render:
+            render()
+        for name, p in host.splats.items():
+            host.splats[name] = torch.nn.Parameter(p.detach()[1:], requires_grad=p.requires_grad)
+        with (
+            nullcontext()
+            if halved_after_a_render
+            else pytest.raises(HostError, match=r"must be float64, got torch\.float16")
+        ):
+            render()
+    assert torch.equal(recorder.changes[0], torch.arange(1, 3_000))
