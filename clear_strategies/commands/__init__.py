@@ -36,6 +36,7 @@ _RESEARCH: Final = {
     "clear-strategies +strategy=clear data=llff data.path=FOLDER": "one run of the whole configuration",
     "clear-strategies -m +strategy=clear,gco fit.seed=0,1": "a sweep: a run for every combination",
     "clear-strategies +strategy=clear --cfg job": "prints a run's configuration; nothing runs",
+    "python -m clear_strategies.report FOLDER": "a table of the runs in a folder, and report.html",
     "clear-strategies --hydra-help": "the flags of Hydra, which reads these lines",
 }
 
@@ -70,6 +71,8 @@ def _meant(word: str) -> str | None:
         return f"clear-strategies view {quoted}"
     if "/" in word or Path(word).exists():
         return f"clear-strategies train {quoted}"
+    if word in ("report", "bench"):
+        return f"python -m clear_strategies.{word}"
     return next(iter(difflib.get_close_matches(word.lower(), NAMES, 1)), None)
 
 

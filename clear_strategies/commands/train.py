@@ -25,7 +25,7 @@ The command trains +strategy=best on all photos for fit.iterations={_ITERATIONS}
   clear-strategies train photos/ fit.iterations=3000
   clear-strategies train photos/ data.views.test_every=8          every 8th photo is kept for testing
   clear-strategies train photos/ data.views.max_hr_megapixels=8   sharper, slower, more memory
-  clear-strategies train photos/ data.reader.skip_faulty=true         go on without photos that cannot be read
+  clear-strategies train photos/ data.reader.skip_faulty=true     go on without photos that cannot be read
   clear-strategies train photos/ fit.viewer=true -v               look while it trains; every detail on the console
 
 `clear-strategies data=photos --cfg job` prints all settings.

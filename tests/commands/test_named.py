@@ -51,6 +51,7 @@ def test_overrides_and_flags_are_hydras(first):
         ("~/photos", "Did you mean clear-strategies train '~/photos'?"),  # in quotes, which no shell expands
         ("views", "Did you mean clear-strategies train views?"),  # a folder that is there
         ("point_cloud.ply", "Did you mean clear-strategies view point_cloud.ply?"),
+        ("report", "Did you mean python -m clear_strategies.report?"),
         ("fit.iterations", "clear-strategies --help lists all; a setting is written name=value."),
     ],
 )
