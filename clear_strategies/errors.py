@@ -54,6 +54,11 @@ class HostError(ClearError, RuntimeError):
     """Another trainer does something that is not supported. The message says what, and what to change there."""
 
 
+def counted(n: int, thing: str) -> str:
+    """A number of things in words: 1 view, 2 views."""
+    return f"{n:,} {thing}{'' if n == 1 else 's'}"
+
+
 def one_line(text: object) -> str:
     """A text, or the message of an error, in one line."""
     return " ".join(str(text).split())

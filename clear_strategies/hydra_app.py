@@ -30,7 +30,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from clear_strategies import console, files, signals
 from clear_strategies.compose import quoted, require_each_once
-from clear_strategies.errors import ClearError, SettingError
+from clear_strategies.errors import ClearError, SettingError, counted
 from clear_strategies.hydra_errors import no_option, not_composed
 from clear_strategies.jobs import exit_codes, sweep
 from clear_strategies.options import CONF, options, sweeps
@@ -226,7 +226,7 @@ class SweepCallback(Callback):
             failed[message].append(int(job.removeprefix("job ")))
         if failed:
             listed = (f"job {', '.join(map(str, sorted(jobs)))}: {message}" for message, jobs in failed.items())
-            _log.error("%d job(s) failed: %s", sum(map(len, failed.values())), " | ".join(listed))
+            _log.error("%s failed: %s", counted(sum(map(len, failed.values())), "job"), " | ".join(listed))
             sys.exit(exit_codes.UNUSABLE)
 
 

@@ -24,6 +24,7 @@ from clear_strategies.bench.results import Results
 from clear_strategies.compose import conductor
 from clear_strategies.core.deferred import Number
 from clear_strategies.data.priors import Bicubic
+from clear_strategies.errors import counted
 from clear_strategies.geometry import stereo
 from integration.examples.demo import load_demo, splats_with_optimizers
 from integration.gsplat import attach
@@ -140,12 +141,12 @@ def measure(
             results.tables["host_error"] = pd.DataFrame([_error(name) for name in strategies])
     threads, images = torch.get_num_threads(), f"LR {width} px wide, HR {4 * width}"
     results.note(
-        f"{gaussians:,} Gaussians, {images}, {threads} thread(s) of torch and of the kernels; means of {repeats} steps."
+        f"{gaussians:,} Gaussians, {images}, {counted(threads, 'thread')} of torch and of the kernels; means of {repeats} steps."
     )
 
 
 def _timed(loops: Mapping[str, Loop], repeats: int, device: str) -> pd.DataFrame:
-    """Milliseconds of every step, wall clock and processor, and of its merge, on a CPU in processor time. The number of steps is
+    """Milliseconds of every step, wall clock and CPU, and of its merge, on a CPU in CPU time. The number of steps is
     even, since pseudo views come at every second.
     """
     rows = []

@@ -118,7 +118,7 @@ def test_a_run_is_stopped_resumed_and_overwritten_and_a_sweep_makes_its_report(t
     said = (
         "before iteration 6",
         f"exit code {128 + windows.BREAK}",
-        "5 iterations are done",
+        "after 5 iterations",
         "of an earlier run; removed",
     )
     assert all(words in result.stdout for words in said), result.stdout

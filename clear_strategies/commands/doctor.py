@@ -11,7 +11,7 @@ from typing import Final
 
 from clear_strategies import console
 from clear_strategies.commands import parser_of
-from clear_strategies.errors import SettingError, one_line
+from clear_strategies.errors import SettingError, counted, one_line
 from clear_strategies.jobs.exit_codes import NEEDED
 from clear_strategies.outputs.provenance import origin
 
@@ -110,7 +110,10 @@ def _cache() -> Iterator[tuple[str, str]]:
     folder = cache_folder()
     files = [path for path in folder.rglob("*") if path.is_file()] if folder.is_dir() else []
     size = sum(path.stat().st_size for path in files)
-    yield "SR images", f"{folder}: {len(files)} files, {size / 1e6:.0f} MB (CLEAR_CACHE moves it; it may be deleted)"
+    yield (
+        "SR images",
+        f"{folder}: {counted(len(files), 'file')}, {size / 1e6:.0f} MB (CLEAR_CACHE moves it; it may be deleted)",
+    )
 
 
 def _backends(broken: list[str], *, slow: bool) -> Iterator[tuple[str, str]]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from clear_strategies import console
 from clear_strategies.commands import parser_of, path_of, positive
-from clear_strategies.errors import SettingError
+from clear_strategies.errors import SettingError, counted
 
 if TYPE_CHECKING:
     from clear_strategies.jobs.saved import SavedSplat
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str]) -> None:
             continue
         for name, camera in where.items():
             write_png(out / kind / f"{name}.png", torch.from_numpy(draw(camera)) / 255)
-    _log.info("%s: %d pictures in %.1f s", out, len(where) * len(kinds), time.perf_counter() - began)
+    _log.info("%s: %s in %.1f s", out, counted(len(where) * len(kinds), "picture"), time.perf_counter() - began)
 
 
 def cameras_of(splat: SavedSplat, path: str, frames: int) -> dict[str, Camera]:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from clear_strategies.core import deferred
 from clear_strategies.core.deferred import Number
-from clear_strategies.errors import DivergedError
+from clear_strategies.errors import DivergedError, counted
 
 
 def is_finite(x: Tensor) -> bool:
@@ -40,7 +40,7 @@ def rows_not_finite(x: Tensor) -> str:
     """In words, which rows of a tensor are not finite."""
     bad = ~torch.isfinite(x)
     rows = bad.flatten(1).any(1) if x.dim() > 1 else bad
-    return f"is not finite for {int(rows.sum())} Gaussians, first Gaussian {int(rows.nonzero()[0])}"
+    return f"is not finite for {counted(int(rows.sum()), 'Gaussian')}, first Gaussian {int(rows.nonzero()[0])}"
 
 
 def require_finite_losses(where: str, losses: Mapping[str, Number], images: Mapping[str, Tensor]) -> None:
@@ -60,7 +60,7 @@ def require_finite_losses(where: str, losses: Mapping[str, Number], images: Mapp
                 bad = (~torch.isfinite(x)).any(-1)
                 row, column = bad.nonzero()[0].tolist()
                 raise DivergedError(
-                    f"{where}: the loss {name} is {value}, since {image} is not finite at {int(bad.sum())} pixels, first "
-                    f"pixel ({column}, {row})."
+                    f"{where}: the loss {name} is {value}, since {image} is not finite at {counted(int(bad.sum()), 'pixel')}, "
+                    f"first pixel ({column}, {row})."
                 )
         raise DivergedError(f"{where}: the loss {name} is {value} although both images are finite.")

@@ -15,6 +15,7 @@ from clear_strategies.core.view import View
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.priors import Prior, fingerprint, network_of
 from clear_strategies.data.view_settings import ViewSettings
+from clear_strategies.errors import counted
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
@@ -38,9 +39,9 @@ def scene_notes(
     network, unused = network_of(prior) if sr else None, len(capture.frames) - len(train) - len(test)
     none = f"none{'' if unused else ': all are trained on'} (data.views.test_every=8 keeps every 8th for testing)"
     return {
-        "scene": f"{capture.name}, {len(capture.frames)} photos",
+        "scene": f"{capture.name}, {counted(len(capture.frames), 'photo')}",
         **capture.notes,
-        "train views": _names(train) + (f"; {unused} photos are not used (data.views)" if unused else ""),
+        "train views": _names(train) + (f"; not used: {counted(unused, 'photo')} (data.views)" if unused else ""),
         "test views": _names(test) if test else none,
         "sizes": f"photos of {size_of(photo)}, shrink {views.shrink}, {views.sizes} to whole pixels at both scales",
         "LR": f"{size_of(sample.lr.camera)}{others}, {_lr_source(views)}",

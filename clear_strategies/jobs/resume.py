@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from clear_strategies.data.scene import Scene
-from clear_strategies.errors import DataError
+from clear_strategies.errors import DataError, counted
 from clear_strategies.files import FINISHED, read_bytes
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.metrics import Metrics
@@ -137,7 +137,7 @@ def restore(state: TrainState, scene: Scene, saved: Checkpoint, source: Path, co
     _require_same_cameras(source, scene)
     _require_same_photos(source, saved, state.photos)
     state.restore(saved, source)
-    _log.info("resumed from %s: %d iterations are done.", source, saved.t - 1)
+    _log.info("resumed from %s, after %s.", source, counted(saved.t - 1, "iteration"))
     if saved.device != state.device.type:
         _log.warning(
             "this run trained on %s until now and continues on %s: its bits differ from those of an uninterrupted run.",

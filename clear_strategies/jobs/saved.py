@@ -18,7 +18,7 @@ from clear_strategies.core.images import to_bytes
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.data.view_names import file_stems
-from clear_strategies.errors import DataError, SettingError
+from clear_strategies.errors import DataError, SettingError, counted
 from clear_strategies.jobs import device
 from clear_strategies.jobs.device import ReadyRasterizer
 from clear_strategies.jobs.resume import folder_of
@@ -92,7 +92,7 @@ def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
     is_ply = path.is_file() and path.suffix != checkpoint.SUFFIX
     if not is_ply and checkpoint.saved(folder / CHECKPOINTS):
         saved = checkpoint.load(path)
-        field, source, name = _field_of(saved, path), f"{folder}, {saved.t - 1} iterations", folder.name
+        field, source, name = _field_of(saved, path), f"{folder}, {counted(saved.t - 1, 'iteration')}", folder.name
         settings = {
             key.removeprefix(_OF_RASTERIZER): value
             for key, value in saved.config.items()
@@ -114,7 +114,7 @@ def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
     background = cameras[0].background if cameras else (0.0, 0.0, 0.0)
     drawing = _drawing(settings, rasterizer).over(background).among(field.means.data)
     painter = Painter(field.to(drawing.device), drawing.make)
-    source += f", {len(field):,} Gaussians"
+    source += f", {counted(len(field), 'Gaussian')}"
     return SavedSplat(folder, name or "splat", source, painter, cameras, bool(settings.get("antialiased", True)))
 
 

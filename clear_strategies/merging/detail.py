@@ -6,6 +6,7 @@ import logging
 from dataclasses import dataclass, replace
 
 from clear_strategies.core.checks import require_number, require_whole
+from clear_strategies.errors import counted
 from clear_strategies.schedules import LARGEST_RATE
 
 _log = logging.getLogger(__name__)
@@ -41,7 +42,7 @@ class DetailRates:
             return self
         rate = self.rate * iterations / self.steps
         _log.debug(
-            "f_det learns at a rate of %.2g instead of %.2g: the run has %d iterations (optim.detail_steps: %d).",
-            rate, self.rate, iterations, self.steps,
+            "f_det learns at a rate of %.2g instead of %.2g: the run has %s (optim.detail_steps: %d).",
+            rate, self.rate, counted(iterations, "iteration"), self.steps,
         )  # fmt: skip
         return replace(self, rate=rate)

@@ -21,6 +21,7 @@ from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.view import View
 from clear_strategies.core.work_log import WorkLog
+from clear_strategies.errors import counted
 from clear_strategies.schedules import milestone
 
 _log = logging.getLogger(__name__)
@@ -103,7 +104,7 @@ class SkipPolicy:
         elif s.plateau_gain > 0:
             phrases.append(
                 f"all iterations up to {s.plateau_to}, once the loss of the training views falls by less than "
-                f"{s.plateau_gain:.1%} in {s.plateau_window} iterations"
+                f"{s.plateau_gain:.1%} in {counted(s.plateau_window, 'iteration')}"
             )
         return phrases
 

@@ -22,7 +22,7 @@ from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.ply import GaussianPly, write_gaussians
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.view_names import file_stems
-from clear_strategies.errors import DataError, SettingError, one_line
+from clear_strategies.errors import DataError, SettingError, counted, one_line
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.figures import SheetRow, spaced, write_contact_sheet, write_curves
 from clear_strategies.outputs.image_scores import Metric
@@ -82,7 +82,7 @@ def write_results(
     stems = file_stems(view.name for view in (*scene.train, *scene.test))
     history = pd.DataFrame(list(state.history_as_floats()))
     synthetic = " · SYNTHETIC prior" * scene.synthetic_prior
-    title = f"{scene.name} · {chosen.title} · {state.t - 1} iterations · seed {settings.seed}{synthetic}"
+    title = f"{scene.name} · {chosen.title} · {counted(state.t - 1, 'iteration')} · seed {settings.seed}{synthetic}"
     rendered: dict[str, Tensor] = {}
 
     def render(view: View) -> Tensor:

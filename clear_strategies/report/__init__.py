@@ -25,7 +25,7 @@ from clear_strategies import console, files
 from clear_strategies.commands import path_of
 from clear_strategies.data.file_names import alike
 from clear_strategies.data.photo_files import read_image
-from clear_strategies.errors import ClearError, DataError
+from clear_strategies.errors import ClearError, DataError, counted
 from clear_strategies.jobs import exit_codes
 from clear_strategies.outputs.figures import SheetRow, write_contact_sheet, write_curves
 from clear_strategies.report import paper
@@ -88,7 +88,7 @@ def write(runs: Sequence[FinishedRun], out: Path) -> str:
         sections.append({**section, "pictures": pictures})
     sections += [{"title": title, "cells": cells, "notes": [paper.NOTE]} for title, cells in papers.items()]
     _write_page(out / "report.html", sections)
-    _log.info("report of %d runs: %s (report.html opens in any browser)", len(runs), out)
+    _log.info("report of %s: %s (report.html opens in any browser)", counted(len(runs), "run"), out)
     return text
 
 

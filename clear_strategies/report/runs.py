@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import pandas as pd
 
-from clear_strategies.errors import DataError
+from clear_strategies.errors import DataError, counted
 from clear_strategies.files import FINISHED
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.plan import OF_STRATEGY, Chosen
@@ -146,7 +146,8 @@ def _told_apart(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
         if len(places := {photos[other] for other in of}) > 1:
             scene = f"{scene} of {_shortest(photos[run], places)}"
         if len({other.views for other in of if photos[other] == photos[run]}) > 1:
-            scene = f"{scene}, {len(run.views)} views: {', '.join(run.views[:3])}{', …' if len(run.views) > 3 else ''}"
+            some = ", ".join(run.views[:3]) + (", …" if len(run.views) > 3 else "")
+            scene = f"{scene}, {counted(len(run.views), 'view')}: {some}"
         apart.append(replace(run, scene=scene))
     for scene in dict.fromkeys(run.scene for run, other in zip(runs, apart, strict=True) if run.scene != other.scene):
         _log.warning("%s: runs of other photos, or scored on other views, are not compared.", scene)

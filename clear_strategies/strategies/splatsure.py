@@ -23,6 +23,7 @@ from clear_strategies.core import deferred
 from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.step import Step
+from clear_strategies.errors import counted
 from clear_strategies.strategies.base import Strategy
 from rasterizers.geometry import depths
 from rasterizers.interface import Camera
@@ -59,8 +60,8 @@ class SplatSuRe(Strategy):
         super().on_fit_start(n_views, seed)
         if n_views < self.min_views:
             _log.warning(
-                "SplatSuRe has no effect: %d training views are fewer than min_views=%d, so that every weight is 1.",
-                n_views, self.min_views,
+                "SplatSuRe has no effect: %s, fewer than min_views=%d, so that every weight is 1.",
+                counted(n_views, "training view"), self.min_views,
             )  # fmt: skip
 
     def without_effect(self, *, lambda_lr: float, lambda_hr: float, lambda_hf: float) -> str | None:

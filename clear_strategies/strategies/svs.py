@@ -20,7 +20,7 @@ from clear_strategies.core.gradients import ATTRIBUTES, Grads
 from clear_strategies.core.points import spread
 from clear_strategies.core.seeds import dropout_mask
 from clear_strategies.core.step import Step
-from clear_strategies.errors import AnchorError
+from clear_strategies.errors import AnchorError, counted
 from clear_strategies.schedules import Ramp, milestone
 from clear_strategies.strategies.base import Strategy
 from rasterizers.native import empty_for
@@ -82,8 +82,9 @@ class SVS(Strategy):
             )  # fmt: skip
         elif self.cache["share"] < 1 and self.dropout.maximum > 0:
             _log.debug(
-                "dropout rises to %.3f instead of %.3f: each of the %d training views is seen %d times (svs.looks: %d).",
-                self.dropout.maximum * self.cache["share"], self.dropout.maximum, n_views, self.dropout.full // n_views,
+                "dropout rises to %.3f instead of %.3f: each of the %s is seen %s (svs.looks: %d).",
+                self.dropout.maximum * self.cache["share"], self.dropout.maximum, counted(n_views, "training view"),
+                counted(self.dropout.full // n_views, "time"),
                 self.looks,
             )  # fmt: skip
 

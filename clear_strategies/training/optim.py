@@ -13,6 +13,7 @@ from torch import Tensor
 
 from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.gradients import ATTRIBUTES, gathered
+from clear_strategies.errors import counted
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.schedules import LARGEST_RATE, LogLinear, milestone
 
@@ -80,8 +81,8 @@ class LearningRates:
             return rates
         factor = (self.geometry_steps / iterations) ** _GEOMETRY_POWER
         _log.debug(
-            "means, scales and quats learn %.2f times as fast: the run has %d iterations (optim.geometry_steps: %d).",
-            factor, iterations, self.geometry_steps,
+            "means, scales and quats learn %.2f times as fast: the run has %s (optim.geometry_steps: %d).",
+            factor, counted(iterations, "iteration"), self.geometry_steps,
         )  # fmt: skip
         means = replace(self.means, initial=factor * self.means.initial, final=factor * self.means.final)
         return replace(rates, means=means, scales=factor * self.scales, quats=factor * self.quats)

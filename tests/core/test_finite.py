@@ -87,7 +87,7 @@ def test_a_gradient_that_is_not_finite_is_named_before_the_step(begun, name, bad
         self.gradients = gradients
 
     monkeypatch.setattr(FieldShot, "__init__", spoiled)
-    with pytest.raises(DivergedError, match=r"^t=6, view view\d: .* is not finite for 1 Gaussians, first Gaussian 7"):
+    with pytest.raises(DivergedError, match=r"^t=6, view view\d: .* is not finite for 1 Gaussian, first Gaussian 7"):
         iterate(state, toy.RASTERIZER)
     assert_same(before, tensors(state))
 

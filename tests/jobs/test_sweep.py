@@ -59,7 +59,7 @@ def test_a_sweeps_job_that_is_refused_leaves_the_folder_of_a_finished_run_as_it_
 
     before, sweep = state(), ["-m", "hydra.sweep.dir=.", "hydra.sweep.subdir=here", *AUTO]
     result = run("+strategy=clear", *sweep, "fit.iterations=-1", cwd=whole.parent)
-    assert (result.returncode, "1 job(s) failed: job 0: " in result.stdout) == (2, True), result.stdout
+    assert (result.returncode, "1 job failed: job 0: " in result.stdout) == (2, True), result.stdout
     assert state() == before
     assert whole.with_name(f"here_{FAILED}").read_text().startswith("job 0: fit.iterations: must be")
 
@@ -103,7 +103,7 @@ def test_a_sweep_whose_jobs_all_lack_the_same_is_refused_once_before_any_of_them
 )
 def test_a_sweep_whose_jobs_do_not_all_lack_the_same_begins(swept, failed, tmp_path):
     result = run(*swept, "hydra.sweep.dir=all", cwd=tmp_path)
-    assert f"{failed} job(s) failed" in result.stdout if failed else not result.returncode, result.stdout
+    assert f"{failed} jobs failed" in result.stdout if failed else not result.returncode, result.stdout
 
 
 @pytest.mark.parametrize(
@@ -331,7 +331,7 @@ def test_failed_jobs_are_told_where_the_report_cannot_be_written(tmp_path, caplo
     with pytest.raises(SystemExit) as ended:
         callback.on_multirun_end(config)
     assert ended.value.code == 2
-    assert "1 job(s) failed: job 1: no such photo" in caplog.text
+    assert "1 job failed: job 1: no such photo" in caplog.text
     assert "there is no report: [Errno" in caplog.text
 
 

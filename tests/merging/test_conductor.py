@@ -225,7 +225,7 @@ ANSWERS = {
     "keep": ("reconcile", Weights(keep=None), "keep is a number or a tensor \\[30\\] or \\[30, 6\\], got None"),
     "keep NaN": (
         "reconcile", lambda p, step: Weights(keep=nan_of_first(p.dot[:, 0])),
-        "must give finite numbers, but keep is not finite for 1 Gaussians, first Gaussian 3",
+        "must give finite numbers, but keep is not finite for 1 Gaussian, first Gaussian 3",
     ),
     "keep, a number": ("reconcile", Weights(keep=float("nan")), "must give finite numbers, but keep is nan"),
     "keep, complex": (

@@ -231,7 +231,7 @@ def test_what_is_not_finite_is_refused_but_under_a_gradient_scaler(side, hint):
     run = partial(merge_in_place, conductor(), params, hr, step, T, before=before)
     run(must_be_finite=False)
     where = f"the merged gradient{hint} of scales"
-    with pytest.raises(DivergedError, match=f"{where} is not finite for 1 Gaussians, first Gaussian 17"):
+    with pytest.raises(DivergedError, match=f"{where} is not finite for 1 Gaussian, first Gaussian 17"):
         run()
 
 

@@ -400,7 +400,7 @@ def test_scenes_of_one_name_with_other_photos_or_other_views_are_no_one_scene(tm
     made("d", "/x/two/photos", "[2]", test=test)
     scenes = [run.scene for run in report.collect([tmp_path])]
     assert scenes[0] == scenes[1] == "photos of one/photos"
-    assert scenes[2:] == ["photos of two/photos, 1 views: view.png", "photos of two/photos, 1 views: other.png"]
+    assert scenes[2:] == ["photos of two/photos, 1 view: view.png", "photos of two/photos, 1 view: other.png"]
     assert "photos: runs of other photos, or scored on other views, are not compared" in caplog.text
 
 

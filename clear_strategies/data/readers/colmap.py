@@ -17,6 +17,7 @@ from clear_strategies.data.file_names import finder, is_file
 from clear_strategies.data.masks import masks_of
 from clear_strategies.data.photo_folders import folder_note, image_folder, images_in, usable
 from clear_strategies.data.readers.colmap_model import Model, find_model, is_model, model_folders, read_model
+from clear_strategies.errors import counted
 from rasterizers.interface import Color
 
 _UNEVEN: Final = 1e-6  # a quaternion's length may differ from 1 by this much without a note
@@ -99,7 +100,7 @@ def capture(
     posed = {*paths.values(), *masks.values()}
     unposed = [path.relative_to(folder).as_posix() for path in images_in(folder, pattern) if path not in posed]
     if unposed:
-        notes["without pose"] = f"{len(unposed)} photos, not used: {', '.join(unposed[:8])}"
+        notes["without pose"] = f"{counted(len(unposed), 'photo')}, not used: {', '.join(unposed[:8])}"
     notes |= lens_notes(frames)
     if uneven := sum(abs(math.hypot(*image.quat) - 1) > _UNEVEN for image in model.images):
         notes["rotations"] = f"{uneven} quaternions were not of length 1 and were normalised"

@@ -23,7 +23,7 @@ from clear_strategies.data.photo_folders import image_folder, usable
 from clear_strategies.data.ply import read_points
 from clear_strategies.data.poses import pose_from_opengl
 from clear_strategies.data.strict_json import Number, read_object, typed
-from clear_strategies.errors import DataError
+from clear_strategies.errors import DataError, counted
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
@@ -82,7 +82,10 @@ def read(
                 raise DataError(file, key, f"{name!r} is for training, too", "list each photo once")
     if removed:
         _log.warning(
-            "%s: its split lists name %d photos that are no frame's file_path: %s.", file, len(removed), some(removed)
+            "%s: %s in its split lists, and no frame's file_path: %s.",
+            file,
+            counted(len(removed), "photo"),
+            some(removed),
         )
     listed = [
         Listed(transform, name, path, splits.get(path))
@@ -94,10 +97,8 @@ def read(
         counts = Counter(frame.split for frame in frames)
         notes["split"] = f"the file's own: {counts['train']} train, {counts['test']} test, {counts[None]} in neither"
         if counts[None]:
-            message = (
-                "%s: %d frames are in none of its split lists and are not used; data.views.own_split=false uses them."
-            )
-            _log.warning(message, file, counts[None])
+            message = "%s: %s in none of its split lists, so not used; data.views.own_split=false uses all."
+            _log.warning(message, file, counted(counts[None], "frame"))
     return Capture(folder.resolve().name, sorted_by_name(frames, file), points_of(file, content), background, notes)
 
 

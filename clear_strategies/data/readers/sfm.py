@@ -33,7 +33,7 @@ from clear_strategies.core.progress import Progress
 from clear_strategies.data.capture import MORE_PHOTOS, NO_PARALLAX, STEP_ASIDE
 from clear_strategies.data.file_names import some
 from clear_strategies.data.photo_files import Optics, read_image
-from clear_strategies.errors import DataError
+from clear_strategies.errors import DataError, counted
 
 _log = logging.getLogger(__name__)
 
@@ -255,7 +255,7 @@ def _match(pycolmap: Any, database: Path, copies: Sequence[str], threads: int) -
     pairing.match_list_path = database.with_name("pairs.txt")
     blocks = [copies[first : first + _BLOCK] for first in range(0, len(copies), _BLOCK)]
     total, done = math.comb(len(copies), 2), 0
-    _log.info("matching %d pairs of photos.", total)
+    _log.info("matching %s of photos.", counted(total, "pair"))
     progress = Progress("matching", "pairs of photos", total)
     for one, other in itertools.combinations_with_replacement(blocks, 2):
         pairs = list(itertools.combinations(one, 2) if one is other else itertools.product(one, other))
@@ -348,7 +348,9 @@ def _require_addresses(root: Path, threads: int) -> None:
         if sys.platform != "win32":  # which has no such limit
             mmap.mmap(-1, (threads + 1) * _PER_WORKER, flags=mmap.MAP_PRIVATE, prot=0).close()
     except OSError as error:
-        needed = f"COLMAP takes up to {(threads + 1) * _PER_WORKER >> 20} MB of addresses with {threads} thread(s)"
+        needed = (
+            f"COLMAP takes up to {(threads + 1) * _PER_WORKER >> 20} MB of addresses with {counted(threads, 'thread')}"
+        )
         remedy = "raise `ulimit -v`" + ", or set data.reader.threads=1" * (threads > 1)
         raise DataError(root, "memory", f"{needed}, and the system leaves this process less", remedy) from error
 

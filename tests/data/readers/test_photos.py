@@ -190,7 +190,7 @@ def test_less_memory_than_colmap_takes_is_told_before_its_libraries_end_the_proc
     ended = subprocess.run([sys.executable, "-c", LIMITED], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stdout) == (
         0,
-        "here: memory: COLMAP takes up to 768 MB of addresses with 2 thread(s), and the system leaves this process less: "
+        "here: memory: COLMAP takes up to 768 MB of addresses with 2 threads, and the system leaves this process less: "
         "raise `ulimit -v`, or set data.reader.threads=1\n",
     ), ended.stderr
 

@@ -131,7 +131,7 @@ def test_the_files_lists_split_the_frames_and_the_rest_is_logged(tmp_path, caplo
     lists = {"train_filenames": ["images/b.png"], "val_filenames": ["images/a.png"], "test_filenames": []}
     capture = nerfstudio.read(changed(tmp_path, lambda value: value.update(lists)))
     assert [frame.split for frame in capture.frames] == ["test", "train", None]
-    assert "1 frames are in none" in caplog.text
+    assert "1 frame in none of its split lists" in caplog.text
 
 
 def test_the_masks_it_names_hide_their_black_pixels_and_are_undistorted_with_their_photos(tmp_path: Path) -> None:
@@ -209,7 +209,7 @@ def test_photos_may_all_lie_in_subfolders_with_masks_in_subfolders_of_the_same_n
     shutil.copytree(tmp_path / "images/cam_a", tmp_path / "images/cam_d")
     capture = colmap.read(tmp_path)
     assert [frame.name for frame in capture.frames] == ["cam_a/1.png", "cam_b/1.png", "cam_c/1.png"]
-    assert capture.notes["without pose"] == "1 photos, not used: cam_d/1.png"
+    assert capture.notes["without pose"] == "1 photo, not used: cam_d/1.png"
     a, b, c = (frame.shown for frame in capture.frames)
     assert (bool(a().any()), bool(b().all()), c) == (False, True, None)
 

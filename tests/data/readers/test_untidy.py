@@ -146,7 +146,7 @@ POSED: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "a split list that names a photo without a frame": (
         "nerfstudio",
         lambda root: captures.edit(root / "transforms.json", lambda value: value.update(LISTS)),
-        "its split lists name 1 photos that are no frame's file_path: images/gone.png",
+        "1 photo in its split lists, and no frame's file_path: images/gone.png",
     ),
     "a byte order mark": ("nerfstudio", encoded("transforms.json", "utf-8-sig"), ""),
     "UTF-16, as PowerShell writes it": ("nerfstudio", encoded("transforms.json", "utf-16"), ""),
