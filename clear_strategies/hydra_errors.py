@@ -73,8 +73,11 @@ def not_composed(error: Exception, overrides: Sequence[str], config: str) -> Set
     if (unknown := re.match(r"Could not (?:override|delete from config\.) '([^']+)'", str(error))) is None:
         return SettingError(of_hydra(error, config))
     key = unknown[1]
+    value = next((o.partition("=")[2] for o in overrides if _key(o) == key), "")
     if (CONF / key).is_dir():
-        return SettingError(f"{key}: no choice of this group is there to be replaced, so it is added: +{key}=….")
+        return SettingError(
+            f"{key}: no choice of this group is there to be replaced, so it is added: +{key}={value or '…'}."
+        )
     others, group = [o for o in overrides if _key(o) != key], key.partition(".")[0]
 
     def settings(*chosen: str) -> dict[str, Any]:
@@ -92,7 +95,6 @@ def not_composed(error: Exception, overrides: Sequence[str], config: str) -> Set
     remedy = "clear-strategies --cfg job prints all of them."
     parent, _, name = key.rpartition(".")
     beside = {".".join(k.split(".")[: key.count(".") + 1]) for k in flat(known) if k.startswith(f"{parent}.")}
-    value = next((o.partition("=")[2] for o in overrides if _key(o) == key), "")
     if value.partition(",")[0] in options(name):  # as data.scene=fern
         remedy = f"Did you mean +{name}={value}?"
     elif has_parameter(str(flat(known).get(f"{parent}.{TARGET}")), name):

@@ -41,9 +41,13 @@ def main(arguments: list[str]) -> None:
         sys.stdout.write(_USAGE)
         return
     settings = overrides(arguments)
-    sys.stdout.write(f"clear-strategies {shlex.join(settings)}\n")
     from clear_strategies import hydra_app
 
+    plain = (
+        f"data.path={path_of(arguments[0])}"  # with the quotes of the shell alone, where the command line adds Hydra's
+    )
+    shown = [plain if hydra_app.readable(plain) == word else word for word in settings]
+    sys.stdout.write(f"clear-strategies {shlex.join(shown)}\n")
     hydra_app.main(settings)
 
 

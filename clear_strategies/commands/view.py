@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import logging
 import socket
 import time
@@ -20,15 +21,13 @@ _log = logging.getLogger(__name__)
 def main(arguments: Sequence[str]) -> None:
     """Open the viewer and serve it until Ctrl-C."""
     parser = parser_of("view", "Look at a saved run, or a PLY file, in the browser. The run's own rasterizer draws.")
-    parser.add_argument("--port", type=int, default=8080, help="%(default)s, or the next one that is free")
+    parser.add_argument("--port", type=_port, default=8080, help="%(default)s, or the next one that is free")
     hosts = "%(default)s: this machine only; 0.0.0.0: every machine that reaches this one"
     parser.add_argument("--host", default="127.0.0.1", help=hosts)
     parser.add_argument("--no-browser", action="store_true", help="do not open a browser")
     options = parser.parse_args(arguments)
     console.show(verbose=options.verbose)
     _require_own(options.host)
-    if not 0 <= options.port <= 65535:
-        raise SettingError(f"--port: must be 0 to 65535, got {options.port}.")
     from clear_strategies.jobs.saved import open_splat
 
     exit_codes.require("view")
@@ -47,6 +46,12 @@ def main(arguments: Sequence[str]) -> None:
         while True:
             time.sleep(3600)  # on Windows, Ctrl-C ends no other wait
     viewer.close()
+
+
+def _port(text: str) -> int:
+    if not (text.isdecimal() and int(text) <= 65535):
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 65535, got {text}")
+    return int(text)
 
 
 def _require_own(host: str) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import functools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from clear_strategies.compose import ConductorSettings
@@ -12,6 +13,7 @@ from clear_strategies.data.priors import Bicubic, Prior
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs import device, scene
 from clear_strategies.jobs.device import RasterizerSettings
+from clear_strategies.options import CONF
 from clear_strategies.settings import build
 from clear_strategies.training.densifier import DensifierSettings
 from clear_strategies.training.mip import MipFilter
@@ -51,6 +53,15 @@ class JobSettings(ConductorSettings):
 
 
 def settings_of(values: Mapping[str, Any]) -> JobSettings:
-    """The settings of a resolved configuration, see `compose.tree`."""
+    """The settings of a resolved configuration, see `compose.tree`.
+
+    Raises:
+        SettingError: as `build`; of a group that is nearly one of conf/, it names that.
+    """
+    groups, known = [folder.name for folder in CONF.iterdir()], {f.name for f in fields(JobSettings)}
+    for key, value in values.items():
+        if key not in known and (near := difflib.get_close_matches(key, groups, 1)):
+            word = f"{'' if near[0] in values else '+'}{near[0]}={value if isinstance(value, str) else '…'}"
+            raise SettingError(f"{key}: there is no such setting. Did you mean {word}?")
     settings: JobSettings = build({**values, "rasterizer": device.rasterizer_node(values["rasterizer"])})
     return settings
