@@ -207,12 +207,12 @@ def _from_depth(
     stereo, photos, finer = settings.stereo, lr, 1.0
     few = hr_is_photo or len(lr) <= _FEW_PHOTOS
     compared = hr if settings.compare == "hr" or (settings.compare == "auto" and few) else ()
-    if compared and hr_is_photo:
+    if compared and hr_is_photo:  # photos that show more than LR
         reduced = [photo.reduced(photo.factor_to(stereo.max_pixels)) for photo in hr]
         if (ratio := reduced[0].camera.width / lr[0].camera.width) > 1:
             stereo, photos, finer = stereo.finer(ratio), reduced, ratio
     maps = depth_maps(photos, features.means, stereo, background)
-    if compared and not hr_is_photo and not cut_out(lr, background or BLACK):
+    if compared and not hr_is_photo and not cut_out(lr, background or BLACK):  # SR images complete what LR leaves open
         factor = hr[0].camera.width // lr[0].camera.width
         least = max(photo.factor_to(stereo.max_pixels) for photo in hr)
         by = next((factor // k for k in range(least, factor) if factor % k == 0), 1)
