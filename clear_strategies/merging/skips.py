@@ -74,7 +74,7 @@ class SkipPolicy:
         self._coarse: dict[str, View] = {}
 
     def descriptions(self, views: Sequence[View], *, uses_hr: bool = True, in_host: bool = False) -> list[str]:
-        """A phrase for each skip that is on, for the plan; a warning for one that has no effect.
+        """A phrase for each skip that is on, for the plan; one that has no effect is logged.
 
         Args:
             uses_hr: there is work on HR to leave out.
@@ -98,9 +98,7 @@ class SkipPolicy:
         if s.undrawn > 0:
             phrases.append("Gaussians too faint to be drawn, once the structure has settled")
         if s.plateau_gain > 0 and s.plateau_window == 0:
-            _log.warning(
-                "skips.plateau_gain has no effect: in this short run plateau_window is less than one iteration."
-            )
+            _log.debug("skips.plateau_gain has no effect: in this short run plateau_window is less than one iteration.")
         elif s.plateau_gain > 0:
             phrases.append(
                 f"all iterations up to {s.plateau_to}, once the loss of the training views falls by less than "
