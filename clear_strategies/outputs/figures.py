@@ -136,14 +136,16 @@ class SheetRow:
 
     Args:
         name: of the row.
-        compared: the columns by which a part of the images is chosen, the one where these differ most; it is outlined, and shown
-            below. Empty: none is.
+        compared: the columns by which a part of the images is chosen, see `window`; it is outlined, and shown below. Empty: none
+            is.
+        truth: the column that these are compared with, if it is known.
     """
 
     name: str
     images: Mapping[str, np.ndarray]
     captions: Mapping[str, str] = field(default_factory=dict)
     compared: Collection[str] = ()
+    truth: str | None = None
 
 
 def magnification(height: int, width: int) -> float:
@@ -155,20 +157,25 @@ def magnification(height: int, width: int) -> float:
     return max(1, min(math.ceil(_NARROW / width), _TALL // height))
 
 
-def window(images: Sequence[np.ndarray]) -> tuple[slice, slice]:
-    """The part [rows, columns] of RGB images [H, W, 3] where they differ most, the central one where all are equal. Of images
-    that a sheet reduces it is as large as they are shown, and square at most where they are upright.
+def window(images: Sequence[np.ndarray], truth: np.ndarray | None = None) -> tuple[slice, slice]:
+    """The part [rows, columns] of RGB images [H, W, 3] where they differ most, the central one where all are equal. Where the
+    truth is given, their errors differ most there: noise that all images have differs everywhere, and no more than that.
+
+    Of images that a sheet reduces it is as large as they are shown, and square at most where they are upright.
     """
-    deviation = np.stack(list(images)).std(axis=0).mean(axis=-1)
-    times = magnification(*deviation.shape)
-    h, w = (max(1, round(size * times) if times < 1 else size // _ENLARGED) for size in deviation.shape)
+    several = np.stack(images)
+    apart = several.std(axis=0).mean(axis=-1)
+    errors = None if truth is None else np.abs(several - truth).mean(axis=-1)
+    times = magnification(*apart.shape)
+    h, w = (max(1, round(size * times) if times < 1 else size // _ENLARGED) for size in apart.shape)
     h = min(h, w) if times < 1 else h
-    tops, lefts = (
-        range(0, size - part + 1, max(1, part // 4)) for size, part in zip(deviation.shape, (h, w), strict=True)
-    )
+    tops, lefts = (range(0, size - part + 1, max(1, part // 4)) for size, part in zip(apart.shape, (h, w), strict=True))
     windows = [(slice(top, top + h), slice(left, left + w)) for top in tops for left in lefts]
-    middle = windows[len(windows) // 2]
-    return max(windows, key=lambda window: float(deviation[window].sum())) if deviation.any() else middle
+
+    def difference(part: tuple[slice, slice]) -> float:
+        return float(apart[part].sum() if errors is None else errors[:, *part].sum(axis=(1, 2)).std())
+
+    return max(windows, key=difference) if apart.any() else windows[len(windows) // 2]
 
 
 class _Sheet:
@@ -207,7 +214,10 @@ def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: 
     shapes = [image.shape for row in rows for image in row.images.values()]
     times = magnification(*(max(shape[axis] for shape in shapes) for axis in (0, 1)))
     cell_h, cell_w = (round(times * max(shape[axis] for shape in shapes)) for axis in (0, 1))
-    parts = [window([row.images[name] for name in row.compared]) if row.compared else None for row in rows]
+    parts = [
+        window([row.images[name] for name in row.compared], row.images.get(row.truth or "")) if row.compared else None
+        for row in rows
+    ]
     zoom = 1 if times < 1 else int(times) * _ENLARGED
     part_h = [0 if part is None else zoom * (part[0].stop - part[0].start) + _GAP for part in parts]
     larger = max(1.0, max(len(columns) * cell_w, len(rows) * cell_h + sum(part_h)) / _SCREEN)

@@ -137,5 +137,6 @@ def _compare_renders(path: Path, scene: str, runs: Mapping[str, FinishedRun]) ->
         _log.warning("%s: the runs rendered at different sizes, so there is no comparison image.", scene)
         return False
     captions = {method: f"mean of its views: {run.numbers['psnr']:.2f} dB" for method, run in runs.items()}
-    write_contact_sheet(path, [SheetRow("", {**tiles, **truth}, captions, tiles)], f"{scene} · {Path(view).stem}")
+    row = SheetRow("", {**tiles, **truth}, captions, tiles, next(iter(truth), None))
+    write_contact_sheet(path, [row], f"{scene} · {Path(view).stem}")
     return True

@@ -126,6 +126,16 @@ def test_a_comparison_enlarges_the_part_where_runs_differ_most(tmp_path: Path) -
     assert window([base, base]) == (slice(24, 40), slice(90, 150))  # equal runs: the centre
 
 
+def test_runs_differ_most_where_one_is_closer_to_the_truth_not_where_both_are_noisy() -> None:
+    truth = np.full((64, 240, 3), 0.5)
+    noisy = [truth.copy(), truth.copy()]
+    for noise, tile in zip((0.4, -0.4), noisy, strict=True):
+        tile[:16, :60] += noise
+    noisy[1][32:48, 120:180] += 0.1
+    assert window(noisy) == (slice(0, 16), slice(0, 60))
+    assert window(noisy, truth) == (slice(32, 48), slice(120, 180))
+
+
 def history(**columns: float) -> pd.DataFrame:
     rows = [{"t": float(t), "seconds": t / 2, **{k: v + t / 200 for k, v in columns.items()}} for t in range(1, 21)]
     return pd.DataFrame(rows)
