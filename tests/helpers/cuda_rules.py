@@ -18,7 +18,7 @@ class Act:
     Args:
         what: "pool", "begin", "end" and "replay" of a graph; "warp stream", "warp begin" and "warp end"; "wait" for another
             stream; "work", "allocate", "sort", "read", "send" and "pin"; "load" of a kernel's module; "random" numbers of the
-            device's own generator; "empty": `torch.cuda.empty_cache`.
+            device's own generator; "empty": `torch.cuda.empty_cache`; "event": one is recorded; "graph": autograd notes work.
         on: the stream. graph: whose pool, beginning, end or replay it is. other: the stream that is waited for.
         freed: the graph reads memory that is no more. by_warp: memory is Warp's, not torch's.
     """
@@ -152,7 +152,9 @@ def waiting_for_the_device(a: Act, s: State) -> bool:
 
 @rule
 def pinning_memory(a: Act, s: State) -> bool:
-    """Operation not permitted when stream is capturing: cudaHostAlloc, in the modes global and thread_local."""
+    """Operation not permitted when stream is capturing: cudaHostAlloc, in the modes global and thread_local, and the query of
+    an event that precedes it (torch before 2.11, whose pinned memory has no pools of graphs).
+    """
     return a.what == "pin" and s.capture is not None
 
 
@@ -196,6 +198,20 @@ def random_numbers_after_a_failed_capture(a: Act, s: State) -> bool:
     the generator as within it; torch 2.13 has a state for each capture).
     """
     return a.what == "random" and s.capture is None and s.seeds
+
+
+@rule
+def timing_in_a_capture(a: Act, s: State) -> bool:
+    """Operation not permitted on an event last recorded in a capturing stream: it has no time, and cannot be asked for one."""
+    return a.what == "event" and s.captures(a.on)
+
+
+@check
+def a_graph_of_autograd_on_another_stream(a: Act, _: State) -> bool:
+    """The AccumulateGrad node's stream does not match the stream of the node that produced the incoming gradient (torch from
+    2.10 on; a warning, and each backward pass waits).
+    """
+    return a.what == "graph" and bool(a.on.records)
 
 
 @rule

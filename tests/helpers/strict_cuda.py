@@ -35,10 +35,30 @@ class Stream:
     """A `torch.cuda.Stream`."""
 
     cuda: StrictCuda
+    records: bool = False
     device = torch.device("cpu", 0)
 
     def wait_stream(self, other: Stream) -> None:
         self.cuda.ask("wait", on=self, other=other)
+
+
+class Event:
+    """A `torch.cuda.Event`."""
+
+    def __init__(self, cuda: StrictCuda, enable_timing: bool = False) -> None:
+        self.cuda = cuda
+
+    def record(self) -> None:
+        self.cuda.ask("event")
+
+    def query(self) -> bool:
+        self.cuda.ask("read")
+        return True
+
+    synchronize = query
+
+    def elapsed_time(self, end: Event) -> float:
+        return 1.0
 
 
 class StrictCuda:
@@ -163,6 +183,8 @@ class _Operations(TorchDispatchMode):
         cuda, graph, kwargs = self.cuda, self.cuda.state.capture, kwargs or {}
         if torch.Tag.nondeterministic_seeded in op.tags and kwargs.get("generator") is None:
             cuda.ask("random")
+        if torch.is_grad_enabled() and any(x.requires_grad for x in _tensors((args, kwargs))):
+            cuda.ask("graph")
         if graph is None:
             return op(*args, **kwargs)
         if kwargs.get("generator") is not None:
@@ -171,7 +193,8 @@ class _Operations(TorchDispatchMode):
             return drawn
         name = op.overloadpacket.__name__
         is_masked = name.startswith(("index", "_index")) and any(x.dtype == torch.bool for x in _tensors(args[1:2]))
-        if is_masked or {torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape} & set(op.tags):
+        tells = {torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape} & set(op.tags)
+        if is_masked or tells or name == "_linalg_check_errors":
             cuda.ask("read")
         if name.startswith("lift_fresh"):
             cuda.ask("send")
@@ -325,9 +348,10 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
 
     patches: dict[Any, dict[str, Any]] = {
         torch.cuda: {
-            "CUDAGraph": partial(Graph, cuda), "stream": cuda.using, "current_stream": lambda device: cuda.current,
-            "graph_pool_handle": Pool, "synchronize": lambda device=None: cuda.ask("read"),
-            "memory_reserved": lambda device=None: state.living + state.cached, "mem_get_info": cuda.free,
+            "CUDAGraph": partial(Graph, cuda), "Event": partial(Event, cuda), "stream": cuda.using,
+            "current_stream": lambda device: cuda.current, "graph_pool_handle": Pool,
+            "synchronize": lambda device=None: cuda.ask("read"), "mem_get_info": cuda.free,
+            "memory_reserved": lambda device=None: state.living + state.cached,
             "memory_allocated": lambda device=None: state.living, "empty_cache": cuda.empty_cache,
             "set_sync_debug_mode": cuda.set_sync_debug_mode,
             "default_generators": (_Generator(state),),
@@ -341,7 +365,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         torch.autograd: {name: autograd.does(getattr(torch.autograd, name)) for name in ("backward", "grad")},
         wp.utils: {"radix_sort_pairs": sorts},
         warp_runtime._Launch: {"__init__": constructed, "prepare": prepared},
-        recording: {"_side_stream": cache(lambda device: Stream(cuda))},
+        recording: {"_side_stream": cache(lambda device: Stream(cuda, records=True))},
         deferred: {"is_immediate": lambda x: False},
         native: {"available": lambda: False},
         per_gaussian: {"DEVICES": {"cpu"}},

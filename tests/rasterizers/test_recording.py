@@ -268,13 +268,16 @@ EXAMPLES: dict[str, list[Callable[[StrictCuda, torch.Tensor], object]]] = {
     "waiting_for_the_device": [
         lambda cuda, x: x.item(), lambda cuda, x: bool(x), lambda cuda, x: x.tolist(), lambda cuda, x: x.cpu(),
         lambda cuda, x: x.numpy(), lambda cuda, x: x.nonzero(), lambda cuda, x: x[x > 0],
-        lambda cuda, x: torch.cuda.synchronize(),
+        lambda cuda, x: torch.cuda.synchronize(), lambda cuda, x: torch.cuda.Event().query(),
+        lambda cuda, x: torch.linalg.inv(x[:, None]),
     ],
     "pinning_memory": [lambda cuda, x: x.pin_memory()],
     "sending_where_waits_are_refused": [
         lambda cuda, x: [torch.cuda.set_sync_debug_mode("error"), x.new_tensor(2.0)]
     ],
-    "sending_numbers_of_python": [lambda cuda, x: torch.tensor([1.0]), lambda cuda, x: x.new_tensor(2.0)],
+    "sending_numbers_of_python": [
+        lambda cuda, x: torch.tensor([1.0]), lambda cuda, x: x.new_tensor(2.0), lambda cuda, x: x[[0]],
+    ],
     "allocating_outside_the_pool": [
         lambda cuda, x: wp.empty(3, device="cpu"), on_the_default_stream(lambda cuda, x: torch.empty(3))
     ],
@@ -283,6 +286,8 @@ EXAMPLES: dict[str, list[Callable[[StrictCuda, torch.Tensor], object]]] = {
         lambda cuda, x: torch.cuda.empty_cache(), after_a_failed_end(lambda cuda, x: torch.cuda.empty_cache())
     ],
     "random_numbers_after_a_failed_capture": [after_a_failed_end(lambda cuda, x: torch.rand(1))],
+    "timing_in_a_capture": [lambda cuda, x: torch.cuda.Event(enable_timing=True).record()],
+    "a_graph_of_autograd_on_another_stream": [lambda cuda, x: x.clone().requires_grad_().add(1)],
     "loading_a_module": [lambda cuda, x: launch(doubled, [1], (x,), CPU)],
     "waiting_for_a_capturing_stream": [lambda cuda, x: cuda.state.legacy.wait_stream(cuda.current)],
     "a_capturing_stream_waiting": [lambda cuda, x: cuda.current.wait_stream(cuda.state.legacy)],

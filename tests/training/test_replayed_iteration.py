@@ -12,6 +12,7 @@ import torch
 
 import clear_strategies as cs
 import rasterizers
+from clear_strategies.core import work_log
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
@@ -213,6 +214,15 @@ def test_an_anchored_step_and_that_of_an_extra_view_are_both_recorded():
     )  # fmt: skip
     assert replays_of(replayed) >= 12
     assert live_in(replayed).keys() == {FIRST}
+
+
+def test_stages_are_timed_by_events_and_none_in_a_recording(monkeypatch):
+    monkeypatch.setattr(work_log, "_BATCH", 2)
+    state = start(cs.PseudoViews(count=8, reach=0.1), density=False)
+    state.conductor.work_log.device = torch.device("cuda")
+    entries = trained(state, replayed=True, until=8).conductor.work_log.entries
+    assert live_in(state).keys() == {FIRST}
+    assert all(entries[name].seconds > 0 for name in ("replayed", "render LR", "density and filter"))
 
 
 def test_where_lists_are_too_short_the_iteration_is_live_and_recorded_anew():
