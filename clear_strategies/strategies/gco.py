@@ -90,8 +90,8 @@ class GCO(Strategy):
         c = times(dot, per_norm)  # Eq. 6
         below = c.add_(τ).clamp_max_(0)  # c + τ_c, how far a cosine lies below the margin; 0: no conflict
         below[:, _QUATS] *= _turns_something(p.l2) & _turns_something(p.h2)
-        if len(self.groups) < len(CONFLICT_GROUPS):
-            below[:, [k for k, group in enumerate(CONFLICT_GROUPS) if group not in self.groups]] = 0
+        for group in set(CONFLICT_GROUPS).difference(self.groups):  # an index that is a list waits for the device
+            below[:, CONFLICT_GROUPS.index(group)].zero_()
         evidence = None if step is None else step.evidence
         q = p.dot.new_zeros(1) if evidence is None else evidence.reliability.double()
         ω = times(below, ((1 - q) / (τ - 1))[:, None]).clamp_(self.weight_min, self.weight_max)  # s (1 - q), Eq. 11
@@ -102,8 +102,8 @@ class GCO(Strategy):
 
     def _together(self, of_groups: Float[Tensor, "N G"]) -> Float[Tensor, "N G"]:
         """The sum over the groups that are compared, in the place of each."""
-        columns = [CONFLICT_GROUPS.index(group) for group in self.groups]
-        return of_groups[:, columns].sum(1, keepdim=True).repeat(1, of_groups.shape[1])
+        compared = [of_groups[:, CONFLICT_GROUPS.index(group)] for group in self.groups]
+        return torch.stack(compared, 1).sum(1, keepdim=True).repeat(1, of_groups.shape[1])
 
     def _report(self, p: Products, below: Float[Tensor, "N G"], ω: Float[Tensor, "N G"], has_evidence: bool) -> None:
         """Log what was corrected; it is counted where somebody asks for it."""

@@ -216,6 +216,13 @@ def test_an_anchored_step_and_that_of_an_extra_view_are_both_recorded():
     assert live_in(replayed).keys() == {FIRST}
 
 
+@pytest.mark.parametrize("settings", [{"groups": ("means", "sh0")}, {"whole": True}, {"drop": True}])
+def test_every_correction_of_conflicts_is_recorded(settings):
+    replayed = both(lambda: start(reconciles=cs.GCO(**settings), density=False, rises_at=2), 10)
+    assert replays_of(replayed) >= 5
+    assert live_in(replayed).keys() == {FIRST}
+
+
 def test_stages_are_timed_by_events_and_none_in_a_recording(monkeypatch):
     monkeypatch.setattr(work_log, "_BATCH", 2)
     state = start(cs.PseudoViews(count=8, reach=0.1), density=False)
