@@ -14,7 +14,9 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import accumulate, islice, takewhile
+from operator import itemgetter
 from typing import Final, NamedTuple, cast
 
 import torch
@@ -38,12 +40,19 @@ class Element(NamedTuple):
     k: int
 
 
-_UNREAD: Final = (Tensor, Deferred, Element)
+class Derived(NamedTuple):
+    """A function of the numbers of a vector on a device that is never written to again."""
+
+    vector: Float[Tensor, " K"]
+    of: Callable[[Sequence[float]], float]
+
+
+_UNREAD: Final = (Tensor, Deferred, Element, Derived)
 
 Scalar = float | Tensor
 """For arithmetic: a float, or a 0-dim tensor on a device that is never written to again."""
 
-Number = Scalar | Deferred | Element
+Number = Scalar | Deferred | Element | Derived
 """For logs and tables: a scalar, or a function of scalars."""
 
 
@@ -79,6 +88,8 @@ def read(numbers: Sequence[Number]) -> list[float]:
             return x.recipe(*map(value, x.parts))
         if isinstance(x, Element):
             return values[id(x.vector)][x.k]
+        if isinstance(x, Derived):
+            return x.of(values[id(x.vector)])
         return values[id(x)][0] if isinstance(x, Tensor) else x
 
     return [value(x) for x in numbers]
@@ -92,14 +103,25 @@ def gathered(row: Mapping[str, Number]) -> tuple[Float[Tensor, " K"], Callable[[
     device = parts[0].device if parts else None
     vector = torch.cat([*parts, torch.empty(0, dtype=torch.float64, device=device)])
 
-    def of(number: Number, copy: Tensor) -> Number:
-        if isinstance(number, Deferred):
-            return Deferred(number.recipe, tuple(of(part, copy) for part in number.parts))
-        if isinstance(number, Element):
-            return Element(copy, firsts[id(number.vector)] + number.k)
-        return Element(copy, firsts[id(number)]) if isinstance(number, Tensor) else number
+    def position(number: Number) -> int | None:
+        vector = number if isinstance(number, Tensor) else getattr(number, "vector", None)
+        return None if vector is None else firsts[id(vector)] + getattr(number, "k", 0)
 
-    return vector, lambda copy: {name: of(number, copy) for name, number in row.items()}
+    def reader(number: Number) -> Callable[[Sequence[float]], float]:
+        if isinstance(number, Deferred):
+            recipe, each = number.recipe, [*map(reader, number.parts)]
+            return lambda values: recipe(*(one(values) for one in each))
+        if (k := position(number)) is None:
+            return lambda _: cast(float, number)
+        return (lambda values: number.of(values[k:])) if isinstance(number, Derived) else itemgetter(k)
+
+    def maker(number: Number) -> Callable[[Tensor], Number]:
+        if isinstance(number, (Deferred, Derived)):  # one tuple, of however many numbers
+            return partial(Derived, of=reader(number))
+        return (lambda _: number) if (k := position(number)) is None else partial(Element, k=k)
+
+    makers = {name: maker(number) for name, number in row.items()}
+    return vector, lambda copy: {name: make(copy) for name, make in makers.items()}
 
 
 def resolve(rows: Sequence[dict[str, Number]]) -> Sequence[dict[str, float]]:
@@ -132,7 +154,7 @@ def _tensors(x: Number) -> Iterator[Tensor]:
     if isinstance(x, Deferred):
         for part in x.parts:
             yield from _tensors(part)
-    elif isinstance(x, Element):
+    elif isinstance(x, (Element, Derived)):
         yield x.vector
     elif isinstance(x, Tensor):
         yield x

@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.core.conflicts import Products, Weights
-from clear_strategies.core.deferred import Deferred, Element, Number
+from clear_strategies.core.deferred import Deferred, Derived, Element, Number
 from clear_strategies.core.evidence import Evidence, PatchMaps
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, Shot, gathered
 from clear_strategies.core.step import Step
@@ -239,7 +239,9 @@ class Strategy:
         every hundredth. A 0-dim tensor on a device is read later, see `core.deferred`. Where another strategy has logged this
         name, the column is "<class>.<name>".
         """
-        is_number = value.dim() == 0 if isinstance(value, Tensor) else isinstance(value, (Real, Deferred, Element))
+        is_number = (
+            value.dim() == 0 if isinstance(value, Tensor) else isinstance(value, (Real, Deferred, Derived, Element))
+        )
         if not (is_number or callable(value)):
             found = f"a tensor {[*value.shape]}" if isinstance(value, Tensor) else f"{value!r:.80}"
             raise AnswerError(f"{type(self).__name__}.log({name!r}, …) takes one number, got {found}.")

@@ -42,6 +42,21 @@ def test_on_the_cpu_numbers_are_floats_and_elsewhere_nothing_is_read_until_asked
     assert [row["loss"] for row in history] == [t / 2 for t in range(301)]
 
 
+def test_a_row_of_a_copied_vector_has_its_numbers_in_the_rows_order(on_a_device):
+    x, (_, second) = torch.tensor(3.0), deferred.elements(torch.tensor([7, 8]))
+    nested = deferred.defer(deferred.ratio, second, deferred.defer(deferred.added, x, 1.0))
+    row = {"share": nested, "one": 1.0, "x": x, "second": second}
+    for doubled in (1, 2):  # the row of a row, too
+        vector, row_of = deferred.gathered(row)
+        row = row_of(doubled * vector)
+        assert [type(number) for number in row.values()] == [
+            deferred.Derived, float, deferred.Element, deferred.Element
+        ]  # fmt: skip
+        assert [*row] == ["share", "one", "x", "second"]
+        expected = [8 * doubled / (3 * doubled + 1), 1, 3 * doubled, 8 * doubled]
+        assert deferred.read([*row.values()]) == expected
+
+
 def test_numbers_cross_once_and_exactly_and_a_recipe_runs_once(on_a_device, monkeypatch):
     moved = []
     monkeypatch.setattr(torch, "cat", lambda tensors, real=torch.cat: moved.append(len(tensors)) or real(tensors))
