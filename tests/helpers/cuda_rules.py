@@ -18,7 +18,8 @@ class Act:
     Args:
         what: "pool", "begin", "end" and "replay" of a graph; "warp stream", "warp begin" and "warp end"; "wait" for another
             stream; "work", "allocate", "sort", "read", "send" and "pin"; "load" of a kernel's module; "random" numbers of the
-            device's own generator; "empty": `torch.cuda.empty_cache`; "event": one is recorded; "graph": autograd notes work.
+            device's own generator; "empty": `torch.cuda.empty_cache`; "event": one is recorded; "graph": autograd notes work;
+            "destroy": a graph is no more.
         on: the stream. graph: whose pool, beginning, end or replay it is. other: the stream that is waited for.
         freed: the graph reads memory that is no more. by_warp: memory is Warp's, not torch's.
     """
@@ -153,7 +154,7 @@ def waiting_for_the_device(a: Act, s: State) -> bool:
 @rule
 def pinning_memory(a: Act, s: State) -> bool:
     """Operation not permitted when stream is capturing: cudaHostAlloc, in the modes global and thread_local, and the query of
-    an event that precedes it (torch before 2.11, whose pinned memory has no pools of graphs).
+    an event that precedes it (of a torch whose pinned memory has no pools of graphs).
     """
     return a.what == "pin" and s.capture is not None
 
@@ -204,6 +205,12 @@ def random_numbers_after_a_failed_capture(a: Act, s: State) -> bool:
 def timing_in_a_capture(a: Act, s: State) -> bool:
     """Operation not permitted on an event last recorded in a capturing stream: it has no time, and cannot be asked for one."""
     return a.what == "event" and s.captures(a.on)
+
+
+@rule
+def destroying_a_graph(a: Act, s: State) -> bool:
+    """Operation not permitted when stream is capturing: cudaGraphExecDestroy, where torch does not relax the mode for it."""
+    return a.what == "destroy" and s.capture is not None
 
 
 @check

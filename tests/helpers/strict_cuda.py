@@ -92,6 +92,11 @@ class StrictCuda:
         self.ask("empty")
         self.state.cached = 0
 
+    def destroy(self) -> None:
+        """As `CUDAGraph::reset`, which warns."""
+        with contextlib.suppress(RuntimeError):
+            self.ask("destroy")
+
     def set_sync_debug_mode(self, mode: str) -> None:
         """`torch.cuda.set_sync_debug_mode`."""
         self.state.no_waits = mode == "error"
@@ -138,6 +143,7 @@ class Graph:
             raise RuntimeError("Operation failed due to a previous error during capture.")
         self.cuda.end_allocate(0, self.pooled)
         self.cuda.state.seeds, self.captured = False, True
+        weakref.finalize(self, self.cuda.destroy)
 
     def pool(self) -> Pool:
         self.cuda.ask("pool", graph=self)

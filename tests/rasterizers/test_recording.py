@@ -83,6 +83,12 @@ def test_a_recording_keeps_memory_of_which_an_operation_returns_a_part(recorded_
     assert recorded.result.item() == 2
 
 
+def test_a_recording_that_is_dropped_in_another_ends_that(strict_cuda):
+    older = [Recording(CPU, lambda: torch.zeros(1))]
+    with pytest.raises(RuntimeError, match="a previous error"):
+        Recording(CPU, lambda: (older.clear(), torch.zeros(1)))
+
+
 def test_memory_of_recordings_that_were_dropped_is_given_back_before_it_runs_short(strict_cuda):
     for _ in range(2 * ROOM):
         Recording(CPU, lambda: torch.zeros(1))
@@ -287,6 +293,7 @@ EXAMPLES: dict[str, list[Callable[[StrictCuda, torch.Tensor], object]]] = {
     ],
     "random_numbers_after_a_failed_capture": [after_a_failed_end(lambda cuda, x: torch.rand(1))],
     "timing_in_a_capture": [lambda cuda, x: torch.cuda.Event(enable_timing=True).record()],
+    "destroying_a_graph": [lambda cuda, x: cuda.ask("destroy")],
     "a_graph_of_autograd_on_another_stream": [lambda cuda, x: x.clone().requires_grad_().add(1)],
     "loading_a_module": [lambda cuda, x: launch(doubled, [1], (x,), CPU)],
     "waiting_for_a_capturing_stream": [lambda cuda, x: cuda.state.legacy.wait_stream(cuda.current)],
