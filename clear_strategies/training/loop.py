@@ -49,7 +49,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
     scales = {"lr": conductor.wants_lr and conductor.skips.lr_due(view, hr_due, conductor.work_log), "hr": hr_due}
     z, background = conductor.gate(t, len(θ)), conductor.background(t)  # zᵗ             Eq. 15       SVS
     u, row = learned(s, rasterizer, GivenView(t, view, scales, z, background), learn)
-    conductor.draw(t, θ.means.data, partial(enlarged, s, over(rasterizer, background)))
+    conductor.draw(t, θ.means.data, partial(enlarged, s, rasterizer, background))
     extra = extra_steps(s, rasterizer, conductor.extra_views(t), background)
     conductor.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS
     with stage("density and filter"):
@@ -103,10 +103,10 @@ def _order_of_views(seed: int, epoch: int, n: int) -> list[int]:
     return order
 
 
-def enlarged(s: TrainState, rasterizer: Rasterizer, camera: Camera, factor: int) -> Photo:
+def enlarged(s: TrainState, rasterizer: Rasterizer, background: Color | None, camera: Camera, factor: int) -> Photo:
     """What the field shows, see `Strategy.draw`."""
     with s.conductor.work_log.stage("pictures drawn"):
-        image = s.field.render(rasterizer, camera, detail=False)
+        image = s.field.render(over(rasterizer, background), camera, detail=False)
         network = network_of(s.conductor.sr) or Bicubic()
         large = network("a drawn picture", images.quantize(image.cpu()), factor) if factor > 1 else image
     return Photo(camera.scaled(factor), large.to(image.device))
