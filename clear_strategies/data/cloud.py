@@ -260,7 +260,7 @@ def from_tracks(sfm: SfmPoints, train_ids: Sequence[int], min_views: int) -> Poi
     pairs = torch.unique(torch.stack((sfm.track_point[observed], sfm.track_image[observed]), dim=1), dim=0)
     kept = torch.nonzero(torch.bincount(pairs[:, 0], minlength=len(sfm.means)) >= min_views)[:, 0]
     if len(kept) == 0:
-        problem = f"none is observed by {min_views} of {counted(len(train_ids), 'training view')}"
+        problem = f"none is observed by {min_views} of the {counted(len(train_ids), 'training view')}"
         raise DataError("scene", "points", problem, "lower min_views, or use init=triangulated")
     source = f"{len(kept):,} points observed by >= {min_views} training views, of {sfm.source}"
     return PointCloud(sfm.means.float(), sfm.colors.float(), source, uses_test_views="yes")[kept]
