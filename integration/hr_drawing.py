@@ -1,9 +1,9 @@
-"""HR and extra views, which an iteration takes gradients of besides the host's own rendering. The host's function draws them, or
-this package's rasterizer, whatever draws LR; what it draws is on CUDA recorded and replayed.
+"""The gradients of HR and of extra views, which an iteration takes in addition to those of the host's own rendering. Either the
+host's function draws them, or this package's rasterizer, whose work is recorded and replayed on CUDA.
 
-A host gives its rasterizer activated tensors, which a `Drawable` holds. What is made of them is one work: render, losses, both
-cotangents in one pass, evidence, routing. A recording reads copies of them, since a host makes new ones in each step. From there
-the gradients go on to the parameters through the host's own graph, which stays live.
+A host gives its rasterizer activated tensors, which a `Drawable` holds. The work on them is rendering, losses, both cotangents in
+one pass, evidence and routing. A host makes new tensors in each step, so a recording reads copies of them. The gradients then
+reach the parameters through the host's own autograd graph, which stays live.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from clear_strategies.core.gradients import Grads
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide
-from clear_strategies.merging.recorded_work import RecordedWork, replays_on, why_strategies_are_not_recorded
+from clear_strategies.merging.recorded_work import RecordedWork, replays_on, why_not_recorded
 from integration.autograd_shot import AutogradShot, HostOutput, Target, every_number, to_parameters
 from integration.views import enlarged_mask
 from rasterizers.autograd import BackwardHook, Drawing
 from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer, Recordable, can_be_recorded, over
 from rasterizers.modes import in_full_precision
-from rasterizers.replays import Kind, copied, write
+from rasterizers.replays import GraphKey, copied, write
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawable:
-    """What a host asks its rasterizer for, as one of this package draws it.
+    """A rendering that a host asks for, as the arguments of a rasterizer of this package.
 
     Args:
         drawn: means, quats, scales, opacities and colors [N, K, 3], in the host's graph.
-        bands: of the colours, active. offset: f_det, at HR.
+        bands: the number of active bands of the colours. offset: f_det, at HR.
         background: behind the picture.
         params: raw parameters by gsplat's names.
     """
@@ -56,41 +56,46 @@ class Drawable:
 
     @property
     def inputs(self) -> Inputs:
-        """What is drawn, without its graph."""
+        """The tensors that are drawn, without their graph."""
         return Inputs(**self.drawn, rgb_offset=self.offset).drawn(self.bands)
 
 
 RenderAt = Callable[[Target, Float[Tensor, " N"] | None, View], HostOutput | Drawable]
-"""Renders by the host's own renderer, opacities multiplied by the gate: with f_det at HR, without it for any other target. The
-view is that of the iteration, with an SR image of the size that is due. A `Drawable`, of any target but LR, is to be rendered.
+"""Renders by the host's own renderer, with opacities multiplied by the gate; with f_det at HR, without it for any other target.
+The view is that of the iteration, its SR image as large as the iteration needs. For a target other than LR, the function may
+return a `Drawable`, which `HrDrawing` then renders.
 """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Given:
-    """What the work on one picture reads.
+class _RenderInputs:
+    """All tensors that the work on one picture reads.
 
     Args:
         drawn: see `Drawable.inputs`.
         photo: what the picture is compared with.
-        known: what strategies look up of its view, or the weight of the pixels of an extra view.
+        looked_up: see `Step.looked_up`; None for an extra view.
+        weight: of the pixels of an extra view; None at HR.
+        mask: by which the host multiplies the picture.
     """
 
     drawn: Inputs
     background: Float[Tensor, "1 3"]
     camera: Camera
     photo: Photo
-    known: Tensor | None
+    looked_up: Tensor | None
+    weight: Tensor | None
     mask: Float[Tensor, "H W 1"] | None
 
-    def copied(self) -> _Given:
+    def copied(self) -> _RenderInputs:
         photo = Photo(self.photo.camera, self.photo.image.clone(), copied(self.photo.shown))
         drawn, background = self.drawn.copied(), self.background.clone()
-        return _Given(drawn, background, replace(self.camera), photo, copied(self.known), copied(self.mask))
+        rest = map(copied, (self.looked_up, self.weight, self.mask))
+        return _RenderInputs(drawn, background, replace(self.camera), photo, *rest)
 
     @property
     def of_the_scene(self) -> list[Tensor | None]:
-        return [*self.drawn, self.photo.image, self.photo.shown, self.known, self.mask]
+        return [*self.drawn, self.photo.image, self.photo.shown, self.looked_up, self.weight, self.mask]
 
     def tensors(self, rasterizer: Recordable) -> list[Tensor | None]:
         numbers = rasterizer.numbers_of(self.camera, self.background.device)
@@ -114,19 +119,19 @@ class _Given:
 
 
 _Made = tuple[Any, dict[str, Number]]
-_Work = Callable[[_Given], _Made]
-"""Work on what is given, or on a recording's copy of it. It returns what it makes, and its numbers."""
+_Work = Callable[[_RenderInputs], _Made]
+"""Work on these inputs, or on a recording's copies of them. It returns its result, and numbers by name."""
 
 
 class HrDrawing:
-    """HR and extra views, drawn by the host's function or by this package's rasterizer, as the adapter asks for.
+    """Renders HR and extra views, and takes their gradients.
 
     Args:
-        device: of the Gaussians. On CUDA the work on what this package draws is recorded and replayed.
-        masks, reads_score: see `Attachment`. counts: `Attachment.counts`, to which this adds.
+        device: of the Gaussians. On CUDA, the work on what this package draws is recorded and replayed.
+        masks, reads_score: see `Attachment`. counts: `Attachment.counts`, to which this class adds.
 
     Attributes:
-        is_scored: whether a strategy has a densification score, and the host's densifier reads it.
+        is_scored: whether a strategy has a densification score that the host's densifier reads.
     """
 
     def __init__(
@@ -135,12 +140,12 @@ class HrDrawing:
         self._conductor, self._masks, self._counts = conductor, masks, counts
         self.is_scored = reads_score and conductor.owner("score") is not None
         self._replays = replays_on(device, conductor.work_log, "the replay of HR")
-        if self._replays is not None and (reason := next(why_strategies_are_not_recorded(conductor), None)) is not None:
+        if self._replays is not None and (reason := next(why_not_recorded(conductor), None)) is not None:
             self._replays = None
             _log.info("HR is not replayed: %s.", reason)
 
     def wanted(self, t: int) -> bool:
-        """Whether HR takes part at t. Where the host's densifier reads its score, no iteration is skipped."""
+        """Whether HR takes part at t. No iteration is skipped while the host's densifier reads a score."""
         conductor = self._conductor
         scores = self.is_scored and conductor.may_densify(t)
         return conductor.wants_hr(t) and (scores or not conductor.skips.leaves_out_hr(t, conductor.work_log))
@@ -148,7 +153,7 @@ class HrDrawing:
     def hr(
         self, view: View, t: int, gate: Float[Tensor, " N"] | None, render_at: RenderAt, params: Mapping[str, Tensor]
     ) -> tuple[HrSide, Grads | None]:
-        """The gradients of HR, and the same of the raw parameters where HR takes part in the merge."""
+        """The gradients of HR, and the same with respect to the raw parameters if HR takes part in the merge."""
         self._counts["HR renders"] += 1
         conductor, mask, drawn = self._conductor, self._masks.get(view.name), render_at("hr", gate, view)
         merges = conductor.objective.lambda_hr(t) > 0
@@ -172,7 +177,7 @@ class HrDrawing:
         return hr, shot.routed(hr) if merges else None
 
     def extra_view(self, extra: ExtraView, view: View, t: int, render_at: RenderAt) -> Grads:
-        """The gradient of an extra view, which is drawn without a gate and without f_det."""
+        """The gradient of an extra view, which is drawn without gate and f_det."""
         drawn = render_at(extra.photo.camera, None, view)
         if isinstance(drawn, Drawable):
             return self._own_extra_view(drawn, extra, t)
@@ -184,20 +189,19 @@ class HrDrawing:
     def _own_hr(
         self, asked: Drawable, view: View, t: int, mask: Float[Tensor, "H W 1"] | None
     ) -> tuple[HrSide, Grads]:  # fmt: skip
-        """Draw the view at HR, compare it with the SR image, and route the gradients. Returns what HR gives, and g^HR of the raw
-        parameters.
-        """
+        """As `hr`, drawn by this package; g^HR also where HR takes no part in the merge."""
         conductor = self._conductor
         photo = view.hr.over(conductor.background(t), view.background)
-        known = None if self._replays is None else conductor.looked_up(view)
-        given = _Given(asked.inputs, asked.background, asked.camera, photo, known, mask)
+        looked_up = None if self._replays is None else conductor.looked_up(view)
+        inputs = _RenderInputs(asked.inputs, asked.background, asked.camera, photo, looked_up, None, mask)
 
-        def work(given: _Given) -> tuple[tuple[HrSide, Grads], dict[str, Number]]:
-            shown = view if given.photo is photo else replace(view, hr=given.photo)
-            hr = conductor.hr_gradients(given.shot(asked), shown, t, AutogradShot.gradients, looked_up=given.known)
+        def work(inputs: _RenderInputs) -> tuple[tuple[HrSide, Grads], dict[str, Number]]:
+            shown = view if inputs.photo is photo else replace(view, hr=inputs.photo)
+            shot = inputs.shot(asked)
+            hr = conductor.hr_gradients(shot, shown, t, AutogradShot.gradients, looked_up=inputs.looked_up)
             return (hr, hr.g if asked.offset is None else hr.routed), {**hr.losses}  # Eq. 9, 10, 12, 13
 
-        (hr, g), losses = self._done(asked, given, t, ("hr", view.factor), work)
+        (hr, g), losses = self._done(asked, inputs, t, ("hr", view.factor), work)
         params = {name: p.detach() for name, p in asked.params.items()}
         losses = {name: x.vector[x.k] if isinstance(x, Element) else x for name, x in losses.items()}
         step = hr.step if self._replays is None else hr.step.copied()
@@ -210,36 +214,36 @@ class HrDrawing:
     @in_full_precision
     @torch.no_grad()
     def _own_extra_view(self, asked: Drawable, extra: ExtraView, t: int) -> Grads:
-        """The gradient of `Conductor.extra_loss`, a number for each of the raw parameters."""
+        """As `extra_view`, drawn by this package."""
         conductor = self._conductor
         photo = extra.photo.over(conductor.background(t), extra.background)
-        given = _Given(asked.inputs, asked.background, asked.camera, photo, extra.weight, None)
+        inputs = _RenderInputs(asked.inputs, asked.background, asked.camera, photo, None, extra.weight, None)
 
-        def work(given: _Given) -> tuple[Grads, dict[str, Number]]:
-            shot = given.shot(asked)
-            shown = replace(extra, photo=given.photo, weight=cast(Tensor, given.known))
+        def work(inputs: _RenderInputs) -> tuple[Grads, dict[str, Number]]:
+            shot = inputs.shot(asked)
+            shown = replace(extra, photo=inputs.photo, weight=cast(Tensor, inputs.weight))
             (g,) = shot.gradients(conductor.extra_loss(shot.image, shown, t).cotangents)
             return g, {}
 
-        g, _ = self._done(asked, given, t, ("extra", extra.robust), work)
+        g, _ = self._done(asked, inputs, t, ("extra", extra.robust), work)
         found = every_number(to_parameters(g, asked.drawn, asked.params), asked.params)
-        return Grads({name: x.clone() for name, x in found.items()})  # some are those that the next replay overwrites
+        return Grads({name: x.clone() for name, x in found.items()})  # the next replay overwrites some of them
 
-    def _done(self, asked: Drawable, given: _Given, t: int, facts: tuple[Any, ...], work: _Work) -> _Made:
-        """The work, live or by a replay."""
+    def _done(self, asked: Drawable, inputs: _RenderInputs, t: int, constants: tuple[Any, ...], work: _Work) -> _Made:
+        """Do the work, live or by a replay."""
         conductor, rasterizer = self._conductor, asked.rasterizer
         if self._replays is None or not can_be_recorded(rasterizer):
-            return work(given)
-        asked_of = (conductor.owner(hook) for hook in ("observe", "route"))
-        state = [rows.data_ptr() for s in asked_of if s is not None for rows in s.state.values()]
-        kind = Kind((len(asked.drawn["means"]), *state), given.shapes, (rasterizer, *facts))
+            return work(inputs)
+        called = (conductor.owner(hook) for hook in ("observe", "route"))
+        state = [rows.data_ptr() for s in called if s is not None for rows in s.state.values()]
+        key = GraphKey((len(asked.drawn["means"]), *state), inputs.shapes, (rasterizer, *constants))
 
-        def record() -> RecordedWork[_Given, _Made]:
-            own = given.copied()
-            tensors = own.tensors(rasterizer)
+        def record() -> RecordedWork[_RenderInputs, _Made]:
+            static = inputs.copied()
+            tensors = static.tensors(rasterizer)
             return RecordedWork(
-                given.background.device, conductor, lambda: work(own),
+                inputs.background.device, conductor, lambda: work(static),
                 write=lambda new: write(tensors, new.tensors(rasterizer)), outcome=lambda _, made, row: (made, row),
             )  # fmt: skip
 
-        return self._replays.do(kind, t, given, live=lambda: work(given), record=record)
+        return self._replays.do(key, t, inputs, live=lambda: work(inputs), record=record)

@@ -1,7 +1,7 @@
-"""The merge of a host's gradients, on CUDA recorded and replayed: of the kernels that it launches, 22 are GCO's.
+"""The merge of a host's gradients, which is recorded and replayed on CUDA: 22 of the kernels that it launches are GCO's.
 
-A host has other gradients in each step, so a recording reads copies of them, and its result is copied to where the host has its
-own. The parameters, and what strategies that reconcile or regularize store, it reads in place.
+A host's gradients are new tensors in each step, so a recording reads copies of them, and its result is copied to the host's
+tensors. It reads in place the parameters, and what strategies that reconcile or regularize store.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from clear_strategies.core.gradients import Colour, Grads
 from clear_strategies.core.step import Step
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Merged
-from clear_strategies.merging.recorded_work import RecordedWork, replays_on, that_merge
+from clear_strategies.merging.recorded_work import RecordedWork, merging_strategies, replays_on
 from rasterizers.guards import iteration, unread
-from rasterizers.replays import Kind, write
+from rasterizers.replays import GraphKey, write
 
 _FINITE: Final = "finite"
 _CONFLICT: Final = "conflict of "
-"""Keys of a replay's numbers; the latter before a group's name."""
+"""Keys of a replay's numbers; a group's name follows the second."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Given:
+class _MergeInputs:
     """The arguments of `Conductor.merge_routed` where HR takes part."""
 
     params: Mapping[str, Tensor]
@@ -39,7 +39,7 @@ class _Given:
 
     @property
     def tensors(self) -> dict[str, Tensor | None]:
-        """Those that a recording has copies of, by a name for each."""
+        """The tensors that a recording copies, each by a name."""
         found = dict[str, Tensor | None](visible=self.step.visible)
         for side, g in {"lr": self.lr, "hr": self.hr}.items():
             found |= {f"{side} {name}": x for name, x in g.items()}
@@ -49,39 +49,41 @@ class _Given:
             found |= {"reliability": e.reliability, "demand": e.demand, "sums": e.sums}
         return found
 
-    def copied(self) -> _Given:
-        """The same with copies. They do not tell the view of the iteration, which is another one in a replay."""
+    def copied(self) -> _MergeInputs:
+        """Copies, whose view must not be read, since each replay has another one."""
         own = replace(self.step.copied(), view=unread(self.step.view, "the view"), looked_up=None)
-        return _Given(self.params, _copied(self.lr), _copied(self.hr), own, self.out)
+        return _MergeInputs(self.params, _copied(self.lr), _copied(self.hr), own, self.out)
 
 
-def _recorded(conductor: Conductor, given: _Given) -> RecordedWork[_Given, Merged]:
-    """The recording of one kind of merge, which reads what it is given from tensors of its own."""
-    own, first, lambda_hr = given.copied(), next(iter(given.out.values())), conductor.objective.lambda_hr
-    tensors, λ = [*own.tensors.values()], first.new_empty(1)
-    λ_now = -1.0  # which is on the device
+def _recorded(conductor: Conductor, inputs: _MergeInputs) -> RecordedWork[_MergeInputs, Merged]:
+    """The recording of a merge, which reads its inputs from static tensors."""
+    static, first, lambda_hr = inputs.copied(), next(iter(inputs.out.values())), conductor.objective.lambda_hr
+    tensors, λ = [*static.tensors.values()], first.new_empty(1)
+    λ_now = -1.0  # the value on the device
 
     def work() -> tuple[list[Tensor], dict[str, Number]]:
-        step = replace(own.step, t=iteration(given.step.t))
-        out = {name: torch.empty_like(x, memory_format=torch.contiguous_format) for name, x in given.out.items()}
-        merged = conductor.merge_routed(own.params, own.lr, own.hr, step, given.step.t, out, λ)
+        step = replace(static.step, t=iteration(inputs.step.t))
+        out = {name: torch.empty_like(x, memory_format=torch.contiguous_format) for name, x in inputs.out.items()}
+        merged = conductor.merge_routed(static.params, static.lr, static.hr, step, inputs.step.t, out, λ)
         conflict = {f"{_CONFLICT}{group}": share for group, share in merged.conflict.items()}
         return [*out.values()], {_FINITE: merged.finite, **conflict}
 
-    def write_own(new: _Given) -> None:
+    def write_static(new: _MergeInputs) -> None:
         nonlocal λ_now
         write(tensors, [*new.tensors.values()])
         if (λ_new := lambda_hr(new.step.t)) != λ_now:
             λ_now = λ_new
             λ.fill_(λ_new)
 
-    def outcome(new: _Given, made: list[Tensor], row: dict[str, Number]) -> Merged:
+    def outcome(new: _MergeInputs, made: list[Tensor], row: dict[str, Number]) -> Merged:
         write([*new.out.values()], made)
         conflict = {name.removeprefix(_CONFLICT): x for name, x in row.items() if name.startswith(_CONFLICT)}
         return Merged(Grads(new.out), conflict, row[_FINITE])
 
-    write_own(given)
-    return RecordedWork(first.device, conductor, work, write=write_own, outcome=outcome, asked=that_merge(conductor))
+    write_static(inputs)
+    return RecordedWork(
+        first.device, conductor, work, write=write_static, outcome=outcome, calls=merging_strategies(conductor)
+    )
 
 
 class ReplayedMerge:
@@ -106,15 +108,15 @@ class ReplayedMerge:
 
         if self._replays is None or step is None or not g_hr.tensors or conductor.objective.lambda_hr(t) == 0:
             return live()
-        given = _Given(params, g_lr, g_hr, step, out)
-        return self._replays.do(self._kind(given), t, given, live=live, record=lambda: _recorded(conductor, given))
+        inputs = _MergeInputs(params, g_lr, g_hr, step, out)
+        return self._replays.do(self._key(inputs), t, inputs, live=live, record=lambda: _recorded(conductor, inputs))
 
-    def _kind(self, given: _Given) -> Kind:
-        asked = self._conductor.owner("reconcile"), *self._conductor.regularizers
-        stored = [rows for s in asked if s is not None for rows in s.state.values()]
-        addresses = [x.data_ptr() for x in (*given.params.values(), *given.step.params.values(), *stored)]
-        shapes = [(name, None if x is None else x.shape) for name, x in given.tensors.items()]
-        return Kind((len(next(iter(given.out.values()))), *addresses), tuple(shapes), tuple(given.out))
+    def _key(self, inputs: _MergeInputs) -> GraphKey:
+        called = self._conductor.owner("reconcile"), *self._conductor.regularizers
+        stored = [rows for s in called if s is not None for rows in s.state.values()]
+        addresses = [x.data_ptr() for x in (*inputs.params.values(), *inputs.step.params.values(), *stored)]
+        shapes = [(name, None if x is None else x.shape) for name, x in inputs.tensors.items()]
+        return GraphKey((len(next(iter(inputs.out.values()))), *addresses), tuple(shapes), tuple(inputs.out))
 
 
 def _copied(g: Grads) -> Grads:

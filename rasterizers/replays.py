@@ -1,8 +1,8 @@
-"""Work on CUDA that is recorded by its kind and replayed; see `rasterizers.recording`.
+"""Work on CUDA that is recorded and replayed, one recording for each `GraphKey`; see `rasterizers.recording`.
 
-Work of a new kind is live first, so that kernels are compiled and caches filled. The next time it is recorded, and then it is
-replayed while the tensors that it reads lie where they lay. Where they lie elsewhere, it is recorded anew. Whatever fails in a
-recording or a replay, all that follows is live.
+Work with a new key runs live first, which compiles kernels and fills caches. The second time it is recorded, and from then on it
+is replayed, as long as the tensors that it reads stay at their addresses. When they move, it is recorded again. If a recording or
+a replay fails, all later work runs live.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ DEVICES: Final = {"cuda"}
 """The kinds of devices whose work can be recorded; tests add the CPU."""
 
 _FAILED: Final = "a recording failed"
-_RESTLESS: Final = 20  # changes of memory without a replay between them, where no structure changes so often
-_MOST_KINDS: Final = 8  # a recording keeps the memory of its work
-_MOST_TURNS: Final = 8  # recordings made anew that have not paid off
+_MOST_MOVES: Final = 20  # changes of addresses without a replay between them; no structure changes so often
+_MOST_RECORDINGS: Final = 8  # a recording keeps the memory of its work
+_MOST_GUARD_FAILURES: Final = 8  # that replays have not paid for
 _PAYS_AFTER: Final = 2  # replays
 
-G = TypeVar("G")
+In = TypeVar("In")
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
-    """What Python decides by in the work: work of one kind launches the same kernels.
+class GraphKey:
+    """What Python decides by in the work: work with equal keys launches the same kernels.
 
     Args:
-        addresses: where the tensors lie that it reads in place, and how many rows they have. When this changes, every recording
-            is dropped.
-        shapes, facts: whatever else Python looks at.
+        addresses: of the tensors that the work reads in place, and their number of rows. When they change, every recording is
+            dropped.
+        shapes, constants: whatever else Python looks at.
     """
 
     addresses: tuple[int, ...]
     shapes: tuple[Any, ...]
-    facts: tuple[Any, ...]
+    constants: tuple[Any, ...]
 
 
 def can_record(device: torch.device) -> bool:
@@ -53,27 +53,27 @@ def can_record(device: torch.device) -> bool:
     return device.type in DEVICES
 
 
-class Recorded(Generic[G, T]):
-    """Work of one kind, which reads what it is given from tensors of its own.
+class Recorded(Generic[In, T]):
+    """Recorded work, which reads its inputs from static tensors.
 
     Args:
-        recording: of the work. write: writes what a replay is given to where the work reads it.
+        recording: of the work. write: copies the inputs of a replay to the static tensors.
     """
 
-    def __init__(self, recording: Recording[Any], write: Callable[[G], None]) -> None:
+    def __init__(self, recording: Recording[Any], write: Callable[[In], None]) -> None:
         self._recording, self._write = recording, write
 
     def holds_at(self, t: int) -> bool:
-        """Whether what Python has decided by the iteration, as a strategy may, is the same at t."""
+        """Whether Python decides at t as it did in the recording, e.g. in a strategy that compares the iteration."""
         return self._recording.holds_at(t)
 
-    def replay(self, given: G) -> bool:
-        """Do the work with what it is given; False where the recording does not hold for it, before anything has changed."""
-        self._write(given)
+    def replay(self, inputs: In) -> bool:
+        """Do the work with these inputs; False if the recording does not hold for them, before anything has changed."""
+        self._write(inputs)
         return self._recording.replay()
 
-    def outcome(self, given: G) -> T:
-        """What the work has made."""
+    def outcome(self, inputs: In) -> T:
+        """The result of the last replay."""
         raise NotImplementedError
 
 
@@ -81,63 +81,66 @@ class Replays:
     """The recordings of one training, or of the drawings of one thread.
 
     Args:
-        name: of what ends where a recording fails, for the log.
-        count: is told the reason whenever work is live.
+        name: of what ends when a recording fails, for the log.
+        count: called with the reason whenever work runs live.
     """
 
     def __init__(self, device: torch.device, name: str, count: Callable[[str], None] = lambda reason: None) -> None:
         self._device, self._name, self._count = device, name, count
-        self._recorded: dict[Kind, Any] = {}  # None: to be recorded
-        # What work that was live has in common with such whose tensors lie elsewhere.
-        self._done = set[tuple[Any, ...]]()
+        self._recorded: dict[GraphKey, Any] = {}  # None: to be recorded
+        self._warm = set[tuple[Any, ...]]()  # keys, apart from addresses, of work that has run live
         self._addresses: tuple[int, ...] = ()
-        self._moves = 0  # changes of these since the last replay
-        self._turns = 0.0  # how often a recording did not hold at its iteration, less what the replays since have saved
+        self._moves = 0  # changes of `_addresses` since the last replay
+        self._guard_failures = 0.0  # less what the replays since then have saved
         self._failed = False
 
-    def do(self, kind: Kind, t: int, given: Any, *, live: Callable[[], T], record: Callable[[], Recorded[Any, T]]) -> T:
-        """Do the work: by a replay, while it is recorded, or live."""
+    def do(
+        self, key: GraphKey, t: int, inputs: Any, *, live: Callable[[], T], record: Callable[[], Recorded[Any, T]]
+    ) -> T:
+        """Do the work live, while it is recorded, or by a replay."""
         if self._failed:
             return self._live(live, _FAILED)
-        if kind.addresses != self._addresses:  # the structure has changed, and with it everything that was recorded
+        if key.addresses != self._addresses:  # the structure has changed, and no recording holds
             self._recorded.clear()
-            self._addresses, self._moves = kind.addresses, self._moves + 1
-            if self._moves == _RESTLESS:
+            self._addresses, self._moves = key.addresses, self._moves + 1
+            if self._moves == _MOST_MOVES:
                 _log.warning(
                     "%s: nothing is replayed, so that on a GPU an iteration takes two to three times as long. In each one, the "
                     "number of Gaussians is another one, or a tensor of the field or of a strategy's state is a new one. Write "
                     "to Strategy.state in place, by copy_().",
                     self._name,
                 )
-        if kind not in self._recorded:
-            if len(self._recorded) == _MOST_KINDS:
-                return self._live(live, f"more than {_MOST_KINDS} kinds")
-            self._recorded[kind] = None
-            alike = len(kind.addresses), kind.shapes, kind.facts
-            if alike not in self._done or self._moves > 1:  # where nothing lasts, a recording does not pay
-                self._done.add(alike)
-                with on_side_stream(self._device):  # some caches are of a stream
+        if key not in self._recorded:
+            if len(self._recorded) == _MOST_RECORDINGS:
+                return self._live(live, f"more than {_MOST_RECORDINGS} kinds")
+            self._recorded[key] = None
+            elsewhere = len(key.addresses), key.shapes, key.constants
+            if elsewhere not in self._warm or self._moves > 1:  # a recording does not pay if addresses change each time
+                self._warm.add(elsewhere)
+                with on_side_stream(self._device):  # some caches belong to a stream
                     return self._live(live, "the first of its kind")
         try:
-            known = self._recorded[kind]
-            if known is not None and not known.holds_at(t):
-                known, self._turns = None, self._turns + 1
-                if self._turns > _MOST_TURNS:
+            recorded = self._recorded[key]
+            if recorded is not None and not recorded.holds_at(t):
+                recorded, self._guard_failures = None, self._guard_failures + 1
+                if self._guard_failures > _MOST_GUARD_FAILURES:
                     raise RuntimeError(
                         "a strategy decides by the iteration, or by what it stores in Python, and again and again another way. "
                         "Numbers that it changes belong in tensors that it writes in place."
                     )
-            recorded = record() if known is None else known if known.replay(given) else None
-            if recorded is known is not None:
-                self._moves, self._turns = 0, max(0.0, self._turns - 1 / _PAYS_AFTER)
-            reason = "the recorded lists of pairs are too short"  # recorded anew, with space for more
+            if recorded is None:
+                recorded = record()
+            elif recorded.replay(inputs):
+                self._moves, self._guard_failures = 0, max(0.0, self._guard_failures - 1 / _PAYS_AFTER)
+            else:  # the next recording has space for more
+                recorded, reason = None, "the recorded lists of pairs are too short"
         except Exception as error:
             self._failed, recorded, reason = True, None, _FAILED
             self._recorded.clear()
             cause = f"{type(error).__name__}: {error}".partition("\n")[0]
             _log.warning("%s ends at t=%d, and iterations are live from now on: %s", self._name, t, cause)
-        self._recorded[kind] = recorded
-        return self._live(live, reason) if recorded is None else recorded.outcome(given)
+        self._recorded[key] = recorded
+        return self._live(live, reason) if recorded is None else recorded.outcome(inputs)
 
     def _live(self, live: Callable[[], T], reason: str) -> T:
         self._count(reason)
@@ -148,10 +151,10 @@ def copied(x: Tensor | None) -> Tensor | None:
     return None if x is None else x.clone()
 
 
-def write(own: Sequence[Tensor | None], given: Sequence[Tensor | None]) -> None:
-    """Write what work is given to where the recorded one reads it: tensors of one type and layout by one kernel."""
+def write(static: Sequence[Tensor | None], inputs: Sequence[Tensor | None]) -> None:
+    """Copy inputs to the static tensors that recorded work reads, by one kernel for all of one type and layout."""
     alike = defaultdict[torch.dtype, list[tuple[Tensor, Tensor]]](list)
-    for x, y in zip(own, given, strict=True):
+    for x, y in zip(static, inputs, strict=True):
         if x is None or y is None:
             continue
         if x.dtype == y.dtype and x.stride() == y.stride():

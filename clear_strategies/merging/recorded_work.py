@@ -1,6 +1,4 @@
-"""What recordings of the trainer and of hosts add to `rasterizers.replays`: what was skipped, numbers for logs, and which
-strategies can be recorded.
-"""
+"""What recordings of strategies add to `rasterizers.replays`: logs, counts of skipped work, and what can be recorded."""
 
 from __future__ import annotations
 
@@ -21,33 +19,33 @@ from rasterizers.guards import Guarded
 from rasterizers.recording import Recording
 from rasterizers.replays import Recorded, Replays, can_record
 
-G = TypeVar("G")
+In = TypeVar("In")
 T = TypeVar("T")
 
 LIVE: Final = "live in place of a replay"
-"""The work log's entry for work that was not replayed, by the reason. It has no runs, so that none seem saved."""
+"""The work log's entry for work that was not replayed. It counts reasons and no runs, so that no work seems to be saved."""
 
 
-class RecordedWork(Recorded[G, T]):
-    """Recorded work, with what it has skipped, its numbers for the history, and what strategies log in it.
+class RecordedWork(Recorded[In, T]):
+    """Recorded work, with counts of what it skips, numbers for the history, and the logs of strategies.
 
     Args:
-        work: returns what it makes, and numbers by name. See `Recording`.
-        write: writes what a replay is given to where the work reads it.
-        outcome: what the replay returns, of what it was given, of what the work has made, whose tensors the next replay
-            overwrites, and of its numbers, copied.
-        asked: strategies that the work asks. It holds while they store what they stored before it.
+        work: returns its result, and numbers by name. See `Recording`.
+        write: copies the inputs of a replay to the static tensors that the work reads.
+        outcome: makes the result of a replay from its inputs, the result of the work, whose tensors the next replay overwrites,
+            and a copy of the numbers.
+        calls: the strategies that the work calls. The recording holds while they store what they stored before it.
     """
 
     def __init__(
         self, device: torch.device, conductor: Conductor, work: Callable[[], tuple[Any, Mapping[str, Number]]], *,
-        write: Callable[[G], None], outcome: Callable[[G, Any, dict[str, Number]], T], asked: Iterable[Strategy] = (),
+        write: Callable[[In], None], outcome: Callable[[In, Any, dict[str, Number]], T], calls: Iterable[Strategy] = (),
     ) -> None:  # fmt: skip
         self._outcome = outcome
-        self._work_log, self._strategies, self._asked = conductor.work_log, conductor.strategies, [*asked]
-        self._stored = [*map(_stored_by, self._asked)]  # before the work, which may change it
-        self._of_t: dict[str, Any] = {}  # numbers that Python has made of the iteration
-        self._t: int | None = None  # of the replay; None: of the recording
+        self._work_log, self._strategies, self._calls = conductor.work_log, conductor.strategies, [*calls]
+        self._stored = [*map(_stored_by, self._calls)]  # before the work, which may change it
+        self._of_t: dict[str, Any] = {}  # numbers that Python computes from the iteration
+        self._t: int | None = None  # the iteration of the replay; None: that of the recording
 
         def gathered() -> tuple[Any, Tensor, Callable[[Tensor], dict[str, Number]]]:
             made, numbers = work()
@@ -64,19 +62,19 @@ class RecordedWork(Recorded[G, T]):
                 super().__init__(Recording(device, gathered), write)
         finally:
             for s in self._strategies:
-                s.logs.clear()  # of the recording's tensors
+                s.logs.clear()  # they hold tensors of the recording
 
     def holds_at(self, t: int) -> bool:
         self._t = t
-        return self._stored == [*map(_stored_by, self._asked)] and super().holds_at(t)
+        return self._stored == [*map(_stored_by, self._calls)] and super().holds_at(t)
 
-    def replay(self, given: G) -> bool:
-        self._write(given)
+    def replay(self, inputs: In) -> bool:
+        self._write(inputs)
         with self._work_log.stage("replayed"):
             return self._recording.replay()
 
-    def outcome(self, given: G) -> T:
-        """What the work has made. The strategies have then logged what the work logs."""
+    def outcome(self, inputs: In) -> T:
+        """The result of the last replay. The strategies' logs are those of the work afterwards."""
         made, numbers, row_of = self._recording.result
         row: dict[str, Number] = row_of(numbers.clone()) | {name: x.at(self._t) for name, x in self._of_t.items()}
         for k, (name, reason, count) in enumerate(self._skips):
@@ -86,17 +84,17 @@ class RecordedWork(Recorded[G, T]):
             )
         for k, (s, name) in enumerate(self._logged):
             s.logs[name] = row.pop(f"log {k}")
-        return self._outcome(given, made, row)
+        return self._outcome(inputs, made, row)
 
 
-def that_merge(conductor: Conductor) -> Iterator[Strategy]:
-    """The strategies that a merge asks."""
+def merging_strategies(conductor: Conductor) -> Iterator[Strategy]:
+    """The strategies that a merge calls."""
     return (s for s in conductor.strategies if any(overrides(s, h) for h in ("reconcile", "correct", "regularize")))
 
 
 def _stored_by(strategy: Strategy) -> Any:
-    """All that the strategy stores beside `state`, to be compared, and the numbers in `state` that the host reads, of which a
-    replay would repeat what they were. Another tensor that is written in place stays the same.
+    """All that a strategy stores apart from `state`, in a form that `==` compares, and the CPU numbers in `state`, which a replay
+    would repeat. A tensor that is written in place stays equal to itself.
     """
     of_host = [x.item() for x in strategy.state.values() if x.dim() == 0 and not can_record(x.device)]
     return of_host + [_comparable(x) for name, x in vars(strategy).items() if name not in ("state", "logs")]
@@ -109,16 +107,20 @@ def _comparable(x: Any) -> Any:
         return [*map(_comparable, x)]
     if type(x) in (bool, int, float, str):
         return x
-    return id(x), x, _comparable(getattr(x, "__dict__", None) or ())  # with x itself, so that its id is nobody else's
+    return (
+        id(x),
+        x,
+        _comparable(getattr(x, "__dict__", None) or ()),
+    )  # x is kept alive, so that no other object gets its id
 
 
 def replays_on(device: torch.device, work_log: WorkLog, name: str) -> Replays | None:
-    """`Replays` whose live work the log counts, under `LIVE`; None where work on the device cannot be recorded."""
+    """`Replays` whose live work the work log counts as `LIVE`; None if work on the device cannot be recorded."""
     return Replays(device, name, partial(work_log.skip, LIVE)) if can_record(device) else None
 
 
-def why_strategies_are_not_recorded(conductor: Conductor) -> Iterator[str]:
-    """The strategies that depend on a view by more than they state, as reasons."""
+def why_not_recorded(conductor: Conductor) -> Iterator[str]:
+    """A reason for each strategy that may depend on more of the view than it states."""
     for strategy in conductor.strategies:
         if any(overrides(strategy, hook) for hook in ("observe", "route", "score")) and not describes(
             strategy, "looked_up"

@@ -29,13 +29,13 @@ from clear_strategies.signals import Interrupted, deferred_signals, foremost
 from clear_strategies.training import checkpoint
 from clear_strategies.training.clock import Clock
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
-from clear_strategies.training.replayed_iteration import GivenExtra, GivenView, learned, replays_for
+from clear_strategies.training.replayed_iteration import ExtraViewInputs, ViewInputs, replays_for, run_or_replay
 from clear_strategies.training.state import TrainState
 from rasterizers import native
 from rasterizers.interface import Camera, Color, Rasterizer, over
 
 EXTRA_LOSS: Final = "loss_extra"
-"""The column of the history: the LR loss of the iteration's last extra view."""
+"""The history's column with the LR loss of the iteration's last extra view."""
 
 
 def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
@@ -48,7 +48,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
     hr_due = conductor.wants_hr(t) and (needs_hr or not conductor.skips.leaves_out_hr(t, conductor.work_log))
     scales = {"lr": conductor.wants_lr and conductor.skips.lr_due(view, hr_due, conductor.work_log), "hr": hr_due}
     z, background = conductor.gate(t, len(θ)), conductor.background(t)  # zᵗ             Eq. 15       SVS
-    u, row = learned(s, rasterizer, GivenView(t, view, scales, z, background), learn)
+    u, row = run_or_replay(s, rasterizer, ViewInputs(t, view, scales, z, background), learn)
     conductor.draw(t, θ.means.data, partial(enlarged, s, rasterizer, background))
     extra = extra_steps(s, rasterizer, conductor.extra_views(t), background)
     conductor.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS
@@ -64,20 +64,20 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
     s.advance()
 
 
-def learn(s: TrainState, rasterizer: Rasterizer, given: GivenView) -> tuple[Update, dict[str, Number]]:
+def learn(s: TrainState, rasterizer: Rasterizer, inputs: ViewInputs) -> tuple[Update, dict[str, Number]]:
     """What an iteration does with its view: render, compare, step on the merged gradient, and accumulate statistics.
 
-    It can be recorded, see `replays_for`: then nothing here reads a number from the device.
+    `replayed_iteration` may record it, so nothing here may read a number from the device.
     """
-    t, view, θ, conductor, stage = given.t, given.view, s.field, s.conductor, s.conductor.work_log.stage
-    with stage(f"render {' + '.join(scale.upper() for scale, wanted in given.scales.items() if wanted)}"):
+    t, view, θ, conductor, stage = inputs.t, inputs.view, s.field, s.conductor, s.conductor.work_log.stage
+    with stage(f"render {' + '.join(scale.upper() for scale, wanted in inputs.scales.items() if wanted)}"):
         lr, hr = θ.render_scales(  # Î_LR, Î_HR     Eq. 2, 3
-            over(rasterizer, given.background), view, gate=given.gate, **given.scales
+            over(rasterizer, inputs.background), view, gate=inputs.gate, **inputs.scales
         )
     params = θ.raw()
     scored = s.density.collects(t)
-    u = conductor.update(params, lr, hr, view, t, s.compiled_step, scored=scored, looked_up=given.looked_up)
-    if u.grads is not None:  # else the compiled step has made the step
+    u = conductor.update(params, lr, hr, view, t, s.compiled_step, scored=scored, looked_up=inputs.looked_up)
+    if u.grads is not None:  # otherwise the compiled step has updated the parameters
         with stage("optimizer"):
             s.optimizer.step(params, u.grads)
             θ.constrain()
@@ -85,7 +85,7 @@ def learn(s: TrainState, rasterizer: Rasterizer, given: GivenView) -> tuple[Upda
     if scored:
         s.density.accumulate(u, finest, t)  # S^dens         Eq. 14
     low = images.area_mean(finest.image, view.factor) if lr is None else lr.image
-    photo = view.lr.over(given.background, view.background)
+    photo = view.lr.over(inputs.background, view.background)
     row: dict[str, Number] = {"psnr_train_lr": psnr_of(low, photo.image, photo.shown)}
     row |= {f"loss_{name}": value for name, value in u.losses.items()}
     return u, row | conflict_columns(u.conflict)
@@ -104,7 +104,7 @@ def _order_of_views(seed: int, epoch: int, n: int) -> list[int]:
 
 
 def enlarged(s: TrainState, rasterizer: Rasterizer, background: Color | None, camera: Camera, factor: int) -> Photo:
-    """What the field shows, see `Strategy.draw`."""
+    """A render of the field, enlarged; see `Strategy.draw`."""
     with s.conductor.work_log.stage("pictures drawn"):
         image = s.field.render(over(rasterizer, background), camera, detail=False)
         network = network_of(s.conductor.sr) or Bicubic()
@@ -115,8 +115,7 @@ def enlarged(s: TrainState, rasterizer: Rasterizer, background: Color | None, ca
 def extra_steps(
     s: TrainState, rasterizer: Rasterizer, extra_views: Sequence[ExtraView], background: Color | None = None
 ) -> dict[str, Number]:  # fmt: skip
-    """One step of the optimizer on the LR loss of each extra view: a picture that a strategy wants the field to match besides
-    the iteration's own view.
+    """One step of the optimizer on the LR loss of each extra view, a picture that a strategy adds to the iteration's own view.
 
     Args:
         background: behind everything that is drawn; None: the rasterizer's.
@@ -125,26 +124,26 @@ def extra_steps(
         The column `EXTRA_LOSS` of the history; nothing without extra views.
 
     Raises:
-        DivergedError: a loss or a gradient is not finite; that step was not made.
+        DivergedError: a loss or a gradient is not finite; its step is not made.
     """
     row: dict[str, Number] = {}
     for extra in extra_views:
         steps = s.optimizer.steps
-        row |= learned(s, rasterizer, GivenExtra(s.t, extra, background), learn_extra)[1]
+        row |= run_or_replay(s, rasterizer, ExtraViewInputs(s.t, extra, background), learn_extra)[1]
         s.optimizer.steps = steps  # the learning rates follow the iteration
     return row
 
 
-def learn_extra(s: TrainState, rasterizer: Rasterizer, given: GivenExtra) -> tuple[None, dict[str, Number]]:
-    """What an iteration does with an extra view. It can be recorded as `learn`."""
-    θ, extra, where = s.field, given.view, f"t={given.t}, an extra view"
+def learn_extra(s: TrainState, rasterizer: Rasterizer, inputs: ExtraViewInputs) -> tuple[None, dict[str, Number]]:
+    """What an iteration does with an extra view. It may be recorded, like `learn`."""
+    θ, extra, where = s.field, inputs.view, f"t={inputs.t}, an extra view"
     with s.conductor.work_log.stage("extra views"):
-        shot = θ.shot(over(rasterizer, given.background), extra.photo.camera)
-        losses = s.conductor.extra_loss(shot.image, extra, given.t)
+        shot = θ.shot(over(rasterizer, inputs.background), extra.photo.camera)
+        losses = s.conductor.extra_loss(shot.image, extra, inputs.t)
         if s.compiled_step is not None:
             (g,) = s.compiled_step.vjp(shot, losses.cotangents)
             require_finite_parts(where, g, None)
-            s.compiled_step.step_extra(θ.raw(), shot, g, given.t)
+            s.compiled_step.step_extra(θ.raw(), shot, g, inputs.t)
         else:
             (grads,) = shot.vjp(losses.cotangents)
             require_finite(f"{where}: the gradient", grads)
@@ -200,9 +199,9 @@ def fit(
     Raises:
         Interrupted: after a signal, once the step is done and saved.
         DivergedError: a loss, a gradient or a parameter became NaN or infinite.
-        AnswerError: a strategy answers a hook with what that hook must not give.
+        AnswerError: a strategy's answer to a hook is not valid.
 
-    After any error the state before the iteration is saved, unless the optimizer has made its step.
+    After any error, the state before the iteration is saved, unless the optimizer has already stepped.
     """
     settings = state.settings
 
@@ -226,14 +225,14 @@ def fit(
                 if checkpoints is not None and state.optimizer.steps != steps:
                     where = " Its step was made, so that its state is not saved."
                 elif checkpoints is not None:
-                    with suppress(Exception):  # the first error is the one to tell
+                    with suppress(Exception):  # the first error is reported
                         where = f" The state before that step is {save()}; fit.resume goes on from it."
                 if isinstance(error, AnswerError):
                     raise AnswerError(f"t={done}: {error}{where}") from error
                 if isinstance(error, DivergedError):
                     remedy = "Check that view's photos, or lower the learning rates."
                     raise DivergedError(f"{error}{where} {remedy}") from error
-                error.add_note(f"This was in iteration t={done}.{where}")  # of a strategy's own code, or of a device
+                error.add_note(f"This was in iteration t={done}.{where}")  # e.g. of a strategy's own code
                 raise
             ended = state.ended
             state.history[-1].update(clock.read())

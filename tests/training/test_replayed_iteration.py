@@ -28,7 +28,7 @@ from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from rasterizers import replays
 from rasterizers.recording import Recording, running
-from rasterizers.replays import Kind, Replays
+from rasterizers.replays import GraphKey, Replays
 from tests.helpers.backends import needs
 from tests.helpers.short_run import SCENE, tensors, with_depth
 from tests.training.test_resume import without_time
@@ -245,7 +245,7 @@ def test_where_lists_are_too_short_the_iteration_is_live_and_recorded_anew():
 
 
 def test_kinds_beyond_the_most_are_live_and_counted(monkeypatch):
-    monkeypatch.setattr(replays, "_MOST_KINDS", 1)
+    monkeypatch.setattr(replays, "_MOST_RECORDINGS", 1)
     replayed = both(lambda: start(density=False, degree_every=6), 9)
     assert live_in(replayed) == {FIRST: 1, "more than 1 kinds": 8}
 
@@ -257,9 +257,9 @@ def test_recordings_of_an_earlier_structure_are_dropped():
         made.append(SimpleNamespace(holds_at=lambda t: True, replay=lambda _: True, outcome=lambda _: "replayed"))
         return made[-1]
 
-    for address in range(2 * replays._MOST_KINDS):
-        kind = Kind((address,), (), ())
-        found = [kept.do(kind, 1, None, live=lambda: "live", record=recorded) for _ in range(3)]
+    for address in range(2 * replays._MOST_RECORDINGS):
+        key = GraphKey((address,), (), ())
+        found = [kept.do(key, 1, None, live=lambda: "live", record=recorded) for _ in range(3)]
         assert found == ["replayed" if address else "live", "replayed", "replayed"]
         assert len(made) == address + 1
 
@@ -283,7 +283,7 @@ def test_work_is_recorded_anew_as_long_as_recordings_pay_off(lasts, pays):
                 holds_at=lambda now: now // lasts == t // lasts, replay=lambda _: True, outcome=lambda _: "replayed"
             )
 
-        return kept.do(Kind((), (), ()), t, None, live=lambda: "live", record=record)
+        return kept.do(GraphKey((), (), ()), t, None, live=lambda: "live", record=record)
 
     found = [do(t) for t in range(240)]
     assert found[1] == "replayed"
@@ -292,7 +292,7 @@ def test_work_is_recorded_anew_as_long_as_recordings_pay_off(lasts, pays):
 
 def test_memory_that_is_new_in_each_iteration_is_told_and_not_recorded(caplog):
     kept = Replays(DEVICE, "")
-    found = [kept.do(Kind((k,), (), ()), k, None, live=lambda: "live", record=fails) for k in range(30)]
+    found = [kept.do(GraphKey((k,), (), ()), k, None, live=lambda: "live", record=fails) for k in range(30)]
     assert set(found) == {"live"}
     assert caplog.text.count("Write to Strategy.state in place") == 1
 
