@@ -1,4 +1,4 @@
-"""What a host's log says of the strategies when they are attached, and at the end of a loop in which HR took no part."""
+"""What a host's log says about the strategies when they are attached, and at the end of a loop without HR."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _STRETCH: Final = "Make the conductor for the length of the loop: conductor(…,
 
 
 def announce(conductor: Conductor, views: Sequence[View], *, own_background: bool, iterations: int | None) -> None:
-    """Log what each strategy will do, and which have no effect. After `on_fit_start`.
+    """After `on_fit_start`, log what each strategy will do, and which have no effect.
 
     Args:
-        own_background: the host chooses its background by itself. iterations: of the loop, where they are known.
+        own_background, iterations: see `Attachment`.
     """
     if (first := _first_hr(conductor)) is not None:
         _log.info("HR takes part from step %d on (objective.lambda_hr.start).", first)
@@ -49,7 +49,11 @@ def announce(conductor: Conductor, views: Sequence[View], *, own_background: boo
 
 
 def warn_without_hr(conductor: Conductor, counts: Mapping[str, int]) -> None:
-    """At the end of a loop. `counts` are those of its `Attachment`."""
+    """At the end of a loop, warn if HR took no part in it.
+
+    Args:
+        counts: `Attachment.counts`.
+    """
     first = _first_hr(conductor)
     if first is not None and 0 < counts["merges"] < first and not counts["HR renders"]:
         _log.warning(

@@ -4,12 +4,12 @@ One training iteration:
 
 1. The host renders. The gate zᵗ is sampled, Î_HR is rendered and its gradients are taken. Each extra view is rendered and
    its gradient is taken. Then Î_LR is rendered with the same zᵗ and the same random numbers, and returned to the host.
-2. The host calls `backward()` on its own loss, whatever it is: that is the LR side. When this pass ends, `.grad` of every
-   parameter becomes the merged gradient. If a strategy has a densification score, the tensor that the densifier reads
-   holds it; otherwise the densifier's statistic stays the host's own.
+2. The host calls `backward()` on its own loss, which is the LR side. When this pass ends, `.grad` of every parameter becomes
+   the merged gradient. If a strategy has a densification score, it is written to the tensor that the densifier reads;
+   otherwise the densifier's statistic stays the host's own.
 3. Gradient clipping, unscaling, the optimizer step and densification are the host's, in any order.
 4. After the host's optimizer has stepped, it steps once more on the gradient of each extra view. Once all optimizers have
-   stepped, the strategies do what they do after a step.
+   stepped, `after_step` of the strategies is called.
 
 HR and extra views are in hr_drawing.py, what waits for `backward()` in pending.py, the merge in host_merge.py, the optimizers'
 steps in host_steps.py, changes of the structure in structure.py, and the first lines of the log in announcement.py.
@@ -63,24 +63,24 @@ class Attachment:
             iteration, since densifiers replace parameters.
         views: all training views. seed: of the strategies.
         poll_parents: called at every iteration. It returns parents[M] if the structure has changed since its last call (row i of
-            every parameter now comes from row parents[i], or from none where that is -1); None: it has not, or the host does
-            not say how.
-        remedy: what to do in this host about Gaussians that come from no other, where strategies store something of each.
-        restart_parents: called where the host has loaded other parameters, which come from no earlier ones.
+            every parameter now comes from row parents[i], or from none if that is -1); None: it has not, or the host does not
+            say how.
+        remedy: for the error if strategies store something per Gaussian, but some Gaussians come from no other.
+        restart_parents: called after the host has loaded other parameters, which come from no earlier ones.
         threshold: the host's densification threshold on the mean ‖∇_u‖ in NDC units; None: the score is not scaled.
         loss_scale: returns the factor of the host's loss (`scaler.get_scale` of an AMP gradient scaler).
         accumulation: backward passes per optimizer step, each of 1/accumulation of the loss.
-        masks: [h, w] by the name of a view, what the host multiplies its LR image by; the HR image is multiplied here.
-        own_background: the host chooses the colour behind its renderings; `background` then counts for nothing.
+        masks: [h, w] by the name of a view, by which the host multiplies its LR image; the HR image is multiplied here.
+        own_background: the host chooses the colour behind its renderings, and `background` has no effect.
         reads_score: the host's densifier reads the screen gradient.
-        iterations: of the loop, where they are known.
+        iterations: of the loop, if they are known.
 
     Attributes:
         t: the current iteration, from 1.
         passes: its backward passes so far.
         counts: how often each kind of work was done.
         removed: whether `remove` was called.
-        undo: what `remove` undoes of an adapter's changes to its host.
+        undo: callbacks of `remove`, by which an adapter undoes its changes to the host.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class Attachment:
             conductor, device, threshold=threshold, loss_scale=loss_scale, accumulation=accumulation, counts=self.counts
         )
         self._step: Step | None = None  # of the rendering, until `after_step`
-        self._has_told_of_accumulation = False
+        self._has_warned_of_accumulation = False
         self._logged: dict[str, deferred.Number | Callable[[], deferred.Number]] = {}
         self._steps = HostSteps(
             is_waiting=lambda: self._pending is not None and self._pending.output is not None,
@@ -128,34 +128,34 @@ class Attachment:
         )  # fmt: skip
         conductor.on_fit_start(len(views), seed, device, views)
         announce(conductor, views, own_background=own_background, iterations=iterations)
-        self._farewell = finalize(self, warn_without_hr, conductor, self.counts)
+        self._finalizer = finalize(self, warn_without_hr, conductor, self.counts)
 
     def render_view(self, view: View, render_at: RenderAt) -> Any:
         """Render a training view at both scales; returns what the host's render function returns at LR.
 
         Raises:
-            HostError: a backward pass is under way.
+            HostError: a backward pass is running.
         """
         if current_pass() >= 0:
             raise HostError(
                 f"{view.name} is rendered inside of a backward pass, as torch.utils.checkpoint does it: HR would be drawn twice, "
                 "and the loss be that of another picture. Checkpoint what comes before the rendering, or after it."
             )
-        self._finish_step()  # where not every optimizer has stepped, or the structure has changed since
+        self._finish_step()  # not every optimizer may have stepped, and the structure may have changed
         conductor, t, params = self.conductor, self.t, {name: p.detach() for name, p in self.params().items()}
         means = params["means"]
         conductor.logs.forget()
         z = conductor.gate(t, self._n)
         if z is not None:
             z = z.to(means)
-        # Torch's random numbers are those before, after HR or an extra view: a dropout of the host drops the same at LR.
+        # HR and extra views leave torch's random numbers as they were, so a dropout of the host drops the same at LR.
         apart = torch.random.fork_rng([means.device] if means.device.type == "cuda" else [])(render_at)
         hr = routed = None
         if self._hr.wanted(t):
             view = conductor.skips.view(view, t)
             hr, routed = self._hr.hr(view, t, z, apart, params)
         self._step = Step(t, view, params=params) if hr is None else hr.step
-        if self.passes == 0:  # one step of the host, however many passes it accumulates
+        if self.passes == 0:  # once per step of the host, however many passes it accumulates
             extra_views = conductor.extra_views(t)
             self._steps.follow_by(self.params(), (self._hr.extra_view(x, view, t, apart) for x in extra_views))
         output = render_at("lr", z, view)
@@ -178,11 +178,11 @@ class Attachment:
         return None if self._own_background else self.conductor.background(self.t)
 
     def hook(self, optimizers: Sequence[torch.optim.Optimizer]) -> None:
-        """Hook the steps of the optimizers that the host now has, and no longer those of earlier ones."""
+        """Hook the steps of these optimizers, and remove the hooks of earlier ones."""
         self._steps.hook(optimizers)
 
     def state_dict(self) -> dict[str, Any]:
-        """The iteration, and what the strategies store per Gaussian, for the host's checkpoint."""
+        """The iteration and the strategies' state, for the host's checkpoint."""
         if not self.removed:
             self._follow_structure(len(self.params()["means"]))  # the host may have densified since it rendered
         return {
@@ -192,7 +192,7 @@ class Attachment:
         }  # fmt: skip
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state; the host has loaded its parameters already."""
+        """Continue from a state, after the host has loaded its parameters."""
         self.t, self.passes = int(state["t"]), int(state["passes"])
         self.conductor.load_state_dict(state["strategies"])
         self._restart_parents()
@@ -205,7 +205,7 @@ class Attachment:
             self._merging.scaler.load_state_dict(state["score"])
 
     def summary(self) -> str:
-        """What was done how often, e.g. for the end of a log."""
+        """How often each kind of work was done, e.g. for the end of a log."""
         return ", ".join(f"{n:,} {what}" for what, n in self.counts.items()) or "nothing was done"
 
     @property
@@ -214,16 +214,16 @@ class Attachment:
         return deferred.resolve([{name: x() if callable(x) else x for name, x in self._logged.items()}])[0]
 
     def remove(self) -> None:
-        """Restore the host: its renderings pass through, and the gradients of one that is still pending stay unmerged."""
+        """Restore the host: its renderings pass through, and the gradients of a pending one are not merged."""
         self.removed, self._pending, self._pass = True, None, None
         self.hook([])
         self._steps.follow_by({}, [])
         self.conductor.on_fit_end()
-        self._farewell()
+        self._finalizer()
         self.undo.close()
 
     def _step_begins(self, has_merged: bool) -> None:
-        """Refuse a first step in which no strategy takes part, and tell of a later one."""
+        """Raise an error if no strategy takes part in the host's first step; warn of a later one."""
         if has_merged:
             self._merging.fading.before_step()
             return
@@ -241,17 +241,17 @@ class Attachment:
             )  # fmt: skip
 
     def _after_optimizer(self) -> None:
-        """Once all optimizers have stepped, the strategies do what they do after a step: what the loop computes of the parameters
-        from then on, before it renders, is of what they have left. In the iteration in which densification ends they wait for the
-        next rendering, since a host may densify in it, and an anchor is taken after that.
+        """Finish the step once all optimizers have stepped: strategies may change parameters in place, and the loop may compute
+        with them before it renders again. The iteration in which densification ends is finished at the next rendering, since
+        the host may still densify in it, and an anchor is taken after that.
         """
         may_densify = self.conductor.may_densify
         if self._steps.is_complete and may_densify(self.t) == may_densify(max(1, self.t - 1)):
             self._finish_step()
 
     def _finish_step(self) -> None:
-        """Call `on_resize` and `after_step`, now that the host has stepped and perhaps densified. Passes whose gradients the loop
-        has dropped before it stepped, e.g. after an error, are of no iteration.
+        """Call `on_resize` and `after_step`, after the host has stepped and perhaps densified. Passes whose gradients the loop
+        dropped before a step, e.g. after an error, do not count.
         """
         params = self.params()
         self._follow_structure(len(params["means"]))
@@ -262,13 +262,13 @@ class Attachment:
             if self._step is not None:
                 self.conductor.after_step({name: _to_change(p) for name, p in params.items()}, self._step)
             self.t += 1
-        gradients = (p.grad for name, p in params.items() if name != "detail")  # which the host may know nothing of
+        gradients = (p.grad for name, p in params.items() if name != "detail")  # which the host may not zero
         if has_stepped or not any(g is not None and bool(g.any()) for g in gradients):
             self.passes = 0
             self._merging.fading.forget()
 
     def _follow_structure(self, n: int) -> None:
-        """The host has N Gaussians now."""
+        """Tell the strategies about a change of structure, if there was one; the host has n Gaussians now."""
         parents = self._poll_parents()
         if parents is not None or n != self._n:
             self._step = resized(self.conductor, self._step, self._n, n, parents, self._remedy)
@@ -276,7 +276,7 @@ class Attachment:
             self.counts["structure changes"] += 1
 
     def _reached(self, nth: int) -> TakeColours | None:
-        """A backward pass of the host has reached the nth rendering, but no parameter yet."""
+        """Called when a backward pass of the host has reached the nth rendering, but no parameter yet."""
         if self.removed or self._pending is None:
             return None
         if self._pass is None or self._pass.task != current_pass():
@@ -287,9 +287,9 @@ class Attachment:
 
     @torch.no_grad()
     def _on_backward_end(self, done: BackwardPass) -> None:
-        """A backward pass of the host has ended: replace the gradients that it has brought by the merged ones.
+        """At the end of a backward pass of the host, replace the gradients that it added by the merged ones.
 
-        A pass that leaves every `.grad` as it was (`torch.autograd.grad`) asks for something else.
+        A pass that leaves every `.grad` as it was (`torch.autograd.grad`) is ignored.
         """
         pending, self._pass = self._pending, None
         trained = {name for name, p in done.params.items() if p.requires_grad and name != "detail"}
@@ -324,14 +324,14 @@ class Attachment:
             _log.info("t=%d: %s, lambda_HR %.3f, %s Gaussians.", self.t, losses_now, λ, f"{self._n:,}")
 
     def _warn_of_accumulation(self, before: Sequence[Tensor]) -> None:
-        """Tell once that a step sums more passes than `accumulation` names.
+        """Warn once if a step sums more passes than `accumulation` names.
 
         Args:
-            before: the gradients to which the first of `accumulation` passes has added.
+            before: `.grad` before the first pass of a step.
         """
-        if self._has_told_of_accumulation or self.counts["merges"] == 1 or not any(bool(g.any()) for g in before):
+        if self._has_warned_of_accumulation or self.counts["merges"] == 1 or not any(bool(g.any()) for g in before):
             return
-        self._has_told_of_accumulation = True
+        self._has_warned_of_accumulation = True
         _log.warning(
             "%d backward passes over training views add to the same gradients, without an optimizer step between them, but "
             "accumulation=%d: HR weighs too much, and the schedules of the strategies end too early. Pass accumulation=n, the "
@@ -341,14 +341,14 @@ class Attachment:
 
 
 def _to_change(p: Tensor) -> Tensor:
-    """What a strategy may change in place: a copy, where the host has frozen the parameter. What a loop has computed of it before
-    it renders stays valid for autograd.
+    """A parameter that strategies may change in place without a change of version, since the loop may have computed with it
+    before it renders; a copy if the host has frozen it.
     """
     return p.data if p.requires_grad else p.detach().clone()
 
 
 def _rows_of(step: Step | None) -> dict[str, Tensor]:
-    """What a step holds per Gaussian, for a checkpoint."""
+    """The tensors per Gaussian of a step, for a checkpoint."""
     if step is None:
         return {}
     e, visible = step.evidence, {} if step.visible is None else {"visible": step.visible}
@@ -356,7 +356,7 @@ def _rows_of(step: Step | None) -> dict[str, Tensor]:
 
 
 def _require_supported(conductor: Conductor, accumulation: int) -> None:
-    """Raise a SettingError for what no host can do."""
+    """Raise a SettingError for settings that no host supports."""
     require_whole("accumulation", accumulation, least=1)
     if not conductor.wants_lr:
         raise SettingError(

@@ -1,4 +1,4 @@
-"""What a host renders, as a `Shot`: gradients come through the host's own autograd graph."""
+"""A host's rendering as a `Shot`, whose gradients pass through the host's own autograd graph."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from rasterizers.autograd import Drawing, Rendered, outer
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, summed_vjp
 
-_GOLDEN: Final = 0.6180339887498949  # multiples of it modulo 1 lie far apart for rows that are close
-_SAME_CODE: Final = 0.1  # what else a row depends on, e.g. the mean of all, changes the ratio of its gradients a little
+_GOLDEN: Final = 0.6180339887498949  # its multiples modulo 1 differ most for neighbouring rows
+_SAME_CODE: Final = 0.1  # tolerance of the ratio of a row's gradients, which e.g. the mean of all rows changes a little
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,9 +75,9 @@ class ScreenGradientSlot:
 class AutogradShot:
     """A rendering by a host, differentiable by autograd.
 
-    Gradients are taken in two parts: from the image to what the rasterizer was given, which costs a backward pass of the
-    rasterizer, and from there through the host's activations to the raw parameters. Since both parts are linear and each Gaussian
-    is activated by itself, cotangents are weighted by Gaussian between the two, and the second is passed once.
+    Gradients are taken in two parts: from the image to the rasterizer's inputs, by a backward pass of the rasterizer, and from
+    there through the host's activations to the raw parameters. Both parts are linear, and each Gaussian is activated by itself,
+    so gradients can be weighted by Gaussian between the two, and the second part is computed once.
 
     Args:
         image: a function of `params` and of the tensor that holds the screen gradient.
@@ -85,10 +85,9 @@ class AutogradShot:
         visible: Gaussians that contribute to the image.
         params: raw parameters by gsplat's names. A parameter that the image does not depend on has gradient 0.
         slot: where the host keeps the screen gradient; None: the image is a function of `means2d` itself.
-        drawn: means, quats, scales, opacities and colors that the rasterizer was given, none of them with a hook; None: the raw
-            parameters.
-        drawings: by this package's rasterizers, for this image; a single one takes all cotangents in one pass.
-        mask: the image is a drawing that no graph holds, times this.
+        drawn: the rasterizer's means, quats, scales, opacities and colors, none of them with a hook; None: the raw parameters.
+        drawings: of this image by this package's rasterizers; a single one takes all cotangents in one pass.
+        mask: the image is a drawing outside of any graph, times this mask.
     """
 
     image: Float[Tensor, "H W 3"]
@@ -102,12 +101,12 @@ class AutogradShot:
 
     @property
     def drawing(self) -> Drawing | None:
-        """The only one of `drawings`; None: another rasterizer drew the image, or it was put together of several."""
+        """The only one of `drawings`; None: another rasterizer drew the image, or it is composed of several drawings."""
         return self.drawings[0] if len(self.drawings) == 1 else None
 
     @property
     def is_in_order(self) -> bool:
-        """Whether the rasterizer was given the rows in the order of the parameters, see `are_in_order`."""
+        """Whether the rasterizer's rows are in the order of the parameters, see `are_in_order`."""
         drawn = self.drawn if self.drawing is None else self.drawing.inputs
         return drawn is None or are_in_order(drawn, self.params)
 
@@ -126,8 +125,8 @@ class AutogradShot:
     def gradients(
         self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
     ) -> list[Grads]:  # fmt: skip
-        """The first part, for every cotangent: by the names of `drawn`; of this package's rasterizers means, quats, scales,
-        opacities, and the colours by their factors. With `weight` as `core.gradients.summed` makes them.
+        """The first part for every cotangent, by the names of `drawn`; for this package's rasterizers the colours' gradient is
+        factors. With `weight`, the result of `core.gradients.summed`.
         """
         if self.drawing is not None:
             return gradients_of(summed_vjp(self.drawing.rendering, self._at_drawing(cotangents), weight))
@@ -163,7 +162,7 @@ class AutogradShot:
             return to_parameters(g, self.drawing.inputs, self.params)
         if self.drawn is not None:
             return to_parameters(g, self.drawn, self.params)
-        return Grads({name: g[name] for name in _trained(self.params)})  # with what their hooks have done to it
+        return Grads({name: g[name] for name in _trained(self.params)})  # which hooks may have changed
 
     def _detail(self, g: Grads) -> Grads:
         """The gradient of f_det, which is that of the colour."""
@@ -175,21 +174,20 @@ class AutogradShot:
         return Grads() if found is None else Grads({"detail": found})
 
     def _at_drawing(self, cotangents: Float[Tensor, "K H W 3"]) -> Float[Tensor, "K H W 3"]:
-        """The cotangents of what the rasterizer drew; the host may have changed it into `image`."""
+        """The cotangents of the rasterizer's image, from which the host may have computed `image`."""
         if self.mask is not None:
             return cotangents * self.mask
         image, drawn = self.image, self.drawing.image  # type: ignore[union-attr]
         if image.data_ptr() == drawn.data_ptr() and image.shape == drawn.shape and image.stride() == drawn.stride():
-            return cotangents  # a view of all of it
+            return cotangents  # `image` is the whole of it
         return torch.stack([torch.autograd.grad(image, drawn, c, retain_graph=True)[0] for c in cotangents])
 
 
 def to_parameters(g: Grads, drawn: Mapping[str, Tensor], params: Mapping[str, Tensor]) -> Grads:
-    """From the gradients of what was drawn to those of the raw parameters, without f_det, through the host's own graph.
+    """The gradients of the raw parameters, without f_det, from those of the drawn tensors, through the host's own graph.
 
     Args:
-        g: by the names of `drawn`, the colours by their factors where this package drew them. Those of sh0 and shN stay factors
-            where `are_joined`.
+        g: by the names of `drawn`; the colours' gradient as factors if this package drew them. It stays so if `are_joined`.
     """
     raw, colour = _trained(params), None
     if g.colour is not None:
@@ -210,17 +208,17 @@ def to_parameters(g: Grads, drawn: Mapping[str, Tensor], params: Mapping[str, Te
 
 
 def every_number(g: Grads, params: Mapping[str, Tensor]) -> Grads:
-    """The same with a number for each of the parameters; 0 where there is no gradient."""
+    """The gradients of all parameters in full; 0 for one without a gradient."""
     known = dense(g, params)
     return Grads({name: torch.zeros_like(p) for name, p in params.items() if name not in known} | known)
 
 
 def are_in_order(drawn: Mapping[str, Tensor], params: Mapping[str, Tensor]) -> bool:
-    """Whether row i of what was drawn is made of row i of the parameters.
+    """Whether row i of the drawn tensors is computed from row i of the parameters.
 
-    Rows that pass through unchanged are the memory of the parameter. Others are asked by two cotangents, of which row i is 1 and
-    c_i. A parameter's rows in their order have gradients g and c_i g, in another order g and c_j g. Without any gradient,
-    positions are compared.
+    A tensor with the parameter's memory is. Any other is tested by two cotangents, whose rows i are 1 and c_i: in the same order,
+    the gradients of the parameter's row i are g and c_i g, otherwise g and c_j g. If no tensor has a gradient, positions are
+    compared.
     """
     asked = list[tuple[Tensor, Tensor]]()
     for name in ("opacities", "scales", "means", "quats", "colors"):
@@ -260,7 +258,7 @@ def _trained(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 class Graph(NamedTuple):
-    """What a tensor was computed from: the leaves, and the cameras by which this package's rasterizers drew."""
+    """The leaves that a tensor was computed from, and the cameras of drawings by this package's rasterizers."""
 
     leaves: list[Tensor]
     cameras: list[Camera]
@@ -282,17 +280,17 @@ def graph_of(x: Tensor) -> Graph:
 
 
 Target = Literal["lr", "hr"] | Camera
-"""What a host draws: the view of this iteration at one of its sizes, or what a camera without a photo sees."""
+"""What a host renders: the view of this iteration at LR or HR, or the scene from another camera."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HostOutput:
-    """What a host's render function returned, as its adapter passes it to an `Attachment`.
+    """The result of a host's render function, as its adapter passes it to an `Attachment`.
 
     Args:
-        marks: tensors whose gradient comes in every backward pass over the rendering, before that of any parameter; a drawing by
-            this package's rasterizers needs none. The host must not change them in place.
-        returned: what the host's own render function returns.
+        marks: tensors that every backward pass over the rendering reaches before any parameter; a drawing by this package's
+            rasterizers needs none. The host must not change them in place.
+        returned: the return value of the host's render function.
     """
 
     shot: AutogradShot

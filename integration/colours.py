@@ -1,17 +1,17 @@
-"""Where the gradient of the colours takes the short way: as factors Y ⊗ ∇rgb, in place of a tensor as wide as the colours.
+"""When the gradient of the colours may stay the factors Y ⊗ ∇rgb, instead of a tensor as wide as the colours.
 
-The rule. In a backward pass, factors are taken only where
+In a backward pass, all of these conditions must hold:
     1. the pass has queued the merge of the rendering that it has reached,
-    2. it adds to `.grad` of the leaves sh0 and shN, both, and
-    3. every node between the drawing and these leaves is known to pass the gradient on unchanged: the tensor that was drawn is
-       `cat((sh0, shN), 1)` of the leaves themselves, and no hook looks at it, at sh0 or at shN.
-Any other gradient goes the way that autograd gives it, whole. So an offset, a sum, a cast, a scale or a view on the way needs no
-thought here: it makes another node, and the rule does not hold. `Attachment` knows 1. All are asked when the pass has reached the
-drawing, since a loop may freeze, hook or replace what it likes before.
+    2. it adds to `.grad` of both leaves, sh0 and shN, and
+    3. every node between the drawing and these leaves passes the gradient on unchanged: the drawn tensor is
+       `cat((sh0, shN), 1)` of the leaves themselves, and neither it nor sh0 nor shN has a hook.
+Any other gradient takes autograd's path, in full. An offset, a sum, a cast, a scale or a view between the two makes another node,
+so condition 3 does not hold. `Attachment` checks condition 1. All are checked when the pass has reached the drawing, since until
+then a loop may freeze, hook or replace tensors.
 
-The gradient of HR is taken by part 3 alone: its pass is this package's own.
+The gradient of HR needs only condition 3, since its backward pass is this package's own.
 
-Torch shows no hooks of nodes (`tensor.grad_fn.register_hook`); such a hook on the `cat` or on a leaf's node is not called.
+Torch does not list hooks of nodes (`tensor.grad_fn.register_hook`); such a hook on the `cat` or on a leaf's node is not called.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ _JOINS: Final = "CatBackward0"
 
 
 def are_joined(colors: Tensor, params: Mapping[str, Tensor]) -> bool:
-    """Part 3: whether the gradient of `colors` is that of the leaves sh0 and shN side by side, and nobody looks at it."""
+    """Condition 3: whether the gradient of `colors` is that of the leaves sh0 and shN side by side, without any hook."""
     leaves = [params[name] for name in ("sh0", "shN") if name in params]
     node: Any = colors.grad_fn
-    if node is None or node.name() != _JOINS:  # of their shapes, only along the bands
+    if node is None or node.name() != _JOINS:  # with these shapes, it can only join bands
         return False
     if len(leaves) != 2 or any(not p.requires_grad or p.dtype != colors.dtype for p in leaves):
         return False
@@ -39,15 +39,15 @@ def are_joined(colors: Tensor, params: Mapping[str, Tensor]) -> bool:
 
 
 def are_accumulated(params: Mapping[str, Tensor]) -> bool:
-    """Part 2: whether the backward pass under way adds to `.grad` of sh0 and shN."""
+    """Condition 2: whether the running backward pass adds to `.grad` of sh0 and shN."""
     try:
         return all(torch._C._will_engine_execute_node(_accumulator(params[name])) for name in ("sh0", "shN"))
-    except RuntimeError:  # what torch does in a pass of `torch.autograd.grad` for one of them
+    except RuntimeError:  # raised in a pass of `torch.autograd.grad` for one of them
         return False
 
 
 def is_hooked(x: Tensor) -> bool:
-    """Whether a hook looks at the gradient of a tensor, and may change it."""
+    """Whether the gradient of a tensor has a hook, which may change it."""
     return bool(x._backward_hooks or getattr(x, "_post_accumulate_grad_hooks", None))
 
 

@@ -1,4 +1,4 @@
-"""What strategies change about a host's densification: its end (SVS: anchor_start), and the score that it reads.  Eq. 14"""
+"""How strategies change a host's densification: its end (SVS: anchor_start), and the score that it reads.  Eq. 14"""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from clear_strategies.merging.conductor import Conductor
 from integration.autograd_shot import ScreenGradientSlot
 
 _log = logging.getLogger(__name__)
-_VIEWS_PER_FIT: Final = 10  # sorting N scores at every view would cost more than a fresher factor gains
+_VIEWS_PER_FIT: Final = 10  # sorting N scores at every view would cost more than a newer factor gains
 
 
 def end_with_strategies(conductor: Conductor, settings: Any, name: str, first: int = 1) -> None:
-    """Lower `settings.<name>`, from which on the host no longer densifies, to the iteration at which a strategy ends it.
+    """Lower `settings.<name>`, the iteration at which the host stops densifying, to that at which a strategy ends densification.
 
     Args:
-        settings: an object of the host that its loop reads at every iteration; without such a field nothing is done.
+        settings: an object of the host that its loop reads at every iteration; without this field, nothing is done.
         first: the host's number of its first iteration, 0 or 1.
     """
     until = getattr(settings, name, None)
@@ -37,10 +37,10 @@ def end_with_strategies(conductor: Conductor, settings: Any, name: str, first: i
 
 
 def require_end(conductor: Conductor, until: int | None, name: str, first: int = 1) -> None:
-    """Refuse, or warn, where the host's densification outlasts the strategies' and cannot be ended from here.
+    """Raise an error, or warn, if the host's densification outlasts the strategies' and cannot be ended from here.
 
     Args:
-        until: the host's setting `name`, from which on it no longer densifies; None: unknown.
+        until: the host's setting `name`, the iteration at which it stops densifying; None: unknown.
 
     Raises:
         SettingError: a strategy takes an anchor before the structure stops changing.
@@ -59,11 +59,11 @@ def require_end(conductor: Conductor, until: int | None, name: str, first: int =
 
 
 def _end_of_densification(conductor: Conductor, until: int, first: int) -> int:
-    """The first iteration, in the host's count, from which on the strategies no longer allow densification; at most `until`.
+    """The iteration, in the host's count, from which on the strategies no longer allow densification; at most `until`.
 
-    Strategies hear of what a host changes in iteration t before `after_step(t)`, as of what this package's trainer changes after
-    iteration t - 1. A host has an end, but cannot be asked at each iteration: it densifies where a strategy forbids it earlier,
-    with a warning.
+    A host's change of structure in iteration t reaches the strategies before `after_step(t)`, like a change after iteration t - 1
+    in this package's trainer. Only the end of a host's densification can be set; a warning names earlier iterations at which a
+    strategy forbids it.
     """
     allowed = [i for i in range(first, until) if conductor.may_densify(max(1, i - first))]
     end = allowed[-1] + 1 if allowed else first
@@ -76,7 +76,7 @@ def _end_of_densification(conductor: Conductor, until: int, first: int) -> int:
 
 
 def _forbidding(conductor: Conductor, t: int) -> str:
-    """The strategies that forbid densification at iteration t, or at the first where t is before it."""
+    """The strategies that forbid densification at iteration t, at least 1."""
     return ", ".join(type(s).__name__ for s in conductor.strategies if not s.may_densify(max(1, t)))
 
 
@@ -91,7 +91,7 @@ class ScoreScaler:
         half_life: number of views after which a view counts half in the means.
 
     Attributes:
-        factor: what the score was last multiplied by.
+        factor: by which the score was last multiplied.
     """
 
     def __init__(self, threshold: float, half_life: int = 100) -> None:
@@ -106,7 +106,7 @@ class ScoreScaler:
     def __call__(
         self, score: Float[Tensor, " N"], ordinary: Float[Tensor, " N"], visible: Bool[Tensor, " N"]
     ) -> Float[Tensor, " N"]:
-        """The scaled score of one view; a changed number of Gaussians starts the means anew."""
+        """The scaled score of one view; a change of the number of Gaussians resets the means."""
         if self._sums is None or self._sums.shape[1] != len(score):
             self._sums, self._views = score.new_zeros(3, len(score)), 0
         self._sums = self._sums.to(score)  # a checkpoint may have been loaded onto another device
@@ -119,7 +119,7 @@ class ScoreScaler:
         return score * self.factor
 
     def state_dict(self) -> dict[str, Any]:
-        """The means so far, to continue from."""
+        """The means so far, for a checkpoint."""
         return {"factor": self.factor, "sums": None if self._sums is None else self._sums.clone(), "views": self._views}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -140,7 +140,7 @@ def score_for_host(
     scaler: ScoreScaler | None,
     loss_scale: float = 1.0,
 ) -> Float[Tensor, " N"] | None:
-    """The values in NDC units that the host's densifier should read; None: those that it has already.
+    """The values in NDC units that the host's densifier should read; None: its own.
 
     Args:
         score, ordinary: from `Conductor.scores`; the same tensor if no strategy has a score.
@@ -148,7 +148,7 @@ def score_for_host(
     """
     absgrad = slot.absgrad(len(score))
     if absgrad is not None:
-        # The host's threshold applies to Σ|∂L/∂u|, so that statistic decides how many Gaussians the score lets pass.
+        # The host's threshold is for Σ|∂L/∂u|, so this statistic decides how many Gaussians pass.
         if score is ordinary:
             return None
         ordinary = screen_norm(to_ndc(absgrad / loss_scale, slot.size))

@@ -1,4 +1,4 @@
-"""The detail feature f_det in hosts, which have no such parameter: its Adam, how it fades, and how it shows in the colours."""
+"""The detail feature f_det in hosts, which have no such parameter: its Adam, its decay, and its offset of the colours."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _PATIENCE: Final = 10  # steps with a gradient of f_det, before a warning that n
 
 
 def detail_adam(detail: torch.nn.Parameter, rates: DetailRates) -> torch.optim.Adam:
-    """An Adam for f_det that steps all Gaussians. A loop may pass it the visible ones, as gsplat's SelectiveAdam takes them: the
-    argument is dropped, since others are visible at HR.
+    """An Adam for f_det that steps all Gaussians. It drops the mask of visible ones that a loop may pass to all optimizers, as to
+    gsplat's SelectiveAdam, since others are visible at HR.
     """
     fused = detail.device.type in ("cpu", "cuda")  # one operation
     adam = torch.optim.Adam([detail], lr=rates.rate, eps=DETAIL_EPS, fused=fused)
@@ -38,11 +38,11 @@ def sh0_offset(detail: Float[Tensor, "N 3"], sh0: Float[Tensor, "N ..."]) -> Flo
 
 
 class Fading:
-    """f_det loses a share of itself with each step of the host in which HR takes part. L_HF does not change with a constant
-    added to the colours, so that nothing else would hold the mean of f_det.
+    """The decay of f_det in each step of the host in which HR takes part. L_HF does not change if a constant is added to the
+    colours, so nothing else would keep the mean of f_det near 0.
 
     Args:
-        passes: backward passes per step, which have equal parts of the share.
+        passes: backward passes per step, each of which adds an equal part of the decay.
     """
 
     def __init__(self, rates: DetailRates, passes: int) -> None:
@@ -51,8 +51,10 @@ class Fading:
         self._gradients = 0
 
     def add_pass(self, detail: Tensor, *, is_learned: bool) -> None:
-        """After a backward pass in which HR takes part, by its scores alone where f_det is not learned. Warns if f_det has not
-        changed after the first gradients.
+        """Count a backward pass in which HR takes part. Warns if f_det has not changed after several gradients.
+
+        Args:
+            is_learned: whether the pass has a gradient of f_det; otherwise HR is rendered only for its scores.
         """
         self._passed.append(detail)
         self._gradients += is_learned
@@ -65,11 +67,11 @@ class Fading:
 
     @torch.no_grad()
     def before_step(self) -> None:
-        """The share of the passes since the last step is lost, of the tensor that they have given a gradient to."""
+        """Apply the decay of the passes since the last step, to the tensors of these passes."""
         for detail in self._passed:
             detail.mul_(1 - self._rates.decay / self._passes)
         self._passed.clear()
 
     def forget(self) -> None:
-        """The host has dropped the passes since its last step, or skips the step."""
+        """Drop the passes since the last step, after the host has dropped them or skipped its step."""
         self._passed.clear()

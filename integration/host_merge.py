@@ -1,4 +1,4 @@
-"""Where a backward pass of the host has ended: the gradients that it has brought become the merged ones."""
+"""The merge at the end of a host's backward pass: the merged gradients replace those that the pass has added."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from integration.replayed_merge import ReplayedMerge
 
 
 class HostMerge:
-    """The merge of a rendering, which one backward pass ends or several do, each with other parameters.
+    """Merges the gradients of a rendering, after one backward pass, or after several with different parameters.
 
     Args:
         device: of the Gaussians.
-        threshold, loss_scale, accumulation: see `Attachment`. counts: `Attachment.counts`, to which this adds.
+        threshold, loss_scale, accumulation: see `Attachment`. counts: `Attachment.counts`, to which this class adds.
 
     Attributes:
         scaler: of the densification score; None: the score is not scaled.
@@ -54,7 +54,7 @@ class HostMerge:
             DivergedError: a merged gradient is not finite, and no gradient scaler would skip the step.
         """
         params, hr, first = {name: done.params[name] for name in names}, pending.hr, not pending.merged
-        # Of the gradients of this pass; a gradient scaler's waits for the device.
+        # The factor of this pass's gradients; a gradient scaler reads its own from the device.
         scale = (1.0 if self._loss_scale is None else self._loss_scale()) / self._accumulation
         for name, p in params.items():
             if p.grad is not None and p.grad.is_sparse:
@@ -63,11 +63,11 @@ class HostMerge:
                     "rasterization(sparse_grad=False)."
                 )
             if p.grad is not None and p.grad.requires_grad:
-                p.grad = p.grad.detach()  # of create_graph=True, of which the merged gradient is no part
+                p.grad = p.grad.detach()  # create_graph=True: the merged gradient has no graph
         detail = done.params.get("detail") if first else None
         if detail is not None and detail.requires_grad:
             params["detail"] = detail
-            if detail.grad is not None:  # what the host has given it stays
+            if detail.grad is not None:  # the host's own gradient of it stays
                 done.before["detail"] = detail.grad
         conflict = merge_in_place(
             self._conductor, params, pending.routed_of(names, done.params), None if hr is None else hr.step, t,
@@ -82,13 +82,13 @@ class HostMerge:
         return conflict
 
     def _write_score(self, shot: AutogradShot, screen: Tensor, hr: HrSide, t: int, scale: float) -> None:
-        """Write the score where the host's densifier reads the screen gradient, if it does and a strategy has one."""
+        """Write the score to the tensor that the host's densifier reads, if it reads one and a strategy has a score."""
         slot = shot.gradient_slot
         if not (slot.tensor.is_leaf or slot.tensor.retains_grad) or slot.tensor.grad is None:
             return
         screen_lr = to_ndc(slot.per_gaussian(screen / scale, len(shot.visible)), slot.size)
         score, ordinary = self._conductor.scores(screen_lr, hr, self._conductor.objective.weights(t))
-        if score is ordinary:  # without a strategy's score, the statistic that the host's threshold is meant for stays
+        if score is ordinary:  # no strategy has a score: the host's own statistic stays
             return
         statistic = torch.linalg.vector_norm(screen_lr, dim=-1)  # the host's own
         written = score_for_host(slot, score, statistic, shot.visible, self.scaler, scale)
@@ -97,9 +97,9 @@ class HostMerge:
             self._counts["scores written"] += 1
 
     def _finish_detail(self, detail: Tensor, others: Mapping[str, Tensor], t: int, *, by_hf: bool) -> None:
-        """After the merge of f_det, which the host's optimizer steps as the others."""
+        """Prepare f_det for the step of the host's optimizer, after its merge."""
         if self._loss_scale is not None and detail.grad is not None:
-            # A gradient scaler asks each optimizer apart whether to step; 0 times a number that is not finite is not finite.
+            # A gradient scaler skips steps by optimizer: f_det's is skipped with the others, as 0 times inf or NaN is NaN.
             for p in others.values():
                 if p.grad is not None:
                     detail.grad += 0 * p.grad.sum(dtype=torch.float32)

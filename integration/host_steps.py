@@ -1,8 +1,7 @@
-"""The steps of a host's optimizers: when one of the host begins and ends, and those on extra views, pictures that strategies want
-the field to match besides the training view.
+"""The steps of a host's optimizers: when a step of the host begins and ends, and additional steps on extra views.
 
 Both scales of the training view and its extra views are rendered from the same parameters, because a host may have computed its
-activations before it calls its renderer. So the gradient of each extra view waits until the host has stepped.
+activations before it calls its renderer. The gradient of each extra view is therefore applied after the host has stepped.
 """
 
 from __future__ import annotations
@@ -27,13 +26,13 @@ _PATIENCE: Final = 10  # iterations with extra views, one after the other, of wh
 
 
 class HostSteps:
-    """Hooks on the host's optimizers. One step of the host is each optimizer once, and then once for each extra view.
+    """Hooks on the host's optimizers. In a step of the host, each optimizer steps once, and then once for each extra view.
 
     Args:
         is_waiting: whether a rendering waits for its backward pass.
-        begins: called when a step of the host begins, with whether gradients were merged since the one before.
-        after: called after an optimizer's own step, and its steps on extra views.
-        counts: `Attachment.counts`, to which this adds.
+        begins: called when a step of the host begins, with whether gradients have been merged since the last step.
+        after: called after an optimizer has stepped, also on extra views.
+        counts: `Attachment.counts`, to which this class adds.
     """
 
     def __init__(
@@ -45,12 +44,13 @@ class HostSteps:
         self._stepped: set[int] = set()  # the optimizers that have made this step
         self._has_merged = False  # since the last step
         self._extra: list[Grads] = []
-        self._rendered: Mapping[str, Tensor] = {}  # what they are gradients of
-        self._steps_on_extra = False  # now, which is no step of the host
-        self._has_stepped, self._unused = False, 0  # on those of this iteration; iterations since the last that did
+        self._rendered: Mapping[str, Tensor] = {}  # the leaves of `_extra`
+        self._steps_on_extra = False  # an optimizer is stepping on an extra view
+        self._has_stepped = False  # on the extra views of this iteration
+        self._unused = 0  # consecutive iterations whose extra views no optimizer has stepped on
 
     def hook(self, optimizers: Sequence[torch.optim.Optimizer]) -> None:
-        """Hook the steps of these, and no longer those of earlier ones. Others than torch's have no hooks."""
+        """Hook the steps of these optimizers, and remove the hooks of earlier ones. Only torch's optimizers have hooks."""
         distinct = list({id(o): o for o in optimizers if isinstance(o, torch.optim.Optimizer)}.values())
         if list(map(id, distinct)) == list(map(id, self._hooked)):
             return
@@ -64,7 +64,7 @@ class HostSteps:
         ]  # fmt: skip
 
     def on_merge(self) -> None:
-        """Gradients were merged; the next step of any optimizer begins one of the host."""
+        """Called when gradients were merged: the next step of any optimizer begins a step of the host."""
         self._stepped.clear()
         self._has_merged = True
 
@@ -75,15 +75,15 @@ class HostSteps:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all have."""
+        """Whether all optimizers have stepped since the last merge."""
         return len(self._stepped) == len(self._hooked)
 
     def follow_by(self, params: Mapping[str, Tensor], gradients: Iterable[Grads]) -> None:
-        """The gradients of the extra views of this iteration, with respect to these leaves of the host, in place of those of the
-        one before, stepped on or not. Warn where they no longer are.
+        """Set the gradients of this iteration's extra views. Warns if no optimizer has stepped on those of several iterations.
 
         Args:
-            gradients: made one by one, once the memory of those before is free.
+            params: the host's leaves, by name.
+            gradients: with respect to `params`; computed one by one, after the memory of the last iteration's is free.
         """
         if self._extra:
             self._unused = 0 if self._has_stepped else self._unused + 1
@@ -99,7 +99,7 @@ class HostSteps:
     def _before_one(self, optimizer: torch.optim.Optimizer, *given: Any) -> None:
         """
         Args:
-            given: what `step` was called with.
+            given: the arguments of `step`.
         """
         if self._steps_on_extra:
             return
@@ -130,9 +130,9 @@ class HostSteps:
 
     @torch.no_grad()
     def _step_on_extra(self, optimizer: torch.optim.Optimizer) -> None:
-        """One step of this optimizer for each extra view; those of the positions are counted.
+        """One step of this optimizer for each extra view; those of the optimizer of the positions are counted.
 
-        An optimizer whose parameters were replaced after the views were rendered makes none (3DGS densifies before it steps).
+        An optimizer whose parameters were replaced after the views were rendered does not step (3DGS densifies before it steps).
         """
         stepped = [p for group in optimizer.param_groups for p in group["params"]]
         ids = {id(p) for p in stepped}
@@ -140,7 +140,7 @@ class HostSteps:
         if not params:
             return
         before, self._steps_on_extra = [p.grad for p in stepped], True
-        scale = getattr(optimizer, "grad_scale", None)  # an AMP gradient scaler's, which a fused optimizer divides by
+        scale = getattr(optimizer, "grad_scale", None)  # of an AMP gradient scaler, by which a fused optimizer divides
         if scale is not None:  # gradients of extra views are not scaled
             optimizer.grad_scale = None  # type: ignore[attr-defined]
         try:
@@ -167,7 +167,7 @@ def _parameters(step: Callable[..., Any]) -> frozenset[str]:
 
 
 def _step(optimizer: torch.optim.Optimizer, rows: Tensor) -> None:
-    """One step of all rows. An Adam of visible Gaussians takes which move, 3DGS's SparseGaussianAdam also how many there are."""
+    """One step of all rows. An Adam of visible Gaussians takes a mask of them, 3DGS's SparseGaussianAdam also their number."""
     parameters = _parameters(type(optimizer).step)
     known: dict[str, Any] = {}
     if "visibility" in parameters:

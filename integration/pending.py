@@ -1,4 +1,4 @@
-"""What is rendered and not merged yet, and a backward pass of the host that may end that."""
+"""A rendering whose gradients are not merged yet, and the host's backward passes over it."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from integration.colours import are_accumulated, are_joined
 from rasterizers.autograd import TakeColours
 
 Reached = Callable[[int], TakeColours | None]
-"""Called when a backward pass has reached the nth rendering and no parameter yet; what it returns is that of
+"""Called when a backward pass has reached the nth rendering and no parameter yet; returns the same as
 `rasterizers.autograd.BackwardHook.reached`.
 """
 
 
 @dataclass(slots=True, eq=False)
 class BackwardPass:
-    """A backward pass over a rendering, from where it has reached it.
+    """A backward pass of the host that has reached a rendering.
 
     Args:
         task: torch's number of the pass.
-        params: the leaves then.
-        renderings: the numbers of those that it has reached.
-        colour: the gradient of sh0 and shN that it has brought as factors, so that their `.grad` lacks it.
+        params: the leaves when it reached the rendering.
+        renderings: the numbers of all renderings that it has reached.
+        colour: the gradient of sh0 and shN that it has brought as factors, which their `.grad` lacks.
 
     Attributes:
-        before: `.grad` as it was, by name, where it was there.
+        before: `.grad` when it reached the rendering, by name, of parameters that had one.
     """
 
     task: int
@@ -54,7 +54,7 @@ class BackwardPass:
         self.colour = Colour(rgb, basis)
 
     def accumulated(self) -> list[str]:
-        """The parameters that it has given a gradient to, f_det apart."""
+        """The parameters, except for f_det, that the pass has given a gradient."""
         of_colour = () if self.colour is None else ("sh0", "shN")
         return [name for name in self.params if name in of_colour or (name != "detail" and self._has_changed(name))]
 
@@ -69,10 +69,10 @@ class Pending:
     """A rendering of a training view that waits for the host's backward pass.
 
     Args:
-        nth: its number. output: None once everything that is trained is merged.
-        hr: the gradients of HR, and routed: the same of the raw parameters; None where HR takes no part.
-        screen: the screen gradient of LR and the pass that it came in, where a densifier reads it.
-        merged: the parameters that a pass has brought, which no other may.
+        nth: its number. output: None once all trained parameters are merged.
+        hr: the gradients of HR. routed: the same of the raw parameters. None if HR takes no part.
+        screen: the screen gradient of LR by the number of its pass, if a densifier reads it.
+        merged: the parameters whose gradients are merged.
     """
 
     nth: int
@@ -84,9 +84,9 @@ class Pending:
     merged: set[str] = field(default_factory=set)
 
     def listen(self, reached: WeakMethod[Reached], *, to_screen: bool) -> None:
-        """Have `reached` called in every backward pass over the rendering.
+        """Register `reached` for every backward pass over the rendering.
 
-        The reference is weak, and nothing that autograd holds refers to this object: its tensors would never be freed.
+        Hooks that autograd holds must not refer to the attachment or to this object, whose tensors would then never be freed.
         """
         if self.output is None:
             return
@@ -98,11 +98,11 @@ class Pending:
         for drawing in self.output.shot.drawings:
             drawing.hook.reached = called
 
-        def told(_: Tensor) -> None:  # and the gradient is left as it is
+        def on_gradient(_: Tensor) -> None:  # returns None, so that the gradient stays
             called()
 
         for mark in self.output.marks:
-            mark.register_hook(told)  # type: ignore[no-untyped-call]
+            mark.register_hook(on_gradient)  # type: ignore[no-untyped-call]
         centres = self.output.shot.gradient_slot.tensor
         if to_screen and centres.requires_grad:
 
@@ -113,14 +113,14 @@ class Pending:
             centres.register_hook(keep)  # type: ignore[no-untyped-call]
 
     def may_take_factors(self, params: Mapping[str, Tensor]) -> bool:
-        """Parts 2 and 3 of the rule of colours.py."""
+        """Conditions 2 and 3 of colours.py: whether a pass may bring the colours' gradient as factors."""
         drawing = None if self.output is None else self.output.shot.drawing
         if drawing is None or not self.merged.isdisjoint(("sh0", "shN")):
             return False
         return are_joined(drawing.inputs["colors"], params) and are_accumulated(params)
 
     def routed_of(self, names: Iterable[str], params: Mapping[str, Tensor]) -> Grads | None:
-        """g^HR of these parameters alone, and the gradient of f_det."""
+        """g^HR of these parameters only, and the gradient of f_det."""
         g, wanted = self.routed, {*names, "detail"}
         if g is None or wanted.issuperset(params):
             return g
@@ -130,7 +130,7 @@ class Pending:
         return Grads({name: rows for name, rows in g.items() if name in wanted})
 
     def require_alone(self, of: BackwardPass) -> None:
-        """Raise a HostError for a pass that adds to parameters by another rendering, too."""
+        """Raise a HostError if the pass has also reached another rendering."""
         if of.renderings == {self.nth}:
             return
         if self.nth in of.renderings:
@@ -145,7 +145,7 @@ class Pending:
         )
 
     def require_first(self, names: Iterable[str], correcting: str) -> None:
-        """Raise a HostError where another pass over the rendering has brought the same, and a strategy has used it."""
+        """Raise a HostError if an earlier pass over the rendering had gradients of these parameters, and a strategy used them."""
         if correcting and (again := [name for name in names if name in self.merged]):
             raise HostError(
                 f"a second backward pass over the rendering of {self.view} adds to the gradient of {', '.join(again)}, which is "
@@ -156,13 +156,13 @@ class Pending:
 
 
 def current_pass() -> int:
-    """Torch's number of the backward pass under way in this thread; -1: there is none."""
+    """Torch's number of the backward pass that runs in this thread; -1: none runs."""
     number: int = torch._C._current_graph_task_id()
     return number
 
 
 def why_nothing_was_merged(pending: Pending | None, trained: Sequence[str]) -> tuple[str, str]:
-    """The cause that a host steps without a merge, and what to do.
+    """Why a host steps without a merge, and what to do about it.
 
     Args:
         pending: the last rendering. trained: names of the parameters that require gradients.

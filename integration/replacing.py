@@ -1,4 +1,4 @@
-"""Functions and attributes in place of a host's own, inside a context."""
+"""Contexts that replace functions and attributes of a host."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 @contextmanager
 def replaced_attribute(owner: Any, name: str, value: Any) -> Iterator[None]:
-    """The attribute has another value."""
+    """Give an attribute another value."""
     original = getattr(owner, name)
     setattr(owner, name, value)
     try:
@@ -22,7 +22,7 @@ def replaced_attribute(owner: Any, name: str, value: Any) -> Iterator[None]:
 
 @contextmanager
 def replaced_everywhere(original: Callable[..., Any], replacement: Callable[..., Any]) -> Iterator[None]:
-    """A function is another one in all loaded modules, under any name.
+    """Replace a function in all loaded modules, under any name.
 
     Functions that a module binds later, or holds in another object, are not found; an `Attachment` raises an error if
     its host then renders with the original.
@@ -37,16 +37,16 @@ def replaced_everywhere(original: Callable[..., Any], replacement: Callable[...,
 
 @contextmanager
 def replaced_methods(owner: Any, replacements: Mapping[str, Callable[..., Any]]) -> Iterator[None]:
-    """Methods of one object are others, each of which gets the original as its first argument. Copies and pickles of the object
-    have its own methods.
+    """Replace methods of one object. Each replacement gets the original as its first argument. Copies and pickles of the object
+    have the original methods.
 
     Args:
-        replacements: by the name of the method. Those that the object does not have are left out.
+        replacements: by the name of the method; names that the object does not have are ignored.
     """
     names = [name for name in replacements if hasattr(owner, name)]
     for name in names:
         original = getattr(owner, name)
-        named = functools.wraps(original, updated=())  # the attributes of a method that was replaced before are its own
+        named = functools.wraps(original, updated=())  # without the attributes of an earlier replacement
         setattr(owner, name, named(_Method(replacements[name], owner, name)))
     try:
         yield

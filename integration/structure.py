@@ -1,4 +1,4 @@
-"""Which Gaussian is which: a host's changes of structure, as the strategies hear of them, and rows found by their values."""
+"""A host's changes of structure, as the strategies are told of them, and rows that are found by their values."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ def is_same(parents: Int[Tensor, " M"], n: int) -> bool:
 
 
 def composed(parents: Int[Tensor, " M"], earlier: Int[Tensor, " N"]) -> Int[Tensor, " M"]:
-    """What rows that come from `parents` come from, where these come from `earlier`; -1, no row, stays."""
+    """The parents of two changes of structure, `earlier` and then `parents`; -1, no parent, stays."""
     return torch.where(parents < 0, -1, earlier[parents.clamp_min(0)]) if len(earlier) else parents
 
 
 def resized(
     conductor: Conductor, step: Step | None, before: int, now: int, parents: Int[Tensor, " M"] | None, remedy: str
 ) -> Step | None:  # fmt: skip
-    """Gather what the strategies store per Gaussian; returns the step with the rows of now.
+    """Gather what the strategies store per Gaussian; returns the step with its rows gathered, too.
 
     Args:
-        step: holds numbers per Gaussian, too. parents, remedy: see `Attachment`.
-        before, now: the numbers of the host's Gaussians.
+        before, now: the host's number of Gaussians before and after the change.
+        parents, remedy: see `Attachment`.
 
     Raises:
-        HostError: something is stored of each Gaussian, but it is unknown where new ones come from.
+        HostError: strategies store something per Gaussian, but it is unknown which Gaussian a new one comes from.
     """
     state = ", ".join(name for name, rows in conductor.state_dict().items() if rows.dim() > 0)
     if parents is None:
@@ -46,7 +46,7 @@ def resized(
                 f"the number of Gaussians changed from {before:,} to {now:,} and the host does not say which came from "
                 f"which, but {state} is stored per Gaussian. End densification first, or pass the host's state."
             )
-        return None if step is None else Step(step.t, step.view)  # what it holds per Gaussian cannot be gathered
+        return None if step is None else Step(step.t, step.view)  # its rows cannot be gathered
     if len(parents) != now:
         raise HostError(f"the host says of {len(parents):,} Gaussians which they come from, but has {now:,}.")
     if (unknown := int((parents < 0).sum())) and state:
@@ -59,17 +59,17 @@ def resized(
 
 
 def rows_drawn(means: Float[Tensor, "*B M 3"], own: Float[Tensor, "N 3"]) -> Int[Tensor, "*B M"] | None:
-    """Which of our Gaussians a loop draws: for each that it gives its rasterizer, the row of the same position, -1 where there is
-    none. None: those are our rows in their order; or as many, all elsewhere than ours, as a loop has them that moves the scene.
+    """For each Gaussian that a loop draws, the row of the parameter with the same position; -1: there is none. None: the rows are
+    those of the parameters, in the same order, or the loop has moved the whole scene.
 
     Args:
-        means: what the rasterizer is given; batches in front are scenes.
+        means: the rasterizer's positions; leading dimensions are scenes.
         own: the positions among the parameters.
     """
     is_alike = means.shape == own.shape
     if is_alike and means.data_ptr() == own.data_ptr():
         return None
-    drawn, known = means.double().reshape(-1, 3), own.double()  # a type that holds those of all
+    drawn, known = means.double().reshape(-1, 3), own.double()  # which holds every other type
     if is_alike and torch.equal(drawn, known):
         return None
     rows, _ = first_equal(bits(known), bits(drawn))

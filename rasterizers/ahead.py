@@ -1,4 +1,4 @@
-"""One image that is drawn together with another before it is asked for: hosts ask for the two scales of a view one by one."""
+"""Draws the second scale of a view together with the first, before it is asked for: hosts ask for the two one by one."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from rasterizers.interface import Camera, Rasterizer, Rendering, Splats
 
 
 class _Ahead(threading.local):
-    """One image that is drawn together with another, before it is asked for.
+    """The image that is drawn ahead.
 
     Attributes:
-        wanted: the camera of the image, until it is drawn.
-        kept: the image, what it shows, and the splats: while these live, no other tensors lie at their addresses.
+        wanted: its camera, until it is drawn.
+        kept: what it shows, the image, and the splats, kept alive so that no other tensors get their addresses.
     """
 
     wanted: Camera | None = None
@@ -44,10 +44,10 @@ def _shown(rasterizer: Rasterizer, splats: Splats, camera: Camera, depth: bool) 
 
 @contextmanager
 def drawing_ahead(viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, height: int) -> Iterator[None]:
-    """The first drawing inside from this pose brings along the one of the same splats by K and without `rgb_offset`.
+    """The first drawing from this pose in the context also draws the image of the same splats by K and without `rgb_offset`.
 
-    A later drawing inside of just that takes it: the two share projection, colour and depth order. It is forgotten with the
-    block.
+    The two share projection, colours and depth order. If the second image is asked for in the context, it is ready; it is dropped
+    at the end.
     """
     (fx, _, cx), (_, fy, cy), _ = K.tolist()
     _ahead.wanted, _ahead.kept = Camera(viewmat.detach(), fx, fy, cx, cy, width, height), None
@@ -62,7 +62,7 @@ def is_drawing_ahead() -> bool:
 
 
 def draw_or_take(rasterizer: Rasterizer, splats: Splats, camera: Camera, *, depth: bool) -> Rendering:
-    """The image, or the same that was drawn ahead."""
+    """The image, drawn now or ahead."""
     if _ahead.kept is not None and _ahead.kept[0] == _shown(rasterizer, splats, camera, depth):
         rendering, _ahead.kept = _ahead.kept[1], None
         return rendering
@@ -70,10 +70,10 @@ def draw_or_take(rasterizer: Rasterizer, splats: Splats, camera: Camera, *, dept
     if wanted is None or camera.world_to_camera.tolist() != wanted.world_to_camera.tolist():
         return drawing(rasterizer, depth)(splats, camera)
     _ahead.wanted = None
-    if splats.rgb_offset is None and _grid(camera) == _grid(wanted):  # it is this one
+    if splats.rgb_offset is None and _grid(camera) == _grid(wanted):  # this is the image itself
         return drawing(rasterizer, depth)(splats, camera)
     plain = replace(splats, rgb_offset=None)
-    other = replace(wanted, world_to_camera=camera.world_to_camera)  # by the same tensor, as a backend sees at once
+    other = replace(wanted, world_to_camera=camera.world_to_camera)  # so that both share a tensor
     together = functools.partial(rasterizer.render_scales, depth=[True] * 2) if depth else rasterizer.render_scales
     ahead, rendering = together([(plain, other), (splats, camera)])
     _ahead.kept = _shown(rasterizer, plain, other, depth), ahead, plain

@@ -1,8 +1,8 @@
 """Rasterizers as differentiable torch functions.
 
-`draw` returns a rendering that is part of the autograd graph; `as_gsplat.rasterization` does so with gsplat's signature. Each
-backward pass handles one cotangent; `Rendering.vjp` handles several, and `collected_drawings` gives it
-to callers of code that draws.
+`draw` returns a rendering that is part of the autograd graph; `as_gsplat.rasterization` does so with gsplat's signature. A
+backward pass handles one cotangent; `Rendering.vjp` handles several, and `collected_drawings` returns it to callers of code that
+draws.
 """
 
 from __future__ import annotations
@@ -52,16 +52,16 @@ class Drawn(NamedTuple):
 
 
 TakeColours = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N B1"]], None]
-"""Gets a gradient of the spherical harmonics Y ⊗ ∇rgb by its factors: ∇rgb and Y."""
+"""Takes a gradient of the spherical harmonics, Y ⊗ ∇rgb, as its factors ∇rgb and Y."""
 
 
 @dataclass(slots=True, eq=False)
 class BackwardHook:
-    """What a caller does when a backward pass reaches a drawing.
+    """A caller's hook on the backward passes that reach a drawing.
 
     Attributes:
-        reached: called in the pass, before the gradients of the drawing exist. It returns where this pass brings the gradient of
-            the colours, which `colors` then does not get; None: `colors` gets it, as every other tensor.
+        reached: called in the pass, before the drawing's gradients are computed. If it returns a function, that takes the
+            gradient of the colours, and `colors` gets none; None: `colors` gets it.
     """
 
     reached: Callable[[], TakeColours | None] = lambda: None
@@ -69,12 +69,12 @@ class BackwardHook:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawing:
-    """What `draw` drew.
+    """A drawing with gradients.
 
     Args:
-        inputs: means, quats, scales, opacities and colors [N, K, 3] as they were given, and image: as it was returned, all in
-            the autograd graph.
-        hook: of the backward passes that reach it.
+        inputs: means, quats, scales, opacities and colors [N, K, 3], the arguments of `draw` in the autograd graph.
+        image: as `draw` returned it, in the autograd graph.
+        hook: called by backward passes that reach the drawing.
     """
 
     rendering: Rendering
@@ -84,13 +84,13 @@ class Drawing:
 
 
 _collecting: Final = ContextVar[tuple[list[Drawing], ...]]("collecting", default=())
-"""The lists that the drawings of this thread are added to, the innermost last."""
+"""The lists to which this thread's drawings are appended, the innermost last."""
 
 
 @contextmanager
 def collected_drawings() -> Iterator[list[Drawing]]:
-    """What this thread draws with gradients inside, by any code. Its VJP takes several cotangents in one pass and stops at what
-    was drawn.
+    """Collects all drawings with gradients that this thread makes in the context. Their VJP takes several cotangents in one pass
+    and stops at the drawn tensors.
     """
     drawings: list[Drawing] = []
     before = _collecting.set((*_collecting.get(), drawings))
@@ -119,7 +119,7 @@ def draw(
     Args:
         means2d: a tensor that receives the projected centres and whose `.grad` will be the screen gradient; None makes one.
         depth: also draw the expected depth.
-        colors: the tensor that `splats.sh0` and `splats.shN` are slices of, for a caller that has them as one.
+        colors: the tensor of which `splats.sh0` and `splats.shN` are slices, if the caller has one.
 
     Raises:
         ValueError: the rasterizer lacks the trait `depth` that `depth=True` needs.
@@ -147,10 +147,10 @@ class Rendered(NamedTuple):
 def render(
     rasterizer: Rasterizer, inputs: Inputs, bands: int, camera: Camera, *, depth: bool, replays: bool = False
 ) -> Rendered:
-    """Draw.
+    """Draw without autograd; `in_graph` makes the result differentiable.
 
     Args:
-        replays: the drawing may be a replay, and a backward pass follows.
+        replays: allows a replay, which expects a backward pass.
     """
     if torch._C._functorch.peek_interpreter_stack() is not None:
         raise NotImplementedError(
@@ -176,10 +176,11 @@ def in_graph(
     pose: Float[Tensor, "4 4"] | None = None,
     absgrad: Float[Tensor, "M 2"] | None = None,
 ) -> Drawn:
-    """What was rendered, as a function of the inputs, of the projected centres, those of all or of these rows, and of the pose.
+    """The rendering as a differentiable function of the inputs, the projected centres and the pose.
 
     Args:
-        absgrad: receives in each backward pass Σ|∂L/∂u| over the pixels, of the rows.
+        rows: the Gaussians whose centres `means2d` holds; None: all.
+        absgrad: each backward pass adds Σ|∂L/∂u| over the pixels, of these rows.
     """
     hook = BackwardHook()
     if absgrad is not None:
@@ -204,9 +205,9 @@ class _Draw(torch.autograd.Function):
         ctx.pose = None if pose is None else (pose.device, pose.dtype)
         ctx.mark_non_differentiable(visible := rendering.visible.data)
         ctx.set_materialize_grads(False)
-        # Other tensors over the same memory: an output that ctx holds would hold ctx in turn, and nothing would free either.
+        # `.data` makes other tensors with the same memory: ctx and an output that it holds would keep each other alive.
         alpha, depth = rendering.alpha.data, None if rendering.depth is None else rendering.depth.data
-        # The gradient of depth reads both outputs: torch refuses it if one was changed in place.
+        # The gradient of depth reads alpha and depth: saved tensors let torch refuse it if one was changed in place.
         ctx.save_for_backward(*inputs, *([] if depth is None else [alpha, depth]))
         return rendering.image.data, alpha, visible, depth
 
@@ -215,10 +216,10 @@ class _Draw(torch.autograd.Function):
     @once_differentiable  # a second derivative would silently be 0
     def backward(ctx: Any, d_image: Tensor | None, d_alpha: Tensor | None, _: None, d_depth: Tensor | None) -> Any:
         rendering, rasterizer, camera, bands = ctx.rendered
-        besides = {"alpha": d_alpha, "depth": d_depth}
-        besides = {name: v[None] for name, v in besides.items() if v is not None and bool(v.any())}
-        whole = rasterizer.traits.depth_gradient
-        if "depth" in besides and not whole:  # silence would leave out a part of the loss
+        layers: dict[str, Any] = {"alpha": d_alpha, "depth": d_depth}
+        layers = {name: d[None] for name, d in layers.items() if d is not None and bool(d.any())}
+        takes_layers = rasterizer.traits.depth_gradient
+        if "depth" in layers and not takes_layers:  # else a part of the loss would silently have no gradient
             raise NotImplementedError(
                 f"the loss depends on a rendered depth, which has no gradient in {type(rasterizer).__name__} (its "
                 "traits.depth_gradient is False); detach it, draw with cpp or torch, or let rasterizers.rasterization draw it."
@@ -228,17 +229,16 @@ class _Draw(torch.autograd.Function):
         inputs = Inputs(*saved[: len(Inputs._fields)])
         if d_image is None:
             d_image = torch.zeros_like(rendering.image)
-        if whole or d_alpha is None or not besides:
-            drawn = [(rendering, d_image)]
+        if takes_layers or not layers:
+            drawn, more = [(rendering, d_image)], layers
         else:
-            # With C the colour and T = 1 - alpha, I(b) = C + T b. The difference of two backgrounds has the gradient of T.
+            # I(b) = C + T b with the colour C, T = 1 - alpha and the background b: the difference of two images has T's gradient.
             b = rasterizer.background
             other = (0.0 if b[0] > 0.5 else 1.0, *b[1:])
             d_red = torch.zeros_like(d_image)
-            d_red[..., 0] = d_alpha / (other[0] - b[0])
+            d_red[..., 0] = layers["alpha"][0] / (other[0] - b[0])
             over_other = over(rasterizer, other)(inputs.splats(bands), camera)
-            drawn = [(rendering, d_image + d_red), (over_other, -d_red)]
-        more: dict[str, Any] = besides if whole else {}
+            drawn, more = [(rendering, d_image + d_red), (over_other, -d_red)], {}
         if ctx.absgrad is not None:
             more = more | {"absgrad": True}
         each = [cast(Any, image).vjp(cotangent[None], **more) for image, cotangent in drawn]
@@ -264,19 +264,19 @@ class _Draw(torch.autograd.Function):
 
 
 def outer(rgb: Float[Tensor, "N 3"], basis: Float[Tensor, "N B1"], bands: int) -> Float[Tensor, "N K 3"]:
-    """The gradient of the colours from its factors, Y ⊗ ∇rgb, for as many bands; those that were not drawn have gradient 0."""
+    """The gradient of the colours from its factors, Y ⊗ ∇rgb; of the `bands`, those that were not drawn have gradient 0."""
     drawn = torch.mul(basis[..., None], rgb[:, None], out=empty_for(basis, (*basis.shape, 3)))
     return drawn if bands == basis.shape[1] else torch.nn.functional.pad(drawn, (0, 0, 0, bands - basis.shape[1]))
 
 
 def stacked(tensors: Sequence[Tensor]) -> Tensor:
-    """One tensor of all; a single one is not copied."""
+    """The tensors stacked; a single one is not copied."""
     together: Tensor = tensors[0][None] if len(tensors) == 1 else _Stack.apply(*tensors)  # type: ignore[no-untyped-call]
     return together
 
 
 class _Stack(torch.autograd.Function):
-    """`torch.stack`, to memory that is used again: fresh pages of eight images cost a tenth of drawing them."""
+    """`torch.stack` into recycled memory: new pages for eight images take a tenth of the time of drawing them."""
 
     @staticmethod
     def forward(ctx: Any, *tensors: Tensor) -> Tensor:
@@ -288,7 +288,7 @@ class _Stack(torch.autograd.Function):
 
 
 def __getattr__(name: str) -> Any:
-    """`rasterization` and `drawing_ahead`, which stood here."""
+    """The earlier places of `rasterization` and `drawing_ahead`."""
     if name == "rasterization":
         return import_module("rasterizers.as_gsplat").rasterization
     if name == "drawing_ahead":

@@ -1,7 +1,7 @@
-"""What another replay has otherwise, as recorded work is given it: the iteration, and a view's name and camera.
+"""Proxies, for recorded work, of values that differ between replays: the iteration, and a view's name and camera.
 
-A replay repeats what Python has decided by them. Decisions by the iteration become guards of the recording, which does not hold
-where one of them would be another one. Anything else that is read of them ends the recording by an error.
+A replay repeats what Python has decided by such a value. A comparison with the iteration becomes a guard of the recording, which
+no longer holds at an iteration at which the result differs. Any other read of a proxy ends the recording with an error.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ R = TypeVar("R")
 
 
 class Unread:
-    """What recorded work must not read.
+    """A value that recorded work must not read.
 
     Args:
         what: its name, for the error.
@@ -34,7 +34,7 @@ class Unread:
         return type(self._value)
 
     def __str__(self) -> str:
-        """A seed or a key may be made of it. After the recording it can be put into a message."""
+        """Refused in a recording, where it might become a seed or a key; allowed afterwards, e.g. in a message."""
         if running() is not None:
             self._refuse()
         return str(self._value)
@@ -55,11 +55,11 @@ class Unread:
 
 
 class Guarded(Unread):
-    """The iteration t, or a number that Python has made of it. Its comparisons have answers, each of which becomes a guard of the
-    recording. It refuses to become a number, which a replay would keep.
+    """The iteration t, or a number computed from it. Each comparison becomes a guard of the recording. It cannot become a
+    plain number, which a replay would repeat.
 
     Args:
-        of: the number by t.
+        of: the number as a function of t.
     """
 
     def __init__(self, value: Any, what: str, of: Callable[[int], Any] = lambda t: t) -> None:
@@ -83,13 +83,17 @@ class Guarded(Unread):
         return self._answered(bool)
 
 
-def _method(kind: Callable[..., Any], by: Callable[..., Any], *, reflected: bool = False) -> Callable[..., Any]:
-    """A method that Python calls for an operator."""
+def _method(how: Callable[..., Any], by: Callable[..., Any], *, reflected: bool = False) -> Callable[..., Any]:
+    """The method that Python calls for the operator `by`.
+
+    Args:
+        how: `Guarded._made` or `Guarded._answered`.
+    """
 
     def called(self: Guarded, *other: Any) -> Any:
-        if any(isinstance(x, (Unread, Tensor)) for x in other):  # a tensor would keep this number
+        if any(isinstance(x, (Unread, Tensor)) for x in other):  # a tensor would store this number
             self._refuse()
-        return kind(self, (lambda x, y: by(y, x)) if reflected else by, *other)
+        return how(self, (lambda x, y: by(y, x)) if reflected else by, *other)
 
     return called
 
@@ -109,10 +113,10 @@ for _name in _COMPARED:
 
 
 def iteration(t: int) -> int:
-    """The iteration, for what may be recorded."""
+    """The iteration; a proxy of it in a recording."""
     return t if running() is None else cast(int, Guarded(t, "the iteration"))
 
 
 def unread(value: R, what: str, but: Collection[str] = ()) -> R:
-    """A value that recorded work must not read, see `Unread`."""
+    """A proxy of a value that recorded work must not read, see `Unread`."""
     return cast(R, Unread(value, what, but))

@@ -1,4 +1,4 @@
-"""The tensors that a drawing is a function of, as a loop has them."""
+"""The tensors of a drawing, as a loop has them."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from rasterizers.interface import Splats
 
 
 class Inputs(NamedTuple):
-    """The tensors that a drawing is a function of. The colours are one tensor, as hosts have them: autograd would fill others as
-    wide with zeros for the gradient of a slice.
+    """The tensors of a drawing. The colours are one tensor, as in hosts: for the gradient of a slice, autograd would fill another
+    tensor of that size with zeros.
     """
 
     means: Float[Tensor, "N 3"]
@@ -24,15 +24,19 @@ class Inputs(NamedTuple):
     rgb_offset: Float[Tensor, "N 3"] | None
 
     def drawn(self, bands: int | None = None) -> Inputs:
-        """The same without their graph, with the first bands of the colours; None: with all."""
+        """The same without their autograd graph.
+
+        Args:
+            bands: the number of bands of the colours to keep; None: all.
+        """
         means, quats, scales, opacities, colors, offset = (x if x is None else x.detach() for x in self)
         return Inputs(means, quats, scales, opacities, colors[:, :bands], offset)  # type: ignore[arg-type, index]
 
     def splats(self, bands: int | None = None) -> Splats:
-        """`drawn` as a rasterizer takes them."""
+        """`drawn`, as `Splats`."""
         means, quats, scales, opacities, colors, offset = self.drawn(bands)
         return Splats(means, quats, scales, opacities, colors[:, :1], colors[:, 1:], offset)
 
     def copied(self) -> Inputs:
-        """The same in memory of their own, row by row."""
+        """Contiguous copies."""
         return Inputs(*(x if x is None else x.clone(memory_format=torch.contiguous_format) for x in self))  # type: ignore[arg-type]

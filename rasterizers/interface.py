@@ -31,7 +31,7 @@ class BackendUnavailable(RuntimeError):
 
 
 class OutdatedKernels(RuntimeError):
-    """Compiled kernels of other sources than those beside the Python that calls them. No other backend takes their place."""
+    """Compiled kernels that were built from other sources than the present ones. No other backend replaces them."""
 
 
 Color = tuple[float, float, float]
@@ -192,9 +192,9 @@ class SplatGradients:
         return self.basis[None, :, 1:, None] * self.rgb[:, :, None, :]
 
     def summed(self, weight: Float[Tensor, " N"]) -> SplatGradients:
-        """The last gradient added to the one before, `weight` times each Gaussian's row.
+        """The last gradient, each Gaussian's row times `weight`, is added to the one before.
 
-        `screen` stays that of each cotangent, for statistics, and the last row of `rgb` is what was added.
+        `screen` keeps that of each cotangent, for statistics, and the last of `rgb` is what was added.
         """
 
         def total(g: Tensor) -> Tensor:
@@ -252,9 +252,10 @@ class Traits:
         devices: "cpu", "cuda" or both: where the splats' tensors may be.
         dtypes: the types that the splats' tensors may have.
         native_threads: it computes on the threads of `rasterizers.native`, not on torch's.
-        depth: it draws expected depth. Without this trait nobody passes the argument `depth`, so its methods may lack it.
+        depth: it draws expected depth. Without this trait, its methods are never called with `depth` and may lack the argument.
         absgrad: `WithTraits.vjp` takes this argument.
-        depth_gradient: it takes alpha and depth. Without this trait alpha's gradient takes a second image, and depth has none.
+        depth_gradient: `WithTraits.vjp` takes alpha and depth. Without this trait, depth has no gradient, and alpha's needs a
+            second image.
         radii: its renderings have `WithTraits.radii`.
     """
 
@@ -268,7 +269,7 @@ class Traits:
 
 
 class WithTraits(Rendering, Protocol):
-    """All that a rendering may have besides; `Traits` says what of it a backend's have."""
+    """A rendering with every optional feature; a backend's `Traits` say which of them it has."""
 
     def vjp(
         self,
@@ -281,8 +282,8 @@ class WithTraits(Rendering, Protocol):
         """See `Rendering.vjp`.
 
         Args:
-            absgrad: with `SplatGradients.absgrad`, for the trait of this name.
-            alpha, depth: gradients of `Rendering.alpha` and of `Rendering.depth` of the same K losses, for the trait
+            absgrad: also compute `SplatGradients.absgrad`, for the trait of this name.
+            alpha, depth: gradients of the same K losses with respect to `Rendering.alpha` and `Rendering.depth`, for the trait
                 `depth_gradient`; None: 0.
 
         Raises:
@@ -291,16 +292,16 @@ class WithTraits(Rendering, Protocol):
         ...
 
     def summed_vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"]) -> SplatGradients:
-        """See the function of this name, which looks for this method: a backend may sum before its projection's VJP what
-        `SplatGradients.summed` sums after it.
+        """See the function of this name, which calls this method if there is one: a backend may sum before the VJP of its
+        projection, `SplatGradients.summed` sums after it.
         """
         ...
 
     @property
     def radii(self) -> Int[Tensor, "N 2"]:
-        """Half the box of each Gaussian, px, rounded up; 0 for those that are not visible. For the trait of this name.
+        """Half the size of each Gaussian's bounding box, px, rounded up; 0 for invisible ones. For the trait of this name.
 
-        As in gsplat it reaches to where alpha falls below `alpha_min`, at most 3.33 standard deviations.
+        As in gsplat, the box ends where alpha falls below `alpha_min`, at 3.33 standard deviations at most.
         """
         ...
 
@@ -308,10 +309,10 @@ class WithTraits(Rendering, Protocol):
 def summed_vjp(
     rendering: Rendering, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None
 ) -> SplatGradients:
-    """The gradients of two losses of an image that count as one, the second `weight` times, Gaussian by Gaussian.
+    """The gradients for all cotangents; those for the last two are summed, the last times `weight`, Gaussian by Gaussian.
 
     Args:
-        cotangents: those of the two losses last, after any others. weight: None: nothing is summed, as by `Rendering.vjp`.
+        weight: None: nothing is summed, as by `Rendering.vjp`.
     """
     if weight is None:
         return rendering.vjp(cotangents)
@@ -347,18 +348,16 @@ class Rasterizer(Protocol):
 
 @runtime_checkable
 class Recordable(Rasterizer, Protocol):
-    """A rasterizer whose renderings can be part of a `recording.Recording`: what changes from one replay to the next, it reads
-    from tensors.
-    """
+    """A rasterizer whose renderings can be part of a `recording.Recording`. It reads from tensors what changes in a replay."""
 
     def numbers_of(self, camera: Camera, device: torch.device) -> Sequence[Tensor]:
-        """A camera's numbers, in tensors that belong to this camera object. Another camera's of the same size may be copied to
-        them.
+        """The numbers of a camera, in tensors that belong to this camera object. Those of another camera of the same size may be
+        copied to them.
         """
         ...
 
     def background_on(self, device: torch.device) -> Float[Tensor, "1 3"]:
-        """The background, in a tensor that is not written to."""
+        """The background, in a tensor that must not be changed."""
         ...
 
     def over_changing(self, background: Float[Tensor, "1 3"]) -> Rasterizer:
@@ -367,7 +366,7 @@ class Recordable(Rasterizer, Protocol):
 
 
 def can_be_recorded(rasterizer: Rasterizer) -> TypeGuard[Recordable]:
-    """As `isinstance`, which for a protocol takes a tenth of the time that the host has in a replay."""
+    """Whether it is `Recordable`. `isinstance` with a protocol would take a tenth of the host's time in a replay."""
     return hasattr(rasterizer, "over_changing")
 
 

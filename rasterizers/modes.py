@@ -1,4 +1,4 @@
-"""Modes of torch that a loop may be in, and this package's code must not: `torch.compile`, `torch.autocast`, autograd."""
+"""Decorators that turn off modes of torch in which a loop may call this package: `torch.compile`, `torch.autocast`, autograd."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _R = TypeVar("_R")
 
 
 def in_full_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """The function with torch's autocast off, whose products of matrices would be in half precision."""
+    """The function with torch's autocast off, which would multiply matrices in half precision."""
 
     @functools.wraps(function)
     def called(*args: _P.args, **kwargs: _P.kwargs) -> _R:
@@ -30,20 +30,18 @@ def in_full_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def apart_from_the_loop(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """The function with torch's autocast and autograd off: what it calls runs in the same modes in every loop, and what it stores
-    keeps no graph.
-    """
+    """The function with torch's autocast and autograd off, so that it runs in the same modes in each loop and stores no graph."""
     return in_full_precision(torch.no_grad()(function))
 
 
 def uncompiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """The function, which `torch.compile` leaves as it is where compiled code calls it: the kernels take memory, not traces."""
+    """The function, called outside of the graph by code that `torch.compile` compiles: kernels take memory, not traces."""
 
     @functools.wraps(function)
     def called(*args: _P.args, **kwargs: _P.kwargs) -> _R:
         if torch.compiler.is_compiling():
             apart: Callable[_P, _R] = torch.compiler.disable(function)  # type: ignore[no-untyped-call]
-            return apart(*args, **kwargs)  # made here, since at import it would take a second
+            return apart(*args, **kwargs)  # not at import, where it would take a second
         return function(*args, **kwargs)
 
     return called

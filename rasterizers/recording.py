@@ -1,7 +1,7 @@
-"""Work on CUDA that is recorded once and then done again without the Python that launched it.
+"""Work on CUDA that is recorded once as CUDA graphs, and replayed without the Python that launched it.
 
-A recording consists of CUDA graphs. A replay runs the same kernels on the same memory. What changes from one replay to the next
-must lie in tensors that are written before it: a number that Python passed to a kernel or to torch is the same in every replay.
+A replay runs the same kernels on the same memory. What changes from one replay to the next must be written to tensors before it,
+since a number that Python passed to a kernel or to torch is the same in every replay.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ R = TypeVar("R")
 T = TypeVar("T")
 
 _CACHED: Final = 0.25
-"""Of the free memory: as much may be cached when a recording begins."""
+"""The share of the free memory that torch may have cached when a recording begins."""
 
 
 class Recording(Generic[T]):
-    """What `work` did on the device. It is done once while it is recorded, and again by each `replay`.
+    """The launches of `work` on the device, which run once after they are recorded, and again in each `replay`.
 
     Args:
         device: the CUDA device of all tensors of `work`, which runs on a stream of its own.
-        work: launches by torch and by `rasterizers.warp_runtime`. It must not read a number from the device, but in a `pause`.
-            What it does once, such as to compile kernels or to fill caches, must have been done, in a scope of `on_side_stream`.
+        work: launches by torch and by `rasterizers.warp_runtime`. It may read numbers from the device only in a `pause`. Kernels
+            must have been compiled and caches filled before, in a scope of `on_side_stream`.
 
     Attributes:
-        result: what `work` returned. Its tensors receive new values in every replay.
+        result: what `work` returned. Every replay overwrites its tensors.
         guards: conditions on the iteration under which a replay holds, see `rasterizers.guards`.
 
     Raises:
-        RuntimeError: `work` does what cannot be recorded. Live work can go on: the capture has been ended, and of the part
-            that was being recorded nothing has been done.
+        RuntimeError: `work` cannot be recorded. The capture has been ended, nothing of the part that was being recorded has run,
+            and the work can be done live.
     """
 
     def __init__(self, device: torch.device, work: Callable[[], T]) -> None:
@@ -48,7 +48,7 @@ class Recording(Generic[T]):
         self._parts: list[tuple[Callable[[], None], Callable[[], bool]]] = []
         self.guards: list[Callable[[int], bool]] = []
         self._watch = _Watch(device.type)
-        self._graph: Any = None  # which is being captured, and what ends that
+        self._graph: Any = None  # the graph that is being captured, and what ends the capture
         self._ends = ExitStack()
         with _one_at_a_time, on_side_stream(device), _running_as(self):
             try:
@@ -62,11 +62,11 @@ class Recording(Generic[T]):
                 raise
 
     def pause(self, read: Callable[[], R], holds: Callable[[], bool]) -> R:
-        """End a part of the work, and return what the host reads of it.
+        """End a graph, let the host read from the device, and begin the next graph.
 
         Args:
-            read: called once, while nothing is recorded.
-            holds: asked at this place of every replay, whether what was recorded after it holds for what was computed before it.
+            read: called once, while nothing is recorded; its result is returned.
+            holds: called at this place of every replay: whether the later graphs hold for what the earlier ones have computed.
         """
         self._end(holds)
         found = read()
@@ -74,15 +74,15 @@ class Recording(Generic[T]):
         return found
 
     def launched(self, tensors: Iterable[Any]) -> None:
-        """Note a launch that torch does not see, which reads and writes these tensors."""
+        """Keep alive the tensors of a launch that torch does not see."""
         self._watch.keep(tensors)
 
     def holds_at(self, t: int) -> bool:
-        """Whether what Python has decided by the iteration is the same at t."""
+        """Whether Python decides at t as it did in the recording: all guards hold."""
         return all(guard(t) for guard in self.guards)
 
     def replay(self) -> bool:
-        """Do the work again; False: it ended at a `pause` where what was recorded does not hold."""
+        """Do the work again; False: it ended at a `pause` after which the recording does not hold."""
         for work, holds in self._parts:
             work()
             if not holds():
@@ -102,18 +102,18 @@ class Recording(Generic[T]):
 
     def _end(self, holds: Callable[[], bool]) -> None:
         self._ends.close()
-        self._graph.replay()  # to record is not to run
+        self._graph.replay()  # capturing runs nothing
         self._parts.append((self._graph.replay, holds))
 
 
 _failed: Final[list[Any]] = []
-"""Graphs whose capture CUDA has ended by an error. Torch's allocator of pinned memory asks them later, whose they are."""
+"""Graphs whose capture CUDA ended with an error, kept alive since torch's allocator of pinned memory refers to them later."""
 
 
 @contextmanager
 def _captured_by(graph: Any, pool: Any, device: int) -> Iterator[None]:
-    """A scope that ends the graph's capture. Where CUDA ends it by an error, torch goes on as within the capture: its allocator
-    keeps what is cached, also where memory runs out, `torch.cuda.empty_cache` and random numbers raise. This undoes that.
+    """A scope that ends the graph's capture. If CUDA ends it with an error, torch stays in the state of a capture: its allocator
+    frees no cached memory, even if memory runs out, and `torch.cuda.empty_cache` and random numbers raise. The scope undoes that.
     """
     generator: Any = torch.cuda.default_generators[device]
     before = generator.clone_state()
@@ -132,8 +132,8 @@ def _captured_by(graph: Any, pool: Any, device: int) -> Iterator[None]:
 
 
 def _make_room(device: torch.device) -> None:
-    """Give cached memory back before it runs short. In a capture torch gives none back, and what dropped recordings leave in
-    their pools nothing else can use.
+    """Free cached memory before it runs short: torch frees none in a capture, and nothing else can use the memory that dropped
+    recordings leave in their pools.
     """
     cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     if cached > _CACHED * torch.cuda.mem_get_info(device)[0]:
@@ -141,8 +141,8 @@ def _make_room(device: torch.device) -> None:
 
 
 class _Watch(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Keeps the tensors that operations of torch read and write and that were allocated before, and refuses to read a number
-    before CUDA does, which would make the capture invalid.
+    """Keeps alive the tensors that torch's operations read or write and that were allocated before the recording. Refuses to read
+    a number from the device before CUDA does, which would invalidate the capture.
     """
 
     def __init__(self, device: str) -> None:
@@ -160,7 +160,7 @@ class _Watch(TorchDispatchMode):  # type: ignore[no-untyped-call]
             raise RuntimeError("recorded work must not read a number from the device.")
         given, result = tree_leaves((args, kwargs)), op(*args, **kwargs)
         if not (op.is_view or op._schema.is_mutable):
-            self._own |= _addresses(tree_leaves(result)) - _addresses(given)  # unsafe_split returns what it is given
+            self._own |= _addresses(tree_leaves(result)) - _addresses(given)  # unsafe_split returns its input
         self.keep(given)
         return result
 
@@ -170,7 +170,7 @@ def _addresses(tensors: Iterable[Any]) -> set[int]:
 
 
 class _Running(threading.local):
-    """What a thread is recording, and its side streams: work of another thread on one that is captured would be recorded, too."""
+    """A thread's recording and its side streams: a capture would record another thread's work on the same stream, too."""
 
     recording: Recording[Any] | None = None
 
@@ -180,7 +180,7 @@ class _Running(threading.local):
 
 _running: Final = _Running()
 _one_at_a_time: Final = threading.RLock()
-"""Of recordings by several threads, since Warp's list of captures is that of all threads, and so is Python's collector."""
+"""Threads record one at a time, since they share Warp's list of captures and Python's garbage collector."""
 
 
 def running() -> Recording[Any] | None:
@@ -190,7 +190,7 @@ def running() -> Recording[Any] | None:
 
 @contextmanager
 def _running_as(recording: Recording[Any]) -> Iterator[None]:
-    """A scope without Python's collector: what that frees may be memory or an event of CUDA, and so end a capture."""
+    """A scope without Python's garbage collector, which may free memory or an event of CUDA, and so end the capture."""
     collects = gc.isenabled()
     gc.disable()
     _running.recording = recording
@@ -204,8 +204,8 @@ def _running_as(recording: Recording[Any]) -> Iterator[None]:
 
 @contextmanager
 def on_side_stream(device: torch.device) -> Iterator[None]:
-    """A scope whose work runs on the stream that graphs are captured on, which torch's default stream cannot be: after what was
-    launched before the scope, and before what is launched after it.
+    """A scope whose work runs on the stream for captures, which cannot be torch's default stream. It is ordered after all work
+    launched before the scope, and before all work launched after it.
     """
     outer, side = torch.cuda.current_stream(device), _side_stream(device)
     side.wait_stream(outer)
@@ -217,7 +217,7 @@ def on_side_stream(device: torch.device) -> Iterator[None]:
 
 
 def _side_stream(device: torch.device) -> Any:
-    """This thread's."""
+    """This thread's stream for captures."""
     if device not in _running.streams:
         _running.streams[device] = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
     return _running.streams[device]
@@ -225,7 +225,7 @@ def _side_stream(device: torch.device) -> Any:
 
 @cache
 def warp_stream(stream: Any) -> Any:
-    """Torch's stream as a Warp stream. Cached, because Warp keeps the scratch memory of its sort with the stream."""
+    """Torch's stream as a Warp stream. It is cached, because Warp stores the scratch memory of its sort with the stream."""
     import warp as wp
 
     wp.init()  # the recorded work may be torch's alone

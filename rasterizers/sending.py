@@ -1,4 +1,4 @@
-"""Numbers of Python on a device, without waiting for what it has still to do, as `Tensor.new_tensor` does."""
+"""Copies of small CPU tensors to a device. Unlike `Tensor.new_tensor`, the host does not wait for the device's queued work."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rasterizers.interface import Color
 
 
 def sent(numbers: Tensor, device: torch.device) -> Tensor:
-    """A small tensor of the CPU on the device."""
+    """A small CPU tensor, copied to the device without waiting."""
     return numbers.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else numbers
 
 

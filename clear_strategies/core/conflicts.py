@@ -21,8 +21,8 @@ class Products:
     Args:
         names: the groups that both gradients have.
         dot, l2, h2: a column for each of `CONFLICT_GROUPS`, 0 for a group that is not in `names`.
-        comparable: how many Gaussians have two gradients other than zero, by group: invisible and dropped ones do not count (F38,
-            F42); a seventh number is for the Gaussian as a whole.
+        comparable: how many Gaussians have two nonzero gradients, by group: invisible and dropped ones do not count (F38, F42);
+            the seventh number is of whole Gaussians.
         opposed: how many of these have a cosine below 0.
     """
 

@@ -1,4 +1,4 @@
-"""What the SR image of a view is worth: per patch, and per Gaussian."""
+"""How reliable the SR image of a view is, and how much it is needed: per patch, and per Gaussian."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Evidence:
     """q_i and a_i of one view, in [0, 1]; both are 0 for a Gaussian that is not visible in the view (F24).
 
     Args:
-        sums: on a device, the number of visible Gaussians, and Σ q_i and Σ w_i; None where they have not been added up.
+        sums: the number of visible Gaussians, Σ q_i and Σ w_i, on a device; None: not computed.
     """
 
     reliability: Float[Tensor, " N"]

@@ -24,7 +24,7 @@ CONFLICT_GROUPS: Final = ("means", "sh0", "shN", "opacities", "scales", "quats")
 
 
 class Colour(NamedTuple):
-    """A gradient of the spherical harmonics by its factors, Y ⊗ ∇rgb: three numbers a Gaussian and those of Y in place of 48.
+    """A gradient of the spherical harmonics as its factors, Y ⊗ ∇rgb: per Gaussian three numbers and Y, instead of 48 numbers.
 
     Args:
         basis: Y of the active bands of each Gaussian, from the camera that drew it.
@@ -40,7 +40,7 @@ class Grads(dict[str, Tensor]):
     An absent attribute has gradient 0.
 
     Attributes:
-        colour: the gradient of sh0 and shN by its factors, in addition to what these have by name; None: there is none.
+        colour: the gradient of sh0 and shN as factors, in addition to what they have by name; None: there is none.
         screen: the gradient of the projected centre [N, 2], 1/pixel; arithmetic drops it, since it is a statistic and not the
             gradient of a parameter.
     """
@@ -56,7 +56,7 @@ class Grads(dict[str, Tensor]):
 
     @property
     def tensors(self) -> Mapping[str, Tensor]:
-        """What must be finite before a step, by name. Y is finite wherever a Gaussian is drawn, and is a third of the numbers."""
+        """The tensors that must be finite before a step, by name. Y, a third of the numbers, is finite for drawn Gaussians."""
         return self if self.colour is None else {**self, "rgb": self.colour.rgb}
 
     def __add__(self, other: Mapping[str, Tensor]) -> Grads:
@@ -92,8 +92,8 @@ class Grads(dict[str, Tensor]):
 
 
 def gradients_of(g: SplatGradients) -> list[Grads]:
-    """The gradients of what was drawn, one for each cotangent, that of the colours by its factors; of `SplatGradients.summed` as
-    of `summed`.
+    """The gradients of the drawn splats, one for each cotangent, with the colours' gradient as factors. From
+    `SplatGradients.summed` it makes what `summed` returns.
     """
     basis, n = g.basis.contiguous(), len(g.means)
     rows = (g.means, g.quats, g.scales, g.opacities, g.rgb[:n], g.screen[:n])
@@ -109,9 +109,9 @@ def gradients_of(g: SplatGradients) -> list[Grads]:
 
 
 def summed(each: Sequence[Grads], weight: Float[Tensor, " N"]) -> list[Grads]:
-    """The last gradient, `weight` times each row, added to the one before, whose `screen` stays.  Eq. 13
+    """The last gradient times `weight`, row by row, is added to the one before, which keeps its `screen`.  Eq. 13
 
-    Of the last itself remain its `screen` and the gradient of f_det, `weight` times: f_det gets nothing else.
+    The last keeps its `screen` and `weight` times its gradient of f_det, the only gradient that f_det gets.
     """
     *others, base, hf = each
     total = base.without_detail().plus(hf.without_detail(), weight)
@@ -157,7 +157,7 @@ def scale_rows(value: Float[Tensor, "N ..."], weight: float | Float[Tensor, " N"
 
 
 def gathered(rows: Float[Tensor, "N ..."], parents: Int[Tensor, " M"]) -> Float[Tensor, "M ..."]:
-    """Row i is a copy of row parents[i]; in the same memory where there are as many, so that recordings of it hold."""
+    """Row i is a copy of row parents[i]. If the number of rows stays, so does the memory, and recordings that read it hold."""
     chosen = rows.index_select(0, parents)
     return rows.copy_(chosen) if len(rows) == len(parents) else chosen
 
@@ -174,7 +174,7 @@ def to_ndc(screen: Float[Tensor, "N 2"], size: tuple[int, int]) -> Float[Tensor,
 
 @lru_cache(maxsize=64)
 def _half(size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Float[Tensor, " 2"]:
-    """Half the size of an image. It is written on the device; to copy it there the host would wait."""
+    """Half the size of an image, written on the device: for a copy from the CPU the host would wait."""
     return torch.cat([torch.full((1,), pixels / 2, dtype=dtype, device=device) for pixels in size])
 
 

@@ -18,11 +18,11 @@ class Step:
 
     Args:
         t: the iteration, from 1.
-        view: what this iteration trains on: photo and SR image, each with a camera that knows its size in pixels.
+        view: the photo and the SR image of this iteration, each with its camera.
         visible: the Gaussians that the HR render shows, [N]; None in an iteration without HR.
         evidence: the answer of `Strategy.observe`; None before it, and where no strategy gives one.
         params: raw parameters by attribute (log scales, logit opacities), to read; empty where the structure has changed since.
-        looked_up: what the strategy that observes looks up of the view (`Strategy.looked_up`); None: it looks itself.
+        looked_up: `Strategy.looked_up` of the strategy that observes; None: the strategy calls it itself.
     """
 
     t: int
@@ -33,7 +33,7 @@ class Step:
     looked_up: Tensor | None = None
 
     def copied(self) -> Step:
-        """The same step with tensors of its own."""
+        """The same step with copies of its tensors."""
         e, visible = self.evidence, self.visible
         if e is not None:
             e = Evidence(e.reliability.clone(), e.demand.clone(), None if e.sums is None else e.sums.clone())

@@ -56,11 +56,11 @@ class Photo:
         return replace(self, image=self.image.to(device), shown=shown, transparency=transparency)
 
     def over(self, color: Color | None, background: Color) -> Photo:
-        """The photo before `color` in place of `background`, as far as it is transparent, and then opaque; itself for None."""
+        """The photo composited over `color` instead of `background`, and then opaque; itself if `color` is None."""
         if color is None or self.transparency is None:
             return self
-        before, behind = (color_on(c, self.image.device, self.image.dtype)[0] for c in (background, color))
-        image = (self.image + self.transparency[..., None] * (behind - before)).clamp(0, 1)
+        old, new = (color_on(c, self.image.device, self.image.dtype)[0] for c in (background, color))
+        image = (self.image + self.transparency[..., None] * (new - old)).clamp(0, 1)
         return replace(self, image=image, transparency=None)
 
     def factor_to(self, max_pixels: int) -> int:
@@ -68,8 +68,8 @@ class Photo:
         return max(1, math.ceil(math.sqrt(self.camera.width * self.camera.height / max_pixels)))
 
     def reduced(self, factor: int) -> Photo:
-        """The mean of each block of `factor` × `factor` pixels, hidden where one of them is. What is left over at the right and
-        at the bottom is cut off.
+        """The mean of each block of `factor` × `factor` pixels, hidden if one of them is. Pixels that fill no block, at the right
+        and bottom, are cut off.
         """
         if factor == 1:
             return self
@@ -141,8 +141,8 @@ class View:
         sr_source: the prior's label, e.g. "onnx span_x4.onnx".
         depth: of the photo's surfaces, from stereo, on the pixels of `depth_photo`; None where nothing needs it, e.g. in
             test views.
-        disagreement: |D(I) - I_LR|, where I is the SR image as the network made it and `hr` is I after back-projection, which
-            removes that difference. P2G measures the reliability by it. None where `hr` is I itself.
+        disagreement: |D(I) - I_LR| of the network's SR image I, by which P2G measures reliability. Back-projection, which makes
+            `hr` of I, removes this difference. None if `hr` is I itself.
         background: RGB in [0, 1] behind the scene; pixels of this colour belong to no surface.
     """
 
@@ -167,7 +167,7 @@ class View:
 
     @property
     def depth_photo(self) -> Photo:
-        """The photo that `depth` is of: `lr`, or where HR is a photo, too, `hr` reduced to the size of the depth map."""
+        """The photo that `depth` belongs to: `lr`, or if HR is a photo too, `hr` reduced to the size of the depth map."""
         if self.depth is None or self.depth.depth.shape == self.lr.image.shape[:2]:
             return self.lr
         return self.hr.reduced(self.hr.camera.width // self.depth.depth.shape[1])
@@ -178,8 +178,8 @@ class View:
         return replace(self, lr=replace(self.lr, shown=shown), hr=replace(self.hr, shown=fine))
 
     def brightened(self, gain: Float[Tensor, " 3"]) -> View:
-        """The same view with its images times a gain for each channel, in [0, 1]. Its background is then no longer
-        `background`, so that no other can take its place.
+        """The same view with its images times a gain for each channel, clamped to [0, 1], and opaque: their background is not
+        the view's, so another colour cannot replace it.
         """
         lr, hr = (
             replace(photo, image=(photo.image * gain).clamp(0, 1), transparency=None) for photo in (self.lr, self.hr)
@@ -204,7 +204,7 @@ class ExtraView:
         photo: the target, and its camera. Any size; the smaller, the cheaper.
         weight: >= 0 for each pixel, a multiple of λ_LR; 0 where the target is unknown.
         background: see `View.background`; what a transparent photo lies over.
-        robust: the photo was invented in part: where the render differs from it much more than elsewhere, the weight is lower,
+        robust: parts of the photo may be invented. The weight is lower where the render differs from it much more than elsewhere,
             see `clear_strategies.core.images.agreement`.
     """
 

@@ -21,7 +21,7 @@ from clear_strategies.outputs.metrics import Metrics
 from clear_strategies.settings import CHANGES_NO_RESULT, flat
 from clear_strategies.training import checkpoint
 from clear_strategies.training.checkpoint import CHECKPOINTS, Checkpoint
-from clear_strategies.training.state import PHOTOS, TrainState, colours
+from clear_strategies.training.state import PHOTOS, TrainState, fingerprints
 from clear_strategies.viewing.cameras import FILE as CAMERAS
 from clear_strategies.viewing.cameras import read_cameras
 from rasterizers.interface import Camera
@@ -33,7 +33,7 @@ AUTO: Final = "auto"  # the value of fit.resume that is not a path
 
 # What may differ between a run and the one that it resumes. Another device changes bits, which is logged.
 _NOT_COMPARED: Final = CHANGES_NO_RESULT | {"fit.device"}
-# Where photos and SR images lie, which may be moved: cameras and colours of what is read there are compared.
+# Where photos and SR images lie, which may be moved: cameras and fingerprints of what is read there are compared.
 _PLACE: Final = re.compile(r"data\.(path|root|reader\.(root|cache)|views\.lr_folder)|prior\.(.*\.)?path")
 # A file, such as initial points or a network, has its digest beside the key of its path.
 _FILE: Final = ".path"
@@ -79,7 +79,7 @@ def finished(folder: Path, config: Mapping[str, Any], scene: Callable[[], Scene]
     if moved or any(_written(Path(place), path) for key, place in places.items() if key.endswith(_FILE)):
         _require_same_cameras(folder, there := scene())
         if (last := newest(folder)) is not None:
-            _require_same_photos(folder, checkpoint.load(last), colours(there))
+            _require_same_photos(folder, checkpoint.load(last), fingerprints(there))
     mean = content.shown.mean.get("ours")
     score = "no PSNR" if mean is None or mean.psnr is None else f"PSNR {mean.psnr:.2f} dB"
     _log.info(

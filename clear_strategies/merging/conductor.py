@@ -50,7 +50,7 @@ P = TypeVar("P")
 
 _UNKNOWN: Final[Mapping[str, Tensor]] = {}
 _ONE_ANSWER: Final = ("densifier", "background", "gate", "observe", "route", "reconcile", "score")
-_ALSO_BY: Final = {"reconcile": ("correct",)}  # other hooks that answer the same
+_ALSO_BY: Final = {"reconcile": ("correct",)}  # hooks that may be overridden instead
 
 
 class Conductor:
@@ -68,10 +68,10 @@ class Conductor:
     Attributes:
         skips: which work of the run is left out.
         regularizers: the strategies that override `regularize`.
-        showing: those that override `extra_views`.
+        showing: the strategies that override `extra_views`.
         decorated: whether `prior` has been called, or there are no decorators.
-        sr: the prior that `prior` was called with; None before.
-        views: that `on_fit_start` was called with.
+        sr: the argument of `prior`; None before it is called.
+        views: the argument of `on_fit_start`.
         logs: the scalars that the strategies log.
 
     Raises:
@@ -93,7 +93,7 @@ class Conductor:
         self.views: tuple[View, ...] = ()
         self._hr_cotangents: Tensor | None = None
         self.logs = IterationLogs(strategies)
-        self._owner = dict.fromkeys(_ONE_ANSWER, Strategy())  # its hooks hold where no strategy overrides them
+        self._owner = dict.fromkeys(_ONE_ANSWER, Strategy())  # whose hooks are the defaults
         for hook in _ONE_ANSWER:
             hooks = [hook, *_ALSO_BY.get(hook, ())]
             owners = [s for s in strategies if any(overrides(s, name) for name in hooks)]
@@ -140,7 +140,7 @@ class Conductor:
             s.on_fit_end()
 
     def prior(self, prior: P) -> P:
-        """The prior with every decorator around it: what makes the SR images of a run with this conductor."""
+        """The prior with every decorator around it, which makes the SR images of a run with this conductor."""
         self.sr = prior
         for decorate in self.decorators:
             prior = decorate(prior)
@@ -157,7 +157,7 @@ class Conductor:
         return None if z is None else z.detach().float()  # kernels read no other type
 
     def looked_up(self, view: View) -> Tensor | None:
-        """What the strategy that observes looks up of a view, for `Step.looked_up`."""
+        """`Strategy.looked_up` of the strategy that observes, for `Step.looked_up`."""
         return self._owner["observe"].looked_up(view)
 
     def background(self, t: int) -> Color | None:
@@ -167,7 +167,7 @@ class Conductor:
         return color
 
     def wants_hr(self, t: int) -> bool:
-        """Whether the HR render has any use at t: λ_HR > 0, Î_LR is made of it, or a densification score needs it."""
+        """Whether the HR render is used at t: λ_HR > 0, Î_LR is its area mean, or a densification score needs it."""
         if self.objective.lambda_hr(t) > 0 or not self.wants_lr:
             return True
         collecting = self.statistics_from is not None and t > self.statistics_from
@@ -205,13 +205,13 @@ class Conductor:
         Args:
             params: raw parameters by attribute. lr, hr: this view rendered at both scales. hr None skips HR; lr None
                 stands for the area mean of hr, where `wants_lr` is False or both scales have one size.
-            stepper: merges and steps in one pass; None: the readable path below.
+            stepper: merges and steps in one pass; None: `merge`, and the caller steps.
             scored: False: no densification reads the scores of this iteration.
-            looked_up: for `Step.looked_up`.
+            looked_up: see `Step.looked_up`.
 
         Raises:
             ValueError: a scale that the objective needs was not rendered.
-            DivergedError: a loss or a gradient is not finite; neither `params` nor the optimizer have changed.
+            DivergedError: a loss or a gradient is not finite; `params` and the optimizer are unchanged.
         """
         o, stage = self.objective, self.work_log.stage
         vjp: Callable[..., Sequence[Grads]] = _vjp if stepper is None else stepper.vjp
@@ -224,7 +224,7 @@ class Conductor:
             )
         self.logs.keep()
         with stage("losses LR"):
-            low, photo = rendered.image.detach(), self._before_background(view.lr, t, view.background)
+            low, photo = rendered.image.detach(), self._over_background(view.lr, t, view.background)
             _require_size(view, "HR" if reduced else "LR", low, view.hr.image if reduced else photo.image)
             l_lr = o.lr(images.area_mean(low, view.factor) if reduced else low, photo.image, photo.shown)  # Eq. 4
         where = _where(view, t)
@@ -239,10 +239,10 @@ class Conductor:
         else:
             # Where Î_LR is the area mean of Î_HR, the cotangent of L_LR passes through the same HR render.
             through_mean = images.area_mean_transposed(l_lr.cotangents, view.factor) if reduced else None
-            drawn = Step(iteration(t), self._told(view), hr.visible, params=params, looked_up=looked_up)
-            g_mean, from_hr = self._backward_hr(hr, view, drawn, t, vjp, through_mean)
+            hr_step = Step(iteration(t), self._guarded(view), hr.visible, params=params, looked_up=looked_up)
+            g_mean, from_hr = self._backward_hr(hr, view, hr_step, t, vjp, through_mean)
             g_lr = g_mean if reduced else g_lr
-        step = Step(iteration(t), self._told(view), params=params) if from_hr is None else from_hr.step
+        step = Step(iteration(t), self._guarded(view), params=params) if from_hr is None else from_hr.step
         with stage("strategies" if stepper is None else "per-Gaussian pass"):
             score = ordinary = None
             if scored:
@@ -276,22 +276,22 @@ class Conductor:
 
         Args:
             vjp: as `Stepper.vjp`; None: by `Shot.vjp`.
-            apart: False: one cotangent, of L_base + λ_HF L_HF, where no strategy routes or scores by the two apart.
-            params, looked_up: for `Step`.
+            apart: False: one cotangent, of L_base + λ_HF L_HF, unless a strategy routes or scores by L_HF.
+            params, looked_up: see `Step`.
         """
         apart = apart or self.owner("route") is not None or self.owner("score") is not None
-        step = Step(iteration(t), self._told(view), hr.visible, params=params, looked_up=looked_up)
+        step = Step(iteration(t), self._guarded(view), hr.visible, params=params, looked_up=looked_up)
         return self._backward_hr(hr, view, step, t, vjp or _vjp, apart=apart)[1]
 
     @apart_from_the_loop
     def draw(self, t: int, means: Float[Tensor, "N 3"], enlarged: Callable[[Camera, int], Photo]) -> None:
-        """Let the strategies draw what the field shows, before `extra_views`."""
+        """Let the strategies render the field, before `extra_views`."""
         for s in self.strategies:
             s.draw(t, means, enlarged)
 
     @apart_from_the_loop
     def extra_views(self, t: int) -> list[ExtraView]:
-        """The pictures that the field should match at t besides the view; each gets a step on `extra_loss`."""
+        """The pictures that the field should match at t in addition to the view; each gets a step on `extra_loss`."""
         if self.objective.lambda_lr == 0 or not self.showing:
             return []
         with self.work_log.stage("pictures of extra views"):  # a pseudo view is made when it is first asked for
@@ -307,7 +307,7 @@ class Conductor:
             DivergedError: the loss is not finite.
         """
         weight = extra.weight[..., None]
-        photo = self._before_background(extra.photo, t, extra.background)
+        photo = self._over_background(extra.photo, t, extra.background)
         target = torch.where(weight > 0, photo.image, 0.0)
         render = torch.where(weight > 0, image.detach(), 0.0)
         if extra.robust:
@@ -337,8 +337,8 @@ class Conductor:
         Args:
             g_hr: g^HR of Eq. 13, and m λ_HF ∇L_HF of f_det; empty without HR. step: the iteration, with the evidence.
             out: receives the merged gradient, by attribute, contiguous; None: new tensors, for what has a gradient.
-            lambda_hr: λ_HR(t) > 0, of a recording.
-            finite: look at the numbers that strategies answer, too.
+            lambda_hr: λ_HR(t) > 0 on the device, in a recording.
+            finite: check also that the strategies' answers are finite.
         """
         λ = self.objective.lambda_hr(t) if lambda_hr is None else lambda_hr
         plus = self.regularized(params, t, finite=finite)
@@ -363,14 +363,14 @@ class Conductor:
     def reconciled(
         self, products: Products, step: Step | None, both: Callable[[], tuple[Grads, Grads]], *, finite: bool = False
     ) -> Weights | Grads:  # fmt: skip
-        """How the strategies reconcile g_HR with g_LR: the weights of `reconcile`, or ĝ_HR where one overrides `correct`.
+        """How the strategies reconcile g_HR with g_LR: the weights of `reconcile`, or ĝ_HR if one overrides `correct`.
 
         Args:
-            both: g_LR and g^HR with every number, which only `correct` needs.
-            finite: look at the numbers, too.
+            both: returns g_LR and g^HR in full, which only `correct` needs.
+            finite: check also that the answer is finite.
 
         Raises:
-            AnswerError: the answer is none that the hook may give.
+            AnswerError: the answer is not valid.
         """
         s = self._owner["reconcile"]
         if overrides(s, "correct"):
@@ -384,7 +384,7 @@ class Conductor:
         """What the strategies add to the merged gradient; empty: nothing.  Eq. 16
 
         Args:
-            finite: look at the numbers, too.
+            finite: check also that the answers are finite.
         """
         total = Grads()
         for s in self.regularizers:
@@ -397,13 +397,13 @@ class Conductor:
 
     @apart_from_the_loop
     def pulls(self, params: Mapping[str, Tensor], t: int) -> bool:
-        """Whether a strategy adds a gradient of its own, which moves Gaussians that no view draws."""
+        """Whether a strategy adds a gradient at t, which moves even Gaussians that no view draws."""
         return any(s.regularize(params, t) is not None for s in self.regularizers)
 
     def scores(
         self, screen_lr: Float[Tensor, "N 2"], hr: HrSide | None, weights: LossWeights
     ) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
-        """The densification score of the strategies, and the ordinary ‖∇_u L‖ that holds without them.
+        """The densification score of the strategies, and the ordinary one, ‖∇_u L‖.
 
         Args:
             screen_lr: ∇_u(λ_LR L_LR) in NDC units. weights: λ_HR and λ_HR λ_HF.
@@ -420,7 +420,7 @@ class Conductor:
     @apart_from_the_loop
     def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
         """After the optimizer steps of an iteration."""
-        params = MappingProxyType(params)  # a tensor that was put into it would change nothing
+        params = MappingProxyType(params)  # to replace an entry would have no effect
         for s in self.strategies:
             s.after_step(params, step)
             answers.require_state(s, params)
@@ -459,12 +459,12 @@ class Conductor:
         s = self._owner[hook]
         return None if type(s) is Strategy else s
 
-    def _before_background(self, photo: Photo, t: int, behind: Color) -> Photo:
-        """The photo before the background of iteration t; a recording is given it so."""
-        is_so = photo.transparency is None or running() is not None
-        return photo if is_so else photo.over(self.background(t), behind)
+    def _over_background(self, photo: Photo, t: int, background: Color) -> Photo:
+        """The photo composited over the background of iteration t instead of its own. Those of a recording are so already."""
+        is_final = photo.transparency is None or running() is not None
+        return photo if is_final else photo.over(self.background(t), background)
 
-    def _told(self, view: View) -> View:
+    def _guarded(self, view: View) -> View:
         return guarded(view, over_changing=self.owner("background") is not None)
 
     def _backward_hr(
@@ -477,12 +477,12 @@ class Conductor:
         lr_cotangents: Tensor | None = None,
         apart: bool = True,
     ) -> tuple[Grads | None, HrSide]:
-        """∇(λ_LR L_LR) where its cotangents [1, H, W, 3] are given, and the gradients of the HR losses."""
+        """∇(λ_LR L_LR) if its cotangents [1, H, W, 3] are passed, else None; and the gradients of the HR losses."""
         stage = self.work_log.stage
         with stage("losses HR"):
-            sr = self._before_background(view.hr, t, view.background)
+            sr = self._over_background(view.hr, t, view.background)
             _require_size(view, "HR", hr.image, sr.image)
-            # The memory is kept: an allocator maps tens of megabytes afresh each time, at a page fault for every 4 KB.
+            # The memory is reused: an allocator would map tens of megabytes anew each time, with a page fault for every 4 KB.
             losses = self.objective.hr(hr.image.detach(), sr.image, sr.shown, reuse=self._hr_cotangents)  # Eq. 5
             self._hr_cotangents = losses.cotangents
         require_finite_losses(_where(view, t), losses.values, {"the SR image": sr.image, "the HR render": hr.image})
@@ -511,7 +511,7 @@ class Conductor:
 def _vjp(
     shot: Shot, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
 ) -> Sequence[Grads]:  # fmt: skip
-    """As `Stepper.vjp`, of any shot."""
+    """`Stepper.vjp` for any shot."""
     if weight is None:
         return shot.vjp(cotangents)
     of_shot = getattr(shot, "summed_vjp", None)

@@ -1,4 +1,4 @@
-"""The merge for trainers that have their own optimizer: their gradients become the merged ones, in place."""
+"""The merge for trainers with an optimizer of their own: the merged gradients replace `.grad`, in place."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ def merge_in_place(
     """Turn `.grad` of the parameters, before + scale · ∇(λ_LR L_LR), into before + scale · the merged gradient.
 
     Args:
-        params: the leaves by gsplat's names; those without `.grad` are frozen and stay so, but for "detail".
+        params: the leaves by gsplat's names; those without `.grad`, except for "detail", are frozen and stay so.
         g_hr: g^HR of the raw parameters after routing, and the gradient of f_det; None: without HR.  Eq. 12, 13
         step: the iteration, with the evidence; None without HR.
-        before: `.grad` as it was when the backward pass began, by name, where it was there.
-        lr_colour: what `.grad` of sh0 and shN lacks of this pass.
+        before: `.grad` at the beginning of the backward pass, by name, for parameters that had one.
+        lr_colour: the gradient of sh0 and shN that the pass has brought as factors, which their `.grad` lacks.
         scale: of the loss: an AMP gradient scaler's, or 1 / the number of accumulated passes.
-        merge: in place of `Conductor.merge_routed`.
+        merge: replaces `Conductor.merge_routed`.
 
     Returns:
         The conflict ratios by group, before correction; {} without HR.
 
     Raises:
-        DivergedError: a merged gradient in the CPU's memory is not finite, and `must_be_finite`: False for a trainer with an
+        DivergedError: a merged gradient in the CPU's memory is not finite. Not with `must_be_finite=False`, for a trainer with an
             AMP gradient scaler, which skips such a step.
     """
     factored = ("detail",) if lr_colour is None else ("detail", "sh0", "shN")
@@ -73,7 +73,7 @@ def merge_in_place(
         require_finite(f"t={t}: the merged gradient{hint}", merged.grads)
     for name, p in trained.items():
         g = out[name] if scale == 1 else out[name].mul_(scale)
-        _give(p, g.add_(before[name]) if name in before else g)
+        _set_grad(p, g.add_(before[name]) if name in before else g)
     return merged.conflict
 
 
@@ -81,8 +81,8 @@ def _widened(x: Tensor) -> Tensor:
     return x.float() if x.dtype in _HALF else x
 
 
-def _give(p: Tensor, gradient: Tensor) -> None:
-    """Make a gradient that of a parameter, in the tensor that holds it already where there is one."""
+def _set_grad(p: Tensor, gradient: Tensor) -> None:
+    """Set `.grad` of a parameter, in the memory of its present `.grad` if it has one."""
     if p.grad is None:
         p.grad = gradient.to(p.dtype)
     elif p.grad.data_ptr() != gradient.data_ptr() or p.grad.dtype != gradient.dtype:

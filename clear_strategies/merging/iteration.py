@@ -1,4 +1,4 @@
-"""What one iteration gives and decides: the gradients of HR, the merged ones, the update, and whoever steps by them."""
+"""The results of an iteration: the gradients of HR, the merged gradients and the update; and `Stepper`, which applies them."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ LossWeights = tuple[float, float] | Tensor
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HrSide:
-    """What the HR render of one view gives: its gradients, the evidence, and the routing weights.
+    """The HR side of one view: its gradients, the evidence and the routing weights.
 
     Args:
         g: g^HR, with the `.screen` of ∇L_base.  Eq. 13
-        detail: m λ_HF ∇L_HF of f_det, which is never corrected and gets nothing of L_base, with the `.screen` of ∇L_HF; None
-            where λ_HF = 0.
+        detail: m λ_HF ∇L_HF of f_det, which L_base does not move and nothing corrects, with the `.screen` of ∇L_HF; None if
+            λ_HF = 0.
         size: (width, height) of the image in whose pixels `.screen` counts.
         step: the iteration, with the answer of `observe`. m: the answer of `route`, [N] or 1.
         losses: L_base and L_HF by name.
@@ -55,7 +55,7 @@ class Merged(NamedTuple):
     Args:
         grads: g_LR + λ_HR ĝ_HR + λ∇L_stab, for the optimizer.  Eq. 8, 16
         conflict: share of Gaussians in conflict before correction, by group and as "gaussian".
-        finite: whether every number of `grads` is; on a device it is not known yet.
+        finite: whether all of `grads` is finite; on a device, a number that is not read yet.
     """
 
     grads: Grads
@@ -69,13 +69,13 @@ class Update:
 
     Args:
         step: the iteration, for `Conductor.after_step`.
-        grads: the merged gradient by attribute, for the optimizer; None where a `Stepper` has made the step.
-        score: S_i, the statistic that densification uses; `ordinary` is that of 3DGS, without strategies. None where nothing
-            collects them.
+        grads: the merged gradient by attribute, for the optimizer; None if a `Stepper` has made the step.
+        score: S_i, the statistic that densification uses; `ordinary` is that of 3DGS, without strategies. None if no
+            densification reads them.
         conflict: share of Gaussians in conflict before correction, by group and as "gaussian"; empty without HR.
         losses: scalars by name. logs: the scalars that the strategies logged in the update.
 
-    On a device, losses, conflict and logs are not floats yet: `deferred.read`.
+    On a device, losses, conflict and logs become floats by `deferred.read`.
     """
 
     step: Step
@@ -89,12 +89,12 @@ class Update:
 
 @runtime_checkable
 class Stepper(Protocol):
-    """Merges and steps in one pass: the same arithmetic as `Conductor.merge` and the optimizer, with no gradient left."""
+    """Merges and steps in one pass: the arithmetic of `Conductor.merge` and of the optimizer, without storing the gradient."""
 
     def vjp(
         self, shot: Any, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
     ) -> Sequence[Grads]:  # fmt: skip
-        """One gradient per cotangent; with `weight` as `core.gradients.summed` makes them."""
+        """One gradient per cotangent; with `weight`, the result of `core.gradients.summed`."""
         ...
 
     def step(
@@ -113,11 +113,11 @@ class Stepper(Protocol):
 
 
 def require_finite_parts(where: str, g_lr: Grads, hr: HrSide | None) -> None:
-    """Check what a `Stepper` merges: the gradients, and the weights of the strategies; those on a device are not read."""
+    """Check the inputs of a `Stepper`: gradients, evidence and routing weights; those on a device are not read."""
     if g_lr.screen is None or not deferred.is_immediate(g_lr.screen):
         return
     parts: dict[str, Mapping[str, Tensor]] = {}
-    if hr is not None:  # the weights first, which are in the gradients
+    if hr is not None:  # evidence and weights first, since the gradients contain them
         weights = {} if hr.step.evidence is None else {"reliability": hr.step.evidence.reliability}
         parts["the evidence"] = weights | ({"m": hr.m} if isinstance(hr.m, Tensor) else {})
         parts |= {"∇L_HR": hr.g.tensors} | ({} if hr.detail is None else {"∇L_HF": hr.detail.tensors})
@@ -128,10 +128,10 @@ def require_finite_parts(where: str, g_lr: Grads, hr: HrSide | None) -> None:
 
 
 def guarded(view: View, *, over_changing: bool) -> View:
-    """The view as strategies see it. In a recording its images alone may be read, which are copied before a replay.
+    """The view that strategies get. In a recording they may read only its images, which are copied before each replay.
 
     Args:
-        over_changing: a strategy chooses the background, so that an image with transparency is another one in each replay.
+        over_changing: a strategy chooses the background, so transparent images differ between replays.
     """
     if running() is None:
         return view

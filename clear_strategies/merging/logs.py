@@ -9,36 +9,36 @@ from clear_strategies.strategies.base import Logged, Strategy, by_class
 
 
 class IterationLogs:
-    """What the strategies have logged since `forget`, also where `Strategy.logs` has been emptied since."""
+    """The scalars that the strategies have logged since `forget`, including those that `keep` took out of `Strategy.logs`."""
 
     def __init__(self, strategies: Sequence[Strategy]) -> None:
         self._strategies = strategies
         self._kept: list[dict[str, Logged]] = [{} for _ in strategies]
 
     def forget(self) -> None:
-        """Before an iteration: what the strategies log from now on belongs to it."""
+        """Begin an iteration: drop the scalars of the last one."""
         self.keep()
         for kept in self._kept:
             kept.clear()
 
     def keep(self) -> None:
-        """Keep what `Strategy.logs` hold, and empty them: then they hold what is logged from now on."""
+        """Take all scalars out of `Strategy.logs`, which then hold only what is logged from now on."""
         for kept, s in zip(self._kept, self._strategies, strict=True):
             kept.update(s.logs)
             s.logs.clear()
 
     def uncounted(self) -> dict[str, Logged]:
-        """As the strategies logged them: some are what computes the scalar. A name that another strategy has logged follows that
-        of the class.
+        """The scalars as they were logged, some as functions that compute them. A name that another strategy has logged too is
+        prefixed by the class.
         """
         return _named(self._strategies, [kept | s.logs for kept, s in zip(self._kept, self._strategies, strict=True)])
 
     def counted(self) -> dict[str, Number]:
-        """The scalars."""
+        """The scalars, computed."""
         return _counted(self.uncounted())
 
     def counted_since_kept(self) -> dict[str, Number]:
-        """Those that were logged since `keep`."""
+        """The scalars that were logged since `keep`, computed."""
         return _counted(_named(self._strategies, [s.logs for s in self._strategies]))
 
 

@@ -1,4 +1,4 @@
-"""The losses. Images in, losses and image-space cotangents out; Gaussians play no part.  Eq. 4, 5"""
+"""The losses, from images alone: their values and their cotangents, the gradients with respect to the render.  Eq. 4, 5"""
 
 from __future__ import annotations
 
@@ -36,8 +36,7 @@ class Objective:
         lambda_hr: λ_HR(t).
         lambda_hf: λ_HF >= 0; 0 skips the high-frequency loss altogether.
         lambda_lr: λ_LR >= 0; at 0 the LR photos are not trained on: nothing is rendered at LR, L_LR is only logged.
-        lr_from: where Î_LR comes from: rendered at "lr", or the area mean of Î_HR, "hr", which is then all that is
-            rendered.
+        lr_from: "lr": Î_LR is rendered; "hr": it is the area mean of Î_HR, and only HR is rendered.
         lambda_ssim, lambda_ssim_hr: share of 1 - SSIM in L_LR and L_base, in [0, 1]; the rest is L1.
         haar_levels: levels of the Haar transform, at least 1; 1 is the top octave, 2 is the band that 4x SR adds (F18).
         clamp_render: compare renders clamped to [0, 1] (DropGaussian); 3DGS clamps for metrics only.
@@ -88,7 +87,7 @@ class Objective:
         """L_LR, and the cotangent of λ_LR L_LR.
 
         Args:
-            shown: where False the target counts as equal to the image, and the cotangent is 0.
+            shown: where it is False, the target counts as equal to the image, and the cotangent is 0.
         """
         compared, target = self._compared(image, target, shown)
         cotangents = compared.new_empty(1, *compared.shape)
@@ -107,7 +106,7 @@ class Objective:
         """L_base and L_HF, two cotangents; L_base alone where λ_HF = 0. `shown` as for `lr`.
 
         Args:
-            reuse: cotangents of an earlier call that are needed no more; their memory is taken where it fits.
+            reuse: cotangents of an earlier call that are no longer needed; their memory is used if it fits.
         """
         (compared, target), use = self._compared(image, target, shown), self.kernels
         shape = (2 if self.lambda_hf > 0 else 1, *compared.shape)
@@ -123,7 +122,7 @@ class Objective:
     def _compared(
         self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None
     ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]]:
-        """Both images as the losses compare them: equal where the target is hidden."""
+        """Both images as the losses compare them, equal where the target is hidden."""
         image = image.clamp(0, 1) if self.clamp_render else image
         return image, target if shown is None else torch.where(shown[..., None], target, image)
 

@@ -40,15 +40,15 @@ class Skips:
     Args:
         coarse_until: until this iteration HR is rendered and compared at half its size, and LR is not rendered where that is
             LR's size; 0: never.
-        hr_every: until then, HR is rendered and compared in one of so many iterations, where no densification reads its scores;
-            1: in each.
+        hr_every: until then, HR is rendered and compared in one of so many iterations, and in each whose scores densification
+            reads; 1: in each.
         plateau_gain: once the loss of the training views, drawn whole, has not fallen by at least this share within
             `plateau_window` iterations, training continues at iteration `plateau_to`; 0: never.
         plateau_window: iterations between two measurements.
         plateau_from: iteration of the earliest measurement.
         plateau_to: iteration from which every run trains: the learning rates fall, and HR is at full size.
-        undrawn: once the structure has settled, Gaussians too faint to be drawn in any view are removed where they are at least
-            this share of all, and where no strategy pulls parameters; 0: never.
+        undrawn: once the structure has settled, Gaussians too faint to be drawn in any view are removed if they are at least
+            this share of all and no strategy regularizes; 0: never.
     """
 
     coarse_until: int = milestone(0)
@@ -67,7 +67,7 @@ class Skips:
 
 
 class SkipPolicy:
-    """Applies the skips of one run. It holds caches only, so a checkpoint needs nothing of it."""
+    """Applies the skips of one run. It stores only caches, which no checkpoint needs."""
 
     def __init__(self, skips: Skips | None = None) -> None:
         self.skips = skips if skips is not None else Skips()
@@ -118,14 +118,14 @@ class SkipPolicy:
         return self._coarse[view.name]
 
     def leaves_out_hr(self, t: int, work_log: WorkLog) -> bool:
-        """Whether HR is left out of iteration t. Of two iterations that is the second; pseudo views come then, too."""
+        """Whether HR is left out of iteration t: with `hr_every=2` of even ones, in which pseudo views come, too."""
         if t > self.skips.coarse_until or (t - 1) % self.skips.hr_every == 0:
             return False
         work_log.skip("render LR + HR", f"HR in one of {self.skips.hr_every} iterations (skips.hr_every)")
         return True
 
     def lr_due(self, view: View, hr_due: bool, work_log: WorkLog) -> bool:
-        """Whether LR is rendered: not where HR at half its size is as large as the photo, for one render then serves both."""
+        """Whether LR is rendered: not if HR at half its size is as large as the photo, since one render then serves both."""
         if view.factor > 1 or not hr_due or view is not self._coarse.get(view.name):
             return True
         work_log.skip("render LR", "HR at half its size is as large (skips.coarse_until)")
@@ -154,8 +154,8 @@ class SkipPolicy:
 
     def settled(self, history: Sequence[dict[str, Number]], t: int) -> bool:
         """Whether the training views have stopped improving by iteration t, the last of the history; `plateau_to` then follows.
-        Unknown, and so False, where iterations were left out within the window, where the structure has changed at one end of
-        it, or where another loss was measured there.
+        False if it is unknown: iterations were left out within the window, or at one end of it the structure has changed or
+        another loss was measured.
         """
         window = self.skips.plateau_window
         if not (self.measured(t) and self.measured(t - window) and len(history) > window):

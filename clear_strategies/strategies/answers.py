@@ -1,6 +1,6 @@
-"""What the answers of strategies must be. Each check names the strategy, the hook, the rule, and what was found.
+"""Checks of the strategies' answers. Each error names the strategy, the hook, the rule, and what was found.
 
-Types and shapes are looked at, and the numbers where `finite` asks for it, but not on a device, since the host would wait.
+Types and shapes are checked, and with `finite` also numbers in the CPU's memory; to read those of a device, the host would wait.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def require_weights(s: Strategy, weights: Any, n: int, groups: int, *, finite: b
 
 
 def corrected(s: Strategy, answer: Any, g_hr: Mapping[str, Tensor], *, finite: bool) -> Grads:
-    """The answer of `correct`: attributes of g_HR; those that it leaves out are 0."""
+    """The answer of `correct`, by attributes of g_HR; those that it leaves out are 0."""
     return _rows_like(s, "correct", answer, g_hr, "of g_HR", finite)
 
 
@@ -98,7 +98,7 @@ def regularized(s: Strategy, answer: Any, params: Mapping[str, Tensor], *, finit
 
 
 def require_score(s: Strategy, score: Any, n: int) -> None:
-    """Its numbers, too: a Gaussian whose score is NaN never grows."""
+    """Check the numbers, too: a Gaussian whose score is NaN never grows."""
     if score is not None and not _is_real(score, (n,)):
         _refuse(s, "score", f"a tensor [{n}] or None", score)
     _require_finite(s, "score", {"S": score})
@@ -125,7 +125,7 @@ def _require_finite(s: Strategy, hook: str, numbers: Mapping[str, Any]) -> None:
 
 
 def _may_be_finite(x: Any) -> bool:
-    """False: it has been looked at, and is not."""
+    """False only if it has been read and is not finite."""
     if isinstance(x, Tensor):
         return not deferred.is_immediate(x) or is_finite(x)
     return not isinstance(x, Real) or math.isfinite(x)

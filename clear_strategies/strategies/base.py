@@ -36,7 +36,7 @@ _ALIKE: Final = 0.85  # "regularise" to "regularize" 0.9, "densify" to "densifie
 _OWN_NAMES: Final = {"state", "cache", "logs", "device", "seed", "lambda_hr"}
 
 Logged = Number | Callable[[], Number]
-"""A scalar, or what computes it."""
+"""A scalar, or a function that computes it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,14 +148,14 @@ class Strategy:
     def correct(self, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor], step: Step | None = None) -> Grads:
         """ĝ_HR, from two gradients by attribute: by the weights of `reconcile`.
 
-        A strategy that decides number by number overrides this hook in place of `reconcile`; it is given all numbers of both.
+        A strategy that decides number by number overrides this hook instead of `reconcile`, and gets both gradients in full.
 
         Args:
-            lr, hr: attribute -> gradient [N, …], any of `CONFLICT_GROUPS`; what only one of them has is not compared, and what
-                is None is left out.
+            lr, hr: attribute -> gradient [N, …], any of `CONFLICT_GROUPS`. A group that only one of them has is not compared,
+                and a gradient that is None is left out.
 
         Raises:
-            ValueError: both have gradients, but none of the same group, so that nothing could be compared.
+            ValueError: both have gradients, but no group in common.
         """
         lr, hr = (Grads({name: g for name, g in grads.items() if g is not None}) for grads in (lr, hr))
         if not lr or not hr:
@@ -170,19 +170,18 @@ class Strategy:
         return None
 
     def draw(self, t: int, means: Float[Tensor, "N 3"], enlarged: Callable[[Camera, int], Photo]) -> None:
-        """Before the extra views of t: draw what the field shows, e.g. to make extra views of it. Other trainers never call this
-        hook.
+        """Before the extra views of t: render the field, e.g. to make extra views of it. Other trainers never call this hook.
 
         Args:
-            means: of the field. enlarged: what the field shows by a camera, without f_det, a whole number of times as large by
-                the network of the prior; by bicubic interpolation where the prior has none.
+            means: of the field. enlarged: renders the field by a camera, without f_det, and enlarges the picture by a whole
+                factor, by the network of the prior or, if it has none, bicubically.
         """
 
     def extra_views(self, t: int) -> Sequence[ExtraView]:
         """Which other pictures should the field match at t? Several strategies may answer.
 
-        Each of them is rendered once, without dropout and f_det, and gets an optimizer step of its own on the LR loss, after
-        the step of the iteration's view. It takes no part in evidence, conflicts, densification or regularization.
+        Each is rendered once, without dropout and f_det, and gets an optimizer step of its own on the LR loss, after the step
+        of the iteration's view. Evidence, conflicts, densification and regularization ignore it.
         """
         return ()
 
@@ -202,10 +201,10 @@ class Strategy:
     def on_fit_end(self) -> None:
         """After the last iteration: release the memory that only training needs."""
 
-    # ---- facts about the strategy: the plan, the pictures and recordings read them ------------------------------------
+    # ---- facts about the strategy, for the plan, the pictures and recordings -------------------------------------------
 
     def summary(self) -> str | None:
-        """What the strategy has prepared for this run, a phrase for the plan; None: nothing."""
+        """A phrase for the plan that says what the strategy has prepared for this run; None: nothing."""
         return None
 
     def without_effect(self, *, lambda_lr: float, lambda_hr: float, lambda_hf: float) -> str | None:
@@ -227,17 +226,17 @@ class Strategy:
         return None
 
     def looked_up(self, view: View) -> Tensor | None:
-        """What `observe` and `route` read of a view, if they and `score` depend on view and iteration by it and by what they are
-        given alone, so that an iteration can be recorded: in a replay they read the tensor `Step.looked_up`.
+        """All that `observe` and `route` read of a view, as a tensor. It allows iterations to be recorded: a replay passes it as
+        `Step.looked_up`. They and `score` must then depend on view and iteration only by it and by their arguments.
         """
         return None
 
     # ---- for subclasses ---------------------------------------------------------------------------------------------
 
     def log(self, name: str, value: Logged) -> None:
-        """Log a scalar of this iteration, or what computes it where it is asked for before the next one: a host asks for it in
-        every hundredth. A 0-dim tensor on a device is read later, see `core.deferred`. Where another strategy has logged this
-        name, the column is "<class>.<name>".
+        """Log a scalar of this iteration, or a function that computes it, which is called before the next iteration if at all: a
+        host calls it in every hundredth. A 0-dim tensor on a device is read later, see `core.deferred`. If another strategy has
+        logged the same name, the column is "<class>.<name>".
         """
         is_number = (
             value.dim() == 0 if isinstance(value, Tensor) else isinstance(value, (Real, Deferred, Derived, Element))
@@ -286,9 +285,9 @@ def misspelled(cls: type[Strategy]) -> dict[str, str]:
 
 
 def describes(strategy: Strategy, fact: str) -> bool:
-    """Whether `fact` ("looked_up") describes what the strategy's class does.
+    """Whether `fact` ("looked_up") holds for the strategy's class.
 
-    A subclass that overrides any method of the class that states the fact no longer does the same: it must state the fact itself.
+    The class that defines it states it for its own methods. A subclass that overrides one of these must define it anew.
     """
     cls = type(strategy)
     stated_by = next(base for base in cls.__mro__ if fact in vars(base))
@@ -303,7 +302,7 @@ def by_class(strategies: Sequence[Strategy]) -> dict[str, Strategy]:
     """Each strategy by the name of its class; a second one of a class as "<class>2"."""
     named: dict[str, Strategy] = {}
     for s in strategies:
-        kind = type(s).__name__
-        same = sum(type(other).__name__ == kind for other in named.values())
-        named[kind if same == 0 else f"{kind}{same + 1}"] = s
+        name = type(s).__name__
+        same = sum(type(other).__name__ == name for other in named.values())
+        named[name if same == 0 else f"{name}{same + 1}"] = s
     return named

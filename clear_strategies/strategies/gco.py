@@ -106,7 +106,7 @@ class GCO(Strategy):
         return torch.stack(compared, 1).sum(1, keepdim=True).repeat(1, of_groups.shape[1])
 
     def _report(self, p: Products, below: Float[Tensor, "N G"], ω: Float[Tensor, "N G"], has_evidence: bool) -> None:
-        """Log what was corrected; it is counted where somebody asks for it."""
+        """Log what was corrected. It is counted when a log is read."""
         groups = [group for group in self.groups if group in p.names]
         if not groups:
             self._warn_once(p.names)
@@ -115,8 +115,8 @@ class GCO(Strategy):
         @cache
         def counted() -> tuple[Sequence[Number], ...]:
             corrected = (below < 0).sum(0)
-            calm = len(below) - corrected  # where ω is at its lower bound, too
-            sums = corrected, ω.sum(0) - self.weight_min * calm, (ω <= self.weight_min).sum(0) - calm
+            kept = len(below) - corrected  # their ω is at its lower bound, too
+            sums = corrected, ω.sum(0) - self.weight_min * kept, (ω <= self.weight_min).sum(0) - kept
             return (p.comparable, *map(deferred.elements, sums))
 
         def share(part: int, whole: int, of: Sequence[str] = groups) -> Number:

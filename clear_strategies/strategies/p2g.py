@@ -1,8 +1,8 @@
 """P2G: evidence-guided patch-to-Gaussian routing.  Eq. 9, 10, 12, 14
 
 For each patch of a view, P2G estimates how well the SR image agrees with the authentic LR photo and how
-much detail it adds. Both are looked up at the projected Gaussians, where they weigh high-frequency
-gradients and densification.
+much detail it adds. Each Gaussian looks both up at its projected centre; they weight its high-frequency
+gradient and its densification.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class P2G(Strategy):
             disagreement = (reduced - lr).abs()
         tau_r = _tau_r(self.reliability_scale, float(disagreement.mean()))
         R = torch.exp(-patch_means(disagreement, self.patch) / tau_r)
-        # All kernels of D but "area" round to 8 bits. What that loses of an SR image with more of them is no detail.
+        # All kernels of D but "area" round to 8 bits. In an SR image with more bits, what rounding loses is not detail.
         shown = hr if self.down == "area" else quantize(hr)
         residual = (shown - upsample(reduced, factor)).abs()
         A = (patch_means(residual, self.patch * factor) / (2 * residual.mean() + self.detail_eps)).clamp(0, 1)

@@ -45,8 +45,8 @@ class SVS(Strategy):
         anchor_strength: λ_stab >= 0; 0 takes no anchor (densification still stops at t_a); the paper's is 0.01 (F40).
         anchor_weights: W by attribute, >= 0, on raw parameters; positions count in units of the extent of the anchored
             cloud (90th percentile of the distance from its median).
-        shared: both scales lose the same Gaussians; false, which is not the paper's, but for experiment=claims: each its own. The
-            readable pass then takes the place of the compiled one, and other trainers refuse it.
+        shared: both scales drop the same Gaussians. False, for experiment=claims and not in the paper: each scale drops its own;
+            the step is then not compiled, and other trainers refuse it.
         reduction: "sum" over Gaussians as printed in the paper, or their "mean" (negligible for 1e5 Gaussians).
 
     Raises:
@@ -73,7 +73,7 @@ class SVS(Strategy):
     def on_fit_start(self, n_views: int, seed: int) -> None:
         super().on_fit_start(n_views, seed)
         n_views = max(1, n_views)
-        # How far a run that sees each view `dropout.full` / n_views times needs the rate.
+        # The share of the rate for a run that sees each view `dropout.full` / n_views times.
         self.cache["share"] = min(1.0, self.dropout.full / (self.looks * n_views)) if self.looks else 1.0
         if self.dropout.full == 0 and self.looks and self.dropout.maximum > 0:
             _log.warning(
@@ -127,7 +127,7 @@ class SVS(Strategy):
         return t < self.anchor_start
 
     def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
-        """θ^a = sg(θ(t_a)); the last structural change was at t < t_a."""
+        """Take the anchor θ^a = sg(θ(t_a)); the last structural change was at t < t_a."""
         if step.t >= self.anchor_start and self.anchor_strength > 0 and not self.state:  # skips may jump over t_a
             self.state.update(
                 {

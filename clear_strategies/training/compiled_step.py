@@ -1,12 +1,12 @@
 """The merge and the optimizer's step in two compiled passes over the Gaussians, with the weights of the strategies between them.
 
-The passes compute what `Conductor.merge`, `Activation.vjp`, `Adam.step` and `GaussianField.constrain` compute; these remain the
-specification, and tests/training/test_compiled_step.py compares the two. The products of the higher bands are rounded less
-here, so that a strategy may decide otherwise on a Gaussian that lies within 2e-7 of a bound; two trainings then drift apart as
-two seeds do. Every hook of the strategies is called as in the readable path.
+The passes compute the same as `Conductor.merge`, `Activation.vjp`, `Adam.step` and `GaussianField.constrain`, which remain the
+specification: tests/training/test_compiled_step.py compares the two. Here the products of the higher bands are rounded less, so a
+strategy may decide differently for a Gaussian within 2e-7 of a bound, and two trainings then drift apart as two seeds do. Every
+hook of the strategies is called as by the readable path.
 
-C++ runs for Gaussians in the CPU's memory, Warp for Gaussians on CUDA. On CUDA the host never waits: counts stay on the
-device, and so do the numbers made of them (`core.deferred`).
+C++ runs for Gaussians in the CPU's memory, Warp for Gaussians on CUDA. On CUDA the host never waits: counts, and numbers
+computed from them, stay on the device (`core.deferred`).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _LIMITS: Final = {"opacities": LOGIT_LIMIT, "scales": LOG_SCALE_LIMIT}
 
 
 def compiled_step_for(conductor: Conductor, optimizer: Adam, mode: FusedMode = "auto") -> CompiledStep | None:
-    """The compiled step for this conductor and optimizer; None, and a log line with the reason, where there is none."""
+    """The compiled step for this conductor and optimizer; None if there is none, and a log line with the reason."""
     reason = next(_why_not(conductor, optimizer, mode), None)
     if reason is None:
         return CompiledStep(conductor, optimizer)
@@ -56,9 +56,9 @@ def compiled_step_for(conductor: Conductor, optimizer: Adam, mode: FusedMode = "
 def _why_not(conductor: Conductor, optimizer: Adam, mode: FusedMode) -> Iterator[str]:
     if mode == "off":
         yield "fit.fused=off"
-    for thing, base in ((conductor, Conductor), (optimizer, Adam)):
-        if type(thing) is not base:
-            yield f"{type(thing).__name__} may compute something else than {base.__name__}"
+    for instance, base in ((conductor, Conductor), (optimizer, Adam)):
+        if type(instance) is not base:
+            yield f"{type(instance).__name__} may compute something else than {base.__name__}"
     if not all(s.shares_gate for s in conductor.strategies):
         yield "a mask for each scale makes two activations of the field"
     for name, moments in optimizer.first.items():
@@ -85,12 +85,11 @@ def gaussian_pass(optimizer: Adam) -> GaussianPass:
 class CompiledStep:
     """A `Stepper`: merges as `Conductor.merge` does, steps as `Adam.step` does, and constrains the parameters.
 
-    A row stays as it is where its gradient and both moments are 0, and so do bands of the spherical harmonics above the active
-    degree.
+    It skips rows whose gradient and both moments are 0, and bands of the spherical harmonics above the active degree.
 
     Args:
-        skips: for tests: False visits every row. The result has the same bits.
-        passes: what computes; None: what runs on the device of the optimizer's moments.
+        skips: False visits every row; the result has the same bits.
+        passes: the passes' implementation; None: that for the device of the optimizer's moments.
 
     Attributes:
         records: whether a step can be part of a recording.
@@ -103,8 +102,8 @@ class CompiledStep:
         self._passes = gaussian_pass(optimizer) if passes is None else passes
         self.records = getattr(self._passes, "records", False)
         self._numbers: Tensor | None = None  # see `_recorded_numbers`
-        self._examined: tuple[int, int] | None = None
-        self._quiet = False
+        self._momentum_read: tuple[int, int] | None = None  # the active degree's bands and `restored`, then
+        self._has_no_momentum = False
 
     def vjp(
         self, shot: FieldShot, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
@@ -116,7 +115,7 @@ class CompiledStep:
     ) -> Mapping[str, Number]:
         """Step `params` and the optimizer's moments in place; returns the conflict ratios by group."""
         gaussians, λ = self._gaussians(shot.activation, g_lr, hr), self.conductor.objective.lambda_hr(t)
-        weights, given, conflict = Weights(), Grads(), dict[str, Number]()
+        weights, corrected, conflict = Weights(), Grads(), dict[str, Number]()
         if hr is not None and λ > 0:
             products = gaussians.products()
             conflict = products.conflict()  # before correction
@@ -124,14 +123,14 @@ class CompiledStep:
             if isinstance(answer, Weights):
                 weights = answer  # ĝ^HR           Eq. 6, 7, 11
             else:
-                weights, given = Weights(keep=0.0), answer
+                weights, corrected = Weights(keep=0.0), answer
         plus = self.conductor.regularized(params, t, finite=True)
         decays = (hr is not None and hr.detail is not None) or "detail" in plus
-        self._apply(gaussians, params, g_lr, t, weights, given, plus, decays=decays)
+        self._apply(gaussians, params, g_lr, t, weights, corrected, plus, decays=decays)
         return conflict
 
     def count(self, t: int) -> None:
-        """Count a step that is recorded or replayed, and write its numbers."""
+        """Count a step that is recorded or replayed, and write its numbers to the device."""
         from clear_strategies.kernels.gaussian_step.warp import written
 
         rates, bias2 = self.optimizer.advance()
@@ -140,11 +139,11 @@ class CompiledStep:
 
     @property
     def _recorded_numbers(self) -> Tensor | None:
-        """What changes from one replay of a recording to the next, on the device: `count` has written it. None outside of one."""
+        """The numbers on the device that `count` writes before each replay of a recording; None outside of a recording."""
         return None if running() is None else self._numbers
 
     def weights(self, t: int) -> LossWeights:
-        """λ_HR(t) and λ_HR(t) λ_HF; of a recording on the device."""
+        """λ_HR(t) and λ_HR(t) λ_HF; on the device in a recording."""
         if (numbers := self._recorded_numbers) is None:
             return self.conductor.objective.weights(t)
         from clear_strategies.kernels.gaussian_step.warp import loss_weights
@@ -162,7 +161,7 @@ class CompiledStep:
         g_lr: Grads,
         t: int,
         weights: Weights,
-        given: Mapping[str, Tensor],
+        corrected: Mapping[str, Tensor],
         plus: Mapping[str, Tensor],
         *,
         decays: bool,
@@ -170,7 +169,7 @@ class CompiledStep:
         """Merge and step.
 
         Args:
-            given: ĝ_HR, in place of that of the losses. decays: f_det decays.
+            corrected: ĝ_HR, if a strategy overrides `correct`. decays: f_det decays.
         """
         numbers = self._recorded_numbers
         rates, bias2 = self.optimizer.advance() if numbers is None else ({}, 1.0)
@@ -178,19 +177,19 @@ class CompiledStep:
         attributes = {
             name: kernel.Attribute(
                 p, self.optimizer.first[name], self.optimizer.second[name], rates.get(name, 0.0),
-                _rows_like(p, given.get(name)), _rows_like(p, plus.get(name)), keep if name == "detail" else 1.0,
+                _rows_like(p, corrected.get(name)), _rows_like(p, plus.get(name)), keep if name == "detail" else 1.0,
                 _LIMITS.get(name, float("inf")),
             )
             for name, p in params.items()
         }  # fmt: skip
         all_bands, active = params["shN"].shape[1], _basis(g_lr).shape[1] - 1
-        quiet = self.skips and self._above_is_quiet(active, moved="shN" in plus or "shN" in given)
-        bands = active if quiet else all_bands
+        moved = "shN" in plus or "shN" in corrected
+        bands = active if self.skips and self._has_no_momentum_above(active, moved=moved) else all_bands
         settings = self._settings(t, bias2, self.skips, 3 * bands, numbers)
-        still = gaussians.step(attributes, weights, settings)
+        unchanged = gaussians.step(attributes, weights, settings)
         skip = self.conductor.work_log.skip
-        if isinstance(still, Tensor) or still:  # a number on the device is not read here
-            skip("optimizer rows", "gradient and moments are 0", still)
+        if isinstance(unchanged, Tensor) or unchanged:  # a number on the device is not read here
+            skip("optimizer rows", "gradient and moments are 0", unchanged)
         if bands < all_bands:
             skip("SH bands in the optimizer", "above the active degree", all_bands - bands)
 
@@ -208,28 +207,28 @@ class CompiledStep:
         λ = self.conductor.objective.lambda_hr(t)
         return kernel.StepSettings(BETA1, BETA2, bias2, self.optimizer.rates.eps, λ, skips, width, changing)
 
-    def _above_is_quiet(self, active: int, *, moved: bool) -> bool:
+    def _has_no_momentum_above(self, active: int, *, moved: bool) -> bool:
         """Whether bands above the active degree have no momentum.
 
-        Read anew where the moments have been restored. Else the result holds: a pass that skips the bands leaves them quiet,
-        momentum does not vanish, and a change of the structure gathers rows and zeroes some.
+        The moments are read once after a checkpoint has restored them. After that the answer holds: a pass that skips the bands
+        gives them no momentum, momentum does not vanish, and a change of the structure gathers rows and zeroes some.
 
         Args:
-            moved: a strategy gives them a gradient. It is not read, since on a device the host would wait.
+            moved: a strategy gives them a gradient, which is not read, since on a device the host would wait.
         """
         restored = self.optimizer.restored
-        if self._examined is not None and not moved:
-            examined_at, same = self._examined
-            if same == restored and (examined_at <= active if self._quiet else examined_at == active):
-                return self._quiet
+        if self._momentum_read is not None and not moved:
+            read_at, same = self._momentum_read
+            if same == restored and (read_at <= active if self._has_no_momentum else read_at == active):
+                return self._has_no_momentum
         moments = (self.optimizer.first["shN"], self.optimizer.second["shN"])
-        self._quiet = not moved and not any(bool(x[:, active:].any()) for x in moments)
-        self._examined = active, restored
-        return self._quiet
+        self._has_no_momentum = not moved and not any(bool(x[:, active:].any()) for x in moments)
+        self._momentum_read = active, restored
+        return self._has_no_momentum
 
 
 def _basis(g_lr: Grads, g_hr: Grads | None = None) -> Float[Tensor, "N B1"]:
-    """Y of a view, which both scales see from one place. Some rasterizers leave it out where a scale draws nothing."""
+    """Y of a view, the same at both scales. Some rasterizers leave out the rows of Gaussians that a scale does not draw."""
     low, high = (None if g is None else g.colour for g in (g_lr, g_hr))
     if low is None:
         raise ValueError("the gradient of the colours must be given by its factors.")
@@ -239,12 +238,12 @@ def _basis(g_lr: Grads, g_hr: Grads | None = None) -> Float[Tensor, "N B1"]:
 
 
 def _dense(gaussians: kernel.GaussianStep, params: Mapping[str, Tensor]) -> tuple[Grads, Grads]:
-    """g_LR and g^HR with every number, for strategies that override `correct`."""
+    """g_LR and g^HR in full, for strategies that override `correct`."""
     both = [Grads({name: empty_for(params[name]) for name in CONFLICT_GROUPS}) for _ in range(2)]
     gaussians.dense(*both)
     return both[0], both[1]
 
 
 def _rows_like(p: Tensor, g: Tensor | None) -> Tensor | None:
-    """What a strategy has returned, as the passes take it."""
+    """A strategy's gradient, in the type, device and layout that the passes take."""
     return None if g is None else g.to(p).reshape(p.shape).contiguous()

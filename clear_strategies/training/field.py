@@ -35,7 +35,7 @@ class GaussianField(nn.Module):
     Attributes:
         quats: wxyz, any norm. scales: log. opacities: logit.
         detail: f_det, an RGB offset in HR renderings, 0 at the start.
-        filter_3d: standard deviation of the 3D filter, world units; no parameter.
+        filter_3d: standard deviation of the 3D filter, world units; not trained.
         degree: active degree of spherical harmonics.
     """
 
@@ -110,7 +110,7 @@ class GaussianField(nn.Module):
         return shots.get(False), shots.get(True)
 
     def shot(self, rasterizer: Rasterizer, camera: Camera) -> FieldShot:
-        """A rendering to learn from, of all Gaussians, without f_det."""
+        """A rendering with gradients, of all Gaussians, without f_det."""
         active = self._activate()
         return FieldShot(rasterizer(active.splats(detail=False), camera), active, detail=False)
 
@@ -119,7 +119,7 @@ class GaussianField(nn.Module):
         return rasterizer(self._activate().splats(detail=detail), camera).image
 
     def update_filter(self, cameras: Sequence[Camera], variance: float, near: float = NEAR) -> None:
-        """Recompute the 3D filter from the present means, where it lies if it has a row for each."""
+        """Recompute the 3D filter from the present means, in the same memory if their number is the same."""
         stds = filter_std(self.means.data, cameras, variance, near)
         if len(stds) == len(self.filter_3d):
             self.filter_3d.copy_(stds)
@@ -216,7 +216,7 @@ class FieldShot:
     def gradients(
         self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
     ) -> SplatGradients:  # fmt: skip
-        """Of the rendered splats, before the chain rule of `activation`; see `rasterizers.interface.summed_vjp`."""
+        """The gradients of the rendered splats, before the chain rule of `activation`; see `rasterizers.interface.summed_vjp`."""
         return summed_vjp(self._rendering, cotangents, weight)
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
@@ -224,7 +224,7 @@ class FieldShot:
         return [self.activation.vjp(g, k, detail=self._detail) for k in range(len(cotangents))]
 
     def summed_vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"]) -> list[Grads]:
-        """As `core.gradients.summed`, before the projection's VJP."""
+        """The result of `core.gradients.summed`, which is summed before the projection's VJP."""
         g = self.gradients(cotangents, weight)
         each = [self.activation.vjp(g, k, detail=False) for k in range(len(g.means))]
         return [*each, Grads({"detail": g.rgb[-1]} if self._detail else {}, screen=g.screen[-1])]

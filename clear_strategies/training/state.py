@@ -34,14 +34,14 @@ _log = logging.getLogger(__name__)
 
 _RULES: Final = RasterSettings()
 PHOTOS: Final = "photos"
-"""What a checkpoint's tensors of `colours` begin with."""
+"""The prefix of `fingerprints` in a checkpoint."""
 _CELLS: Final = 16  # a side
 
 
-def colours(scene: Scene) -> dict[str, Tensor]:
-    """By the name of each view its means in a grid, by which a checkpoint knows its photo: red, green, blue, the share of pixels
-    that its mask shows, and 1 - alpha; of a training view also the mean squares of its SR image, since back-projection gives
-    all SR images of a photo the same means. Hidden pixels count as black, and so do those that are not finite.
+def fingerprints(scene: Scene) -> dict[str, Tensor]:
+    """A fingerprint of each view by its name, by which a resumed run recognises its photos: means in a grid of red, green, blue,
+    the mask and 1 - alpha; for training views also of the square of the SR image, since back-projection gives all SR images of a
+    photo the same means. Pixels that are hidden or not finite count as black.
     """
     found: dict[str, Tensor] = {}
     for view in (*scene.train, *scene.test):
@@ -58,14 +58,14 @@ def _means(layers: Float[Tensor, "H W C"]) -> Float[Tensor, "C h w"]:
 
 @dataclass(slots=True)
 class TrainState:
-    """Everything that changes while training, on the device where the views lie.
+    """Everything that changes while training, on the device of the views.
 
     Args:
-        t: the iteration to come, from 1.
-        rules: by which the rasterizer draws.
+        t: the next iteration, from 1.
+        rules: the settings of the rasterizer.
         history: one row per iteration; read it by `history_as_floats`, since on a device its numbers are deferred.
-        photos: the scene's `colours`, those of test views included, by which a resumed run knows its photos.
-        replays: the recordings of iterations where they are replayed (`fit.replay`); no checkpoint needs them.
+        photos: the scene's `fingerprints`.
+        replays: the recordings of iterations, if these are replayed (`fit.replay`); no checkpoint needs them.
     """
 
     field: GaussianField
@@ -98,7 +98,7 @@ class TrainState:
 
         Args:
             settings, density, rates, mip: with milestones already scaled to this run.
-            density: replaced where a strategy brings a densifier.
+            density: of the densifier, unless a strategy brings its own.
             rules: of the rasterizer that draws.
         """
         device = scene.device
@@ -116,7 +116,7 @@ class TrainState:
             )
         optimizer = Adam(theta.raw(), rates, extent)
         conductor.on_fit_start(len(scene.train), settings.seed, device, scene.train)
-        photos = colours(scene)
+        photos = fingerprints(scene)
         state = cls(theta, conductor, optimizer, densifier, settings, mip, scene.train, rules, photos=photos)
         state.compiled_step = compiled_step_for(conductor, optimizer, settings.fused)
         state.refilter()
@@ -124,7 +124,7 @@ class TrainState:
 
     @property
     def device(self) -> torch.device:
-        """The device of the field and of everything else per Gaussian or pixel."""
+        """The device of the field, and of all other tensors per Gaussian or pixel."""
         return self.field.means.device
 
     def history_as_floats(self) -> Sequence[dict[str, float]]:
@@ -160,7 +160,7 @@ class TrainState:
 
     def remove_undrawn(self) -> bool:
         """Once the structure has settled, remove the Gaussians that no view draws, see `Skips.undrawn`; returns whether there
-        were any. Nothing would bring them back: their gradient is 0.
+        were any. They would never return, since their gradient is 0.
         """
         if not self.density.settled(self.t):
             return False
@@ -177,14 +177,14 @@ class TrainState:
         return True
 
     def restructure(self) -> bool:
-        """Let the densifier do what is due at t; returns whether the structure changed.
+        """Let the densifier change the structure, if it is due at t; returns whether it did.
 
         Raises:
-            AnswerError: the densifier did not tell what became of which Gaussian. That one row has become another is seen on a
-                CPU alone.
+            AnswerError: the densifier changed the structure without calling `resized`. A Gaussian that moves to another row is
+                noticed on a CPU only.
         """
         n, name, calls = len(self.field), f"{type(self.density).__name__}.step()", list[int]()
-        colours = self.field.sh0.data.clone() if self.device.type == "cpu" else None  # by which a Gaussian is known
+        colours = self.field.sh0.data.clone() if self.device.type == "cpu" else None  # they identify Gaussians
 
         def resized(parents: Int[Tensor, " M"]) -> None:
             nonlocal colours
@@ -206,21 +206,21 @@ class TrainState:
         return bool(calls)
 
     def _moved(self, colours: Float[Tensor, "N 1 3"]) -> tuple[int, int] | None:
-        """A row that has become a copy of another, and that one; None: there is none.
+        """A row that has become a copy of another row, and that row; None: there is none.
 
         Args:
-            colours: of the Gaussian that is said to be in each row.
+            colours: sh0 of each row, according to the densifier.
         """
         now, quats = self.field.sh0.data, self.field.quats.data
         if torch.equal(now, colours):
             return None
         row = int((now != colours).flatten(1).any(1).nonzero()[0])
-        same = (colours == now[row]).flatten(1).all(1) & (quats == quats[row]).all(1)  # a colour alone may be another's
+        same = (colours == now[row]).flatten(1).all(1) & (quats == quats[row]).all(1)  # others may have its colour
         return (row, int(same.nonzero()[0])) if bool(same.any()) else None
 
     def resized(self, parents: Int[Tensor, " M"]) -> None:
-        """Gather what strategies keep per Gaussian, and recompute the filter, after a change of structure: row i comes from row
-        parents[i]. Field and optimizer have been gathered.
+        """Complete a change of structure in which row i of field and optimizer came from row parents[i]: gather what strategies
+        store per Gaussian, and recompute the filter.
         """
         self.conductor.on_resize(parents)
         self.refilter()
@@ -230,7 +230,7 @@ class TrainState:
         return self.conductor.may_densify(t) and self.density.reset_due(t)
 
     def filter_due(self) -> bool:
-        """Whether the 3D filter is recomputed at t; every change of structure does so as well."""
+        """Whether the 3D filter is recomputed at t; every change of structure also recomputes it."""
         return self.t % self.mip.every == 0 and self.t <= self.settings.iterations - self.mip.last
 
     def checkpoint(self, config: Mapping[str, Any]) -> Checkpoint:

@@ -26,7 +26,7 @@ from integration.settings import Settings
 
 @contextmanager
 def _installed_by_cli(save_lr: Path | None, settings: Settings) -> Iterator[list[Any]]:
-    """CLEAR is installed when the script calls `cli`, which is when its `Runner` exists."""
+    """Install CLEAR when the script calls `cli`, after it has defined its `Runner`."""
     distributed: Any = importlib.import_module("gsplat.distributed")
     cli, attached, undo = distributed.cli, list[Any](), ExitStack()
 

@@ -45,31 +45,31 @@ class Attached:
 
     Args:
         params: gsplat's dict of leaves.
-        optimizers: a dict with one for each of them, or of which some step the Gaussians; they may be made anew in it. Or one
-            for all.
-        views: all training views. A rendering is that of the view named by `rendering`, else of the one with its pose.
+        optimizers: a dict with one for each of them, or with others beside those that step the Gaussians; the loop may replace
+            them in it. Or a single optimizer.
+        views: all training views. A rendering belongs to the view named by `rendering`, or else to the view with its pose.
         strategy: gsplat's densification strategy, whose threshold scales P2G's score; None: a loop without one.
-        state: where changes of structure are recorded, in place of `params`: the state of gsplat 1.4's strategy, or `signal` of
-            the scene that gsplat 1.6's strategy is given.
+        state: the dict that records changes of structure, instead of `params`: the state of gsplat 1.4's strategy, or `signal`
+            of the scene that gsplat 1.6's strategy gets.
         detail: add the detail feature f_det as `params["detail"]`, with an Adam of its own. gsplat's strategies clone,
             split and prune it like any other parameter.
         names: gsplat's parameter name -> the host's, where they differ (nerfstudio: sh0 is features_dc).
         loss_scale, accumulation: see `Attachment`.
-        masks: [h, w] by the name of a view, what the host multiplies the LR image by after rendering.
-        own_background: the loop adds a background to its renderings itself; else the strategies may choose the `backgrounds` of
+        masks: [h, w] by the name of a view, by which the host multiplies the LR image after rendering.
+        own_background: the loop adds a background to its renderings itself; otherwise strategies may choose the `backgrounds` of
             calls that name none.
-        iterations: of the loop. Where HR would take part after them only, a warning says so before the first step.
-        hr_by: what draws HR and extra views. "host": the function that is wrapped; a name of `rasterizers.load`: that rasterizer
-            of this package; "auto": on CUDA "warp", whose work is recorded and replayed, where it draws what the call asks for,
-            else "host". Pictures of the two differ by 3e-3 at most, where one blends a contribution of 1/255 and the other not.
+        iterations: of the loop. A warning before the first step says if HR would take part only after them.
+        hr_by: what draws HR and extra views. "host": the wrapped function. A name of `rasterizers.load`: that rasterizer of this
+            package. "auto": on CUDA "warp", whose work is recorded and replayed, if it supports the call, otherwise "host".
+            Pictures of the two differ by 3e-3 at most, where only one of them blends a contribution of 1/255.
 
     Attributes:
-        views: as they were given.
+        views: the argument.
 
     Raises:
-        ValueError: there is no view, a parameter is missing, or f_det is there with another number of rows.
+        ValueError: there is no view, a parameter is missing, or `params["detail"]` has another number of rows.
         HostError: a network makes the colours; `params` are attached already.
-        SettingError: densification outlasts the anchor; a scheduler exists that an optimizer of all parameters cannot follow.
+        SettingError: densification outlasts the anchor; a single optimizer has a learning rate scheduler already.
     """
 
     def __init__(
@@ -120,8 +120,8 @@ class Attached:
         self._has_drawn_bands = False  # after a call with spherical harmonics, one without them draws no colours
         self._product: tuple[Tensor, Tensor, Tensor] | None = None  # see `_gated`
         self._trains_detail = detail
-        self._hr_by, self._told = hr_by, ""  # what draws HR, and what the log says of it
-        self._is_ours = False  # the wrapped function is this package's, see `wrap`
+        self._hr_by, self._logged_by = hr_by, ""  # what draws HR, and the last log line about it
+        self._is_ours = False  # whether the wrapped function is this package's, see `wrap`
         stop, threshold = (getattr(strategy, name, None) for name in ("refine_stop_iter", "grow_grad2d"))
         require_end(conductor, stop, "refine_stop_iter", first=0)
         warn_if_score_is_unused(conductor, strategy, threshold)
@@ -140,7 +140,7 @@ class Attached:
         return {name: self._params[host_name] for name, host_name in names.items()}
 
     def wrap(self, rasterization: Rasterization) -> Rasterization:
-        """`rasterization` that renders training views at both scales, and shows f_det in renderings without gradients."""
+        """Wrap `rasterization`: it renders training views at both scales, and adds f_det to renderings without gradients."""
         if (attached := getattr(rasterization, _ATTACHED, None)) is not None and not attached.attachment.removed:
             raise HostError(
                 "this rasterization is wrapped already; remove() the attachment that wrapped it first, or "
@@ -183,8 +183,8 @@ class Attached:
 
     @contextmanager
     def rendering(self, view: View | None) -> Iterator[None]:
-        """Renderings with gradients are those of this view, whatever their pose (pose optimization, pose noise); None: of no
-        training view, e.g. a second pass for normals, which f_det is then not added to.
+        """A context in which renderings with gradients belong to this view, whatever their pose (pose optimization, pose noise).
+        None: they belong to no training view, e.g. a second pass for normals, and f_det is not added.
         """
         with replaced_attribute(self, "_named", (view,)):
             yield
@@ -208,7 +208,7 @@ class Attached:
         self.attachment.remove()
 
     def _follow_optimizers(self) -> None:
-        """Hook those that the host has now."""
+        """Hook the optimizers that the host has now."""
         params = self.params()
         found = optimizers_of(self._optimizers, params, self._names.values())
         if self._trains_detail:
@@ -216,14 +216,14 @@ class Attached:
         self.attachment.hook(found)
 
     def _together(self, call: Mapping[str, Any]) -> AbstractContextManager[None]:
-        """A context in which HR and LR share work, where this package draws both."""
+        """A context in which HR and LR share work, if this package's function draws both."""
         if not self._is_ours or self._own_rasterizer(call) is not None:
             return nullcontext()
         pose, K = (call[name].detach().reshape(n, n) for name, n in (("viewmats", 4), ("Ks", 3)))
         return drawing_ahead(pose, K, call["width"], call["height"])
 
     def _draws_colors(self, call: Mapping[str, Any]) -> bool:
-        """Whether a call draws the colours of the scene, and not its depth alone, its normals or other features."""
+        """Whether a call draws the colours of the scene, and not only depth, normals or other features."""
         as_bands = call.get("sh_degree") is not None
         self._has_drawn_bands |= as_bands
         if "RGB" not in call.get("render_mode", "RGB") or call["colors"].shape[-1] != 3:
@@ -268,7 +268,7 @@ class Attached:
         return calls.host_output(rasterization, call, params, gate, aliases if target == "lr" else ())
 
     def _own_rasterizer(self, call: Mapping[str, Any]) -> Rasterizer | None:
-        """What draws HR and extra views in place of the host's function; None: nothing does. The log says once, which."""
+        """The rasterizer of this package that draws HR and extra views; None: the host's function does. Logs the choice once."""
         if self._hr_by == "host" or (self._hr_by == "auto" and call["means"].device.type != "cuda"):
             return None
         backend = "warp" if self._hr_by == "auto" else self._hr_by
@@ -280,30 +280,34 @@ class Attached:
             if self._hr_by != "auto":
                 raise
             by = f"the host's own function: {error}"
-        if by != self._told:
+        if by != self._logged_by:
             _log.info("HR and extra views are drawn by %s", by)
-            self._told = by
+            self._logged_by = by
         return rasterizer
 
     def _gated(self, opacities: Float[Tensor, " N"], gate: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-        """Their product, made once for both scales."""
+        """Opacities times the gate, computed once for both scales."""
         if self._product is None or self._product[0] is not opacities or self._product[1] is not gate:
             self._product = opacities, gate, opacities * gate.to(opacities)
         return self._product[2]
 
     def _background(self, call: Mapping[str, Any]) -> dict[str, Tensor]:
-        """The `backgrounds` that the strategies choose for a call; none where it names its own."""
+        """The `backgrounds` that the strategies choose for a call; empty if it names its own."""
         color = self.attachment.background
         if color is None or call.get("backgrounds") is not None:
             return {}
         return {"backgrounds": color_on(color, call["means"].device, call["means"].dtype)}
 
     def _with_detail(self, arguments: Mapping[str, Any], *, trained: bool) -> dict[str, Any]:
-        """The same call with colours f_base + f_det; f_det gets a gradient only if it is trained by the rendering."""
+        """The same call with colours f_base + f_det.
+
+        Args:
+            trained: whether f_det gets a gradient.
+        """
         detail = self._params.get("detail")
         if detail is None:
             return dict(arguments)
-        if not trained:  # a loop may draw a part of the scene, or in another order
+        if not trained:  # a loop may draw part of the scene, or in another order
             detail, rows = detail.detach(), rows_drawn(arguments["means"].detach(), self.params()["means"].detach())
             if rows is not None:
                 detail = detail[rows.clamp_min(0)] * (rows >= 0)[..., None]
@@ -311,7 +315,7 @@ class Attached:
 
 
 attach = Attached
-_MADE: Final = WeakSet[Attached]()  # since what they change in a loop cannot be seen there
+_MADE: Final = WeakSet[Attached]()  # all that exist, since a loop does not show that it is attached
 
 
 def require_bands(params: Mapping[str, Any] | torch.nn.ParameterDict) -> None:

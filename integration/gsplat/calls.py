@@ -1,5 +1,5 @@
-"""Calls of gsplat's `rasterization`, by the names of its parameters: which view one draws; the same call at another size, from
-another camera, or with f_det in the colours; and what a call returns, as an `Attachment` needs it.
+"""Calls of gsplat's `rasterization`, as dicts of arguments: finds the view of a call; changes its size, camera or colours; and
+converts its result for `Attachment`.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ _LENS: Final = (
     "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs", "lidar_coeffs", "external_distortion_coeffs",
     "viewmats_rs", "rays",
 )  # fmt: skip
-_POSE_RATIO: Final = 10  # how many times as far the second nearest pose must be, since frames of a video lie close
+_POSE_RATIO: Final = 10  # by which the second nearest pose must be farther away, since frames of a video lie close
 
 
 class Poses:
-    """The poses of the training views, by which the view of a call is found where the loop does not name it."""
+    """Finds the view of a call by its pose, if the loop does not name the view."""
 
     def __init__(self, views: Sequence[View]) -> None:
         self._views = tuple(views)
         self._poses = torch.stack([view.lr.camera.world_to_camera for view in views]).double().cpu().numpy()
 
     def find(self, viewmats: Float[Tensor, "*C 4 4"]) -> View | None:
-        """The view of this pose; None: it is none of a training view.
+        """The view with this pose; None: no training view has it.
 
         Raises:
             HostError: there are several poses, or two views have this one.
@@ -62,13 +62,13 @@ class Poses:
 
 
 def enlarged(call: Call, factor: int) -> dict[str, Any]:
-    """With `factor` times as many pixels along an edge, colours alone."""
+    """The call with `factor` times as many pixels along an edge, for colours only."""
     Ks = torch.cat((call["Ks"][..., :2, :] * factor, call["Ks"][..., 2:, :]), -2)
     return {**call, "Ks": Ks, "width": call["width"] * factor, "height": call["height"] * factor, "render_mode": "RGB"}
 
 
 def require_pinhole(call: Call, showing: Sequence[object]) -> None:
-    """Raise a HostError for other cameras where strategies show pictures between photos, which are warped by pinhole cameras."""
+    """Raise a HostError for other cameras if strategies have extra views, since these are warped by pinhole cameras."""
     if not showing:
         return
     model = call.get("camera_model", "pinhole")
@@ -81,7 +81,7 @@ def require_pinhole(call: Call, showing: Sequence[object]) -> None:
 
 
 def seen_by(call: Call, camera: Camera) -> dict[str, Any]:
-    """From another camera, colours alone."""
+    """The call from another camera, for colours only."""
     viewmats, Ks = call["viewmats"], call["Ks"]
     return {
         **call, "viewmats": camera.world_to_camera.to(viewmats).reshape(viewmats.shape),
@@ -90,10 +90,10 @@ def seen_by(call: Call, camera: Camera) -> dict[str, Any]:
 
 
 def with_offset(call: Call, detail: Float[Tensor, "*B N 3"], *, is_ours: bool) -> dict[str, Any]:
-    """With f_det as an offset of the colours.
+    """The call with f_det as an offset of the colours.
 
     Args:
-        is_ours: the function is this package's, which takes an offset by itself.
+        is_ours: the function is this package's, which has an argument for the offset.
     """
     colors, as_bands = call["colors"], call.get("sh_degree") is not None
     if is_ours and as_bands:
@@ -108,15 +108,15 @@ def with_offset(call: Call, detail: Float[Tensor, "*B N 3"], *, is_ours: bool) -
 
 
 def aliased(call: Call) -> tuple[dict[str, Any], tuple[Tensor, ...]]:
-    """With other tensors over the same memory in place of those that require gradients; and these. They have none of the loop's
-    hooks, and what the loop does to its renderings cannot reach theirs.
+    """The call with aliases of all tensors that require gradients, and the aliases. An alias shares the memory, but has none of
+    the loop's hooks.
     """
     aliases = {name: x.view_as(x) for name, x in call.items() if isinstance(x, Tensor) and x.requires_grad}
     return {**call, **aliases}, tuple(aliases.values())
 
 
 def drawable(rasterizer: Rasterizer, call: Call, params: Mapping[str, Tensor], camera: Camera | None) -> Drawable:
-    """A call, as this package draws it.
+    """The `Drawable` of a call.
 
     Args:
         camera: None: that of the call.
@@ -127,7 +127,7 @@ def drawable(rasterizer: Rasterizer, call: Call, params: Mapping[str, Tensor], c
     behind = call.get("backgrounds")
     background = call["means"].new_zeros(1, 3) if behind is None else behind.detach().reshape(1, 3).float()
     drawn = {name: call[name] for name in ("means", "quats", "scales", "opacities", "colors")}
-    drawn["colors"] = drawn["colors"].to(drawn["means"].dtype)  # some hosts have them in float16
+    drawn["colors"] = drawn["colors"].to(drawn["means"].dtype)  # float16 in some hosts
     return Drawable(rasterizer, camera, drawn, (call["sh_degree"] + 1) ** 2, params.get("detail"), background, params)
 
 
@@ -135,7 +135,7 @@ def host_output(
     rasterization: Rasterization, call: Call, params: Mapping[str, Tensor], gate: Float[Tensor, " N"] | None,
     marks: Sequence[Tensor] = (),
 ) -> HostOutput:  # fmt: skip
-    """One rendering. Gaussians that the gate drops are marked as not visible in its `info`.
+    """Render. Gaussians that the gate drops are marked as invisible in `info`.
 
     Raises:
         HostError: the function does not return what gsplat's does.
@@ -151,7 +151,7 @@ def host_output(
     size, n, packed = (call["width"], call["height"]), len(params["means"]), info["means2d"].dim() == 2
     rows = info.get("gaussian_ids") if packed else None
     means2d = info["means2d"].detach().reshape(-1, 2)
-    if len(drawings) == 1:  # what the gate drops is not visible in it
+    if len(drawings) == 1:  # in which dropped Gaussians are invisible
         means2d, visible = drawings[0].rendering.means2d, drawings[0].rendering.visible
     else:
         radii: Tensor = info["radii"]

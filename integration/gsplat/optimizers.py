@@ -1,4 +1,4 @@
-"""The optimizers of a host's loop, which it may join, split, and make anew in mid-training."""
+"""The optimizers of a host's loop, which it may combine, split or replace during training."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ _DETAIL = "detail"
 def optimizers_of(
     given: Mapping[str, Any] | torch.optim.Optimizer, params: Mapping[str, Tensor], names: Iterable[str]
 ) -> list[torch.optim.Optimizer]:
-    """Those that step the Gaussians: they have these names, or hold one of the parameters. Others, e.g. of poses, do not count.
+    """The optimizers that step the Gaussians: they have one of the names, or hold one of the parameters. Others, e.g. of poses,
+    are left out.
 
     Args:
-        given: the host's, by the names of its parameters or by any, or a single one.
+        given: the host's optimizers, by the names of its parameters or by any other names, or a single one.
     """
     if isinstance(given, torch.optim.Optimizer):
         return [given]
@@ -36,11 +37,11 @@ def step_detail(
     detail: torch.nn.Parameter,
     rates: DetailRates,
 ) -> list[torch.optim.Optimizer]:
-    """`found`, of which one now steps f_det: a group of the only one where it steps several parameters, for such a loop steps no
-    other, else an Adam of its own in the host's dictionary.
+    """`found`, with an optimizer that steps f_det. If a single optimizer steps all parameters, the loop steps no other, and f_det
+    becomes a group of it. Otherwise f_det gets an Adam of its own in the host's dictionary.
 
     Raises:
-        SettingError: a learning rate scheduler counts the groups of the only optimizer.
+        SettingError: the single optimizer has a learning rate scheduler, which counts its groups.
     """
     if any(p is detail for o in found for p in _stepped(o)):
         return found
@@ -56,7 +57,7 @@ def step_detail(
         if not isinstance(given, torch.optim.Optimizer):
             given.setdefault(_DETAIL, only)
         return found
-    if _DETAIL not in given:  # also where a checkpoint of the host held the parameter
+    if _DETAIL not in given:  # also if the parameter came from a checkpoint of the host
         given[_DETAIL] = detail_adam(detail, rates)
         return [*found, given[_DETAIL]]
     return found

@@ -1,4 +1,4 @@
-"""Which Gaussian came from which in hosts that gather every entry of their parameters: row numbers among these."""
+"""Parents of Gaussians in hosts that gather every entry of their parameters: row numbers are one of these entries."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from integration.structure import is_same
 
 ROWS: Final = "clear_rows"
 """Key of the row numbers."""
-_EXACT: Final = 2  # eps of a type of numbers, times the largest up to which it has all whole ones
-_ROUNDING: Final = 0.1  # an average of the same numbers over many steps differs from them by less
+_EXACT: Final = 2  # eps of a type, times the largest n up to which it represents all whole numbers
+_ROUNDING: Final = 0.1  # averaging equal numbers over many steps changes them by less
 
 
 class RowNumbers:
-    """Row numbers that clone, split, prune, relocation and MCMC's sampling gather, since they gather every entry. They are
-    float64, exact up to 2^53, because a loop may treat all its parameters alike, e.g. average them.
+    """Row numbers, which clone, split, prune, relocation and MCMC's sampling gather like every other entry. They are float64,
+    exact up to 2^53, because a loop may treat all its parameters alike, e.g. average them.
 
     Args:
-        entries: the host's parameters, which may hold one that is not trained; or other tensors that follow them: the `state` of
-            gsplat 1.4's strategies, whose parameters may not, or the `signal` of gsplat 1.6's scene, which its events change.
+        entries: the host's parameters, if one of them may be untrained; or other tensors that are gathered with them: the `state`
+            of gsplat 1.4's strategies, or the `signal` of gsplat 1.6's scene.
         means: returns the current positions.
         as_parameter: whether the numbers must be a parameter.
     """
@@ -46,7 +46,7 @@ class RowNumbers:
         self.restart()
 
     def restart(self) -> None:
-        """Number the rows from 1: 0 is what a host writes that knows no origin, or adds a Gaussian that has none."""
+        """Number the rows from 1. A host writes 0 for a new Gaussian whose parent it does not know, or that has none."""
         means = self._means()
         rows = torch.arange(1, len(means) + 1, device=means.device, dtype=torch.float64)
         self._numbered = len(means)
@@ -54,7 +54,7 @@ class RowNumbers:
         self._unchanged = self._entries[ROWS], self._entries[ROWS]._version
 
     def poll(self) -> Int[Tensor, " M"] | None:
-        """parents[M] of the change since the last call: row i comes from row parents[i], or from none where that is -1; None: the
+        """parents[M] of the change since the last call: row i comes from row parents[i], or from none if that is -1; None: the
         rows are the same.
 
         Raises:
@@ -92,7 +92,7 @@ class RowNumbers:
 
     @property
     def remedy(self) -> str:
-        """What to do about Gaussians that come from no other, where something is stored of each."""
+        """What to do about Gaussians without a parent, if strategies store something per Gaussian."""
         if self._as_parameter:
             return (
                 f"As you add one, write to its row of the parameter {ROWS} the row of the Gaussian that it resembles, plus 1. Or "
@@ -109,10 +109,10 @@ class RowNumbers:
 
 
 def _leave_out(_: Any, stored: dict[str, Any], prefix: str, *__: Any) -> None:
-    """A host's checkpoints hold what it trains."""
+    """Keep row numbers out of the host's checkpoints."""
     stored.pop(f"{prefix}{ROWS}", None)
 
 
 def _put_in(module: Any, stored: dict[str, Any], prefix: str, *_: Any) -> None:
-    """Loading such a checkpoint keeps the numbers."""
+    """Keep the present row numbers when a checkpoint is loaded."""
     stored.setdefault(f"{prefix}{ROWS}", module[ROWS])

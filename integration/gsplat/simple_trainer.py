@@ -74,7 +74,7 @@ def install(
     if wanted.from_stereo:
         start_from_stereo(runner_class)
     train, rasterize_splats = runner_class.train, runner_class.rasterize_splats
-    last: Attached | None = None  # of the last Runner, whose evaluation may come after its training
+    last: Attached | None = None  # of the last Runner, which may be evaluated after its training
 
     @functools.wraps(train)
     def train_with_clear(runner: Any) -> Any:
@@ -110,7 +110,7 @@ def install(
 
 
 def require_supported(config: Any, *, from_stereo: bool) -> None:
-    """Raise a SettingError for an option of simple_trainer that does not work with two scales, or with points between photos."""
+    """Raise a SettingError for an option of simple_trainer that does not work with two scales, or with points from stereo."""
     for name, (needed, why) in (_NEEDED | (_NEEDED_BY_STEREO if from_stereo else {})).items():
         found = getattr(config, name, needed)
         if found != needed:
@@ -120,7 +120,7 @@ def require_supported(config: Any, *, from_stereo: bool) -> None:
 def _attach(
     runner: Any, views: Sequence[View], masks: Mapping[str, Tensor], chosen: Conductor, wanted: Settings
 ) -> Attached:
-    """CLEAR in one Runner, whose files hold f_base + f_det."""
+    """Attach CLEAR to a Runner, whose files then hold f_base + f_det."""
     splats = runner.splats
     attached = Attached(
         splats, runner.optimizers, views, chosen, strategy=runner.cfg.strategy, seed=wanted.seed, masks=masks,
@@ -145,7 +145,7 @@ def _attach(
 
 
 def _fold(_: Any, stored: dict[str, Any], prefix: str, *__: Any) -> None:
-    """A checkpoint's sh0 is f_base + f_det, and it has the keys that the trainer's evaluation expects."""
+    """Store f_base + f_det as a checkpoint's sh0, and only the keys that the trainer's evaluation expects."""
     detail = stored.pop(f"{prefix}detail")
     stored[f"{prefix}sh0"] = stored[f"{prefix}sh0"] + sh0_offset(detail, stored[f"{prefix}sh0"])
 
@@ -190,7 +190,7 @@ def start_from_stereo(runner_class: Any) -> None:
         init_type = call.arguments.get("init_type", "sfm")
         if init_type == "sfm":
             cloud = stereo_points(photos_of(dataset(parser, split="train")))
-            parser = copy.copy(parser)  # what else its points are used for (depths) needs its own
+            parser = copy.copy(parser)  # other uses of its points (depths) need the original
             parser.points, parser.points_rgb = cloud.means.numpy(), (cloud.colors * 255).numpy()
         else:
             _log.warning("points=stereo has no effect with init_type=%s. Set init_type=sfm.", init_type)

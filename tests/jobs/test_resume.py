@@ -16,7 +16,7 @@ from clear_strategies.jobs import job, resume
 from clear_strategies.jobs import scene as scenes
 from clear_strategies.signals import Interrupted
 from clear_strategies.training.loop import iterate
-from clear_strategies.training.state import colours
+from clear_strategies.training.state import fingerprints
 from tests.helpers import captures, forked, toy
 from tests.helpers.command_line import ALONE, TINY, run
 from tests.helpers.configs import composed
@@ -158,7 +158,7 @@ def test_rounding_is_no_change_of_a_photo_and_checkpoints_of_earlier_versions_kn
     def brighter(by: float):
         first, *others = SCENE.train
         changed = replace(SCENE, train=(replace(first, lr=replace(first.lr, image=first.lr.image + by)), *others))
-        (state := start(())).photos = colours(changed)
+        (state := start(())).photos = fingerprints(changed)
         return state
 
     saved = start(()).checkpoint({})

@@ -106,7 +106,7 @@ def no_data(monkeypatch):
     """What is made once, from the data, is there already."""
     monkeypatch.setattr(torch, "Generator", Generator)
     monkeypatch.setattr(TrainState, "refilter", lambda self: None)
-    monkeypatch.setattr("clear_strategies.training.state.colours", lambda views: {})
+    monkeypatch.setattr("clear_strategies.training.state.fingerprints", lambda views: {})
 
 
 def cache_evidence(state: TrainState) -> None:

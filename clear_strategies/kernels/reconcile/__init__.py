@@ -1,10 +1,10 @@
-"""What every reconciliation of two gradients needs beside its weights, which are a strategy's (`Strategy.reconcile`):
+"""The two computations of every reconciliation of gradients; its weights come from a strategy (`Strategy.reconcile`):
 
     products    ⟨l, h⟩, ‖l‖², ‖h‖² of every Gaussian, by attribute group
     apply       g_LR + λ_HR (keep · g_HR - remove · g_LR) + what regularizers add                  Eq. 7, 8, 16
 
-`reference` specifies both. `cpp` computes them for float32 in the CPU's memory, `warp` on CUDA, and `reference` anything else.
-`kernels.gaussian_step` computes the same for the trainer of this package, whose gradients are never stored.
+`reference` specifies both. `cpp` computes them for float32 in the CPU's memory, `warp` on CUDA, `reference` in all other cases.
+`kernels.gaussian_step` computes the same in this package's trainer, without storing gradients.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def products(lr: Grads, hr: Grads) -> Products:
     """The inner products of both gradients.
 
     Raises:
-        ValueError: no two gradients are of one group.
+        ValueError: the gradients have no group in common.
     """
     if not (names := common_groups(lr, hr)):
         raise ValueError(
@@ -47,15 +47,15 @@ def apply(
     out: Mapping[str, Tensor], lr: Grads, hr: Grads, weights: Weights, *, lambda_hr: float | Float[Tensor, " 1"] = 1.0,
     plus: Grads | None = None, keeps_lr: bool = True,
 ) -> Number:  # fmt: skip
-    """Write the merged gradient of these attributes; f_det takes part with keep 1.
+    """Write the merged gradient to `out`, by attribute; for f_det, keep is 1.
 
     Args:
         out: contiguous, [N, …]; it may hold the tensors of `lr`. An attribute that no gradient has becomes 0.
-        lambda_hr: a tensor of the type of `out` where a recording reads it, see `rasterizers.recording`.
-        keeps_lr: False: keep · g_HR - remove · g_LR alone.
+        lambda_hr: a tensor of the type of `out` in a recording, see `rasterizers.recording`.
+        keeps_lr: False: without g_LR, only keep · g_HR - remove · g_LR.
 
     Returns:
-        Whether every number of the result is finite, 0 or 1; on a device, it is not known yet.
+        Whether the whole result is finite, 0 or 1; on a device, it is read later.
     """
     plus = Grads() if plus is None else plus
     chosen = _chosen(*out.values(), *lr.tensors.values(), *hr.tensors.values(), *plus.values())
@@ -64,7 +64,7 @@ def apply(
 
 
 def dense(g: Grads, like: Mapping[str, Tensor]) -> Grads:
-    """The same with every number of the spherical harmonics, in the shapes of `like` and for its attributes alone."""
+    """The gradient in full, without factors, in the shapes of `like` and only for its attributes."""
     out = {name: g[name].reshape(x.shape) for name, x in like.items() if name in g}
     if g.colour is not None:
         bands = {name: empty_for(like[name]) for name in ("sh0", "shN") if name in like}

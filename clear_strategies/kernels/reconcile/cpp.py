@@ -53,9 +53,9 @@ def apply(
 
 
 def _rows(name: str, width: int, n: int, *tensors: Tensor | None) -> tuple[int, ...]:
-    """An attribute as the kernel takes it: addresses of lr, hr, plus and out, width, group, first band."""
+    """An attribute for the kernel: addresses of lr, hr, plus and out, width, group, first band."""
     at = [_address(name, x, n, width) for x in tensors]
-    group = _GROUPS.get(name, _GROUPS["detail"])  # others are summed, too
+    group = _GROUPS.get(name, _GROUPS["detail"])  # other attributes are summed, like f_det
     return (*at, *[0] * (4 - len(at)), width, group, FIRST_BANDS.get(name, -1))
 
 
@@ -67,7 +67,7 @@ def _factors(g: Grads, n: int) -> tuple[int, int, int]:
 
 
 def _address(name: str, x: Tensor | None, n: int, width: int) -> int:
-    """Of the tensor's numbers; 0 where there is none."""
+    """The address of a tensor; 0 for None."""
     if x is None:
         return 0
     if x.numel() != n * width or not x.is_contiguous():

@@ -1,4 +1,4 @@
-"""Products and apply in torch, in float64, on any device: the specification of the compiled ones."""
+"""Products and apply in torch, in float64, on any device: the specification of the other two."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def apply(
 
 
 def _rows(g: Grads, name: str, width: int, like: Tensor | None = None) -> Float[Tensor, "N D"]:
-    """An attribute's gradient in float64, as many numbers a row; 0 where there is none."""
+    """An attribute's gradient in float64, as rows of `width` numbers; 0 if there is none."""
     first = next(iter(g.tensors.values())) if like is None else like
     rows = first.new_zeros(len(first), width, dtype=torch.float64)
     if name in g and width:

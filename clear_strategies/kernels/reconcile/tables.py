@@ -1,4 +1,4 @@
-"""How gradients and weights lie in memory for the compiled passes."""
+"""The memory layout of gradients and weights for the compiled passes."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from clear_strategies.core.conflicts import Weights
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Colour, Grads
 
 WIDEST: Final = 45
-"""Numbers of a Gaussian in one attribute, at most: three degrees of spherical harmonics."""
+"""The most numbers of a Gaussian in one attribute: the higher bands of three degrees of spherical harmonics."""
 
 FIRST_BANDS: Final = {"sh0": 0, "shN": 1}
 """The first band of the attributes that are spherical harmonics."""
 
 
 def has(g: Grads, name: str) -> bool:
-    """Whether this gradient is known of the attribute, by name or by its factors."""
+    """Whether there is a gradient of the attribute, by name or as factors."""
     return name in g or (g.colour is not None and name in FIRST_BANDS)
 
 
@@ -35,7 +35,7 @@ def contiguous(g: Grads) -> Grads:
 
 
 def row_width(name: str, *gradients: Grads) -> int:
-    """Numbers of a row of an attribute that one of the gradients has."""
+    """The numbers of a row of an attribute that one of the gradients has."""
     for g in gradients:
         if name in g:
             return g[name].shape[1:].numel()
@@ -44,16 +44,16 @@ def row_width(name: str, *gradients: Grads) -> int:
 
 
 WeightTable = tuple[float, Tensor | None, int]
-"""A weight as the kernels take it: a number, or float64 rows in its place, and the distance from one group to the next."""
+"""A weight as the kernels take it: a number, float64 rows that replace it, and the stride from one group to the next."""
 
 
 def weight_tables(weights: Weights, n: int, device: torch.device) -> tuple[WeightTable, ...]:
-    """Keep and remove of n Gaussians."""
+    """The tables of keep and remove, of n Gaussians."""
     return tuple(_table(name, weight, n, device) for name, weight in zip(Weights._fields, weights, strict=True))
 
 
 def addresses(tables: Sequence[WeightTable]) -> tuple[tuple[float, int, int], ...]:
-    """The same as the C++ kernels take it, which do not keep the rows alive."""
+    """The tables as the C++ kernels take them; the caller keeps the rows alive."""
     return tuple((number, 0 if rows is None else rows.data_ptr(), stride) for number, rows, stride in tables)
 
 

@@ -1,4 +1,4 @@
-"""Products and apply in Warp, for CUDA; the same kernels run on a CPU, to check them. Counts stay on the device.
+"""Products and apply in Warp, for CUDA; tests also run the kernels on a CPU. Counts stay on the device.
 
 `compare` has one thread per Gaussian, `combine` one per number, so that neighbouring threads write neighbouring memory. Products
 are in float64, where no product of two floats over- or underflows. `kernels.gaussian_step.warp` shares the first half of this
@@ -64,12 +64,12 @@ def weights_of(tables: Sequence[WeightTable]) -> Any:
 
 
 def product_table(like: Tensor, n: int, blocks: int) -> tuple[Tensor, Tensor]:
-    """What a kernel writes products and counts to, [18, N] and [blocks, 14]."""
+    """Tensors for a kernel's products and counts, [18, N] and [blocks, 14]."""
     return like.new_empty(3 * GROUPS, n, dtype=torch.float64), like.new_empty(blocks, COUNTS, dtype=torch.int32)
 
 
 def products_of(names: Sequence[str], table: Tensor, counts: Tensor) -> conflicts.Products:
-    """What the kernel has written."""
+    """The `Products` of tensors that a kernel has written."""
     sums = deferred.elements(counts.sum(0))
     dot, l2, h2 = (x.T for x in table.view(3, GROUPS, -1))
     return conflicts.Products(names, dot, l2, h2, sums[:7], sums[7:])
@@ -90,7 +90,7 @@ def reconciled(high: wp.float32, low: wp.float32, keep: wp.float64, remove: wp.f
 
 @wp.func
 def compared_and_opposed(products: wp.vec3d) -> wp.vec2i:
-    """Whether neither gradient is zero, and whether their cosine is below 0, too; 0 or 1."""
+    """Whether neither gradient is zero, and whether their cosine is also below 0; 0 or 1."""
     zero = wp.float64(0.0)
     comparable = wp.where(products[1] > zero and products[2] > zero, 1, 0)
     return wp.vec2i(comparable, wp.where(products[0] < zero, comparable, 0))
@@ -295,7 +295,7 @@ def _options(n: int, lr: Grads, hr: Grads, lambda_hr: float = 1.0, keeps_lr: boo
 
 
 def _rows(name: str, width: int, lr: Grads, hr: Grads, plus: Grads, out: Tensor | None) -> Any:
-    """An attribute as the kernels take it; one of no width is absent."""
+    """An attribute for the kernels; one of width 0 is absent."""
     if width == 0:
         return struct(Rows, {})
     tensors = {"lr": lr.get(name), "hr": hr.get(name), "plus": plus.get(name), "out": out}
