@@ -28,9 +28,9 @@ class Host:
 
     Args:
         script: a description of its script.
-        hook: takes `--save-lr` and the settings of `install`; a context in which the script runs with CLEAR. Its value is
-            the list of what was attached (`Attached` of this host), which the script fills.
-        otherwise: why that list may be empty at the end.
+        hook: takes `--save-lr` and the settings of `install`; returns a context in which the script runs with CLEAR. Its value
+            is a list, to which the host's `Attached` are added while the script runs.
+        otherwise: why the list may be empty at the end.
     """
 
     script: str
@@ -44,7 +44,7 @@ def main(module: str, host: Host, arguments: Sequence[str] | None = None) -> int
 
 
 def parser(module: str, description: str) -> argparse.ArgumentParser:
-    """Its options, by the names of `Settings`."""
+    """The parser of the program's options, by the names of `Settings`."""
     made = argparse.ArgumentParser(prog=f"python -m {module}", description=description)
     add = made.add_argument
     add("--strategies", metavar="NAMES", help="of conf/strategy: clear, gco, gco,svs … (%(default)s)")
@@ -100,13 +100,13 @@ def run(options: argparse.Namespace, prepared: Callable[[], Host]) -> int:
 
 
 def save_lr(photos: Iterable[HostPhoto], folder: Path) -> NoReturn:
-    """What `--save-lr` does in place of training."""
+    """Implements `--save-lr`, instead of training."""
     save_photos(photos, folder)
     raise SystemExit(0)
 
 
 def _settings(options: argparse.Namespace) -> Settings:
-    """The settings of `install`; what it would refuse is refused here, before the host loads its scene.
+    """The settings of `install`, checked before the host loads its scene.
 
     Raises:
         SettingError: the configuration or `points` is refused, or HR is used without SR images.

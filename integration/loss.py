@@ -34,9 +34,9 @@ def joint_loss(
     t: int,
     scaler: ScoreScaler | None = None,
 ) -> tuple[Float[Tensor, ""], Update]:
-    """λ_LR L_LR + λ_HR (L_base + λ_HF L_HF), whose gradient is the conductor's merged gradient, and what was decided.
+    """λ_LR L_LR + λ_HR (L_base + λ_HF L_HF), whose gradient is the conductor's merged gradient, and the `Update`.
 
-    What else the LR rendering depends on (exposure, poses, an offset of the colours) gets the gradient of λ_LR L_LR.
+    Other leaves of the LR rendering (exposure, poses, an offset of the colours) get the gradient of λ_LR L_LR.
 
     Args:
         params: the leaves of the Gaussians that the host optimizes, by gsplat's names (and "detail", if the host has it).
@@ -48,7 +48,7 @@ def joint_loss(
         The loss, and the `Update`: the step for `Conductor.after_step`, densification scores, conflict ratios.
 
     Raises:
-        ValueError: `params` and the renderings do not name the same parameters, or one has no row for each Gaussian; f_det shows
+        ValueError: `params` and the renderings have different parameters, or one without a row for each Gaussian; f_det is drawn
             at LR, or not at HR; this package drew another training view than `view`; a strategy has not started.
     """
     values = {name: p.detach() for name, p in params.items()}
@@ -96,8 +96,8 @@ def extra_loss(conductor: Conductor, image: Float[Tensor, "h w 3"], extra: Extra
 
 
 def with_gradients(value: Scalar, gradients: Sequence[Tensor], *tensors: Tensor) -> Float[Tensor, ""]:
-    """A scalar with these gradients with respect to these tensors; scaling it scales them."""
-    scalar: Tensor = _GivenGradients.apply(value, gradients, *tensors)  # type: ignore[no-untyped-call]
+    """A scalar that has these gradients with respect to the tensors; scaling it scales them."""
+    scalar: Tensor = _WithGradients.apply(value, gradients, *tensors)  # type: ignore[no-untyped-call]
     return scalar
 
 
@@ -123,7 +123,7 @@ def _require_detail(detail: Tensor | None, lr: Graph, hr: Graph | None) -> None:
 
 
 def _require_view(conductor: Conductor, view: View, **graphs: Graph | None) -> None:
-    """A pose that is that of no view, e.g. since the host optimizes it, is taken."""
+    """Raise a ValueError for a render by another view's camera. A pose of no view is accepted: the host may optimize poses."""
 
     def with_pose(camera: Camera, views: Sequence[View]) -> list[View]:
         if not views or camera.world_to_camera is views[0].lr.camera.world_to_camera:  # nothing is read from the device
@@ -151,7 +151,7 @@ def _require_started(conductor: Conductor) -> None:
 def _others(
     conductor: Conductor, params: Mapping[str, Tensor], lr: Shot, leaves_of_lr: Sequence[Tensor], view: View, t: int
 ) -> Iterator[tuple[Tensor, Tensor]]:  # fmt: skip
-    """The leaves that the LR rendering depends on besides `params`, each with the gradient of λ_LR L_LR."""
+    """The other leaves of the LR rendering, each with its gradient of λ_LR L_LR."""
     slot = lr.gradient_slot.tensor if isinstance(lr, AutogradShot) else lr.means2d
     known = {id(slot), *map(id, params.values())}
     if leaves := [leaf for leaf in leaves_of_lr if id(leaf) not in known]:
@@ -161,7 +161,7 @@ def _others(
         yield from ((leaf, g) for leaf, g in zip(leaves, found, strict=True) if g is not None)
 
 
-class _GivenGradients(torch.autograd.Function):
+class _WithGradients(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, value: Scalar, gradients: Sequence[Tensor], *tensors: Tensor) -> Tensor:
         ctx.gradients = gradients

@@ -1,4 +1,4 @@
-"""What `install` takes, in every host."""
+"""The settings of `install`, the same in every host."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from integration.views import Points, SuperResolve
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Which strategies train, from which SR images and points.
+    """The strategies, the SR images, and the initial points.
 
     Args:
         strategies: names of conf/strategy: "clear", "gco", "gco,svs" …
@@ -27,7 +27,7 @@ class Settings:
         factor: HR pixels per LR pixel.
         points: "own": the Gaussians start as the host makes them; "stereo": from dense stereo between its training photos.
         seed: of the strategies.
-        hr_by: what draws HR in a gsplat-style host, see `integration.gsplat.attach`; others draw it themselves.
+        hr_by: what draws HR in a gsplat-style host, see `integration.gsplat.attach`; other hosts draw it themselves.
         accumulation: see `Attachment`.
 
     Raises:
@@ -62,8 +62,7 @@ class Settings:
         return conductor(self.strategies, *self.overrides, iterations=iterations)
 
     def sr_source(self, conductor: Conductor) -> tuple[SuperResolve, int]:
-        """What makes the SR images, with the conductor's decorators around it, and their factor. Without SR images the "HR" view
-        is the LR view.
+        """The prior of the SR images, with the conductor's decorators around it, and their factor. Without SR images, HR is LR.
 
         Raises:
             SettingError: there are no SR images, but the objective or a strategy needs them.

@@ -29,12 +29,12 @@ _log = logging.getLogger(__name__)
 SAME_POSE: Final = 1e-3
 """Largest difference between the entries of two poses of one camera."""
 _SHOWN: Final = 0.5  # a mask above it shows its pixel
-_OVERSHOOT: Final = 0.5  # of a network's images outside of [0, 1] at edges
+_OVERSHOOT: Final = 0.5  # by which a network's images may leave [0, 1] at edges
 
 SuperResolve = Callable[[str, Float[Tensor, "h w 3"], int], Float[Tensor, "H W 3"]]
 """I_HR of a view from its name, its LR image and the factor: a prior of `clear_strategies.data.priors`, or your function."""
 Points = Literal["own", "stereo"]
-"""Whose points the Gaussians start from."""
+"""The initial points: the host's own, or dense stereo."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +46,7 @@ class HostPhoto:
         image: RGB in [0, 1] or 8 bits; further channels are left out.
         world_to_camera: OpenCV axes (x right, y down, z forward).
         K: focal lengths and principal point in pixels of `image`; pixel (0, 0) spans [0, 1)².
-        mask: what the host's loss multiplies its rendering by, in [0, 1]; None: nothing is hidden.
+        mask: by which the host's loss multiplies its rendering, in [0, 1]; None: nothing is hidden.
 
     Raises:
         DataError: one has another shape, or values outside of [0, 1]; or pose and K are no camera.
@@ -83,7 +83,7 @@ class HostPhoto:
 
     @property
     def camera(self) -> Camera:
-        """At the size of the image, on the CPU, where cameras stay, see `Photo.to`."""
+        """The camera at the size of the image, on the CPU, where cameras stay, see `Photo.to`."""
         h, w = self.image.shape[:2]
         (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
         return Camera(self.world_to_camera.detach().float().cpu(), fx, fy, cx, cy, w, h)
@@ -126,14 +126,14 @@ def view(
     """One training view of a host, on the device of its image.
 
     Args:
-        name, image, world_to_camera, K: see `HostPhoto`. Arrays of numpy are taken, too.
-        sr: gives the SR image. factor: HR pixels per LR pixel.
-        mask: see `HostPhoto`. Photo and SR image are multiplied by it, so that a pixel that the host hides is hidden at both
-            scales; the HR rendering must be as well, see `enlarged_mask`.
+        name, image, world_to_camera, K: see `HostPhoto`; numpy arrays are accepted.
+        sr: makes the SR image. factor: HR pixels per LR pixel.
+        mask: see `HostPhoto`. Photo and SR image are multiplied by it, so a pixel that the host hides is hidden at both scales;
+            multiply the HR rendering as well, see `enlarged_mask`.
 
     Raises:
         DataError: photo, mask, pose or K has another shape, or is no array of numbers; the SR image is not `factor` times as
-            large as the photo; an image is not in [0, 1] but for a network's overshoot.
+            large as the photo; an image lies outside of [0, 1] by more than a network's overshoot.
         SettingError: sr cannot be called, or factor is no whole number of at least 1.
     """
     require_whole("factor", factor, least=1)
@@ -171,18 +171,14 @@ def _require_range(name: str, what: str, values: Tensor) -> None:
 
 
 def require_unique(names: Iterable[str]) -> None:
-    """Refuse two photos of one name: SR images are found by it, and strategies know a view by it.
-
-    Raises:
-        DataError: there are two.
-    """
+    """Raise a DataError if two photos have the same name, which identifies views and SR images."""
     if twice := [name for name, count in Counter(names).items() if count > 1]:
         remedy = "give each its own; where folders have equal file names, name the views with their folders"
         raise DataError(twice[0], "name", "is that of two photos", remedy)
 
 
 def save_photos(photos: Iterable[HostPhoto], folder: Path | str) -> None:
-    """Write the photos, and black where a mask hides them, as PNG by their names, for an SR tool to enlarge.
+    """Write the photos as PNG files by their names, black where a mask hides them, for an SR tool to enlarge.
 
     Raises:
         DataError: two photos would have the same file.
@@ -211,11 +207,10 @@ def stereo_points(photos: Sequence[HostPhoto]) -> PointCloud:
     """Dense stereo between a host's training photos; one line of the log sums them up.
 
     Args:
-        photos: in the host's world. Where the mask is below 0.5 the host hides the pixel, which gets no points. Stereo runs on
-            their device.
+        photos: in the host's world. Pixels whose mask is below 0.5 are hidden and get no points. Stereo runs on their device.
 
     Returns:
-        At most `MAX_POINTS` points on the CPU: world units, RGB in [0, 1]. More are reduced at random, always to the same.
+        At most `MAX_POINTS` points on the CPU: world units, RGB in [0, 1]. More are reduced to a reproducible random choice.
 
     Raises:
         DataError: there are fewer than two photos, or stereo confirms no depth.

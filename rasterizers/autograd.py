@@ -195,6 +195,10 @@ def in_graph(
     return Drawn(image, alpha, means2d, visible, depth)
 
 
+_POSE: Final = 4  # among the arguments of `_Draw.forward`
+_COLORS: Final = 6 + Inputs._fields.index("colors")
+
+
 class _Draw(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -252,10 +256,10 @@ class _Draw(torch.autograd.Function):
         basis, colors = each[0].basis, None
         if take_colours is not None:
             take_colours(rgb, basis)
-        elif ctx.needs_input_grad[10]:
+        elif ctx.needs_input_grad[_COLORS]:
             colors = outer(rgb, basis, inputs.colors.shape[1])
         pose = None
-        if ctx.needs_input_grad[4]:
+        if ctx.needs_input_grad[_POSE]:
             means, quats, scales, opacities = (x[None] for x in geometry)
             g = SplatGradients(means, quats, scales, opacities, screen[None], rgb[None], basis)
             pose = pose_gradient(inputs.splats(bands), camera, g).to(*ctx.pose)

@@ -1,4 +1,4 @@
-"""What the backends of this package share: a base class, and the checks of their input."""
+"""The base class of this package's backends, and checks of their inputs."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def info_of_visible(
 
 @in_full_precision
 def _columns(rendered: Rendered, splats: Inputs, rows: Int[Tensor, " M"]) -> dict[str, Tensor]:
-    """What gsplat says of the visible Gaussians."""
+    """The columns of gsplat's `info` for the visible Gaussians."""
     settings = cast(RasterSettings, rendered.rasterizer)  # `over` has checked it
     f = footprints(splats.means[rows], splats.quats[rows], splats.scales[rows], rendered.camera, settings.kernel)
     opacities = splats.opacities[rows] * f.compensation if settings.antialiased else splats.opacities[rows]

@@ -44,7 +44,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraView:
-    """What one camera is to show.
+    """The picture of one camera.
 
     Args:
         inputs, sh_degree, background, render_mode: as of `as_gsplat.rasterization`, for one scene and camera.

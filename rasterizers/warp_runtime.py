@@ -1,5 +1,4 @@
-"""What the Warp packages share: a check that Warp runs here, torch tensors as kernel arguments, launches, and
-torch's stream.
+"""Shared by all Warp code: a check that Warp runs here, torch tensors as kernel arguments, launches, and torch's stream.
 
 Used by `rasterizers.warp_backend` and by the Warp kernels in `clear_strategies.kernels`. Imports Warp only when called.
 """
@@ -69,8 +68,8 @@ def launch(
 ) -> None:  # fmt: skip
     """Launch a kernel with a thread for each index of `dim`, in a scope of `on_stream`.
 
-    As `wp.launch`, in a fifth of the host's time, which on CUDA exceeds the kernels': what does not change is made once.
-    Without any index the kernel is compiled and loaded, as it must have been before a recording.
+    Does the same as `wp.launch` in a fifth of the host's time, which on CUDA exceeds the kernels': arguments that do not change
+    are converted once. With an empty `dim` it only compiles and loads the kernel, which a recording cannot.
 
     Args:
         arguments: numbers, structures of `struct`, and tensors or None for the kernel's arrays, see `array`.
@@ -89,7 +88,7 @@ def launch(
 
 
 class _Launch:
-    """A launch whose size and arguments are written anew where they change."""
+    """A launch that converts its size and arguments only when they change."""
 
     def __init__(self, kernel: Any, device: torch.device, block: int) -> None:
         import warp as wp
@@ -166,8 +165,8 @@ _MOST_SHAPES: Final = 256  # the number of Gaussians, and so the shapes, change 
 def sort_pairs(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
     """Sort the first `count` keys and values by key, stably, in a scope of `on_stream`; both have twice that length, for scratch.
 
-    As `wp.utils.radix_sort_pairs` of `wp.from_torch` of both, which takes longer than that sort. Warp's arrays of a length are
-    kept, and receive the tensors' addresses.
+    Does the same as `wp.utils.radix_sort_pairs`, but `wp.from_torch` would take longer than the sort: Warp's arrays are cached by
+    length, and only their addresses change.
     """
     import warp as wp
 
@@ -195,8 +194,8 @@ def array(tensor: Tensor | None, kind: Any) -> Any:
     structure, and before them some that the array's last dimension goes through.
 
     Raises:
-        TypeError: its numbers are of another type than the array's.
-        ValueError: it is no such array in memory.
+        TypeError: its numbers have another type than the array's.
+        ValueError: its strides do not fit the array.
     """
     if tensor is None:
         return _empty_array()
@@ -272,7 +271,7 @@ def _empty_array() -> Any:
 
 @cache
 def _offsets(kind: Any) -> Mapping[str, int]:
-    """Where each field of a Warp structure begins."""
+    """The offset of each field of a Warp structure."""
     return {name: getattr(kind.ctype, name).offset for name, _ in kind.ctype._fields_}
 
 

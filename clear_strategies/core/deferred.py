@@ -32,8 +32,8 @@ class Deferred(NamedTuple):
 
 
 class Element(NamedTuple):
-    """The k-th number of a vector on a device that is never written to again. Many of a vector cost less than a tensor each, and
-    are fetched together.
+    """The k-th number of a vector on a device that is never written to again. Many elements cost less than a tensor each, and are
+    fetched together.
     """
 
     vector: Float[Tensor, " K"] | Int[Tensor, " K"]
@@ -62,7 +62,7 @@ def is_immediate(x: Tensor) -> bool:
 
 
 def scalar(x: Tensor) -> Scalar:
-    """A 0-dim tensor as a float where it is read at once, else itself."""
+    """A 0-dim tensor as a float if it is on the CPU, else itself."""
     return float(x.detach().numpy()) if is_immediate(x) else x
 
 

@@ -1,4 +1,4 @@
-"""NaN and infinity are found before they reach a parameter: one sum per tensor, and a search only where that is not finite.
+"""Checks that find NaN and infinity before they reach a parameter, by one sum per tensor; only if it is not finite, they search.
 
 A device's numbers are not read here, since that would make the host wait; `TrainState.require_finite` checks the parameters
 there before every save.

@@ -13,10 +13,10 @@ T = TypeVar("T")
 
 
 def generator_at(seed: int, t: int, device: torch.device | str = "cpu") -> torch.Generator:
-    """A new generator: another one for every t < 1,000,003 of every seed.
+    """A new generator, a different one for every t < 1,000,003 of every seed.
 
-    Two purposes that ask at the same (seed, t) begin with the same random bits. A purpose that must be independent of the
-    others takes `hashed_generator_at`.
+    Two purposes with the same (seed, t) get the same random bits. A purpose that must be independent of the others takes
+    `hashed_generator_at`.
     """
     return torch.Generator(device).manual_seed((seed * 1_000_003 + t) % 2**63)
 
@@ -29,7 +29,7 @@ def hashed_generator_at(seed: int, t: int, device: torch.device | str = "cpu") -
 
 
 def one_of(items: Sequence[T], generator: torch.Generator) -> T:
-    """One of them, each as likely as another."""
+    """One of the items, all equally likely."""
     return items[int(torch.randint(len(items), (), generator=generator))]
 
 

@@ -85,7 +85,7 @@ class WorkLog:
 
     @contextmanager
     def noted(self) -> Iterator[list[tuple[str, str, int | Tensor]]]:
-        """A scope of work that is recorded: its skips are not counted but noted, as the arguments of each `skip`."""
+        """A scope of recorded work, whose skips are not counted: it returns a list of the arguments of each `skip`."""
         self._noted = []
         try:
             yield self._noted
@@ -93,8 +93,8 @@ class WorkLog:
             self._noted = None
 
     def rows(self) -> list[dict[str, str | int | float]]:
-        """One row per stage: runs, ms per run, seconds, the process's peak of memory until its end, skips, and the seconds
-        that these saved at that rate. The stage whose peak is above that of those before it needs that memory.
+        """One row per stage: runs, ms per run, seconds, the process's peak of memory at its last end, skips, and the seconds that
+        these saved at that rate. A stage whose peak is above that of all earlier stages needs that memory.
         """
         table: list[dict[str, str | int | float]] = []
         for name, entry in self.entries.items():
@@ -147,7 +147,7 @@ class WorkLog:
 
 
 def peak_mib() -> int:
-    """The most main memory that the process has held so far, MiB; 0 where the system does not tell."""
+    """The process's peak of main memory so far, MiB; 0 on a system that does not report it."""
     if sys.platform == "win32":
         return 0
     else:  # noqa: RET505 - as mypy knows platforms
@@ -155,7 +155,7 @@ def peak_mib() -> int:
 
 
 class _Stage:
-    """A block that is timed. A generator in its place takes three times as long, in eight stages of every iteration."""
+    """A timed block. A generator would take three times as long, in eight stages of every iteration."""
 
     __slots__ = ("_log", "_name", "_start")
 

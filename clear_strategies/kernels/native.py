@@ -1,4 +1,4 @@
-"""The compiled module of this package, which `src/` becomes, and whether there is one."""
+"""The compiled module of this package, built from `src/`, and whether there is one."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def available() -> bool:
 
 
 def module() -> ModuleType:
-    """The compiled module for this processor's instruction set; a BackendUnavailable where there is none."""
+    """The compiled module for this processor's instruction set; raises BackendUnavailable if there is none."""
     return load_kernels("clear_strategies.kernels")
 
 
 def times(a: Float[Tensor, "N G"], b: Tensor) -> Float[Tensor, "N G"]:
-    """A · b, with a's type and layout; in recycled memory where the kernels are there."""
+    """A · b, with a's type and layout; in recycled memory if there are compiled kernels."""
     if a.device.type != "cpu" or not available():
         return a * b
     out = empty(a.shape, a.dtype) if a.is_contiguous() else empty(a.shape[::-1], a.dtype).T
@@ -41,5 +41,5 @@ def runs(x: Tensor) -> bool:
 
 
 def all_finite(tensors: Collection[Tensor]) -> bool:
-    """Whether every number is known to be finite, in one call; False where the kernels do not take all of the tensors."""
+    """Whether every number is known to be finite, in one call; False if the kernels do not support all of the tensors."""
     return all(runs(x) and x.is_contiguous() for x in tensors) and bool(module().all_finite([*tensors]))

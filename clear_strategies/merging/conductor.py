@@ -500,8 +500,9 @@ class Conductor:
             answers.require_route(self._owner["route"], m, n)
         with stage("backward HR"):  # one pass for all cotangents
             both = of_hr if lr_cotangents is None else torch.cat((lr_cotangents, of_hr))
+            detail = None
             if len(of_hr) == 1:
-                *of_lr, g, detail = *vjp(hr, both), None
+                *of_lr, g = vjp(hr, both)
             else:
                 rows = m.to(hr.image.dtype) if isinstance(m, Tensor) else hr.image.new_full((n,), float(m))
                 *of_lr, g, detail = vjp(hr, both, rows * λ_hf)  # g^HR        Eq. 13

@@ -65,7 +65,7 @@ class Merged(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Update:
-    """What one iteration decided.
+    """The result of `Conductor.update`.
 
     Args:
         step: the iteration, for `Conductor.after_step`.

@@ -189,7 +189,7 @@ def progress_bar(
 
 
 def _numbers(row: Mapping[str, float], lambda_lr: float) -> dict[str, str]:
-    """What the bar shows of a row of the history."""
+    """A row of the history, for the progress bar."""
     loss, numbers = lambda_lr * row["loss_lr"], {"N": f"{int(row['n_gaussians']):,}"}
     if row["lambda_hr"] == 0 or "loss_base" in row:  # else HR was left out, and the loss would jump
         numbers["loss"] = f"{loss + row['lambda_hr'] * row.get('loss_base', 0.0):.4f}"

@@ -64,7 +64,7 @@ class FinishedRun:
 
     @property
     def data(self) -> str:
-        """Where the photos lay."""
+        """The folder of the photos."""
         return str(next((self.config[key] for key in _DATA if self.config.get(key)), ""))
 
     @classmethod

@@ -71,7 +71,7 @@ def _quantities(table: pd.DataFrame) -> dict[str, tuple[str, str]]:
 
 
 def notes(table: pd.DataFrame, runs: Sequence[FinishedRun]) -> list[str]:
-    """What a reader of the table has to know about it."""
+    """Notes for readers of the table."""
     lines = [f"bicubic, prior: PSNR of the enlarged LR photos and of the SR images; {NOTE}."]
     if _differ(table):
         error = "; its ±: standard error of the differences seed by seed" * int(table["psnr_delta_error"].notna().any())

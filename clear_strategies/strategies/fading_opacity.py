@@ -1,7 +1,7 @@
-"""FadingOpacity: every Gaussian fades a little at each iteration, so that one stays only where a loss holds it.
+"""FadingOpacity: every Gaussian fades a little in each iteration, unless a loss raises its opacity again.
 
-A Gaussian that no training view needs keeps the opacity it has: it floats in free space, or hides at the border of a photo,
-until a test view shows it. Where opacities fade, the gradient must bring them back again and again.
+Without it, a Gaussian that no training view needs keeps its opacity: it floats in free space, or lies beyond the border of a
+photo, and test views show it.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ class FadingOpacity(Strategy):
     """Opacity × (1 - rate) after each iteration.
 
     Args:
-        rate: share of its opacity that a Gaussian loses at an iteration, in [0, 1). It is for three training views; with more
-            of them it is lower in proportion, so that a Gaussian fades equally between two looks at one view. Where `until`
-            comes before 1,350, it is lower in proportion, too: opacities start low, and a short run must first raise them.
-        until: the iteration after which opacities are left alone.
+        rate: share of its opacity that a Gaussian loses in an iteration, in [0, 1). It is for three training views; with more
+            views it is lower in proportion, so that a Gaussian fades equally between two iterations of one view. It is also
+            lower in proportion if `until` is less than 1,350: opacities start low, and a short run must first raise them.
+        until: the last iteration in which opacities fade.
 
     Raises:
         SettingError: a setting is outside its range.

@@ -1,10 +1,9 @@
-"""Pseudo views: the field also matches what cameras beside the training cameras would see.
+"""Pseudo views: the field also matches pictures from cameras beside the training cameras.
 
-A few photos leave much space that no camera sees from near, and a Gaussian there costs nothing while it hides behind the
-borders of the photos. A pseudo view is a training camera moved aside; its picture is warped from the photos by their depth
-(`clear_strategies.geometry.pseudo_views`). Where no photo shows the colour, the colours around are continued smoothly, and so
-they are at the border of a training camera with a wider field: at a small weight, so that such pixels are neither black nor
-invented.
+With few photos, much of the space near the cameras is in no photo, and a Gaussian there causes no loss. A pseudo view is a
+training camera moved aside; its picture is warped from the photos by their depth (`clear_strategies.geometry.pseudo_views`).
+Pixels that no photo shows continue the surrounding colours smoothly, with a small weight, so that they are neither black nor
+invented. So do the pixels beyond the border of a photo in a training camera with a wider field.
 """
 
 from __future__ import annotations
@@ -36,22 +35,21 @@ _TOGETHER: Final = 16_000_000  # pixels of all pseudo views, and of all borders,
 class PseudoViews(Strategy):
     """Photos, warped by their depth to cameras beside theirs, as extra views.
 
-    The depth is that of the views (`View.depth`); where a training loop has none, it comes from dense stereo.
+    The depth is that of the views (`View.depth`); if a training loop has none, it comes from dense stereo.
 
     Args:
         every: iterations from one pseudo view to the next, at least 1.
-        count: how many different pseudo views there are, at least 1; fewer, where they would have more than 16 million
-            pixels together.
+        count: the number of different pseudo views, at least 1; fewer if they would have more than 16 million pixels together.
         reach: largest distance of a pseudo camera from its photo's, > 0, as a multiple of the photo's median depth.
-        weight: of their LR loss, > 0, as a multiple of a photo's, which is λ_LR.
+        weight: of their LR loss, > 0, as a multiple of λ_LR, a photo's.
         tolerance: largest relative difference, > 0, between the depth of a point and that of a photo that shows its colour.
-        continued: weight of the pixels that no photo shows, in [0, 1], as a multiple of `weight`: they continue the colours
-            around them smoothly. 0: they have no weight, and no border is shown.
-        border: width of the training cameras' field, at least 1, where they show the continued border of their photos, as a
-            multiple of the photo's. 1: no border is shown. Of many photos only every second, third … shows its border, so
-            that they have at most 16 million pixels together.
-        max_pixels: larger photos are first reduced by a whole factor; bounds the time of an iteration. 250,000: where depth is
-            that of HR photos of 504x376 pixels, half of their size costs 0.3 dB.
+        continued: weight of the pixels that no photo shows, in [0, 1], as a multiple of `weight`: they continue the surrounding
+            colours smoothly. 0: they have no weight, and there are no views of borders.
+        border: field of view of the training cameras that show the continued border of their photos, at least 1, as a multiple of
+            the photo's. 1: there are no such views. Of many photos only every second, third … has one, so that they have at most
+            16 million pixels together.
+        max_pixels: larger photos are first reduced by a whole factor, which bounds the time of an iteration. 250,000, since for
+            HR photos of 504x376 pixels with depth, half of their size costs 0.3 dB.
 
     Raises:
         SettingError: a setting is outside its range.
@@ -75,8 +73,8 @@ class PseudoViews(Strategy):
         require_number("border", self.border, least=1)
 
     def on_views(self, views: Sequence[View]) -> None:
-        """Choose the pseudo views: a function of the views and the seed. Each is made in the first iteration that shows it.
-        There are none, and a message says why, where they would be of no use.
+        """Choose the pseudo views as a function of the views and the seed. Each is made in the first iteration that uses it. If
+        they would be of no use, there are none, and a message says why.
         """
         if not views:
             _log.warning("PseudoViews has no effect: this training loop does not give its views.")
@@ -116,7 +114,7 @@ class PseudoViews(Strategy):
         )
 
     def _pixels(self, photos: dict[str, Photo]) -> int:
-        """Of the largest photo, reduced to `max_pixels`."""
+        """The pixels of the largest photo, reduced to `max_pixels`."""
         return max(p.camera.width * p.camera.height // p.factor_to(self.max_pixels) ** 2 for p in photos.values())
 
     def _target(self, make: Callable[[], PseudoView], background: Color) -> ExtraView:
@@ -126,7 +124,7 @@ class PseudoViews(Strategy):
         return ExtraView(replace(view.photo, image=image), weight, background)
 
     def extra_views(self, t: int) -> Sequence[ExtraView]:
-        """One of them every `every` iterations: a function of (seed, t)."""
+        """One view every `every` iterations, a function of (seed, t)."""
         aside: Sequence[Callable[[], ExtraView]] = self.cache.get("views", ())
         borders: Sequence[Callable[[], ExtraView]] = self.cache.get("borders", ())
         if not (aside or borders) or t % self.every:
@@ -155,7 +153,7 @@ class PseudoViews(Strategy):
 
 
 def _depths(views: Sequence[View]) -> dict[str, DepthMap]:
-    """The depth of each photo: that of its view, or where no view has any, that of stereo."""
+    """The depth of each photo: that of its view or, if no view has depth, from stereo."""
     known = {view.name: view.depth for view in views if view.depth is not None}
     if known:
         return known

@@ -1,10 +1,10 @@
 """RandomBackground: each iteration is rendered over another colour, so that surfaces become opaque.
 
-Over a black background, a dark surface can be thin: the background is as dark as it. From another camera something else shows
-through, and its dark parts are holes. Over a colour that changes at each iteration, only an opaque surface matches its photo.
+Over a black background, a dark surface can be transparent, since the background is as dark. From another camera, something else
+shows through it. Over a colour that changes in each iteration, only an opaque surface matches its photo.
 
-Many views hold a surface from several sides; there the changing colour is noise, and costs more than it brings. Not so where
-photos are transparent around an object: they are composited over the same colour, and only Gaussians that an object needs
+With many views, which see a surface from several sides, the changing colour is noise that costs more than it gains. This does not
+hold for photos that are transparent around an object: they are composited over the same colour, and only Gaussians of the object
 match all of them.
 """
 
@@ -29,15 +29,14 @@ _LONG_RUN: Final = 1_350  # iterations over other colours; with fewer, surfaces 
 
 @dataclass(frozen=True)
 class RandomBackground(Strategy):
-    """A background of a random colour at each iteration, for at most five photos that show surfaces everywhere, and for any
+    """A background of a random colour in each iteration, for at most five photos that show surfaces everywhere, and for any
     number of photos of an object whose background is transparent.
 
-    Photos of an object before a plain background that is not transparent keep it: they do show what is behind the object.
+    If an object's background is plain but not transparent, it stays, since the photos do show what is behind the object.
 
     Args:
-        until: the iteration after which the background is the scene's own, so that the run ends on what it is tested with.
-            Where it comes before 1,350, the background stays as it is: opacities start low, and a short run that must first
-            raise them loses by it.
+        until: the iteration after which the background is the scene's own, as in evaluation. If it is less than 1,350, the
+            background never changes: opacities start low, and a short run that must first raise them would lose quality.
     """
 
     until: int = milestone(9_000)
@@ -55,7 +54,7 @@ class RandomBackground(Strategy):
             self.cache["reason"] = self._reason_to_keep(len(views), views)
 
     def _reason_to_keep(self, n_views: int, views: Sequence[View] = ()) -> str:
-        """Why the background stays as it is; empty where it changes."""
+        """Why the background stays; empty if it changes."""
         if self.until < _LONG_RUN:
             return f"because the run has fewer than {_LONG_RUN:,} iterations for it"
         if any(view.lr.shown is not None for view in views):

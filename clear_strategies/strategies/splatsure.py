@@ -1,4 +1,4 @@
-"""SplatSuRe's weighting, per Gaussian: SR detail is used where no other view samples the Gaussian better.
+"""SplatSuRe's weighting, per Gaussian: SR detail is used if no other view samples the Gaussian better.
 
 If one view sees a Gaussian from near and another from far, the LR photo of the near view shows what the SR image of
 the far view can only guess. The HR gradient of the Gaussian is therefore withheld in all views but the one that samples it best.
@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SplatSuRe(Strategy):
-    """Withhold HR gradients where another view samples the Gaussian better.
+    """Withholds HR gradients of Gaussians that another view samples better.
 
     `state` holds, by view, the sampling rate f / z of each Gaussian (HR pixels per world unit) when it was last visible in
     that view, and 0 before. So a Gaussian keeps its whole HR gradient until `min_views` views have shown it.

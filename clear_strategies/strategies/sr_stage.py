@@ -1,8 +1,8 @@
 """A stage of its own for the SR images, after S2Gaussian (Wan et al. 2025): first a field of the LR photos, then its refinement.
 
-In the second stage each iteration also matches a picture at HR: in turn the SR image of a training view, and what the field of
-the first stage showed by a camera beside a training camera, enlarged by the network of the prior. Both are invented in part, and
-each view is invented differently, so pixels that the field contradicts count less (`ExtraView.robust`).
+In the second stage each iteration also matches a picture at HR: by turns the SR image of a training view, and a render of the
+first stage's field from a camera beside a training camera, enlarged by the network of the prior. Parts of both are invented, and
+differently in each view, so pixels that the field contradicts count less (`ExtraView.robust`).
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SRStage(Strategy):
-    """HR pictures in a second stage. It has an effect in this package's trainer alone, which calls `draw`.
+    """HR pictures in a second stage. It has an effect only in this package's trainer, which calls `draw`.
 
-    A run that is resumed in its second stage draws its pictures anew, and says so: its bits differ from an uninterrupted run's.
+    A run that is resumed in its second stage draws its pictures again, with a warning: its bits are not an uninterrupted run's.
 
     Args:
         start: the last iteration of the first stage.
@@ -56,7 +56,7 @@ class SRStage(Strategy):
         self.cache["views"] = views
 
     def draw(self, t: int, means: Float[Tensor, "N 3"], enlarged: Callable[[Camera, int], Photo]) -> None:
-        """Draw the pictures beside the training cameras, where t is the first iteration of the second stage."""
+        """Draw the pictures beside the training cameras, at the first iteration of the second stage."""
         views: Sequence[View] = self.cache.get("views", ())
         if t <= self.start or not views or "pictures" in self.cache:
             return
@@ -70,7 +70,7 @@ class SRStage(Strategy):
             pictures.append(enlarged(camera, view.factor))
 
     def extra_views(self, t: int) -> Sequence[ExtraView]:
-        """After `draw` one picture at HR: a function of (seed, t) and of the field at the end of the first stage."""
+        """After `draw`, one picture at HR: a function of (seed, t) and of the field at the end of the first stage."""
         if "pictures" not in self.cache:
             return ()
         views: Sequence[View] = self.cache["views"]

@@ -50,7 +50,7 @@ class _Stated(msgspec.Struct):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Checkpoint:
-    """What a run needs to continue.
+    """All that a run needs to continue.
 
     Args:
         t: the next iteration. config: the run's composed configuration, to refuse another one on resume; see `plain_settings`.

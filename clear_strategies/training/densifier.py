@@ -29,7 +29,7 @@ class Densifier:
 
     @property
     def second_stage(self) -> int | None:
-        """The iteration at which the second stage of a method of two begins."""
+        """The iteration at which the second stage begins, for a method with two stages; None: it has one."""
         return None
 
     def collects(self, t: int) -> bool:
@@ -37,10 +37,10 @@ class Densifier:
         return True
 
     def accumulate(self, update: Update, shot: Shot, t: int) -> None:
-        """Accumulate the scores of iteration t, where `collects(t)`; `shot` is the rendering that they belong to.
+        """Accumulate the scores of iteration t, if `collects(t)`; `shot` is the rendering that they belong to.
 
         Args:
-            update: without `grads`, since the compiled step leaves none.
+            update: without `grads`, which the compiled step does not store.
         """
 
     def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
@@ -50,8 +50,8 @@ class Densifier:
             field: its rows change by `take(parents)`, its parameters in place, as `field.opacities.data`.
             optimizer: its rows change by `take(parents, fresh)`; fresh rows start without momentum.
             resized: called with parents[M] once field and optimizer have been gathered; row i of everything else per
-                Gaussian now comes from row parents[i]. A densifier that moves a Gaussian to another gathers, too, though their
-                number stays: what strategies and optimizer store follows the rows.
+                Gaussian now comes from row parents[i]. A densifier that moves a Gaussian onto another must gather, too, although
+                their number stays, so that the state of strategies and optimizer follows the rows.
         """
         raise NotImplementedError
 
@@ -60,18 +60,18 @@ class Densifier:
         return False
 
     def gather(self, parents: Int[Tensor, " M"]) -> None:
-        """Follow a change of structure that is not its own: row i of what it keeps per Gaussian comes from row parents[i]."""
+        """Gather its own tensors after a change of structure by others: row i comes from row parents[i]."""
 
     def reset_due(self, t: int) -> bool:
-        """Whether opacities are lowered at t; renders right after that do not show how good the field is."""
+        """Whether opacities are lowered at t. Renders right after that do not show the quality of the field."""
         return False
 
     def state_dict(self) -> dict[str, Tensor]:
-        """What a checkpoint keeps of it."""
+        """The tensors for a checkpoint."""
         return {}
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        """Take up what `state_dict` returned."""
+        """Restore the tensors that `state_dict` returned."""
 
 
 @runtime_checkable

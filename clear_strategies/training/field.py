@@ -101,13 +101,11 @@ class GaussianField(nn.Module):
         Args:
             gate: of both scales, or a row for LR and one for HR.
         """
-        active = [self._activate(gate)] * 2 if gate is None or gate.dim() == 1 else list(map(self._activate, gate))
-        wanted = [(detail, photo.camera) for detail, photo, on in ((False, view.lr, lr), (True, view.hr, hr)) if on]
-        renderings = rasterizer.render_scales(
-            [(active[detail].splats(detail=detail), camera) for detail, camera in wanted]
-        )
-        shots = {d: FieldShot(r, active[d], detail=d) for (d, _), r in zip(wanted, renderings, strict=True)}
-        return shots.get(False), shots.get(True)
+        at_lr, at_hr = [self._activate(gate)] * 2 if gate is None or gate.dim() == 1 else map(self._activate, gate)
+        jobs = [(at_lr, False, view.lr.camera)] * lr + [(at_hr, True, view.hr.camera)] * hr
+        renderings = rasterizer.render_scales([(active.splats(detail=d), camera) for active, d, camera in jobs])
+        shots = [FieldShot(r, active, detail=d) for (active, d, _), r in zip(jobs, renderings, strict=True)]
+        return shots[0] if lr else None, shots[-1] if hr else None
 
     def shot(self, rasterizer: Rasterizer, camera: Camera) -> FieldShot:
         """A rendering with gradients, of all Gaussians, without f_det."""

@@ -35,8 +35,8 @@ class LearningRates:
         detail, detail_steps, detail_decay: rate, steps and decay of `DetailRates`.
         geometry_steps: the iterations that the rates of means, scales and quats are for. In a run of T < geometry_steps
             these are (geometry_steps / T)^(1/3) times as high, see `of_run`; 0: as they stand in a run of any length.
-        cool_from, end: between these iterations all rates but that of the means, which falls all along, fall linearly to 0, so
-            that a run ends on what its views agree on and not on the last of them. Equal, no rate does.
+        cool_from, end: between these iterations all rates fall linearly to 0, except for that of the means, which always falls.
+            A run then ends on what its views agree on and not on the last view. Equal: no rate falls.
         eps: Adam's. Gradients of mean losses are near 1e-6, so torch's default of 1e-8 would freeze the small ones.
     """
 
@@ -65,16 +65,16 @@ class LearningRates:
 
     @property
     def of_detail(self) -> DetailRates:
-        """Those of f_det."""
+        """The rates of f_det."""
         return DetailRates(self.detail, self.detail_steps, self.detail_decay)
 
     def of_run(self, iterations: int) -> LearningRates:
         """The rates of a run of this length, by `geometry_steps` and `detail_steps`.
 
-        A Gaussian begins round, as large as the distance to its neighbours, and has to become a disc. Adam moves a parameter by
-        at most its rate in a step, so a run of a twentieth of the iterations ends on the way. The best factor grows more slowly
-        than T shrinks, because the noise at the end grows with the rate. Colours need no factor: they begin as the photos show
-        them, and higher rates only fit the training views more closely.
+        A Gaussian begins as a sphere, as large as the distance to its neighbours, and has to become a disc. In a step, Adam moves
+        a parameter by its rate at most, so a run of a twentieth of the iterations ends too early. The best factor grows more
+        slowly than T shrinks, because the noise at the end grows with the rate. Colours need no factor: they begin as the photos
+        show them, and higher rates only fit the training views more closely.
         """
         rates = replace(self, detail=self.of_detail.of_run(iterations).rate)
         if iterations >= self.geometry_steps:
@@ -102,7 +102,7 @@ class Adam:
         extent: 3DGS's cameras_extent, world units: scales the positions' learning rate.
 
     Attributes:
-        restored: how often the moments came from elsewhere, a checkpoint.
+        restored: how often a checkpoint has restored the moments.
     """
 
     def __init__(self, params: Mapping[str, Tensor], rates: LearningRates, extent: float) -> None:

@@ -168,7 +168,7 @@ def _copied(s: TrainState, inputs: IterationInputs) -> IterationInputs:
     if isinstance(inputs, ExtraViewInputs):
         extra = replace(inputs.view, photo=photos[0], weight=inputs.view.weight.clone())
         return replace(inputs, view=extra, background=None)
-    lr, hr, *_ = [*photos, inputs.view.hr]  # without HR, only its size is read
+    lr, hr = photos[0], photos[1] if inputs.scales["hr"] else inputs.view.hr  # without HR, only its size is read
     truth = hr.image if inputs.view.hr_is_photo else inputs.view.truth
     view = replace(inputs.view, lr=lr, hr=hr, truth=truth)
     looked_up = copied(s.conductor.looked_up(inputs.view))

@@ -1,4 +1,4 @@
-"""Everything that changes while training, and what a checkpoint holds of it."""
+"""Everything that changes while training, and its checkpoint."""
 
 from __future__ import annotations
 
@@ -234,7 +234,7 @@ class TrainState:
         return self.t % self.mip.every == 0 and self.t <= self.settings.iterations - self.mip.last
 
     def checkpoint(self, config: Mapping[str, Any]) -> Checkpoint:
-        """What a run needs to continue."""
+        """The checkpoint of this state."""
         self.require_finite()
         tensors: dict[str, Tensor] = {}
         for prefix, table in (

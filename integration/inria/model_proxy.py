@@ -21,7 +21,7 @@ from rasterizers.autograd import Drawing
 from rasterizers.interface import Camera
 
 Role = Literal["gate", "detail"]
-"""What an override changes: opacities are multiplied by the gate, colours are offset by f_det."""
+"""The changes of an override: opacities are multiplied by the gate, colours are offset by f_det."""
 _ROLES: Final[tuple[tuple[str, Role], ...]] = (
     ("get_opacity", "gate"),
     ("get_opacity_with_3D_filter", "gate"),

@@ -1,4 +1,4 @@
-"""Which Gaussian came from which in a GaussianModel: row indices follow the two functions that change its structure.
+"""Parents of the Gaussians of a GaussianModel: row indices follow the two functions that change its structure.
 
 Where the indices are lost, values identify the rows. A model replaces its parameters when it clones, splits or prunes. The
 replaced parameters hold the values of the last step, and every new row is a copy of an old row except for position, scale and

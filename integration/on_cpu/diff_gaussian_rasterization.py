@@ -133,7 +133,7 @@ class GaussianRasterizer(torch.nn.Module):
                 )
 
     def markVisible(self, positions: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:  # noqa: N802 - the name of 3DGS
-        """Which positions are far enough before the camera."""
+        """Whether each position is far enough in front of the camera."""
         return depths(positions.detach(), self.raster_settings.camera().world_to_camera.to(positions)) > _NEAR
 
     @_refusing

@@ -1,4 +1,4 @@
-"""What gsplat compiles for CUDA, as functions on the CPU; the rest of gsplat is torch, and stays."""
+"""CPU versions of the functions that gsplat compiles for CUDA; the rest of gsplat is torch, and stays."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ class Centre:
 
 @wp.struct
 class Geometry:
-    """What does not depend on the focal length; shared by the grids of a pose."""
+    """The part of a projection that does not depend on the focal length; the grids of a pose share it."""
 
     inverse_z: wp.float32
     tan: wp.vec2  # x/z, y/z

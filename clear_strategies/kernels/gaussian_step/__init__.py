@@ -1,5 +1,5 @@
-"""The per-Gaussian step of one iteration in compiled code, for gradients that are never stored: the same three as
-`kernels.reconcile` (products, the strategy's weights, apply), with the chain rule to the raw parameters before and Adam behind.
+"""The per-Gaussian step of an iteration in compiled code, which never stores the gradients: the chain rule to the raw parameters,
+the same three parts as `kernels.reconcile` (products, the strategy's weights, apply), and Adam.
 
 It is specified by `merging.conductor.Conductor.merge`, `training.field.Activation.vjp`, `training.optim.Adam.step` and
 `training.field.GaussianField.constrain`. `training.compiled_step` calls it; tests/training/test_compiled_step.py compares.
@@ -25,7 +25,7 @@ class Attribute(NamedTuple):
 
     Args:
         rate: learning rate over the bias of the first moment.
-        hr: ĝ_HR where a strategy has computed it; λ_HR times it is added to the gradient. plus: what regularizers add to it.
+        hr: ĝ_HR, if a strategy has computed it; λ_HR times it is added to the gradient. plus: added by regularizers.
         keep: factor of the parameter's decay per step.
         limit: the parameter is clamped to ±limit.
     """
@@ -48,7 +48,7 @@ class StepSettings:
         bias2: bias of Adam's second moment.
         skips: skip rows that would not change.
         width: numbers of an shN row that are stepped, at least those of the active bands.
-        changing: on a device, the rates, `bias2` and `lambda_hr`, in place of the others: `warp.written` makes it.
+        changing: the rates, `bias2` and `lambda_hr` on a device, which replace those here; `warp.written` makes it.
     """
 
     beta1: float
@@ -63,7 +63,7 @@ class StepSettings:
 
 @runtime_checkable
 class GaussianStep(Protocol):
-    """The gradients of one view's losses, and the passes over them. Implementations take them as `cpp.CppGaussianStep` does."""
+    """The gradients of one view's losses, and the passes over them. Constructors are as of `cpp.CppGaussianStep`."""
 
     def products(self) -> Products:
         """The inner products of g_LR and g^HR."""

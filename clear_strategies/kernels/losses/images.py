@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 DEVICES: Final = {"cpp": ("cpu",), "warp": ("cuda", "cpu")}
-"""Where the kernels of each compiled implementation run."""
+"""The devices of each compiled implementation."""
 _IN_WORDS: Final = {"cpu": "the CPU", "cuda": "CUDA"}
 
 

@@ -1,8 +1,8 @@
-"""What an iteration computes for each Gaussian beside its renderings and its step.
+"""The computations of an iteration for each Gaussian, apart from rendering and the optimizer's step.
 
-`reference` specifies it in torch. `warp` computes the same on CUDA, in a few kernels where torch launches one for each operation,
-and `cpp` on a CPU what torch takes long for: functions of the same names and arguments, of which one is chosen here.
-tests/kernels/test_per_gaussian.py compares.
+`reference` specifies them in torch. `warp` has functions of the same names and arguments for CUDA, in a few kernels instead of
+one for each operation, and `cpp` those in which torch is slow on a CPU. This module chooses one;
+tests/kernels/test_per_gaussian.py compares them.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 DEVICES: Final = {"cuda"}
-"""Where Warp's kernels are used; tests add the CPU."""
+"""The devices for which Warp's kernels are used; tests add the CPU."""
 
 
 def _fastest(function: Callable[P, T]) -> Callable[P, T]:
-    """C++ or Warp computes it where they have a function of that name, and take the tensors among the arguments."""
+    """The function, computed by C++ or Warp if they have a function of its name that takes the tensors of the arguments."""
 
     @wraps(function)
     def chosen(*args: P.args, **kwargs: P.kwargs) -> T:
@@ -45,13 +45,13 @@ def _tensors(argument: object) -> Sequence[Tensor]:
     return [argument] if isinstance(argument, Tensor) else []
 
 
-def _kernels(given: Sequence[Tensor]) -> ModuleType | None:
+def _kernels(tensors: Sequence[Tensor]) -> ModuleType | None:
     """C++ for contiguous tensors on a CPU, Warp on CUDA, both for float32; None: torch."""
-    if any(x.is_floating_point() and x.dtype != torch.float32 for x in given):
+    if any(x.is_floating_point() and x.dtype != torch.float32 for x in tensors):
         return None
-    if native.available() and all(x.device.type == "cpu" and x.is_contiguous() for x in given):
+    if native.available() and all(x.device.type == "cpu" and x.is_contiguous() for x in tensors):
         return cpp
-    if all(x.device.type in DEVICES for x in given) and runs_warp(given[0].device.type):
+    if all(x.device.type in DEVICES for x in tensors) and runs_warp(tensors[0].device.type):
         from clear_strategies.kernels.per_gaussian import warp
 
         return warp

@@ -1,4 +1,4 @@
-"""What each function computes, in torch; kernels of the same name in `cpp` and `warp` take its place."""
+"""The functions in torch, the specification of the kernels of the same names in `cpp` and `warp`."""
 
 from __future__ import annotations
 

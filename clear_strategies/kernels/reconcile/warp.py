@@ -98,7 +98,7 @@ def compared_and_opposed(products: wp.vec3d) -> wp.vec2i:
 
 @wp.func
 def counted(p: Products) -> Counts:
-    """What one Gaussian adds to the counts."""
+    """The counts of one Gaussian."""
     tally, whole = Counts(), wp.vec3d()
     for k in range(GROUPS):
         found = compared_and_opposed(p[k])
@@ -141,7 +141,7 @@ class Factors:
 
 @wp.struct
 class Options:
-    """What holds for all attributes."""
+    """Options that all attributes share."""
 
     n: wp.int32
     lr: Factors

@@ -1,7 +1,6 @@
-"""The per-Gaussian step in Warp, for CUDA; the same kernels run on a CPU, to check them.
+"""The per-Gaussian step in Warp, for CUDA; tests also run the kernels on a CPU.
 
-Counts stay on the device, as int64. Importing this
-package imports Warp; call `rasterizers.warp_runtime.require_warp` first.
+Counts stay on the device, as int64. Importing this package imports Warp; call `rasterizers.warp_runtime.require_warp` first.
 """
 
 from __future__ import annotations
@@ -123,8 +122,8 @@ class WarpGaussianStep:
         return LANES[self._like.device.type]
 
     def _attribute(self, a: Attribute, width: int) -> Any:
-        """The kernels' structure. Between changes of the field it is the same in every iteration, and kept, as checked, by where
-        the tensors lie.
+        """The structure for the kernels, checked, and cached by the tensors' addresses, which stay between changes of the field's
+        structure.
         """
         tensors = {"p": a.p, "m": a.m, "v": a.v, "hr": a.hr, "plus": a.plus}
         where = [None if x is None else (x.data_ptr(), x.numel(), x.dtype) for x in tensors.values()]
@@ -136,13 +135,13 @@ class WarpGaussianStep:
             if len(_attributes) >= _MOST_ATTRIBUTES:
                 _attributes.clear()
             _attributes[key] = struct(
-                passes.Attribute, tensors, width=width, given=a.hr is not None, added=a.plus is not None,
+                passes.Attribute, tensors, width=width, has_hr=a.hr is not None, has_plus=a.plus is not None,
                 bounded=a.keep != 1 or a.limit != math.inf, keep=a.keep, limit=a.limit,
             )  # fmt: skip
         return _attributes[key]
 
     def _rows(self, kind: Any, tensors: Mapping[str, Tensor], widths: Mapping[str, int]) -> Any:
-        """A structure of type `kind` over tensors of n rows with `widths` numbers each, for which it checks them."""
+        """A structure of type `kind` from tensors, which must have n rows of `widths` numbers."""
         for name, width in widths.items():
             self._require(name, tensors[name], width)
         return struct(kind, tensors)
@@ -160,7 +159,7 @@ class WarpGaussianStep:
 def written(
     s: StepSettings, rates: Mapping[str, float], device: torch.device, *, lambda_hf: float = 0.0, out: Tensor | None = None
 ) -> Tensor:  # fmt: skip
-    """The numbers of a step on the device, as a row of `passes.AdamStep`; written into `out` where it is given.
+    """The numbers of a step on the device, as a row of `passes.AdamStep`; written to `out` unless that is None.
 
     Args:
         rates: each attribute's, see `Attribute`. lambda_hf: λ_HR λ_HF.
@@ -177,6 +176,6 @@ def written(
 
 
 def loss_weights(numbers: Tensor) -> Float[Tensor, " 2"]:
-    """λ_HR and λ_HR λ_HF, where `written` has put them."""
+    """λ_HR and λ_HR λ_HF, as `written` has stored them."""
     first, last = (getattr(_STEP, name).offset // _BYTES for name in ("lambda_hr", "lambda_hf"))
     return numbers[0, first : last + 1]

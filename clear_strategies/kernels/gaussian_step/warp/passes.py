@@ -62,7 +62,7 @@ class Activation:
 
 @wp.struct
 class View:
-    """How many Gaussians there are, and which gradients are given."""
+    """The number of Gaussians, and which gradients there are."""
 
     n: wp.int32
     has_hr: wp.bool
@@ -103,7 +103,7 @@ def activation_vjp(g: Gradient, a: Activation, i: wp.int32) -> RawGradient:
 def load(
     activation: Activation, lr: Gradient, hr: Gradient, view: View, i: wp.int32
 ) -> tuple[RawGradient, RawGradient]:
-    """∇L_LR and g^HR of a Gaussian; 0 for one not given."""
+    """∇L_LR and g^HR of a Gaussian; 0 for one that is missing."""
     g_lr, g_hr = activation_vjp(lr, activation, i), RawGradient()
     if view.has_hr:
         g_hr = activation_vjp(hr, activation, i)
@@ -112,7 +112,7 @@ def load(
 
 @wp.func
 def detail_of(hr: Gradient, view: View, i: wp.int32) -> wp.vec3:
-    """What f_det learns by, m λ_HF ∇L_HF; 0 where it is not given."""
+    """The gradient of f_det, m λ_HF ∇L_HF; 0 if there is none."""
     g = wp.vec3()
     if view.has_detail:
         g = hr.detail[i]
@@ -151,7 +151,7 @@ class Rates:
 
 @wp.struct
 class AdamStep:
-    """What changes from step to step, and the settings that all attributes share."""
+    """Numbers that change from step to step, and settings that all attributes share."""
 
     rates: Rates
 
@@ -167,7 +167,7 @@ class AdamStep:
 
 @wp.struct
 class Attribute:
-    """A parameter tensor with its moments, row-major, what is added to its gradient, and its limits."""
+    """A parameter with its moments, row-major, terms that are added to its gradient, and its limits."""
 
     p: wp.array[wp.float32]
     m: wp.array[wp.float32]
@@ -175,8 +175,8 @@ class Attribute:
     hr: wp.array[wp.float32]  # ĝ_HR where a strategy has computed it
     plus: wp.array[wp.float32]
     width: wp.int32
-    given: wp.bool  # there is `hr`
-    added: wp.bool  # there is `plus`
+    has_hr: wp.bool
+    has_plus: wp.bool
     bounded: wp.bool  # a row that takes no step may still decay or be clamped
     keep: wp.float32  # factor of the decay per step (f_det), 1: none
     limit: wp.float32
@@ -198,9 +198,9 @@ def step_number(
         return
     p = a.p[at]
     g = gradient
-    if a.given:
+    if a.has_hr:
         g += a.hr[at] * adam.lambda_hr
-    if a.added:
+    if a.has_plus:
         g += a.plus[at]
     after = p * a.keep
     if moves:
@@ -218,13 +218,13 @@ def step_number(
 
 @wp.func
 def is_still(a: Attribute, i: wp.int32, width: wp.int32) -> wp.bool:
-    """Whether a row to which the losses give nothing would stay as it is: both moments and what is added are 0."""
+    """Whether a row without a gradient of the losses would not change: both moments, `hr` and `plus` are 0."""
     for at in range(a.width * i, a.width * i + width):
         if a.m[at] != 0.0 or a.v[at] != 0.0:
             return False
-        if a.given and a.hr[at] != 0.0:
+        if a.has_hr and a.hr[at] != 0.0:
             return False
-        if a.added and a.plus[at] != 0.0:
+        if a.has_plus and a.plus[at] != 0.0:
             return False
     return True
 
