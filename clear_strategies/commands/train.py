@@ -43,9 +43,7 @@ def main(arguments: list[str]) -> None:
     settings = overrides(arguments)
     from clear_strategies import hydra_app
 
-    plain = (
-        f"data.path={path_of(arguments[0])}"  # with the quotes of the shell alone, where the command line adds Hydra's
-    )
+    plain = f"data.path={path_of(arguments[0])}"  # shown with the shell's quotes, without those that Hydra needs
     shown = [plain if hydra_app.readable(plain) == word else word for word in settings]
     sys.stdout.write(f"clear-strategies {shlex.join(shown)}\n")
     hydra_app.main(settings)

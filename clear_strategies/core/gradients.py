@@ -99,7 +99,7 @@ def gradients_of(g: SplatGradients) -> list[Grads]:
     rows = (g.means, g.quats, g.scales, g.opacities, g.rgb[:n], g.screen[:n])
     each = [
         Grads(
-            {name: x.contiguous() for name, x in zip(PARAMETERS, drawn, strict=False)},
+            {name: x.contiguous() for name, x in zip(PARAMETERS[:4], drawn, strict=True)},
             colour=Colour(rgb.contiguous(), basis), screen=screen,
         )
         for *drawn, rgb, screen in zip(*(x.unbind() for x in rows), strict=True)

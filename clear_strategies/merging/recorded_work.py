@@ -107,11 +107,8 @@ def _comparable(x: Any) -> Any:
         return [*map(_comparable, x)]
     if type(x) in (bool, int, float, str):
         return x
-    return (
-        id(x),
-        x,
-        _comparable(getattr(x, "__dict__", None) or ()),
-    )  # x is kept alive, so that no other object gets its id
+    # x is kept alive, so that no other object gets its id.
+    return id(x), x, _comparable(getattr(x, "__dict__", None) or ())
 
 
 def replays_on(device: torch.device, work_log: WorkLog, name: str) -> Replays | None:
