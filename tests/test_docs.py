@@ -194,7 +194,7 @@ def test_the_guides_reader_reads_a_folder_and_is_chosen_for_it(tmp_path, monkeyp
 def test_the_readmes_loop_prints_the_number_of_its_table():
     gsplat_loop = pytest.importorskip("integration.examples.gsplat_loop")
     (shown,) = re.findall(
-        r"^\| `--strategies best` \| ([\d.]+) ± [\d.]+ dB", (ROOT / "README.md").read_text(), re.MULTILINE
+        r"^\| `--strategies best` \| \**([\d.]+) ± [\d.]+ dB", (ROOT / "README.md").read_text(), re.MULTILINE
     )
     torch.manual_seed(0)
     assert gsplat_loop.main(500, "best") == pytest.approx(float(shown), abs=0.15)
