@@ -26,17 +26,18 @@ def test_the_two_have_the_type_that_was_drawn():
     assert not are_joined(COLOURS["joined"](p), p)
 
 
-def hooks():
-    yield lambda p, colors: colors.retain_grad()
-    yield lambda p, colors: colors.register_hook(lambda g: None)
-    yield lambda p, colors: p["sh0"].register_hook(lambda g: None)
-    yield lambda p, colors: p["shN"].register_post_accumulate_grad_hook(lambda q: None)
-    yield lambda p, colors: p["shN"].requires_grad_(False)
-    yield lambda p, colors: p.update(sh0=Parameter(torch.ones(3, 1, 3)))
-    yield lambda p, colors: p.pop("shN")
+CHANGES = [
+    lambda p, colors: colors.retain_grad(),
+    lambda p, colors: colors.register_hook(lambda g: None),
+    lambda p, colors: p["sh0"].register_hook(lambda g: None),
+    lambda p, colors: p["shN"].register_post_accumulate_grad_hook(lambda q: None),
+    lambda p, colors: p["shN"].requires_grad_(False),
+    lambda p, colors: p.update(sh0=Parameter(torch.ones(3, 1, 3))),
+    lambda p, colors: p.pop("shN"),
+]
 
 
-@pytest.mark.parametrize("changes", hooks())
+@pytest.mark.parametrize("changes", CHANGES)
 def test_no_hook_looks_at_them_and_the_leaves_are_those_that_train(changes):
     p = params()
     colors = COLOURS["joined"](p)
