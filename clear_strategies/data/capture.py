@@ -1,6 +1,6 @@
-"""Posed photos, as readers return them: frames, the capture that holds them, and its structure-from-motion points.
+"""Posed photos as readers return them: `Frame`, `SfmPoints` and `Capture`.
 
-Readers only read files. `prepare.py` splits a capture, makes its photos at both scales, and returns a `Scene`.
+Readers only read files. `prepare.py` splits a capture, makes its images at both scales, and returns a `Scene`.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ STEP_ASIDE: Final = "take a step to the side from photo to photo, in place of tu
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One posed photo. Readers never call `load`, `shown` and `transparency`, which decode it."""
+    """One posed photo. `load`, `shown` and `transparency` decode its files; readers never call them."""
 
     name: str  # unique in its capture, e.g. the file's name
     camera: Camera  # a pinhole, on the pixel grid of what `load` returns
     load: Callable[[], Float[Tensor, "H W 3"]]
     split: str | None = None  # "train" or "test" where the data set itself defines the split (Blender)
     sfm_id: int | None = None  # in `SfmPoints.track_image`
-    lens: Lens | None = None  # as the data set gives it; None: the camera was exact
+    lens: Lens | None = None  # before undistortion; None: the data set gives `camera` itself
     shown: Callable[[], Bool[Tensor, "H W"]] | None = None  # its mask, False at hidden pixels
     transparency: Callable[[], Float[Tensor, "H W"]] | None = None  # 1 - alpha; None: its file has no alpha
 
@@ -57,17 +57,18 @@ class Frame:
         sfm_id: int | None = None,
         mask: Path | str | None = None,
     ) -> Frame:
-        """The frame of a file, with the lens fitted to the photo's real size. Reads the file's header only.
+        """Make the frame of an image file, with the lens rescaled to the size of the image. Reads only the file's header.
 
         Args:
-            lens: for the photo, and for its mask, at any size.
+            lens: of the photo, and of its mask, at any resolution.
             pose: world to camera, OpenCV axes.
-            upright: the lens is that of the photo as its EXIF block turns it. None: for a photo on its side, the lens's shape
-                decides this; other turned photos are refused.
+            upright: the lens is of the photo after its EXIF rotation. None: for a photo stored on its side, the aspect ratio of
+                the lens decides; photos with another EXIF rotation are refused.
             background: behind transparent pixels; None: black, logged.
             mask: see `read_mask`; `masks_of` finds it.
         """
-        path, mask = Path(path), None if mask is None else Path(mask)
+        path = Path(path)
+        mask = None if mask is None else Path(mask)
         turn = _turned_as(path, lens) if upright is None else upright
         width, height = image_size(path, turn=turn)
         fitted = lens.resized(width, height, path)
@@ -79,7 +80,7 @@ class Frame:
         shown = None if mask is None else partial(read_mask, mask, fitted, pinhole, turn)
 
         def transparency() -> Float[Tensor, "H W"]:
-            """The photo over white less the photo over black."""
+            """The photo over white minus the photo over black."""
             return (load((1.0, 1.0, 1.0)) - load(BLACK)).mean(dim=2).clamp(0, 1)
 
         through = transparency if has_alpha(path) else None
@@ -104,8 +105,8 @@ class Capture:
     Args:
         background: the colour behind the scene (white for Blender's RGBA).
         notes: label -> fact for the printed plan (the source of the poses, what was undistorted …).
-        own_prior: makes the prior of `prior=auto` of what loads the photos, by the frames' names; real photos have none.
-        unplaced: why the pose is unknown, by the names of such photos.
+        own_prior: makes the prior for `prior=auto` from the frames' `load` functions by name; None for real photos.
+        unplaced: photos without a pose: the reason by the photo's name.
     """
 
     name: str
@@ -118,13 +119,13 @@ class Capture:
 
 
 def sorted_by_name(frames: Sequence[Frame], file: Path) -> tuple[Frame, ...]:
-    """Frames in order of names, after `require_names`."""
+    """Check the frames by `require_names`, and sort them by name."""
     require_names(frames, file)
     return tuple(sorted(frames, key=lambda frame: frame.name))
 
 
 def require_names(frames: Sequence[Frame], file: Path) -> None:
-    """A DataError where two frames have the same name, it leads out of a folder where images are written, or there is none."""
+    """Raise a DataError if there are no frames, two have the same name, or a name leads out of the folder it is relative to."""
     if not frames:
         raise DataError(file, "frames", "there is none", "give a capture with at least one posed photo")
     for name, following in itertools.pairwise(sorted(frame.name for frame in frames)):
@@ -137,7 +138,7 @@ def require_names(frames: Sequence[Frame], file: Path) -> None:
 
 
 def lens_notes(frames: Sequence[Frame]) -> dict[str, str]:
-    """How lenses became the frames' cameras, for the printed plan."""
+    """Describe, for the printed plan, how lenses were rescaled and undistorted to the frames' cameras."""
     notes = {}
     pairs = [(frame.lens, frame.camera) for frame in frames if frame.lens is not None]
     scaled = [(a, b) for a, b in pairs if (a.width, a.height) != (b.width, b.height)]
@@ -147,18 +148,18 @@ def lens_notes(frames: Sequence[Frame]) -> dict[str, str]:
             f"{len(scaled)} of {len(frames)} rescaled to their photos, e.g. {lens.width}x{lens.height} to "
             f"{camera.width}x{camera.height}: x {camera.width / lens.width:.5g}, y {camera.height / lens.height:.5g}"
         )
-    bent = [(a, b) for a, b in pairs if a.distorts]
-    if bent:
-        lens, camera = bent[0]
+    distorted = [(a, b) for a, b in pairs if a.distorts]
+    if distorted:
+        lens, camera = distorted[0]
         notes["lens"] = (
-            f"{len(bent)} of {len(frames)} photos undistorted by OpenCV (bicubic, no borders), "
+            f"{len(distorted)} of {len(frames)} photos undistorted by OpenCV (bicubic, no borders), "
             f"e.g. fx {lens.fx * camera.width / lens.width:.5g} to {camera.fx:.5g} px"
         )
     return notes
 
 
 def _turned_as(path: Path, lens: Lens) -> bool | None:
-    """As `read_image` takes it, for a photo whose lens may be that of the stored or of the upright pixels."""
+    """Choose `turn` of `read_image` by the aspect ratio of the lens; None where the ratio does not decide it."""
     if lens.width == lens.height or not is_on_its_side(path):
         return None
     width, height = image_size(path, turn=False)

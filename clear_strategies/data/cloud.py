@@ -1,4 +1,4 @@
-"""The initial cloud: the points that training starts from. `CloudSettings` has the choices, `initial_points` makes the cloud.
+"""The initial point cloud of training, which `initial_points` makes by `CloudSettings`.
 
 `PointCloud.source` and `PointCloud.uses_test_views` record where the points come from.
 """
@@ -41,7 +41,7 @@ Compare = Literal["auto", "hr", "lr"]
 
 @dataclass(frozen=True, slots=True)
 class CloudSettings:
-    """Which points, and how they are processed.
+    """The source of the initial points, and their post-processing.
 
     Args:
         init: "stereo": from the depth of the training LR images, which are compared with each other under their known
@@ -52,7 +52,7 @@ class CloudSettings:
             were used for.
         path: the PLY file for init=ply.
         min_views: training views that must observe a point, for init=sfm_train.
-        enough: the fewest triangulated points that init=auto takes.
+        enough: the fewest triangulated points that init=auto uses.
         densify: add points between those of `init`, at completed depth, one every `stride` LR px of each view;
             "auto": if the cloud has fewer points than those grids. With stereo, true and auto add points only where
             there is no depth and no other view looks through them. Random points are never densified.
@@ -115,7 +115,7 @@ def require_source(settings: CloudSettings, sfm: SfmPoints | None) -> None:
 
 
 class InitialPoints(NamedTuple):
-    """The initial cloud, and the depth maps that stereo made it from, one for each photo; without stereo none."""
+    """The initial cloud, and the depth maps of stereo that it was made from, one per photo; empty without stereo."""
 
     cloud: PointCloud
     depths: tuple[DepthMap, ...] = ()
@@ -133,19 +133,20 @@ def initial_points(
     background: Color | None = None,
     seed: int = 0,
 ) -> InitialPoints:
-    """The cloud that training starts from.
+    """Make the initial point cloud.
 
     Args:
         photos: the training views at LR.
         hr: the same views at HR, see `CloudSettings.compare`; empty: stereo compares `photos`.
         hr_is_photo: the HR images are photos, not SR images.
         sfm: the scene's SfM points; None: it has none.
-        train_ids: their ids of the training frames.
+        train_ids: ids of the training frames in `SfmPoints.track_image`.
         sfm_is_train: every photo of the capture is a training view, so init=auto may take the SfM points as features.
         background: the colour of pixels without a surface (Blender's white), RGB in [0, 1].
     """
     require_source(settings, sfm)
-    shown, initial = [blackened(photo) for photo in photos], None
+    shown = [blackened(photo) for photo in photos]
+    initial: InitialPoints | None = None
     match settings.init:
         case "ply":
             points = read_points(path := Path(str(settings.path)))
@@ -185,7 +186,7 @@ def initial_points(
 def _sfm_of_training_views(
     settings: CloudSettings, sfm: SfmPoints | None, train_ids: Sequence[int]
 ) -> PointCloud | None:
-    """For init=auto, the SfM points of a capture whose photos are all training views; None: fewer than `settings.enough`."""
+    """SfM points for init=auto, of a capture whose photos are all training views; None: fewer than `settings.enough`."""
     if settings.init != "auto" or sfm is None or len(sfm.means) == 0:
         return None
     try:
@@ -203,10 +204,10 @@ def _from_depth(
     features: PointCloud,
     background: Color | None,
 ) -> InitialPoints | None:
-    """init=stereo and auto: points of the depth of `lr` or `hr` (`CloudSettings.compare`); with auto, None if it is unknown."""
+    """Make points from stereo depth of `lr` or `hr`, see `CloudSettings.compare`; None: init=auto, and no depth was found."""
     stereo, photos, finer = settings.stereo, lr, 1.0
-    few = hr_is_photo or len(lr) <= _FEW_PHOTOS
-    compared = hr if settings.compare == "hr" or (settings.compare == "auto" and few) else ()
+    auto_compares_hr = hr_is_photo or len(lr) <= _FEW_PHOTOS
+    compared = hr if settings.compare == "hr" or (settings.compare == "auto" and auto_compares_hr) else ()
     if compared and hr_is_photo:  # photos that show more than LR
         reduced = [photo.reduced(photo.factor_to(stereo.max_pixels)) for photo in hr]
         if (ratio := reduced[0].camera.width / lr[0].camera.width) > 1:
@@ -215,9 +216,10 @@ def _from_depth(
     if compared and not hr_is_photo and not cut_out(lr, background or BLACK):  # SR images complete what LR leaves open
         factor = hr[0].camera.width // lr[0].camera.width
         least = max(photo.factor_to(stereo.max_pixels) for photo in hr)
-        by = next((factor // k for k in range(least, factor) if factor % k == 0), 1)
-        if by > 1:
-            images = [photo.reduced(factor // by) for photo in hr]
+        divisor = next((k for k in range(least, factor) if factor % k == 0), factor)
+        if divisor < factor:
+            by = factor // divisor
+            images = [photo.reduced(divisor) for photo in hr]
             finest = depth_maps(images, features.means, stereo.finer(by), background)
             maps = [map_lr.completed_by(map_sr.reduced(by)) for map_lr, map_sr in zip(maps, finest, strict=True)]
     cloud = stereo_cloud(
@@ -234,7 +236,7 @@ def _from_depth(
 def _cleaned(
     settings: CloudSettings, cloud: PointCloud, photos: Sequence[Photo], background: Color | None
 ) -> InitialPoints:
-    """The cloud without outliers, densified where `settings.densify` asks for it."""
+    """Remove outliers, and densify the cloud as `settings.densify` says."""
     cloud = without_outliers(cloud, settings.outlier_neighbours, settings.outlier_ratio)
     grid = sum(len(pixel_grid(photo, settings.stride)) for photo in photos)
     if settings.densify == "auto" and len(cloud) >= grid:
@@ -267,7 +269,7 @@ def from_tracks(sfm: SfmPoints, train_ids: Sequence[int], min_views: int) -> Poi
 
 
 def random_cloud(photos: Sequence[Photo], count: int, seed: int, box: float | None = None) -> PointCloud:
-    """Uniform points, nearly grey, in a box around the origin of half-edge `box`, world units; None: `common_box`."""
+    """Sample points uniformly, nearly grey, in a box around the origin of half-edge `box`, world units; None: `common_box`."""
     if box is None:
         (low, high), where = common_box(photos), "the cameras' common box"
     else:

@@ -1,4 +1,4 @@
-"""The names of files: which are the same, and which file a capture means by one."""
+"""Comparison of file names, and lookup of the files that a capture names."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ LISTED: Final = 5
 
 
 def normalized(name: str) -> str:
-    """A name with its letters composed, as names are compared: those of zips from a Mac are decomposed, and look the same."""
+    """Return the name in Unicode's form NFC; zip files from a Mac have names in form NFD, which look the same."""
     return unicodedata.normalize("NFC", name)
 
 
 def alike(name: str) -> str:
-    """What names have in common that differ in the case or the composition of their letters alone."""
+    """Return a key that is equal for names that differ only in case and in Unicode's form."""
     return normalized(name).lower()
 
 
 def named(folder: Path, name: str) -> Path:
-    """What lies in a folder under a name that is `alike`; a path to nothing where there is none."""
+    """Return the path of a folder's entry whose name is `alike`; `folder / name` if there is none."""
     path = folder / name
     if path.exists() or not folder.is_dir():
         return path
@@ -36,16 +36,16 @@ def named(folder: Path, name: str) -> Path:
 
 
 def finder(folder: Path) -> Callable[[str], Path]:
-    """How each reader finds the files that a capture names, in or below a folder.
+    """Return a function that finds the files that a capture names, in or below a folder.
 
-    A name is taken as it stands, without an ending as that of a PNG file. Where no such file is there, backslashes separate
-    folders, names need only be `alike`, the beginning of an absolute path may differ, the folder's own name may stand first, and
-    the ending is that of the only image of this name. Where all of this finds none, the path leads to nothing.
+    A name is first used literally, then with ".png" appended. If there is no such file, backslashes separate folders, names need
+    only be `alike`, leading folders of an absolute path are ignored, the folder's own name may come first, and the suffix may
+    differ if only one image has that stem. If nothing is found, the returned path does not exist.
     """
 
     @cache
     def entries(parent: Path) -> dict[str, list[Path]]:
-        """What lies there, by what is `alike` of its name, and images also of their names without ending."""
+        """The entries of a folder by `alike` of their names, images also by that of their stems."""
         found: dict[str, list[Path]] = {}
         for path in sorted(parent.iterdir()) if parent.is_dir() else ():
             for key in {alike(path.name), alike(path.stem if path.suffix.lower() in SUFFIXES else path.name)}:
@@ -80,19 +80,19 @@ def finder(folder: Path) -> Callable[[str], Path]:
 
 
 def names_below(paths: Sequence[Path]) -> list[str]:
-    """The names of photos below the deepest folder that all of them lie in."""
+    """Return the paths relative to the deepest folder that contains all of them."""
     shared = os.path.commonprefix([path.parent.parts for path in paths])  # noqa: RUF071 - compares tuples of folders
     return ["/".join(path.parts[len(shared) :]) for path in paths]
 
 
 def is_file(path: Path) -> bool:
-    """Whether the path leads to a file; not for a name that no file can have, such as one of 5,000 letters."""
+    """Return True if the path is a file; False for a name that no file can have, such as one of 5,000 letters."""
     return os.path.isfile(path)  # noqa: PTH113 - Path.is_file raises for a name that is too long
 
 
 def require_text(names: Iterable[str]) -> None:
-    """Raise a DataError for a name that has a control character, such as an end of a line, or is not UTF-8, which the JSON files
-    and pages written after training could not hold.
+    """Raise a DataError for a name with a control character, such as a line break, or that is not UTF-8: the JSON files and pages
+    written after training could not contain it.
     """
     for name in names:
         if any(unicodedata.category(letter) in ("Cc", "Cs") for letter in name):
@@ -101,6 +101,6 @@ def require_text(names: Iterable[str]) -> None:
 
 
 def some(names: Sequence[str]) -> str:
-    """The first few names, each at most 80 characters of it."""
+    """Join the first `LISTED` names, each cut to 80 characters."""
     shown = [name[:80].encode(errors="backslashreplace").decode() for name in names[:LISTED]]
     return ", ".join(shown) + (", …" if len(names) > LISTED else "")

@@ -1,4 +1,4 @@
-"""Lenses as files give them, and their undistortion by OpenCV."""
+"""Intrinsics with lens distortion, as files give them, and undistortion by OpenCV."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from clear_strategies.errors import DataError
 FARTHEST: Final = 1e12
 """The largest coordinate, world units: float32 cannot resolve a scene beyond it."""
 _LARGEST_SIDE: Final = 1 << 20
-_SHORTEST: Final = 0.1  # of a focal length, in sides of the image: a pinhole of 157 degrees, a fisheye of more than 360
-# Coefficients of each camera model of COLMAP that OpenCV undistorts, in OpenCV's order; of the others all must be 0.
+_SHORTEST: Final = 0.1  # focal length in sides of the image: a pinhole of 157 degrees, a fisheye of more than 360
+# The coefficients of COLMAP's camera models that OpenCV undistorts, in OpenCV's order; all others must be 0.
 _PERSPECTIVE: Final = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE: Final = ("k1", "k2", "k3", "k4")
 _TERMS: Final = {
     "SIMPLE_PINHOLE": (), "PINHOLE": (), "SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2"), "FULL_OPENCV": _PERSPECTIVE,
-    "OPENCV": ("k1", "k2", "p1", "p2", "k3"),  # nerfstudio's has a k3, and a k4 that is another than OpenCV's
+    "OPENCV": ("k1", "k2", "p1", "p2", "k3"),  # nerfstudio adds k3, and a k4 that is not OpenCV's
     "FOV": (), "SIMPLE_DIVISION": (), "DIVISION": (), "EUCM": (),
     "SIMPLE_FISHEYE": (), "FISHEYE": (), "SIMPLE_RADIAL_FISHEYE": ("k1",), "RADIAL_FISHEYE": ("k1", "k2"),
     "OPENCV_FISHEYE": _FISHEYE, "THIN_PRISM_FISHEYE": _FISHEYE, "RAD_TAN_THIN_PRISM_FISHEYE": _FISHEYE,
@@ -40,8 +40,11 @@ _BORDER_SAMPLES: Final = 33
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """Intrinsics in pixels of a width × height image whose first pixel is centred at (0.5, 0.5), and the first of OpenCV's
-    (k1, k2, p1, p2, k3, k4, k5, k6), or with `fisheye` of (k1, k2, k3, k4); none: a pinhole.
+    """Intrinsics, in pixels of a width × height image whose first pixel is centred at (0.5, 0.5), and lens distortion.
+
+    Args:
+        distortion: the first of OpenCV's (k1, k2, p1, p2, k3, k4, k5, k6), or with `fisheye` of (k1, k2, k3, k4); empty: a
+            pinhole.
     """
 
     width: int
@@ -59,12 +62,14 @@ class Lens:
 
     @property
     def coefficients(self) -> Float[np.ndarray, " k"]:
-        """The distortion for OpenCV, which takes at least four numbers."""
+        """The distortion with zeros appended, since OpenCV needs at least four numbers."""
         return np.array([*self.distortion, *[0.0] * (4 - len(self.distortion))])
 
     def resized(self, width: int, height: int, file: Path) -> Lens:
-        """The same lens for an image scaled to another size, each axis by its own factor; a DataError where the two sizes differ
-        in their aspect ratio, beyond a pixel of rounding of the smaller one: `file` is another image.
+        """Rescale the lens to an image of another size, each axis by its own factor.
+
+        Raises:
+            DataError: the aspect ratios differ by more than a pixel of the smaller image: `file` is another image.
         """
         if abs(width * self.height - height * self.width) > max(width + height, self.width + self.height):
             problem = f"is {width}x{height}, but its camera is for {self.width}x{self.height}: another shape"
@@ -74,8 +79,10 @@ class Lens:
         return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
     def undistorted(self, file: Path) -> Lens:
-        """The pinhole of the undistorted image: the same size, zoomed so that every pixel has data; a DataError where there is
-        none, because the distortion folds the image over itself.
+        """Return the pinhole of the undistorted image, of the same size and zoomed so that every pixel has data.
+
+        Raises:
+            DataError: there is none, because the distortion folds the image over itself.
         """
         pinhole = _filled_pinhole(self) if self.distorts else replace(self, distortion=())
         if pinhole is None:
@@ -86,7 +93,7 @@ class Lens:
         return pinhole
 
     def undistort(self, image: Float[Tensor, "H W *C"], pinhole: Lens) -> Float[Tensor, "H W *C"]:
-        """The image resampled for `pinhole`; bicubic, in [0, 1]."""
+        """Resample the image for `pinhole`, bicubically; the result lies in [0, 1]."""
         import cv2
 
         x, y = _sampling_maps(self, pinhole)
@@ -106,11 +113,14 @@ def lens_of(
     pinhole: tuple[float, float, float, float],
     terms: Mapping[str, float],
 ) -> Lens:
-    """The lens of a camera model that a file names; a DataError where OpenCV cannot undistort it.
+    """Make the lens of a camera model by name.
 
     Args:
         pinhole: fx, fy, cx, cy.
-        terms: its coefficients by their names, p and k counted from 1; those left out are 0.
+        terms: distortion coefficients by their names, p and k counted from 1; those left out are 0.
+
+    Raises:
+        DataError: OpenCV cannot undistort the lens, or its intrinsics are not plausible.
     """
     kept = terms_of(file, where, model)
     if rest := [name for name, value in terms.items() if value != 0 and name not in kept]:
@@ -123,12 +133,13 @@ def lens_of(
         raise DataError(file, where, problem, "estimate the cameras again")
     if not (0 < width < _LARGEST_SIDE and 0 < height < _LARGEST_SIDE):
         raise DataError(file, where, f"has size {width}x{height}", "check the camera")
-    shortest, in_sides = min(fx / width, fy / height), 0 < max(cx, cy) <= 1 < min(width, height) / 8
+    shortest = min(fx / width, fy / height)
+    in_sides = 0 < max(cx, cy) <= 1 < min(width, height) / 8  # units of the image's sides in place of pixels
     if not (shortest > _SHORTEST and max(fx, fy) / width < 1e6) or in_sides:
         lengths = f"focal lengths {fx:g}, {fy:g} and principal point ({cx:g}, {cy:g})"
-        sides = shortest > 0 and "multiply what is in units of the image by its width (x) and height (y)"
+        remedy = "multiply what is in units of the image by its width (x) and height (y)"
         problem = f"has {lengths} where the image is {width}x{height}; all must be pixels"
-        raise DataError(file, where, problem, sides or "estimate the cameras again")
+        raise DataError(file, where, problem, remedy if shortest > 0 else "estimate the cameras again")
     if not (-width < cx < 2 * width and -height < cy < 2 * height):
         raise DataError(
             file, where, f"has its principal point ({cx:g}, {cy:g}) px far outside the image", "check the camera"
@@ -137,7 +148,7 @@ def lens_of(
 
 
 def terms_of(file: Path, where: str, model: str) -> tuple[str, ...]:
-    """The coefficients of a camera model that need not be 0; a DataError for a model that is not supported."""
+    """Return the coefficients of a camera model that need not be 0; a DataError if the model is not supported."""
     if model in _TERMS:
         return _TERMS[model]
     remedy = _CUT if model == "EQUIRECTANGULAR" else f"undistort the photos first: {_UNDISTORT}"
@@ -164,7 +175,7 @@ def _filled_pinhole(lens: Lens) -> Lens | None:
 
 
 def _covers(lens: Lens, pinhole: Lens) -> bool:
-    """Whether the border of the new image lies inside the old one, up to OpenCV's approximation."""
+    """Return True if the border of the undistorted image lies inside the distorted one, up to OpenCV's approximation."""
     import cv2
 
     t = np.linspace(0, 1, _BORDER_SAMPLES)
@@ -182,7 +193,7 @@ def _covers(lens: Lens, pinhole: Lens) -> bool:
 
 @lru_cache(maxsize=1)
 def _sampling_maps(lens: Lens, pinhole: Lens) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
-    """The position of each new pixel in the distorted image."""
+    """The position of each undistorted pixel in the distorted image."""
     import cv2
 
     maps, size = (cv2.fisheye if lens.fisheye else cv2).initUndistortRectifyMap, (lens.width, lens.height)
@@ -191,5 +202,5 @@ def _sampling_maps(lens: Lens, pinhole: Lens) -> tuple[Float[np.ndarray, "H W"],
 
 
 def forget_maps() -> None:
-    """Free what `Lens.undistort` keeps for the next photo of a lens: 8 bytes per pixel."""
+    """Free the sampling maps that `Lens.undistort` caches, 8 bytes per pixel."""
     _sampling_maps.cache_clear()

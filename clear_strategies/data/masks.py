@@ -1,4 +1,4 @@
-"""Masks: whose file is whose, and what it hides."""
+"""Mask files: matching them to photos, and reading them."""
 
 from __future__ import annotations
 
@@ -26,18 +26,23 @@ _MARKED: Final = re.compile(r"^(?:.*mask[-_.])?(.+?)(?:[-_.]mask)?$")  # dynamic
 
 
 def masks_of(root: Path, paths: Iterable[Path], given: Mapping[Path, Path] = MappingProxyType({})) -> dict[Path, Path]:
-    """The mask of each photo that has one; a warning names the files in a folder of masks that belong to no photo.
+    """Find the masks of photos. A warning names the files in a folder of masks that match no photo.
+
+    Masks lie in a folder `masks` (or `mask`) that replaces one folder of the photo's path below `root`, or lies in one of them;
+    for images_4, `masks_4` is preferred. A mask is named like its photo, with or without its suffix, in any case, and may be
+    marked: 0001.png, 0001.jpg.png, 0001_mask.png, dynamic_mask_0001.png. Marked masks may also lie among the photos, see
+    `masks_among`.
 
     Args:
-        given: the masks of photos whose capture names them.
+        given: masks that the capture names, by their photos.
 
-    Masks lie in a folder `masks` (or `mask`), in place of one folder of the photo's path below `root`, or in one of them; beside
-    images_4, `masks_4` comes first. A mask is named like its photo, with its ending or without, in any case, and may be marked:
-    0001.png, 0001.jpg.png, 0001_mask.png, dynamic_mask_0001.png. Marked ones may also lie among the photos, see `masks_among`.
+    Returns:
+        The masks by their photos.
     """
-    found, used, folders = dict(given), set(given.values()), dict[Path, dict[str, Path]]()
+    found, used = dict(given), set(given.values())
+    folders = dict[Path, dict[str, Path]]()
     for parent in dict.fromkeys(path.parent for path in paths):
-        for folder in filter(Path.is_dir, dict.fromkeys(_folders(root, parent))):
+        for folder in filter(Path.is_dir, dict.fromkeys(_mask_folders(root, parent))):
             masks = folders.setdefault(folder, _by_name(folder))
             for photo in images_in(parent):
                 names = (alike(photo.stem), alike(photo.name))
@@ -54,13 +59,14 @@ def masks_of(root: Path, paths: Iterable[Path], given: Mapping[Path, Path] = Map
 
 
 def masks_among(photos: Sequence[Path]) -> dict[Path, Path]:
-    """The masks that lie among the photos of a folder, by the photo: 0001.jpg.mask.png of RealityCapture, 0001_mask.png."""
+    """Find the masks among the images of a folder, by their photos: 0001.jpg.mask.png (RealityCapture), 0001_mask.png."""
     named = {alike(name): photo for photo in photos for name in (photo.stem, photo.name)}
     marked = {file: _MARKED.sub(r"\g<1>", stem) for file in photos if (stem := alike(file.stem))}
     return {named[name]: file for file, name in marked.items() if named.get(name, file).stem != file.stem}
 
 
-def _folders(root: Path, parent: Path) -> Iterator[Path]:
+def _mask_folders(root: Path, parent: Path) -> Iterator[Path]:
+    """Yield the folders in which masks of the photos in `parent` may lie, the preferred ones first."""
     parts = parent.relative_to(root).parts if parent.is_relative_to(root) else ()
     for i, part in enumerate(parts):
         size = part.removeprefix("images") if part.startswith("images") else ""
@@ -72,7 +78,7 @@ def _folders(root: Path, parent: Path) -> Iterator[Path]:
 
 
 def _by_name(folder: Path) -> dict[str, Path]:
-    """The masks of a folder by the names that their photos may have; the plainest name comes first, then PNG."""
+    """The masks of a folder by the names that their photos may have; unmarked names are preferred, then PNG files."""
     masks = dict[str, Path]()
     files = sorted(images_in(folder), key=lambda file: file.suffix.lower() != SUFFIXES[0])
     for names in (r"\g<0>", r"\g<1>"):
@@ -82,16 +88,18 @@ def _by_name(folder: Path) -> dict[str, Path]:
 
 
 def check_mask(path: Path, lens: Lens, turn: bool | None) -> None:
-    """A DataError where a mask is no image of its lens's shape, by its header; `turn` as of `read_image`."""
-    with _of_mask():
+    """Raise a DataError unless a mask has the aspect ratio of the lens. Reads only the header; `turn`: see `read_image`."""
+    with _errors_of_mask():
         lens.resized(*image_size(path, turn=turn), path)
 
 
 def read_mask(path: Path, lens: Lens, pinhole: Lens, turn: bool | None) -> Bool[Tensor, "H W"]:
-    """False where the mask hides its photo: where it is 0, as in COLMAP and nerfstudio, so that 0 and 1 are a mask as 0 and 255
-    are. Of a lossy file, whose 0 is not exact, at most half of its largest value. It is brought to the size of `lens`.
+    """Read a mask at the size of `lens`, undistorted for `pinhole`; False at hidden pixels.
+
+    The value 0 hides, as in COLMAP and nerfstudio, so a mask of 0 and 1 means the same as one of 0 and 255. In a lossy file,
+    where 0 is not exact, values up to half of the largest one hide.
     """
-    with _of_mask():
+    with _errors_of_mask():
         values = read_image(path, turn=turn).amax(dim=2)
         shown = (values > (values.max() / 2 if is_lossy(path) else 0)).float()
     shown = F.interpolate(shown[None, None], (lens.height, lens.width), mode="nearest-exact")[0, 0]
@@ -101,8 +109,8 @@ def read_mask(path: Path, lens: Lens, pinhole: Lens, turn: bool | None) -> Bool[
 
 
 @contextmanager
-def _of_mask() -> Iterator[None]:
-    """What would help a photo does not help its mask."""
+def _errors_of_mask() -> Iterator[None]:
+    """Raise DataErrors again with a remedy for masks: that for photos does not apply."""
     try:
         yield
     except DataError as error:

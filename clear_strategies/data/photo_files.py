@@ -1,10 +1,10 @@
-"""Image files, read and written, and their EXIF blocks. An image that cannot be read exactly is refused, but one of more than 100
-megapixels is reduced by a whole factor.
+"""Reading and writing of image files, and their EXIF blocks. Images that cannot be read exactly are refused; those of more than
+100 megapixels are reduced by a whole factor.
 
 The content of a file decides its format. A truncated file is an error, not an image with a grey bottom. 16 bits stay 16 bits.
-Colours of another profile become sRGB, in 8 bits. Alpha is composited over a given background, before anything is resampled, so
-that no colour of a transparent pixel shows at an edge. The caller decides whether a photo is turned as its EXIF block says,
-because programs disagree on whether a camera's pose includes the turn.
+Other colour profiles are converted to sRGB, in 8 bits. Alpha is composited over a given background before anything is resampled,
+so that colours of transparent pixels do not show at edges. The caller decides whether the EXIF rotation is applied, because
+programs disagree on whether a camera's pose includes it.
 """
 
 from __future__ import annotations
@@ -38,28 +38,28 @@ SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".jfif", ".webp", ".tif", ".tiff", "
 _FORMATS: Final = ("PNG", "JPEG", "WEBP", "TIFF")
 _LOSSLESS: Final = ("PNG", "TIFF")
 _HEIF_BRANDS: Final = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1")  # bytes 8 to 12, behind "ftyp"
-_MAX_PIXELS: Final = 100_000_000  # of what is read, 1.2 GB: of larger photos, the mean of 2x2 or more pixels
-_LARGEST: Final = 500_000_000  # pixels of a file with 8 bits: its header may promise any number
+_MAX_PIXELS: Final = 100_000_000  # of an image as it is returned, 1.2 GB; of larger photos, means of 2x2 or more pixels
+_LARGEST: Final = 500_000_000  # pixels of a file with 8 bits, since a header may state any number
 PNG_LEVEL: Final = 3  # a third of the time of zlib's default, for 5 % more bytes
 _ADOBE_RGB: Final = "R03"  # EXIF's index of interoperability
-_ON_THE_SIDE: Final = (5, 6, 7, 8)
+_ON_THE_SIDE: Final = (5, 6, 7, 8)  # EXIF orientations that exchange width and height
 _SAME_COLOR: Final = 4  # levels of 255 by which makers' sRGB profiles differ
-_PROFILES: Final = threading.Lock()  # several photos are read at once, and each profile is logged once
-_OPENING: Final = threading.Lock()  # Pillow's limit of pixels is one for all threads
+_PROFILES_LOCK: Final = threading.Lock()  # several photos are read at once, and each profile is logged once
+_OPENING_LOCK: Final = threading.Lock()  # Pillow's limit of pixels is one for all threads
 _NCLX_PRIMARIES: Final = (1, 2)  # BT.709's, which are sRGB's, and unknown
 _NCLX_TRANSFER: Final = (1, 2, 6, 13, 14, 15)  # BT.709's in all its names, unknown, and sRGB's
-_OF_LENS: Final = (
+_LENS_TAGS: Final = (
     ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.LensModel, ExifTags.Base.FocalLength,
     ExifTags.Base.DigitalZoomRatio,
 )  # fmt: skip
 
 
 class Optics(NamedTuple):
-    """What a photo's EXIF block says of its camera.
+    """The camera data of a photo's EXIF block.
 
     Args:
-        focal_35mm: the focal length on 35 mm film of the same diagonal, mm, where it is known.
-        lens: maker, model, lens, focal length and digital zoom, as they stand there.
+        focal_35mm: the focal length on 35 mm film of the same diagonal, mm; None: unknown.
+        lens: maker, model, lens, focal length and digital zoom, as written in the block.
     """
 
     focal_35mm: float | None
@@ -69,13 +69,13 @@ class Optics(NamedTuple):
 def read_image(
     path: Path, *, background: Color | None = None, expect: tuple[int, int] | None = None, turn: bool | None = None
 ) -> Float[Tensor, "H W 3"]:
-    """RGB in [0, 1], float32.
+    """Read an image as RGB in [0, 1], float32.
 
     Args:
         background: RGB in [0, 1] behind (straight) alpha: rgb · alpha + background · (1 - alpha). None: black, logged.
-        expect: (width, height) the image must have.
-        turn: of an image that is stored turned by its EXIF block: True turns it upright, False keeps the stored pixels, None
-            refuses it. A TIFF is never kept as it is stored, and a PNG of 16 bits never turned: they are refused.
+        expect: (width, height) that the image must have.
+        turn: what to do with an EXIF rotation. True: apply it, and refuse a 16-bit PNG, which cannot be rotated. False: return
+            the stored pixels, and refuse a TIFF, which decoders rotate. None: refuse the image.
     """
     with _opened(path, turn) as image:
         sixteen_bits = _has_sixteen_bits(image)  # unknown after decoding
@@ -91,7 +91,7 @@ def read_image(
         decoded_upright = image.format == "TIFF"  # by Pillow and by OpenCV
         as_asked = {None: False, True: decoded_upright or not sixteen_bits, False: not decoded_upright}[turn]
         if orientation != 1 and not as_asked:
-            raise _turned(path, orientation)
+            raise _rotation_error(path, orientation)
         if orientation != 1 and turn and not decoded_upright:
             ImageOps.exif_transpose(image, in_place=True)
         pixels = _to_float(path, image, sixteen_bits)
@@ -108,55 +108,55 @@ def read_image(
 
 
 def image_size(path: Path, *, turn: bool | None = None) -> tuple[int, int]:
-    """(width, height), from the header only; `turn` and the DataErrors as of `read_image`."""
+    """Return (width, height). Reads only the header; `turn` and errors as of `read_image`."""
     with _opened(path, turn) as image:
         width, height = image.size
-        # Of a turned TIFF some versions of PIL say the upright size.
+        # Some versions of PIL return the upright size of a rotated TIFF.
         if isinstance(image, TiffImagePlugin.TiffImageFile):
             width, height = image.tag_v2[TiffImagePlugin.IMAGEWIDTH], image.tag_v2[TiffImagePlugin.IMAGELENGTH]
-        factor = _factor(width * height)
+        factor = _reduction_factor(width * height)
         width, height = -(-width // factor), -(-height // factor)
         return (height, width) if turn and _orientation_of(image) in _ON_THE_SIDE else (width, height)
 
 
 def is_on_its_side(path: Path) -> bool:
-    """Whether the EXIF block turns the stored pixels by a quarter, from the header only; the DataErrors as of `read_image`."""
+    """Return True if the EXIF rotation exchanges width and height. Reads only the header; errors as of `read_image`."""
     with _opened(path, False) as image:
         return _orientation_of(image) in _ON_THE_SIDE
 
 
 def has_alpha(path: Path) -> bool:
-    """Whether the file may have transparent pixels, from the header only; the DataErrors as of `read_image`."""
+    """Return True if the image may have transparent pixels. Reads only the header; errors as of `read_image`."""
     with _opened(path, False) as image:
         return _has_alpha(image)
 
 
 def is_lossy(path: Path) -> bool:
-    """Whether the file's format may change pixels, from the header only; the DataErrors as of `read_image`."""
+    """Return True if the file's format is not lossless. Reads only the header; errors as of `read_image`."""
     with _opened(path, False) as image:
         return image.format not in _LOSSLESS
 
 
 def optics(path: Path) -> Optics:
-    """What the EXIF block says of the camera; the DataErrors as of `read_image`. Cameras also write 0, 0/0, text and tuples."""
+    """Return the camera data of the EXIF block; errors as of `read_image`."""
     with _opened(path, False) as image:
         tags = _tags(image, ExifTags.IFD.Exif)
     value = tags.get(ExifTags.Base.FocalLengthIn35mmFilm, 0)
-    try:
+    try:  # cameras also write 0, 0/0, text and tuples
         number = float(value[0] if isinstance(value, tuple) else value)
     except (TypeError, ValueError, ZeroDivisionError, IndexError):
         number = math.nan
     focal = number if math.isfinite(number) and number > 0 else None
-    return Optics(focal, tuple(str(tags.get(tag, "")) for tag in _OF_LENS))
+    return Optics(focal, tuple(str(tags.get(tag, "")) for tag in _LENS_TAGS))
 
 
 def write_png(path: Path, image: Float[Tensor, "H W 3"] | Float[Tensor, "H W"]) -> None:
-    """8-bit PNG, written atomically; a [H, W] image is grey. Values outside [0, 1] are clamped."""
+    """Write an 8-bit PNG atomically; an [H, W] image becomes grey. Values outside [0, 1] are clamped."""
     write_bytes(path, png_bytes(image))
 
 
 def png_bytes(image: Float[Tensor, "H W 3"] | Float[Tensor, "H W"]) -> bytes:
-    """The file of `write_png`."""
+    """Return the bytes of the file that `write_png` writes."""
     buffer = io.BytesIO()
     Image.fromarray(to_bytes(image)).save(buffer, format="PNG", compress_level=PNG_LEVEL)
     return buffer.getvalue()
@@ -164,10 +164,11 @@ def png_bytes(image: Float[Tensor, "H W 3"] | Float[Tensor, "H W"]) -> bytes:
 
 @contextmanager
 def _opened(path: Path, turn: bool | None) -> Iterator[Image.Image]:
+    """Open an image and check its size and EXIF rotation, without decoding its pixels."""
     require_regular(path)
     formats = (*_FORMATS, "HEIF") if _is_heif(path) else _FORMATS
     try:
-        with _OPENING, warnings.catch_warnings():
+        with _OPENING_LOCK, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # PIL's warnings: damage fails on decoding
             limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # 200 megapixels of a phone exceed it
             try:
@@ -187,13 +188,13 @@ def _opened(path: Path, turn: bool | None) -> Iterator[Image.Image]:
             problem = f"{image.width}x{image.height} is more than {most:,} pixels"
             raise DataError(path, "size", problem, f"reduce it: mogrify -resize 50% {shlex.quote(str(path))}")
         if turn is None and image.format != "PNG" and (orientation := _orientation_of(image)) != 1:
-            raise _turned(path, orientation)
+            raise _rotation_error(path, orientation)
         yield image
 
 
-@lru_cache(maxsize=16)  # photos of one size are told once
-def _factor(pixels: int) -> int:
-    """By which each side of an image of so many pixels is reduced as it is read."""
+@lru_cache(maxsize=16)  # logs once for photos of one size
+def _reduction_factor(pixels: int) -> int:
+    """The factor by which the sides of an image with this number of pixels are reduced when it is read."""
     factor = math.ceil(math.sqrt(pixels / _MAX_PIXELS))
     if factor > 1:
         _log.info("photos of %d megapixels are read at 1/%d of their width and height.", pixels // 10**6, factor)
@@ -201,22 +202,22 @@ def _factor(pixels: int) -> int:
 
 
 def _reduced(image: Image.Image) -> Image.Image:
-    factor = _factor(image.width * image.height)
+    factor = _reduction_factor(image.width * image.height)
     return image if factor == 1 else image.reduce(factor)
 
 
 def _has_sixteen_bits(image: Image.Image) -> bool:
-    """Of an image that is not decoded: the layout in its file."""
+    """Return True if the file has 16 bits per channel; known only until the image is decoded."""
     return ";16" in str(getattr(image, "tile", ""))
 
 
 def _is_heif(path: Path) -> bool:
-    """Whether the content is HEIC or HEIF, which PIL can then open; a DataError if pillow-heif is not installed."""
+    """Return True if the content is HEIC or HEIF, after enabling PIL to open it; a DataError if pillow-heif is not installed."""
     try:
         with path.open("rb") as file:
             head = file.read(12)
     except OSError:
-        return False  # opening it as an image says why
+        return False  # opening it as an image raises the error
     if head[4:8] != b"ftyp" or head[8:] not in _HEIF_BRANDS:
         return False
     try:
@@ -224,18 +225,18 @@ def _is_heif(path: Path) -> bool:
     except ImportError as error:
         remedy = "pip install 'clear-strategies[heic]', or save the photo as JPEG"
         raise DataError(path, "HEIC", "needs pillow-heif, which is not installed", remedy) from error
-    pillow_heif.register_heif_opener()  # which turns images upright, and says so in their EXIF block
+    pillow_heif.register_heif_opener()  # rotates images upright, and sets the orientation in their EXIF block to match
     return True
 
 
 def _orientation_of(image: Image.Image) -> int:
-    """The EXIF orientation of an opened image, 1 to 8; 1, upright, where there is none or it cannot be read."""
+    """The EXIF orientation of an opened image, 1 to 8; 1, upright, if it is missing or cannot be read."""
     orientation = _tags(image).get(ExifTags.Base.Orientation, 1)
     return orientation if orientation in range(1, 9) else 1
 
 
 def _tags(image: Image.Image, *blocks: int) -> dict[int, Any]:
-    """The tags of an image's EXIF block, and of blocks in it; none where it cannot be read."""
+    """The tags of an image's EXIF block, and of the given blocks in it; empty if it cannot be read."""
     try:
         exif = image.getexif()
         return {**exif, **{tag: value for block in blocks for tag, value in exif.get_ifd(block).items()}}
@@ -244,14 +245,14 @@ def _tags(image: Image.Image, *blocks: int) -> dict[int, Any]:
         return {}
 
 
-def _turned(path: Path, orientation: int) -> DataError:
+def _rotation_error(path: Path, orientation: int) -> DataError:
     problem = f"is {orientation}: the photo is stored turned, and its pose may not include that"
     remedy = "turn the pixels first (e.g. with `mogrify -auto-orient`), then estimate poses from the result"
     return DataError(path, "EXIF orientation", problem, remedy)
 
 
 def _to_float(path: Path, image: Image.Image, sixteen_bits: bool) -> Float[np.ndarray, "H W C"]:
-    """[H, W, 3 or 4] in [0, 1]."""
+    """Convert a decoded image to sRGB, with alpha if it has any: [H, W, 3 or 4] in [0, 1]."""
     if image.format in ("PNG", "TIFF", "WEBP") and getattr(image, "n_frames", 1) > 1:
         raise DataError(path, "pages", "are several in one file", "save each image as a file of its own")
     if image.mode in ("I;16", "I;16B", "I;16L", "I;16N"):
@@ -268,15 +269,15 @@ def _to_float(path: Path, image: Image.Image, sixteen_bits: bool) -> Float[np.nd
 
 
 def _to_srgb_of(image: Image.Image) -> Any:
-    """What turns the image's colours into sRGB; None where they are sRGB, or it does not say."""
-    with _PROFILES:
+    """The transform from the image's colours to sRGB; None if they are sRGB, or the file has no profile."""
+    with _PROFILES_LOCK:
         if profile := image.info.get("icc_profile"):
             return _to_srgb(profile, image.mode in ("1", "L", "LA"))
         nclx = image.info.get("nclx_profile") or {}
         primaries, transfer = nclx.get("color_primaries", 1), nclx.get("transfer_characteristics", 1)
         if primaries not in _NCLX_PRIMARIES or transfer not in _NCLX_TRANSFER:
-            of = f"the primaries {primaries} and the transfer {transfer} of ITU-T H.273 (HDR, or a wide gamut)"
-            _warn_of_colors(of)
+            h273 = f"the primaries {primaries} and the transfer {transfer} of ITU-T H.273 (HDR, or a wide gamut)"
+            _warn_of_colors(h273)
         elif _tags(image, ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex) == _ADOBE_RGB:
             _warn_of_colors("Adobe RGB (EXIF)")
         return None
@@ -305,7 +306,7 @@ def _to_srgb(profile: bytes, grey: bool) -> Any:
 
 @lru_cache(maxsize=16)
 def _warn_of_colors(colors: str) -> None:
-    """Warn of photos that say what their colours are without a profile that converts them."""
+    """Warn once of photos whose files state other colours than sRGB, without a profile to convert them."""
     _log.warning("photos have the colours of %s, and are taken as sRGB. Export them in sRGB.", colors)
 
 
@@ -314,7 +315,7 @@ def _has_alpha(image: Image.Image) -> bool:
 
 
 def _read_sixteen_bits(path: Path) -> Float[np.ndarray, "H W C"]:
-    """PIL keeps only the upper 8 bits of 16-bit colour; OpenCV keeps all."""
+    """Read 16-bit colour by OpenCV, since PIL keeps only the upper 8 bits."""
     import cv2
 
     data = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)

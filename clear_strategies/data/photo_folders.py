@@ -1,4 +1,4 @@
-"""The photos of a folder or a capture: where they are, and which can be used."""
+"""Finding the photos of a folder or a capture, and selecting those that can be used."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _BELOW: Final = ("*/*", "*/*/*")  # a memory card has DCIM/100CANON
 _NO_PHOTOS: Final = ("mask", "masks")  # names of folders
 FRAMES: Final = "ffmpeg -i VIDEO -vf thumbnail=15 -fps_mode passthrough -q:v 2 FOLDER/%03d.jpg"
 HDR: Final = "-vf thumbnail=15,scale=out_primaries=bt709:out_transfer=iec61966-2-1,format=rgb24 (ffmpeg 8)"
-# What people have in place of photos, by its endings, and what makes photos of it.
+# Kinds of files that folders contain in place of photos: their suffixes, and how to convert them.
 _OTHER_KINDS: Final = {
     "raw photos": (
         ".3fr .arw .cr2 .cr3 .dng .nef .orf .pef .raf .raw .rw2 .srw",
@@ -43,8 +43,8 @@ _Entry = TypeVar("_Entry")
 
 
 def image_folder(root: Path, name: str | None = None) -> Path:
-    """The folder of photos in `root`; without a name, the first of images, images_2, images_4, images_8, else `root`
-    itself, else the only folder below it that holds images.
+    """Return the folder of photos in `root`. Without a name, it is the first of images, images_2, images_4 and images_8 that
+    exists, else `root` itself, else the only folder below it that contains images.
     """
     present = [folder for name in _FOLDERS if (folder := named(root, name)).is_dir()]
     if not root.is_dir():
@@ -66,14 +66,14 @@ def image_folder(root: Path, name: str | None = None) -> Path:
 
 
 def folder_note(folder: Path) -> str:
-    """The folder's name, and which others exist beside it, for the plan."""
+    """The folder's name, and the names of other folders of photos beside it, for the plan."""
     others = [name for name in _FOLDERS if name != folder.name and (folder.parent / name).is_dir()]
     return f"{folder.name} (there are also {', '.join(others)})" if others else folder.name
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The image files of a folder, by their suffix, in order of names, without hidden ones; a DataError where there is none, with
-    what is there in their place.
+    """List the image files of a folder, by their suffix, in order of names, without hidden files. If there is none, the DataError
+    names what the folder contains instead.
     """
     if not folder.is_dir():
         raise DataError(folder, "folder", "is not there", "check the path")
@@ -89,19 +89,19 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def folders_of_images(root: Path) -> dict[Path, int]:
-    """The folders up to two below this one that hold images other than masks, and how many."""
+    """Count the images in each folder that lies up to two levels below this one; folders of masks are left out."""
     images = [path for pattern in _BELOW for path in images_in(root, pattern)]
     return dict(Counter(path.parent for path in images if path.parent.name.lower() not in _NO_PHOTOS))
 
 
 def counted(root: Path, folders: Mapping[Path, int]) -> str:
-    """Folders with the numbers of their photos, those with most first."""
+    """Describe folders and the numbers of their photos, the largest first."""
     most = sorted(folders.items(), key=lambda item: -item[1])
     return some([f"{folder.relative_to(root).as_posix()} holds {count}" for folder, count in most])
 
 
 def in_place_of_photos(paths: Iterable[Path]) -> tuple[str, str] | None:
-    """What these files are, of the kind that most of them have, and what makes photos of it; None for no known kind."""
+    """Describe the most frequent known kind of these files, and how to convert it to photos; None if no kind is known."""
     kind_of = {ending: kind for kind, (endings, _) in _OTHER_KINDS.items() for ending in endings.split()}
     of_kind = dict[str, list[Path]]()
     for path in paths:
@@ -115,7 +115,7 @@ def in_place_of_photos(paths: Iterable[Path]) -> tuple[str, str] | None:
 
 
 def images_in(folder: Path, pattern: str = "*") -> list[Path]:
-    """As `list_images`, but empty where there is none; with the pattern "**/*" also those of the folders below."""
+    """List images as `list_images` does, possibly none; the pattern "**/*" includes the folders below."""
     images = sorted(p for p in folder.glob(pattern) if p.suffix.lower() in SUFFIXES and p.is_file())
     return [p for p in images if not any(part.startswith(".") for part in p.relative_to(folder).parts)]
 
@@ -128,11 +128,11 @@ def usable(
     skip_faulty: bool,
     scene: Path | None = None,
 ) -> list[_Entry]:
-    """The entries whose photos can be used, in their order.
+    """Select the entries whose photos can be used, in order.
 
     Args:
         listing: the file or folder that lists the photos, for messages.
-        scene: the folder below which data.reader.images names that of the photos; None: the reader has no such setting.
+        scene: the folder that data.reader.images is relative to; None: the reader has no such setting.
         skip_faulty: decode every photo, and leave out those that are missing or cannot be decoded, with a warning for each.
             Else no photo is decoded: a damaged one fails when it is loaded, and a missing one is a DataError.
     """
@@ -147,7 +147,7 @@ def usable(
 
     absent = [path_of(entry) for entry in entries if not is_file(path_of(entry))]
     if absent and len(absent) == len(entries):
-        raise _none_there(listing, absent, scene)
+        raise _none_found(listing, absent, scene)
     if absent and not skip_faulty:
         problem = f"{len(absent)} of {len(entries)} are not there: {some([path.name for path in absent])}"
         remedy = "put them back, or train without them: data.reader.skip_faulty=true"
@@ -158,8 +158,8 @@ def usable(
     return kept
 
 
-def _none_there(listing: Path, absent: Sequence[Path], scene: Path | None) -> DataError:
-    """The error where no photo of a list is there: the folder that was searched, and what lies there or one folder deeper."""
+def _none_found(listing: Path, absent: Sequence[Path], scene: Path | None) -> DataError:
+    """The error for a list of which no photo exists; it names the folder that was searched, and what that contains."""
     searched = next(folder for folder in absent[0].parents if folder.is_dir())
     remedy = f"give the photos these names, or correct those in {listing.name}"
     if photos := images_in(searched) or images_in(searched, "*/*"):

@@ -1,4 +1,4 @@
-"""PLY files: Gaussians in the standard layout of 3DGS and point clouds, in and out.
+"""Reading and writing of PLY files: Gaussians in the layout of 3DGS, and point clouds.
 
 The reader is strict: counts are compared with the file's size before anything is allocated. (plyfile would make this shorter; its
 licence, GPL-3.0, does not go with this package's.)
@@ -54,7 +54,7 @@ _ROTATION: Final = ("rot_0", "rot_1", "rot_2", "rot_3")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GaussianPly:
-    """Gaussians in the standard layout: raw parameters, view-dependent colour (B in {0, 3, 8, 15} bands) included."""
+    """Raw parameters of Gaussians, as the layout of 3DGS stores them, with B in {0, 3, 8, 15} bands of view-dependent colour."""
 
     means: Float[Tensor, "N 3"]
     sh0: Float[Tensor, "N 1 3"]
@@ -69,7 +69,7 @@ class GaussianPly:
 
 
 def write_gaussians(path: Path | str, g: GaussianPly) -> None:
-    """Binary little-endian, atomically; a ValueError where a number is not finite."""
+    """Write Gaussians, binary little-endian, atomically; a ValueError if a number is not finite."""
     rest = g.shN.transpose(1, 2).reshape(len(g), g.shN.shape[1] * 3)  # channel-major
     groups = (
         (_XYZ, g.means), (_NORMAL, torch.zeros_like(g.means)), (_DC, g.sh0[:, 0]), (_rest_names(rest.shape[1]), rest),
@@ -104,8 +104,8 @@ def read_gaussians(path: Path | str) -> GaussianPly:
 
 
 def write_points(path: Path | str, means: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"]) -> None:
-    """Positions, normals of 0, and colours (RGB in [0, 1]) of 8 bits: the layout of 3DGS' points3D.ply. Binary little-endian,
-    atomically; a ValueError for what no file should hold.
+    """Write points in the layout of 3DGS' points3D.ply: positions, normals of 0, and colours (RGB in [0, 1]) as 8 bits. Binary
+    little-endian, atomically; a ValueError for a wrong shape, a colour out of range or a number that is not finite.
     """
     n = len(means)
     if tuple(means.shape) != (n, 3) or tuple(colors.shape) != (n, 3):
@@ -118,7 +118,7 @@ def write_points(path: Path | str, means: Float[Tensor, "N 3"], colors: Float[Te
 
 
 def _write(path: Path, groups: Sequence[tuple[Sequence[str], Tensor]], comments: Sequence[str] = ()) -> None:
-    """The vertices' properties, floats and bytes, each group with its values [N, C]."""
+    """Write vertices with groups of properties: the names of C properties, and their values [N, C], floats or bytes."""
     columns = {
         name: (values[:, k].detach().cpu().numpy(), "uchar" if values.dtype == torch.uint8 else "float")
         for names, values in groups for k, name in enumerate(names)
@@ -158,7 +158,7 @@ def _rest_names(count: int) -> tuple[str, ...]:
 
 
 def _rgb(path: Path, table: np.ndarray) -> Float[Tensor, "N 3"]:
-    """Colours in [0, 1]; the full range of 8-bit or 16-bit unsigned integers is mapped to it."""
+    """Colours in [0, 1], to which the full range of 8-bit or 16-bit unsigned integers is mapped."""
     colors = _columns(path, table, _RGB)
     kinds = {table.dtype[name].str[1:] for name in _RGB}
     if kinds <= {"u1"} or kinds <= {"u2"}:
@@ -172,19 +172,21 @@ def _rgb(path: Path, table: np.ndarray) -> Float[Tensor, "N 3"]:
 
 
 def _read_vertices(path: Path) -> tuple[np.ndarray, str]:
-    """The vertex element, the first of the file, as a structured array, and the header."""
+    """Read the vertices, which must be the file's first element, as a structured array; also returns the header."""
     data = read_bytes(path)
     header, start = _split_header(path, data[:_LONGEST_HEADER])
-    form, count, row, alone = _parsed(path, header)
+    form, count, row, alone = _parse_header(path, header)
     dtype = np.dtype(row).newbyteorder(_BYTE_ORDERS[form])
-    lines = [line for line in data[start:].decode("latin-1").splitlines() if line.strip()] if form == "ascii" else None
-    needed, left, unit = (
-        (count * dtype.itemsize, len(data) - start, "bytes") if lines is None else (count, len(lines), "rows")
-    )
+    lines: list[str] = []
+    if form == "ascii":
+        lines = [line for line in data[start:].decode("latin-1").splitlines() if line.strip()]
+        needed, left, unit = count, len(lines), "rows"
+    else:
+        needed, left, unit = count * dtype.itemsize, len(data) - start, "bytes"
     if needed > left or (needed < left and alone):
         problem = f"has a count of {count}, which needs {needed} {unit}, but {left} follow"
         raise DataError(path, "element vertex", problem, "the file is truncated or damaged; write it again")
-    if lines is None:
+    if form != "ascii":
         return np.frombuffer(data, dtype, count, start), header
     try:
         with warnings.catch_warnings():
@@ -196,7 +198,7 @@ def _read_vertices(path: Path) -> tuple[np.ndarray, str]:
 
 
 def _split_header(path: Path, head: bytes) -> tuple[str, int]:
-    """The lines between `ply` and `end_header`, and the offset behind them."""
+    """Return the lines between `ply` and `end_header`, and the offset of the data."""
     if not (first := re.match(rb"(?:\xef\xbb\xbf)?\s*ply\s*\n", head)):
         raise DataError(path, "header", "does not begin with a line `ply`", "give a .ply file")
     if not (last := re.search(rb"^[ \t]*end_header[ \t\r]*\n", head, re.MULTILINE)):
@@ -205,8 +207,8 @@ def _split_header(path: Path, head: bytes) -> tuple[str, int]:
     return head[first.end() : last.start()].decode("latin-1"), last.end()
 
 
-def _parsed(path: Path, header: str) -> tuple[str, int, list[tuple[str, str]], bool]:
-    """The format, the number of vertices, the name and type of each of their properties, and whether nothing follows them."""
+def _parse_header(path: Path, header: str) -> tuple[str, int, list[tuple[str, str]], bool]:
+    """Return the format, the number of vertices, the name and type of their properties, and True if no element follows."""
     if "packed_position" in header:
         remedy = f"convert it: splat-transform {path.name} {path.name.removesuffix('.ply').removesuffix('.compressed')}-plain.ply"
         raise DataError(path, "format", "is SuperSplat's compressed PLY, which is not read", remedy)
@@ -238,7 +240,7 @@ def _names_of(table: np.ndarray) -> tuple[str, ...]:
 def _columns(
     path: Path, table: np.ndarray, names: Sequence[str], *, infinite: tuple[float, float] = (-math.inf, math.inf)
 ) -> Float[Tensor, "N C"]:
-    """Properties as float32; each must exist and be finite, unless `infinite` has what stands for -inf and inf."""
+    """Return properties as float32. They must exist and be finite, or `infinite` gives the numbers that replace -inf and inf."""
     missing = [name for name in names if name not in _names_of(table)]
     if missing:
         problem = f"is missing from the vertices, which have {', '.join(_names_of(table))}"

@@ -1,4 +1,4 @@
-"""Poses as files give them: camera-to-world matrices and rotations, checked, to world-to-camera."""
+"""Conversion of the poses in files, camera-to-world matrices and rotations, to world-to-camera, with checks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _Rows = Annotated[
 
 
 def pose_from_opengl(file: Path, where: str, matrix: object) -> Float[Tensor, "4 4"]:
-    """World-to-camera (OpenCV axes) from a camera-to-world matrix with OpenGL axes (x right, y up, z back)."""
+    """Convert a camera-to-world matrix with OpenGL axes (x right, y up, z back) to world-to-camera with OpenCV axes."""
     remedy = "write camera-to-world matrices: a rotation, a translation, last row 0 0 0 1"
     try:
         rows = np.array(msgspec.convert(matrix, _Rows))
@@ -35,7 +35,9 @@ def pose_from_opengl(file: Path, where: str, matrix: object) -> Float[Tensor, "4
 
 
 def rigid_inverse(file: Path, where: str, rotation: np.ndarray, center: np.ndarray) -> Float[Tensor, "4 4"]:
-    """World-to-camera from a camera's axes (columns), which are orthonormal and right-handed within 1e-3, and centre."""
+    """World-to-camera of a camera with these axes (columns) and centre; a DataError unless the axes are orthonormal and
+    right-handed within 1e-3.
+    """
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or abs(np.linalg.det(rotation) - 1) > 1e-3:
         problem = f"holds no rotation (determinant {np.linalg.det(rotation):.4g})"
         raise DataError(file, where, problem, "remove scale and reflection from the camera-to-world matrices")

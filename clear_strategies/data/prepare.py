@@ -1,4 +1,4 @@
-"""From a capture to a scene: the views' LR photos, SR images and truth, and the initial points.
+"""Preparation of a scene from a capture: the views' LR photos, SR images and true HR images, and the initial points.
 
 Every choice made here changes published numbers, so each has a line in the scene's notes (`scene_notes.py`).
 """
@@ -39,12 +39,13 @@ from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
-_READERS: Final = 4  # photos read at once, at most: each is held at its full size meanwhile
-_WHOLE: Final = 0.99  # of a pixel's mask, for the pixel to be shown
+_READERS: Final = 4  # photos read at once, at most, since each is held at its full size meanwhile
+_WHOLE: Final = 0.99  # least share of a pixel that the mask shows, for the pixel to be shown
 _SAME_EXPOSURE: Final = 0.01  # photos whose gains are closer to 1 stay as they are
-_ONE_PLACE: Final = 1e-6  # distances of the cameras, in that to the origin: as files round positions
-_NO_STEP: Final = 1e-3  # the same in that to the points: less than two pixels of a photo of 2,000
-_BLURRED: Final = 3e-4  # rounding of positions, in distances of the cameras, that is a visible part of an HR pixel
+# Radius of the cameras' positions around their mean …
+_ONE_PLACE: Final = 1e-6  # … over their distance from the origin, up to which rounding in files explains it
+_NO_STEP: Final = 1e-3  # … over that of the points, up to which parallax is less than two pixels of a photo of 2,000
+_BLURRED: Final = 3e-4  # rounding of positions over that radius, from which it is a visible part of an HR pixel
 
 
 def prepare(
@@ -52,13 +53,16 @@ def prepare(
 ) -> Scene:  # fmt: skip
     """Split the frames, make LR and HR of each view, and make the initial points.
 
-    What the headers of the photos show is checked before any photo is decoded; a DataError says what the capture cannot give.
+    The headers of the photos are checked before any photo is decoded.
+
+    Raises:
+        DataError: the capture cannot be prepared with these settings.
     """
     train_frames, test_frames = split(capture, views)
     frames = [*train_frames, *(replace(frame, transparency=None) for frame in test_frames)]  # only training needs it
-    maker = _Views(capture, views, prior, check_headers(frames, views))
+    maker = _ViewMaker(capture, views, prior, check_headers(frames, views))
     require_source(cloud, capture.points)
-    _check_places(capture, [frame.camera for frame in train_frames], cloud)
+    _check_positions(capture, [frame.camera for frame in train_frames], cloud)
     progress = Progress("photos and their SR images", "photos", len(frames))
     made, work_log = list[View](), WorkLog() if work_log is None else work_log
     with work_log.stage("photos and SR images"):
@@ -114,14 +118,14 @@ def save_lr(scene: Scene, folder: Path) -> None:
 
 
 def photos_of(frames: Sequence[Frame], views: ViewSettings) -> Iterator[Photo]:
-    """The photos of these frames in order, at HR size, or with photos_are=lr at LR size. A few are read at once."""
+    """Load the photos of these frames in order, a few at a time, at HR size, or with photos_are=lr at LR size."""
     with ThreadPoolExecutor(min(torch.get_num_threads(), _READERS)) as pool:
         yield from pool.map(partial(_reduced, views=views), frames)
     forget_maps()
 
 
 def at_hr(capture: Capture, views: ViewSettings) -> Capture:
-    """The capture with photos that load as `photos_of` gives them, for priors that use the truth."""
+    """The capture with photos that load at the size of `photos_of`, for priors that use the truth."""
 
     def pixels(frame: Frame) -> Float[Tensor, "H W 3"]:
         return _reduced(replace(frame, shown=None, transparency=None), views).image
@@ -130,8 +134,8 @@ def at_hr(capture: Capture, views: ViewSettings) -> Capture:
 
 
 @dataclass(frozen=True, slots=True)
-class _Views:
-    """What makes the views of a capture; photos as `photos_of` gives them."""
+class _ViewMaker:
+    """Makes the views of a capture from photos that `photos_of` loads."""
 
     capture: Capture
     settings: ViewSettings
@@ -139,10 +143,11 @@ class _Views:
     lr_files: Mapping[str, Path]
 
     def view(self, frame: Frame, photo: Photo, *, required: bool) -> View:
-        """The view of a frame. Unless it is `required`, bicubic replaces an SR image that the prior lacks."""
+        """The view of a frame. If the prior has no SR image, bicubic replaces it, or a `required` view is a DataError."""
         lr, factor, prior = self.lr(frame, photo), self.settings.sr_scale, self.prior
         hr_camera, truth = (photo.camera.scaled(factor), None) if lr is photo else (photo.camera, photo.image)
-        hr, source, disagreement = replace(photo, shown=None), "the photos themselves", None
+        hr = replace(photo, shown=None)
+        source, disagreement = "the photos themselves", None
         if self.settings.photos_are != "both":
             try:
                 sr = super_resolved(prior, frame.name, lr.image, factor)
@@ -166,7 +171,7 @@ class _Views:
         camera = camera.scaled(1 / factor)
         if frame.name not in self.lr_files:
             down = partial(images.downsample, factor=factor, kernel=self.settings.downsample)
-            return Photo(camera, down(photo.image), transparency=_of_layer(down, photo.transparency))
+            return Photo(camera, down(photo.image), transparency=_resized_layer(down, photo.transparency))
         file = self.lr_files[frame.name]
         image = read_image(file, background=self.capture.background, expect=(camera.width, camera.height))
         check = f"{file} shows this view, undistorted as data.save_lr writes it"
@@ -174,21 +179,21 @@ class _Views:
         return Photo(camera, image)
 
     def enlarged(self, transparency: Float[Tensor, "h w"] | None, name: str) -> Float[Tensor, "H W"] | None:
-        """Transparency at HR, by the prior's network; by bicubic where there is no network, or every pixel is opaque."""
+        """Enlarge transparency to HR, by the prior's network; by bicubic without a network, or if every pixel is opaque."""
         transparent = transparency is not None and bool(transparency.any())
         enlarge = (kept_network_of(self.prior) if transparent else None) or Bicubic()
-        return _of_layer(lambda image: enlarge(name, image, self.settings.sr_scale), transparency)
+        return _resized_layer(lambda image: enlarge(name, image, self.settings.sr_scale), transparency)
 
 
-def _of_layer(
+def _resized_layer(
     resize: Callable[[Float[Tensor, "H W 3"]], Float[Tensor, "h w 3"]], layer: Float[Tensor, "H W"] | None
 ) -> Float[Tensor, "h w"] | None:
-    """A layer of one channel, resized as an image of three equal channels; None for None."""
+    """Resize one channel as an image of three equal channels; None for None."""
     return None if layer is None else resize(layer[..., None].expand(-1, -1, 3).contiguous()).mean(dim=2)
 
 
 def _equalized(train: Sequence[View]) -> tuple[tuple[View, ...], dict[str, str]]:
-    """The views at their common exposure, and a line for the plan."""
+    """Bring the views to a common exposure; also returns a line for the plan."""
     depths = [view.depth for view in train if view.depth is not None]
     if len(depths) < len(train):
         why = "there is no depth that tells what the photos share. Set data.cloud.init=stereo."
@@ -203,7 +208,7 @@ def _equalized(train: Sequence[View]) -> tuple[tuple[View, ...], dict[str, str]]
 
 
 def _reduced(frame: Frame, views: ViewSettings) -> Photo:
-    """The photo at the size that `views` asks for, with its transparency and its mask. A pixel is shown if its whole area is."""
+    """Load a photo with its transparency and its mask, at the size of `photos_of`. A pixel is shown if its whole area is."""
     image, camera = frame.load(), frame.camera
     if image.shape[:2] != (camera.height, camera.width):
         problem = f"is {image.shape[1]}x{image.shape[0]}, but its camera is for {size_of(camera)}"
@@ -213,14 +218,14 @@ def _reduced(frame: Frame, views: ViewSettings) -> Photo:
         layer = images.resize(layer, (image.shape[1], image.shape[0]), "area")  # `within_limit` reduces only the photo
         return _sized(layer, camera, views).image
 
-    through = None if frame.transparency is None else _of_layer(sized, frame.transparency())
-    shown = None if frame.shown is None else _of_layer(sized, frame.shown().float())
+    through = None if frame.transparency is None else _resized_layer(sized, frame.transparency())
+    shown = None if frame.shown is None else _resized_layer(sized, frame.shown().float())
     photo = replace(_sized(image, camera, views), transparency=through)
     return photo if shown is None else replace(photo, shown=shown > _WHOLE)
 
 
 def _sized(image: Tensor, camera: Camera, views: ViewSettings) -> Photo:
-    """The photo reduced by `shrink`, with sizes that are whole at both scales; see `ViewSettings.sizes`."""
+    """Reduce the photo by `shrink`, to a size that is whole at both scales, see `ViewSettings.sizes`."""
     multiple = 1 if views.photos_are == "lr" else views.sr_scale
     if views.sizes == "round":
         width, height = (multiple * size for size in lr_size(camera, views))
@@ -231,9 +236,9 @@ def _sized(image: Tensor, camera: Camera, views: ViewSettings) -> Photo:
     return Photo(camera.scaled(1 / views.shrink), images.downsample(image, views.shrink, views.downsample))
 
 
-def _check_places(capture: Capture, cameras: Sequence[Camera], cloud: CloudSettings) -> None:
-    """Refuse photos from one place, whose depth nothing tells but a file of points, and warn where float32 cannot place
-    Gaussians to a part of a pixel, as in a capture with geographic coordinates.
+def _check_positions(capture: Capture, cameras: Sequence[Camera], cloud: CloudSettings) -> None:
+    """Raise a DataError if all photos are from one place, since depth is then unknown, unless a file gives the points. Warn if
+    float32 cannot resolve positions to a fraction of a pixel, as with geographic coordinates.
     """
     centers = centers_of(cameras)
     middle = centers.mean(0)
@@ -254,7 +259,7 @@ def _check_places(capture: Capture, cameras: Sequence[Camera], cloud: CloudSetti
 
 
 def _warn_if_equal(train: Sequence[View]) -> None:
-    """Warn of photos that are all the same, as of one that was copied or a lens cap: their poses may be right, depth is not."""
+    """Warn if all photos are equal, as copies or photos of a lens cap: their poses may be right, but depth cannot be found."""
     first, *others = (view.lr.image for view in train)
     if others and all(torch.equal(first, image) for image in others):
         _log.warning(

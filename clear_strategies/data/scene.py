@@ -1,5 +1,5 @@
-"""The input of training: views at two scales, the initial points, and notes on where each came from. Whether masks and alpha
-leave anything to train on is checked here, for other trainers, too.
+"""The input of training: views at two scales, the initial points, and notes on their origin. `require_shown` checks that masks
+and alpha leave pixels to train on, for other trainers, too.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
-_NOTHING: Final = 1e-3  # of a photo's pixels: one that shows fewer teaches nothing
+_NOTHING: Final = 1e-3  # share of a photo's pixels; a photo that shows fewer is not used
 _NEARLY_ALL: Final = 0.9  # of the photos
-_FAINT: Final = 0.02  # alpha of a pixel that counts as transparent: 1 of 255 does, as in an alpha of 0 and 1
-_LITTLE: Final = 0.1  # of all pixels: less is more often a mask upside down than what was meant
+_FAINT: Final = 0.02  # alpha up to which a pixel counts as transparent; includes 1 of 255, as in an alpha of 0 and 1
+_LITTLE: Final = 0.1  # share of all pixels; masks that show less are probably inverted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,9 +31,9 @@ class Scene:
     """The input of a run.
 
     Args:
-        background: behind the Gaussians.
+        background: the colour behind the Gaussians.
         synthetic_prior: the SR images contain seeded errors, or the truth (the demo); reports mark such runs.
-        notes: label -> fact, as the plan prints and the provenance keeps them.
+        notes: label -> fact, for the printed plan and the provenance.
         unplaced: see `Capture.unplaced`; such photos are not used.
         work_log: how long the views and the initial points took.
     """
@@ -59,10 +59,12 @@ class Scene:
 
 
 def require_shown(views: Sequence[View]) -> None:
-    """Warn of photos whose mask or alpha leaves nothing to train on, and of masks that leave little of all photos; a DataError
-    where nothing is left of nearly all photos.
+    """Warn of photos that masks or alpha hide completely, and of masks that hide most pixels of all photos.
+
+    Raises:
+        DataError: nearly all photos are hidden completely.
     """
-    shown = {view.name: _shown(view.lr) for view in views}
+    shown = {view.name: _shown_share(view.lr) for view in views}
     empty = [name for name, share in shown.items() if share < _NOTHING]
     why = "their masks hide every pixel, or their alpha is 0"
     if len(empty) > _NEARLY_ALL * len(views):
@@ -79,7 +81,7 @@ def require_shown(views: Sequence[View]) -> None:
         _log.warning(message, 100 * (1 - sum(masked) / len(masked)), len(masked))
 
 
-def _shown(photo: Photo) -> float:
+def _shown_share(photo: Photo) -> float:
     """The share of its pixels that a photo shows."""
     shown = torch.ones(photo.image.shape[:2], dtype=torch.bool) if photo.shown is None else photo.shown.cpu()
     if photo.transparency is not None:

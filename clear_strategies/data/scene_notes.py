@@ -33,10 +33,11 @@ def scene_notes(
     points: PointCloud,
     exposure: Mapping[str, str],
 ) -> dict[str, str]:
-    """The notes of a scene, in the order of the plan; `photo`: the camera of the first training photo, as the capture has it."""
+    """The notes of a scene, in the order of the plan; `photo`: the camera of the first training photo in the capture."""
     sample, sr = train[0], views.photos_are != "both"
     others = " and other sizes" if len({size_of(view.lr.camera) for view in train}) > 1 else ""
-    network, unused = network_of(prior) if sr else None, len(capture.frames) - len(train) - len(test)
+    network = network_of(prior) if sr else None
+    unused = len(capture.frames) - len(train) - len(test)
     none = f"none{'' if unused else ': all are trained on'} (data.views.test_every=8 keeps every 8th for testing)"
     return {
         "scene": f"{capture.name}, {counted(len(capture.frames), 'photo')}",
@@ -105,6 +106,6 @@ def _added_detail(views: Sequence[View]) -> float:
 
 
 def _grey_levels(differences: Iterable[Tensor]) -> float:
-    """The mean over images of their mean difference, in grey levels of 255. Of many photos one difference at a time is held."""
+    """The mean over images of their mean difference, in grey levels of 255. A generator keeps one difference in memory."""
     means = [float(difference.mean()) for difference in differences]
     return 255 * sum(means) / len(means)

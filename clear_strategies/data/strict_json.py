@@ -1,4 +1,4 @@
-"""JSON files, checked against msgspec types, which ignore keys that they do not have: `typed(path, read_object(path), Run)`.
+"""JSON files, validated against msgspec types, which ignore unknown keys: `typed(path, read_object(path), Run)`.
 
 A file is data: a configuration that is read from one passes `plain_settings`, and nothing that it names is imported or called.
 """
@@ -26,7 +26,7 @@ _T = TypeVar("_T")
 
 
 def read(path: Path) -> Any:
-    """The content of a file; a DataError where it is no JSON, which has neither NaN nor numbers beyond a float."""
+    """Parse a file; a DataError if it is not valid JSON, as with NaN or a number beyond the range of a float."""
     try:
         data = read_bytes(path, most=_LARGEST)
         text = data.decode(json.detect_encoding(data))  # some editors write a byte order mark, or UTF-16
@@ -38,7 +38,7 @@ def read(path: Path) -> Any:
 
 
 def read_object(path: Path) -> dict[str, Any]:
-    """The JSON object in a file."""
+    """Parse a file that contains a JSON object."""
     value = read(path)
     if not isinstance(value, dict):
         raise DataError(path, "json", f"is a {type(value).__name__}, not an object", "give another file")
@@ -48,8 +48,10 @@ def read_object(path: Path) -> dict[str, Any]:
 def typed(
     path: Path, content: Any, kind: Callable[..., _T], *, where: str = "", remedy: str = "correct the field"
 ) -> _T:
-    """The content, which lies at `where` in the file, as `kind`: a struct, or a list or dict of such. A DataError tells where
-    a value has another type, e.g. at `frames[1].fl_x`.
+    """Convert content, which stands at `where` in the file, to `kind`: a struct, or a list or dict of structs.
+
+    Raises:
+        DataError: a value has another type; the field is named as in `frames[1].fl_x`.
     """
     try:
         value: _T = msgspec.convert(content, kind)
@@ -63,10 +65,10 @@ def typed(
 
 
 def plain_settings(path: Path, config: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration of a run as its files hold it: numbers, text, true, false, null and lists of these, by dotted keys.
+    """Check a run's configuration from a file: numbers, text, true, false, null and lists of these, by dotted keys.
 
-    A table is refused, since `clear_strategies.settings.build` would call what its `_target_` names. Who builds an object of
-    these values chooses the class from what is installed here, or from the user's own command, and never from the file.
+    A table is refused, since `clear_strategies.settings.build` would call what its `_target_` names. Code that builds an object
+    from these values takes the class from an installed package or from the user's command, never from the file.
 
     Raises:
         DataError: a value is or holds a table.

@@ -1,4 +1,4 @@
-"""The names of views, and of the files that belong to them. Photos in different folders may have the same file name."""
+"""Names of views and of their files. Photos in different folders may have the same file name."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def bare(name: str) -> str:
 
 
 def file_stems(names: Iterable[str]) -> dict[str, str]:
-    """The stems of the views' files in a flat folder, by the views' names: "cam1_0001" of "cam1/0001.png". Views that would have
-    the same, on a disk that ignores the case of letters too, keep their endings: "0000.jpg" and "0000.png".
+    """Unique file stems for a flat folder, by the views' names: "cam1_0001" for "cam1/0001.png". Views whose stems would be equal
+    without regard to case keep their suffixes: "0000.jpg" and "0000.png".
     """
     stems = {name: bare(name).replace("/", "_") for name in names}
     shared, taken = Counter(map(alike, stems.values())), set[str]()
@@ -38,20 +38,20 @@ def file_stems(names: Iterable[str]) -> dict[str, str]:
 
 
 def matching(names: Sequence[str], wanted: str) -> list[str]:
-    """The names that are `wanted`, with or without suffix; if there is none, those whose file name is."""
+    """The names that equal `wanted`, with or without suffix; if there is none, those whose file name equals it."""
     wanted = normalized(wanted)
 
     def is_wanted(name: str) -> bool:
         return wanted in (name, bare(name)) or name == bare(wanted)  # the names of a Blender scene have no suffix
 
-    return list(filter(is_wanted, names)) or [name for name in names if is_wanted(_file(name))]
+    return list(filter(is_wanted, names)) or [name for name in names if is_wanted(_file_name(name))]
 
 
 def write_pngs(folder: Path, images: Iterable[tuple[str, Float[Tensor, "h w 3"]]]) -> int:
     """Write images by their views' names, and return how many. `ViewFiles` finds files of the same names.
 
     Raises:
-        DataError: a name is that of two views, or of a file that is there and holds another image, such as the photo itself.
+        DataError: two views have the same name, or a file of that name contains another image, such as the photo itself.
     """
     written = dict[str, str]()
     for name, image in images:
@@ -79,22 +79,22 @@ class ViewFiles:
     _listed: dict[Path, dict[str, list[Path]]] = field(default_factory=dict, init=False)
 
     def file(self, name: str, width: int, height: int) -> Path:
-        """The image of the view; a DataError where it has none or several, one of another view, or of another size."""
+        """Find the image of the view; a DataError if there is none or several, it has another size or is that of another view."""
         name = normalized(name)
         view = bare(name)
         below = named(self.folder, view.rpartition("/")[0])
         folder = below if below.is_dir() else self.folder
-        stem, whole = _file(view) + self.suffix, _file(name) + self.suffix
+        stem, whole = _file_name(view) + self.suffix, _file_name(name) + self.suffix
         if self._listed.get(folder, {}).keys().isdisjoint((stem, whole)):
             self._listed[folder] = {}
             for path in list_images(folder):
                 self._listed[folder].setdefault(normalized(path.stem), []).append(path)
         files = self._listed[folder].get(whole) or self._listed[folder].get(stem, [])
         if not files:
-            raise DataError(folder, _file(view), f"has no {self.what} {stem} ({', '.join(SUFFIXES)})", self.remedy)
+            raise DataError(folder, _file_name(view), f"has no {self.what} {stem} ({', '.join(SUFFIXES)})", self.remedy)
         if len(files) > 1:
             twins = " and ".join(file.name for file in files)
-            raise DataError(folder, _file(view), f"has {twins} for one view", "keep one of them")
+            raise DataError(folder, _file_name(view), f"has {twins} for one view", "keep one of them")
         if (other := self._view_of.setdefault(files[0], name)) != name:
             problem = f"would be that of two views, {other} and {name}"
             remedy = f"put the {self.what}s into subfolders like those of the photos"
@@ -105,5 +105,5 @@ class ViewFiles:
         return files[0]
 
 
-def _file(name: str) -> str:
+def _file_name(name: str) -> str:
     return name.rpartition("/")[2]

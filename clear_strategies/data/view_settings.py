@@ -1,4 +1,4 @@
-"""Which views of a capture train and test, and at which sizes."""
+"""Selection of a capture's training and test views, and of the sizes of their images."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _TWICE: Final = 2
 
 @dataclass(frozen=True, slots=True)
 class ViewSettings:
-    """Which views, at which sizes.
+    """Selection of training and test views, and of image sizes.
 
     Args:
         train: the number of training views, evenly spaced among those that are not for testing; None: all of them.
@@ -123,7 +123,7 @@ def lr_size(camera: Camera, views: ViewSettings) -> tuple[int, int]:
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:
-    """The same rays through width × height pixels, each axis scaled by its own ratio."""
+    """Rescale a camera to width × height pixels, each axis by its own ratio."""
     x, y = width / camera.width, height / camera.height
     return replace(
         camera, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y, width=width, height=height
@@ -131,7 +131,7 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
 
 
 def _only(capture: Capture, names: Sequence[str], wanted: str) -> str:
-    """The name of the only view that `wanted`, a name in `train_names`, matches."""
+    """The only name that matches `wanted`, of `train_names`; a DataError if there is none or several."""
     match matching(names, wanted):
         case [match]:
             return match
@@ -166,7 +166,7 @@ def within_limit(
     megapixels beside 48.
 
     Args:
-        reaches: whether the prior can enlarge by a factor.
+        reaches: returns True if the prior can enlarge by a factor.
         super_resolve: the HR images must come from the prior, which the user has chosen by name.
     """
     limit, photo = views.max_hr_megapixels, _largest(capture)

@@ -73,7 +73,7 @@ def test_a_photo_of_too_many_pixels_is_read_as_their_means_and_its_size_is_that(
         whole = np.asarray(image.convert("RGB"), np.float32) / 255
     monkeypatch.setattr(photo_files, "_MAX_PIXELS", 100)
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 50)  # Pillow's own, which it refuses twice of
-    photo_files._factor.cache_clear()
+    photo_files._reduction_factor.cache_clear()
     caplog.set_level("INFO")
     for _ in range(2):
         found = photo_files.read_image(tmp_path / "a.png")
@@ -85,7 +85,7 @@ def test_a_photo_of_too_many_pixels_is_read_as_their_means_and_its_size_is_that(
     cv2.imwrite(str(tmp_path / "b.png"), pixels.astype(np.uint16))
     with pytest.raises(DataError, match=r"23x13 is more than 100 pixels: reduce it: mogrify -resize 50% .*b.png"):
         photo_files.image_size(tmp_path / "b.png")
-    photo_files._factor.cache_clear()
+    photo_files._reduction_factor.cache_clear()
 
 
 @pytest.mark.parametrize("ending", ENDINGS)

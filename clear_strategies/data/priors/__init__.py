@@ -1,4 +1,4 @@
-"""Priors: where the super-resolved (SR) image of each view comes from. One file per prior; `cache` keeps results."""
+"""Priors, which make the super-resolved (SR) image of each view. One file per prior; `cache` stores results."""
 
 from clear_strategies.data.priors.back_projected import BackProjected
 from clear_strategies.data.priors.cache import Cached, cache_folder, cached

@@ -1,4 +1,4 @@
-"""SR images that agree with their LR photos."""
+"""Back-projection of SR images, which makes them agree with their LR photos."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from clear_strategies.core.images import DownKernel
 from clear_strategies.data.priors.cache import cached
 from clear_strategies.data.priors.interface import Prior, SuperResolved, super_resolved
 
-_MOST_ROUNDS: Final = 100  # each leaves about half of the difference: after 30, float32 has nothing left to move
+_MOST_ROUNDS: Final = 100  # each about halves the difference, which is below float32's resolution after 30
 
 
 @dataclass(frozen=True, slots=True)
 class BackProjected:
-    """Another prior whose SR images are moved until they shrink to their LR photos (`images.back_projected`).
+    """Changes another prior's SR images until, reduced, they equal their LR photos (`images.back_projected`).
 
     An SR network invents detail, which may also change what its LR photo shows. Iterative back-projection (Irani and Peleg,
     1991) removes that part and keeps the rest.
@@ -50,7 +50,7 @@ class BackProjected:
         return self.super_resolved(name, lr, factor).image
 
     def super_resolved(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> SuperResolved:
-        """The SR image, and how far the prior's own image was from the LR photo."""
+        """The SR image, and the difference of the prior's own image, reduced, from the LR photo."""
         sr = super_resolved(self.prior, name, lr, factor).image.to(lr)  # a function may have made it on a GPU
         disagreement = (images.downsample(sr, factor, self.down) - lr).abs()
         moved = images.back_projected(sr, lr, factor, self.rounds, self.down)

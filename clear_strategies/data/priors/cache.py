@@ -1,4 +1,4 @@
-"""SR images of networks, kept on the disk by content."""
+"""A disk cache of the SR images of networks, by content."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ _log = logging.getLogger(__name__)
 
 
 def cache_folder() -> Path:
-    """Where results are kept that can be computed again: $CLEAR_CACHE, else ~/.cache/clear-strategies."""
+    """The folder of all caches: $CLEAR_CACHE, else ~/.cache/clear-strategies."""
     return Path(os.environ.get("CLEAR_CACHE") or Path.home() / ".cache" / "clear-strategies").expanduser()
 
 
 def cached(prior: Prior) -> Prior:
-    """The prior with a cache where it is a network, else the prior itself."""
+    """Wrap a network in a cache; any other prior is returned unchanged."""
     return Cached(prior) if isinstance(prior, Network) else prior
 
 
 def kept_network_of(prior: object) -> Prior | None:
-    """The network behind a prior, as `network_of` finds it, in its cache where it has one."""
+    """The network that a prior is or decorates, as of `network_of`, but with its cache if it has one."""
     return next((inner for inner in layers(prior) if isinstance(inner, Network | Cached)), None)
 
 
 @dataclass(frozen=True, slots=True)
 class Cached:
-    """A network whose results are kept, by LR image, factor, the model's bytes and its settings.
+    """Caches a network's results by LR image, factor, the bytes of the model and its settings.
 
     Args:
         folder: of the results, PNG files; the default is ~/.cache/clear-strategies/sr, or $CLEAR_CACHE/sr.
@@ -60,7 +60,7 @@ class Cached:
             else:
                 _log.debug("%s: SR image from the cache (%s).", name, self.label)
                 return result
-        result = images.quantize(self.prior(name, lr, factor)).contiguous()  # as read_image's: sums have an order
+        result = images.quantize(self.prior(name, lr, factor)).contiguous()  # as read_image's: strides order sums
         try:
             write_png(file, result)
         except OSError as error:  # without the cache the run is slower, not wrong
@@ -68,7 +68,7 @@ class Cached:
         return result
 
     def _key(self, lr: Float[Tensor, "h w 3"], factor: int) -> str:
-        """A hash without the model's path: a moved or linked model is the same model."""
+        """A hash of all inputs but the model's path, so that a moved or linked model has the same results."""
         settings = {f.name: getattr(self.prior, f.name) for f in fields(self.prior) if f.compare and f.name != "path"}  # type: ignore[arg-type]
         identity = (type(self.prior).__name__, settings, factor, tuple(lr.shape), str(lr.dtype))
         digest = hashlib.sha256(repr(identity).encode())

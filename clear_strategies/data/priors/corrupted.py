@@ -35,8 +35,8 @@ class SeededErrors:
         strength: of the errors, >= 0; 0: none.
         patch: edge of a patch, HR px; 64 is the patch of P2G's reliability.
         seed: of the errors; not the run's.
-        hidden: leave of the errors only what the LR photo cannot show: the wrong patches shrink to the same LR pixels as
-            the right ones would. No comparison with the photo finds them.
+        hidden: keep only the part of the errors that the LR photo cannot show: reduced, wrong patches equal right ones, so
+            that no comparison with the photo finds them.
 
     Raises:
         SettingError: a number is outside its range.
@@ -87,7 +87,7 @@ class SeededErrors:
 
 @dataclass(frozen=True, slots=True)
 class Corrupted(SeededErrors):
-    """Another prior's SR images with seeded errors. Reports call it synthetic."""
+    """Adds seeded errors to another prior's SR images. Reports mark such runs as synthetic."""
 
     prior: Prior
 

@@ -1,4 +1,4 @@
-"""The interface of priors, which make the super-resolved (SR) image of each view; bicubic, and what priors share."""
+"""The interface of priors, which make the super-resolved (SR) image of each view; bicubic; and functions that priors share."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from clear_strategies.errors import DataError, SettingError
 _log = logging.getLogger(__name__)
 
 AS_EXPECTED: Final = "it shows this view, and is RGB in [0, 1]"
-"""What to check of an image at HR that is far from its LR image."""
+"""The advice that `warn_if_far_from_lr` gives by default."""
 _USUAL_DISTANCE: Final = 0.03  # mean |D(SR) - LR|; bicubic and the small networks stay near 0.01 on real photos
 
 
@@ -54,7 +54,7 @@ class SuperResolved(NamedTuple):
 
 
 def super_resolved(prior: Any, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> SuperResolved:
-    """The SR image that a prior, or any function with its arguments, makes; a DataError where it is none of `lr`."""
+    """Call a prior, or any function with its arguments; a DataError if the result is not an SR image of `lr`."""
     own = getattr(prior, "super_resolved", None)
     result: SuperResolved = own(name, lr, factor) if own else SuperResolved(prior(name, lr, factor))
     image, (h, w) = result.image, lr.shape[:2]
@@ -78,7 +78,7 @@ class Network(Prior, Protocol):
 
 
 def network_of(prior: object) -> Network | None:
-    """The network that a prior decorates or is; None if there is none."""
+    """The network that a prior is or decorates; None if there is none."""
     return next((inner for inner in layers(prior) if isinstance(inner, Network)), None)
 
 
@@ -108,7 +108,7 @@ def warn_if_far_from_lr(
     factor: int,
     check: str = AS_EXPECTED,
 ) -> None:
-    """Warn where the image at HR, reduced, differs from its LR image: it is of another view, BGR, or in [0, 255]."""
+    """Warn if the HR image, reduced, differs from its LR image, as an image of another view, in BGR, or in [0, 255] does."""
     distance = float((images.downsample(hr, factor, "area") - lr).abs().mean())
     if distance > _USUAL_DISTANCE:
         _log.warning(
@@ -120,7 +120,7 @@ def warn_if_far_from_lr(
 def compared(
     what: str, sr: Float[Tensor, "H W 3"], lr: Float[Tensor, "h w 3"], factor: int, check: str = AS_EXPECTED
 ) -> Float[Tensor, "H W 3"]:
-    """`sr` on 8-bit steps and the device of `lr`, after `warn_if_far_from_lr`."""
+    """Round `sr` to 8-bit steps, move it to the device of `lr`, and compare it by `warn_if_far_from_lr`."""
     result = images.quantize(sr).to(lr)
     warn_if_far_from_lr(f"{what}: the SR image", result, lr, factor, check)
     return result

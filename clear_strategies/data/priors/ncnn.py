@@ -24,7 +24,7 @@ from clear_strategies.errors import DataError, SettingError
 
 
 class _Model(NamedTuple):
-    """A network as its package has it."""
+    """A network, and the package that contains it."""
 
     package: str  # of the weights, as it is installed
     file: str  # name of the network's .param and .bin
@@ -34,7 +34,7 @@ class _Model(NamedTuple):
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The .param and the .bin; none where the package is not installed."""
+        """The .param and the .bin; empty if the package is not installed."""
         spec = find_spec(self.package.replace("-", "_"))
         if spec is None or not spec.submodule_search_locations:
             return ()
@@ -42,7 +42,7 @@ class _Model(NamedTuple):
         return (folder / f"{self.file}.param", folder / f"{self.file}.bin")
 
     def damaged(self, problem: str) -> DataError:
-        """What to raise where its files cannot be used."""
+        """The error to raise if its files cannot be used."""
         return DataError(self.files[1], "network", problem, f"pip install --force-reinstall {self.package}")
 
 
@@ -56,7 +56,7 @@ _MODELS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Ncnn:
-    """A network of the extra [sr].
+    """Super-resolution by a network of the extra [sr].
 
     "waifu2x" is trained to be close to the truth (Nagadomi's UpConv-7, photo model); x4 is x2 twice. "realesrgan" is a
     GAN (Wang et al. 2021, x4plus): its detail looks real, and is invented.
@@ -67,13 +67,13 @@ class Ncnn:
         overlap: see `tiling.tiled`, LR px. 11 and more make no difference to waifu2x.
 
     Raises:
-        SettingError: the model is another, the extra is not installed, or the tiles would be all overlap.
+        SettingError: the model is unknown, the extra is not installed, or the tiles would be all overlap.
     """
 
     model: str = "waifu2x"
     tile: int = 160
     overlap: int = 12
-    version: str = field(init=False)  # of ncnn: another one may round differently, so the cache must know it
+    version: str = field(init=False)  # of ncnn; part of the cache's key, since another version may round differently
 
     def __post_init__(self) -> None:
         require_choice("prior.model", self.model, _MODELS)
@@ -113,8 +113,8 @@ def factors(model: str) -> tuple[int, ...]:
 
 def missing_packages(model: str) -> list[str]:
     """The packages that a model needs and that are not installed, by their names for pip. Nothing is imported."""
-    package = _MODELS[model].package
-    return ["ncnn"] * (find_spec("ncnn") is None) + [package] * (not _MODELS[model].files)
+    installed = {"ncnn": find_spec("ncnn") is not None, _MODELS[model].package: bool(_MODELS[model].files)}
+    return [package for package, is_there in installed.items() if not is_there]
 
 
 def _read_network(model: _Model) -> Any:
@@ -123,7 +123,7 @@ def _read_network(model: _Model) -> Any:
     network = ncnn.Net()
     network.opt.use_vulkan_compute = False
     network.opt.num_threads = torch.get_num_threads()  # the bits are the same for any number
-    # ncnn's default on ARM, whose 11 bits are few for an image of 8.
+    # Half precision, ncnn's default on ARM, has 11 bits, too few for an image of 8.
     network.opt.use_fp16_packed = network.opt.use_fp16_storage = network.opt.use_fp16_arithmetic = False
     param, weights = map(str, model.files)
     if network.load_param(param) or network.load_model(weights):
@@ -132,7 +132,7 @@ def _read_network(model: _Model) -> Any:
 
 
 def _upscale(network: Any, model: _Model, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
-    """The network, applied as often as the factor asks for; what it makes of the padding is cut off each time."""
+    """Apply the network as many times as the factor needs; each time the input is padded, and the result cropped."""
     import ncnn
 
     image, edge = lr.permute(2, 0, 1).float().numpy(), (model.margin, model.margin)

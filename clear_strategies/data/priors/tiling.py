@@ -1,4 +1,4 @@
-"""Super-resolution in tiles, joined without seams, for images that a network cannot take at once."""
+"""Super-resolution in tiles, joined without seams, for images that do not fit into memory as a whole."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def require_tiles(tile: int, overlap: int) -> None:
 
 
 def _shares(size: int, tile: int, overlap: int) -> list[tuple[int, int]]:
-    """[0, size) in nearly equal intervals, short enough for `2 overlap` more pixels on both sides of each."""
+    """Split [0, size) into nearly equal intervals, short enough for `2 overlap` more pixels on both sides of each."""
     count = math.ceil(size / (tile - 4 * overlap)) if size > tile else 1
     ends = [size * i // count for i in range(count + 1)]
     return list(itertools.pairwise(ends))

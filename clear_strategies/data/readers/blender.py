@@ -22,7 +22,7 @@ _WHITE: Final = (1.0, 1.0, 1.0)
 
 
 def recognises(path: Path) -> int:
-    """The rank of `clear_strategies.commands.train.detect`."""
+    """The reader's rank for a path, see `clear_strategies.commands.train.detect`."""
     return 4 * named(path, _TRAIN).is_file()
 
 
@@ -52,7 +52,8 @@ def read(root: str | Path, *, background: Color = _WHITE, skip_faulty: bool = Fa
     listed = {}
     for file, split in splits.items():
         transforms = transforms_of(file, contents[file])
-        paths, prefix = [find(transform.file_path) for transform in transforms], "test/" * (split == "test")
+        paths = [find(transform.file_path) for transform in transforms]
+        prefix = "test/" if split == "test" else ""
         listed[file] = [
             Listed(transform, f"{prefix}{bare(name)}", path, split)
             for transform, name, path in zip(transforms, names_below(paths), paths, strict=True)

@@ -1,4 +1,4 @@
-"""A scene folder with COLMAP's sparse model and photos, as LLFF's scenes are, too."""
+"""Scene folders with a COLMAP sparse model and photos, such as LLFF's."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _UNEVEN: Final = 1e-6  # a quaternion's length may differ from 1 by this much wi
 
 
 def recognises(path: Path) -> int:
-    """The rank of `clear_strategies.commands.train.detect`."""
+    """The reader's rank for a path, see `clear_strategies.commands.train.detect`."""
     return 2 * any(map(is_model, model_folders(path)))
 
 
@@ -69,11 +69,13 @@ def capture(
     upright: bool | None = None,
     points: str = "",
 ) -> Capture:
-    """The capture of a model and its photos: `paths` by the model's names, below `folder`.
+    """Make the capture of a model and its photos.
 
     Args:
+        folder: the folder of the photos.
+        paths: the photos, below `folder`, by the model's names.
         upright: see `Frame.of_photo`.
-        points: where its points come from, for the plan; empty: from the model's own place.
+        points: the origin of the model's points, for the plan; empty: its folder.
 
     Raises:
         DataError: an image cannot be used.

@@ -38,8 +38,8 @@ _MODELS: Final = {  # by COLMAP's numbers, with their parameters; p and k are co
     "DIVISION": _TWO + "k", "SIMPLE_FISHEYE": _ONE, "FISHEYE": _TWO, "EUCM": _TWO + "alpha beta", "EQUIRECTANGULAR": "",
 }  # fmt: skip
 _LONGEST_NAME: Final = 4096
-_SAID: Final = re.compile(r"^# Number of \w+: (\d+)", re.MULTILINE)  # of a text file's header
-_NUMERIC: Final = "0123456789.+-eE \t"  # letters of a line of numbers
+_RECORD_COUNT: Final = re.compile(r"^# Number of \w+: (\d+)", re.MULTILINE)  # in a text file's header
+_NUMERIC: Final = "0123456789.+-eE \t"  # characters of a line of numbers
 
 _COUNT, _CAMERA, _IMAGE = map(struct.Struct, ("<Q", "<iiQQ", "<i7di"))
 _POINT: Final = struct.Struct("<Q3d3BdQ")  # id, position, colour, error, length of the track
@@ -80,7 +80,7 @@ class Points(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Model:
-    """The content of a sparse model's files; `listing` is that of the images, .bin or .txt."""
+    """The content of a sparse model's files; `listing` is the file of the images, .bin or .txt."""
 
     folder: Path
     listing: Path
@@ -90,7 +90,7 @@ class Model:
 
 
 def model_folders(root: Path) -> Iterator[Path]:
-    """Where a scene's model may lie: COLMAP's mapper numbers the models that it leaves in `sparse`."""
+    """Yield the folders that may contain a scene's model; COLMAP's mapper writes numbered models to `sparse`."""
     for sparse in (named(root, "sparse"), root / "colmap" / "sparse"):
         yield from sorted(sparse.glob("[0-9]*"), key=lambda folder: (len(folder.name), folder.name))
         yield sparse
@@ -102,15 +102,15 @@ def is_model(folder: Path) -> bool:
 
 
 def _files(folder: Path, ending: str | None = None) -> list[Path]:
-    """The files of cameras, images and points, RealityCapture's capital letters too; .txt where there is no .bin."""
+    """The files of cameras, images and points, also with RealityCapture's capital letters; .txt if there is no .bin."""
     if ending is None:
         ending = ".bin" if any(file.exists() for file in _files(folder, ".bin")) else ".txt"
     return [named(folder, f"{name}{ending}") for name in ("cameras", "images", "points3D")]
 
 
 def find_model(root: Path) -> Path:
-    """The folder of the sparse model; of several that lie in one folder, the one with most photos. A warning says which, unless
-    it is the only one, in sparse/0 or without a number.
+    """Find the folder of the sparse model; of several in one folder, that with most photos. A warning names it unless it is the
+    only one, and in sparse/0 or without a number.
 
     Raises:
         DataError: there is none, or one of several cannot be read.
@@ -139,8 +139,11 @@ def find_model(root: Path) -> Path:
 
 
 def read_model(folder: Path) -> Model:
-    """Images of a model folder, the cameras that they use, and points; a DataError where a file is missing or not what it should
-    be. What the tracks say of images that are not listed, as after photos were removed, is left out with a warning.
+    """Read a model folder: the images, the cameras that they use, and the points. Entries of tracks that refer to images that are
+    not listed, as after photos were removed, are left out with a warning.
+
+    Raises:
+        DataError: a file is missing or invalid.
     """
     cameras, listing, points3d = _files(folder)
     images = read_images(listing)
@@ -160,12 +163,12 @@ def read_model(folder: Path) -> Model:
 
 
 def read_cameras(path: Path, used: Set[int] | None = None) -> dict[int, Lens]:
-    """The lens of each camera that is `used`, None: of all, by its id; the DataErrors of `read_model`. No other is checked."""
+    """Read the lenses of the cameras in `used`, None: of all, by id; others are not checked. Errors as of `read_model`."""
     return _by_id(path, _binary_cameras(path, used) if path.suffix == ".bin" else _text_cameras(path, used))
 
 
 def read_images(path: Path) -> list[Image]:
-    """The registered images of a file, in its order; the DataErrors of `read_model`."""
+    """Read the registered images, in the file's order; errors as of `read_model`."""
     records = _binary_images(path) if path.suffix == ".bin" else _text_images(path)
     images = _by_id(path, ((image.id, image) for image in records))
     for image in images.values():
@@ -179,7 +182,7 @@ def read_images(path: Path) -> list[Image]:
 
 
 def read_points(path: Path) -> Points:
-    """The points with their tracks; none where there is no file."""
+    """Read the points with their tracks; empty if the file does not exist."""
     records: list[_Point] = []
     if path.exists():
         records = list(_binary_points(path) if path.suffix == ".bin" else _text_points(path))
@@ -221,13 +224,13 @@ def _damaged(path: Path, where: str, problem: str) -> DataError:
 
 
 class _Bytes:
-    """A file's bytes, read from front to back; a DataError where fewer are left than a field needs."""
+    """A sequential reader of a file's bytes; a DataError if fewer are left than a field needs."""
 
     def __init__(self, path: Path) -> None:
         self.data, self.path, self.at = read_bytes(path), path, 0
 
     def skip(self, size: int, field: str) -> int:
-        """The place of the next `size` bytes."""
+        """Skip `size` bytes, and return their offset."""
         start, left = self.at, len(self.data) - self.at
         if size > left:
             raise _damaged(self.path, field, f"needs {size} bytes, {left} are left: truncated")
@@ -259,7 +262,8 @@ def _binary_cameras(path: Path, used: Set[int] | None) -> Iterator[tuple[int, Le
     file = _Bytes(path)
     for i in range(file.count("number of cameras")):
         number, kind, width, height = file.take(_CAMERA, f"camera {i}")
-        where, model = f"camera {number}", dict(enumerate(_MODELS)).get(kind, f"number {kind}")
+        where = f"camera {number}"
+        model = dict(enumerate(_MODELS)).get(kind, f"number {kind}")
         wanted = used is None or number in used
         if wanted or model not in _MODELS:  # of an unknown model the length is unknown, too
             terms_of(path, where, model)  # refuses those that are not supported
@@ -305,25 +309,26 @@ def _text_cameras(path: Path, used: Set[int] | None) -> Iterator[tuple[int, Lens
 
 
 def _text_images(path: Path) -> Iterator[Image]:
-    """A line of an image's pose, and behind it one of its 2D points, which are not used, may be none, or are left out.
+    """Parse a line for each image's pose, and the line of its 2D points after it, which is ignored and may be empty or missing.
 
-    A line that could be either is taken as the number of images in the file's header says.
+    Lines that could be either are poses if the number of images in the file's header says so.
     """
     poses, either = list[tuple[int, str]](), list[tuple[int, str]]()
-    above, (said, lines) = False, _lines(path)  # whether the line above is a pose
+    stated, lines = _lines(path)
+    after_pose = False  # the line before is a pose
     for line, text in lines:
         pose = _could_be_pose(text)
-        points = above and len(text.split()) % 3 == 0 and not (pose and text.strip(_NUMERIC))
+        points = after_pose and len(text.split()) % 3 == 0 and not (pose and text.strip(_NUMERIC))
         if points and pose:
             either.append((line, text))
         elif text.strip() and not points:
             poses.append((line, text))
-        above = bool(text.strip()) and not points
-    if either and said not in (len(poses), len(poses) + len(either)):
+        after_pose = bool(text.strip()) and not points
+    if either and stated not in (len(poses), len(poses) + len(either)):
         raise _damaged(path, f"line {either[0][0]}", "could be an image's pose or the 2D points of the image above")
-    if either and said > len(poses):
+    if either and stated > len(poses):
         poses = sorted(poses + either)
-    _warn_if_cut(path, said, len(poses))
+    _warn_if_truncated(path, stated, len(poses))
     for line, text in poses:
         cells = text.split(maxsplit=9)
         if len(cells) != 10:
@@ -334,7 +339,7 @@ def _text_images(path: Path) -> Iterator[Image]:
 
 
 def _could_be_pose(text: str) -> bool:
-    """Whether a line has an id, a quaternion of a length that is read, the id of a camera and a name where an image has them."""
+    """Return True if a line has the columns of an image: id, quaternion of a length in (0.5, 2), camera id and name."""
     cells = text.split(maxsplit=9)
     if len(cells) < 10 or not (cells[0].isdecimal() and cells[8].isdecimal()):
         return False
@@ -356,27 +361,27 @@ def _text_points(path: Path) -> Iterator[_Point]:
 
 
 def _lines(path: Path) -> tuple[int, list[tuple[int, str]]]:
-    """How many records the header says, else -1; the numbered lines without comments."""
+    """Return the number of records that the header states, else -1, and the numbered lines without comments."""
     try:
         text = io.StringIO(read_bytes(path).decode("utf-8-sig"), newline=None).read()  # with every line break as \n
     except UnicodeDecodeError as error:
         raise _damaged(path, "file", "is no UTF-8 text") from error
-    said = _SAID.findall(text)
+    stated = _RECORD_COUNT.findall(text)
     lines = [(line, row) for line, row in enumerate(text.split("\n"), start=1) if not row.startswith("#")]
-    return int(said[-1]) if said else -1, lines
+    return int(stated[-1]) if stated else -1, lines
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    said, lines = _lines(path)
+    stated, lines = _lines(path)
     rows = [(line, text) for line, text in lines if text.strip()]
-    _warn_if_cut(path, said, len(rows))
+    _warn_if_truncated(path, stated, len(rows))
     return ((line, text.split()) for line, text in rows)
 
 
-def _warn_if_cut(path: Path, said: int, count: int) -> None:
-    if count < said:
+def _warn_if_truncated(path: Path, stated: int, count: int) -> None:
+    if count < stated:
         _log.warning(
-            "%s: its header says %d, and %d are there: if you did not remove any, export it again.", path, said, count
+            "%s: its header says %d, and %d are there: if you did not remove any, export it again.", path, stated, count
         )
 
 

@@ -1,7 +1,7 @@
 """The demo, the default data set: a procedural room, which needs no download.
 
-It holds pictures, boxes and balls at several depths, textured with photographs that scikit-image ships inside its wheel,
-and is ray-cast with anti-aliasing from exact poses. The capture brings its own prior, `priors.DemoPrior`, which is synthetic.
+It contains pictures, boxes and balls at several depths, textured with photographs from scikit-image's wheel, and is ray-cast
+with anti-aliasing from exact poses. The capture has a synthetic prior of its own, `priors.DemoPrior`.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ _PREPARING: Final = Lock()
 
 
 def read(*, width: int = 256, height: int = 192, views: int = 12, train: int = 3) -> Capture:
-    """The room from cameras on an arc.
+    """Make a capture of the room from cameras on an arc.
 
     Args:
         width, height: of the HR images.
-        views: how many cameras there are.
-        train: how many of them, evenly spaced, are for training, at least 2; the others are for testing.
+        views: the number of cameras.
+        train: the number of training views among them, evenly spaced, at least 2; the others are for testing.
 
     Raises:
         SettingError: a number is outside its range.
@@ -82,7 +82,7 @@ def read(*, width: int = 256, height: int = 192, views: int = 12, train: int = 3
 
 def render(camera: Camera) -> Float[Tensor, "H W 3"]:
     """Ray-cast with 4 × 4 rays a pixel and prefiltered textures; 8-bit values, as a photo would have."""
-    with _PREPARING:  # of threads that read the photos at once, one makes what all need
+    with _PREPARING:  # one of the threads that render photos fills the caches for all
         for surface in room():
             photograph(surface.finish.texture)
             light_on(surface)
@@ -95,7 +95,7 @@ def render(camera: Camera) -> Float[Tensor, "H W 3"]:
 
 
 def _camera(position: float, width: int, height: int) -> Camera:
-    """On the arc, `position` in [-1, 1] from left to right, looking at the middle of the room."""
+    """The camera on the arc at `position` in [-1, 1], from left to right, looking at the middle of the room."""
     center = np.array([_ARC * position, -0.15 + 0.12 * math.cos(2.2 * position), 0.35 * position**2])
     forward = unit(_TARGET - center)
     right = unit(np.cross([0.0, 1.0, 0.0], forward))
@@ -109,18 +109,18 @@ def _camera(position: float, width: int, height: int) -> Camera:
 def _cast(rays: Rays) -> Float[Array, "h w 3"]:
     """The colour of the nearest surface along each ray; black where there is none."""
     nearest = np.full((rays.y.size, rays.x.size), np.inf, np.float32)
-    owner = np.full(nearest.shape, -1, np.int8)
+    hit = np.full(nearest.shape, -1, np.int8)
     for k, surface in enumerate(room()):
         distance = surface.depth(rays)
-        owner[distance < nearest] = k
+        hit[distance < nearest] = k
         np.minimum(nearest, distance, out=nearest)
     colors = np.zeros((nearest.size, 3), np.float32)
     for k, surface in enumerate(room()):
-        mine = np.flatnonzero(owner == k)
-        if mine.size:
-            distance, directions = nearest.ravel()[mine], rays.directions(mine)
+        index = np.flatnonzero(hit == k)
+        if index.size:
+            distance, directions = nearest.ravel()[index], rays.directions(index)
             points = f32(rays.origin) + distance[:, None] * directions
-            colors[mine] = _color(surface, points, directions, distance * rays.spacing)
+            colors[index] = _color(surface, points, directions, distance * rays.spacing)
     return colors.reshape(*nearest.shape, 3)
 
 

@@ -1,4 +1,4 @@
-"""What the demo's room is made of: rectangles and balls with photographs on them, which rays meet."""
+"""The surfaces of the demo's room: rectangles and balls textured with photographs, and their intersections with rays."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Rays:
         return np.asarray(self.x * right + (self.y * down + forward))
 
     def directions(self, which: Int[Array, " n"]) -> Float[Array, "n 3"]:
-        """Of the rays with these indices into the grid, counted row by row."""
+        """The directions of the rays with these indices into the grid, counted row by row."""
         right, down, forward = f32(self.axes)
         row, column = np.divmod(which, self.x.size)
         return np.asarray(self.x[0, column, None] * right + (self.y * down + forward)[row])
@@ -58,7 +58,7 @@ class Rays:
 
 @dataclass(frozen=True, slots=True)
 class Finish:
-    """How a surface looks."""
+    """The appearance of a surface."""
 
     texture: str  # a photograph of scikit-image
     tint: Vector = (1.0, 1.0, 1.0)
@@ -71,8 +71,8 @@ class Finish:
 class Panel:
     """A rectangle: its centre, and half its sides as vectors.
 
-    Its normal, down × right, has unit length and points outside. Its chart, which `points` inverts, are coordinates in [0, 1]²
-    for its texture and its light.
+    Its normal, down × right, has unit length and points outside. `chart` maps its points to coordinates in [0, 1]² of its texture
+    and its light, and `points` is the inverse.
     """
 
     finish: Finish
@@ -86,7 +86,7 @@ class Panel:
         return 2 * math.hypot(*self.right), 2 * math.hypot(*self.down)
 
     def depth(self, rays: Rays) -> Float[Array, "h w"]:
-        """Along each ray; infinite if the ray misses the shape."""
+        """The depth along each ray; infinite if the ray misses the shape."""
         offset = rays.origin - np.asarray(self.center)
         right, down = _dual(self.right), _dual(self.down)
         normal = self._normal
@@ -110,7 +110,7 @@ class Panel:
         return np.broadcast_to(self._normal, points.shape)
 
     def blocks(self, points: Float[Array, "n 3"], lamp: Float[Array, " 3"]) -> Bool[Array, " n"]:
-        """Whether the shape is between the points and the lamp."""
+        """Return True for points that the shape hides from the lamp."""
         normal = self._normal
         here, there = (points - self.center) @ normal, (lamp - self.center) @ normal
         apart = (np.abs(here) > 1e-4) & (here * there < 0)
@@ -124,7 +124,7 @@ class Panel:
 
 @dataclass(frozen=True, slots=True)
 class Ball:
-    """A sphere, as a `Panel` in all that it answers. Its chart is longitude and latitude."""
+    """A sphere, with the methods of `Panel`. Its chart is longitude and latitude."""
 
     finish: Finish
     center: Vector
@@ -226,5 +226,5 @@ def _dual(side: Vector) -> Float[Array, " 3"]:
 
 
 def f32(values: Array | tuple[float, ...]) -> Float[Array, "*shape"]:
-    """In single precision: rays are cast twice as fast, and the error is far below a texel."""
+    """Convert to single precision: rays are cast twice as fast, and the error is far below a texel."""
     return np.asarray(values, np.float32)

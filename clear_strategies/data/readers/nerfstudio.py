@@ -1,4 +1,4 @@
-"""transforms.json, as nerfstudio, instant-ngp and NeRF's Blender scenes write it: OpenGL poses, intrinsics shared or of each."""
+"""transforms.json of nerfstudio, instant-ngp and NeRF's Blender scenes: OpenGL poses, shared or per-frame intrinsics."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from rasterizers.interface import Color
 _log = logging.getLogger(__name__)
 
 _FILE: Final = "transforms.json"
-_SIDES: Final = {"train_filenames": "train", "val_filenames": "test", "test_filenames": "test"}
+_SPLIT_LISTS: Final = {"train_filenames": "train", "val_filenames": "test", "test_filenames": "test"}
 _COEFFICIENTS: Final = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 class _Shared(msgspec.Struct):
-    """What a file says of all of its frames: how it splits them, and its points."""
+    """The fields of a file that concern all frames: the split lists and the points."""
 
     train_filenames: list[str] = []
     val_filenames: list[str] = []
@@ -43,17 +43,17 @@ class _Shared(msgspec.Struct):
 
 
 def recognises(path: Path) -> int:
-    """The rank of `clear_strategies.commands.train.detect`."""
+    """The reader's rank for a path, see `clear_strategies.commands.train.detect`."""
     return 4 * ((path.suffix == ".json" and path.is_file()) or named(path, _FILE).is_file())
 
 
 def read(
     root: str | Path, images: str | None = None, *, background: Color = BLACK, skip_faulty: bool = False
 ) -> Capture:
-    """Read a folder with transforms.json, or that file. Poses are taken as they are, `applied_transform` included.
+    """Read a folder with transforms.json, or that file. Poses are used unchanged, `applied_transform` included.
 
     Args:
-        images: the folder that takes the place of the first in the frames' paths, such as images_4, where nerfstudio keeps
+        images: the folder that replaces the first folder of the frames' paths, such as images_4, where nerfstudio stores
             reduced photos. None: the photos that the frames name.
         background: RGB in [0, 1] behind transparent pixels.
         skip_faulty: leave out photos that are missing or damaged, with a warning for each; else they are an error.
@@ -74,11 +74,11 @@ def read(
     lists = typed(file, content, _Shared)
     splits: dict[Path, str] = {}
     removed = list[str]()
-    for key, side in _SIDES.items():
+    for key, split in _SPLIT_LISTS.items():
         for name in getattr(lists, key):
             if find(name) not in paths:
                 removed.append(name)
-            elif splits.setdefault(find(name), side) != side:
+            elif splits.setdefault(find(name), split) != split:
                 raise DataError(file, key, f"{name!r} is for training, too", "list each photo once")
     if removed:
         _log.warning(
@@ -103,9 +103,7 @@ def read(
 
 
 def _in_place_of_first(folder: Path) -> Callable[[str], Path]:
-    """`finder` of the names without their first folder, if they have one, or where they are absolute, without their first
-    folders.
-    """
+    """A `finder` that ignores the first folder of a name, and as many leading folders of an absolute path as necessary."""
     find = finder(folder)
 
     def find_below_first(name: str) -> Path:
@@ -116,7 +114,7 @@ def _in_place_of_first(folder: Path) -> Callable[[str], Path]:
 
 
 def _sized(transform: Transform, find: Callable[[str], Path]) -> Transform:
-    """The frame with the size that its lens is for, which is that of its own photo where it gives none."""
+    """Set a missing image size to that of the photo that the frame names."""
     if transform.w is not None and transform.h is not None:
         return transform
     width, height = image_size(find(transform.file_path))
@@ -124,7 +122,7 @@ def _sized(transform: Transform, find: Callable[[str], Path]) -> Transform:
 
 
 class Transform(msgspec.Struct):
-    """A frame with what it shares with the others. Sizes, focal lengths and the principal point are pixels."""
+    """A frame, completed by the values that all frames share. Sizes, focal lengths and the principal point are in pixels."""
 
     file_path: str = ""
     mask_path: str | None = None
@@ -149,10 +147,11 @@ class Transform(msgspec.Struct):
     p2: Number = 0.0
 
     def lens(self, path: Path, where: str, image: Path) -> Lens:
-        """The lens, for the sizes that the frame gives, else for the size of its image; `path`, `where`: of this frame."""
-        # If the photo is turned, only given sizes show whether the lens is that of the stored pixels.
-        real = (0, 0) if self.w is not None and self.h is not None else image_size(image)
-        width, height = real[0] if self.w is None else self.w, real[1] if self.h is None else self.h
+        """The lens, for the size that the frame gives, else for that of its image; `path`, `where`: of the frame, for errors."""
+        # With an EXIF rotation, only a given size tells that the lens is of the stored pixels.
+        actual = (0, 0) if self.w is not None and self.h is not None else image_size(image)
+        width = actual[0] if self.w is None else self.w
+        height = actual[1] if self.h is None else self.h
 
         def focal(length: float | None, angle: float | None, axis: str, size: float) -> float | None:
             if length is None and angle is not None:
@@ -167,7 +166,8 @@ class Transform(msgspec.Struct):
         if fx is None:
             remedy = "give it or camera_angle_x"
             raise DataError(path, f"{where}.fl_x", "is missing, for the frame and for all", remedy)
-        cx, cy = width / 2 if self.cx is None else self.cx, height / 2 if self.cy is None else self.cy
+        cx = width / 2 if self.cx is None else self.cx
+        cy = height / 2 if self.cy is None else self.cy
         model = "OPENCV_FISHEYE" if self.is_fisheye else self.camera_model
         terms = {key: value for key in _COEFFICIENTS if (value := getattr(self, key)) != 0}
         size, pinhole = (round(width), round(height)), (fx, fx if fy is None else fy, cx, cy)
@@ -175,7 +175,7 @@ class Transform(msgspec.Struct):
 
 
 class Listed(NamedTuple):
-    """A frame as a file lists it, its photo, and the name and the split of its view."""
+    """A frame of a file, the path of its photo, and the name and the split of its view."""
 
     transform: Transform
     name: str
@@ -184,7 +184,7 @@ class Listed(NamedTuple):
 
 
 def transforms_of(path: Path, content: Mapping[str, Any]) -> list[Transform]:
-    """The frames of a file's content, which name their images; a frame's own values replace those shared by all."""
+    """Parse the frames of a file, each of which must name its image; a frame's own values override the shared ones."""
     remedy = "give a transforms file"
     frames = typed(path, content.get("frames", []), list[dict[str, Any]], where="frames", remedy=remedy)
     if not frames:
@@ -199,14 +199,15 @@ def transforms_of(path: Path, content: Mapping[str, Any]) -> list[Transform]:
 def frames_of(
     listed: Mapping[Path, Sequence[Listed]], *, background: Color, skip_faulty: bool, scene: Path | None = None
 ) -> list[Frame]:
-    """The frames of a folder's files whose photos can be used, with their masks: the frames' own, or those of `masks_of`.
+    """Make the frames whose photos are `usable`, with their masks: those that the frames name, or those of `masks_of`.
 
     Args:
-        listed: what each file lists.
+        listed: the frames of each file; all files lie in one folder.
         skip_faulty, scene: see `usable`.
     """
     folder = next(iter(listed)).parent
-    find, every, frames = finder(folder), list(itertools.chain(*listed.values())), list[Frame]()
+    find, every = finder(folder), list(itertools.chain(*listed.values()))
+    frames: list[Frame] = []
     own = {entry.path: find(entry.transform.mask_path) for entry in every if entry.transform.mask_path}
     masks = masks_of(folder, [entry.path for entry in every], own)
     for file, entries in listed.items():
@@ -222,7 +223,7 @@ def frames_of(
 
 
 def points_of(file: Path, content: Mapping[str, Any]) -> SfmPoints | None:
-    """The points of the PLY file that a file names, if it does."""
+    """Read the points of the PLY file that a file names; None if it names none."""
     if not (name := typed(file, content, _Shared).ply_file_path):
         return None
     cloud, none = read_points(finder(file.parent)(name)), torch.zeros(0, dtype=torch.long)

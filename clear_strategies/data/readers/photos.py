@@ -34,13 +34,13 @@ _log = logging.getLogger(__name__)
 
 _HEIC: Final = (".heic", ".heif")
 _FEW: Final = 30  # photos, up to which precise=auto is true
-_HEAD: Final = 1 << 16  # bytes of a file that tell what it is
-_LOOKED_INTO: Final = 50  # files of a kind, at most
+_HEAD: Final = 1 << 16  # bytes of a file by which its format is recognized
+_LOOKED_INTO: Final = 50  # files of each pattern, at most
 _CONVERT: Final = "ns-process-data {0} --data {{root}}{1} --output-dir converted"
 _HERE: Final = "put the model into {root}/sparse/0"
 _ABOVE: Final = "clear-strategies train {root}/.."
-# Poses of other tools that no reader reads: where they lie, what such a file contains, whose they are, what makes use of them.
-_OTHERS: Final = (
+# Files of poses that no reader supports: their pattern, bytes that they contain, the tool, and how its poses can be used.
+_OTHER_POSES: Final = (
     ("*.json", b'"frames"', "transforms.json", "clear-strategies train {file}"),
     ("*.xml", b"<document", "Metashape", _CONVERT.format("metashape", " --xml {file}")),
     ("*.csv", b"#name,x,y", "RealityCapture", _CONVERT.format("realitycapture", " --csv {file}")),
@@ -56,7 +56,7 @@ _OTHERS: Final = (
 
 
 def recognises(path: Path) -> int:
-    """The rank of `clear_strategies.commands.train.detect`: what no other reader knows are photos, or are refused."""
+    """The lowest rank for any path, see `clear_strategies.commands.train.detect`: `read` refuses what contains no photos."""
     return int(path.exists())
 
 
@@ -81,7 +81,7 @@ def read(
         max_features: of a photo, those of the coarsest scales; the time of matching grows with its square.
         precise: features that follow a surface's tilt (affine shape): more photos are placed, in about twice the time;
             "auto": for up to 30 photos.
-        least_placed: the least share of the photos whose poses must be found.
+        least_placed: the least share of the photos for which poses must be found.
         threads: of COLMAP; -1: all. With more than one, the poses' last digits may change from run to run.
         seed: of COLMAP's random samples.
         skip_faulty: leave out photos that are missing or damaged, with a warning for each; else they are an error.
@@ -99,18 +99,18 @@ def read(
     root, name = Path(root), Path(root).resolve().name
     if root.is_file():
         raise DataError(root, "photos", "is a file", _instead_of(root))
-    _tell_of_other_poses(root)
+    _warn_of_other_poses(root)
     root, images = _photos_in(root)
     base = Path(cache) if cache is not None else cache_folder() / "sfm"
     if base.resolve().is_relative_to(root.resolve()):
         raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
-    paths = usable(root, _once_each(images), lambda path: path, skip_faulty=skip_faulty)
+    paths = usable(root, _without_masks_and_twins(images), lambda path: path, skip_faulty=skip_faulty)
     require_text((name, *(path.name for path in paths)))
     if len(paths) < sfm.FEWEST:
         raise DataError(root, "images", f"there are {len(paths)}, poses need at least {sfm.FEWEST}", MORE_PHOTOS)
     photos = {path: optics(path) for path in paths}  # unreadable photos are refused before the long work
     precise = len(paths) <= _FEW if precise == "auto" else precise
-    folder = base / _key(paths, max_side, max_features, precise, seed)
+    folder = base / _cache_key(paths, max_side, max_features, precise, seed)
     if (folder / sfm.MODEL).is_file():
         _log.debug("%s: poses from the cache %s.", root, folder)
     else:
@@ -126,7 +126,7 @@ def read(
 
 
 def _instead_of(file: Path) -> str:
-    """What to give in place of a file."""
+    """The remedy where a file is given in place of a folder."""
     if file.suffix.lower() in SUFFIXES:
         return f"give the folder of all photos: clear-strategies train {shlex.quote(str(file.parent))}"
     if other := in_place_of_photos([file]):
@@ -135,8 +135,8 @@ def _instead_of(file: Path) -> str:
 
 
 def _photos_in(root: Path) -> tuple[Path, list[Path]]:
-    """The photos and their folder: the first of `root`, its folder `images` and the only folder below that holds any, in which
-    there are enough, else in which there are most.
+    """Choose the folder of the photos, and list them: of `root`, its folder `images` and the only folder below with images, the
+    first that contains enough, else that with most.
     """
     below, images = folders_of_images(root), named(root, "images")
     found = {folder: images_in(folder) for folder in (root, images, *(below if len(below) == 1 else ()))}
@@ -152,11 +152,11 @@ def _photos_in(root: Path) -> tuple[Path, list[Path]]:
     return folder, found[folder] or list_images(folder)
 
 
-def _tell_of_other_poses(root: Path) -> None:
-    """Warn of poses that are there, and would be estimated anew; a DataError where there are no photos beside them."""
+def _warn_of_other_poses(root: Path) -> None:
+    """Warn of poses in a format that is not read, since they are estimated anew; a DataError if no photos lie beside them."""
     if (sparse := named(root, "sparse")).is_dir():  # else `colmap` would read it
         _log.warning("%s holds no model (cameras.bin and images.bin, or .txt): the poses are estimated anew.", sparse)
-    for pattern, content, tool, remedy in _OTHERS:
+    for pattern, content, tool, remedy in _OTHER_POSES:
         for file in filter(Path.is_file, sorted(root.glob(pattern))[:_LOOKED_INTO]):
             with file.open("rb") as opened:
                 if content not in opened.read(_HEAD):
@@ -171,8 +171,8 @@ def _tell_of_other_poses(root: Path) -> None:
             return
 
 
-def _once_each(paths: Sequence[Path]) -> list[Path]:
-    """The photos without their masks, and without the HEIC file of one that a phone has saved as JPEG, too."""
+def _without_masks_and_twins(paths: Sequence[Path]) -> list[Path]:
+    """The images without masks, and without HEIC files of photos that a phone has saved as JPEG, too."""
     masks, stems = set(masks_among(paths).values()), {path.stem for path in paths if path.suffix.lower() not in _HEIC}
     twice = {path for path in paths if path.suffix.lower() in _HEIC and path.stem in stems}
     for left, what in (
@@ -187,7 +187,7 @@ def _once_each(paths: Sequence[Path]) -> list[Path]:
     return kept
 
 
-def _key(paths: Sequence[Path], *settings: int) -> str:
+def _cache_key(paths: Sequence[Path], *settings: int) -> str:
     version = "upright copies, points of two views, affine, EXIF on trial, a camera for each lens"
     digest = hashlib.sha256(repr((version, *settings)).encode())
     for path in paths:

@@ -1,8 +1,8 @@
 """Structure from motion on the CPU through pycolmap: a sparse model from photos alone, with bounded memory.
 
-COLMAP reads copies of the photos: upright JPEG files, no larger than needed. Photos of the same size, whose EXIF blocks say the
-same of the lens, share a camera, whose estimate starts at the focal length there. If photos are left without a pose, all are
-placed again without it, since programs and adapters write wrong focal lengths, and the model with more photos is used.
+COLMAP reads copies of the photos: upright JPEG files, no larger than needed. Photos of the same size and lens (by EXIF) share a
+camera, whose estimate starts at EXIF's focal length. If photos are left without a pose, all are placed again without that focal
+length, since programs and adapters write wrong ones, and the model with more photos is used.
 """
 
 from __future__ import annotations
@@ -47,18 +47,18 @@ _COPIES: Final = "copies"
 _WORK: Final = "[0-9a-f]" * 24 + ".????????"
 """Folders of runs that estimate poses: the key in the cache, and tempfile's ending."""
 _FEW_FEATURES: Final = 200  # a photo with fewer shows too little
-_MATCHED: Final = 50  # features in common, from which a pair's relation is trusted
+_MATCHED: Final = 50  # inlier matches, from which a pair's two-view geometry is trusted
 _NEARLY_ALL: Final = 0.9  # of the pairs
-_TURN: Final = 0.03  # entries by which a map between two photos may differ from a turn's, as distortion makes it
+_ROTATION: Final = 0.03  # largest entry of HᵀH - I, up to which a homography H is a rotation with lens distortion
 _LISTED: Final = 3  # photos without a pose in the warning, at most
-_UNKNOWN: Final = 1.2  # a focal length in larger sides of the photo: COLMAP's own first guess
+_UNKNOWN: Final = 1.2  # focal length in longer sides of the photo: COLMAP's default guess
 _DIAGONAL_35MM: Final = math.hypot(36, 24)  # mm
-_LARGE: Final = 1_200_000  # px of a copy, above which its own scale has features enough
-_ENOUGH: Final = 0.25  # of the features that a photo may have
-_PER_THREAD: Final = 2  # photos whose features are found between two looks at the progress
+_LARGE: Final = 1_200_000  # pixels of a copy, above which features are first found without enlarging it
+_ENOUGH: Final = 0.25  # share of `max_features`, below which they are found again in enlarged copies
+_PER_THREAD: Final = 2  # photos per thread whose features are found between two updates of the progress
 _PER_FEATURE, _PER_DATABASE = 320, 8 << 20  # bytes that features, matches and models take on the disk, at most
-_PER_WORKER: Final = 256 << 20  # addresses that a thread of COLMAP's takes, and COLMAP itself
-_BLOCK: Final = 20  # photos that are matched between two looks: COLMAP indexes their features anew for each block
+_PER_WORKER: Final = 256 << 20  # bytes of address space for each thread of COLMAP's, and for COLMAP itself
+_BLOCK: Final = 20  # photos per block of matching; COLMAP builds an index of their features for each block
 
 _Groups = dict[tuple[int, int, float | None, tuple[str, ...]], list[str]]
 """The names of copies by width, height, focal length (pixels of the copy, or None) and lens: those of one camera."""
@@ -66,7 +66,7 @@ _Groups = dict[tuple[int, int, float | None, tuple[str, ...]], list[str]]
 
 @dataclass(frozen=True, slots=True)
 class SfmSettings:
-    """How poses are estimated: the arguments of `photos.read`, with `precise` decided."""
+    """Settings of the estimation of poses: the arguments of `photos.read`, with `precise` resolved to a bool."""
 
     max_side: int
     max_features: int
@@ -76,10 +76,10 @@ class SfmSettings:
 
 
 def reconstruct(root: Path, photos: Mapping[Path, Optics], folder: Path, settings: SfmSettings) -> None:
-    """Estimate the poses of these photos, and write the model with most of them to `folder`. Its images have `copy_name`s.
+    """Estimate the poses of these photos, and write the largest model to `folder`, with images named by `copy_name`.
 
     Args:
-        photos: with what EXIF says of their cameras.
+        photos: their paths, with the camera data of their EXIF blocks.
 
     Raises:
         DataError: pycolmap is not installed, memory is limited to too little, or too few photos can be placed.
@@ -93,9 +93,9 @@ def reconstruct(root: Path, photos: Mapping[Path, Optics], folder: Path, setting
     try:
         with tempfile.TemporaryDirectory(prefix=f"{folder.name}.", dir=folder.parent) as work, files.hold(Path(work)):
             models = sorted(
-                _map(pycolmap, photos, Path(work), settings), key=lambda m: m.num_reg_images(), reverse=True
+                _models(pycolmap, photos, Path(work), settings), key=lambda m: m.num_reg_images(), reverse=True
             )
-            require_placed(root, _most(models), count)
+            require_placed(root, _most_placed(models), count)
             (result := Path(work) / "result").mkdir()
             models[0].write_binary(str(result))
             placed = [{image.name for image in model.images.values()} for model in models]  # a photo may be in several
@@ -113,7 +113,7 @@ def reconstruct(root: Path, photos: Mapping[Path, Optics], folder: Path, setting
 
 
 def _sweep(cache: Path) -> None:
-    """Remove the folders of runs that were killed: the system has freed their locks."""
+    """Remove the folders of killed runs, whose locks the system has freed."""
     for left in cache.glob(_WORK):
         try:
             with files.hold(left):
@@ -137,13 +137,14 @@ def require_placed(root: Path, placed: int, count: int, least: float = 0.0) -> N
     if placed >= FEWEST:
         share = 1000 * placed // count / 1000  # rounded up, it would be refused again
         remedy += f"; or go on with the {placed}: data.reader.least_placed={share}"
-    some = f"only {placed}" if placed else "none"
-    raise DataError(root, "poses", f"{some} of the {count} photos could be related to each other", remedy)
+    few = f"only {placed}" if placed else "none"
+    raise DataError(root, "poses", f"{few} of the {count} photos could be related to each other", remedy)
 
 
-def _map(pycolmap: Any, photos: Mapping[Path, Optics], work: Path, settings: SfmSettings) -> list[Any]:
-    """The models that COLMAP's incremental pipeline finds: features, matching of all pairs, mapping."""
-    copies, database, count, root = work / _COPIES, work / _DATABASE, len(photos), next(iter(photos)).parent
+def _models(pycolmap: Any, photos: Mapping[Path, Optics], work: Path, settings: SfmSettings) -> list[Any]:
+    """Run COLMAP's incremental pipeline: extract features, match all pairs, and map; returns the models."""
+    copies, database = work / _COPIES, work / _DATABASE
+    count, root = len(photos), next(iter(photos)).parent
     level = pycolmap.logging.minloglevel
     # COLMAP's progress is hundreds of lines, and its errors are raised.
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
@@ -167,13 +168,13 @@ def _map(pycolmap: Any, photos: Mapping[Path, Optics], work: Path, settings: Sfm
         _keep_coarsest(pycolmap, database, settings.max_features)
         _match(pycolmap, database, [name for names in groups.values() for name in names], settings.threads)
         _require_parallax(pycolmap, database, root)
-        models = _place(pycolmap, work, count, settings)
+        models = _mapped(pycolmap, work, count, settings)
         lengths = sorted({said.focal_35mm for said in photos.values() if said.focal_35mm is not None})
-        if (placed := _most(models)) < count and lengths:
+        if (placed := _most_placed(models)) < count and lengths:
             _log.info("%d of %d photos are placed: again, without EXIF's focal length.", placed, count)
             _forget_focal_lengths(pycolmap, database, settings.threads)
-            free = _place(pycolmap, work, count, settings)
-            if (more := _most(free)) > placed:
+            free = _mapped(pycolmap, work, count, settings)
+            if (more := _most_placed(free)) > placed:
                 models, told = free, some([f"{focal:g} mm" for focal in lengths])
                 message = "%s: EXIF's focal length (%s on 35 mm film) is not used: %d of %d photos are placed with it, %d without"
                 _log.warning(message, root, told, placed, count, more)
@@ -182,14 +183,14 @@ def _map(pycolmap: Any, photos: Mapping[Path, Optics], work: Path, settings: Sfm
     return models
 
 
-def _place(pycolmap: Any, work: Path, count: int, settings: SfmSettings) -> list[Any]:
-    """The models that COLMAP makes of the related pairs."""
+def _mapped(pycolmap: Any, work: Path, count: int, settings: SfmSettings) -> list[Any]:
+    """Run COLMAP's mapper on the verified pairs; returns the models."""
     mapping = pycolmap.IncrementalPipelineOptions()
     mapping.num_threads, mapping.random_seed = settings.threads, settings.seed
-    # COLMAP's thresholds are for hundreds of photos. Of ten photos around a table these place six where those place four.
+    # COLMAP's thresholds are for hundreds of photos: they place four of ten photos around a table, these place six.
     mapping.mapper.init_min_num_inliers, mapping.mapper.init_min_tri_angle = 50, 8.0
     mapping.mapper.abs_pose_min_num_inliers = 15
-    # Most points of few photos are seen by two photos only. With these points those six poses are four times more exact.
+    # With few photos most points are seen by two only. These points make the six poses four times more exact.
     mapping.triangulation.ignore_two_view_tracks = False
     _log.info("placing the photos.")
     progress, placed = Progress("placing", "photos", count), itertools.count(3)  # after the first two
@@ -199,13 +200,13 @@ def _place(pycolmap: Any, work: Path, count: int, settings: SfmSettings) -> list
     return list(models.values())
 
 
-def _most(models: Sequence[Any]) -> int:
-    """The photos of the largest model."""
+def _most_placed(models: Sequence[Any]) -> int:
+    """The number of photos in the largest model."""
     return max((model.num_reg_images() for model in models), default=0)
 
 
 def _forget_focal_lengths(pycolmap: Any, database: Path, threads: int) -> None:
-    """Relate the matched pairs anew, with cameras whose focal lengths are unknown."""
+    """Reset the cameras' focal lengths to unknown, and verify the matched pairs again."""
     with pycolmap.Database.open(database) as opened:
         for camera in opened.read_all_cameras():
             size = camera.width, camera.height
@@ -218,7 +219,7 @@ def _forget_focal_lengths(pycolmap: Any, database: Path, threads: int) -> None:
 
 
 def _find_features(pycolmap: Any, database: Path, groups: _Groups, settings: SfmSettings, *, octave: int) -> int:
-    """Find the features of all copies; returns how many a copy has, the median.
+    """Find the features of all copies; returns their median number per copy.
 
     Args:
         octave: of the finest scale: 0, that of the copies; -1, that of copies enlarged twice.
@@ -236,13 +237,13 @@ def _find_features(pycolmap: Any, database: Path, groups: _Groups, settings: Sfm
         if focal is not None:
             reader.camera_params = f"{focal},{width / 2},{height / 2},0"  # of SIMPLE_RADIAL, its default
         for first in range(0, len(names), at_once):
-            some = names[first : first + at_once]
+            batch = names[first : first + at_once]
             pycolmap.extract_features(
-                database, database.with_name(_COPIES), image_names=some, camera_mode=pycolmap.CameraMode.SINGLE,
+                database, database.with_name(_COPIES), image_names=batch, camera_mode=pycolmap.CameraMode.SINGLE,
                 reader_options=reader, extraction_options=extraction, device=pycolmap.Device.cpu,
             )  # fmt: skip
             with pycolmap.Database.open(database) as opened:
-                reader.existing_camera_id = opened.read_image_with_name(some[0]).camera_id
+                reader.existing_camera_id = opened.read_image_with_name(batch[0]).camera_id
                 progress(opened.num_images())
     with pycolmap.Database.open(database) as opened:
         return int(statistics.median(opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()))
@@ -268,7 +269,7 @@ def _match(pycolmap: Any, database: Path, copies: Sequence[str], threads: int) -
 
 
 def _require_parallax(pycolmap: Any, database: Path, root: Path) -> None:
-    """Refuse photos of which each is another turned, by whatever focal length, before COLMAP makes up motion."""
+    """Raise a DataError if the photos differ only by rotations, for some focal length: COLMAP would invent motion."""
     kinds = pycolmap.TwoViewGeometryConfiguration
     flat = {int(kind) for kind in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)}
     with pycolmap.Database.open(database) as opened:
@@ -281,27 +282,27 @@ def _require_parallax(pycolmap: Any, database: Path, root: Path) -> None:
         ]
 
     def centred(camera: Any) -> Float[np.ndarray, "3 3"]:
-        """From pixels to a square of about 1 around the middle of the photo."""
+        """The matrix from pixels to coordinates around the middle of the photo, in longer sides."""
         width, height = int(camera.width), int(camera.height)
         size = max(width, height)
         return np.array([[1, 0, -width / 2], [0, 1, -height / 2], [0, 0, size]]) / size
 
-    turns = [centred(b) @ found.H @ np.linalg.inv(centred(a)) for a, b, found in pairs if int(found.config) in flat]
-    if len(turns) < _NEARLY_ALL * len(pairs) or not turns:
+    maps = [centred(b) @ found.H @ np.linalg.inv(centred(a)) for a, b, found in pairs if int(found.config) in flat]
+    if len(maps) < _NEARLY_ALL * len(pairs) or not maps:
         return
-    maps = np.stack([H / np.cbrt(np.linalg.det(H)) for H in turns])
-    scale = np.array([1.0, 1.0, 0.0])
-    bent = min(
-        float(np.median(np.abs(turn.mT @ turn - np.eye(3)).max(axis=(1, 2))))
-        for focal in np.geomspace(0.3, 5.0, 60)
-        for turn in [maps * (scale * (1 / focal - 1) + 1)[:, None] * (scale * (focal - 1) + 1)]
-    )
-    if bent < _TURN:
+    homographies = np.stack([H / np.cbrt(np.linalg.det(H)) for H in maps])
+
+    def distance_from_rotations(focal: float) -> float:
+        """The median over pairs of the largest entry of |RᵀR - I| with R = K⁻¹ H K."""
+        R = homographies * np.array([1 / focal, 1 / focal, 1])[:, None] * np.array([focal, focal, 1])
+        return float(np.median(np.abs(R.mT @ R - np.eye(3)).max(axis=(1, 2))))
+
+    if min(map(distance_from_rotations, np.geomspace(0.3, 5.0, 60))) < _ROTATION:
         raise DataError(root, "poses", NO_PARALLAX, STEP_ASIDE)
 
 
 def _keep_coarsest(pycolmap: Any, database: Path, most: int) -> None:
-    """Leave each photo at most that many features, those of the coarsest scales, which COLMAP writes first.
+    """Keep at most `most` features of each photo: those of the coarsest scales, which COLMAP writes first.
 
     COLMAP's own limit is soft: of photos of 12 megapixels it left 21,609 features for 8192, and the time of matching grows with
     their square.
@@ -343,9 +344,9 @@ def _threads(settings: SfmSettings) -> int:
 
 
 def _require_addresses(root: Path, threads: int) -> None:
-    """Refuse where the system limits memory to less than COLMAP takes: its libraries then end the process, or wait for ever."""
+    """Raise a DataError if the system limits memory to less than COLMAP takes: its libraries would abort, or wait for ever."""
     try:
-        if sys.platform != "win32":  # which has no such limit
+        if sys.platform != "win32":  # Windows has no such limit
             mmap.mmap(-1, (threads + 1) * _PER_WORKER, flags=mmap.MAP_PRIVATE, prot=0).close()
     except OSError as error:
         needed = (
@@ -357,7 +358,7 @@ def _require_addresses(root: Path, threads: int) -> None:
 
 def _pycolmap() -> Any:
     try:
-        # The import sets a handler of SIGTERM that prints a stack trace, and makes an ImportError of an exception, or loses it.
+        # The import sets a handler of SIGTERM that prints a stack trace, and turns an exception into an ImportError, or drops it.
         with signals.held():
             import pycolmap
     except (ImportError, RuntimeError) as error:  # its own, where a library of the system is missing
@@ -367,7 +368,11 @@ def _pycolmap() -> Any:
 
 
 def _unplaced(pycolmap: Any, database: Path, names: Sequence[str], placed: Set[str]) -> dict[str, str]:
-    """Why each photo has no pose whose copy is not `placed`; `names` of the photos are in the order of their copies."""
+    """The reason why a photo has no pose, by its name, for each copy that is not `placed`.
+
+    Args:
+        names: of the photos, in the order of their copies.
+    """
     with pycolmap.Database.open(database) as opened:
         copies = {image.image_id: image.name for image in opened.read_all_images()}
         features = {number: opened.num_keypoints_for_image(number) for number in copies}

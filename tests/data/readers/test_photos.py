@@ -265,7 +265,7 @@ def estimate(tmp_path, monkeypatch):
     photos = {tmp_path / f"{i}.jpg": Optics(None, ()) for i in range(10)}
 
     def run(mapping):
-        monkeypatch.setattr(sfm, "_map", mapping)
+        monkeypatch.setattr(sfm, "_models", mapping)
         sfm.reconstruct(tmp_path, photos, tmp_path / "poses", SfmSettings(1600, 8192, False, threads=1, seed=0))
 
     return run
