@@ -1,4 +1,4 @@
-"""Where a job computes: the rasterizer, the device of the field, and the threads."""
+"""The rasterizer of a job, the device of its field, and its number of threads."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SHARED: Final = RasterSettings()
 
 @dataclass(frozen=True, slots=True)
 class RasterizerSettings:
-    """A rasterizer of this repository by name, and its settings; None leaves a setting to the backend.
+    """A rasterizer of this repository by name, and its settings; None: the backend's default.
 
     Args:
         name: auto, or a name of `rasterizers.names`.
@@ -70,8 +70,8 @@ BY_NAME: Final = f"{RasterizerSettings.__module__}.{RasterizerSettings.__qualnam
 
 
 def rasterizer_node(node: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration's `rasterizer`. For a class of another package, `rasterizer._target_=pkg.Mine`, it keeps the fields of
-    `RasterSettings`, so that they mean the same for each rasterizer, and leaves out `name` and every None.
+    """Return the configuration's `rasterizer` for `build`. For a class of another package, `rasterizer._target_=pkg.Mine`, the
+    fields of `RasterSettings` are kept, since they mean the same for each rasterizer; `name` and every None are left out.
     """
     if node.get(TARGET) in (None, BY_NAME):
         return dict(node)
@@ -83,8 +83,8 @@ class ReadyRasterizer:
     """A rasterizer that is ready to draw.
 
     Args:
-        name: for the plan. device: that it draws on and the field lies on.
-        make: makes the rasterizer anew, with other settings.
+        name: for the plan. device: of the drawing and the field.
+        make: makes the rasterizer again, with other settings.
     """
 
     rasterizer: Rasterizer
@@ -94,28 +94,28 @@ class ReadyRasterizer:
 
     @property
     def rules(self) -> RasterSettings:
-        """The settings that every rasterizer has."""
+        """The settings that all rasterizers have in common."""
         given = self.make.keywords
         return RasterSettings(**{f.name: given[f.name] for f in fields(RasterSettings) if f.name in given})
 
     def having(self, **settings: Any) -> ReadyRasterizer:
-        """The same with other settings."""
+        """Return the rasterizer with other settings."""
         make = functools.partial(self.make, **settings)
         return replace(self, rasterizer=make(), make=make)
 
     def over(self, background: Color) -> ReadyRasterizer:
-        """The same over the data set's background, unless the settings name one."""
+        """Return the rasterizer with the data set's background, unless the settings name one."""
         return self if "background" in self.make.keywords else self.having(background=background)
 
     def among(self, means: Float[Tensor, "N 3"]) -> ReadyRasterizer:
-        """The same for a scene of these points: where they spread less than 1, the default near plane is as much nearer."""
+        """Return the rasterizer for a scene of these points: if their `spread` is below 1, it scales a default near plane."""
         if self.make.keywords.get("near") != _SHARED.near or not len(means) or not 0 < (size := spread(means)) < 1:
             return self
         return self.having(near=_SHARED.near * size)
 
 
 def drawing(settings: RasterizerSettings | functools.partial[Rasterizer], asked: Device | None) -> ReadyRasterizer:
-    """The rasterizer of the settings on the device that was asked for."""
+    """Make the rasterizer of the settings on the device that was asked for."""
     if asked == "cuda" and not torch.cuda.is_available():
         raise SettingError(
             "fit.device: is cuda, and torch finds no CUDA device. Install NVIDIA's driver and a torch built for CUDA, or "
@@ -138,7 +138,7 @@ def drawing(settings: RasterizerSettings | functools.partial[Rasterizer], asked:
 
 
 def log_choice(settings: RasterizerSettings | functools.partial[Rasterizer], chosen: ReadyRasterizer) -> None:
-    """Log why the other backends were not chosen, where `auto` found neither CUDA nor compiled kernels."""
+    """Log why other backends were not chosen, if `auto` found neither CUDA nor compiled kernels."""
     auto = isinstance(settings, RasterizerSettings) and settings.name == "auto"
     if auto and chosen.device == "cpu" and not chosen.rasterizer.traits.native_threads:
         for name, reason in rasterizers.available().items():
@@ -147,7 +147,7 @@ def log_choice(settings: RasterizerSettings | functools.partial[Rasterizer], cho
 
 
 def drawn_on(devices: frozenset[str], name: str, asked: Device | None) -> Device:
-    """The device that was asked for, or else the best that this rasterizer draws on."""
+    """The device that was asked for; None: the best one that this rasterizer draws on."""
     if asked is None:
         return "cuda" if "cuda" in devices and torch.cuda.is_available() else "cpu"
     if asked not in devices:
@@ -159,7 +159,7 @@ def drawn_on(devices: frozenset[str], name: str, asked: Device | None) -> Device
 
 
 def threads(asked: int | None) -> tuple[int, str]:
-    """How many threads a job has, and why: at most torch's own number, which OMP_NUM_THREADS sets.
+    """The number of threads of a job, at most torch's own, which OMP_NUM_THREADS sets; and the reason for it.
 
     Two jobs must not use the same core: OpenMP's threads wait by spinning, so two jobs of two threads on two cores are
     tens of times slower than two jobs of one thread.
@@ -173,7 +173,7 @@ def threads(asked: int | None) -> tuple[int, str]:
 
 
 def jobs_at_once() -> int:
-    """How many jobs share this machine and its terminal, as joblib counts them; 1 for other launchers."""
+    """The number of jobs that share this machine and its terminal, as joblib counts them; 1 for other launchers."""
     launcher = HydraConfig.get().launcher if HydraConfig.initialized() else None
     return int(launcher.n_jobs) if launcher is not None and "n_jobs" in launcher else 1
 
@@ -185,5 +185,5 @@ def cores() -> int:
 
 @functools.cache
 def _threads_of_torch() -> int:
-    """As it was before the first job changed it; a process may do several jobs."""
+    """The number of torch's threads before the first of a process's jobs changed it."""
     return torch.get_num_threads()

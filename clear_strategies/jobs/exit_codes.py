@@ -1,4 +1,4 @@
-"""How a process ends: the one-line message of an error, and the exit code.
+"""Exit codes of the process, and one-line messages of errors.
 
 0: done. 2: a setting, a file or a sweep's job cannot be used, or memory ran out. 3: the disk is full or read-only.
 128 + n: stopped by signal n. Any other error is a bug: Python shows its traceback, and exits with 1.
@@ -19,7 +19,7 @@ _LESS_MEMORY: Final = (
     "rasterizer's lists. Of clear-strategies render: lower --width."
 )
 
-# What may help before writing elsewhere does, by the system's error; of one without access, a photo's folder may be meant.
+# A remedy that is named before "elsewhere", by the system's error number; without access, a photo's folder may be meant.
 _FIRST: Final = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "Free space, or write"),
     errno.EACCES: "Allow access to it, or write",
@@ -29,7 +29,7 @@ UNUSABLE: Final = 2
 NO_DISK: Final = 3
 SIGNALS: Final = 128
 
-# What needs an extra, by its name, and the modules that it brings.
+# What needs an extra, and the modules that it installs, by its name.
 NEEDED: Final = {
     "train": ("training", (
         "cv2", "filelock", "jinja2", "kornia", "matplotlib", "msgspec", "pandas", "psutil", "safetensors", "scipy", "skimage",
@@ -40,7 +40,7 @@ NEEDED: Final = {
 
 
 class Ending(NamedTuple):
-    """How the process ends."""
+    """The exit code of a process, and its message."""
 
     code: int
     message: str
@@ -49,19 +49,19 @@ class Ending(NamedTuple):
 def describe(error: BaseException) -> Ending | None:
     """The message and exit code of an error that the user can solve; None for a bug."""
     if signals.told and not isinstance(error, signals.Interrupted | KeyboardInterrupt):
-        error = KeyboardInterrupt(signals.told[0])  # whatever fails after it fails by it
+        error = KeyboardInterrupt(signals.told[0])  # an error after a signal is a consequence of it
     if isinstance(error, ClearError):
         return Ending(error.exit_code, one_line(error))
     if isinstance(error, KeyboardInterrupt):
         signum = signals.signal_of(error)
-        return Ending(SIGNALS + signum, f"stopped by {signum.name}.")  # a job says what it has saved
+        return Ending(SIGNALS + signum, f"stopped by {signum.name}.")  # the job itself has logged what it saved
     if isinstance(error, _library_errors()):
         from clear_strategies.hydra_errors import of_hydra
 
         return Ending(UNUSABLE, of_hydra(error))  # before OSError: Hydra's error for an option that is not there is one
     if message := _of_memory(error):
         return Ending(UNUSABLE, message)
-    disk = error if isinstance(error, OSError) else error.__cause__  # logging wraps it where it cannot open its file
+    disk = error if isinstance(error, OSError) else error.__cause__  # logging wraps it if it cannot open its file
     if isinstance(disk, OSError):
         where = one_line(f"{disk.filename or 'output'}: {disk.strerror or disk}")
         remedy = f"{_FIRST.get(disk.errno or 0, 'Write')} elsewhere"
@@ -71,7 +71,7 @@ def describe(error: BaseException) -> Ending | None:
 
 
 def _of_memory(error: BaseException) -> str | None:
-    """What to tell where memory ran out, or may have."""
+    """The message if memory ran out, or may have; None for other errors."""
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY in str(error)):
         return f"out of memory: {one_line(error) or 'Python had none left.'} {_LESS_MEMORY}"
     if isinstance(error, ImportError) and "failed to map segment" in str(error):  # of a library, by the system
@@ -81,7 +81,7 @@ def _of_memory(error: BaseException) -> str | None:
 
 
 def _library_errors() -> tuple[type[Exception], ...]:
-    """Errors whose messages are for the user; imported here, so that a wrong word waits for none of these libraries."""
+    """Errors whose messages are for the user; imported here, so that a wrong argument is refused without these libraries."""
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
@@ -91,7 +91,7 @@ def _library_errors() -> tuple[type[Exception], ...]:
 
 
 def require(extra: str) -> None:
-    """Raise a SettingError where a library of this extra of `NEEDED` is not installed; none is imported."""
+    """Raise a SettingError if a library of this extra of `NEEDED` is not installed. Imports none of them."""
     what, modules = NEEDED[extra]
     if missing := [name for name in modules if find_spec(name) is None]:
         raise SettingError(f"{what} needs {', '.join(missing)}: pip install 'clear-strategies[{extra}]'.")

@@ -47,9 +47,9 @@ def run(
     Every setting is checked before the folder is locked and before data is read.
 
     Args:
-        overrides: that the configuration was composed of, which the report names the run by.
-        claim: called, perhaps twice, once the folder is this run's: at once where there was no run, else when nothing can refuse
-            this one any more. Nothing is written there before, except the lock.
+        overrides: of the command line, from which the report makes the run's name.
+        claim: called, perhaps twice, once the folder is this run's: at once if it had no run, else when all checks of this one
+            are done. Before, only the lock is written there.
 
     Returns:
         The mean PSNR of the test views, dB, which a sweeper may optimize; of the training views if there are no test views.
@@ -57,8 +57,8 @@ def run(
 
     Raises:
         SettingError, StrategyConflict: the configuration cannot be used.
-        DataError: a file cannot be used, another job is at work in the folder, or the folder holds a run that is neither resumed
-            nor to be overwritten, or is one of another configuration.
+        DataError: a file cannot be used, another job runs in the folder, or the folder has a run that is neither resumed nor to
+            be overwritten, or that has another configuration.
     """
     values = tree(config)
     settings = settings_of(values)
@@ -81,7 +81,7 @@ class _Job:
     """A job whose settings have been checked, in its locked folder.
 
     Args:
-        compared: the configuration from `resume.comparable`, which a resumed run must have in common.
+        compared: the part of the configuration that a resumed run must share, from `resume.comparable`.
     """
 
     settings: JobSettings
@@ -154,7 +154,7 @@ class _Job:
     def _announce(
         self, scene: Scene, state: TrainState, drawing: device.ReadyRasterizer, threads: str, level: int
     ) -> None:
-        """Log the plan, and what was set in vain. A SettingError if the run does not fit into memory."""
+        """Log the plan, and settings without effect. A SettingError if the run does not fit into memory."""
         memory.release()
         machine = {
             "rasterizer": f"{drawing.name}, kernel {drawing.rules.kernel} px²",
@@ -169,7 +169,7 @@ class _Job:
             _log.warning("%s has no effect: %s densifies in place of it.", ", ".join(idle), state.density.name)
 
     def _watched(self, scene: Scene, painter: Painter) -> AbstractContextManager[Callable[[int], None] | None]:
-        """Opens the viewer if `fit.viewer` asks for it; its value is called after each iteration."""
+        """Open the viewer if `fit.viewer` is set; the value of the context is called after each iteration."""
         if not self.settings.fit.viewer:
             return nullcontext()
         from clear_strategies.viewing.server import watched
@@ -184,8 +184,9 @@ class _Job:
         self, scene: Scene, there: Scene, state: TrainState, drawing: device.ReadyRasterizer
     ) -> tuple[Evaluation, float]:
         """Train to the end and write the files; return the scores and the seconds of training in this command."""
-        title, alone, painter = self.chosen.title, device.jobs_at_once() == 1, Painter(state.field, drawing.make)
-        before = state.seconds  # what a resumed run took
+        title, alone = self.chosen.title, device.jobs_at_once() == 1
+        painter = Painter(state.field, drawing.make)
+        before = state.seconds  # of the run that was resumed
         began = time.perf_counter()
         with signals.interrupted("before the run was finished", lambda: resume.newest(self.folder)):
             write_cameras(self.folder, scene)
@@ -196,7 +197,7 @@ class _Job:
                 checkpoints = self.folder / CHECKPOINTS
                 fit(state, there, drawing.rasterizer, checkpoints=checkpoints, config=self.compared, progress=progress)
             training = time.perf_counter() - began
-            self.conductor.on_fit_end()  # its memory is for the results
+            self.conductor.on_fit_end()  # frees memory for the results
             memory.release()
             evaluation = results.write_results(
                 self.folder, scene, state, drawing.rasterizer, painter, self.chosen, backend=drawing.name,
@@ -211,7 +212,7 @@ _AFTER: Final = ("maps", "evaluate", "video", "pictures")
 
 
 def _parts(scene: Scene, state: TrainState, training: float) -> dict[str, float]:
-    """The seconds of what a command does, one stage after the other."""
+    """The seconds of each stage of the command, in order."""
     entries = state.conductor.work_log.entries
     before = {**scene.work_log.entries, **{name: e for name, e in entries.items() if name == _PREPARED}}
     after = sum(entries[name].seconds for name in _AFTER if name in entries)

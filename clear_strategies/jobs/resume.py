@@ -1,4 +1,4 @@
-"""Resuming a run that was stopped, and recognizing one that is finished."""
+"""Resuming stopped runs, and recognizing finished ones."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ _log = logging.getLogger(__name__)
 _TRAIN_AGAIN: Final = "remove the file: the run is then trained again"
 AUTO: Final = "auto"  # the value of fit.resume that is not a path
 
-# What may differ between a run and the one that it resumes. Another device changes bits, which is logged.
+# Settings that may differ between a run and the one that it resumes. Another device changes bits, which is logged.
 _NOT_COMPARED: Final = CHANGES_NO_RESULT | {"fit.device"}
-# Where photos and SR images lie, which may be moved: cameras and fingerprints of what is read there are compared.
+# Paths of photos and SR images, which may be moved: cameras and fingerprints of the images are compared instead.
 _PLACE: Final = re.compile(r"data\.(path|root|reader\.(root|cache)|views\.lr_folder)|prior\.(.*\.)?path")
 # A file, such as initial points or a network, has its digest beside the key of its path.
 _FILE: Final = ".path"
 _DIGEST: Final = " digest"
 _DIGEST_EARLIER: Final = (" content", " holds")  # of earlier versions, also of folders
-_ROUNDED: Final = 1e-6  # of a position, as float32 has it
-_SAME: Final = 1e-3  # of a camera's focal length, and of the distances between the cameras
-_SAME_COLOUR: Final = 5e-4  # more than other machines round or decode differently
+_ROUNDED: Final = 1e-6  # relative error of a position in float32
+_SAME: Final = 1e-3  # relative to a camera's focal length, and to the distances between the cameras
+_SAME_COLOUR: Final = 5e-4  # more than rounding and decoding differ between machines
 
 
 def comparable(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration, flat and JSON-ready, without what a resumed run may change."""
+    """The configuration, flat and JSON-ready, without the settings that a resumed run may change."""
     compared = {key: value for key, value in flat(values).items() if key not in _NOT_COMPARED}
     files = {key: Path(str(value)) for key, value in compared.items() if key.endswith(_FILE) and value}
     compared |= {
@@ -57,17 +57,17 @@ def comparable(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def begun(folder: Path) -> str | None:
-    """What a run has left in this folder, "results" or "checkpoints"; None where there was none."""
+    """Return "results" or "checkpoints" if an earlier run left some in this folder, else None."""
     if (folder / FINISHED).exists():
         return "results"
     return "checkpoints" if newest(folder) is not None else None
 
 
 def finished(folder: Path, config: Mapping[str, Any], scene: Callable[[], Scene]) -> Metrics | None:
-    """The results of the finished run in this folder; None where there is none.
+    """The results of the finished run in this folder; None if there is none.
 
     Args:
-        scene: reads that of `config`, if its place is another, or has been written to since.
+        scene: loads the scene of `config`; called if its path has changed, or a file there is newer than the results.
     """
     path = folder / FINISHED
     if not path.exists():
@@ -76,7 +76,7 @@ def finished(folder: Path, config: Mapping[str, Any], scene: Callable[[], Scene]
     _require_same(folder, content.config, config)
     places = {key: config[key] for key in filter(_PLACE.fullmatch, config) if config[key]}
     moved = any(content.config.get(key) != place for key, place in places.items())
-    if moved or any(_written(Path(place), path) for key, place in places.items() if key.endswith(_FILE)):
+    if moved or any(_has_newer(Path(place), path) for key, place in places.items() if key.endswith(_FILE)):
         _require_same_cameras(folder, there := scene())
         if (last := newest(folder)) is not None:
             _require_same_photos(folder, checkpoint.load(last), fingerprints(there))
@@ -91,17 +91,17 @@ def finished(folder: Path, config: Mapping[str, Any], scene: Callable[[], Scene]
     return content
 
 
-def _written(place: Path, since: Path) -> bool:
-    """Whether a place has a file that is newer than this one."""
-    return any(file.lstat().st_mtime > since.stat().st_mtime for file in place.rglob("*"))
+def _has_newer(folder: Path, than: Path) -> bool:
+    """Return True if a file in the folder is newer than another file."""
+    return any(file.lstat().st_mtime > than.stat().st_mtime for file in folder.rglob("*"))
 
 
 def resume(state: TrainState, scene: Scene, source: str | None, folder: Path, config: Mapping[str, Any]) -> None:
-    """Restore what `fit.resume` names.
+    """Restore the state from the checkpoint that `fit.resume` names.
 
     Args:
         scene: of the state.
-        source: a run's folder or one of its checkpoints; "auto": the newest checkpoint in `folder` that is whole, or none.
+        source: a run's folder or one of its checkpoints; "auto": the newest undamaged checkpoint in `folder`, if there is one.
     """
     if source is None:
         return
@@ -122,7 +122,7 @@ def resume(state: TrainState, scene: Scene, source: str | None, folder: Path, co
 
 
 def folder_of(source: Path) -> Path:
-    """The run's folder, of itself, its folder of checkpoints, or one of these."""
+    """The run's folder, from that folder itself, its folder of checkpoints, or a checkpoint."""
     return next((path.parent for path in (source, source.parent) if path.name == CHECKPOINTS), source)
 
 
@@ -158,7 +158,7 @@ def _require_same(source: Path, then: Mapping[str, Any], now: Mapping[str, Any])
 
 
 def _require_same_cameras(source: Path, scene: Scene) -> None:
-    """Refuse a scene with other photos, sizes or poses than those of the run of `source`, if its folder has them."""
+    """Raise a DataError if the scene's photos, sizes or poses differ from those that the run of `source` has saved, if it has."""
     file = folder_of(source) / CAMERAS
     if not file.is_file():
         return
@@ -180,7 +180,7 @@ def _require_same_cameras(source: Path, scene: Scene) -> None:
 
 
 def _require_same_photos(source: Path, saved: Checkpoint, photos: Mapping[str, Tensor]) -> None:
-    """Refuse photos, masks or SR images with another content; checkpoints of earlier versions have less of it, or nothing."""
+    """Raise a DataError if photos, masks or SR images have changed; checkpoints of earlier versions have fewer fingerprints."""
     now = {name: (saved.tensors.get(f"{PHOTOS}/{name}", x), x) for name, x in photos.items()}
     if changed := [name for name, (a, b) in now.items() if not _same_colours(a, b)]:
         problem = f"{len(changed)} of {len(now)} have another content, mask or SR image than in this run, such as {changed[0]}"

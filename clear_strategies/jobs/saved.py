@@ -1,4 +1,4 @@
-"""A saved splat, opened to be looked at: a run by its newest checkpoint, or a PLY file."""
+"""Opening a saved splat to render it: a run by its newest checkpoint, or a PLY file."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _FAR: Final = 2.5  # radii of the scene, distance of the camera for a PLY file w
 _SIZE: Final = (1280, 720)  # px, of that camera
 _OF_RASTERIZER: Final = "rasterizer."
 _SHARED: Final = ("kernel", "antialiased", "background")  # settings that mean the same for every rasterizer
-_DEPTH: Final = 3  # cameras.json lies at most so many folders above a PLY file
+_ABOVE: Final = 3  # folders above that of a PLY file in which cameras.json may lie
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,10 +48,10 @@ class SavedSplat:
 
     Args:
         folder: of the run, or of the PLY file.
-        name: of the folder, or of a PLY file that has one of its own; one word, for files and the title of a window.
-        source: what was opened, for messages.
-        cameras: of the run; empty where none are known.
-        antialiased: it was trained with opacity compensation.
+        name: of the folder, or of a PLY file that is not named point_cloud; for files and the title of a window.
+        source: a description of what was opened, for messages.
+        cameras: of the run; empty if none are known.
+        antialiased: the splat was trained with opacity compensation.
     """
 
     folder: Path
@@ -62,7 +62,7 @@ class SavedSplat:
     antialiased: bool
 
     def photo(self, name: str) -> UInt8[np.ndarray, "h w 3"] | None:
-        """The LR photo of a camera, which the run has saved; None where there is none."""
+        """The LR photo of a camera, if the run has saved it, else None."""
         stem = file_stems(saved.name for saved in self.cameras)[name]
         path = self.folder / "views" / f"{stem}_lr.png"
         try:
@@ -72,21 +72,20 @@ class SavedSplat:
             return None
 
     def poses(self) -> list[Camera]:
-        """The training cameras, or, where none are known, one that sees the whole splat."""
-        train, field = [saved.camera for saved in self.cameras if saved.split == "train"], self.painter.field
-        return (
-            train
-            or [saved.camera for saved in self.cameras]
-            or [overview(field.means.data, field.opacities.data.sigmoid())]
-        )
+        """The training cameras, else all cameras, else one that sees the whole splat."""
+        if self.cameras:
+            train = [saved.camera for saved in self.cameras if saved.split == "train"]
+            return train or [saved.camera for saved in self.cameras]
+        field = self.painter.field
+        return [overview(field.means.data, field.opacities.data.sigmoid())]
 
 
 def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
     """Open a run's folder, one of its checkpoints, or a PLY file.
 
     Args:
-        rasterizer: by name, or by the dotted name of another package's class; None: the one that the run trained with, if it is
-            known here (see `_drawing`), or else the fastest.
+        rasterizer: by name, or by the dotted name of another package's class; None: that of the run, if it is known here (see
+            `_drawing`), else the fastest.
     """
     folder, above = folder_of(path), 0
     is_ply = path.is_file() and path.suffix != checkpoint.SUFFIX
@@ -108,7 +107,7 @@ def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
         field = GaussianField(raw | {"detail": torch.zeros_like(gaussians.means)})
         field.degree = field.max_degree
         settings = {} if gaussians.antialiased else {"kernel": 0.3, "antialiased": False}
-        folder, above, source = ply.parent, _DEPTH, str(ply)
+        folder, above, source = ply.parent, _ABOVE, str(ply)
         name = folder.name if ply.name == PLY else ply.stem
     cameras = _cameras_near(folder, above)
     background = cameras[0].background if cameras else (0.0, 0.0, 0.0)
@@ -145,7 +144,7 @@ def _field_of(saved: checkpoint.Checkpoint, path: Path) -> GaussianField:
 
 
 def _ply_in(folder: Path, path: Path) -> Path:
-    """The PLY file of a run's folder, or of a model's of Inria's 3DGS."""
+    """Find the PLY file in a run's folder, or in a model's folder of Inria's 3DGS."""
     last = sorted(folder.glob(f"point_cloud/iteration_*/{PLY}"), key=lambda p: len(p.parent.name))
     if (ply := next((p for p in reversed([folder / PLY, *last]) if p.is_file()), None)) is None:
         problem = "has neither a checkpoint nor a point_cloud.ply" if path.exists() else "is not there"
@@ -154,13 +153,13 @@ def _ply_in(folder: Path, path: Path) -> Path:
 
 
 def _drawing(settings: Mapping[str, Any], name: str | None) -> ReadyRasterizer:
-    """The rasterizer with the settings of a run, or the one that was asked for.
+    """Make the rasterizer with the settings of a run, or the one that was asked for.
 
     The class is one of this repository, one that the configuration of an installed package names, or the one that was asked for:
-    a file gives arguments, and never what is called with them.
+    a file gives arguments, never the class that is called with them.
 
     Args:
-        settings: what a checkpoint holds, so plain values.
+        settings: from a checkpoint, so plain values.
     """
     target, shared = settings.get(TARGET, device.BY_NAME), {key: settings[key] for key in _SHARED if key in settings}
     own = {key: value for key, value in settings.items() if not key.startswith("_")}
@@ -184,7 +183,7 @@ def _made(node: Mapping[str, Any]) -> ReadyRasterizer:
 
 
 def _cameras_near(folder: Path, above: int) -> list[SavedCamera]:
-    """The cameras.json of a folder, or of one of the folders above it."""
+    """Read the cameras.json of a folder, else of the nearest of `above` folders above it."""
     for candidate in (folder, *list(folder.resolve().parents)[:above]):
         if (candidate / CAMERAS).is_file():
             return read_cameras(candidate / CAMERAS)

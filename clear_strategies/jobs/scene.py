@@ -1,4 +1,4 @@
-"""The scene of a job: which data, which views of it, which prior."""
+"""The scene of a job, from its settings of data, views and prior."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from clear_strategies.settings import LISTED
 _log = logging.getLogger(__name__)
 
 FEW_PLACED: Final = "few photos"
-"""The note of a scene that lacks so many photos that this is said before and after training."""
+"""The note of a scene in which so few photos have a pose that a warning is logged before and after training."""
 _ENOUGH: Final = 0.6  # of the photos
 _NETWORK: Final = "waifu2x"  # of `auto`: close to the truth and fast
 
 
 def _variable() -> Any:
-    """A key that only some data sets have: conf/ has it, the defaults have not."""
+    """A key that only some data sets have: it is in their files of conf/, not among the defaults."""
     return field(default=None, metadata={LISTED: False})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DataSettings:
-    """A data set, and what is made of it.
+    """A data set, its views and its initial points.
 
     Args:
-        reader: reads the capture; called once every setting has been checked.
+        reader: reads the capture; called after every setting has been checked.
         save_lr: write the LR images to this folder, for an external SR model, and stop.
         path, root, scene: for the interpolations of conf/: the scene's folder, the folder of the scenes' folders, and the
             name of one of them.
@@ -58,16 +58,14 @@ class DataSettings:
 
     @property
     def source(self) -> str:
-        """The folder that is read; where there is none, what reads, as "demo"."""
+        """The folder that is read; without one, the name of the reader, as "demo"."""
         read = getattr(self.reader, "func", self.reader)
         return self.path or str(getattr(read, "__module__", type(read).__module__)).rpartition(".")[2]
 
 
 @dataclass(frozen=True, slots=True)
 class AutoPrior:
-    """The prior that the reader gives the capture, as the demo's does; else waifu2x, where it is installed and reaches the
-    factor, or bicubic.
-    """
+    """The capture's own prior, as the demo has one; else waifu2x, if it is installed and reaches the factor; else bicubic."""
 
     def of(self, capture: Capture, factor: int) -> Prior:
         """The prior for this capture."""
@@ -78,11 +76,11 @@ class AutoPrior:
 
 
 PriorSettings = AutoPrior | Callable[..., Any]
-"""`auto`, a `Prior`, or one that waits for the HR photos: `_partial_` in conf/prior."""
+"""`auto`, a `Prior`, or a function that makes one from the HR photos: `_partial_` in conf/prior."""
 
 
 def require_factor(prior: PriorSettings, factor: int) -> None:
-    """Raise a SettingError if the prior cannot enlarge by this factor, as far as this is known before it is asked to."""
+    """Raise a SettingError if it is known beforehand that the prior cannot enlarge by this factor."""
     if isinstance(network := network_of(prior), Ncnn):
         network.require_factor(factor)
 
@@ -121,24 +119,26 @@ def load(
 
 
 def read(data: DataSettings, prior: PriorSettings) -> tuple[Capture, ViewSettings]:
-    """The capture as the data set has it, and the settings of its views, both within the limit of the HR images."""
+    """Read the capture, and fit it and the settings of its views into the limit of the HR images' size."""
     capture = data.reader()
     require_text((capture.name, *(frame.name for frame in capture.frames), *capture.unplaced))
     placed, photos = len(capture.frames), len(capture.frames) + len(capture.unplaced)
     if placed < _ENOUGH * photos:
         few = f"{placed} of {photos} photos ({placed / photos:.0%}) have a pose, and the others are not used: {MORE_PHOTOS}"
         capture = replace(capture, notes={**capture.notes, FEW_PLACED: few})
-    auto, network = isinstance(prior, AutoPrior) and data.save_lr is None, network_of(prior)
+    auto = isinstance(prior, AutoPrior) and data.save_lr is None
+    network = network_of(prior)
 
     def reaches(factor: int) -> bool:
-        """Of an unknown prior only `sr_scale` is expected."""
-        return factor in factors(network.model) if isinstance(network, Ncnn) else auto or isinstance(prior, Bicubic)
+        if isinstance(network, Ncnn):
+            return factor in factors(network.model)
+        return auto or isinstance(prior, Bicubic)  # other priors are expected to reach `sr_scale` only
 
     return within_limit(capture, data.views, reaches=reaches, super_resolve=not auto)
 
 
 def _remedy(factor: int) -> str:
-    """How to get SR images with detail where `auto` found none for this factor."""
+    """The remedy if `auto` found no prior with detail for this factor."""
     if factor in factors(_NETWORK):
         return "For a super-resolution network: pip install 'clear-strategies[sr]'"
     reached = " or ".join(map(str, factors(_NETWORK)))

@@ -26,8 +26,8 @@ class JobSettings(ConductorSettings):
     """The whole of conf/config.yaml, as objects.
 
     Args:
-        metrics: by name what else the renders are scored by, each called with an image and the truth, [H, W, 3] in [0, 1].
-        method: which baseline of the papers' tables this is, for the plan and the tables; set by +method=NAME.
+        metrics: further metrics of the renders by name, each called with an image and the truth, [H, W, 3] in [0, 1].
+        method: the name of a baseline of the papers' tables, for the plan and the tables; set by +method=NAME.
     """
 
     rasterizer: RasterizerSettings | functools.partial[Any]
@@ -42,13 +42,13 @@ class JobSettings(ConductorSettings):
 
     def __post_init__(self) -> None:
         if isinstance(self.prior, functools.partial):
-            self.prior(truth={})  # it waits for the photos; its own settings are refused now
+            self.prior(truth={})  # checks its settings; it is made again with the photos
         elif not isinstance(self.prior, scene.AutoPrior | Prior):
             raise SettingError(
                 f"prior: {type(self.prior).__name__} is no Prior: it needs the property label, and __call__."
             )
         for decorate in self.decorators.values():
-            decorate(Bicubic())  # likewise
+            decorate(Bicubic())  # checks its settings, too
         scene.require_factor(self.prior, self.data.views.sr_scale)
 
 
@@ -56,7 +56,7 @@ def settings_of(values: Mapping[str, Any]) -> JobSettings:
     """The settings of a resolved configuration, see `compose.tree`.
 
     Raises:
-        SettingError: as `build`; of a group that is nearly one of conf/, it names that.
+        SettingError: as `build`; for a group with a name close to one of conf/, it suggests that one.
     """
     groups, known = [folder.name for folder in CONF.iterdir()], {f.name for f in fields(JobSettings)}
     for key, value in values.items():

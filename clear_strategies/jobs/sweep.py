@@ -1,4 +1,4 @@
-"""A sweep of jobs: why none of them can begin, and how a signal reaches those that joblib runs in processes of their own."""
+"""Sweeps of jobs: checks before the first job, and signals to the jobs that joblib runs in processes of their own."""
 
 from __future__ import annotations
 
@@ -31,29 +31,29 @@ from clear_strategies.files import FINISHED, expanded
 from clear_strategies.options import UNNAMED
 from clear_strategies.settings import absent, missing
 
-# Launchers whose jobs see the folders that the process sees which was started; on the nodes of a cluster there may be others.
+# Launchers whose jobs share the file system of the process that was started; nodes of a cluster may have another.
 _LOCAL: Final = ("basic", "cores", "joblib", "submitit_local")
 
 stopped: Final = list[int]()
-"""The signals by which a sweep of several processes was stopped: in the process that was started, and in each of the others."""
+"""The signals that stopped a sweep of several processes, in the process that was started and in each of the others."""
 
 
 def in_sweep() -> bool:
-    """Whether this job is one of a sweep."""
+    """Return True if this job is one of a sweep."""
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
 def refusal(config: DictConfig) -> str | None:
-    """Why a sweep cannot begin: a job stands in it twice, or all jobs lack a value, folder or file; None where it can.
+    """The reason why a sweep cannot begin: a job is in it twice, or all jobs lack the same value, folder or file; else None.
 
     Jobs are composed until one lacks nothing, or something else than the first.
 
     Args:
-        config: of the sweep, as Hydra gives it to callbacks.
+        config: of the sweep, as Hydra passes it to callbacks.
     """
     try:
         jobs = Counter(map(tuple, _overrides_of_jobs(config)))
-        if _are_named_by_us(config) and (twice := next((job for job, count in jobs.items() if count > 1), None)):
+        if _has_default_folders(config) and (twice := next((job for job, count in jobs.items() if count > 1), None)):
             return (
                 f"{' '.join(twice)}: stands twice in this sweep, and has one folder. Name each value once; "
                 "hydra.sweep.subdir='${hydra.job.num}' gives each job a folder of its own."
@@ -62,24 +62,24 @@ def refusal(config: DictConfig) -> str | None:
         first = next(lacks, None)
         return first if first and all(lack == first for lack in lacks) else None
     except (HydraException, OmegaConfBaseException, OSError):
-        return None  # the jobs tell it, or Hydra, which composes all of them next
+        return None  # Hydra, which composes all jobs next, or the jobs raise the error
 
 
 def name_by_all_that_is_swept(config: DictConfig) -> None:
-    """Have the names of the jobs' folders tell also those settings, else left out, in which the jobs differ.
+    """Add settings that the names of the jobs' folders leave out by default to these names, if the sweep varies them.
 
     Args:
         config: as of `refusal`.
     """
-    if _are_named_by_us(config) and (
+    if _has_default_folders(config) and (
         swept := UNNAMED & {word.key_or_group for word in _words(config) if word.is_sweep_override()}
     ):
         with read_write(config.hydra):
             config.hydra.overrides.hydra.append(f"hydra.sweep.subdir='${{job_folder:{','.join(sorted(swept))}}}'")
 
 
-def _are_named_by_us(config: DictConfig) -> bool:
-    """Whether the folders of the jobs are named by their overrides."""
+def _has_default_folders(config: DictConfig) -> bool:
+    """Return True if the folders of the jobs are named by their overrides, which is the default."""
     given: Any = OmegaConf.to_container(config.hydra.sweep)
     return bool(given["subdir"] == "${job_folder:}")
 
@@ -92,7 +92,7 @@ def _words(config: DictConfig) -> list[Override]:
 
 
 def _overrides_of_jobs(config: DictConfig) -> list[list[str]]:
-    """The overrides of each job; none where another sweeper than Hydra's own chooses the values."""
+    """The overrides of each job; empty if another sweeper than Hydra's own chooses the values."""
     if config.hydra.runtime.choices["hydra/sweeper"] != "basic":
         return []
     (jobs,) = BasicSweeper.split_arguments(_words(config), None)
@@ -100,13 +100,13 @@ def _overrides_of_jobs(config: DictConfig) -> list[list[str]]:
 
 
 def _jobs(config: DictConfig) -> Iterator[DictConfig]:
-    """The configuration of each of them."""
+    """The configuration of each job."""
     for overrides in _overrides_of_jobs(config):
         yield GlobalHydra.instance().config_loader().load_sweep_config(config, overrides)
 
 
 def _lack(config: DictConfig) -> str | None:
-    """What a job needs and has not."""
+    """The message about a value, folder or file that a job lacks; None if it lacks nothing."""
     values: dict[str, Any] = OmegaConf.to_container(config)  # type: ignore[assignment]
     if (key := absent({name: node for name, node in values.items() if name != "hydra"})) is not None:
         return str(missing(key))
@@ -124,13 +124,13 @@ def _lack(config: DictConfig) -> str | None:
 
 
 def in_worker() -> bool:
-    """Whether this is a process of joblib's, which ends all others at once where one of them ends or has an error."""
+    """Return True in a process of joblib's, which ends all others as soon as one of them ends or has an error."""
     return in_sweep() and multiprocessing.parent_process() is not None
 
 
 @contextmanager
 def first_signal_ends_job() -> Iterator[None]:
-    """A job in a process of joblib's: the first signal ends it, after it has saved."""
+    """During a job in a process of joblib's, let the first signal end the job after it has saved."""
     signals.handle(_end_job)
     try:
         yield
@@ -144,14 +144,14 @@ def _note(signum: int, _frame: FrameType | None) -> None:
 
 
 def _end_job(signum: int, frame: FrameType | None) -> None:
-    """The handler of joblib's processes in a job, where no step defers signals."""
+    """The handler of joblib's processes during a job, outside steps that defer signals."""
     if not stopped and not signals.asked():
         _note(signum, frame)
         signals.stop(signum, frame)
 
 
 def worker_ended(error: BrokenProcessPool) -> ClearError:
-    """What to tell where one of joblib's processes has ended before its job: joblib ends the others, too."""
+    """The error if one of joblib's processes has ended before its job: joblib ends the others, too."""
     how = re.search(r"\{(.*)\}", str(error))  # joblib's: "The exit codes of the workers are {SIGKILL(-9)}"
     return ClearError(
         f"a process of the sweep was ended ({how[1] if how else 'unknown'}), as the system does where memory runs out (SIGKILL). "
@@ -161,17 +161,17 @@ def worker_ended(error: BrokenProcessPool) -> ClearError:
 
 
 def stop_workers(signum: int, frame: FrameType | None) -> None:
-    """The handler of a sweep: joblib's processes save their runs, and begin no other; a second signal acts at once."""
+    """The handler of a sweep: joblib's processes save their runs, and start no other job; a second signal acts at once."""
     if not (workers := multiprocessing.active_children()):
         signals.stop(signum, frame)
     stopped.append(signum)
     for twice in signals.TWICE:
         signal.signal(twice, signals.stop)
-    # joblib composes each job when its turn comes, from a list in one of these frames: no other begins where that is empty.
+    # joblib composes each job just before it starts, from a list in one of these frames: an empty list starts no other job.
     while frame is not None:
         frame.f_locals.get("job_overrides", []).clear()
         frame = frame.f_back
-    if sys.platform != "win32":  # whose console has told them; `kill` would end them before they have saved
+    if sys.platform != "win32":  # its console has sent them the signal; `kill` would end them before they have saved
         for worker in workers:
             with suppress(ProcessLookupError):
                 os.kill(worker.pid, signum)  # type: ignore[arg-type]
