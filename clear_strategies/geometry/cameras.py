@@ -1,4 +1,4 @@
-"""What several cameras look at, which of them are compared, and cameras beside a camera."""
+"""The region that several cameras look at, the choice of cameras to compare, and cameras beside a camera."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from torch import Tensor
 from clear_strategies.core.view import Photo
 from rasterizers.interface import Camera
 
-_PARTNERS: Final = 12  # of a photo, those that it is compared with
-_NEAREST: Final = 8  # of them, those that are nearest
-_ALONG: Final = 0.3  # movements along the viewing direction are this much shorter: going close leaves holes
+_PARTNERS: Final = 12  # photos that a photo is compared with
+_NEAREST: Final = 8  # nearest photos among them
+_ALONG: Final = 0.3  # factor of movements along the viewing direction, since moving closer leaves holes
 
 
 def centers_of(cameras: Sequence[Camera]) -> Float[Tensor, "C 3"]:
-    """Where the cameras are, float64 on the CPU."""
+    """The positions of the cameras, float64 on the CPU."""
     return torch.stack([camera.center.double().cpu() for camera in cameras])
 
 
 def common_box(photos: Sequence[Photo]) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
-    """(smallest, largest corner) of the cube around the largest ball that all cameras see whole, about what they look at."""
+    """(smallest, largest corner) of the cube around the largest ball at `looked_at` that all cameras see whole."""
     cameras = [photo.camera for photo in photos]
     middle, centers = looked_at(cameras), centers_of(cameras)
     distance = float(torch.linalg.vector_norm(centers - middle, dim=-1).mean())
@@ -54,10 +54,10 @@ def looked_at(cameras: Sequence[Camera]) -> Float[Tensor, " 3"]:
 
 
 def partners(cameras: Sequence[Camera]) -> list[list[int]]:
-    """For each camera the others that its photo is compared with: all of few, of many the nearest and some that lie ever
-    farther away.
+    """Choose for each camera the others to compare its photo with: all if there are few, else the nearest ones and some at
+    increasing distances.
 
-    The nearest alone may be a burst, which shows no depth, or one side of the scene, which shows nothing of the other.
+    The nearest alone may be a burst, without parallax, or show only one side of the scene.
     """
     centers, others = centers_of(cameras), len(cameras) - 1
     far = np.geomspace(_NEAREST + 1, max(others, _PARTNERS), _PARTNERS - _NEAREST).round().astype(int) - 1
@@ -68,7 +68,9 @@ def partners(cameras: Sequence[Camera]) -> list[list[int]]:
 
 
 def moved_aside(camera: Camera, distance: float, reach: float, generator: torch.Generator) -> Camera:
-    """The camera moved by up to `reach` × `distance`, and turned to keep in its middle what it saw there at `distance`."""
+    """Move the camera at random by up to `reach` × `distance`, and turn it so that the point at `distance` on its axis stays in
+    the middle.
+    """
     direction = torch.randn(3, generator=generator, dtype=torch.float64)
     length = torch.rand((), generator=generator, dtype=torch.float64)
     direction = direction / torch.linalg.vector_norm(direction) * length
@@ -86,6 +88,6 @@ def moved_aside(camera: Camera, distance: float, reach: float, generator: torch.
 
 
 def beside(camera: Camera, means: Float[Tensor, "N 3"], reach: float, generator: torch.Generator) -> Camera:
-    """The camera moved aside at its distance to the middle of the points, the median of each coordinate; 1 if it is there."""
+    """Move the camera aside, see `moved_aside`, with its distance to the median of the points, or 1 if that is 0."""
     distance = torch.linalg.vector_norm(camera.center.double() - means.median(dim=0).values.cpu().double())
     return moved_aside(camera, float(distance) or 1.0, reach, generator)

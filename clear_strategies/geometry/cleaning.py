@@ -1,6 +1,6 @@
-"""Cleaning a cloud: outliers are removed, as Open3D defines them, and voxels averaged by it.
+"""Removal of a cloud's outliers, as Open3D defines them, and averaging in voxels by Open3D.
 
-Outliers are SciPy's work, because most runs remove them and importing Open3D takes two seconds.
+Outliers are removed by SciPy, because most runs remove them and importing Open3D takes two seconds.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ OUTLIER_RATIO: Final = 3.0
 
 
 def without_outliers(cloud: PointCloud, neighbours: int, ratio: float) -> PointCloud:
-    """The cloud without outliers; all of it if `neighbours` is 0 or there are too few points.
+    """Remove outliers; none if `neighbours` is 0 or there are too few points.
 
     A point's measure is the mean distance to its `neighbours` nearest points (2 or more), itself included. The point is kept if
     its measure is below the average plus `ratio` standard deviations. A point whose measure is 0, because its neighbours
@@ -49,7 +49,7 @@ def without_outliers(cloud: PointCloud, neighbours: int, ratio: float) -> PointC
 
 
 def averaged_in_voxels(cloud: PointCloud, edge: float) -> PointCloud:
-    """One point per occupied cube of this edge (world units): the averages of its positions and colours, ordered by cube. The
+    """Replace the points in each cube of this edge (world units) by one with their mean position and colour, ordered by cube. The
     grid starts half a cube below the smallest coordinates.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Photos at one exposure and white balance: a gain for each photo and channel, from the colours of surfaces that photos share.
+"""Equalization of exposure and white balance: a gain per photo and channel, from the colours of surfaces that photos share.
 
 A camera that chooses its exposure for each photo multiplies linear light, and so does white balance. Where the sRGB curve is
 close to a power, the photo is multiplied by a power of the same number: one gain per channel describes both.
@@ -18,16 +18,16 @@ from clear_strategies.geometry.cameras import partners
 from clear_strategies.geometry.projection import back_project, project, sample_colors, seen_pixels
 
 _TOLERANCE: Final = 0.02  # relative difference of depth up to which two photos show the same surface
-_UNCLIPPED: Final = (0.05, 0.92)  # darker, a ratio is that of noise; lighter, the photo may have been clipped
+_UNCLIPPED: Final = (0.05, 0.92)  # darker pixels are mostly noise, lighter ones may be clipped
 _FEWEST: Final = 100  # shared pixels of a pair, per channel
 
 
 def exposure_gains(photos: Sequence[Photo], depths: Sequence[DepthMap]) -> Float[Tensor, "V 3"]:
-    """The gains that bring the photos to their common exposure: photo × gain.
+    """Compute the gains that bring the photos to a common exposure: photo × gain.
 
-    Each photo and its `partners` give the median ratio of the colours of the surfaces that both show; least squares over
-    all pairs make one gain of each photo of them. Over photos that are connected by pairs, the gains of a channel have the
-    geometric mean 1. A photo that shares nothing with another has the gain 1.
+    For each pair of a photo and one of its `partners`, the median ratio of the colours of shared surfaces is measured; least
+    squares over all pairs gives a gain per photo. Over photos that are connected by pairs, the gains of a channel have the
+    geometric mean 1. A photo that shares no surface with another has the gain 1.
 
     Args:
         depths: of the photos, on their pixels.
@@ -49,7 +49,7 @@ def exposure_gains(photos: Sequence[Photo], depths: Sequence[DepthMap]) -> Float
 
 
 def _ratio(photo: Photo, depth: DepthMap, other: Photo, other_depth: DepthMap) -> tuple[Tensor, Tensor]:
-    """The median of log(photo / other) over the surfaces that both show, and how many pixels show one, by channel."""
+    """The median of log(photo / other) over the surfaces that both show, and the number of their pixels, by channel."""
     rows, columns = torch.nonzero(depth.known, as_tuple=True)
     surface = back_project(photo.camera, torch.stack((columns, rows), dim=1) + 0.5, depth.depth[rows, columns])
     shared, row, column, z = seen_pixels(other.camera, surface)

@@ -1,4 +1,4 @@
-"""More points on the same surfaces, at depths completed from those that are known.
+"""Densification of a cloud: points at depths that are completed from known ones.
 
 On a plane, inverse depth is linear in the pixels: its second differences are 0 there, and large where a surface ends, which is
 mostly where colours change. The completed inverse depth u minimises, with d what is known of it,
@@ -33,21 +33,21 @@ _log = logging.getLogger(__name__)
 STRIDE: Final = 2
 """LR px between the points of a grid, by default."""
 
-_FEWEST_SAMPLES: Final = 4  # pixels of known depth from which a view's depth is completed
-_OF_POINTS: Final = 0.3  # confidence in a point that projects into a photo, which may hide it; its own depth has 1
-_MAX_PIXELS: Final = 16_000  # a larger photo is reduced first: 0.5 s of CPU time each
-_BEYOND: Final = 2.0  # no depth is completed further than this factor of those that are known
+_FEWEST_SAMPLES: Final = 4  # least number of pixels of known depth from which a view's depth is completed
+_OF_POINTS: Final = 0.3  # confidence of a point that projects into a photo, but may be occluded; stereo's depth has 1
+_MAX_PIXELS: Final = 16_000  # larger photos are reduced first: 0.5 s of CPU time each
+_BEYOND: Final = 2.0  # largest factor by which completed depths exceed the range of known ones
 _NEARER: Final = 0.95  # share of another photo's depth, in front of which a point floats in free space
-_EDGE: Final = 0.025  # difference of colours, of 1, at which an edge of the photo weakens the smoothness e-fold
+_EDGE: Final = 0.025  # difference of colours in [0, 1] at which smoothness is weakened e-fold
 _LEVEL: Final = 3e-3  # weight of the first differences
-_BEND: Final = 0.01  # second difference from which it counts by its size in place of its square; in medians of d
-_OUTLIER: Final = 0.05  # distance from d at which ρ' begins to fall; in medians of d
-_HELD: Final = 1e-9  # weight of the median of d, where nothing else decides
+_BEND: Final = 0.01  # second difference, in medians of d, from which the penalty is linear instead of quadratic
+_OUTLIER: Final = 0.05  # distance from d, in medians of d, at which ρ' begins to fall
+_HELD: Final = 1e-9  # weight of the median of d, where no other term applies
 _ROUNDS: Final = 6  # of reweighted least squares
 
 
 def densify(cloud: PointCloud, photos: Sequence[Photo], stride: int, background: Color | None = None) -> PointCloud:
-    """The cloud, with what `grid_points` adds where the photos hide nothing."""
+    """Add `grid_points` to the cloud."""
     means, colors = grid_points(cloud.means, photos, stride, background)
     if len(means) == 0:
         _log.warning("densify added no point.")
@@ -64,16 +64,17 @@ def grid_points(
     background: Color | None = None,
     maps: Sequence[DepthMap] | None = None,
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
-    """(positions, colours): in each photo a point every `stride` pixels, at depth that is completed from `means` and `maps`.
+    """(positions, colours) of a point every `stride` shown pixels of each photo, at depth completed from `means` and `maps`.
 
     Args:
         background: pixels of this colour show no surface and get no point.
-        maps: of each photo; only pixels of unknown depth get a point, unless it floats in front of the depth that another
-            photo knows. None: no depth is known.
+        maps: of each photo. Pixels of known depth get no point, nor do those whose point would float in front of another photo's
+            known depth. None: no depth is known.
     """
 
     def points_in(i: int) -> tuple[Tensor, Tensor]:
-        photo, grid, depth_map = photos[i], pixel_grid(photos[i], stride), None if maps is None else maps[i]
+        photo, grid = photos[i], pixel_grid(photos[i], stride)
+        depth_map = None if maps is None else maps[i]
         x, y = grid.long().unbind(dim=1)
         wanted = torch.ones(photo.image.shape[:2], dtype=torch.bool) if photo.shown is None else photo.shown.cpu()
         if depth_map is not None:
@@ -104,7 +105,7 @@ def grid_points(
 
 
 def pixel_grid(photo: Photo, stride: int) -> Float[Tensor, "G 2"]:
-    """The centres of the image's squares of `stride` pixels."""
+    """The centres of the image's squares of `stride` pixels, (column, row)."""
     x = torch.arange(stride / 2, photo.camera.width, stride, dtype=torch.float64)
     y = torch.arange(stride / 2, photo.camera.height, stride, dtype=torch.float64)
     return torch.cartesian_prod(x, y)
@@ -113,9 +114,9 @@ def pixel_grid(photo: Photo, stride: int) -> Float[Tensor, "G 2"]:
 def _completed(
     means: Float[Tensor, "N 3"], photo: Photo, at: Float[Tensor, "G 2"], cell: int, depth_map: DepthMap | None
 ) -> Float[Tensor, " G"] | None:
-    """Inverse depth at these pixels, from the photo's own depth and the points; None where fewer than 4 are known.
+    """Complete the inverse depth at these pixels, from the photo's own depth and the points; None if fewer than 4 are known.
 
-    Occluded points would distort the depth, so only the nearest point per square of `cell` pixels counts.
+    Occluded points would distort the depth, so only the nearest point per square of `cell` pixels is used.
     """
     _, row, column, depth = seen_pixels(photo.camera, means)
     order = torch.argsort(depth, stable=True)
@@ -134,7 +135,7 @@ def _completed(
         return None
     factor = photo.factor_to(_MAX_PIXELS)
     small = photo.reduced(factor)
-    if factor > 1:  # the nearest of each block, and how sure the surest is
+    if factor > 1:  # the nearest depth and the largest confidence of each block
         known, confidence = (max_pool2d(values[None], factor)[0] for values in (known.nan_to_num(0.0), confidence))
         known[known == 0] = torch.nan
     finite = known[known.isfinite()]
@@ -147,11 +148,11 @@ def _completed(
 def completed(
     known: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"], image: Float[Tensor, "h w 3"]
 ) -> Float[Tensor, "h w"]:
-    """Inverse depth at every pixel, float64; it may be 0 or less far from all that is known.
+    """Complete the inverse depth at every pixel, float64; far from known pixels it may be 0 or less.
 
     Args:
-        known: inverse depth > 0, NaN where unknown; known somewhere.
-        confidence: c ≥ 0 of what is known.
+        known: inverse depth d > 0, NaN where unknown; at least one pixel is known.
+        confidence: c ≥ 0 of the known pixels.
         image: the photo, in [0, 1].
     """
     import scipy.sparse as sp

@@ -1,4 +1,4 @@
-"""The libraries of the extra [train], which the geometry uses where they are installed."""
+"""The libraries of the extra [train] that the geometry uses if they are installed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ REMEDY: Final = "pip install 'clear-strategies[train]'"
 
 
 def missing(*modules: str) -> str:
-    """The packages of those modules that cannot be imported, joined by commas; empty where all can."""
+    """The packages of those modules that cannot be imported, joined by commas; empty if all can."""
     packages = []
     for module in modules:
         try:

@@ -1,4 +1,4 @@
-"""From points to pixels and back, which cameras see a point, and an image's colours there. Pixel (0, 0) spans [0, 1)²."""
+"""Projection of points to pixels and back, visibility of points, and sampling of colours. Pixel (0, 0) spans [0, 1)²."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rasterizers.interface import Camera
 
-_BEHIND: Final = 0.03  # a camera sees a point whose depth there exceeds the camera's own by at most this share of it
+_BEHIND: Final = 0.03  # relative excess over the surface's depth up to which a point is visible
 
 
 def intrinsics(camera: Camera) -> Float[Tensor, "3 3"]:
@@ -25,21 +25,21 @@ def projection_matrix(camera: Camera) -> Float[Tensor, "3 4"]:
 
 
 def project(camera: Camera, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N 2"], Float[Tensor, " N"]]:
-    """(pixels, depths in world units), float64; pixels are meaningful where depth > 0."""
+    """Project points to (pixels, depths in world units), float64; pixels are meaningful where depth > 0."""
     matrix = projection_matrix(camera)
     homogeneous = points.double() @ matrix[:, :3].T + matrix[:, 3]
     return homogeneous[:, :2] / homogeneous[:, 2:], homogeneous[:, 2]
 
 
 def inside(x: Tensor, y: Tensor, depth: Tensor, width: int | Tensor, height: int | Tensor) -> Bool[Tensor, "*shape"]:
-    """Whether what projects to these columns and rows, at these depths, lies in an image of this size."""
+    """True for points that project to these columns x and rows y, at these depths, inside an image of this size."""
     return (depth > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
 
 
 def seen_pixels(
     camera: Camera, points: Float[Tensor, "N 3"]
 ) -> tuple[Bool[Tensor, " N"], Int[Tensor, " M"], Int[Tensor, " M"], Float[Tensor, " M"]]:
-    """Which points project into the image, and the rows, columns and depths of these M points."""
+    """(mask of the points that project into the image, the rows, columns and depths of these M points)."""
     pixels, depth = project(camera, points)
     seen = inside(pixels[:, 0], pixels[:, 1], depth, camera.width, camera.height)
     column, row = pixels[seen].long().unbind(dim=1)
@@ -49,7 +49,7 @@ def seen_pixels(
 def times_seen(
     points: Float[Tensor, "N 3"], cameras: Sequence[tuple[Camera, Float[Tensor, "h w"]]]
 ) -> Int[Tensor, " N"]:
-    """In how many cameras, each with its depth (nan without a surface), each point is inside the image and not hidden."""
+    """Count for each point the cameras, each given with its depth (nan: no surface), in whose image it is and not occluded."""
     count = torch.zeros(len(points), dtype=torch.long)
     for camera, depth in cameras:
         seen, row, column, z = seen_pixels(camera, points)
@@ -58,7 +58,7 @@ def times_seen(
 
 
 def back_project(camera: Camera, pixels: Float[Tensor, "G 2"], depth: Float[Tensor, " G"]) -> Float[Tensor, "G 3"]:
-    """The points at these depths (z, world units) behind these pixels."""
+    """The points at these depths (z, world units) on the rays of these pixels (column, row)."""
     pose = camera.world_to_camera.double().cpu()
     x = (pixels[:, 0] - camera.cx) / camera.fx * depth
     y = (pixels[:, 1] - camera.cy) / camera.fy * depth
@@ -70,12 +70,12 @@ def ray_angles(a: Float[Tensor, " 3"], b: Float[Tensor, "*K 3"], points: Float[T
     y = points - b[..., None, :]
     x = (points - a).expand_as(y)
     sine = torch.linalg.vector_norm(torch.linalg.cross(x, y), dim=-1)
-    # Not from the cosine alone: that of a small angle rounds to 1.
+    # The cosine alone would not do: that of a small angle rounds to 1.
     return torch.rad2deg(torch.atan2(sine, (x * y).sum(-1)))
 
 
 def sample_colors(image: Float[Tensor, "H W 3"], pixels: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
-    """Bilinear samples; outside the centres of the border pixels, the border's colour."""
+    """Sample bilinearly at pixels (column, row); beyond the centres of the border pixels, the border's colour is returned."""
     height, width = image.shape[:2]
     grid = (2 * pixels / torch.tensor([width, height]) - 1).to(image)[None, None]
     batch = image.permute(2, 0, 1)[None]

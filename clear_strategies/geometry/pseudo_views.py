@@ -1,7 +1,7 @@
-"""Pseudo views: what cameras beside the training cameras would see, made from stereo depth and the LR photos.
+"""Pseudo views: images at cameras beside the training cameras, warped from the LR photos by stereo depth.
 
-Each pseudo view has a training camera moved aside. Its depth is that of the nearest photos' surfaces, its colours are those of
-the photos that see the same surface; where no photo does, the colour is unknown. A border view has a training camera with a
+A pseudo view's camera is a training camera moved aside. Its depth is that of the nearest photos' surfaces, its colours are those
+of the photos that see the same surface; where no photo does, the colour is unknown. A border view has a training camera with a
 wider field: its photo is known, the border around it is not. `clear_strategies.strategies.pseudo_views` trains on them.
 """
 
@@ -23,23 +23,23 @@ from clear_strategies.geometry.photos import is_background
 from clear_strategies.geometry.projection import inside, projection_matrix
 from rasterizers.interface import Camera, Color
 
-_SOURCES: Final = 4  # the nearest photos that a pseudo view is made of
-_NEIGHBOURS: Final = 3  # of a pixel and the eight around it, those that must be known, or it is an outlier
+_SOURCES: Final = 4  # the nearest photos that a pseudo view is warped from
+_NEIGHBOURS: Final = 3  # least number of known pixels in a pixel's 3 × 3 window; with fewer, it is an outlier
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PseudoView:
-    """A picture that was not taken: its camera and its colours, 0 where they are unknown."""
+    """A synthesized photo: its camera and its colours, 0 where they are unknown."""
 
     photo: Photo
     known: Bool[Tensor, "h w"]
 
 
 class _Source(NamedTuple):
-    """A photo with depth: its points, and the depth up to which its colours are used, 0 where they are not.
+    """A photo with depth: its points, its depth, 0 where its colours are not used, and the median of its depth.
 
-    Points are those of a camera, not of the world, so that float32 holds them wherever the world's origin is. Their coordinates
-    stand in rows: torch then computes with each at once.
+    Points are in camera coordinates, so that float32 resolves them wherever the world's origin is, and stored as rows x, y, z, so
+    that torch computes with contiguous coordinates.
     """
 
     photo: Photo
@@ -59,7 +59,7 @@ def pseudo_views(
     background: Color,
     seed: int,
 ) -> list[Callable[[], PseudoView]]:
-    """Functions that make `count` pseudo views, the training cameras taken in turn; none where fewer than two photos have depth.
+    """Return functions that make `count` pseudo views of the training cameras in turn; none if fewer than two photos have depth.
 
     Args:
         photos, depths: by the photos' names, on one device, where the pseudo views are made.
@@ -85,7 +85,7 @@ def pseudo_views(
 
 
 def border_view(photo: Photo, *, field: float, max_pixels: int) -> PseudoView:
-    """The photo, reduced to at most `max_pixels`, as the middle of a picture `field` times as wide and as high."""
+    """Place the photo, reduced to at most `max_pixels`, in the middle of an image `field` times as wide and as high."""
     photo = photo.reduced(photo.factor_to(max_pixels))
     c = photo.camera
     x, y = (round(n * (field - 1) / 2) for n in (c.width, c.height))
@@ -98,7 +98,7 @@ def border_view(photo: Photo, *, field: float, max_pixels: int) -> PseudoView:
 
 
 def _source(photo: Photo, depth_map: DepthMap, background: Color) -> _Source:
-    """Pixels at the border of the background are mixed with it: they give points but no colour."""
+    """Make a source. Pixels at the border of the background are mixed with it, so their colours are not used."""
     known, depth = depth_map.known, torch.nan_to_num(depth_map.depth)
     points = _behind(photo.camera, depth)[:, known.flatten()]
     mixed = F.max_pool2d(is_background(photo.image, background)[None, None].float(), 3, 1, 1)[0, 0] > 0
@@ -125,13 +125,13 @@ def _warped(camera: Camera, sources: Sequence[_Source], tolerance: float) -> Pse
 
 
 def _front(camera: Camera, sources: Sequence[_Source]) -> Float[Tensor, "h w"]:
-    """The depth of the frontmost point, infinite without one. A point covers 2 × 2 pixels, so that surfaces have no holes."""
+    """The depth of the nearest point at each pixel, infinite without one. A point covers 2 × 2 pixels, which closes holes."""
     width, height = camera.width + 1, camera.height + 1
     outside = height * width
     front = sources[0].depth.new_full((outside + 1,), torch.inf)
     for s in sources:
         x, y, depth = _projected(s.points, s.photo.camera, camera)
-        # Of the lower right one of its pixels, after a border of one.
+        # The lower right one of its four pixels, with a border of one pixel.
         column, row = x.add_(0.5).floor_(), y.add_(0.5).floor_()
         shown = inside(column, row, depth, width, height)
         place = torch.where(shown, row.mul_(width).add_(column), outside).long()
@@ -144,7 +144,7 @@ def _front(camera: Camera, sources: Sequence[_Source]) -> Float[Tensor, "h w"]:
 def _seen(
     source: _Source, camera: Camera, points: Float[Tensor, "3 N"], tolerance: float
 ) -> tuple[Bool[Tensor, " N"], Float[Tensor, "3 N"]]:
-    """Whether the photo shows each of the camera's points, at its own depth up to `tolerance`, and the photo's colours there."""
+    """(True where the photo shows a point of the camera, i.e. its depth there agrees up to `tolerance`; the photo's colours)."""
     own = source.photo.camera
     x, y, depth = _projected(points, camera, own)
     shown = inside(x, y, depth, own.width, own.height)
@@ -156,14 +156,14 @@ def _seen(
 
 
 def _projected(points: Float[Tensor, "3 N"], of: Camera, to: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """(columns, rows, depths) in one camera of another's points; columns and rows have a meaning where depth > 0."""
+    """Project points in coordinates of one camera to (columns, rows, depths) of another, meaningful where depth > 0."""
     matrix = (projection_matrix(to) @ torch.linalg.inv(of.world_to_camera.double())).to(points)
     x, y, depth = torch.addmm(matrix[:, 3:], matrix[:, :3], points)
     return x.div_(depth), y.div_(depth), depth
 
 
 def _behind(camera: Camera, depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 N"]:
-    """The camera's points at these depths behind all its pixels."""
+    """The points on the rays of all pixels at these depths, in camera coordinates."""
     numbers = partial(torch.arange, dtype=torch.float64, device=depth.device)
     x = (numbers(camera.width) + (0.5 - camera.cx)) / camera.fx
     y = (numbers(camera.height) + (0.5 - camera.cy)) / camera.fy
@@ -171,11 +171,11 @@ def _behind(camera: Camera, depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 N"]
 
 
 def continued(image: Float[Tensor, "h w 3"], known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
-    """`image` where it is known, elsewhere a smooth continuation of the colours around; `image` itself if nothing is known.
+    """Fill unknown pixels by a smooth continuation of the colours around; return `image` itself if nothing is known.
 
-    A pyramid of means: each level halves the one before, and its pixels are known where one of the four below is. From the
-    coarsest level down, each unknown pixel takes the colour of the coarser level, so that colours become smoother the further
-    away known pixels are.
+    A pull-push pyramid: each level halves the one before by means over known pixels, and a pixel is known if one of its four is.
+    From the coarsest level down, each unknown pixel takes the colour of the coarser level, so that colours become smoother the
+    further away known pixels are.
     """
     if not bool(known.any()):
         return image
@@ -185,7 +185,7 @@ def continued(image: Float[Tensor, "h w 3"], known: Bool[Tensor, "h w"]) -> Floa
 
 
 def _filled(colors: Float[Tensor, "1 3 h w"], mask: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "1 3 h w"]:
-    """`colors`, 0 where they are unknown, filled where `mask` is 0; it is 1 at one pixel at least."""
+    """Fill `colors`, which are 0 where unknown, where `mask` is 0; it is 1 at one pixel at least."""
     if bool(mask.all()):
         return colors
     sums, share = (F.avg_pool2d(x, 2, ceil_mode=True) for x in (colors, mask))  # of each block of four

@@ -24,15 +24,15 @@ from rasterizers.interface import Camera
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stereo:
-    """What `stereo` returns, on the device of the photos.
+    """The result of `stereo`, on the device of the photos.
 
     Args:
         depths: one for each photo: `depth` [h, w], z in world units at each pixel's centre, nan where unknown, and
             `confidence` [h, w] in [0, 1], 0 where unknown.
         means: positions of the points, world units.
         colors: of the points, RGB in [0, 1].
-        summary: one line: the number of points, the share of each photo whose depth is known, and what was left out
-            because a library is missing.
+        summary: one line: the number of points, the share of each photo whose depth is known, and steps left out because a
+            library is missing.
     """
 
     depths: tuple[DepthMap, ...]
@@ -52,9 +52,9 @@ def stereo(
     fill: bool = True,
     features: tuple[Tensor, Tensor] | None = None,
 ) -> Stereo:
-    """Dense stereo between photos with known poses: the same depth and the same cloud as data.cloud.init=stereo of the trainer.
+    """Compute depth maps and a cloud by dense stereo between photos with known poses, as the trainer's data.cloud.init=stereo.
 
-    It is deterministic, and its bits do not depend on the number of threads. The trainer reduces clouds of more than
+    The result is deterministic, and its bits do not depend on the number of threads. The trainer reduces clouds of more than
     200,000 points; here all of them are returned.
 
     Args:
@@ -65,14 +65,13 @@ def stereo(
             [0, 1)².
         background: the colour of pixels without a surface, RGB in [0, 1], e.g. Blender's white; None: every pixel shows
             a surface.
-        masks: one for each photo, [h, w] of its size: 0 or False where the photo hides its pixels, which then give neither
-            depth nor points; None among them, or in their place: nothing is hidden.
-        settings: of the comparison; None: `StereoSettings()`.
+        masks: one for each photo, [h, w] of its size: 0 or False hides a pixel, which then gives neither depth nor points; None
+            among them, or in their place: nothing is hidden.
+        settings: None: `StereoSettings()`.
         fill: add points at completed depth where a photo's depth is unknown. Needs SciPy.
-        features: (means [N, 3] in world units, colors [N, 3] in [0, 1]) of points that are known already, e.g. COLMAP's.
-            They give the range of depth, check the maps, and are part of the cloud where depth is unknown. None:
-            features of the photos are triangulated, which needs OpenCV, kornia and SciPy; without them, the cameras give
-            the range.
+        features: (means [N, 3] in world units, colors [N, 3] in [0, 1]) of known points, e.g. COLMAP's. They give the range of
+            depth, the maps are checked against them, and they are part of the cloud where depth is unknown. None: features of
+            the photos are triangulated, which needs OpenCV, kornia and SciPy; without them, the cameras give the range.
 
     Raises:
         DataError: a shape, range or camera is wrong, there are fewer than two photos, or stereo confirms no depth.
@@ -98,7 +97,7 @@ def stereo(
 def _photos(
     images: Sequence[Tensor] | Tensor, poses: Tensor, Ks: Tensor, masks: Sequence[Tensor | None] | None
 ) -> list[Photo]:
-    """What was given, checked; black where a mask hides it."""
+    """Check the arguments of `stereo`, and make photos of them, black at hidden pixels."""
     count = len(images)
     _require(
         count >= 2, "images", f"must be at least 2 photos, got {count}", "depth needs a second photo of the surfaces"

@@ -1,9 +1,8 @@
-"""Triangulation of SIFT matches between photos, under their known poses.
+"""Triangulation of SIFT matches between photos with known poses.
 
-SIFT finds features, and each pair of views that are `partners` matches them in both directions. A match is rejected if it
-violates the epipolar geometry of the known poses, or if its triangulated point lies behind a camera, reprojects too far
-away, or has too small an angle between its rays. Matches that share features form a track, which is one point; the pair with the
-widest angle gives its position.
+SIFT features are matched between `partners`, in both directions. A match is rejected if it violates the epipolar geometry of the
+poses, or if its triangulated point lies behind a camera, has too large a reprojection error, or too small an angle between its
+rays. Matches that share features form a track, which is one point; the pair with the widest angle gives its position.
 """
 
 from __future__ import annotations
@@ -35,12 +34,12 @@ _ROWS: Final = 512  # features matched at a time, so that their distances stay i
 
 @dataclass(frozen=True, slots=True)
 class TriangulationSettings:
-    """When two features are the same point.
+    """Settings of SIFT, and of the acceptance of matches.
 
     Args:
         enlarge: factor by which images are enlarged before SIFT runs; small images give few features otherwise.
         contrast: SIFT's contrast threshold; a lower one gives more and weaker features.
-        max_features: of an image, the strongest; the time of matching grows with its square. None: all.
+        max_features: number of strongest features of an image; the time of matching grows with its square. None: all.
         ratio: largest distance of a match, relative to that of the second best (Lowe's ratio test).
         epipolar: largest distance from the epipolar lines, root mean square over both views, LR px.
         reprojection: largest reprojection error in either view, LR px.
@@ -75,7 +74,9 @@ class Features(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """Points of two views: position, the two features (numbered over all views), angle between the rays (degrees)."""
+    """Triangulated points of pairs of views: position, the two features (numbered over all views), angle between the rays
+    (degrees).
+    """
 
     means: Float[Tensor, "P 3"]
     features: Int[Tensor, "P 2"]
@@ -83,7 +84,7 @@ class Pairs(NamedTuple):
 
 
 def features_of(photos: Sequence[Photo]) -> PointCloud:
-    """The points of `triangulate`; none without OpenCV, kornia or SciPy, and the log and the cloud's `source` say so."""
+    """The points of `triangulate`; empty without OpenCV, kornia or SciPy, with a note in the log and the cloud's `source`."""
     if packages := missing("cv2", "kornia", "scipy"):
         _log.warning("no features are triangulated without %s: %s", packages, REMEDY)
         return PointCloud(torch.zeros(0, 3), torch.zeros(0, 3), f"no triangulated features without {packages}")
@@ -91,7 +92,7 @@ def features_of(photos: Sequence[Photo]) -> PointCloud:
 
 
 def triangulate(photos: Sequence[Photo], settings: TriangulationSettings | None = None) -> PointCloud:
-    """The points that at least two photos have in common; an empty cloud if nothing matches."""
+    """Triangulate the features that at least two photos have in common; an empty cloud if nothing matches."""
     settings = settings or TriangulationSettings()
     features = [find_features(photo, settings) for photo in photos]
     view = torch.repeat_interleave(torch.arange(len(photos)), torch.tensor([len(f.pixels) for f in features]))
@@ -116,7 +117,7 @@ def triangulate(photos: Sequence[Photo], settings: TriangulationSettings | None 
 
 
 def find_features(photo: Photo, settings: TriangulationSettings) -> Features:
-    """SIFT keypoints of the enlarged image, with the square roots of their descriptors (RootSIFT)."""
+    """Find SIFT keypoints in the enlarged image, with RootSIFT descriptors: square roots of the L1-normalized ones."""
     import cv2
 
     grey = cv2.cvtColor(to_bytes(photo.image), cv2.COLOR_RGB2GRAY)
@@ -136,7 +137,7 @@ def find_features(photo: Photo, settings: TriangulationSettings) -> Features:
 
 
 def match(a: Features, b: Features, ratio: float) -> Int[Tensor, "M 2"]:
-    """Indices of mutual nearest neighbours that pass Lowe's ratio test against the second nearest in b."""
+    """Match features: indices of mutual nearest neighbours that pass Lowe's ratio test against the second nearest in b."""
     if len(a.pixels) < 1 or len(b.pixels) < 2:
         return torch.zeros(0, 2, dtype=torch.long)
     nearest = [(rows @ b.descriptors.T).topk(2, dim=1) for rows in torch.split(a.descriptors, _ROWS)]
@@ -151,7 +152,7 @@ def match(a: Features, b: Features, ratio: float) -> Int[Tensor, "M 2"]:
 def triangulate_pair(
     a: Camera, b: Camera, x: Float[Tensor, "M 2"], y: Float[Tensor, "M 2"], settings: TriangulationSettings
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, " M"], Bool[Tensor, " M"]]:
-    """(point, angle in degrees, accepted) of the rays through pixels x of a and y of b."""
+    """Triangulate the rays through pixels x of a and y of b: (point, angle in degrees, accepted)."""
     from kornia.geometry import epipolar
 
     if len(x) == 0:  # kornia refuses empty batches
@@ -171,7 +172,7 @@ def triangulate_pair(
 
 
 def one_per_track(pairs: Pairs, view: Int[Tensor, " F"]) -> Int[Tensor, " T"]:
-    """The pair with the widest angle of each track. A track with two features of one view is contradictory and dropped."""
+    """Choose the pair with the widest angle of each track. A track with two features of one view is contradictory and dropped."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

@@ -1,4 +1,4 @@
-"""Points from depth maps: one every few pixels of surface, however many photos see it."""
+"""Points from depth maps: one per few pixels of surface, independent of the number of photos that see it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def stereo_cloud(
     outlier_neighbours: int = OUTLIER_NEIGHBOURS,
     outlier_ratio: float = OUTLIER_RATIO,
 ) -> PointCloud | None:
-    """The points of the depth maps, features where depth is unknown, and points that fill the rest; None: no depth is known.
+    """Make a cloud of the depth maps, with features where depth is unknown and points that fill the rest; None: no known depth.
 
     Without SciPy no outlier is removed and nothing is filled; the log and the cloud's `source` say so.
 
@@ -72,10 +72,10 @@ def stereo_cloud(
 def points_of(
     photos: Sequence[Photo], maps: Sequence[DepthMap], spacing: float, tolerance: float
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
-    """(positions, colours): in each photo, the most confident pixel of each square of `spacing` pixels.
+    """(positions, colours) of the most confident pixel in each square of `spacing` pixels of each photo.
 
-    Squares in which a point of an earlier photo lies on the surface already add none. A photo from which a surface is
-    seen closer has more squares on it, so it adds points between those of photos farther away.
+    A square adds no point if one of an earlier photo already lies on the surface there. A photo closer to the surface has more
+    squares on it, so it adds points between those of photos farther away.
 
     Args:
         spacing: LR px, at least 1.

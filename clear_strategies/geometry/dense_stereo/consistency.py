@@ -1,4 +1,4 @@
-"""Which depths hold: those that other photos confirm, and that are not alone among their neighbours."""
+"""Consistency of depth: confirmation by other photos, and detection of isolated depths."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from clear_strategies.geometry.projection import inside
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """The depth of one photo, before it is compared with that of others."""
+    """The depth of one photo, before the check against other photos."""
 
     image: Grey
     inverse_depth: Float[Tensor, "H W"]  # 1 / z, 1 / world units
@@ -28,11 +28,10 @@ class Estimate:
 def confirm(
     estimate: Estimate, others: Sequence[Estimate], settings: StereoSettings
 ) -> tuple[Int[Tensor, "H W"], Float[Tensor, "H W"]]:
-    """(how many of the others agree at each pixel, mean inverse depth of all that agree, the photo itself included).
+    """(number of others that agree at each pixel, mean inverse depth over those and the photo itself).
 
-    Each pixel's point is looked up in the depth of the others, and the point found there is brought back.
-    Another photo agrees if that depth differs by at most `tolerance`, relatively, and if the point comes back to within
-    `reprojection` pixels.
+    Each pixel's point is projected into the others, and the point at their depth there is projected back. A photo agrees if the
+    relative difference of the depths is at most `tolerance`, and the distance from the pixel at most `reprojection` pixels.
     """
     height, width = estimate.inverse_depth.shape
     agreeing = torch.zeros(height, width, dtype=torch.long, device=estimate.inverse_depth.device)
@@ -40,10 +39,10 @@ def confirm(
     column = torch.arange(width, device=total.device) + 0.5
     row = (torch.arange(height, device=total.device) + 0.5)[:, None]
     for other in others:
-        u, v, depth, seen = carry(estimate, other, estimate.inverse_depth)
+        u, v, depth, seen = reproject(estimate, other, estimate.inverse_depth)
         x, y = u.long(), v.long()
         other_inverse = other.inverse_depth[y, x]
-        u, v, back, ahead = carry(other, estimate, other_inverse, (y, x))
+        u, v, back, ahead = reproject(other, estimate, other_inverse, (y, x))
         same = (depth * other_inverse - 1).abs() <= settings.tolerance
         near = (u - column).square() + (v - row).square() <= settings.reprojection**2
         agrees = seen & ahead & same & near
@@ -52,11 +51,13 @@ def confirm(
     return agreeing, (total / (agreeing + 1)).float()
 
 
-def carry(
+def reproject(
     estimate: Estimate, other: Estimate, inverse_depth: Float[Tensor, "H W"], at: tuple[Tensor, Tensor] | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(column, row, depth, whether inside) in the other estimate of the points at these inverse depths, behind every pixel or
-    those `at` (rows, columns). Columns and rows are in pixels and clamped into the other photo.
+    """Project the points at these inverse depths, behind every pixel or those `at` (rows, columns), into the other photo.
+
+    Returns:
+        (column, row, depth, inside): columns and rows in pixels, clamped into the photo; `inside` is False for those clamped.
     """
     rotated, shift = estimate.image.towards(other.image)
     if at is not None:
@@ -72,9 +73,9 @@ def carry(
 
 
 def speckles(depth: Float[Tensor, "h w"], fewest: int, tolerance: float) -> Bool[Tensor, "h w"]:
-    """Where known depth belongs to fewer than `fewest` connected pixels: mostly chance matches. Nowhere without SciPy.
+    """Find known depth in groups of fewer than `fewest` connected pixels: mostly chance matches. All False without SciPy.
 
-    Two pixels are connected if they share an edge, and their depths, NaN where unknown, differ by at most this share.
+    Two pixels are connected if they share an edge and their depths, NaN where unknown, differ relatively by at most `tolerance`.
     """
     if fewest <= 1 or missing("scipy"):
         return torch.zeros_like(depth, dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""The grey images that stereo compares, and the cost volume: how unlike a photo the others are at each pixel and depth plane."""
+"""The grey images that stereo compares, and the cost volume: the dissimilarity of photos at each pixel and depth plane."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rasterizers.native import threads
 
 _VARIANCE_FLOOR: Final = 1e-5  # of grey in [0, 1]: windows with less contrast than noise correlate with nothing
 _BLOCK: Final = 1 << 19  # pixels times planes that are compared at once
-_ENLARGED: Final = 64_000  # the most pixels of an enlarged photo
+_ENLARGED: Final = 64_000  # largest number of pixels of an enlarged photo
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +47,7 @@ class Grey:
 
 
 def grey(photo: Photo, enlarge: int, max_pixels: int) -> Grey:
-    """The photo's grey image, enlarged, or reduced to at most `max_pixels`."""
+    """The grey image of a photo, enlarged by `enlarge` if it is small, or reduced to at most `max_pixels`."""
     image, camera = photo.image, photo.camera
     reduce = 1
     while (camera.width // reduce) * (camera.height // reduce) > max_pixels:
@@ -119,7 +119,7 @@ class _Swept:
         self.image = other.image.contiguous()
 
     def through(self, inverse_depths: Float[Tensor, " P"]) -> tuple[Float[Tensor, "P H W"], Bool[Tensor, "P H W"]]:
-        """(the other photo drawn through each plane, whether the pixel lies inside it).
+        """(the other photo warped by each plane, True where the pixel lies inside it).
 
         A pixel's point at inverse depth d projects to K' (R K⁻¹ x + d t), up to its third coordinate.
         """
@@ -135,7 +135,7 @@ class _Swept:
 
 
 def _cost(reference: _Windows, other: _Swept, inverse_depths: Float[Tensor, " P"]) -> Float[Tensor, "P H W"]:
-    """From the covariance with the windows of the other photo drawn through each plane, 0 where it does not see them."""
+    """The cost from the correlation with the windows of the other photo warped by each plane; unseen ones correlate with 0."""
     drawn, seen = other.through(inverse_depths)
     mean, variance = _moments(drawn, reference.window)
     covariance = box_mean(reference.image * drawn, reference.window) - reference.mean * mean

@@ -24,8 +24,8 @@ from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
-_MANY_PHOTOS = 12  # from here on, two others must agree
-_ASKED = 8  # the most photos by which one is confirmed
+_MANY_PHOTOS = 12  # number of photos from which two others must agree
+_CONFIRMING = 8  # largest number of photos that confirm the depth of one
 _FEW_POINTS = 10  # triangulated points in a photo, below which its depth is not checked by them
 _LIKE = 0.05  # relative difference of depth up to which neighbouring pixels show one surface
 _CLOSE = 0.1  # relative error up to which depth agrees with a triangulated point
@@ -37,13 +37,12 @@ def depth_maps(
     settings: StereoSettings | None = None,
     background: Color | None = None,
 ) -> list[DepthMap]:
-    """The depth of each photo where others confirm it; unknown everywhere for photos whose stereo cannot be trusted.
+    """Compute the depth of each photo where others confirm it; unknown everywhere for photos whose stereo is not plausible.
 
     Args:
-        photos: posed, of any sizes, on one device. What their masks hide gets no depth.
-        points: of the surfaces, world units: they give the range of depth, and the result is checked by them. There may be
-            none; then the cameras give the range. None: features are triangulated where OpenCV, kornia and SciPy are
-            installed.
+        photos: posed, of any sizes, on one device. Pixels that their masks hide get no depth.
+        points: of the surfaces, world units: they give the range of depth, and the result is checked against them. If empty,
+            the cameras give the range. None: features are triangulated if OpenCV, kornia and SciPy are installed.
         background: the colour of pixels without a surface, RGB in [0, 1].
 
     Returns:
@@ -53,7 +52,7 @@ def depth_maps(
     if points is None:
         points = features_of(photos).means
     points = points.cpu()
-    compared = comparisons(photos, points, max(_ASKED, settings.sources))
+    compared = comparisons(photos, points, max(_CONFIRMING, settings.sources))
     estimates = _estimates(photos, compared, settings)
     needed = settings.agreeing or (2 if len(photos) >= _MANY_PHOTOS else 1)
     maps = []
@@ -61,7 +60,7 @@ def depth_maps(
         if estimate is None:
             maps.append(_unknown(photo, "no other photo sees the same surfaces from 1 to 45 degrees aside"))
             continue
-        others = [e for j in compared[i].others[:_ASKED] if (e := estimates[j]) is not None]
+        others = [e for j in compared[i].others[:_CONFIRMING] if (e := estimates[j]) is not None]
         agreeing, inverse_depth = confirm(estimate, others, settings)
         good = agreeing >= min(needed, len(others))
         good &= (estimate.correlation >= settings.min_correlation) & (agreeing > 0)
@@ -80,7 +79,7 @@ def depth_maps(
 def _estimates(
     photos: Sequence[Photo], compared: Sequence[Comparison], settings: StereoSettings
 ) -> list[Estimate | None]:
-    """The depth of each photo at its pixels, from its own plane sweep; None without photos to compare it with."""
+    """The depth of each photo at its pixels, from its own plane sweep; None if there is no photo to compare it with."""
     greys = [grey(photo, settings.enlarge, settings.max_pixels) for photo in photos]
 
     def estimate(i: int) -> Estimate | None:
@@ -99,7 +98,7 @@ def _estimates(
 
 
 def plane_sweep(image: Grey, others: list[Grey], comparison: Comparison, settings: StereoSettings) -> Estimate:
-    """Planes uniform in inverse depth, the minimum of the smoothed cost, and a parabola through its neighbours."""
+    """Sweep planes uniform in inverse depth, and take the minimum of the smoothed cost, refined by a parabola."""
     count = plane_count(image.camera, [other.camera for other in others], comparison, settings)
     planes = torch.linspace(comparison.far, comparison.near, count, dtype=torch.float64)
     cost = cost_volume(image, others, planes.to(image.image), settings.window)
@@ -112,7 +111,7 @@ def plane_sweep(image: Grey, others: list[Grey], comparison: Comparison, setting
 
 
 def parabola_minimum(cost: Float[Tensor, "H W D"], best: Tensor) -> Float[Tensor, "H W"]:
-    """Where the parabola through the minimum and its two neighbours is lowest, in [-0.5, 0.5] planes from the minimum."""
+    """The lowest point of the parabola through the minimum and its two neighbours, in [-0.5, 0.5] planes from the minimum."""
     last = cost.shape[-1] - 1
     before, here, after = (cost.gather(-1, (best + k).clamp(0, last))[..., 0] for k in (-1, 0, 1))
     curvature = (before - 2 * here + after).clamp_min(1e-9)
@@ -122,7 +121,7 @@ def parabola_minimum(cost: Float[Tensor, "H W D"], best: Tensor) -> Float[Tensor
 
 
 def _on_photo(estimate: Estimate, photo: Photo) -> Estimate:
-    """The estimate of an enlarged or reduced image at the photo's pixels: the best correlated of those it covers."""
+    """Resample the estimate of an enlarged or reduced image at the photo's pixels: the best correlated of those each covers."""
     camera, swept = photo.camera, estimate.image.camera
     image = Grey(camera, photo.image.new_zeros(camera.height, camera.width))
     if (camera.height, camera.width) == tuple(estimate.inverse_depth.shape):
@@ -141,7 +140,7 @@ def _on_photo(estimate: Estimate, photo: Photo) -> Estimate:
 
 
 def _checked(photo: Photo, depth_map: DepthMap, points: Float[Tensor, "N 3"], settings: StereoSettings) -> DepthMap:
-    """The depth map, or an unknown one where it covers too little or contradicts the triangulated points."""
+    """Return the depth map, or an unknown one if it covers too few pixels or contradicts the triangulated points."""
     if depth_map.coverage < settings.trust:
         return _unknown(photo, f"its depth is confirmed at only {depth_map.coverage:.1%} of the pixels")
     _, row, column, depth = seen_pixels(photo.camera, points)

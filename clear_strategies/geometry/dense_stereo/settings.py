@@ -7,33 +7,33 @@ from typing import Final
 
 from clear_strategies.core.checks import refuse, require_number, require_whole
 
-# Of photos at HR in place of LR:
-_WIDER: Final = 2  # pixels that windows grow by: finer pixels hold less texture each
-_MORE: Final = 1.5  # factor of planes, and of the pixels by which a point may miss itself: a point moves further
-_APART: Final = 2.0  # largest factor of the distance of points, in pixels
+# Changes for photos at HR in place of LR:
+_WIDER: Final = 2  # pixels added to windows, since finer pixels contain less texture each
+_MORE: Final = 1.5  # factor of `max_planes` and `reprojection`, since points move by more pixels
+_APART: Final = 2.0  # largest factor of `spacing`
 
 
 @dataclass(frozen=True, slots=True)
 class StereoSettings:
-    """How the depth of the training photos is found, and which of it becomes points.
+    """Settings of stereo between the training photos, and of the points made from its depth.
 
     Args:
-        enlarge: factor by which photos are enlarged (bicubic) before they are compared, if that makes at most 64,000
+        enlarge: factor by which photos are enlarged (bicubic) before they are compared, if the result has at most 64,000
             pixels: small photos gain most, large ones would take minutes.
         max_pixels: larger photos are first reduced by a whole factor, so that time and memory are bounded.
-        sources: the most photos that one photo is compared with.
+        sources: largest number of photos that a photo is compared with.
         plane_step: largest shift in a source photo between neighbouring depth planes, pixels of the compared images.
-        max_planes: the most depth planes of one photo; bounds time and memory.
+        max_planes: largest number of depth planes of a photo; bounds time and memory.
         window: edge of the compared windows, pixels of the compared images, odd.
         small_step, large_step: penalties of the smoothing for neighbouring pixels whose planes differ by one, or by more,
             in units of the cost, which is 0 for equal windows and 0.5 for unrelated ones.
-        min_correlation: of the windows at the depth that was found, in [0, 1]; a lower one is no evidence.
+        min_correlation: least correlation of the windows at the depth found, in [0, 1]; with less, depth is unknown.
         tolerance: largest relative difference between the depths that two photos find of one point.
         reprojection: largest distance of a pixel from itself after going to the other photo and back, LR px.
-        agreeing: other photos whose depth must agree; None: 2 where there are at least 12 photos, else 1.
-        speckle: fewer connected pixels of similar depth than these are unknown; 0: none are. Needs SciPy.
+        agreeing: number of other photos whose depth must agree; None: 2 of at least 12 photos, else 1.
+        speckle: depth in groups of fewer connected pixels than this is unknown; 0: none is. Needs SciPy.
         spacing: distance of the points on the surface, LR px of the photo that sees them.
-        trust: a photo is used whose stereo covers at least this share of its pixels.
+        trust: least share of a photo's pixels with known depth; with less, all of its depth is unknown.
 
     Raises:
         SettingError: a number is outside its range.
@@ -70,7 +70,7 @@ class StereoSettings:
             require_number(name, getattr(self, name), least=0, most=1)
 
     def finer(self, ratio: float) -> StereoSettings:
-        """These settings for the same photos `ratio` times as large: HR photos in place of LR photos."""
+        """The settings for the same photos at `ratio` times their size: HR photos in place of LR photos."""
         return replace(
             self, enlarge=1, window=self.window + _WIDER, max_planes=round(_MORE * self.max_planes),
             reprojection=_MORE * self.reprojection, spacing=min(_APART, ratio) * self.spacing,

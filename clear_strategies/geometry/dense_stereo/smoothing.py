@@ -41,7 +41,7 @@ def _scan(
     small_step: float,
     large_step: float,
 ) -> None:
-    """Add L of the paths that come from the row before, `shifts` columns aside, to the rows of the sum."""
+    """Add L of the paths from the row before, offset by `shifts` columns, to the rows of the sum."""
     height, width, planes = cost.shape
     # A column of zeros at both sides: paths that enter there start with L = C.
     before = cost.new_zeros(len(shifts), width + 2, planes + 2)

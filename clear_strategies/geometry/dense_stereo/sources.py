@@ -1,4 +1,4 @@
-"""With which photos a photo is compared, and at which depths."""
+"""The choice of the photos that a photo is compared with, and of the range of depth."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from clear_strategies.geometry.projection import (
 from rasterizers.interface import Camera
 
 _FEW: Final = 20  # points in a photo, below which a grid at guessed depths replaces them
-_SAMPLED: Final = 1000  # points in a photo, at most, by which the others are scored
-_CANDIDATES: Final = 4  # photos that all of these points score, for each that is asked for
-_GLANCED: Final = 40  # the fewer points, about, by which these are chosen
+_SAMPLED: Final = 1000  # largest number of points of a photo by which other photos are scored
+_CANDIDATES: Final = 4  # candidates per photo to be chosen, which are scored by all these points
+_GLANCED: Final = 40  # approximate number of points by which the candidates are chosen
 _ANGLES: Final = (1.0, 5.0, 20.0, 45.0)  # degrees between rays: useless, best from, best to, too different to compare
 _LEAST_SCORE: Final = 0.05
 _QUANTILES: Final = (0.02, 0.98)
 _FARTHER, _NEARER = 0.5, 1.4  # the range of inverse depth is wider than that of the points by these factors
-_GUESS_FAR, _GUESS_NEAR = 0.1, 3.0  # the same, about the depth of what all cameras look at
+_GUESS_FAR, _GUESS_NEAR = 0.1, 3.0  # the same, relative to the depth of the point that all cameras look at
 
 
 class Comparison(NamedTuple):
-    """What one photo is compared with."""
+    """The photos that a photo is compared with, and the range of depth."""
 
     others: tuple[int, ...]  # indices of photos, best first
     far: float  # the smallest inverse depth, 1 / world units
@@ -43,12 +43,12 @@ class Comparison(NamedTuple):
 
 
 def comparisons(photos: Sequence[Photo], points: Float[Tensor, "N 3"], most: int) -> list[Comparison]:
-    """For each photo, the `most` others that see the same surfaces at the best angles, and the range of depth.
+    """Choose for each photo up to `most` others that see the same surfaces at the best angles, and the range of depth.
 
-    Of more photos than `_CANDIDATES` for each that is asked for, a few points choose those that all points score.
+    Of more than `_CANDIDATES` × `most` others, that many are first chosen by a few points, then scored by all.
 
     Args:
-        points: of the surfaces, world units; where a photo sees few, depths are guessed from the cameras.
+        points: of the surfaces, world units; for a photo that sees few, depths are guessed from the cameras.
     """
     low, high = common_box(photos)
     middle = (low + high)[None] / 2
@@ -76,7 +76,7 @@ def comparisons(photos: Sequence[Photo], points: Float[Tensor, "N 3"], most: int
 
 
 def plane_count(camera: Camera, others: Sequence[Camera], comparison: Comparison, settings: StereoSettings) -> int:
-    """Planes, uniform in inverse depth, of which neighbours lie at most `plane_step` px apart in the other photos."""
+    """The number of planes, uniform in inverse depth, with neighbours at most `plane_step` px apart in the other photos."""
     paths = []
     for other in others:
         ends = [project(other, _grid(camera, 1 / inverse)) for inverse in (comparison.far, comparison.near)]
@@ -88,13 +88,13 @@ def plane_count(camera: Camera, others: Sequence[Camera], comparison: Comparison
 
 
 def _grid(camera: Camera, distance: float) -> Float[Tensor, "36 3"]:
-    """Points at one depth behind 6 by 6 pixels."""
+    """6 by 6 points at one depth."""
     x, y = ((torch.arange(6, dtype=torch.float64) + 0.5) / 6 * size for size in (camera.width, camera.height))
     return back_project(camera, torch.cartesian_prod(x, y), torch.full((36,), distance, dtype=torch.float64)).double()
 
 
 class _Cameras:
-    """Cameras as tensors in float64, so that a photo is scored against many others at once."""
+    """Cameras as float64 tensors, to score a photo against many others at once."""
 
     def __init__(self, cameras: Sequence[Camera]) -> None:
         self.matrix = torch.stack([projection_matrix(c) for c in cameras])
@@ -111,7 +111,7 @@ class _Cameras:
         angle = ray_angles(self.center[one], self.center[others], points)
         none, best, until, different = _ANGLES
         suits = torch.minimum((angle - none) / (best - none), (different - angle) / (different - until)).clamp(0, 1)
-        # Of the same surface in the two photos.
+        # The ratio of the surface's size in the two photos.
         scale = (self._projected(one, points)[:, 2] / self.fx[one]) / (depth / self.fx[others, None])
         suits = suits * torch.minimum(scale, 1 / scale).clamp(0, 1)
         return torch.where(shown, suits, 0.0).mean(-1)
