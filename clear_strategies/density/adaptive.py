@@ -1,4 +1,4 @@
-"""Adaptive density control of 3DGS, driven by the strategies' score. Clone, split and prune are one gather map."""
+"""Adaptive density control of 3DGS by the strategies' score. Clone, split and prune are one gather map, `parents`."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ _FEWEST_ROUNDS: Final = 10
 
 @dataclass(frozen=True, slots=True)
 class DensitySettings:
-    """When Gaussians are cloned, split, pruned and reset: in iterations start < t < stop.
+    """Settings of cloning, splitting, pruning and opacity resets, in iterations start < t < stop.
 
     Args:
         threshold: on the mean over views of ‖∇_u‖ in NDC units; 3DGS 2e-4, sparse-view forks 5e-4 (F10).
-        mode: "quantile" picks as many Gaussians by the score as the ordinary statistic picks by the threshold; "fixed"
-            compares the score itself with the threshold. Both are the same where the score is the ordinary one (F9).
+        mode: "quantile" selects as many Gaussians by the score as the ordinary statistic selects by the threshold; "fixed"
+            compares the score itself with the threshold. Both are the same if the score is the ordinary one (F9).
         reduce: a Gaussian's statistic is the "mean" or the "max" over the views since the last round (F12).
         start, stop: iterations between which the structure changes.
-        statistics_from: iteration before which nothing is accumulated (F11).
+        statistics_from: iteration after which statistics are accumulated (F11).
         every: iterations between rounds; lowered where fewer than 10 rounds would fit.
         clone_below: share of the scene's extent; smaller Gaussians are cloned, larger ones are split.
         prune_opacity: Gaussians of lower opacity are removed.
         prune_world: Gaussians larger than this share of the extent are removed; None: never.
         reset_every: iterations between opacity resets to 0.01, stretched to no less than 92, in which an opacity can return to
             1/2; 0: never. White backgrounds get one more reset at `start` (F14).
-        max_gaussians: the cap; a warning says when it binds.
+        max_gaussians: largest number of Gaussians; a warning is logged when it limits densification.
         min_gaussians: pruning to fewer is an error.
     """
 
@@ -93,7 +93,7 @@ class DensitySettings:
 
 
 class Density(Densifier):
-    """Accumulates statistics per Gaussian, and changes the structure by them.
+    """Accumulates statistics per Gaussian, and clones, splits and prunes Gaussians by them.
 
     Args:
         extent: 3DGS's cameras_extent, world units. white_background: adds the early opacity reset.
@@ -124,16 +124,16 @@ class Density(Densifier):
         """Add the scores of this view's visible Gaussians; dropped ones are not visible."""
         if update.score is None or update.ordinary is None:
             return
-        totals, largest = (self.score, self.ordinary, self.count), self.settings.reduce == "max"
-        per_gaussian.accumulate(shot.visible, update.score, update.ordinary, totals, largest)
+        totals = (self.score, self.ordinary, self.count)
+        per_gaussian.accumulate(shot.visible, update.score, update.ordinary, totals, self.settings.reduce == "max")
 
     def due(self, t: int) -> bool:
-        """Whether a round of densification and pruning falls on t."""
+        """Return True if Gaussians are densified and pruned at t."""
         s = self.settings
         return s.start < t < s.stop and t % s.interval == 0
 
     def reset_due(self, t: int) -> bool:
-        """Whether opacities are reset at t."""
+        """Return True if opacities are reset at t."""
         s = self.settings
         if not s.start <= t < s.stop:
             return False
@@ -153,14 +153,14 @@ class Density(Densifier):
         return due
 
     def restructure(self, field: GaussianField, optimizer: Adam, t: int) -> Int[Tensor, " M"]:
-        """Clone, split, prune: returns parents[M], row i of everything per Gaussian now comes from row parents[i].
+        """Clone, split and prune; returns parents [M]: row i of every per-Gaussian tensor comes from row parents[i].
 
         Raises:
             DensityError: fewer than min_gaussians would be left.
             DivergedError: a parameter or a statistic is not finite.
         """
         s, n = self.settings, len(field)
-        # NaN fails every comparison: such a Gaussian would be pruned as if it were faint.
+        # NaN fails every comparison: the Gaussian would be pruned like one of low opacity.
         require_finite(f"t={t}: before densification, the parameter", field.raw(), waits=True)
         statistics = {"score": self.score, "‖∇_u L‖": self.ordinary}
         require_finite(f"t={t}: before densification, the sum", statistics, waits=True)
@@ -192,7 +192,7 @@ class Density(Densifier):
         return parents
 
     def reset_opacity(self, field: GaussianField, optimizer: Adam) -> None:
-        """Lower every rendered opacity to at most 0.01."""
+        """Lower every rendered opacity to at most 0.01, and reset its moments in Adam."""
         field.lower_opacities(_RESET_OPACITY)
         optimizer.forget("opacities")
 
@@ -206,7 +206,7 @@ class Density(Densifier):
         )
 
     def _chosen(self) -> Bool[Tensor, " N"]:
-        """Which Gaussians are cloned or split: the top by score, as many as the threshold and the cap allow."""
+        """The mask of Gaussians to clone or split: those of highest score, as many as the threshold and the cap allow."""
         s = self.settings
         views = self.count.clamp_min(1) if s.reduce == "mean" else torch.ones_like(self.count)
         score, ordinary = self.score / views, self.ordinary / views

@@ -1,8 +1,7 @@
 """Density control as Markov chain Monte Carlo (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo").
 
-Gaussians that have become invisible move to where visible ones are, the field grows by copies of visible ones, and noise moves
-those that are faint. Nothing is split by a threshold and no opacity is reset: what a photo holds stays, and what no photo
-holds looks for another place.
+Gaussians of low opacity are relocated to others, the field grows by copies of Gaussians, both sampled by opacity, and noise is
+added to the positions of faint ones. There is no threshold for splitting, and no reset of opacities.
 """
 
 from __future__ import annotations
@@ -33,30 +32,30 @@ from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
-_MOST_COPIES: Final = 51  # the paper's bound on how many Gaussians one becomes in a round
+_MOST_COPIES: Final = 51  # the paper's largest number of Gaussians that one becomes in a round
 _BINOMIALS: Final = torch.tensor(
     [[math.comb(n, j) for j in range(_MOST_COPIES + 1)] for n in range(_MOST_COPIES + 1)], dtype=torch.float64
 )
 _DENSE: Final = 4.0  # LR px between initial points, up to which their number is a measure of the surface
-_WHOLE: Final = 2**30  # what 1 is, as a whole number: sums of 2²³ Gaussians are exact in float64
+_WHOLE: Final = 2**30  # fixed-point value of 1: sums of the weights of 2²³ Gaussians are exact in float64
 _SHORT_RUN: Final = 750  # the least `stop`, that of 1,500 iterations; shorter runs gain more by density control
 _GATE: Final = 100.0  # slope of the noise's gate σ(100 (dead_opacity - o))
-_STILL: Final = 1e-4  # of the gate: below it, at opacities above 0.1, a Gaussian stays where it is
+_STILL: Final = 1e-4  # value of the gate, reached at opacities above 0.1, below which no noise is added
 
 
 @dataclass(frozen=True)
 class MCMC(Strategy):
-    """Gaussians move and are added by sampling; faint ones wander. In place of `density`.
+    """Relocates and adds Gaussians by sampling, and adds noise to faint ones, in place of `density`.
 
     Args:
-        start: the structure changes in iterations after it.
-        stop: the first iteration without any of it. SVS takes its anchor then.
-        every: iterations between rounds.
+        start: relocation and growth begin after this iteration.
+        stop: the first iteration without relocation, growth and noise. SVS takes its anchor then.
+        every: iterations between rounds of relocation and growth.
         growth: the share of Gaussians that a round adds, up to the cap.
-        per_point: the cap, as a multiple of the Gaussians at the start, which are one for each initial point.
-        max_gaussians: the cap, whatever `per_point` says.
-        min_gaussians: fewer visible ones are an error.
-        dead_opacity: Gaussians of at most this opacity are moved.
+        per_point: the cap, as a multiple of the initial number of Gaussians, one for each initial point.
+        max_gaussians: an upper bound of the cap.
+        min_gaussians: having fewer Gaussians above `dead_opacity` is an error.
+        dead_opacity: Gaussians of at most this opacity are relocated.
         noise: strength of the noise. A Gaussian of covariance Σ moves by noise(t) σ(100 (dead_opacity - opacity)) Σ η / s̃ after
             each iteration until `stop`, with η ~ N(0, I) and s̃ the median of the Gaussians' largest scales; 0: none moves.
         cooling: noise(t) / noise, which falls as the learning rate of the positions does.
@@ -84,7 +83,7 @@ class MCMC(Strategy):
         require_number("dead_opacity", self.dead_opacity, above=0, below=1)
 
     def densifier(self, field: GaussianField, views: Sequence[View], seed: int) -> Sampler | None:
-        """The sampler; None, and a message with the reason, where sampling would be of no use."""
+        """Make the sampler; None, with the reason in the log, if sampling would not help."""
         if self.stop < _SHORT_RUN:
             reason = (
                 f"it needs {2 * _SHORT_RUN:,} iterations or more, {_SHORT_RUN} of them for sampling, and in this run sampling "
@@ -106,7 +105,7 @@ class MCMC(Strategy):
 
 
 class Sampler(Densifier):
-    """Changes the structure by sampling; what it does at t is a function of the field, (seed, t) and the cap.
+    """Relocates and adds Gaussians by sampling; a step is a function of the field, (seed, t) and the cap.
 
     Args:
         n: Gaussians at the start.
@@ -123,7 +122,7 @@ class Sampler(Densifier):
         return False
 
     def due(self, t: int) -> bool:
-        """Whether a round falls on t."""
+        """Return True if Gaussians are relocated and added at t."""
         s = self.settings
         return s.start < t < s.stop and t % s.every == 0
 
@@ -138,13 +137,13 @@ class Sampler(Densifier):
         if parents is not None:
             resized(parents)
         if self.settings.noise > 0:
-            self._wander(field, t, generator)
+            self._add_noise(field, t, generator)
         return parents is not None
 
     def _round(
         self, field: GaussianField, optimizer: Adam, t: int, generator: torch.Generator
     ) -> Int[Tensor, " M"] | None:
-        """Move the dead and add copies: returns parents[M], or None where nothing changes."""
+        """Relocate Gaussians of low opacity and add copies; returns parents [M], or None if nothing changes."""
         s, n = self.settings, len(field)
         require_finite(f"t={t}: before densification, the parameter", field.raw(), waits=True)
         opacities = field.opacities.data.sigmoid()
@@ -162,7 +161,7 @@ class Sampler(Densifier):
         parents = torch.cat((torch.arange(n, device=sources.device), sources[len(dead) :]))
         parents[dead] = sources[: len(dead)]
         copies = torch.bincount(parents, minlength=n)[parents]
-        shared = copies > 1  # sources and their copies, all of which start without momentum
+        shared = copies > 1  # sources and their copies, whose moments in Adam are reset
         field.take(parents)
         optimizer.take(parents, shared)
         o, scales = relocation(field.opacities.data[shared].sigmoid(), field.scales.data[shared].exp(), copies[shared])
@@ -171,11 +170,11 @@ class Sampler(Densifier):
         _log.debug("t=%d: %d moved, %d added: %d -> %d Gaussians.", t, len(dead), added, n, len(parents))
         return parents
 
-    def _wander(self, field: GaussianField, t: int, generator: torch.Generator) -> None:
-        """Add the noise."""
+    def _add_noise(self, field: GaussianField, t: int, generator: torch.Generator) -> None:
+        """Add noise to the positions, see `MCMC.noise`."""
         s, means, quats, scales = self.settings, field.means.data, field.quats.data, field.scales.data
         gate = torch.sigmoid(_GATE * (s.dead_opacity - field.opacities.data.sigmoid()))
-        on_cpu = gate.device.type == "cpu"  # elsewhere the count would have to be waited for
+        on_cpu = gate.device.type == "cpu"  # on CUDA, `nonzero` would wait for the device
         rows = torch.nonzero(gate > _STILL)[:, 0] if on_cpu else torch.arange(len(field), device=gate.device)
         eta = torch.randn(len(rows), 3, generator=generator, device=gate.device)
         per_gaussian.wander(means, quats, scales, gate, rows, eta, s.noise * s.cooling(t))
@@ -188,9 +187,9 @@ class Sampler(Densifier):
 
 
 def drawn(weights: Float[Tensor, " N"], n: int, generator: torch.Generator) -> Int[Tensor, " n"]:
-    """Rows, each with a probability proportional to its weight in [0, 1], with replacement.
+    """Sample n rows with replacement, with probabilities proportional to the weights in [0, 1].
 
-    Unlike those of `torch.multinomial`, the sums are of whole numbers, which no order of addition on a GPU changes.
+    Unlike in `torch.multinomial`, weights are summed as integers, so that the order of addition on a GPU does not matter.
     """
     sums = (weights.double() * _WHOLE).long().cumsum(0)
     at = torch.rand(n, generator=generator, device=weights.device, dtype=torch.float64) * sums[-1]
@@ -198,7 +197,7 @@ def drawn(weights: Float[Tensor, " N"], n: int, generator: torch.Generator) -> I
 
 
 def _spacing(field: GaussianField, cameras: Sequence[Camera]) -> float:
-    """The median distance of initial points, in pixels of the camera that is nearest to each."""
+    """The median distance between initial points, in pixels of the camera that resolves each point best."""
     centers = torch.stack([camera.center.to(field.means.data) for camera in cameras])
     focal = field.means.data.new_tensor([camera.fx for camera in cameras])
     finest = (focal / torch.cdist(field.means.data, centers)).amax(dim=1)
@@ -208,10 +207,10 @@ def _spacing(field: GaussianField, cameras: Sequence[Camera]) -> float:
 def relocation(
     opacities: Float[Tensor, " N"], scales: Float[Tensor, "N 3"], copies: Int[Tensor, " N"], least: float = 0.0
 ) -> tuple[Float[Tensor, " N"], Float[Tensor, "N 3"]]:
-    """Opacity and scale of each of `copies` Gaussians that together look as the one that they replace.  Eq. 9 of that paper
+    """Opacity and scale of each of `copies` Gaussians that together render like the one that they replace.  Eq. 9 of that paper
 
-    o' = 1 - (1 - o)^(1/n), s' = s · o / Σ_j C(n, j) (-1)^(j-1) o'^j / √j: the paper's double sum, its inner binomials
-    added up. No o' is below `least`.
+    o' = 1 - (1 - o)^(1/n), s' = s · o / Σ_j C(n, j) (-1)^(j-1) o'^j / √j: the paper's double sum with its inner sum of
+    binomials evaluated. o' is at least `least`.
     """
     n = copies.clamp(1, _MOST_COPIES)
     o = opacities.double()

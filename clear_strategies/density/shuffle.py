@@ -1,4 +1,4 @@
-"""Adaptive density control, and after it S2Gaussian's Gaussian Shuffle Split, once (Wan et al. 2025)."""
+"""Adaptive density control, followed once by S2Gaussian's Gaussian Shuffle Split (Wan et al. 2025)."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _log = logging.getLogger(__name__)
 
 _CHILDREN: Final = 6  # one at each side of the centre, along each axis
 _ASIDE: Final = 0.5  # of the axis's scale
-_ALONG: Final = 4.0  # what the scale of the axis is divided by,
-_ACROSS: Final = 1.9  # and the two others
+_ALONG: Final = 4.0  # divisor of the scale of that axis
+_ACROSS: Final = 1.9  # divisor of the two other scales
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class ShuffleSettings(DensitySettings):
 
     Args:
         split_at: the iteration after which Gaussians are split into six smaller ones each. No density control follows.
-        split_above: opacity from which they are, in [0, 1); at most as many as `max_gaussians` allows, the most opaque ones.
+        split_above: opacity from which they are split, in [0, 1); if `max_gaussians` limits their number, the most opaque ones.
     """
 
     split_at: int = milestone(5_000)
@@ -51,7 +51,7 @@ class ShuffleSettings(DensitySettings):
 
 
 class ShuffleSplit(Density):
-    """`Density` until `split_at`, then one split, so that there is room for the detail of HR."""
+    """`Density` until `split_at`, then one split, which makes room for the detail of HR."""
 
     settings: ShuffleSettings
     is_split = False
@@ -73,8 +73,8 @@ class ShuffleSplit(Density):
         return changed
 
     def split(self, field: GaussianField, optimizer: Adam, t: int) -> Int[Tensor, " M"]:
-        """Split every opaque Gaussian: returns parents[M]. Along an axis two children stand one behind the other, so each has the
-        opacity 1 - √(1 - o).
+        """Split every opaque Gaussian; returns parents [M]. Seen along an axis two children overlap, so each has the opacity
+        1 - √(1 - o).
         """
         s, n = self.settings, len(field)
         opacities = field.filtered_opacities()

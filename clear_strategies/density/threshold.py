@@ -1,4 +1,4 @@
-"""Which Gaussians a score picks: as many as the ordinary statistic would, whatever the scale of the score (F9)."""
+"""Selection of Gaussians by a score of any scale: as many as the ordinary statistic selects (F9)."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from torch import Tensor
 
 
 def count_passing(statistic: Float[Tensor, " N"], threshold: float) -> int:
-    """How many Gaussians the ordinary statistic passes."""
+    """The number of Gaussians whose statistic reaches the threshold."""
     return int((statistic >= threshold).sum())
 
 
 def topk_mask(score: Float[Tensor, " N"], k: int) -> Bool[Tensor, " N"]:
-    """The k highest scores, the first of equal ones; scores of 0 are never picked."""
+    """The mask of the k highest scores, the first of equal ones; scores of 0 are never selected."""
     order = torch.argsort(score, descending=True, stable=True)[:k]
-    picked = torch.zeros_like(score, dtype=torch.bool)
-    picked[order] = score[order] > 0
-    return picked
+    selected = torch.zeros_like(score, dtype=torch.bool)
+    selected[order] = score[order] > 0
+    return selected
 
 
 def topk_threshold(score: Float[Tensor, " N"], k: int) -> float:
-    """A threshold that the k highest scores exceed (fewer where scores are equal); scores of 0 never do."""
+    """A threshold that the k highest scores exceed (fewer if scores are equal); scores of 0 never do."""
     if k == 0:
         return math.inf
     best = score.double().topk(min(k + 1, len(score))).values
