@@ -1,7 +1,7 @@
-"""Pictures by matplotlib, which need no display: curves over the iterations, and sheets of images.
+"""Figures by matplotlib, without a display: curves over the iterations, and sheets of images.
 
-On a sheet images are laid out in whole pixels: a small image is shown at a whole multiple, and of a large one, which is reduced,
-a part is shown pixel for pixel, because a resized image does not show the detail that this library is about.
+Images on a sheet are scaled by whole factors; of an image that is reduced, a part is shown pixel for pixel, because a resized
+image does not show the detail that this library is about.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ INK, FAINT, RULE = "#222222", "#888888", "#cccccc"
 BLUE, RED, GREEN, YELLOW, CYAN, PURPLE = "#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377"
 
 AS_WRITTEN: Final[dict[str, Any]] = {"parse_math": False}
-"""Style of a text with names of the user's: matplotlib would read what lies between two $ as mathematics."""
+"""Style of a text that contains the user's names: matplotlib would typeset text between two $ as mathematics."""
 
 Item = TypeVar("Item")
 
-# Title, column of history.csv, what it is drawn over, whether as a running mean.
+# Title, column of history.csv, column of the x axis, True for a running mean.
 _CHARTS: Final = (
     ("LR loss (running mean)", "loss_lr", "t", True),
     ("PSNR of test views at HR, dB", "psnr_test", "t", False),
@@ -54,12 +54,12 @@ ERROR_MAX: Final = 0.25  # the colours of an error map end here
 _GAP: Final = 8  # px
 _LINE: Final = 16  # height of a line of small print, px
 _NARROW, _WIDE, _TALL = 240, 512, 384  # the least and the greatest width and the greatest height of a shown image, px
-_ENLARGED: Final = 4  # how many times larger than its image a part is shown, if the image is not reduced
-_SCREEN: Final = 1600  # px: letters of a larger sheet are larger, because screens show it reduced
+_ENLARGED: Final = 4  # magnification of the part over that of its image, if the image is not reduced
+_SCREEN: Final = 1600  # px, size of a sheet from which its letters are enlarged, because screens show it reduced
 
 
 def spaced(items: Sequence[Item], count: int) -> Sequence[Item]:
-    """Every n-th item, at most `count` in all: the views that a figure shows of many."""
+    """Every n-th item, at most `count` in all."""
     return items[:: math.ceil(len(items) / count) or 1] if count else ()
 
 
@@ -76,10 +76,10 @@ def set_title(figure: Figure, title: str) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write the figure as its suffix says: PNG for lines and letters, JPEG for photos, of which it needs a quarter."""
+    """Write the figure in the format of the suffix: .png for lines and letters, .jpg for photos, a quarter as large."""
     buffer, kind = io.BytesIO(), path.suffix[1:]
-    how = {"png": {"compress_level": PNG_LEVEL}, "jpg": {"quality": _JPEG_QUALITY, "subsampling": 0}}[kind]
-    figure.savefig(buffer, format=kind, dpi=DPI, pil_kwargs=how)
+    options = {"png": {"compress_level": PNG_LEVEL}, "jpg": {"quality": _JPEG_QUALITY, "subsampling": 0}}[kind]
+    figure.savefig(buffer, format=kind, dpi=DPI, pil_kwargs=options)
     write_bytes(path, buffer.getvalue())
 
 
@@ -117,7 +117,7 @@ def write_curves(path: Path, histories: Mapping[str, pd.DataFrame], title: str) 
 
 
 def _finish(axis: Any) -> None:
-    """Style the axes so that the data stands out; axes without data say "not measured"."""
+    """Style the axes; those without data are labelled "not measured"."""
     axis.title.set(fontsize=10, color=INK)
     axis.tick_params(which="both", labelsize=8, colors=FAINT)
     axis.spines[["top", "right"]].set_visible(False)
@@ -136,8 +136,8 @@ class SheetRow:
 
     Args:
         name: of the row.
-        compared: the columns by which a part of the images is chosen, see `window`; it is outlined, and shown below. Empty: none
-            is.
+        compared: the columns by which a part of the images is chosen, see `window`; it is outlined, and shown below. Empty: no
+            part is shown.
         truth: the column that these are compared with, if it is known.
     """
 
@@ -149,19 +149,17 @@ class SheetRow:
 
 
 def magnification(height: int, width: int) -> float:
-    """How many times larger an image is shown: a whole number, so that pixels stay squares, or less than 1 for one that is
-    too large.
-    """
+    """The factor at which an image is shown: a whole number, so that pixels stay squares, or less than 1 for a large image."""
     if height > _TALL or width > _WIDE:
         return min(_WIDE / width, _TALL / height)
     return max(1, min(math.ceil(_NARROW / width), _TALL // height))
 
 
 def window(images: Sequence[np.ndarray], truth: np.ndarray | None = None) -> tuple[slice, slice]:
-    """The part [rows, columns] of RGB images [H, W, 3] where they differ most, the central one where all are equal. Where the
-    truth is given, their errors differ most there: noise that all images have differs everywhere, and no more than that.
+    """Find the part [rows, columns] of RGB images [H, W, 3] where they differ most; the central one if all are equal. With the
+    truth, it is where the sum of errors varies most between images, which noise in all of them does not affect.
 
-    Of images that a sheet reduces it is as large as they are shown, and square at most where they are upright.
+    For images that a sheet reduces, the part has the size at which they are shown, and is at most square.
     """
     several = np.stack(images)
     apart = several.std(axis=0).mean(axis=-1)
@@ -179,11 +177,11 @@ def window(images: Sequence[np.ndarray], truth: np.ndarray | None = None) -> tup
 
 
 class _Sheet:
-    """A figure of `width` x `height` px, on which things are placed in px from its upper left corner. It has no axes, which take
-    matplotlib longer than all the rest.
+    """A figure of `width` x `height` px with elements at px from its upper left corner. It has no axes, which take matplotlib
+    longer than all the rest.
 
     Args:
-        larger: how many times larger letters are.
+        larger: the factor of the size of letters.
     """
 
     def __init__(self, width: int, height: int, larger: float = 1.0) -> None:
@@ -200,14 +198,12 @@ class _Sheet:
         return self.figure.figimage(pixels, x, self._height - y - len(pixels), **colors)
 
     def box(self, x: float, y: float, w: float, h: float) -> tuple[float, float, float, float]:
-        """The place of w x h px in matplotlib's units: parts of the figure, from its lower left corner."""
+        """A rectangle of w x h px in matplotlib's units: fractions of the figure, from its lower left corner."""
         return x / self._width, 1 - (y + h) / self._height, w / self._width, h / self._height
 
 
 def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: str = "") -> None:
-    """Draw the rows below the names of their columns, and a bar of colours beside them where there are errors. `note` stands
-    below.
-    """
+    """Draw the rows below the names of their columns, a colour bar beside them if there are errors, and `note` below them."""
     from matplotlib.patches import Rectangle
 
     columns = list(dict.fromkeys(column for row in rows for column in row.images))
@@ -227,7 +223,8 @@ def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: 
     tops = [top + j * (cell_h + 2 * line + _GAP) + sum(part_h[:j]) for j in range(len(rows) + 1)]
     right, with_bar = left + len(columns) * (cell_w + _GAP), any(len(shape) == 2 for shape in shapes)
     width, height = right + 5 * line * with_bar, tops[-1] + line
-    sheet, error, errors = _Sheet(width, height, larger), None, {"cmap": "magma", "vmin": 0, "vmax": ERROR_MAX}
+    sheet, error = _Sheet(width, height, larger), None
+    errors = {"cmap": "magma", "vmin": 0, "vmax": ERROR_MAX}
     sheet.text(_GAP, 1.5 * line, title, 12, ha="left")
     for i, lines in enumerate(heads):
         x = left + i * (cell_w + _GAP)
@@ -257,10 +254,10 @@ def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: 
 
 
 def write_tiles(path: Path, tiles: Mapping[str, np.ndarray], title: str, columns: int) -> None:
-    """Draw images side by side in rows of `columns`, each below its name and as large as the largest is on a sheet.
+    """Draw images side by side in rows of `columns`, each below its name and at the size of the largest on a sheet.
 
     Args:
-        tiles: RGB [H, W, 3], or numbers in [0, 1], [H, W], which get colours: dark is 0, bright is 1, grey is nan.
+        tiles: RGB [H, W, 3], or numbers in [0, 1], [H, W], which are colour-mapped: dark is 0, bright is 1, grey is nan.
     """
     from matplotlib import colormaps
 
@@ -281,7 +278,7 @@ def write_tiles(path: Path, tiles: Mapping[str, np.ndarray], title: str, columns
 
 
 def _resized(pixels: np.ndarray, times: float) -> np.ndarray:
-    """Each pixel repeated where the image is shown larger, means where it is shown smaller."""
+    """Enlarge by repeating pixels, or reduce by means over areas."""
     if times >= 1:
         return pixels.repeat(int(times), 0).repeat(int(times), 1)
     size = [round(times * edge) for edge in pixels.shape[:2]]

@@ -1,20 +1,19 @@
-"""How close an image is to the truth, in four numbers that need no trained network.
+"""Image quality against the truth, in four numbers that need no trained network.
 
 - **PSNR**, dB, and **SSIM**, as scikit-image defines them with data range 1; SSIM with the window of the paper (Wang et
   al. 2004: Gaussian, σ = 1.5, population covariance). Other definitions differ by as much as a row of an ablation.
 - **GMSD**, gradient magnitude similarity deviation (Xue et al. 2014), 0 is perfect: how unevenly edges are preserved. It
   responds to wrong structure (ghosts, warped edges, floaters) that a mean over pixels hides.
-- **Blur**, scikit-image's `blur_effect` (Crete et al. 2007) minus that of the truth, 0 is perfect: a positive number says
-  that the image is blurrier than the truth, a negative one that it has more fine contrast, such as invented texture.
+- **Blur**, scikit-image's `blur_effect` (Crete et al. 2007) minus that of the truth, 0 is perfect: above 0 the image is
+  blurrier than the truth, below 0 it has more fine contrast, such as invented texture.
 
 On photographs of six real scenes each of the four ranks the truth first, then a ×4 network, bicubic ×4 and bicubic ×8.
 Only PSNR, SSIM and GMSD respond to a shift by two pixels: blur ignores where contrast is. Noise on a blurred image brings
 blur back to 0 while GMSD rises, so read the two together.
 
-A run may add metrics of its own (`metrics.*`), which need one.
+A run may add metrics of its own (`metrics.*`), such as LPIPS, which needs one.
 
-Only shown pixels count: where a mask hides one of the truth's, the image is taken to have it, and PSNR, SSIM and GMSD are of the
-others.
+Only shown pixels count: at pixels that a mask hides, the image is replaced by the truth, and PSNR, SSIM and GMSD leave them out.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from rasterizers.native import threads
 _log = logging.getLogger(__name__)
 
 Metric = Callable[[Tensor, Tensor], Any]
-"""A number, or a tensor of one, from an image and the truth."""
+"""Computes a number, or a tensor with one element, from an image and the truth."""
 
 PSNR_CAP: Final = 100.0  # dB, the PSNR of identical images
 _GMSD_C: Final = 170 / 255**2
@@ -61,11 +60,11 @@ class ImageScores:
 
 
 class Truth:
-    """What images are compared with, and what the scores need of it alone.
+    """The image that others are compared with, and the parts of the scores that depend on it alone.
 
     Args:
-        shown: False at pixels that do not count: there an image is taken to be right. One at least is shown. None: all are.
-        own: metrics by name: of an image and the truth, both [H, W, 3] in [0, 1] on the CPU. One that raises has no number.
+        shown: False at pixels that do not count: there the image is replaced by the truth. At least one is True. None: all count.
+        own: metrics by name, of an image and the truth, both [H, W, 3] in [0, 1] on the CPU. One that raises gives NaN.
     """
 
     def __init__(
@@ -110,17 +109,17 @@ def mean_scores(scores: Sequence[ImageScores]) -> ImageScores | None:
     return ImageScores(*(sum(getattr(s, name) for s in scores) / len(scores) for name in four), own=own)
 
 
-@torch.no_grad()  # of each thread its own
+@torch.no_grad()  # the mode is per thread
 def _measured(name: str, metric: Metric, image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> float:
     try:
         return float(metric(image, truth))
-    except Exception as error:  # anyone's; the run is not lost by it
+    except Exception as error:  # of a metric of the user's; the run must not fail by it
         _log.warning("metrics.%s: left out, %s: %s", name, type(error).__name__, one_line(error))
         return math.nan
 
 
 def _ssim(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None) -> float:
-    """By the kernel of the loss, in a thirtieth of scikit-image's time; they differ by less than 1e-6. The kernel has no map."""
+    """Mean SSIM: without a mask by the loss's kernel, in a thirtieth of scikit-image's time; they differ by less than 1e-6."""
     if shown is None and native.available():
         return float(native.module().mean_ssim(x.float().contiguous(), y.float().contiguous(), threads()))
     from skimage.metrics import structural_similarity
@@ -141,13 +140,13 @@ def _blur(grey: np.ndarray) -> float:
 
 
 def _gmsd(gx: np.ndarray, gy: np.ndarray, shown: Bool[Tensor, "H W"] | None) -> float:
-    """Standard deviation of the similarity of two gradient magnitudes, where one of the four pixels is shown."""
+    """Standard deviation of the similarity of two gradient magnitudes, over pixels at half size that are shown in part."""
     similarity = (2 * gx * gy + _GMSD_C) / (gx**2 + gy**2 + _GMSD_C)
     return float((similarity if shown is None else similarity[_at_half_size(shown.double().numpy()) > 0]).std())
 
 
 def _gradient_at_half_size(image: np.ndarray) -> np.ndarray:
-    """Prewitt's gradient magnitude."""
+    """The magnitude of Prewitt's gradient of the image at half size."""
     from skimage.filters import prewitt_h, prewitt_v
 
     half = _at_half_size(image)

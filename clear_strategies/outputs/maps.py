@@ -1,14 +1,14 @@
-"""maps/: where a run trusted its prior, and where the photos overruled it, for some of its training views.
+"""The folder maps/: maps of the prior's evidence and of the correction of its gradients, for some training views.
 
 Five maps per view, in [0, 1] at each HR pixel:
 
 - `reliability` R, `demand` A and `weight` R·A: the patch evidence of a strategy that has it, enlarged.  Eq. 9, 10
 - `corrected`: the share of its HR gradient that a Gaussian lost by correction, ‖g̃_HR - g_HR‖ / ‖g_HR‖ over all groups
   together.  Eq. 7, 11
-- `conflict`: 1 where g_LR and g_HR of a Gaussian point apart, else 0.  Eq. 6
+- `conflict`: 1 where g_LR and g_HR of a Gaussian have a negative scalar product, else 0.  Eq. 6
 
-The last two render the Gaussians over black with that number as their grey. The strategies are copied, so that the run does not
-change. maps.jpg shows the maps side by side, with the depth that dense stereo found, where it did.
+The last two are renderings of the Gaussians over black with that number as their grey. The strategies are copied, so that the
+run does not change. maps.jpg shows the maps side by side, with the depth of dense stereo if there is any.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ MAPS: Final = {
     "conflict": "conflict\n1 where LR and HR gradients point apart",
     "corrected": "corrected\nthe share of the HR gradient that was taken away",
 }
-"""The maps, and what they mean."""
+"""Captions of the maps, by their names."""
 _COLUMNS: Final = 4  # of maps.jpg
 _NOTE: Final = (
     "reliability, demand, weight: means over pixels; corrected, conflict: means over the Gaussians that the view moves "
@@ -64,8 +64,8 @@ _NOTE: Final = (
 )
 _ALWAYS_ON: Final = WarmupDecay(start=0, full=1, decay_from=1, end=1)  # λ_HR = 1 from the first iteration
 
-# Of maps/coverage.png, how many photos see each part of the scene:
-_COMPARED: Final = 64  # photos whose depth is compared, at most
+# Settings of maps/coverage.png, which shows how many photos see each part of the scene:
+_COMPARED: Final = 64  # largest number of photos that are counted
 _LONGER_SIDE: Final = 96  # px, of the depth of a photo
 _SOLID: Final = 0.3  # opacity of the Gaussians that count as surface
 _MOST_POINTS: Final = 60_000  # on the map
@@ -78,7 +78,7 @@ _LONGEST_NOTE: Final = 400  # characters below the map
 
 class ViewMaps(NamedTuple):
     """The maps of one training view at HR, in [0, 1], and their means over pixels or Gaussians, by the names in `MAPS`:
-    "corrected" only where a strategy corrects, those of patch evidence only where a strategy has it; and the render.
+    "corrected" only if a strategy corrects, those of patch evidence only if a strategy has it; and the render.
     """
 
     maps: Mapping[str, Float[Tensor, "H W"]]
@@ -95,10 +95,10 @@ def write_maps(
     Args:
         stems: see `file_stems`.
         views: at least one. The other arguments are those of `view_maps`.
-        beside: does the drawing and encoding.
+        beside: draws and encodes the pictures.
 
     Returns:
-        The renders of these views by their names, so that they need not be rendered again.
+        The renders of these views by their names, for reuse.
     """
     means, renders = dict[str, Mapping[str, float]](), dict[str, Tensor]()
     done = Progress("maps", "views", len(views))
@@ -120,7 +120,7 @@ def write_maps(
 
 
 def view_maps(painter: Painter, conductor: Conductor, rasterizer: Rasterizer, view: View, t: int) -> ViewMaps:
-    """The maps of one view by the strategies of the run as they are at iteration t, without dropout.
+    """Compute the maps of one view by the strategies of the run in their state at iteration t, without dropout.
 
     Args:
         painter: of the run's field. rasterizer: of the run.
@@ -153,13 +153,13 @@ def _write_picture(path: Path, view: View, found: ViewMaps) -> None:
 
 
 def _evidence(conductor: Conductor, view: View) -> tuple[Strategy, PatchMaps] | None:
-    """The strategy that has patch evidence of the view, and that evidence."""
+    """The first strategy with patch evidence of the view, and that evidence; None if there is none."""
     known = ((s, patches) for s in conductor.strategies if (patches := s.patch_maps(view)) is not None)
     return next(known, None)
 
 
 def _enlarged(patches: PatchMaps, view: View) -> dict[str, Tensor]:
-    """R, A and R·A at HR."""
+    """Enlarge R, A and R·A to HR."""
     edge, camera, R, A = patches.patch * view.factor, view.hr.camera, patches.reliability, patches.demand
 
     def enlarged(values: Tensor) -> Tensor:
@@ -171,12 +171,12 @@ def _enlarged(patches: PatchMaps, view: View) -> dict[str, Tensor]:
 def _gradients(
     field: GaussianField, conductor: Conductor, rasterizer: Rasterizer, view: View, t: int
 ) -> tuple[Grads, Grads, Grads | None, Float[Tensor, "H W 3"]]:
-    """g_LR, g_HR before correction, and g̃_HR where a strategy corrects at t, whatever λ_HR is then; Î_HR on the CPU."""
+    """(g_LR, g_HR before correction, g̃_HR or None if no strategy corrects at t, Î_HR on the CPU), with λ_HR = 1."""
     objective = replace(conductor.objective, lambda_hr=_ALWAYS_ON)
     aside = Conductor(*copy.deepcopy(conductor.strategies), objective=objective)
     lr, hr = (cast(FieldShot, shot) for shot in field.render_scales(rasterizer, view))  # both scales are asked for
     (g_lr,) = lr.vjp(objective.lr(lr.image.detach(), view.lr.image, view.lr.shown).cotangents)
-    # The field is drawn over the scene's own background, whichever one a strategy would choose.
+    # The field is drawn over the scene's own background, not over one of a strategy.
     opaque = replace(view, hr=replace(view.hr, transparency=None))
     from_hr = aside.hr_gradients(hr, opaque, t, params={name: p.detach() for name, p in field.raw().items()})
     g_lr, g_hr = g_lr.without_detail(), from_hr.g
@@ -187,7 +187,7 @@ def _gradients(
 
 
 def _compare(lr: Grads, hr: Grads, corrected: Grads | None) -> tuple[dict[str, Tensor], Bool[Tensor, " N"]]:
-    """A number in [0, 1] per Gaussian for each map, and which Gaussians have both gradients: the others are 0."""
+    """A number in [0, 1] per Gaussian for each map, 0 unless it has both gradients; and the mask of those that have."""
     p = reconcile.products(lr, hr)
     dot, lr2, hr2 = (x.sum(1) for x in (p.dot, p.l2, p.h2))
     compared = (lr2 > 0) & (hr2 > 0)
@@ -201,7 +201,7 @@ def _compare(lr: Grads, hr: Grads, corrected: Grads | None) -> tuple[dict[str, T
 
 
 def coverage_of(scene: Scene, painter: Painter) -> tuple[Float[Tensor, "N 3"], Int[Tensor, " N"]]:
-    """Points of the field's surface, and how many training photos see each of them."""
+    """Points of the field's surface, and the number of training photos that see each of them."""
     field, photos = painter.field, [view.hr.camera for view in scene.train]
     small = [at_most(camera, _LONGER_SIDE) for camera in figures.spaced(photos, _COMPARED)]
     solid = field.means.data[field.opacities.data.sigmoid() > _SOLID].cpu()
@@ -210,8 +210,8 @@ def coverage_of(scene: Scene, painter: Painter) -> tuple[Float[Tensor, "N 3"], I
 
 
 def write_coverage(path: Path, scene: Scene, painter: Painter, title: str, beside: Beside) -> None:
-    """Draw the points in the colours of how many photos see them, and the cameras; what fewer photos see lies on top. Nothing
-    where no Gaussian is a surface yet.
+    """Draw the points, coloured by the number of photos that see them, fewer ones on top, and the cameras. Nothing is drawn if no
+    Gaussian is a surface yet.
     """
     points, times = coverage_of(scene, painter)
     if len(points):
@@ -252,7 +252,7 @@ def _draw_coverage(
 
 
 def _from_above(poses: Float[Tensor, "C 3 3"]) -> Float[np.ndarray, "3 2"]:
-    """Right and ahead of the first camera, across the mean of the cameras' up."""
+    """The horizontal plane: right and ahead of the first camera, orthogonal to the mean of the cameras' up."""
     up = torch.nn.functional.normalize(-poses[:, 1].mean(0), dim=0)
     ahead = poses[0, 2] - (poses[0, 2] @ up) * up
     ahead = torch.nn.functional.normalize(ahead if ahead.norm() > 1e-3 else poses[0, 1], dim=0)

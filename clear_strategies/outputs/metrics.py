@@ -1,18 +1,18 @@
-"""Scores of a whole scene, the content of metrics.json, and what a run logs of them at its end.
+"""Scores of a whole scene, the content of metrics.json, and the messages about them at the end of a run.
 
 metrics.json: {"scene", "method", "strategies", "overrides", "seed", "iterations", "gaussians", "seconds", "conflict",
 "synthetic_prior", "config", "provenance", "note", "test": TABLE, "train": TABLE}, where TABLE is {"against", "views":
 {view: {image: scores}}, "mean": {image: scores}}.
 
 - "method" is the name of a published baseline (`+method=`), null where none was chosen.
-- "overrides" are those of the command line, null where they are unknown. Hydra's own file of them is no record of the run:
-  a later command rewrites it even where that command is refused.
-- The images are "ours", "bicubic" (U of the view's own LR photo) and "prior" (the view's SR image). "bicubic" is missing where
-  the HR photo is unknown, both where the HR side is photos (`photos_are=both`).
-- "against" says what they are compared with: "HR photos"; "LR photos", after D, where the HR photos are unknown; "HR and
-  LR photos" where that differs between views.
+- "overrides" are those of the command line, null if they are unknown. Hydra's own file of them is no record of the run, since a
+  later command rewrites it even if that command is refused.
+- The images are "ours", "bicubic" (U of the view's own LR photo) and "prior" (the view's SR image). "bicubic" is missing if the
+  HR photo is unknown, both are if the HR side is photos (`photos_are=both`).
+- "against" names the images of the comparison: "HR photos"; "LR photos", after D, if the HR photos are unknown; "HR and LR
+  photos" if that differs between views.
 - The training TABLE has another key, "of": the number of training views, of which at most 50 are scored.
-- The scores are "psnr", "ssim", "gmsd" and "blur", and where the run has metrics of its own, "own": {name: number}.
+- The scores are "psnr", "ssim", "gmsd" and "blur", and if the run has metrics of its own, "own": {name: number}.
 - A number that is not finite is null.
 """
 
@@ -55,12 +55,12 @@ _LEGEND: Final = (
     "the photo, and below 0 where it is harder."
 )
 
-MOST_TRAIN: Final = 50  # training views that are scored; of more, those spaced evenly
-TRAIN_RENDERS: Final = 4  # training views whose renders are kept where there are no test views
+MOST_TRAIN: Final = 50  # largest number of training views that are scored, evenly spaced
+TRAIN_RENDERS: Final = 4  # number of training views whose renders are kept if there are no test views
 
 
 class Scores(msgspec.Struct):
-    """`ImageScores` in the file; null stands for a number that was not finite."""
+    """`ImageScores` in the file; null for a number that was not finite."""
 
     psnr: float | None
     ssim: float | None
@@ -83,7 +83,7 @@ class Part(msgspec.Struct):
 
 
 class Metrics(msgspec.Struct):
-    """The fields of metrics.json that are read again."""
+    """The fields of metrics.json that this package reads."""
 
     scene: str
     strategies: list[str]
@@ -101,19 +101,19 @@ class Metrics(msgspec.Struct):
 
     @property
     def shown(self) -> Part:
-        """The test views; the training views where there are none."""
+        """The test views; the training views if there are none."""
         return self.test if self.test.mean else self.train
 
 
 def read(path: Path, remedy: str) -> Metrics:
-    """The content of metrics.json."""
+    """Read metrics.json."""
     content = typed(path, read_object(path), Metrics, remedy=remedy)
     content.config = plain_settings(path, content.config)
     return content
 
 
 def as_float(value: float | None) -> float:
-    """A number of the file, where null stands for one that was not finite."""
+    """A number of the file; NaN for null."""
     return math.nan if value is None else value
 
 
@@ -123,11 +123,11 @@ Table = dict[str, dict[str, ImageScores]]
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """Scores of the views, what each part was compared with, and the renders of the test views; where there are none, those of
-    a few training views.
+    """Scores of the views, the images that each part was compared with, and the renders of the test views, or of a few training
+    views if there are none.
 
     Args:
-        train: of at most `MOST_TRAIN` of the training views, whose number is `train_views`.
+        train: scores of at most `MOST_TRAIN` of the `train_views` training views.
     """
 
     test: Table
@@ -141,7 +141,7 @@ class Evaluation:
         return mean_scores([row[image] for row in getattr(self, part).values() if image in row])
 
     def against_lr(self, part: str) -> bool:
-        """Whether views of a part are compared with their LR photos, since their HR photos are unknown."""
+        """Return True if views of a part are compared with their LR photos, since their HR photos are unknown."""
         return "LR" in self.against.get(part, "")
 
 
@@ -149,13 +149,13 @@ def evaluate(
     scene: Scene, render: Callable[[View], Float[Tensor, "H W 3"]], *, down: DownKernel = "bicubic",
     own: Mapping[str, Metric] | None = None,
 ) -> Evaluation:  # fmt: skip
-    """Render and score the views, of many training views a sample. Pixels that a mask hides do not count. Views are scored
-    while the next ones are rendered, each by one thread: scikit-image uses one.
+    """Render and score the views, or a sample of many training views. Pixels that a mask hides do not count. Views are scored
+    while the next ones are rendered, each by one thread, since scikit-image uses one.
 
-    Where the HR photo is unknown, D of the render is compared with the LR photo.
+    If the HR photo is unknown, D of the render is compared with the LR photo.
 
     Args:
-        own: as of `Truth`; they are called in several threads.
+        own: as of `Truth`; called in several threads.
     """
     renders: dict[str, Tensor] = {}
     tables: dict[str, Table] = {"test": {}, "train": {}}
@@ -179,7 +179,7 @@ def evaluate(
             if view.name in kept:
                 renders[view.name] = image
             scored.append((tables[part], view.name, scorers.submit(_scores_of, view, image, down, own)))
-            if len(scored) > n:  # so that not all renders are held
+            if len(scored) > n:  # bounds the number of renders in memory
                 take()
         while scored:
             take()
@@ -217,24 +217,24 @@ def _against(views: Sequence[View]) -> str:
 def _scores_of(
     view: View, image: Float[Tensor, "H W 3"], down: DownKernel, own: Mapping[str, Metric] | None
 ) -> dict[str, ImageScores]:
-    """The scores of the view's images."""
+    """Score the images of a view."""
     truth, mask, scored = view.truth, view.hr.shown, {"ours": image}
     if truth is None:
-        if mask is not None:  # else D would mix what it hides into what is shown
+        if mask is not None:  # else D would mix hidden pixels into shown ones
             scored["ours"] = torch.where(mask[..., None], image, view.hr.image)
         truth, mask, scored["prior"] = view.lr.image, view.lr.shown, view.hr.image
         scored = {name: images.downsample(i, view.factor, down) for name, i in scored.items()}
-    elif not view.hr_is_photo:  # else no SR has a part
+    elif not view.hr_is_photo:  # else there is no SR image
         scored |= {"bicubic": images.upsample(view.lr.image, view.factor), "prior": view.hr.image}
     against = Truth(truth, mask, own)
     return {name: against.score(image) for name, image in scored.items()}
 
 
 def describe(folder: Path, evaluation: Evaluation, seconds: float, parts: Mapping[str, float]) -> str:
-    """What the command took, and the mean scores of the test and training views, of the run and of what it is compared with.
+    """The message at the end of a run: its duration, and the mean scores of its views, of bicubic and of the prior.
 
     Args:
-        seconds: of the whole command. parts: of its stages, by name; those that take a second or more are told.
+        seconds: of the whole command. parts: of its stages, by name; those of a second or more are shown.
     """
     folder = _relative(folder)
     rows = [(part, *row) for part in ("test", "train") for row in _rows(part, evaluation)]
@@ -257,19 +257,19 @@ def describe(folder: Path, evaluation: Evaluation, seconds: float, parts: Mappin
 
 
 def describe_job(number: int, folder: Path, evaluation: Evaluation, seconds: float) -> str:
-    """One line, of a job among many."""
+    """The message at the end of a job of a sweep, one line."""
     means = ((part, mean) for part in ("test", "train") if (mean := evaluation.mean(part)) is not None)
     score = next((f", {part} views {mean.psnr:.2f} dB" for part, mean in means), "")
     return f"job {number}: done in {duration(seconds)}{score}: {_relative(folder)}"
 
 
 def _relative(folder: Path) -> Path:
-    """Relative to the working directory, where the folder lies in it."""
+    """The path relative to the working directory, if the folder lies in it."""
     return folder.relative_to(Path.cwd()) if Path.cwd() in folder.parents else folder
 
 
 def _rows(part: str, evaluation: Evaluation) -> Iterator[tuple[str, str]]:
-    # bicubic and prior are made from the LR photos, so they are not compared with these.
+    # bicubic and prior are made from the LR photos, so a comparison with these would be meaningless.
     for image in ("ours",) if evaluation.against_lr(part) else ("ours", "bicubic", "prior"):
         if (mean := evaluation.mean(part, image)) is not None:
             yield image, _numbers(mean)

@@ -28,12 +28,12 @@ _SHORT: Final[Sequence[str]] = (
     "scene", "poses", "HR side", "train views", "test views", "masks", "LR", "HR", "the SR images add",
     "initial points", "rasterizer", "memory", "time", "skipped",
 )  # fmt: skip
-_LINES: Final = 20  # in a file, which shows no bar
+_LINES: Final = 20  # lines of progress if stderr is no terminal
 _READ_EVERY: Final = 0.25  # seconds; reading the history's numbers waits for the device
 
 
 OF_STRATEGY: Final = re.compile(r"strategies\.(\w+)(?:\._target_)?")
-"""The key of an override that adds a strategy, or leaves one out."""
+"""The key of an override that adds or removes a strategy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class Chosen:
 
     @property
     def title(self) -> str:
-        """The names on the command line, as "best" or "best - p2g"; where there are none, those of the strategies."""
+        """The names on the command line, as "best" or "best - p2g"; if there are none, those of the strategies."""
         given, left_out = [self.method] if self.method else [], list[str]()
         for override in self.overrides or ():
             key, _, value = override.lstrip("+~").partition("=")
@@ -68,7 +68,7 @@ class Chosen:
 
 
 def describe_choices(chosen: Chosen, conductor: Conductor, data: str, iterations: int, seed: int) -> str:
-    """The part of the plan that needs no photo: it stands on the console from the first second."""
+    """The part of the plan that needs no photo, so that the console shows it at once."""
     named = zip(chosen.strategies, conductor.strategies, strict=True)
     none = "none (the paper's baseline)" if chosen.method is None else "none"
     return _table({
@@ -80,8 +80,8 @@ def describe_choices(chosen: Chosen, conductor: Conductor, data: str, iterations
 
 
 def describe(scene: Scene, state: TrainState, chosen: Chosen, machine: Mapping[str, str]) -> tuple[str, str]:
-    """The rest of the plan, a line for each fact: what the console shows, and the details for `-v` and run.log. Strategies
-    without effect give a warning.
+    """The rest of the plan, a line for each fact: (the lines for the console, the details for `-v` and run.log). Warns of
+    strategies without effect.
 
     Args:
         machine: label -> fact: the rasterizer, the threads, the memory.
@@ -120,7 +120,7 @@ def _table(lines: Mapping[str, str]) -> str:
 
 
 def _skipped(state: TrainState) -> Iterator[str]:
-    """The work that this configuration never does, a phrase each."""
+    """Phrases for the work that this configuration never does."""
     objective, hr = state.conductor.objective, state.conductor.objective.lambda_hr
     if not state.conductor.wants_lr:
         used = "is the area mean of the HR render" if objective.lambda_lr > 0 else "plays no part"
@@ -137,7 +137,7 @@ def _skipped(state: TrainState) -> Iterator[str]:
 
 
 def _marks(state: TrainState) -> dict[str, int]:
-    """Iterations by name: of λ_HR and of the strategies."""
+    """The milestones of λ_HR and of the strategies, iterations by name."""
     hr = state.conductor.objective.lambda_hr
     at = {"HR from": hr.start, "HR full": hr.full} | ({"HR decays": hr.decay_from} if hr.final != hr.peak else {})
     for s in state.conductor.strategies:
@@ -153,18 +153,19 @@ def _listed(iterations: Mapping[str, int]) -> str:
 def progress_bar(
     state: TrainState, after_step: Callable[[int], None] | None = None, name: str | None = None, *, shown: bool = True
 ) -> Iterator[Progress]:
-    """A bar with loss, PSNR, number of Gaussians, conflict ratio and remaining time; where stderr is no terminal, 20 lines of it.
-    Yields the function that advances it.
+    """Show a bar with loss, PSNR, number of Gaussians, conflict ratio and remaining time, or 20 lines of it if stderr is no
+    terminal. Yields the function that advances it.
 
     Args:
         after_step: called after each iteration, with its number.
         name: of the training, in front of the bar.
-        shown: False where several jobs share the terminal.
+        shown: False if several jobs share the terminal.
     """
     from tqdm import tqdm
 
     total, in_lines = state.settings.iterations, shown and not sys.stderr.isatty()
-    between, last_read, numbers = max(1, total // _LINES), -math.inf, dict[str, str]()
+    between, last_read = max(1, total // _LINES), -math.inf
+    numbers: dict[str, str] = {}
     with tqdm(
         desc=name, total=total, initial=state.t - 1, unit="it", dynamic_ncols=True, mininterval=0.5, disable=not shown,
         file=io.StringIO() if in_lines else sys.stderr,
@@ -189,9 +190,9 @@ def progress_bar(
 
 
 def _numbers(row: Mapping[str, float], lambda_lr: float) -> dict[str, str]:
-    """A row of the history, for the progress bar."""
+    """Format a row of the history for the progress bar."""
     loss, numbers = lambda_lr * row["loss_lr"], {"N": f"{int(row['n_gaussians']):,}"}
-    if row["lambda_hr"] == 0 or "loss_base" in row:  # else HR was left out, and the loss would jump
+    if row["lambda_hr"] == 0 or "loss_base" in row:  # else HR was skipped in this iteration, and the loss would jump
         numbers["loss"] = f"{loss + row['lambda_hr'] * row.get('loss_base', 0.0):.4f}"
     if not math.isnan(row.get("conflict", math.nan)):
         numbers["conflict"] = f"{row['conflict']:.2f}"

@@ -1,4 +1,4 @@
-"""Where a result came from: versions, machine, source and settings. It never fails; a fact that cannot be found is "unknown"."""
+"""The provenance of results: versions, machine, source and settings. It never fails; facts that cannot be found are "unknown"."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _PACKAGES: Final = (
 
 
 def provenance(**facts: Any) -> dict[str, Any]:
-    """The facts to keep with every result; `facts` are those of the run (seed, backend, plan)."""
+    """The facts that are stored with every result; `facts` are those of the run (seed, backend, plan)."""
     from rasterizers import native
 
     return {**origin(), "threads": native.threads(), **facts}
 
 
 def origin() -> dict[str, Any]:
-    """When, on which machine, from which source, by which command."""
+    """Date, versions, machine, source and command."""
     return {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "versions": {name: version for name in _PACKAGES if (version := _version(name)) is not None},
@@ -55,7 +55,7 @@ def _git() -> str:
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return "no checkout"
-    # Reading must not take the lock of a checkout that someone is working in.
+    # Reading must not lock a checkout that another process uses.
     described = ("describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+dirty")
     command = ["git", "--no-optional-locks", "-C", str(root), *described]
     try:

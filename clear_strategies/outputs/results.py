@@ -1,4 +1,4 @@
-"""The files of a finished run. metrics.json is written last: where it exists, the run is finished."""
+"""The files of a finished run. metrics.json is written last: if it exists, the run is finished."""
 
 from __future__ import annotations
 
@@ -70,13 +70,13 @@ def write_results(
     """Evaluate a finished run and write its files; returns its scores.
 
     Args:
-        scene: on the CPU, wherever the field is.
+        scene: on the CPU, also if the field is on CUDA.
         painter: of the state's field, for depth and video.
         down: D, by which the LR images were made.
         antialiased: the rasterizer compensates opacities, see `RasterSettings`.
         own: metrics, see `image_scores.Truth`.
     """
-    import pandas as pd  # here, as those whose settings are refused need not wait for it
+    import pandas as pd  # here, so that a job whose settings are refused does not wait for it
 
     field, work_log, settings = state.field, state.conductor.work_log, state.settings
     stems = file_stems(view.name for view in (*scene.train, *scene.test))
@@ -95,10 +95,10 @@ def write_results(
                     rendered |= write_maps(
                         folder / "maps", stems, mapped, painter, state.conductor, rasterizer, state.t - 1, beside
                     )
-                except Exception as error:  # of their makers, anyone's strategies: the run is not lost by it
+                except Exception as error:  # of a user's strategy; the run must not fail by it
                     _log.warning("maps: left out, %s: %s", type(error).__name__, one_line(error))
                 write_coverage(folder / _COVERAGE, scene, painter, title, beside)
-        memory.release()  # the gradients that the maps are made of: several times the field
+        memory.release()  # of the maps' gradients, several times the size of the field
         with work_log.stage("evaluate"):
             evaluation = metrics.evaluate(scene, render, down=down, own=own)
         for name, image in evaluation.renders.items():
@@ -108,7 +108,7 @@ def write_results(
         with work_log.stage("video"):
             _write_video(folder / "path.mp4", [view.hr.camera for view in scene.train], painter, settings.video)
         export_ply(folder / "point_cloud.ply", field, antialiased=antialiased)
-        with work_log.stage("pictures"):  # those that were not drawn meanwhile
+        with work_log.stage("pictures"):  # waits for those that are not yet drawn
             beside.finish()
     stages = pd.DataFrame([*scene.work_log.rows(), *_two_stages(state, history), *work_log.rows()])
     _write_tables(folder, history, stages)
@@ -149,11 +149,11 @@ def export_ply(path: Path, field: GaussianField, *, antialiased: bool = True, de
 
 
 def remove_earlier(folder: Path, *, all_files: bool) -> None:
-    """Remove metrics.json of an earlier run, because its presence says that a run is finished.
+    """Remove metrics.json of an earlier run, because it marks a run as finished.
 
     Args:
-        all_files: also the other files of that run, which would be taken for those of the new run. The views in its
-            metrics.json and cameras.json name them; all other files stay.
+        all_files: also remove the other files of that run, which could be mistaken for those of the new run. They are found by
+            the views in its metrics.json and cameras.json; all other files stay.
     """
     path = folder / files.FINISHED
     if not path.exists():
@@ -191,8 +191,9 @@ def _write_video(path: Path, train: Sequence[Camera], painter: Painter, frames: 
 
 
 def _write_sheet(folder: Path, scene: Scene, stems: Mapping[str, str], evaluation: Evaluation, title: str) -> None:
-    """Of a few views the LR photo, the SR image and the render, and where the truth is known, the truth and the error."""
-    rows, part = [], evaluation.test or evaluation.train
+    """Draw the LR photo, the SR image and the render of a few views, with the truth and the error if it is known."""
+    rows: list[SheetRow] = []
+    part = evaluation.test or evaluation.train
     rendered = [view for view in (*scene.test, *scene.train) if view.name in evaluation.renders]
     for view in (*scene.train, *scene.test):  # the viewer shows them beside the rendering
         write_png(folder / "views" / f"{stems[view.name]}_lr.png", view.lr.image)
@@ -204,16 +205,19 @@ def _write_sheet(folder: Path, scene: Scene, stems: Mapping[str, str], evaluatio
         if not view.hr_is_photo:
             columns["LR, enlarged"] = images.upsample(view.lr.image, view.factor, "nearest")
             columns["SR prior"] = view.hr.image
-        columns["ours"], score = evaluation.renders[view.name].clamp(0, 1), part[view.name]["ours"]
+        columns["ours"] = evaluation.renders[view.name].clamp(0, 1)
         if view.truth is not None:
             columns["ground truth"] = view.truth
             columns["error of ours"] = (columns["ours"] - view.truth).abs().mean(-1)
+        score = part[view.name]["ours"]
         captions = {"ours": f"{score.psnr:.2f} dB, SSIM {score.ssim:.3f}"}
         pixels = {name: image.numpy() for name, image in columns.items()}
         pictures = [name for name, image in pixels.items() if image.ndim == 3]
         given = [name for name in pictures if name != "ours"]  # these differ most where there is most detail
         rows.append(SheetRow(view.name, pixels, captions, given if len(given) > 1 else pictures))
-    note = _TRAINED_ON if not scene.test else "" if scene.test[0].hr_is_photo else _OWN_PHOTO
+    note = _TRAINED_ON
+    if scene.test:
+        note = "" if scene.test[0].hr_is_photo else _OWN_PHOTO
     write_contact_sheet(folder / "contact_sheet.jpg", rows, title, note)
 
 
@@ -227,7 +231,7 @@ def _write_tables(folder: Path, history: pd.DataFrame, stages: pd.DataFrame) -> 
 
 
 def _two_stages(state: TrainState, history: pd.DataFrame) -> list[dict[str, str | int | float]]:
-    """Iterations and seconds of each stage of a method of two stages; the rows after them say what the seconds went to."""
+    """Iterations and seconds of both stages of a two-stage method; empty for others."""
     if (begins := state.density.second_stage) is None or history.empty:
         return []
     whole = history["seconds"].iloc[-1]
@@ -237,6 +241,6 @@ def _two_stages(state: TrainState, history: pd.DataFrame) -> list[dict[str, str 
 
 
 def _mean_conflict(history: pd.DataFrame) -> dict[str, float]:
-    """Mean over the iterations that compared gradients, by group and, as "gaussian", for the Gaussian as a whole."""
+    """Mean conflict ratios over the iterations that compared gradients, by group, and as "gaussian" for whole Gaussians."""
     means = history.filter(regex="^conflict").mean().dropna()
     return {name.removeprefix("conflict").removeprefix("_") or "gaussian": float(mean) for name, mean in means.items()}

@@ -1,12 +1,12 @@
-"""`python -m clear_strategies.report DIR …`: runs as a table, pictures and a page.
+"""`python -m clear_strategies.report DIR …`: a table, pictures and an HTML page of finished runs.
 
 Every folder at or below DIR with a metrics.json is a run. Runs of a scene that differ only in their seed share a row.
 Files:
 
-- report.md, report.csv: the table, and the paper's numbers beside ours where the runs are of its data sets
+- report.md, report.csv: the table, and the paper's numbers beside ours if the runs are of its data sets
 - report.html: the tables and pictures of all scenes; it needs the pictures beside it, and no network
 - comparison_SCENE.png: one test view of all methods, enlarged where they differ most
-- curves_SCENE.png: what history.csv holds of them, over iterations and over training time
+- curves_SCENE.png: the columns of history.csv, over iterations and over training time
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ _LONGEST: Final = 60  # characters of a scene in the name of a file
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command; returns its exit code, see `jobs.exit_codes`."""
+    """Run the command; returns its exit code, see `jobs.exit_codes`."""
     parser = argparse.ArgumentParser(
         prog="python -m clear_strategies.report", description=(__doc__ or "").split("\n")[0]
     )
     parser.add_argument("folders", nargs="+", type=path_of, metavar="DIR", help="a run's folder, or a folder of runs")
     parser.add_argument("--out", type=path_of, metavar="FOLDER", help="where the report goes (default: the first DIR)")
     console.steady()
-    logging.captureWarnings(True)  # as `run.main`: matplotlib has one for each letter that its font lacks
+    logging.captureWarnings(True)  # as `run.main`: matplotlib warns of each letter that its font lacks
     options = parser.parse_args(arguments)
     console.show()
     out = options.out or options.folders[0]
@@ -73,14 +73,14 @@ def write(runs: Sequence[FinishedRun], out: Path) -> str:
     records = table.drop(columns=["average", "run"])
     files.write_text(out / "report.csv", records.to_csv(index=False))
 
-    sections: list[dict[str, Any]] = []  # of the page: a scene, or first the average over scenes, which has no pictures
+    sections: list[dict[str, Any]] = []  # of the page: the average over scenes, which has no pictures, then the scenes
     for scene, name in _file_names(table["scene"]).items():
         rows, pictures = table[table["scene"] == scene], list[str]()
         section = {"title": scene, "cells": layout(rows).drop(columns="scene"), "notes": notes(rows, runs)}
         if rows["average"].any():
             sections.insert(0, section)
             continue
-        shown = dict(zip(rows["method"], rows["run"], strict=True))  # of several seeds the first
+        shown = dict(zip(rows["method"], rows["run"], strict=True))  # the first of several seeds
         if _compare_renders(out / f"comparison_{name}.png", scene, shown):
             pictures.append(f"comparison_{name}.png")
         pictures.append(f"curves_{name}.png")
@@ -102,7 +102,7 @@ def _write_page(path: Path, sections: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _file_names(scenes: Iterable[str]) -> dict[str, str]:
-    """A short word for each scene, no two alike."""
+    """A short word for each scene, unique even on disks that ignore case."""
     words: dict[str, str] = {}
     for scene in dict.fromkeys(scenes):
         word = re.sub(r"\W+", "_", scene).strip("_")[:_LONGEST] or "scene"
@@ -113,7 +113,7 @@ def _file_names(scenes: Iterable[str]) -> dict[str, str]:
 
 
 def _compare_renders(path: Path, scene: str, runs: Mapping[str, FinishedRun]) -> bool:
-    """Draw a test view that all runs rendered, and the truth where it is known; returns whether there is one."""
+    """Draw a test view that all runs rendered, and the truth if it is known; returns False if there is no such view."""
     names = [{file.name for file in (run.folder / "renders").glob("*.png")} for run in runs.values()]
     shared = sorted(set.intersection(*names))
     truths = {

@@ -1,6 +1,6 @@
 """The numbers of the paper's tables beside ours, for runs of its data sets.
 
-paper.csv holds them: `ours` is the name of a method or of strategies as a run of this package has it, `source` the table.
+They are in paper.csv: `ours` is the name of a run's method or strategies in this package, `source` the table.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ NOTE: Final = (
     "The columns named paper are the paper's, means over all its scenes at its sizes; ours are means over the scenes that ran. "
     "A dash: not computed, as LPIPS without metrics.lpips, or not printed."
 )
-# What a run's protocol or scene (conf/protocol, conf/scene) is a part of.
+# The paper's data set of a protocol or scene (conf/protocol, conf/scene).
 _DATA: Final[Mapping[str, str]] = {
     "llff_x4": "LLFF", "llff_x4_quarter": "LLFF", "fern": "LLFF", "horns": "LLFF", "blender_x4": "Blender",
     "lego": "Blender", "mip360_x4": "Mip-NeRF 360",
 }  # fmt: skip
-# Another number of views, or scale, is not in the paper's tables.
-_OTHERS: Final = ("data.views.train", "data.views.sr_scale")
+# Settings whose other values are not in the paper's tables.
+_FIXED: Final = ("data.views.train", "data.views.sr_scale")
 _COLUMNS: Final = {
     "psnr": ("PSNR (dB)", ".2f"), "ssim": ("SSIM", ".3f"), "lpips": ("LPIPS", ".3f"), "conflict": ("conflict", ".3f"),
     "seconds": ("seconds", ",.0f"),
@@ -33,14 +33,12 @@ _COLUMNS: Final = {
 
 
 def data_of(run: FinishedRun) -> str | None:
-    """The data set of the paper that a run is of; None: none, or another number of views, or scale."""
-    return None if any(s.lstrip("+").startswith(_OTHERS) for s in run.settings) else _DATA.get(run.protocol or "")
+    """The paper's data set of a run; None if it is of none, or has another number of views or scale."""
+    return None if any(s.lstrip("+").startswith(_FIXED) for s in run.settings) else _DATA.get(run.protocol or "")
 
 
 def beside(runs: Sequence[FinishedRun]) -> dict[str, pd.DataFrame]:
-    """For each of the paper's data sets among the runs: its rows as text, ours beside them; rows of ours that differ in their
-    settings stand below each other.
-    """
+    """The paper's rows for each of its data sets among the runs, as text, with ours beside them, one row per set of settings."""
     numbers = pd.read_csv(NUMBERS)
     return {
         data: _beside(rows, [run for run in runs if data_of(run) == data])

@@ -1,4 +1,4 @@
-"""A finished run as a report reads it: name, settings, scores, history and skipped work."""
+"""Finished runs as reports read them: name, settings, scores and history."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from clear_strategies.viewing.cameras import FILE as CAMERAS
 _log = logging.getLogger(__name__)
 
 OWN: Final = "metrics."
-"""Before the name of a metric of the run's own."""
+"""Prefix of the names of a run's own metrics."""
 _HYDRA: Final = ".hydra"
 _SEED: Final = "fit.seed="
 # The overrides that name a run; the others are its settings.
 _METHOD, _STRATEGY = "method=", "strategy="
 _DATA: Final = ("data.path", "data.root")  # keys of a run's configuration
-# Ends of keys that never tell runs apart; what lies at a place may have moved.
+# Suffixes of keys that never distinguish runs: seeds, and paths, whose content may have moved.
 _OF_SEED_OR_PLACE: Final = ("seed", "path", "root", "cache", "lr_folder")
-# Where the photos lie: the scene has a name.
+# Keys of the photos' place, which is not a setting, since the scene has a name.
 _PATH: Final = re.compile(r"scene|data\.root|data\.(reader\.)?path")
 
 
@@ -39,16 +39,15 @@ class FinishedRun:
     """A finished run.
 
     Args:
-        scene: its name, followed by the marks in parentheses. See `_told_apart`.
-        marks: that the prior is synthetic, that the scores are of training views, that they are against LR photos.
+        scene: its name, followed by the marks in parentheses; see `_with_distinct_scenes`.
+        marks: notes that the prior is synthetic, that scores are of training views, or that they are against LR photos.
         name: method or strategies as given on the command line ("clear"), else as they are named in the run ("gco + p2g").
-        protocol: the option of conf/protocol or conf/scene that it is of; None: of neither.
-        settings: the other overrides, without the seed and those that change no result; then those of files in which runs differ
-            that are alike in all that was said. See `_each_setting`.
-        numbers: mean scores of the test views, or of the training views where there are no test views, those of the run's own
-            metrics as "metrics.<name>"; "bicubic", "prior": PSNR of these images; conflict, gaussians, seconds. NaN where
-            unknown.
-        views: whose scores they are. config: every setting, by its dotted key.
+        protocol: its option of conf/protocol or conf/scene; None: it has none.
+        settings: the other overrides, without the seed and those that change no result; and settings of files, see
+            `_with_settings_of_files`.
+        numbers: mean scores of the test views, or of the training views if there are no test views, those of the run's own
+            metrics as "metrics.<name>"; "bicubic", "prior": PSNR of these images; conflict, gaussians, seconds. NaN: unknown.
+        views: the names of the scored views. config: every setting, by its dotted key.
     """
 
     folder: Path
@@ -103,8 +102,8 @@ class FinishedRun:
 
 
 def collect(folders: Iterable[Path]) -> list[FinishedRun]:
-    """Every finished run at or below the folders and the links in them: the jobs of a sweep by number, other runs by path.
-    Unfinished and damaged runs are logged and left out.
+    """Read every finished run at or below the folders and the links in them: the jobs of a sweep by number, other runs by path.
+    Unfinished and damaged runs are left out with a warning.
     """
     folders = list(folders)
     folders += [link for folder in folders for link in sorted(folder.glob("*")) if link.is_symlink() and link.is_dir()]
@@ -126,16 +125,16 @@ def collect(folders: Iterable[Path]) -> list[FinishedRun]:
     if not runs:
         names = ", ".join(map(str, folders))
         raise DataError(names, "runs", "there is no finished run here", "give the folder of a run or of a sweep")
-    return _each_setting(_told_apart(runs))
+    return _with_settings_of_files(_with_distinct_scenes(runs))
 
 
-def _told_apart(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
-    """The runs with other names for scenes of one name that are not the same: of other photos, or scored on other views."""
+def _with_distinct_scenes(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
+    """Rename scenes of the same name that are not the same, since their photos or their scored views differ."""
     cameras = {
         run: file.read_text(encoding="utf-8") if (file := run.folder / CAMERAS).is_file() else str(file) for run in runs
     }
     alike = {run: [other for other in runs if other.scene == run.scene] for run in runs}
-    # Where the photos lay; runs that have the same cameras have the same.
+    # The folder of the photos; runs with the same cameras have the same photos.
     photos = {
         run: next(other.data for other in of if other.data == run.data or cameras[other] == cameras[run])
         for run, of in alike.items()
@@ -154,32 +153,32 @@ def _told_apart(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
     return apart
 
 
-def _each_setting(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
-    """The runs with the settings that files give, where runs of the same scene, name and overrides have others: a file, or a
-    default of the package, has changed between them.
+def _with_settings_of_files(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
+    """Add settings of files to runs of the same scene, name and overrides that differ in them: a file, or a default of the
+    package, has changed between the runs.
     """
     alike: dict[Any, list[FinishedRun]] = {}
     for run in runs:
         alike.setdefault((run.scene, run.name, frozenset(run.settings)), []).append(run)
-    told = {}
+    complete = {}
     for of in alike.values():
         known = dict.fromkeys(key for run in of for key in run.config if not key.endswith(_OF_SEED_OR_PLACE))
         differ = [k for k in known if len({str(run.config[k]) for run in of if k in run.config}) > 1]
         for run in of:
             more = (f"{key}={run.config[key]}" for key in differ if key in run.config)
-            told[run] = replace(run, settings=(*run.settings, *more))
-    return [told[run] for run in runs]
+            complete[run] = replace(run, settings=(*run.settings, *more))
+    return [complete[run] for run in runs]
 
 
 def _shortest(path: str, others: Collection[str]) -> str:
-    """The end of a path that tells it from the others."""
+    """The shortest end of a path, of two parts or more, that no other one has."""
     parts = Path(path).parts
     ends = ("/".join(parts[-k:]) for k in range(2, len(parts)))
     return next((end for end in ends if sum(other.endswith(end) for other in others) == 1), path)
 
 
 def history(folder: Path) -> pd.DataFrame:
-    """history.csv, one row per iteration; empty, with a warning, where it cannot be read."""
+    """Read history.csv, one row per iteration; empty, with a warning, if it cannot be read."""
     try:
         return pd.read_csv(folder / "history.csv", dtype=float)
     except (OSError, ValueError) as error:
@@ -208,7 +207,7 @@ def _protocol(folder: Path) -> str | None:
 
 
 def _hydra(folder: Path) -> str:
-    """What Hydra says of a run; empty where that is unknown."""
+    """The text of Hydra's own file of a run; empty if it cannot be read."""
     try:
         return (folder / _HYDRA / "hydra.yaml").read_text(encoding="utf-8")
     except (OSError, ValueError):

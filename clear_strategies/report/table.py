@@ -1,6 +1,6 @@
-"""Runs as a table: which of them share a row, and how far each method is from the first.
+"""The table of runs: one row per method, with its difference from the first method.
 
-Differences are taken seed by seed where two methods share seeds: what a seed does to both methods is then no part of the
+Differences are taken seed by seed if two methods share seeds, so that the effect of a seed on both methods is not part of the
 error.
 """
 
@@ -19,27 +19,28 @@ from clear_strategies.report.runs import OWN, FinishedRun
 
 _log = logging.getLogger(__name__)
 
-# Quantity -> header of its column, and how its numbers are written.
+# Quantity -> header of its column, and the format of its numbers.
 _QUANTITIES: Final = {
     "psnr": ("PSNR (dB) ↑", ".2f"), "ssim": ("SSIM ↑", ".4f"), "gmsd": ("GMSD ↓", ".4f"), "blur": ("blur → 0", "+.4f"),
     "bicubic": ("bicubic (dB)", ".2f"), "prior": ("prior (dB)", ".2f"), "conflict": ("conflict", ".3f"),
     "gaussians": ("Gaussians", ",.0f"), "seconds": ("seconds", ",.0f"),
 }  # fmt: skip
-_PAIRS: Final = 2  # the least of which a difference has an error
+_PAIRS: Final = 2  # the least number of pairs for which a difference has an error
 _UNPAIRED: Final = "*"
 
 
 def compare(runs: Sequence[FinishedRun]) -> pd.DataFrame:
-    """For each scene, in the order of the runs, one row per method; then the averages over scenes.
+    """Summarize the runs: for each scene, in the order of the runs, one row per method; then the averages over scenes.
 
     Returns:
-        scene; method: its name, then the settings that not all runs of the scene share; average: whether the row is one; run:
-        the first of a method; runs: how many; seeds. Of each quantity the mean, and over the seeds of a method its standard
-        deviation `_std`. Of PSNR also the best seed `_best`, and the difference from the first method of the scene `_delta`,
-        its standard error `_delta_error` and the number of its pairs `_delta_pairs`: runs of one seed, of an average of one
-        scene and seed.
+        The columns scene; method: its name, then the settings that not all runs of the scene share; average: True for an average;
+        run: the first of a method; runs: their number; seeds. The mean of each quantity, and its standard deviation over the
+        seeds of a method, `_std`. For PSNR also that of the best seed, `_best`, and the difference from the first method of the
+        scene, `_delta`, its standard error, `_delta_error`, and the number of its pairs, `_delta_pairs`: runs of the same seed,
+        in an average of the same scene and seed.
     """
-    single = _each_seed_once(pd.DataFrame([row for of_scene in _by_scene(runs).values() for row in _single(of_scene)]))
+    rows = [row for of_scene in _by_scene(runs).values() for row in _run_rows(of_scene)]
+    single = _each_seed_once(pd.DataFrame(rows))
     tables = [_summary(rows) for _, rows in single.groupby("scene", sort=False)]
     # Scores against LR photos, or of training views, are not averaged with others.
     for marks, alike in single.groupby("marks", sort=False):
@@ -51,7 +52,7 @@ def compare(runs: Sequence[FinishedRun]) -> pd.DataFrame:
 
 
 def layout(table: pd.DataFrame) -> pd.DataFrame:
-    """The rows of `compare` as text, without the columns that are empty throughout."""
+    """Format the rows of `compare` as text, without empty columns."""
     cells: dict[str, Sequence[str]] = {"scene": list(table["scene"]), "method": list(table["method"])}
     for quantity, (header, form) in _quantities(table).items():
         cells[header] = _numbers(table[quantity], table[f"{quantity}_std"], form)
@@ -65,7 +66,7 @@ def layout(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _quantities(table: pd.DataFrame) -> dict[str, tuple[str, str]]:
-    """`_QUANTITIES`, and the metrics of the runs' own."""
+    """`_QUANTITIES`, and the runs' own metrics."""
     own = [name for name in map(str, table) if name.startswith(OWN) and not name.endswith("_std")]
     return {**_QUANTITIES, **{name: (name, ".4f") for name in own}}
 
@@ -94,13 +95,13 @@ def _differ(table: pd.DataFrame) -> bool:
 
 
 def _unpaired(table: pd.DataFrame) -> pd.Series[bool]:
-    """Which rows, other than the first of a scene, have a Δ of too few pairs for an error."""
+    """The mask of rows, other than the first of a scene, whose Δ has too few pairs for an error."""
     later = table.groupby("scene", sort=False).cumcount() > 0
     return later & table["psnr_delta"].notna() & (table["psnr_delta_pairs"] < _PAIRS)
 
 
 def markdown(cells: pd.DataFrame, lines: Sequence[str]) -> str:
-    """A Markdown table whose columns also align in a terminal, and the notes below it."""
+    """Format a Markdown table whose columns also align in a terminal, with the notes below it."""
     columns = [[_plain(cell) for cell in (name, *cells[name])] for name in cells]
     widths = [max(map(len, column)) for column in columns]
     head, *rows = (
@@ -112,12 +113,12 @@ def markdown(cells: pd.DataFrame, lines: Sequence[str]) -> str:
 
 
 def _plain(cell: str) -> str:
-    """A cell that Markdown shows as it is: names of scenes and methods come from files, and Markdown may hold HTML."""
+    """Escape a cell for Markdown, which may contain HTML: names of scenes and methods come from files."""
     return html.escape(" ".join(cell.split()), quote=False).replace("|", "\\|")
 
 
 def _numbers(means: pd.Series[float], deviations: pd.Series[float] | None, form: str) -> list[str]:
-    """The means, ± the deviations that are known; empty where there is no mean."""
+    """Format means, with ± for the deviations that are known; empty for a mean that is not."""
     small = [math.nan] * len(means) if deviations is None else list(deviations)
     return [
         "" if math.isnan(mean) else f"{mean:{form}}" + ("" if math.isnan(s) else f" ± {s:{form.lstrip('+')}}")
@@ -129,8 +130,8 @@ def _by_scene(runs: Sequence[FinishedRun]) -> dict[str, list[FinishedRun]]:
     return {scene: [run for run in runs if run.scene == scene] for scene in dict.fromkeys(run.scene for run in runs)}
 
 
-def _single(runs: Sequence[FinishedRun]) -> list[dict[str, Any]]:
-    """Of one scene: a row for each run.
+def _run_rows(runs: Sequence[FinishedRun]) -> list[dict[str, Any]]:
+    """A row for each run of one scene.
 
     `key` is name and settings, a line each; `identity`, the key of an average, leaves out the `data` settings that all runs of
     the scene share, which describe the scene.
@@ -151,7 +152,7 @@ def _single(runs: Sequence[FinishedRun]) -> list[dict[str, Any]]:
 
 
 def _each_seed_once(single: pd.DataFrame) -> pd.DataFrame:
-    """Of the runs of one method and seed, the last: a mean over seeds that counts one twice has a wrong error."""
+    """Keep the last of several runs of one method and seed: a mean that counts a seed twice has a wrong error."""
     again = single.duplicated(["scene", "key", "seed"], keep="last")
     for scene, method, seed, run in single.loc[again, ["scene", "method", "seed", "run"]].itertuples(index=False):
         _log.warning("%s, %s: another run has seed %s, too; %s is left out.", scene, method, seed, run.folder)
@@ -159,7 +160,7 @@ def _each_seed_once(single: pd.DataFrame) -> pd.DataFrame:
 
 
 def _summary(single: pd.DataFrame) -> pd.DataFrame:
-    """Of one scene: a row for each method."""
+    """A row for each method of one scene."""
     groups = single.groupby("key", sort=False)
     table = groups[["scene", "method", "run"]].first().assign(average=False, runs=groups.size())
     for _, of_method in groups:
@@ -174,7 +175,7 @@ def _summary(single: pd.DataFrame) -> pd.DataFrame:
 
 
 def _of_all_scenes(single: pd.DataFrame, title: str) -> pd.DataFrame:
-    """The runs of the methods that all scenes have."""
+    """Keep the runs of methods that all scenes have."""
     scenes = single.groupby("identity", sort=False)["scene"].nunique()
     complete = single["identity"].map(scenes == single["scene"].nunique())
     if left_out := list(dict.fromkeys(single.loc[~complete, "method"])):
@@ -183,7 +184,7 @@ def _of_all_scenes(single: pd.DataFrame, title: str) -> pd.DataFrame:
 
 
 def _average(single: pd.DataFrame, title: str) -> pd.DataFrame:
-    """A row for each method, each of which all scenes have."""
+    """A row for each method, averaged over the scenes, all of which have it."""
     scenes = single["scene"].nunique()
     means = (
         single.groupby(["identity", "scene"], sort=False)[[*_quantities(single)]].mean().groupby("identity", sort=False)
@@ -199,7 +200,7 @@ def _differences(single: pd.DataFrame, key: str, means: pd.Series[float]) -> pd.
     """PSNR of each method minus that of the first: over the pairs of one scene and seed, or, with fewer than two pairs, the
     difference of the two means, without an error.
     """
-    # A method whose PSNR is never finite has a column as well.
+    # A method whose PSNR is never finite must have a column as well.
     by_seed = single.groupby([key, "scene", "seed"], sort=False)["psnr"].mean().unstack(key, sort=False)
     first = by_seed.columns[0]
     pairs = by_seed.sub(by_seed[first], axis=0)
@@ -213,7 +214,7 @@ def _differences(single: pd.DataFrame, key: str, means: pd.Series[float]) -> pd.
 
 
 def in_all(lists: Sequence[Sequence[str]]) -> list[str]:
-    """What every list holds, in the order of the first."""
+    """The items that all lists have in common, in the order of the first."""
     return [setting for setting in lists[0] if all(setting in other for other in lists)] if lists else []
 
 
