@@ -1,5 +1,5 @@
-"""`python -m clear_strategies.bench`: run time against error, and what a second of training buys.
+"""`python -m clear_strategies.bench`: benchmarks of time, memory and error.
 
-A question of the command line is the module of its name. `scenes` makes what is drawn, `results` lets contenders take turns and
+Each benchmark of the command line is the module of its name. `scenes` makes the scenes, `results` times contenders in turns and
 writes the files.
 """

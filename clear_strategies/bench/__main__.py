@@ -1,4 +1,4 @@
-"""The benchmark's command line. A question is the module of its name; here stand its options.
+"""The command line of the benchmarks. A benchmark, QUESTION, is the module of its name; its options are defined here.
 
 Exit codes: 0; 2 for arguments or input that cannot be used; 130 after Ctrl-C.
 """
@@ -76,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if threads is not None:
         torch.set_num_threads(threads)
     try:
-        if results.out is not None:  # a folder that cannot be made is known before the measuring
+        if results.out is not None:  # fails before the measurements if the folder cannot be made
             results.out.mkdir(parents=True, exist_ok=True)
         module = "integration.bench" if question == "host" else f"clear_strategies.bench.{question}"
         import_module(module).measure(results, **options)
@@ -94,13 +94,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def parser() -> argparse.ArgumentParser:
-    """All questions and their options."""
+    """Make the parser of all benchmarks and their options."""
     result = argparse.ArgumentParser(prog="python -m clear_strategies.bench", description=__doc__)
-    questions = result.add_subparsers(dest="question", required=True, metavar="QUESTION")
+    commands = result.add_subparsers(dest="question", required=True, metavar="QUESTION")
     for question, (what, options) in QUESTIONS.items():
-        ask = questions.add_parser(question, help=what)
-        for name, how in {**_COMMON, **options}.items():
-            ask.add_argument(name, **how)
+        command = commands.add_parser(question, help=what)
+        for flag, keywords in {**_COMMON, **options}.items():
+            command.add_argument(flag, **keywords)
     return result
 
 

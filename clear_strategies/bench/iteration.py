@@ -2,7 +2,7 @@
 
 The truth is the same iteration in float64 by the readable path, at the same cut-offs; each of its stages gets the inputs of the
 measured stage. The outputs of the stages are compared: images, their cotangents, the gradients of the Gaussians, and the merged
-gradient, as Adam's first moment holds it after a step.
+gradient, from Adam's first moment after a step.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from clear_strategies.training.state import TrainState
 from rasterizers.interface import PRESETS, Camera, Rasterizer, Recordable, Rendering, SplatGradients, Splats, summed_vjp
 
 FROZEN: Final = LearningRates(LogLinear(1e-30, 1e-30), *(0.0,) * 6, detail_decay=0.002)
-"""Adam does all its work, and the scene stays the same from turn to turn."""
+"""Adam does all its work, but the scene stays the same from turn to turn."""
 
 TOTAL, REST = "total", "everything else"
 OBJECTIVES: Final = {
@@ -48,7 +48,7 @@ OBJECTIVES: Final = {
     "without_l_hf": Objective(lambda_hf=0.0),
     "lr_only": Objective(lambda_hr=WarmupDecay(peak=0.0, final=0.0)),
 }
-_PER_TURN: Final = {"cpu": 1, "cuda": 16}  # on CUDA the host launches an iteration while the last one is computed
+_PER_TURN: Final = {"cpu": 1, "cuda": 16}  # iterations; on CUDA one is launched while the one before is computed
 _PRESET: Final = "fast"
 _NOISE: Final = 0.02  # standard deviation in the photos
 
@@ -58,7 +58,7 @@ Outputs = dict[str, dict[str, Tensor]]
 
 
 class Training:
-    """CLEAR after densification: HR at full weight, dropout, correction and evidence are all on."""
+    """Training by CLEAR after densification, with HR at full weight, dropout, correction and evidence. A call times a turn."""
 
     def __init__(
         self,
@@ -72,7 +72,7 @@ class Training:
     ) -> None:
         field, device = field_of(workload.splats), workload.splats.means.device
         conductor = Conductor(GCO(), P2G(), *([SVS()] if dropout else []), objective=objective)
-        # Statistics are gathered, although no round of densification follows.
+        # Statistics are accumulated, although no densification follows.
         density = Density(DensitySettings(stop=10_000), len(field), extent=1.0, seed=0, device=device)
         conductor.on_fit_start(1, 0, device)
         optimizer = Adam(field.raw(), FROZEN, 1.0)
@@ -141,7 +141,7 @@ def errors(workload: Workload, view: View, rasterizer: Rasterizer) -> dict[str, 
     measured = _outputs(workload, view, rasterizer, "auto")
     expected = _outputs(wide, replace(view, lr=lr, hr=hr), truth, "off", given=measured)
     return {
-        # The basis is no gradient, and has any value where a Gaussian is not seen.
+        # The SH basis is no gradient, and has arbitrary values for Gaussians that are not seen.
         stage: max(relative(x, expected[stage][name]) for name, x in tensors.items() if name != "basis")
         for stage, tensors in measured.items()
     }
@@ -194,7 +194,7 @@ class _Rasterizer(SimpleNamespace):
 
 
 def field_of(splats: Splats) -> GaussianField:
-    """The field that draws these splats when the 3D filter is off."""
+    """The field that renders as these splats without the 3D filter."""
     eps = torch.finfo(torch.float32).eps
     offset = splats.rgb_offset
     parameters: dict[str, Tensor] = {
@@ -208,7 +208,7 @@ def field_of(splats: Splats) -> GaussianField:
 
 
 def view_of(workload: Workload, rasterizer: Rasterizer) -> View:
-    """One view whose photos are a render plus noise."""
+    """A view whose photos are a render plus noise."""
     factor, camera = workload.lr_factor, workload.camera
     clean = rasterizer(workload.splats, camera).image
     generator = torch.Generator().manual_seed(1)

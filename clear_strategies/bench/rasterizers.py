@@ -1,7 +1,7 @@
 """Time, memory and error of every rasterizer at every preset of cut-offs.
 
-Each contender is compared with float64 twice: at its own cut-offs, which shows the rounding, and without cut-offs, which shows
-the cut-offs too.
+Each contender is compared with float64 twice: at its own cut-offs, which shows the error of rounding, and without cut-offs, which
+includes that of the cut-offs.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ class Contestant:
         return self.rasterizer(self.workload.splats, self.workload.camera)
 
     def __call__(self) -> dict[str, float]:
-        """Forward and backward passes, both scales together and one after the other; on CUDA also a forward and a backward pass
-        (K = 2) that start on an idle device, by the host's clock.
+        """Time forward and backward passes, and both scales together and one after the other; on CUDA also a forward and a
+        backward pass (K = 2) that start on an idle device, by the host's clock.
         """
         device, splats, hr = self.cotangents.device, self.workload.splats, self.workload.camera
         work_log, lr = WorkLog(device), hr.scaled(1 / self.workload.lr_factor)
@@ -95,7 +95,7 @@ def measure(
     """Measure the scenes one after the other.
 
     Args:
-        backend: none: all that run here.
+        backend: names; empty: all that run here.
     """
     require_device(device)
     backends, truth = usable(backend, device, results.note), truth_backend()
@@ -121,7 +121,7 @@ def measure(
 
 
 def figure(time: pd.DataFrame, error: pd.DataFrame) -> Figure:
-    """A panel per scene, a line per backend through its presets; lower left is better."""
+    """Draw a panel per scene, with a line per backend through its presets; lower left is better."""
     rows = time.merge(error[error["truth"] == NONE], on=["scene", "backend", "module", "preset"])
     rows["name"] = (rows["backend"] + " " + rows["module"].fillna("")).str.strip()  # empty in a CSV
     rows["ms"] = rows["forward_ms"] + rows["backward_k1_ms"]
@@ -145,13 +145,13 @@ def figure(time: pd.DataFrame, error: pd.DataFrame) -> Figure:
 
 
 def require_device(device: str) -> None:
-    """Refuse a device that torch does not see."""
+    """Raise a DataError for a device that torch does not find."""
     if device == "cuda" and not torch.cuda.is_available():
         raise DataError("--device", "cuda", "torch sees no such device here", "use --device cpu")
 
 
 def usable(asked: Sequence[str], device: str, note: Callable[[str], None]) -> list[str]:
-    """The backends that run on the device, of those in `asked`, or of all. A DataError where a name is unknown, or none runs."""
+    """The backends that run on the device, of those in `asked`, or of all; a DataError if a name is unknown, or none runs."""
     reasons = rasterizers.available()
     for name in asked:
         if name not in reasons:
@@ -170,19 +170,19 @@ def usable(asked: Sequence[str], device: str, note: Callable[[str], None]) -> li
 
 
 def presets_of(backend: str) -> Sequence[str]:
-    """The presets that a backend draws at: gsplat's cut-offs are fixed."""
+    """The presets of a backend: gsplat's cut-offs are fixed."""
     return ["fast"] if backend == "gsplat" else list(PRESETS)
 
 
 def random_cotangents(workload: Workload) -> Float[Tensor, "K H W 3"]:
-    """Standard normal, the same for every contestant."""
+    """Standard normal cotangents, the same for every contestant."""
     camera, generator = workload.camera, torch.Generator().manual_seed(0)
     values = torch.randn(COTANGENTS, camera.height, camera.width, 3, generator=generator)
     return values.to(workload.splats.means.device)
 
 
 def _time_rows(contestants: Sequence[Contestant], median: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    """Milliseconds, the ratios that say whether shared work pays, and on CUDA the peak of memory."""
+    """A row per contestant: milliseconds, ratios that show the gain of shared work, and on CUDA the peak of memory."""
     for c in contestants:
         ms = median.loc[c.label].dropna().to_dict()
         row: dict[str, Any] = {**c.names} | {f"{stage}_ms": value for stage, value in ms.items() if stage != SEPARATE}
@@ -207,7 +207,11 @@ def _error_rows(workload: Workload, contestants: Sequence[Contestant], backend: 
 
 
 def draw(render: Callable[[], Any], cotangent: Float[Tensor, "H W 3"]) -> ImageAndGradients:
-    """`render` returns an object with `image`, and `vjp` of K cotangents."""
+    """Render, and backpropagate one cotangent.
+
+    Args:
+        render: returns an object with `image`, and `vjp` of K cotangents.
+    """
     rendering = render()
     g = rendering.vjp(cotangent[None])
     return {"image": rendering.image.detach().cpu(), **{name: getattr(g, name)[0].cpu() for name in ATTRIBUTES}}
@@ -241,7 +245,7 @@ def relative(measured: Tensor, truth: Tensor) -> float:
 
 
 def affordable(backend: str, workload: Workload, what: str, note: Callable[[str], None]) -> bool:
-    """Whether a backend draws this scene in seconds; if not, `note` gets the reason."""
+    """Return True if a backend draws this scene in seconds, else call `note` with the reason."""
     if backend != "torch" or len(workload.splats) <= REFERENCE_LIMIT:
         return True
     note(f"{what}, {workload.name}: the torch reference takes at most {REFERENCE_LIMIT:,} Gaussians here.")
@@ -249,13 +253,13 @@ def affordable(backend: str, workload: Workload, what: str, note: Callable[[str]
 
 
 def truth_backend() -> str:
-    """The fastest backend here that computes in float64, on any device."""
+    """The fastest available backend that computes in float64, on any device."""
     runs = (name for name, why_not in rasterizers.available().items() if why_not is None)
     return next(name for name in runs if torch.float64 in rasterizers.load(name).traits.dtypes)
 
 
 def in_float64(backend: str, workload: Workload, rules: Mapping[str, Any]) -> tuple[Rasterizer, Workload]:
-    """A rasterizer, and the workload in float64 on its device, where the rasterizer draws there.
+    """A rasterizer, and the workload in float64, on the workload's device if the rasterizer draws there, else on the CPU.
 
     Args:
         rules: the cut-offs, and settings that differ from `SETTINGS`.
@@ -268,6 +272,6 @@ def in_float64(backend: str, workload: Workload, rules: Mapping[str, Any]) -> tu
 def truth_of(
     backend: str, workload: Workload, cotangent: Float[Tensor, "H W 3"], rules: Mapping[str, Any]
 ) -> ImageAndGradients:
-    """Draw in float64."""
+    """The image and gradients in float64."""
     rasterizer, wide = in_float64(backend, workload, rules)
     return draw(lambda: rasterizer(wide.splats, wide.camera), cotangent.to(wide.splats.means))

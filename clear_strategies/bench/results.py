@@ -1,9 +1,9 @@
-"""How contenders are timed, and the results of a question: tables as CSV, figures as PNG, and the machine as JSON.
+"""Timing of contenders, and the results of a benchmark: tables as CSV, figures as PNG, and the machine as JSON.
 
-Contenders take turns, so that other work on the machine slows all of them alike. On a CPU times are wall-clock. On CUDA they are
-taken between events on torch's current stream (`WorkLog`). `queued` keeps the device busy until the host has launched a stage,
-whose time is then the device's; where the host has to wait for the device within a stage, that wait is a part of it, as in a
-training loop.
+Contenders take turns, so that other work on the machine slows all of them alike. Times are wall-clock on a CPU, and between
+events on torch's current stream on CUDA (`WorkLog`). `queued` keeps the device busy until the host has launched a stage, so that
+the time of the stage is the device's. If the host waits for the device within a stage, the wait is included, as in a training
+loop.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ from clear_strategies.outputs.figures import save
 from clear_strategies.outputs.provenance import provenance
 
 Contender = Callable[[], Mapping[str, float]]
-"""Runs all its stages once and returns the milliseconds of each."""
+"""Runs its stages once and returns the milliseconds of each."""
 WARM_UPS: Final = {"cpu": 1, "cuda": 3}
-"""Rounds that do not count: kernels are compiled, buffers grow and clocks rise in them."""
+"""Turns that do not count: kernels are compiled, buffers grow and clocks rise in them."""
 _AHEAD: Final = 20_000_000
-"""Cycles of a GPU, about 10 ms: more than the host needs to launch a stage."""
+"""GPU cycles of about 10 ms, more than the host needs to launch a stage."""
 
 
 @dataclass(slots=True, eq=False)
 class Results:
-    """The results of one question.
+    """The results of one benchmark.
 
     Args:
         log: prints a line while measuring.
         out: the folder to write to; None: nothing is written.
-        notes: what was not measured and why, and what else a reader of the tables must know.
+        notes: remarks for readers of the tables, e.g. reasons why a contender was not measured.
     """
 
     log: Callable[[str], None]
@@ -55,13 +55,13 @@ class Results:
         self.notes.append(line)
 
     def text(self) -> str:
-        """The tables for a terminal, without the single turns."""
+        """Format the tables for a terminal, without the single turns."""
         shown = {name: table for name, table in self.tables.items() if not name.endswith("turns")}
         written = {n: t.to_string(index=False, na_rep="", float_format="{:.3g}".format) for n, t in shown.items()}
         return "\n\n".join((*(f"{name}\n{table}" for name, table in written.items()), *self.notes)) + "\n"
 
     def write(self, question: str, options: Mapping[str, Any]) -> None:
-        """Write `<table>.csv`, `<figure>.png` and `<question>.json`, which holds these options of the command."""
+        """Write `<table>.csv`, `<figure>.png` and `<question>.json`, which contains these options of the command."""
         if self.out is None:
             return
         for name, table in self.tables.items():
@@ -79,7 +79,7 @@ class Results:
 
 @contextmanager
 def queued(work_log: WorkLog, stage: str) -> Iterator[None]:
-    """A stage that a CUDA device begins after other work, so that it does not start idle and measure how the host launches."""
+    """Time a stage that a CUDA device starts after other work: on an idle device, the host's launches would be timed."""
     if work_log.device.type == "cuda":
         torch.cuda._sleep(_AHEAD)  # type: ignore[no-untyped-call]
     with work_log.stage(stage):

@@ -1,7 +1,7 @@
-"""How time and memory grow: an iteration with Gaussians and with pixels, a whole run with photos.
+"""Scaling of time and memory: of an iteration with Gaussians and with pixels, of a whole run with photos.
 
 The exponent p of a row is that of time ~ size^p from the row before: 1 is linear. Each row is a process of its own, and MiB is
-its peak. Photos are those of the demo; of a run of them the CPU time counts.
+its peak. Photos are those of the demo; the time of a run of them is CPU time.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from clear_strategies.errors import DataError
 from clear_strategies.merging.objective import Objective
 from clear_strategies.training.loop import kernel_threads
 
-_WIDTH, _GAUSSIANS = 504, 100_000  # where the other size varies
+_WIDTH, _GAUSSIANS = 504, 100_000  # the constant size while the other varies
 _RUN: Final = ("data.reader.width=128", "data.reader.height=96")
 
 
@@ -42,7 +42,7 @@ def measure(
 
     Args:
         widths: of HR images of 4:3, px, multiples of 12.
-        photos: training photos of a run of so many `iterations`.
+        photos: numbers of training photos of a run of `iterations`.
     """
     if wrong := [width for width in widths if width % 12]:
         raise DataError("--widths", str(wrong[0]), "is no multiple of 12", "use one, such as 504")
@@ -74,7 +74,7 @@ def _iteration(of: str, size: int, gaussians: int, width: int, repeats: int, thr
 
 
 def _run(one: ProcessPoolExecutor, photos: int, iterations: int) -> list[tuple[Any, ...]]:
-    """A row for the whole run, and one for each of its stages, as timing.csv has them: of these, time is by the clock."""
+    """A row for the whole run, and one for each of its stages, from timing.csv, whose times are wall-clock."""
     with tempfile.TemporaryDirectory() as folder:
         counts = (f"data.reader.views={photos + 1}", f"data.reader.train={photos}", f"fit.iterations={iterations}")
         words = [*_RUN, *counts, f"hydra.run.dir={quoted(f'{folder}/run')}"]

@@ -1,4 +1,4 @@
-"""What the benchmark draws: a generated scene of known statistics, or the field that a run exported."""
+"""Scenes of the benchmarks: generated ones of known statistics, or the exported field of a run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rasterizers.geometry import constant_band
 from rasterizers.interface import Camera, Splats
 
 SETTINGS: Final = {"kernel": 0.3, "near": 0.01, "alpha_max": 0.999, "antialiased": True}
-"""The settings all contenders draw with; their cut-offs come from the preset."""
+"""The settings of all rasterizers; their cut-offs come from the preset."""
 
 _BANDS: Final = 15  # SH degree 3
 _FOCAL: Final = 0.8  # in units of the image's width
@@ -46,7 +46,7 @@ class Workload:
 
 
 def surfaces(name: str, n: int, width: int, height: int, *, radius: float, seed: int = 0) -> Workload:
-    """A wall with relief, the ground, three spheres and some clutter, as in a trained field.
+    """Generate a wall with relief, the ground, three spheres and some clutter, as in a trained field.
 
     The Gaussians are discs aligned to the surfaces, of lognormal sizes, most either faint or opaque.
 
@@ -72,7 +72,7 @@ def surfaces(name: str, n: int, width: int, height: int, *, radius: float, seed:
 
 
 def tails(name: str, n: int, width: int, height: int, *, radius: float, seed: int = 0) -> Workload:
-    """As `surfaces`, with the tails that long training leaves: a hundredth of the Gaussians, faint and large, has most of the
+    """Generate `surfaces` with the heavy tails of long training: a hundredth of the Gaussians, faint and large, has most of the
     pairs of Gaussian and tile, one covers the image, and a fifteenth lies behind one tile.
     """
     w, random = surfaces(name, n, width, height, radius=radius, seed=seed), np.random.default_rng(seed + 1)
@@ -127,7 +127,7 @@ def _surface(
 
 
 def from_ply(path: Path) -> Workload:
-    """Gaussians as a run exports them; a DataError where the file is no such export."""
+    """Read exported Gaussians; a DataError if the file is no such export."""
     g = read_gaussians(path)
     splats = Splats(g.means, g.quats, g.scales.exp(), g.opacities.sigmoid(), g.sh0, g.shN)
     return Workload(path.stem, splats, overview(splats.means, splats.opacities))
@@ -147,7 +147,7 @@ NAMES: Final = ("tiny", "small", "s100k", _AT_LR, "s500k", _TAILS)
 
 
 def load(name: str) -> Workload:
-    """A scene by name, or a .ply file; a DataError where there is none of that name, or the file cannot be used."""
+    """Make a scene by name, or read a .ply file; a DataError if there is neither, or the file cannot be used."""
     if name == _AT_LR:
         hr = load("s100k")
         return Workload(name, hr.splats, hr.camera.scaled(1 / 4))

@@ -1,12 +1,11 @@
 """The subcommands of `clear-strategies`: `clear-strategies NAME …`, or `python -m clear_strategies.run NAME …`.
 
-A command is a module of this folder with `main(arguments)`, imported only when it is called. It returns when it is done and
-raises a `ClearError` for what the user can solve: a run or an argument that cannot be used, a library that is not installed.
-`clear_strategies.run` calls it, and turns errors into exit codes.
-A command imports torch, Hydra and what needs them in the functions that use them, so that its `--help`, and the message for a
-wrong argument, come at once.
+A command is a module of this folder with `main(arguments)`. `clear_strategies.run` imports and calls it, and turns errors into
+exit codes. It raises a `ClearError` for errors that the user can solve: a run or an argument that cannot be used, a library that
+is not installed. It imports torch, Hydra and modules that need them in the functions that use them, so that `--help` and the
+message for a wrong argument appear at once.
 
-What begins with an override or a flag is Hydra's: `+strategy=clear`, `fit.iterations=300`, `-m`, `--cfg job`.
+Arguments that begin with an override or a flag are passed to Hydra: `+strategy=clear`, `fit.iterations=300`, `-m`, `--cfg job`.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from typing import Final, NoReturn
 from clear_strategies.errors import SettingError
 from clear_strategies.files import expanded
 
-# Name and arguments, and what it does.
+# Descriptions of the commands, by their name and arguments.
 COMMANDS: Final = {
     "train PHOTOS [setting=value …]": "from photos or a capture to a splat and pictures",
     "render RUN": "a video of a saved run or a PLY file, or pictures from given cameras",
@@ -42,7 +41,7 @@ _RESEARCH: Final = {
 
 
 def named(arguments: Sequence[str]) -> Callable[[], None] | None:
-    """The call of the command that these arguments of the program name; None where they are Hydra's."""
+    """Return a function that runs the command that the program's arguments name; None if they are for Hydra."""
     name = arguments[0] if arguments else "help"
     if name in ("help", "--help", "-h"):
         return _help
@@ -52,20 +51,19 @@ def named(arguments: Sequence[str]) -> Callable[[], None] | None:
         return lambda: import_module(f"{__name__}.{name}").main(list(arguments[1:]))
     if is_of_hydra(name) or "=" in name:
         return None
-    meant = _meant(name)
-    remedy = (
-        f"Did you mean {meant}?" if meant else "clear-strategies --help lists all; a setting is written name=value."
-    )
+    remedy = "clear-strategies --help lists all; a setting is written name=value."
+    if similar := _similar_command(name):
+        remedy = f"Did you mean {similar}?"
     raise SettingError(f"{name}: there is no such command. {remedy}")
 
 
 def is_of_hydra(word: str) -> bool:
-    """Whether a word begins as flags and overrides do; `~/photos` is a path."""
+    """Return True if a word begins as flags and overrides do; `~/photos` is a path."""
     return word.startswith(("-", "+", "~")) and expanded(word) == word
 
 
-def _meant(word: str) -> str | None:
-    """The command that a wrong one most resembles, or the one for the file or folder that it names; None for neither."""
+def _similar_command(word: str) -> str | None:
+    """The command that is most similar to a wrong one, or the one for the file or folder that it names; else None."""
     quoted = shlex.quote(word)
     if word.endswith(".ply"):
         return f"clear-strategies view {quoted}"
@@ -95,14 +93,14 @@ def _rows(table: Mapping[str, str]) -> str:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Raises a SettingError for wrong arguments, in place of argparse's usage and exit."""
+    """Raises a SettingError for wrong arguments; argparse would print the usage and exit."""
 
     def error(self, message: str) -> NoReturn:
         raise SettingError(f"{message}. {self.prog} --help lists the arguments.")
 
 
 def parser_of(command: str, description: str, *, run: bool = True) -> argparse.ArgumentParser:
-    """A parser with `--verbose`, and with RUN and `--rasterizer` for commands that open one."""
+    """Make a parser with `--verbose`, and with RUN and `--rasterizer` for commands that open a run."""
     parser = _Parser(prog=f"clear-strategies {command}", description=description)
     if run:
         parser.add_argument(
@@ -115,12 +113,12 @@ def parser_of(command: str, description: str, *, run: bool = True) -> argparse.A
 
 
 def path_of(text: str) -> Path:
-    """The type of an argument that is a path."""
+    """The argparse type of a path."""
     return Path(expanded(text))
 
 
 def positive(text: str) -> int:
-    """The type of an argument that must be a whole number above 0."""
+    """The argparse type of a whole number above 0."""
     if not (text.isdecimal() and int(text) > 0):
         raise argparse.ArgumentTypeError(f"must be a whole number above 0, got {text}")
     return int(text)

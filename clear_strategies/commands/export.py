@@ -1,4 +1,4 @@
-"""`clear-strategies export RUN`: a saved run as a PLY file for viewers; splat-transform makes other formats of it."""
+"""`clear-strategies export RUN`: write a saved run as a PLY file for viewers; splat-transform converts it to other formats."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _log = logging.getLogger(__name__)
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Write what the arguments ask for."""
+    """Write the PLY file."""
     parser = parser_of("export", "Write a saved run in the standard layout of 3DGS; f_det and the 3D filter included.")
     parser.add_argument("--out", type=path_of, metavar="FILE", help="where it goes (default: RUN/NAME.ply)")
     kept = "degree of view-dependent colour that is kept (3)"

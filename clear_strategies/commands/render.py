@@ -1,4 +1,4 @@
-"""`clear-strategies render RUN`: a video along the cameras of a saved run, or of any PLY file, or pictures from given cameras."""
+"""`clear-strategies render RUN`: render a saved run or a PLY file, as a video along its cameras or pictures from given ones."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _LOOP: Final = "cameras"  # the --path that is a video
-_LONGEST: Final = 1280  # px, of a video where --width asks for nothing
-_SAMPLED: Final = 5  # cameras that the range of depths is taken from, about
+_LONGEST: Final = 1280  # px, longer edge of a video without --width
+_SAMPLED: Final = 5  # approximate number of cameras that the range of depths is taken from
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Render what the arguments ask for."""
+    """Render the video or the pictures."""
     options = _parser().parse_args(arguments)
     console.show(verbose=options.verbose)
     import torch
@@ -43,24 +43,24 @@ def main(arguments: Sequence[str]) -> None:
     splat = open_splat(options.run, options.rasterizer)
     _log.info("%s", splat.source)
     painter = splat.painter
-    where, width = cameras_of(splat, options.path, options.frames), options.width
+    cameras, width = cameras_of(splat, options.path, options.frames), options.width
     if width is not None:
-        where = {name: resized(c, width, max(1, round(c.height * width / c.width))) for name, c in where.items()}
+        cameras = {name: resized(c, width, max(1, round(c.height * width / c.width))) for name, c in cameras.items()}
     if options.path == _LOOP:
-        where = {name: at_most(c, None if width is not None else _LONGEST) for name, c in where.items()}
+        cameras = {name: at_most(c, None if width is not None else _LONGEST) for name, c in cameras.items()}
     kinds: dict[str, Callable[[Camera], Pixels]] = {"": lambda camera: to_bytes(painter.color(camera))}
     if options.depth:
-        near, far = depth_range(torch.cat([painter.depth(c).flatten() for c in spaced([*where.values()], _SAMPLED)]))
+        near, far = depth_range(torch.cat([painter.depth(c).flatten() for c in spaced([*cameras.values()], _SAMPLED)]))
         _log.info("depth: %.3g (bright) to %.3g (dark) world units, grey where nothing is", near, far)
         kinds["depth"] = lambda camera: colored(painter.depth(camera), near, far)
     out = options.out or splat.folder / "rendered"
     for kind, draw in kinds.items():
         if options.path == _LOOP:
-            write_video(out / f"{_LOOP}{kind and f'_{kind}'}.mp4", map(draw, where.values()))
+            write_video(out / f"{_LOOP}{kind and f'_{kind}'}.mp4", map(draw, cameras.values()))
             continue
-        for name, camera in where.items():
+        for name, camera in cameras.items():
             write_png(out / kind / f"{name}.png", torch.from_numpy(draw(camera)) / 255)
-    _log.info("%s: %s in %.1f s", out, counted(len(where) * len(kinds), "picture"), time.perf_counter() - began)
+    _log.info("%s: %s in %.1f s", out, counted(len(cameras) * len(kinds), "picture"), time.perf_counter() - began)
 
 
 def cameras_of(splat: SavedSplat, path: str, frames: int) -> dict[str, Camera]:
@@ -81,7 +81,7 @@ def cameras_of(splat: SavedSplat, path: str, frames: int) -> dict[str, Camera]:
         chosen = cameras = read_cameras(file)
     else:
         raise SettingError(f"--path: must be {_LOOP}, train, test or a file of cameras, got {path}.")
-    count = Counter(saved.name for saved in cameras)  # Inria's are without their endings
+    count = Counter(saved.name for saved in cameras)  # Inria's names lack suffixes, so they may not be unique
     names = {saved: f"{saved.name}_{i}" if count[saved.name] > 1 else saved.name for i, saved in enumerate(cameras)}
     stems = file_stems(names.values())
     return {stems[names[saved]]: saved.camera for saved in chosen}

@@ -1,6 +1,6 @@
-"""`clear-strategies train PHOTOS`: a run on photos or a capture, by the same configuration as every other.
+"""`clear-strategies train PHOTOS`: train on photos or a capture, with the configuration of `clear-strategies setting=value …`.
 
-The reader is the one of what lies in the folder. Everything behind the folder goes to Hydra unchanged.
+The reader is chosen by the content of the folder. All arguments after the folder are passed to Hydra unchanged.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Final
 from clear_strategies.commands import is_of_hydra, path_of
 from clear_strategies.errors import SettingError
 
-# The photos are trained on at up to two megapixels, where an iteration takes about half a second of a core.
+# Training uses photos of up to two megapixels, for which an iteration takes about half a second of a core.
 _ITERATIONS: Final = 1000
 _USAGE: Final = f"""clear-strategies train PHOTOS [setting=value …]
 
@@ -30,13 +30,13 @@ The command trains +strategy=best on all photos for fit.iterations={_ITERATIONS}
 
 `clear-strategies data=photos --cfg job` prints all settings.
 """
-# What decides which strategies train, and for how long, so that the defaults must not.
+# Beginnings of arguments that choose the strategies, and the number of iterations; each replaces the command's default.
 CHOOSE_STRATEGIES: Final = ("+strategy=", "+method=", "experiment=", "+experiment=")
 _CHOOSE_ITERATIONS: Final = ("fit.iterations=", "experiment=", "+experiment=", "+protocol=", "+scene=")
 
 
 def main(arguments: list[str]) -> None:
-    """Train on what the first argument names."""
+    """Train on the folder that the first argument names."""
     if "--help" in arguments or "-h" in arguments:
         sys.stdout.write(_USAGE)
         return
@@ -50,7 +50,7 @@ def main(arguments: list[str]) -> None:
 
 
 def overrides(arguments: Sequence[str]) -> list[str]:
-    """The arguments of the command as Hydra's; the SettingErrors as of `main`."""
+    """Translate the command's arguments to Hydra overrides; a SettingError for a wrong argument."""
     if not arguments or is_of_hydra(arguments[0]):
         raise SettingError("train needs a folder of photos first: clear-strategies train PHOTOS [setting=value …].")
     path, rest = path_of(arguments[0]), arguments[1:]
@@ -72,8 +72,8 @@ def overrides(arguments: Sequence[str]) -> list[str]:
 
 
 def detect(path: Path) -> str:
-    """The option of conf/data whose reader knows what lies there best: `recognises`, beside the reader's function, returns how
-    well it does, 0 for not at all. One format's folder may hold files of another, as LLFF's a COLMAP model, so there is a rank.
+    """Choose the option of conf/data for a path, by the highest rank of the readers: the value of `recognises` in the reader's
+    module, 0 if it cannot read the path. A folder may contain several formats, as LLFF's contain a COLMAP model.
     """
     from clear_strategies.options import options
 

@@ -1,4 +1,4 @@
-"""`clear-strategies view RUN`: a saved run, or any PLY file, in the browser."""
+"""`clear-strategies view RUN`: view a saved run or a PLY file in the browser."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def main(arguments: Sequence[str]) -> None:
         webbrowser.open(viewer.address)
     with suppress(KeyboardInterrupt):
         while True:
-            time.sleep(3600)  # on Windows, Ctrl-C ends no other wait
+            time.sleep(3600)  # on Windows, Ctrl-C interrupts no other wait
     viewer.close()
 
 
@@ -55,7 +55,7 @@ def _port(text: str) -> int:
 
 
 def _require_own(host: str) -> None:
-    """Raise a SettingError for an address of another machine, for which the viewer's server would wait for ever."""
+    """Raise a SettingError for an address of another machine, for which the viewer's server would wait forever."""
     try:
         socket.create_server((host, 0), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
     except OSError as error:

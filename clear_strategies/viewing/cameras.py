@@ -28,11 +28,9 @@ from rasterizers.interface import Camera, Color
 
 FILE: Final = "cameras.json"
 _MOST_KEYS: Final = 24  # a path through more cameras passes every n-th
-_FAR: Final = (
-    2.0  # longest steps; a path's ends beyond that are not joined, since the way between may lead through the scene
-)
+_FAR: Final = 2.0  # in longest steps: ends of a path further apart are not joined, since the scene may lie between them
 _WRAP: Final = 3  # keys repeated at both ends, so that the rotation's spline has no seam
-_SWAY: Final = 0.1  # world units: how far a single camera moves to each side
+_SWAY: Final = 0.1  # world units by which a single camera moves to each side
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +81,7 @@ def write_cameras(folder: Path, scene: Scene) -> None:
 
 
 def read_cameras(path: Path) -> list[SavedCamera]:
-    """The cameras of a run of ours or of Inria's 3DGS; a DataError if it is no such file."""
+    """Read the cameras of a run of this package or of Inria's 3DGS; a DataError if the file is invalid."""
     remedy, found = "give the cameras.json of a run", list[SavedCamera]()
     for i, e in enumerate(typed(path, strict_json.read(path), list[_Entry], remedy=remedy)):
         pose = rigid_inverse(path, f"[{i}].rotation", np.array(e.rotation), np.array(e.position))
@@ -100,18 +98,18 @@ def read_cameras(path: Path) -> list[SavedCamera]:
 
 
 def at_most(camera: Camera, longest: int | None) -> Camera:
-    """The camera with even numbers of pixels, as videos need them, and the longer edge of at most `longest` pixels."""
+    """Rescale a camera to even numbers of pixels, as videos need them, and a longer edge of at most `longest` pixels."""
     edge = max(camera.width, camera.height)
     times = 1.0 if longest is None else min(1.0, longest / edge)
     return resized(camera, *(max(2, 2 * round(times * size / 2)) for size in (camera.width, camera.height)))
 
 
 def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """A closed, smooth path through the cameras: splines of position and rotation, at an even pace.
+    """Make a closed, smooth path through the cameras: splines of position and rotation, at an even pace.
 
-    The path goes from each camera to the nearest that is left, and passes at most `_MOST_KEYS` of them. It comes back the same
-    way where its ends are far from each other. A single camera sways to both sides. All frames have the first camera's lens and
-    size.
+    The path goes from each camera to the nearest of the remaining ones, and passes at most `_MOST_KEYS` of them. If its ends are
+    far from each other, it returns the same way. A single camera sways to both sides. All frames have the first camera's
+    intrinsics and size.
     """
     from scipy.interpolate import CubicSpline
     from scipy.spatial.transform import Rotation, RotationSpline
@@ -141,7 +139,7 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 
 def _tour(centers: Float[np.ndarray, "C 3"]) -> list[int]:
-    """All indices, from one that lies outermost, each followed by the nearest of those that are left."""
+    """All indices, beginning with that of an outermost camera, each followed by the nearest of the remaining ones."""
     tour = [int(np.linalg.norm(centers - centers[0], axis=1).argmax())]
     left = np.delete(np.arange(len(centers)), tour)
     while len(left):

@@ -1,4 +1,4 @@
-"""Pictures of a field by the run's rasterizer, depth in colours, and frames as a video: H.264 in MP4, which browsers play."""
+"""Rendering a field by the run's rasterizer, colouring depth, and writing videos: H.264 in MP4, which browsers play."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ from clear_strategies.training.field import GaussianField
 from rasterizers.geometry import constant_band, depths
 from rasterizers.interface import Camera, Rasterizer
 
-_SOLID: Final = 0.5  # a pixel has a depth where the Gaussians cover at least this share of it
+_SOLID: Final = 0.5  # alpha of a pixel from which it has a depth
 _EXTREMES: Final = (0.02, 0.98)  # quantiles of depth at the ends of the range
 DEPTH_COLORS: Final = "viridis_r"
 """matplotlib's name of the colours of depth: near is bright."""
 _UNKNOWN: Final = "#cccccc"
 FPS: Final = 24.0  # along a path
 _QUALITY: Final = "20"  # x264's CRF: 18 cannot be told from the frames, 23 is its default
-# Without a word in the file, players guess BT.709 for large pictures and BT.601 for small ones; ffmpeg itself makes BT.601.
+# If the file does not name the colour matrix, players assume BT.709 for large pictures and BT.601 for small ones; ffmpeg writes
+# BT.601 by default.
 _HD: Final = "scale=out_color_matrix=bt709:out_range=tv,setparams=color_primaries=bt709:color_trc=bt709"
 
 Pixels = UInt8[np.ndarray, "_ _ 3"]
@@ -34,7 +35,7 @@ Pixels = UInt8[np.ndarray, "_ _ 3"]
 
 @dataclass(eq=False)
 class Painter:
-    """Draws a field.
+    """Renders a field.
 
     Args:
         make: returns the rasterizer of the run; takes fields of `RasterSettings`, which override the run's.
@@ -50,13 +51,13 @@ class Painter:
 
     @torch.no_grad()
     def color(self, camera: Camera) -> Float[Tensor, "H W 3"]:
-        """The picture, in [0, 1], on the CPU."""
+        """Render the image, in [0, 1], on the CPU."""
         image = self._as_measured(self.field.baked(), camera).image
         return image.clamp(0, 1).nan_to_num().cpu()
 
     @torch.no_grad()
     def depth(self, camera: Camera) -> Float[Tensor, "H W"]:
-        """Mean depth z of what a pixel shows, world units; nan where less than half of it is covered."""
+        """Render the mean depth z of each pixel, world units, on the CPU; nan where alpha is below 1/2."""
         means = self.field.means.data
         z = depths(means, camera.world_to_camera.to(means))
         drawn = self.numbers(camera, torch.stack([z, torch.ones_like(z), torch.zeros_like(z)], dim=1))
@@ -65,15 +66,15 @@ class Painter:
 
     @torch.no_grad()
     def numbers(self, camera: Camera, values: Float[Tensor, "N 3"]) -> Float[Tensor, "H W 3"]:
-        """Three numbers >= 0 per Gaussian, blended as colours are; 0 where nothing is. On the device of the field."""
+        """Render three numbers >= 0 per Gaussian in place of its colour, over 0, on the device of the field."""
         splats = self.field.baked()
         painted = replace(splats, sh0=constant_band(values), shN=splats.shN[:, :0], rgb_offset=None)
         return self._over_black(painted, camera).image
 
 
 def depth_range(depth: Float[Tensor, "*shape"]) -> tuple[float, float]:
-    """The range that the colours span, of depths in world units; those that are not finite are left out. 0 to 1 where none is."""
-    known = depth[depth.isfinite()].cpu().numpy()  # torch's own quantile takes 16 million numbers at most
+    """The range of depths, world units, for `colored`; without those that are not finite, or (0, 1) if none is."""
+    known = depth[depth.isfinite()].cpu().numpy()  # torch.quantile takes 16 million numbers at most
     if not len(known):
         return 0.0, 1.0
     near, far = (float(np.quantile(known, q)) for q in _EXTREMES)
@@ -81,7 +82,7 @@ def depth_range(depth: Float[Tensor, "*shape"]) -> tuple[float, float]:
 
 
 def colored(depth: Float[Tensor, "H W"], near: float, far: float) -> UInt8[np.ndarray, "H W 3"]:
-    """Depth in colours, grey where there is none."""
+    """Map depth to colours; grey where it is not finite."""
     from matplotlib import colormaps
 
     colors = colormaps[DEPTH_COLORS].with_extremes(bad=_UNKNOWN)
@@ -89,7 +90,7 @@ def colored(depth: Float[Tensor, "H W"], near: float, far: float) -> UInt8[np.nd
 
 
 def write_video(path: Path, frames: Iterable[Pixels], *, fps: float = FPS) -> None:
-    """Write the frames into an MP4 file while they come; the file takes its name when it is whole.
+    """Write frames to an MP4 file as the iterable yields them; the file gets its name when it is complete.
 
     Args:
         frames: at least one, all of one size, with an even height and width.
@@ -106,9 +107,9 @@ def write_video(path: Path, frames: Iterable[Pixels], *, fps: float = FPS) -> No
     except RuntimeError as error:
         problem = "videos need ffmpeg, and that of imageio-ffmpeg does not run here: install ffmpeg."
         raise SettingError(problem) from error
-    coming = iter(frames)
-    first = next(coming)
-    with files.replacing(path.absolute()) as partial:  # ffmpeg takes "a:" at the beginning for a protocol
+    rest = iter(frames)
+    first = next(rest)
+    with files.replacing(path.absolute()) as partial:  # ffmpeg interprets "a:" at the beginning as a protocol
         writer = imageio_ffmpeg.write_frames(
             str(partial), first.shape[1::-1], fps=fps, codec="libx264", pix_fmt_out="yuv420p", quality=None,
             output_params=["-vf", _HD, "-crf", _QUALITY, "-preset", "veryfast", "-movflags", "+faststart"],
@@ -116,7 +117,7 @@ def write_video(path: Path, frames: Iterable[Pixels], *, fps: float = FPS) -> No
         )  # fmt: skip
         writer.send(None)
         try:
-            for frame in itertools.chain([first], coming):
+            for frame in itertools.chain([first], rest):
                 writer.send(np.ascontiguousarray(frame))
         finally:
             writer.close()

@@ -1,10 +1,10 @@
-"""The viewer in the browser: viser's page and nerfview's controls, and pictures drawn by the rasterizer of the run.
+"""The viewer in the browser: viser's page and nerfview's controls, with images drawn by the rasterizer of the run.
 
-nerfview ends the process on an error in a thread that draws, and part of it runs in the thread that trains; viser checks nothing
-of what a browser sends. So its camera (`get_camera_state`), its sizes (`_Sizes`), and errors of drawing and updates are dealt
-with here: the browser gets the picture from its last camera, or a black one, and the log gets one line.
+nerfview ends the process on an error in a thread that draws, and part of it runs in the training thread; viser does not check
+what a browser sends. Therefore cameras (`get_camera_state`) and sizes (`_Sizes`) are checked here, and errors of drawing and
+updates caught: the browser gets the image from its last valid camera, or a black one, and one line is logged.
 
-Heavy: it imports viser and nerfview, and is itself imported only once a viewer opens.
+Heavy: it imports viser and nerfview, and is itself imported only when a viewer opens.
 """
 
 from __future__ import annotations
@@ -41,21 +41,21 @@ _log = logging.getLogger(__name__)
 
 _SIZE: Final = 1024  # px, longest edge of a picture at first
 _SIZES: Final = {"viewer_res": (64, 2048), "render_width": (1, 4096), "render_height": (1, 4096)}  # px, least and most
-_BLACK: Final = np.zeros((2, 2, 3), np.uint8)  # a page stretches any picture over itself
+_BLACK: Final = np.zeros((2, 2, 3), np.uint8)  # the page stretches images of any size
 _FOV: Final = (1e-3, 3.1)  # radians
-_ASPECT: Final = (1 / 25, 25.0)  # width by height: beyond, nerfview asks for pictures without pixels
+_ASPECT: Final = (1 / 25, 25.0)  # width by height; beyond this range, nerfview requests images without pixels
 _FARTHEST: Final = 1e9  # world units, of a camera from the origin
-_PATIENCE: Final = 0.02  # seconds between looks at the button while the run is paused
-_PICTURE: Final = 30.0  # seconds that the last picture may take once the viewer closes
+_POLL: Final = 0.02  # seconds between checks of the button while the run is paused
+_PICTURE: Final = 30.0  # seconds that closing waits for the last image
 _NONE: Final = np.zeros((1, 1, 3), np.uint8)
-_PHOTO: Final = 300  # px, the width of the panel: an LR photo has less
-_TURN: Final = 0.002  # seconds that the lock is free after an iteration, so that a thread that waits for it gets it
+_PHOTO: Final = 300  # px, the width of the panel, to which LR photos are enlarged
+_RELEASED: Final = 0.002  # seconds that the lock is free after an iteration, so that a waiting thread acquires it
 
 Photos = Callable[[str], Pixels | None]
 
 
 class _Sizes(nerfview.RenderTabState):  # type: ignore[misc]
-    """nerfview's state of the panel, with sizes that can be drawn: a slider's range binds the page alone."""
+    """nerfview's state of the panel, with sizes clamped to what can be drawn: a slider's range is enforced by the page only."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         least, most = _SIZES.get(name, (None, None))
@@ -63,12 +63,12 @@ class _Sizes(nerfview.RenderTabState):  # type: ignore[misc]
 
 
 class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no types
-    """nerfview's viewer of what a painter draws, and of its depth; a choice of cameras moves it to one, and shows its photo.
+    """nerfview's viewer of a painter's images and depth, with a list of cameras to jump to, and their photos.
 
     Args:
-        cameras: of the run, by name; the first is where it begins.
-        photo: the photo of a camera by its name; None where there is none.
-        mode: "training": with its progress, and buttons that pause and resume it. nerfview draws while it holds `lock`.
+        cameras: of the run, by name; the view starts at the first.
+        photo: returns the photo of a camera by its name; None if there is none.
+        mode: "training" adds progress, and buttons that pause and resume training. nerfview draws while it holds `lock`.
     """
 
     def __init__(
@@ -77,11 +77,11 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         mode: Literal["rendering", "training"] = "rendering",
     ) -> None:  # fmt: skip
         self._painter, self._cameras, self._photo = painter, cameras, photo
-        self._told = set[tuple[str, int]]()
-        self._drawable = WeakKeyDictionary[Any, Any]()  # the last camera of each browser
-        # A browser that goes away while its picture is drawn.
+        self._logged = set[tuple[str, int]]()  # lines of code whose errors have been logged
+        self._drawable = WeakKeyDictionary[Any, Any]()  # the last valid camera of each browser
+        # viser's, of a browser that disconnects while its image is drawn.
         warnings.filterwarnings("ignore", message=".*it will never be delivered")
-        with contextlib.redirect_stdout(io.StringIO()):  # it prints its address; whoever opens it does
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints its address, as the caller does
             server = viser.ViserServer(host=host, port=port, verbose=False, label=title)
         if cameras:
             _aim(server, list(cameras.values()))
@@ -94,29 +94,29 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
 
     @property
     def address(self) -> str:
-        """Where a browser finds it."""
+        """The URL for the browser."""
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
     def get_camera_state(self, client: Any) -> Any:
-        """The camera of a browser; where it sends what cannot be drawn, the last one that could, or else any."""
+        """The camera of a browser; if it cannot be drawn, the last valid one, or a default."""
         try:
             state = super().get_camera_state(client)
             _require_drawable(state)
-        except Exception as error:  # whatever viser and numpy make of it
-            self._tell(error)
+        except Exception as error:  # of any type, raised by viser or numpy
+            self._log_once(error)
             return self._drawable.get(client, nerfview.CameraState(fov=1.0, aspect=1.0, c2w=np.eye(4)))
         self._drawable[client] = state
         return state
 
     def update(self, step: int, num_train_rays_per_step: int) -> None:
-        """nerfview's, in the thread that trains: an error of a browser, such as one that leaves meanwhile, is logged."""
+        """Call nerfview's update, in the training thread, and log errors, e.g. of a browser that disconnects."""
         try:
             super().update(step, num_train_rays_per_step)
         except Exception as error:
-            self._tell(error)
+            self._log_once(error)
 
     def close(self) -> None:
-        """Stop serving and drawing: a thread that still drew when the process ends would abort it."""
+        """Stop serving and drawing: a thread that still draws when the process ends would abort it."""
         drawing = [thread for thread in threading.enumerate() if isinstance(thread, Renderer) and thread.viewer is self]
         for thread in drawing:
             thread.running = False
@@ -126,7 +126,7 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
             thread.join(_PICTURE)
 
     def draw(self, pose: Float[np.ndarray, "4 4"], fov: float, size: tuple[int, int]) -> Pixels:
-        """The picture of `size` (width, height) pixels.
+        """Draw an image of `size` (width, height) pixels.
 
         Args:
             pose: camera to world, OpenCV axes. fov: vertical, radians.
@@ -135,23 +135,24 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         focal, world_to_camera = height / 2 / math.tan(fov / 2), np.linalg.inv(pose.astype(np.float64))
         camera = Camera(torch.from_numpy(world_to_camera), focal, focal, width / 2, height / 2, width, height)
         if not self._depth.value:
-            self._say(f"Drawn: the colour of {len(self._painter.field):,} Gaussians, as the metrics see it.")
+            self._caption(f"Drawn: the colour of {len(self._painter.field):,} Gaussians, as the metrics see it.")
             return to_bytes(self._painter.color(camera))
         depth = self._painter.depth(camera)
         near, far = depth_range(depth)
-        self._say(f"Drawn: depth, bright at {near:.3g} and dark at {far:.3g} world units; grey where nothing is.")
+        self._caption(f"Drawn: depth, bright at {near:.3g} and dark at {far:.3g} world units; grey where nothing is.")
         return colored(depth, near, far)
 
-    def _say(self, drawn: str) -> None:
+    def _caption(self, drawn: str) -> None:
+        """Set the caption, which is sent to browsers only if it changes."""
         if self._drawn.content != drawn:
             self._drawn.content = drawn
 
     def _jump(self, client: viser.ClientHandle, name: str) -> None:
-        """Look from a camera, so that its whole photo is seen."""
-        camera, seen = self._cameras[name], client.camera
+        """Move a browser's view to a camera, with its whole photo in view."""
+        camera, view = self._cameras[name], client.camera
         with client.atomic():
-            seen.position, seen.look_at, seen.up_direction = _stand(camera, looked_at(list(self._cameras.values())))
-            seen.fov = 2 * math.atan(max(camera.height / camera.fy, camera.width / camera.fx / seen.aspect) / 2)
+            view.position, view.look_at, view.up_direction = _look_at(camera, looked_at(list(self._cameras.values())))
+            view.fov = 2 * math.atan(max(camera.height / camera.fy, camera.width / camera.fx / view.aspect) / 2)
 
     def _init_rendering_tab(self) -> None:
         super()._init_rendering_tab()
@@ -187,21 +188,21 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         self._rendering_folder.expand_by_default = False
 
     def _render(self, state: Any, tab: Any) -> Pixels:
-        """Called by nerfview in a thread of each browser, which ends the process on an error: so none may pass."""
+        """Draw for nerfview, which calls this in a thread of each browser and ends the process on an error: none may pass."""
         size = (tab.render_width, tab.render_height) if tab.preview_render else (tab.viewer_width, tab.viewer_height)
         try:
             return self.draw(state.c2w, state.fov, size)
-        except InterruptRenderException:  # by which nerfview itself stops a picture that nobody waits for any more
+        except InterruptRenderException:  # nerfview stops an image that is no longer needed
             raise
-        except Exception as error:  # of memory, of anyone's rasterizer
-            self._tell(error)
+        except Exception as error:  # of any type, e.g. raised by a user's rasterizer
+            self._log_once(error)
             return _BLACK
 
-    def _tell(self, error: Exception) -> None:
-        """Log an error, once for each line of code that raises it: it would come again in every frame."""
+    def _log_once(self, error: Exception) -> None:
+        """Log an error once for each line of code that raises it: it would be raised again in every frame."""
         *_, (frame, line) = traceback.walk_tb(error.__traceback__)
-        if (place := (frame.f_code.co_filename, line)) not in self._told:
-            self._told.add(place)
+        if (place := (frame.f_code.co_filename, line)) not in self._logged:
+            self._logged.add(place)
             _log.warning("the viewer could not draw: %s: %s", type(error).__name__, one_line(error))
 
 
@@ -209,9 +210,9 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
 def watched(
     painter: Painter, cameras: Mapping[str, Camera], title: str, photo: Photos = lambda _: None
 ) -> Iterator[Callable[[int], None]]:
-    """A viewer while a run trains. Yields a function to call after each iteration, with its number.
+    """Open a viewer during training. Yields a function to call after each iteration, with its number.
 
-    The caller holds nerfview's lock, except in that function: the field is never drawn while an iteration changes it, and the
+    The caller holds nerfview's lock, except in that function, so that the field is never drawn while an iteration changes it. The
     run's bits are those of a run without a viewer.
     """
     viewer = SplatViewer(painter, cameras, title=title, photo=photo, mode="training")
@@ -220,16 +221,16 @@ def watched(
 
     def after_step(iteration: int) -> None:
         nonlocal held, began
-        # nerfview shares the time between both by the pixels of each a second: an iteration counts as one.
+        # nerfview divides time between drawing and training by their pixels per second; an iteration counts as one pixel.
         viewer.render_tab_state.num_train_rays_per_sec = 1 / max(time.monotonic() - began, 1e-9)
         held = False
         viewer.lock.release()
         try:
             viewer.update(iteration, 1)
             if viewer.server.get_clients():
-                time.sleep(_TURN)
+                time.sleep(_RELEASED)
             while viewer.state == "paused" and not signals.asked():
-                time.sleep(_PATIENCE)
+                time.sleep(_POLL)
         finally:
             held = viewer.lock.acquire()
         began = time.monotonic()
@@ -237,13 +238,13 @@ def watched(
     try:
         yield after_step
     finally:
-        if held:  # else Ctrl-C came while it waited for a picture
+        if held:  # else interrupted by Ctrl-C while waiting for an image
             viewer.lock.release()
         viewer.close()
 
 
 def _require_drawable(state: Any) -> None:
-    """Raise a ValueError for a camera that no rasterizer should be asked to draw; NaN fails every comparison."""
+    """Raise a ValueError for a camera outside the range that rasterizers can draw; NaN fails every comparison."""
     turned = abs(float(np.linalg.det(state.c2w[:3, :3])) - 1) < 1e-3 and float(np.abs(state.c2w).max()) < _FARTHEST
     if not (turned and _FOV[0] <= state.fov <= _FOV[1] and _ASPECT[0] <= state.aspect <= _ASPECT[1]):
         rule = f"a fov in {_FOV} rad, a width by height in {_ASPECT}, a rotation, and a position within {_FARTHEST:g}"
@@ -252,19 +253,19 @@ def _require_drawable(state: Any) -> None:
 
 
 def _aim(server: viser.ViserServer, cameras: Sequence[Camera]) -> None:
-    """Look from the first camera at the distance of the point that all of them look at."""
+    """Set the initial view: from the first camera, at the point on its axis as far away as the point that all look at."""
     up = -torch.stack([camera.world_to_camera.double() for camera in cameras])[:, 1, :3].mean(0)
     server.scene.set_up_direction(tuple((up / up.norm().clamp_min(1e-9)).tolist()))
-    stand, first, start = _stand(cameras[0], looked_at(cameras)), cameras[0], server.initial_camera
-    start.position, start.look_at, start.up = stand
-    start.fov = 2 * math.atan(first.height / 2 / first.fy)
+    first, view = cameras[0], server.initial_camera
+    view.position, view.look_at, view.up = _look_at(first, looked_at(cameras))
+    view.fov = 2 * math.atan(first.height / 2 / first.fy)
 
 
 Vector = tuple[float, float, float]
 
 
-def _stand(camera: Camera, focus: Float[Tensor, " 3"]) -> tuple[Vector, Vector, Vector]:
-    """Where a camera is, what it looks at, at the distance of `focus`, and where up is."""
+def _look_at(camera: Camera, focus: Float[Tensor, " 3"]) -> tuple[Vector, Vector, Vector]:
+    """(position, point on the axis at the distance of `focus`, up) of a camera."""
     pose, center = camera.world_to_camera.double(), camera.center.double()
     distance = float((focus - center).norm())
     x, y, z = (tuple(v.tolist()) for v in (center, center + distance * pose[2, :3], -pose[1, :3]))
