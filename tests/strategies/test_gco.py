@@ -53,6 +53,20 @@ def test_opposite_gradients_are_corrected_up_to_the_upper_bound_and_agreeing_one
     assert read(gco, "omega_at_lower_bound") < 0.9
 
 
+def test_without_evidence_it_says_once_that_lr_prevails(caplog):
+    """An opposite HR gradient keeps 1 - 0.75 * 0.95 of its length, whichever of the two is longer."""
+    caplog.set_level("INFO")
+    lr, gco = Grads({"means": torch.tensor([[2.0, 0, 0], [0.5, 0, 0]])}), GCO()
+    hr = Grads({"means": torch.tensor([[-1.0, 0, 0], [-4.0, 0, 0]])})
+    gco.correct(lr, hr, toy.step(evidence=Evidence(torch.zeros(2), torch.ones(2))))
+    assert not caplog.messages
+    for t in (1, 2):
+        left = gco.correct(lr, hr, toy.step(t))["means"][:, 0] / hr["means"][:, 0]
+        assert left.tolist() == pytest.approx([0.2875, 0.2875], rel=1e-6)
+    (message,) = caplog.messages
+    assert "GCO corrects without evidence" in message
+
+
 def test_what_the_paper_does_not_do_is_there_to_compare_with():
     """Of two groups one opposes: dropped, it is left out as a whole; as one Gaussian, both agree."""
     lr = Grads({"means": torch.tensor([[3.0, 0, 0]]), "scales": torch.tensor([[1.0, 0, 0]])})
