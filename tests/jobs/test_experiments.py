@@ -13,6 +13,8 @@ import rasterizers
 from clear_strategies import Conductor
 from clear_strategies.compose import tree
 from clear_strategies.data.view_settings import ViewSettings
+from clear_strategies.errors import SettingError
+from clear_strategies.hydra_app import readable
 from clear_strategies.jobs.settings import settings_of
 from clear_strategies.merging.skips import Skips
 from clear_strategies.schedules import scaled
@@ -42,6 +44,18 @@ def pieces(config: DictConfig, stretch: float = 1.0):
     built = [build(values[key], key) for key in ("objective", "density", "optim", "mip", "fit")]
     strategies = build(OmegaConf.to_container(config.strategies, resolve=True), "strategies")
     return [scaled(s, stretch) for s in strategies.values()], *(scaled(thing, stretch) for thing in built[:-1])
+
+
+@pytest.mark.parametrize("word", ["+method=[]", "+method=srgs,[]"])
+def test_the_row_of_clear_can_be_chosen_as_those_of_the_methods(word):
+    """As conf/experiment/table1.yaml says."""
+    assert readable(word) == word
+
+
+@pytest.mark.parametrize("word", ["objective=[]", "+method=null", "+strategy="])
+def test_an_option_that_is_nothing_is_refused_with_the_options_that_there_are(word):
+    with pytest.raises(SettingError, match=r": there is no such option\..* There are "):
+        readable(word)
 
 
 @pytest.mark.parametrize("name", options("method"))
