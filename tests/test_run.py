@@ -227,7 +227,7 @@ ENDINGS = {
     OSError(errno.ENOSPC, "No space", "x"): (3, "x: No space. Free space, or write elsewhere (hydra.run.dir=FOLDER"),
     OSError(errno.EROFS, "Read-only", "x"): (
         3,
-        "x: Read-only. Write elsewhere (hydra.run.dir=FOLDER of a run, --out of",
+        "x: Read-only. Write elsewhere (hydra.run.dir=FOLDER of a run, hydra.sweep.dir=FOLDER of a sweep, --out of",
     ),
     PermissionError(errno.EACCES, "Permission denied", "x"): (
         3,

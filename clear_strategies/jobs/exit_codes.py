@@ -65,7 +65,8 @@ def describe(error: BaseException) -> Ending | None:
     if isinstance(disk, OSError):
         where = one_line(f"{disk.filename or 'output'}: {disk.strerror or disk}")
         remedy = f"{_FIRST.get(disk.errno or 0, 'Write')} elsewhere"
-        elsewhere = "hydra.run.dir=FOLDER of a run, --out of a command, $CLEAR_CACHE of the cache"
+        folders = "hydra.run.dir=FOLDER of a run, hydra.sweep.dir=FOLDER of a sweep"
+        elsewhere = f"{folders}, --out of a command, $CLEAR_CACHE of the cache"
         return Ending(NO_DISK, f"{where}. {remedy} ({elsewhere}). Earlier checkpoints are untouched.")
     return None
 
