@@ -224,6 +224,10 @@ def test_a_launcher_that_is_not_installed_names_its_package(chosen, package, tmp
 ENDINGS = {
     KeyboardInterrupt(): (130, "stopped by SIGINT."),  # a job says what it has saved
     KeyboardInterrupt(signal.SIGTERM): (143, "stopped by SIGTERM."),
+    RuntimeError('Could not detect "srun", are you indeed on a slurm cluster?'): (
+        2,
+        "hydra/launcher: Slurm is not here",
+    ),
     OSError(errno.ENOSPC, "No space", "x"): (3, "x: No space. Free space, or write elsewhere (hydra.run.dir=FOLDER"),
     OSError(errno.EROFS, "Read-only", "x"): (
         3,

@@ -14,6 +14,7 @@ from clear_strategies import signals
 from clear_strategies.errors import ClearError, SettingError, one_line
 
 _NO_MEMORY: Final = "can't allocate memory"  # of torch's allocator on the CPU
+_NO_SLURM: Final = 'Could not detect "srun"'  # of submitit
 _LESS_MEMORY: Final = (
     "Raise `ulimit -v` where it is set. Lower density.max_gaussians or raise data.views.shrink; rasterizer.memory bounds the "
     "rasterizer's lists. Of clear-strategies render: lower --width."
@@ -59,7 +60,7 @@ def describe(error: BaseException) -> Ending | None:
         from clear_strategies.hydra_errors import of_hydra
 
         return Ending(UNUSABLE, of_hydra(error))  # before OSError: Hydra's error for an option that is not there is one
-    if message := _of_memory(error):
+    if message := _of_machine(error):
         return Ending(UNUSABLE, message)
     disk = error if isinstance(error, OSError) else error.__cause__  # logging wraps it if it cannot open its file
     if isinstance(disk, OSError):
@@ -71,8 +72,10 @@ def describe(error: BaseException) -> Ending | None:
     return None
 
 
-def _of_memory(error: BaseException) -> str | None:
-    """The message if memory ran out, or may have; None for other errors."""
+def _of_machine(error: BaseException) -> str | None:
+    """The message if the machine has no Slurm, or if memory ran out, or may have; None for other errors."""
+    if isinstance(error, RuntimeError) and _NO_SLURM in str(error):
+        return "hydra/launcher: there is no Slurm on this machine (no srun). Start the command on a node of its cluster."
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY in str(error)):
         return f"out of memory: {one_line(error) or 'Python had none left.'} {_LESS_MEMORY}"
     if isinstance(error, ImportError) and "failed to map segment" in str(error):  # of a library, by the system
