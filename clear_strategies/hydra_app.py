@@ -103,10 +103,8 @@ def readable(word: str) -> str:
         return f"{key}={quoted(value)}"
     values, group = chosen.value(), chosen.key_or_group
     each = values.list if isinstance(values, ChoiceSweep) else [values]
-    nothing = [
-        option for option in each if not option and not (option == [] and chosen.is_add())
-    ]  # +method=[] adds none
-    if nothing and (CONF / group).is_dir():
+    named = [option for option in each if not (chosen.is_add() and option == [])]  # +method=srgs,[]: a row without one
+    if not all(named) and (CONF / group).is_dir():
         raise SettingError(no_option(group, "null" if None in each else value, [*options(group)]))
     if group == "experiment" and len(each) > 1 and any(isinstance(name, str) and sweeps(name) for name in each):
         alone = ", ".join(f"experiment={name}" for name in each)

@@ -226,7 +226,7 @@ ENDINGS = {
     KeyboardInterrupt(signal.SIGTERM): (143, "stopped by SIGTERM."),
     RuntimeError('Could not detect "srun", are you indeed on a slurm cluster?'): (
         2,
-        "hydra/launcher: Slurm is not here",
+        "hydra/launcher: there is no Slurm on this machine",
     ),
     OSError(errno.ENOSPC, "No space", "x"): (3, "x: No space. Free space, or write elsewhere (hydra.run.dir=FOLDER"),
     OSError(errno.EROFS, "Read-only", "x"): (

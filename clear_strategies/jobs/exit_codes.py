@@ -75,7 +75,9 @@ def describe(error: BaseException) -> Ending | None:
 def _of_machine(error: BaseException) -> str | None:
     """The message if the machine has no Slurm, or if memory ran out, or may have; None for other errors."""
     if isinstance(error, RuntimeError) and _NO_SLURM in str(error):
-        return "hydra/launcher: there is no Slurm on this machine (no srun). Start the command on a node of its cluster."
+        return (
+            "hydra/launcher: there is no Slurm on this machine (no srun). Start the command on a node of its cluster."
+        )
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY in str(error)):
         return f"out of memory: {one_line(error) or 'Python had none left.'} {_LESS_MEMORY}"
     if isinstance(error, ImportError) and "failed to map segment" in str(error):  # of a library, by the system
