@@ -10,6 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from inspect import signature
 from typing import Any, Final
 
@@ -73,6 +74,8 @@ def conductor(
 ) -> Conductor:
     """The strategies of conf/, with their objective and `skips=hosts`, for a host's loop.
 
+    `best` leaves out `random_background` here, unless `strategy` or an override names it.
+
     Args:
         strategy: as after `+strategy=`: "clear", "gco", "gco,svs", "[gco,svs]", "baseline" …, or a list, ["gco", "svs"].
         overrides: as on the command line of `run`: "strategies.gco.tolerance=0.1", "objective=paper", "~strategies.p2g".
@@ -87,13 +90,33 @@ def conductor(
     names = strategy.strip() if isinstance(strategy, str) else f"[{','.join(map(str, strategy))}]"
     chosen = f"+strategy=[{names}]" if "," in names and not names.startswith("[") else f"+strategy={names}"
     config = composed((chosen, *overrides))
-    settings: ConductorSettings = build(tree(config, _TRAINERS))
+    content = tree(config, _TRAINERS)
+    if not any(_COSTLY_IN_HOSTS in named for named in (names, *overrides)):
+        _leave_out(content["strategies"])
+    settings: ConductorSettings = build(content)
     for name, s in settings.strategies.items():
         if not s.shares_gate:
             raise SettingError(
                 f"strategies.{name}: other trainers render both scales with one mask. Leave out shared=false."
             )
     return settings.conductor(iterations / REFERENCE_ITERATIONS, _detail(config).of_run(iterations))
+
+
+_COSTLY_IN_HOSTS: Final = "random_background"
+
+
+def _leave_out(strategies: dict[str, Any]) -> None:
+    """Drop what `best` brings and nobody has named: without `mcmc`, which no host runs, random backgrounds cost up to 0.4 dB."""
+    if strategies.pop(_COSTLY_IN_HOSTS, None) is not None:
+        _say_left_out()
+
+
+@cache  # launchers compose twice
+def _say_left_out() -> None:
+    _log.info(
+        "%s is left out: in other trainers it costs more than it gains. To use it, set strategies.%s.until=9000.",
+        _COSTLY_IN_HOSTS, _COSTLY_IN_HOSTS,
+    )  # fmt: skip
 
 
 # Options for runs and hosts, such as readings=paper, set these as well; a host has its own, but for the rates of f_det.

@@ -5,7 +5,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import ConfigCompositionException
 
-from clear_strategies import GCO, P2G, SVS, Conductor, hydra_app
+from clear_strategies import GCO, P2G, SVS, Conductor, RandomBackground, hydra_app
 from clear_strategies import compose as compose_module
 from clear_strategies.compose import conductor, tree
 from clear_strategies.data.priors import BackProjected, Bicubic
@@ -234,13 +234,23 @@ def test_a_setting_that_cannot_be_used_is_named_by_its_key(overrides, message):
 def test_a_host_gets_the_strategies_the_decorators_and_the_rates_of_what_it_names():
     run = settings_of(tree(composed("+strategy=best")))
     best = conductor("best")
-    assert [type(s) for s in best.strategies] == [type(s) for s in run.conductor(1.0).strategies]
-    assert [type(s).__name__ for s in best.strategies] == [
+    assert [type(s).__name__ for s in run.conductor(1.0).strategies] == [
         "GCO", "P2G", "SVS", "PseudoViews", "FadingOpacity", "MCMC", "RandomBackground",
     ]  # fmt: skip
+    assert [type(s) for s in best.strategies] == [type(s) for s in run.conductor(1.0).strategies][:-1]
     assert best.prior(Bicubic()) == run.conductor(1.0).prior(Bicubic()) == BackProjected(Bicubic())
     run = settings_of(tree(composed("+strategy=[p2g,back_projected]", "data.views.downsample=area")))
     assert run.strategies["p2g"].down == "area"
     assert run.conductor(1.0).prior(Bicubic()) == BackProjected(Bicubic(), down="area")
     assert conductor("clear", iterations=300).detail == DetailRates().of_run(300)
     assert conductor("clear_paper", iterations=300).detail == DetailRates(rate=7.05e-4, steps=0, decay=0.0)
+
+
+def test_in_a_host_best_leaves_random_backgrounds_out_and_says_so_once_unless_they_are_named(caplog):
+    caplog.set_level("INFO")
+    compose_module._say_left_out.cache_clear()
+    without = [("best",), ("best",), ("best", "~strategies.random_background")]
+    assert not any(isinstance(s, RandomBackground) for names in without for s in conductor(*names).strategies)
+    for names in ("best", "strategies.random_background.until=8000"), (["gco", "random_background"],):
+        assert isinstance(conductor(*names).strategies[-1], RandomBackground)
+    assert caplog.text.count("random_background is left out") == 1
