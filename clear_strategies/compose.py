@@ -91,7 +91,7 @@ def conductor(
     chosen = f"+strategy=[{names}]" if "," in names and not names.startswith("[") else f"+strategy={names}"
     config = composed((chosen, *overrides))
     content = tree(config, _TRAINERS)
-    if not any(_COSTLY_IN_HOSTS in named for named in (names, *overrides)):
+    if not any(_NOT_IN_HOSTS in named for named in (names, *overrides)):
         _leave_out(content["strategies"])
     settings: ConductorSettings = build(content)
     for name, s in settings.strategies.items():
@@ -102,12 +102,12 @@ def conductor(
     return settings.conductor(iterations / REFERENCE_ITERATIONS, _detail(config).of_run(iterations))
 
 
-_COSTLY_IN_HOSTS: Final = "random_background"
+_NOT_IN_HOSTS: Final = "random_background"
 
 
 def _leave_out(strategies: dict[str, Any]) -> None:
     """Drop what `best` brings and nobody has named: without `mcmc`, which no host runs, random backgrounds cost up to 0.4 dB."""
-    if strategies.pop(_COSTLY_IN_HOSTS, None) is not None:
+    if strategies.pop(_NOT_IN_HOSTS, None) is not None:
         _say_left_out()
 
 
@@ -115,7 +115,7 @@ def _leave_out(strategies: dict[str, Any]) -> None:
 def _say_left_out() -> None:
     _log.info(
         "%s is left out: in other trainers it costs more than it gains. To use it, set strategies.%s.until=9000.",
-        _COSTLY_IN_HOSTS, _COSTLY_IN_HOSTS,
+        _NOT_IN_HOSTS, _NOT_IN_HOSTS,
     )  # fmt: skip
 
 
