@@ -45,11 +45,12 @@ from integration.announcement import announce, warn_without_hr
 from integration.host_merge import HostMerge
 from integration.host_steps import HostSteps
 from integration.hr_drawing import Drawable, HrDrawing, RenderAt
-from integration.pending import BackwardPass, Pending, current_pass, why_nothing_was_merged
+from integration.pending import BackwardPass, Pending, why_nothing_was_merged
 from integration.structure import resized
 from integration.views import require_unique
 from rasterizers.autograd import TakeColours
 from rasterizers.interface import Color
+from rasterizers.torch_internals import current_pass, when_pass_ends
 
 _log = logging.getLogger(__name__)
 _LOGGED_EVERY: Final = 100  # merges between two lines of the log
@@ -281,7 +282,7 @@ class Attachment:
             return None
         if self._pass is None or self._pass.task != current_pass():
             self._pass = now = BackwardPass(current_pass(), self.params())
-            torch.autograd.Variable._execution_engine.queue_callback(lambda: self._on_backward_end(now))
+            when_pass_ends(lambda: self._on_backward_end(now))
         self._pass.renderings.add(nth)
         return self._pass.take if self._pending.may_take_factors(self._pass.params) else None
 

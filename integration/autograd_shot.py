@@ -13,11 +13,12 @@ from torch import Tensor
 from clear_strategies.core.gradients import Grads, gradients_of, summed
 from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.iteration import HrSide
-from integration.colours import are_joined, is_hooked
+from integration.colours import are_joined
 from integration.structure import rows_drawn
 from rasterizers.autograd import Drawing, Rendered, outer
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, summed_vjp
+from rasterizers.torch_internals import is_hooked
 
 _GOLDEN: Final = 0.6180339887498949  # its multiples modulo 1 differ most for neighbouring rows
 _SAME_CODE: Final = 0.1  # tolerance of the ratio of a row's gradients, which e.g. the mean of all rows changes a little

@@ -16,7 +16,6 @@ from typing import Any, Final
 import pandas as pd
 import torch
 from torch.nn import functional as F
-from torch.utils._python_dispatch import TorchDispatchMode
 from tqdm import tqdm
 
 from clear_strategies.bench.rasterizers import relative, require_device
@@ -31,6 +30,7 @@ from integration.gsplat import attach
 from integration.host_merge import HostMerge
 from integration.views import view
 from rasterizers import native
+from rasterizers.torch_internals import TorchDispatchMode
 
 ALONE: Final = "alone"
 _OURS: Final = ", ours"

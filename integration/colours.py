@@ -19,8 +19,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-import torch
 from torch import Tensor
+
+from rasterizers.torch_internals import accumulates, accumulator, is_hooked
 
 _JOINS: Final = "CatBackward0"
 
@@ -33,24 +34,11 @@ def are_joined(colors: Tensor, params: Mapping[str, Tensor]) -> bool:
         return False
     if len(leaves) != 2 or any(not p.requires_grad or p.dtype != colors.dtype for p in leaves):
         return False
-    if [before for before, _ in node.next_functions] != [_accumulator(p) for p in leaves]:
+    if [before for before, _ in node.next_functions] != [*map(accumulator, leaves)]:
         return False
     return not (colors.retains_grad or any(map(is_hooked, (colors, *leaves))))
 
 
 def are_accumulated(params: Mapping[str, Tensor]) -> bool:
     """Condition 2: whether the running backward pass adds to `.grad` of sh0 and shN."""
-    try:
-        return all(torch._C._will_engine_execute_node(_accumulator(params[name])) for name in ("sh0", "shN"))
-    except RuntimeError:  # raised in a pass of `torch.autograd.grad` for one of them
-        return False
-
-
-def is_hooked(x: Tensor) -> bool:
-    """Whether the gradient of a tensor has a hook, which may change it."""
-    return bool(x._backward_hooks or getattr(x, "_post_accumulate_grad_hooks", None))
-
-
-def _accumulator(leaf: Tensor) -> Any:
-    """The node that adds to a leaf's `.grad`."""
-    return torch.autograd.graph.get_gradient_edge(leaf).node
+    return accumulates(params["sh0"]) and accumulates(params["shN"])

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from clear_strategies.core.gradients import Grads
 from clear_strategies.errors import HostError
-from integration.pending import current_pass
+from rasterizers.torch_internals import current_pass
 
 _log = logging.getLogger(__name__)
 

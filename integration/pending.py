@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from weakref import WeakMethod
 
-import torch
 from torch import Tensor
 
 from clear_strategies.core.gradients import Colour, Grads
@@ -16,6 +15,7 @@ from clear_strategies.merging.iteration import HrSide
 from integration.autograd_shot import HostOutput
 from integration.colours import are_accumulated, are_joined
 from rasterizers.autograd import TakeColours
+from rasterizers.torch_internals import current_pass, version
 
 Reached = Callable[[int], TakeColours | None]
 """Called when a backward pass has reached the nth rendering and no parameter yet; returns the same as
@@ -47,7 +47,7 @@ class BackwardPass:
     def __post_init__(self) -> None:
         grads = {name: p.grad for name, p in self.params.items()}
         self.before = {name: g.detach().clone() for name, g in grads.items() if g is not None}
-        self._found = {name: (g, 0 if g is None else g._version) for name, g in grads.items()}
+        self._found = {name: (g, 0 if g is None else version(g)) for name, g in grads.items()}
 
     def take(self, rgb: Tensor, basis: Tensor) -> None:
         """Keep the gradient of the colours."""
@@ -59,9 +59,9 @@ class BackwardPass:
         return [name for name in self.params if name in of_colour or (name != "detail" and self._has_changed(name))]
 
     def _has_changed(self, name: str) -> bool:
-        before, version = self._found[name]
+        before, written = self._found[name]
         now = self.params[name].grad
-        return now is not before or (now is not None and now._version != version)
+        return now is not before or (now is not None and version(now) != written)
 
 
 @dataclass(slots=True, eq=False)
@@ -153,12 +153,6 @@ class Pending:
                 "backward() once; what is only looked at, take by torch.autograd.grad. For a second pass over the same view, "
                 "call the function that was wrapped, its __wrapped__."
             )
-
-
-def current_pass() -> int:
-    """Torch's number of the backward pass that runs in this thread; -1: none runs."""
-    number: int = torch._C._current_graph_task_id()
-    return number
 
 
 def why_nothing_was_merged(pending: Pending | None, trained: Sequence[str]) -> tuple[str, str]:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from rasterizers.checks import drawing
 from rasterizers.interface import Camera, Rasterizer, Rendering, Splats
+from rasterizers.torch_internals import version
 
 
 class _Ahead(threading.local):
@@ -38,7 +39,7 @@ def _grid(camera: Camera) -> tuple[float, ...]:
 def _shown(rasterizer: Rasterizer, splats: Splats, camera: Camera, depth: bool) -> tuple[Any, ...]:
     """A key of an image: equal for equal images, as long as the tensors are alive."""
     tensors = (getattr(splats, field.name) for field in fields(Splats))
-    memory = [None if x is None else (x.data_ptr(), x.shape, x.stride(), x._version) for x in tensors]
+    memory = [None if x is None else (x.data_ptr(), x.shape, x.stride(), version(x)) for x in tensors]
     return rasterizer, memory, _grid(camera), camera.world_to_camera.tolist(), depth
 
 

@@ -27,6 +27,7 @@ from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients,
 from rasterizers.modes import in_full_precision, uncompiled
 from rasterizers.native import empty_for
 from rasterizers.pose import pose_gradient
+from rasterizers.torch_internals import is_transformed
 
 __all__ = ["BackwardHook", "Drawing", "Drawn", "TakeColours", "collected_drawings", "draw", "outer"]
 
@@ -152,7 +153,7 @@ def render(
     Args:
         replays: allows a replay, which expects a backward pass.
     """
-    if torch._C._functorch.peek_interpreter_stack() is not None:
+    if is_transformed():
         raise NotImplementedError(
             "the transforms of torch.func (grad, vmap, jvp …) do not pass through a rasterizer. Use torch.autograd.grad, one "
             "drawing at a time."

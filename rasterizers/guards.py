@@ -11,9 +11,9 @@ from collections.abc import Callable, Collection
 from typing import Any, Final, TypeVar, cast
 
 from torch import Tensor
-from torch.utils._pytree import tree_leaves
 
 from rasterizers.recording import running
+from rasterizers.torch_internals import tree_leaves
 
 R = TypeVar("R")
 

@@ -15,8 +15,8 @@ from typing import Any, Final, Generic, TypeVar, cast
 
 import torch
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
+
+from rasterizers.torch_internals import TorchDispatchMode, end_failed_pool, reads_number, tree_leaves, writes
 
 R = TypeVar("R")
 T = TypeVar("T")
@@ -124,9 +124,7 @@ def _captured_by(graph: Any, pool: Any, device: int) -> Iterator[None]:
             graph.capture_end()
         except BaseException:
             _failed.append(graph)
-            with suppress(AttributeError, RuntimeError):  # torch before 2.8; the allocator had been told
-                torch._C._cuda_endAllocateToPool(device, pool)
-                torch._C._cuda_releasePool(device, pool)
+            end_failed_pool(device, pool)
             generator.graphsafe_set_state(before)
             raise
 
@@ -156,10 +154,10 @@ class _Watch(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
     def __torch_dispatch__(self, op: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        if op.overloadpacket is torch.ops.aten._local_scalar_dense and args[0].device.type == self._device:
+        if reads_number(op) and args[0].device.type == self._device:
             raise RuntimeError("recorded work must not read a number from the device.")
         given, result = tree_leaves((args, kwargs)), op(*args, **kwargs)
-        if not (op.is_view or op._schema.is_mutable):
+        if not (op.is_view or writes(op)):
             self._own |= _addresses(tree_leaves(result)) - _addresses(given)  # unsafe_split returns its input
         self.keep(given)
         return result

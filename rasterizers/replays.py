@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from rasterizers.recording import Recording, on_side_stream
+from rasterizers.torch_internals import copy_each
 
 _log = logging.getLogger(__name__)
 
@@ -162,4 +163,4 @@ def write(static: Sequence[Tensor | None], inputs: Sequence[Tensor | None]) -> N
         else:
             x.copy_(y)
     for pairs in alike.values():
-        torch._foreach_copy_([x for x, _ in pairs], [y for _, y in pairs])
+        copy_each(*zip(*pairs, strict=True))

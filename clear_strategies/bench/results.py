@@ -81,7 +81,7 @@ class Results:
 def queued(work_log: WorkLog, stage: str) -> Iterator[None]:
     """Time a stage that a CUDA device starts after other work: on an idle device, the host's launches would be timed."""
     if work_log.device.type == "cuda":
-        torch.cuda._sleep(_AHEAD)  # type: ignore[no-untyped-call]
+        torch.cuda._sleep(_AHEAD)  # type: ignore[no-untyped-call]  # without a public name; since torch 1.0
     with work_log.stage(stage):
         yield
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from clear_strategies.errors import HostError
 from integration.structure import is_same
+from rasterizers.torch_internals import version
 
 ROWS: Final = "clear_rows"
 """Key of the row numbers."""
@@ -51,7 +52,7 @@ class RowNumbers:
         rows = torch.arange(1, len(means) + 1, device=means.device, dtype=torch.float64)
         self._numbered = len(means)
         self._entries[ROWS] = torch.nn.Parameter(rows, requires_grad=False) if self._as_parameter else rows
-        self._unchanged = self._entries[ROWS], self._entries[ROWS]._version
+        self._unchanged = self._entries[ROWS], version(self._entries[ROWS])
 
     def poll(self) -> Int[Tensor, " M"] | None:
         """parents[M] of the change since the last call: row i comes from row parents[i], or from none if that is -1; None: the
@@ -69,8 +70,8 @@ class RowNumbers:
                 "must treat every entry of the parameters alike. Where the loop has loaded other Gaussians, remove() and attach "
                 "again."
             )
-        of, version = self._unchanged
-        is_unchanged = rows is of and rows._version == version
+        of, of_version = self._unchanged
+        is_unchanged = rows is of and version(rows) == of_version
         rounds = rows.dtype.is_floating_point and self._numbered * torch.finfo(rows.dtype).eps > _EXACT
         if is_unchanged and rounds:
             self.restart()  # `splats.half()` has converted all parameters
