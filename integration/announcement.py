@@ -9,17 +9,15 @@ from typing import Final
 from clear_strategies.core.view import View
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.strategies.base import overrides
+from integration.host import Host
 
 _log = logging.getLogger(__name__)
 _STRETCH: Final = "Make the conductor for the length of the loop: conductor(…, iterations=…)."
 
 
-def announce(conductor: Conductor, views: Sequence[View], *, own_background: bool, iterations: int | None) -> None:
-    """After `on_fit_start`, log what each strategy will do, and which have no effect.
-
-    Args:
-        own_background, iterations: see `Attachment`.
-    """
+def announce(conductor: Conductor, views: Sequence[View], host: Host) -> None:
+    """After `on_fit_start`, log what each strategy will do, and which have no effect."""
+    iterations = host.iterations
     if (first := _first_hr(conductor)) is not None:
         _log.info("HR takes part from step %d on (objective.lambda_hr.start).", first)
         if iterations is not None and first > iterations:
@@ -37,7 +35,7 @@ def announce(conductor: Conductor, views: Sequence[View], *, own_background: boo
     for hook, reason in {
         "densifier": "keeps its own density control",
         "draw": "draws no picture for it",
-        **({"background": "chooses its background itself"} if own_background else {}),
+        **({"background": "chooses its background itself"} if host.own_background else {}),
     }.items():
         for owner in (s for s in conductor.strategies if overrides(s, hook)):
             _log.info("%s has no effect here: the host %s.", type(owner).__name__, reason)

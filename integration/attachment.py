@@ -29,11 +29,9 @@ from typing import Any, Final
 from weakref import WeakMethod, finalize
 
 import torch
-from jaxtyping import Int
 from torch import Tensor
 
 from clear_strategies.core import deferred
-from clear_strategies.core.checks import require_whole
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import conflict_columns
 from clear_strategies.core.step import Step
@@ -42,6 +40,7 @@ from clear_strategies.data.scene import require_shown
 from clear_strategies.errors import HostError, SettingError
 from clear_strategies.merging.conductor import Conductor
 from integration.announcement import announce, warn_without_hr
+from integration.host import Host
 from integration.host_merge import HostMerge
 from integration.host_steps import HostSteps
 from integration.hr_drawing import Drawable, HrDrawing, RenderAt
@@ -60,21 +59,8 @@ class Attachment:
     """The strategies beside a host's training loop.
 
     Args:
-        params: returns the leaves that the host optimizes, by gsplat's names (and "detail"). It is called at every
-            iteration, since densifiers replace parameters.
+        host: what the adapter knows of the loop.
         views: all training views. seed: of the strategies.
-        poll_parents: called at every iteration. It returns parents[M] if the structure has changed since its last call (row i of
-            every parameter now comes from row parents[i], or from none if that is -1); None: it has not, or the host does not
-            say how.
-        remedy: for the error if strategies store something per Gaussian, but some Gaussians come from no other.
-        restart_parents: called after the host has loaded other parameters, which come from no earlier ones.
-        threshold: the host's densification threshold on the mean ‖∇_u‖ in NDC units; None: the score is not scaled.
-        loss_scale: returns the factor of the host's loss (`scaler.get_scale` of an AMP gradient scaler).
-        accumulation: backward passes per optimizer step, each of 1/accumulation of the loss.
-        masks: [h, w] by the name of a view, by which the host multiplies its LR image; the HR image is multiplied here.
-        own_background: the host chooses the colour behind its renderings, and `background` has no effect.
-        reads_score: the host's densifier reads the screen gradient.
-        iterations: of the loop, if they are known.
 
     Attributes:
         t: the current iteration, from 1.
@@ -84,51 +70,33 @@ class Attachment:
         undo: callbacks of `remove`, by which an adapter undoes its changes to the host.
     """
 
-    def __init__(
-        self,
-        conductor: Conductor,
-        params: Callable[[], Mapping[str, Tensor]],
-        *,
-        views: Sequence[View],
-        poll_parents: Callable[[], Int[Tensor, " M"] | None],
-        restart_parents: Callable[[], None] = lambda: None,
-        remedy: str = "End densification first.",
-        seed: int = 0,
-        threshold: float | None = None,
-        loss_scale: Callable[[], float] | None = None,
-        accumulation: int = 1,
-        masks: Mapping[str, Tensor] | None = None,
-        own_background: bool = True,
-        reads_score: bool = True,
-        iterations: int | None = None,
-    ) -> None:
-        _require_supported(conductor, accumulation)
+    def __init__(self, conductor: Conductor, host: Host, views: Sequence[View], *, seed: int = 0) -> None:
+        _require_supported(conductor)
         require_unique(view.name for view in views)
         require_shown(views)
-        self._views = {view.name: view for view in views}
-        self.conductor, self.params, self.accumulation = conductor, params, accumulation
-        self._own_background = own_background
-        self.t, self.passes = 1, 0
+        self.conductor = conductor
+        self.t = 1
+        self.passes = 0
         self.counts: Counter[str] = Counter()
         self.removed = False
         self.undo = ExitStack()
-        self._poll_parents, self._restart_parents, self._remedy = poll_parents, restart_parents, remedy
-        self._n, device = len(params()["means"]), params()["means"].device
-        self._hr = HrDrawing(conductor, device, masks or {}, self.counts, reads_score=reads_score)
-        self._pending: Pending | None = None  # the last rendering
-        self._pass: BackwardPass | None = None  # the last one that has reached a rendering
-        self._merging = HostMerge(
-            conductor, device, threshold=threshold, loss_scale=loss_scale, accumulation=accumulation, counts=self.counts
-        )
-        self._step: Step | None = None  # of the rendering, until `after_step`
-        self._has_warned_of_accumulation = False
-        self._logged: dict[str, deferred.Number | Callable[[], deferred.Number]] = {}
+        self._host = host
+        self._views = {view.name: view for view in views}
+        means = host.params()["means"]
+        self._n = len(means)
+        self._hr = HrDrawing(conductor, host, means.device, self.counts)
+        self._merging = HostMerge(conductor, host, means.device, self.counts)
         self._steps = HostSteps(
             is_waiting=lambda: self._pending is not None and self._pending.output is not None,
             begins=self._step_begins, after=self._after_optimizer, counts=self.counts,
         )  # fmt: skip
-        conductor.on_fit_start(len(views), seed, device, views)
-        announce(conductor, views, own_background=own_background, iterations=iterations)
+        self._step: Step | None = None  # of the rendering, until `after_step`
+        self._pending: Pending | None = None  # the last rendering
+        self._pass: BackwardPass | None = None  # the last one that has reached a rendering
+        self._logged: dict[str, deferred.Number | Callable[[], deferred.Number]] = {}
+        self._has_warned_of_accumulation = False
+        conductor.on_fit_start(len(views), seed, means.device, views)
+        announce(conductor, views, host)
         self._finalizer = finalize(self, warn_without_hr, conductor, self.counts)
 
     def render_view(self, view: View, render_at: RenderAt) -> Any:
@@ -143,7 +111,7 @@ class Attachment:
                 "and the loss be that of another picture. Checkpoint what comes before the rendering, or after it."
             )
         self._finish_step()  # not every optimizer may have stepped, and the structure may have changed
-        conductor, t, params = self.conductor, self.t, {name: p.detach() for name, p in self.params().items()}
+        conductor, t, params = self.conductor, self.t, {name: p.detach() for name, p in self._host.params().items()}
         means = params["means"]
         conductor.logs.forget()
         z = conductor.gate(t, self._n)
@@ -158,7 +126,7 @@ class Attachment:
         self._step = Step(t, view, params=params) if hr is None else hr.step
         if self.passes == 0:  # once per step of the host, however many passes it accumulates
             extra_views = conductor.extra_views(t)
-            self._steps.follow_by(self.params(), (self._hr.extra_view(x, view, t, apart) for x in extra_views))
+            self._steps.follow_by(self._host.params(), (self._hr.extra_view(x, view, t, apart) for x in extra_views))
         output = render_at("lr", z, view)
         if isinstance(output, Drawable):
             raise TypeError("an adapter renders LR by the host's own function, got a Drawable.")
@@ -176,7 +144,7 @@ class Attachment:
     @property
     def background(self) -> Color | None:
         """The colour behind every rendering of this iteration, for hosts that let the strategies choose it; None: their own."""
-        return None if self._own_background else self.conductor.background(self.t)
+        return None if self._host.own_background else self.conductor.background(self.t)
 
     def hook(self, optimizers: Sequence[torch.optim.Optimizer]) -> None:
         """Hook the steps of these optimizers, and remove the hooks of earlier ones."""
@@ -185,7 +153,7 @@ class Attachment:
     def state_dict(self) -> dict[str, Any]:
         """The iteration and the strategies' state, for the host's checkpoint."""
         if not self.removed:
-            self._follow_structure(len(self.params()["means"]))  # the host may have densified since it rendered
+            self._follow_structure(len(self._host.params()["means"]))  # the host may have densified since it rendered
         return {
             "t": self.t, "passes": self.passes, "strategies": self.conductor.state_dict(),
             "view": None if self._step is None else self._step.view.name, "step": _rows_of(self._step),
@@ -196,10 +164,10 @@ class Attachment:
         """Continue from a state, after the host has loaded its parameters."""
         self.t, self.passes = int(state["t"]), int(state["passes"])
         self.conductor.load_state_dict(state["strategies"])
-        self._restart_parents()
-        self._n = len(self.params()["means"])
+        self._host.restart_parents()
+        self._n = len(self._host.params()["means"])
         if (view := self._views.get(state.get("view") or "")) is not None:  # its `after_step` is still to come
-            rows = {name: x.to(self.params()["means"].device) for name, x in state.get("step", {}).items()}
+            rows = {name: x.to(self._host.params()["means"].device) for name, x in state.get("step", {}).items()}
             evidence = Evidence(rows["reliability"], rows["demand"]) if "demand" in rows else None
             self._step = Step(self.t, view, rows.get("visible"), evidence)
         if self._merging.scaler is not None and state.get("score") is not None:
@@ -228,7 +196,7 @@ class Attachment:
         if has_merged:
             self._merging.fading.before_step()
             return
-        trained = [name for name, p in self.params().items() if p.requires_grad and name != "detail"]
+        trained = [name for name, p in self._host.params().items() if p.requires_grad and name != "detail"]
         cause, remedy = why_nothing_was_merged(self._pending, trained)
         if not self.counts["merges"]:
             raise HostError(
@@ -254,11 +222,13 @@ class Attachment:
         """Call `on_resize` and `after_step`, after the host has stepped and perhaps densified. Passes whose gradients the loop
         dropped before a step, e.g. after an error, do not count.
         """
-        params = self.params()
+        params = self._host.params()
         self._follow_structure(len(params["means"]))
         if not self.passes:
             return
-        has_stepped = self._steps.has_begun or self.passes >= self.accumulation  # a gradient scaler may skip the step
+        has_stepped = (
+            self._steps.has_begun or self.passes >= self._host.accumulation
+        )  # a gradient scaler may skip the step
         if has_stepped:
             if self._step is not None:
                 self.conductor.after_step({name: _to_change(p) for name, p in params.items()}, self._step)
@@ -270,9 +240,9 @@ class Attachment:
 
     def _follow_structure(self, n: int) -> None:
         """Tell the strategies about a change of structure, if there was one; the host has n Gaussians now."""
-        parents = self._poll_parents()
+        parents = self._host.poll_parents()
         if parents is not None or n != self._n:
-            self._step = resized(self.conductor, self._step, self._n, n, parents, self._remedy)
+            self._step = resized(self.conductor, self._step, self._n, n, parents, self._host.remedy)
             self._n = n
             self.counts["structure changes"] += 1
 
@@ -281,7 +251,7 @@ class Attachment:
         if self.removed or self._pending is None:
             return None
         if self._pass is None or self._pass.task != current_pass():
-            self._pass = now = BackwardPass(current_pass(), self.params())
+            self._pass = now = BackwardPass(current_pass(), self._host.params())
             when_pass_ends(lambda: self._on_backward_end(now))
         self._pass.renderings.add(nth)
         return self._pass.take if self._pending.may_take_factors(self._pass.params) else None
@@ -337,7 +307,7 @@ class Attachment:
             "%d backward passes over training views add to the same gradients, without an optimizer step between them, but "
             "accumulation=%d: HR weighs too much, and the schedules of the strategies end too early. Pass accumulation=n, the "
             "number of views in a step, and divide each loss by n.",
-            self.accumulation + 1, self.accumulation,
+            self._host.accumulation + 1, self._host.accumulation,
         )  # fmt: skip
 
 
@@ -356,9 +326,8 @@ def _rows_of(step: Step | None) -> dict[str, Tensor]:
     return visible | ({} if e is None else {"reliability": e.reliability, "demand": e.demand})
 
 
-def _require_supported(conductor: Conductor, accumulation: int) -> None:
+def _require_supported(conductor: Conductor) -> None:
     """Raise a SettingError for settings that no host supports."""
-    require_whole("accumulation", accumulation, least=1)
     if not conductor.wants_lr:
         raise SettingError(
             "objective: a host renders LR itself, so lambda_lr must be > 0 and lr_from must be lr, got "

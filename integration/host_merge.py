@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -17,6 +17,7 @@ from clear_strategies.merging.iteration import HrSide
 from integration.autograd_shot import AutogradShot
 from integration.densification import ScoreScaler, score_for_host
 from integration.detail import Fading
+from integration.host import Host
 from integration.pending import BackwardPass, Pending
 from integration.replayed_merge import ReplayedMerge
 
@@ -25,22 +26,17 @@ class HostMerge:
     """Merges the gradients of a rendering, after one backward pass, or after several with different parameters.
 
     Args:
-        device: of the Gaussians.
-        threshold, loss_scale, accumulation: see `Attachment`. counts: `Attachment.counts`, to which this class adds.
+        device: of the Gaussians. counts: `Attachment.counts`, to which this class adds.
 
     Attributes:
         scaler: of the densification score; None: the score is not scaled.
         fading: of f_det.
     """
 
-    def __init__(
-        self, conductor: Conductor, device: torch.device, *, threshold: float | None, loss_scale: Callable[[], float] | None,
-        accumulation: int, counts: Counter[str],
-    ) -> None:  # fmt: skip
-        self._conductor, self._loss_scale, self._accumulation = conductor, loss_scale, accumulation
-        self._counts = counts
-        self.scaler = None if threshold is None else ScoreScaler(threshold)
-        self.fading = Fading(conductor.detail, accumulation)
+    def __init__(self, conductor: Conductor, host: Host, device: torch.device, counts: Counter[str]) -> None:
+        self._conductor, self._host, self._counts = conductor, host, counts
+        self.scaler = None if host.threshold is None else ScoreScaler(host.threshold)
+        self.fading = Fading(conductor.detail, host.accumulation)
         self._replayed = ReplayedMerge(conductor, device)
 
     def merge(self, pending: Pending, done: BackwardPass, names: Sequence[str], t: int) -> Mapping[str, Number]:
@@ -54,8 +50,7 @@ class HostMerge:
             DivergedError: a merged gradient is not finite, and no gradient scaler would skip the step.
         """
         params, hr, first = {name: done.params[name] for name in names}, pending.hr, not pending.merged
-        # The factor of this pass's gradients; a gradient scaler reads its own from the device.
-        scale = (1.0 if self._loss_scale is None else self._loss_scale()) / self._accumulation
+        scale, skips_steps = self._host.scale(), self._host.loss_scale is not None
         for name, p in params.items():
             if p.grad is not None and p.grad.is_sparse:
                 raise HostError(
@@ -71,7 +66,7 @@ class HostMerge:
                 done.before["detail"] = detail.grad
         conflict = merge_in_place(
             self._conductor, params, pending.routed_of(names, done.params), None if hr is None else hr.step, t,
-            before=done.before, lr_colour=done.colour, scale=scale, must_be_finite=self._loss_scale is None, merge=self._replayed,
+            before=done.before, lr_colour=done.colour, scale=scale, must_be_finite=not skips_steps, merge=self._replayed,
         )  # fmt: skip
         if "detail" in params:
             self._finish_detail(params.pop("detail"), params, t, by_hf=hr is not None and hr.detail is not None)
@@ -98,7 +93,7 @@ class HostMerge:
 
     def _finish_detail(self, detail: Tensor, others: Mapping[str, Tensor], t: int, *, by_hf: bool) -> None:
         """Prepare f_det for the step of the host's optimizer, after its merge."""
-        if self._loss_scale is not None and detail.grad is not None:
+        if self._host.loss_scale is not None and detail.grad is not None:
             # A gradient scaler skips steps by optimizer: f_det's is skipped with the others, as 0 times inf or NaN is NaN.
             for p in others.values():
                 if p.grad is not None:

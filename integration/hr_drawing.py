@@ -25,6 +25,7 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide
 from clear_strategies.merging.recorded_work import RecordedWork, replays_on, why_not_recorded
 from integration.autograd_shot import AutogradShot, HostOutput, Target, every_number, to_parameters
+from integration.host import Host
 from integration.views import enlarged_mask
 from rasterizers.autograd import BackwardHook, Drawing
 from rasterizers.inputs import Inputs
@@ -128,17 +129,15 @@ class HrDrawing:
 
     Args:
         device: of the Gaussians. On CUDA, the work on what this package draws is recorded and replayed.
-        masks, reads_score: see `Attachment`. counts: `Attachment.counts`, to which this class adds.
+        counts: `Attachment.counts`, to which this class adds.
 
     Attributes:
         is_scored: whether a strategy has a densification score that the host's densifier reads.
     """
 
-    def __init__(
-        self, conductor: Conductor, device: torch.device, masks: Mapping[str, Tensor], counts: Counter[str], *, reads_score: bool
-    ) -> None:  # fmt: skip
-        self._conductor, self._masks, self._counts = conductor, masks, counts
-        self.is_scored = reads_score and conductor.owner("score") is not None
+    def __init__(self, conductor: Conductor, host: Host, device: torch.device, counts: Counter[str]) -> None:
+        self._conductor, self._masks, self._counts = conductor, host.masks, counts
+        self.is_scored = host.reads_score and conductor.owner("score") is not None
         self._replays = replays_on(device, conductor.work_log, "the replay of HR")
         if self._replays is not None and (reason := next(why_not_recorded(conductor), None)) is not None:
             self._replays = None

@@ -28,7 +28,7 @@ class Settings:
         points: "own": the Gaussians start as the host makes them; "stereo": from dense stereo between its training photos.
         seed: of the strategies.
         hr_by: what draws HR in a gsplat-style host, see `integration.gsplat.attach`; other hosts draw it themselves.
-        accumulation: see `Attachment`.
+        accumulation: see `integration.host.Host`.
 
     Raises:
         SettingError: `points` is neither of these.

@@ -32,7 +32,7 @@ def resized(
 
     Args:
         before, now: the host's number of Gaussians before and after the change.
-        parents, remedy: see `Attachment`.
+        parents, remedy: see `Host`.
 
     Raises:
         HostError: strategies store something per Gaussian, but it is unknown which Gaussian a new one comes from.

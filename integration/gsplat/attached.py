@@ -26,6 +26,7 @@ from integration.gsplat import calls
 from integration.gsplat.calls import Rasterization
 from integration.gsplat.optimizers import optimizers_of, step_detail
 from integration.gsplat.rows import RowNumbers
+from integration.host import Host
 from integration.hr_drawing import Drawable
 from integration.replacing import replaced_attribute, replaced_everywhere
 from integration.structure import rows_drawn
@@ -54,7 +55,7 @@ class Attached:
         detail: add the detail feature f_det as `params["detail"]`, with an Adam of its own. gsplat's strategies clone,
             split and prune it like any other parameter.
         names: gsplat's parameter name -> the host's, where they differ (nerfstudio: sh0 is features_dc).
-        loss_scale, accumulation: see `Attachment`.
+        loss_scale, accumulation: see `integration.host.Host`.
         masks: [h, w] by the name of a view, by which the host multiplies the LR image after rendering.
         own_background: the loop adds a background to its renderings itself; otherwise strategies may choose the `backgrounds` of
             calls that name none.
@@ -125,11 +126,12 @@ class Attached:
         stop, threshold = (getattr(strategy, name, None) for name in ("refine_stop_iter", "grow_grad2d"))
         require_end(conductor, stop, "refine_stop_iter", first=0)
         warn_if_score_is_unused(conductor, strategy, threshold)
-        self.attachment: Attachment = Attachment(
-            conductor, self.params, views=views, seed=seed, loss_scale=loss_scale, accumulation=accumulation,
-            poll_parents=self._rows.poll, restart_parents=self._rows.restart, threshold=threshold, masks=masks,
-            own_background=own_background, reads_score=threshold is not None, remedy=self._rows.remedy, iterations=iterations,
+        host = Host(
+            self.params, self._rows.poll, restart_parents=self._rows.restart, remedy=self._rows.remedy, threshold=threshold,
+            reads_score=threshold is not None, loss_scale=loss_scale, accumulation=accumulation, masks=masks or {},
+            own_background=own_background, iterations=iterations,
         )  # fmt: skip
+        self.attachment: Attachment = Attachment(conductor, host, views, seed=seed)
         self.attachment.undo.callback(self._rows.remove)
         self._follow_optimizers()
         _MADE.add(self)

@@ -19,6 +19,7 @@ from integration.attachment import Attachment
 from integration.autograd_shot import HostOutput, Target
 from integration.densification import require_end, warn_if_score_is_unused
 from integration.detail import sh0_offset
+from integration.host import Host
 from integration.inria.cameras import HostViews, enlarged_camera, replaced_camera
 from integration.inria.detail import DetailFeature
 from integration.inria.model_proxy import Overrides, host_output, proxy
@@ -56,7 +57,7 @@ class Attached:
         detail: train the detail feature f_det beside the host's parameters.
         own_background: the host chooses the colour behind its renderings (`--random_background`); else the strategies may choose
             another for `bg_color` where that is black.
-        accumulation: see `Attachment`.
+        accumulation: see `integration.host.Host`.
 
     Attributes:
         views: the training views, by name and by camera.
@@ -101,11 +102,11 @@ class Attached:
         self._rows = CarriedRows(gaussians, self._host_params)
         self.detail, self._trains_detail = DetailFeature(lambda: gaussians._xyz, self._rows, conductor.detail), detail
         self._warned: set[str] = set()
-        self.attachment = Attachment(
-            conductor, self.params, views=self.views.all, seed=seed, threshold=threshold, masks=self.views.masks,
-            poll_parents=self.detail.poll_parents, own_background=own_background, accumulation=accumulation,
-            remedy="Nothing has their colour and rotation. End densification first.",
+        host = Host(
+            self.params, self.detail.poll_parents, threshold=threshold, accumulation=accumulation, masks=self.views.masks,
+            own_background=own_background, remedy="Nothing has their colour and rotation. End densification first.",
         )  # fmt: skip
+        self.attachment = Attachment(conductor, host, self.views.all, seed=seed)
         undo = self.attachment.undo
         undo.callback(self._rows.remove)
         undo.enter_context(replaced_methods(gaussians, {

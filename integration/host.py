@@ -1,0 +1,55 @@
+"""What an adapter tells an `Attachment` of a host, the trainer that stays as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from jaxtyping import Int
+from torch import Tensor
+
+from clear_strategies.core.checks import require_whole
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Host:
+    """A trainer, as its adapter describes it.
+
+    Args:
+        params: returns the leaves that the host optimizes, by gsplat's names (and "detail"). It is called at every
+            iteration, since densifiers replace parameters.
+        poll_parents: called at every iteration. It returns parents[M] if the structure has changed since its last call (row i of
+            every parameter now comes from row parents[i], or from none if that is -1); None: it has not, or the host does not
+            say how.
+        restart_parents: called after the host has loaded other parameters, which come from no earlier ones.
+        remedy: for the error if strategies store something per Gaussian, but some Gaussians come from no other.
+        threshold: the densification threshold on the mean ‖∇_u‖ in NDC units; None: the score is not scaled.
+        reads_score: the densifier reads the screen gradient.
+        loss_scale: returns the factor of the loss (`scaler.get_scale` of an AMP gradient scaler).
+        accumulation: backward passes per optimizer step, each of 1/accumulation of the loss.
+        masks: [h, w] by the name of a view, by which the host multiplies its LR image; the HR image is multiplied here.
+        own_background: the host chooses the colour behind its renderings, and `Attachment.background` has no effect.
+        iterations: of the loop, if they are known.
+
+    Raises:
+        SettingError: `accumulation` is not a whole number >= 1.
+    """
+
+    params: Callable[[], Mapping[str, Tensor]]
+    poll_parents: Callable[[], Int[Tensor, " M"] | None]
+    restart_parents: Callable[[], None] = lambda: None
+    remedy: str = "End densification first."
+    threshold: float | None = None
+    reads_score: bool = True
+    loss_scale: Callable[[], float] | None = None
+    accumulation: int = 1
+    masks: Mapping[str, Tensor] = field(default_factory=dict)
+    own_background: bool = True
+    iterations: int | None = None
+
+    def __post_init__(self) -> None:
+        require_whole("accumulation", self.accumulation, least=1)
+
+    def scale(self) -> float:
+        """The factor of the gradients of one backward pass. A gradient scaler reads its own from the device."""
+        return (1.0 if self.loss_scale is None else self.loss_scale()) / self.accumulation
