@@ -34,6 +34,7 @@ class HrSide:
         size: (width, height) of the image in whose pixels `.screen` counts.
         step: the iteration, with the answer of `observe`. m: the answer of `route`, [N] or 1.
         losses: L_base and L_HF by name.
+        lr: ∇(λ_LR L_LR), if it passes through the HR render; else None.
     """
 
     g: Grads
@@ -42,6 +43,7 @@ class HrSide:
     step: Step
     m: float | Float[Tensor, " N"] = 1.0
     losses: Mapping[str, Scalar] = field(default_factory=dict)
+    lr: Grads | None = None
 
     @property
     def routed(self) -> Grads:

@@ -1,0 +1,243 @@
+"""The hooks of a run's strategies: which strategy answers each, and its answer, checked."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Final
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from clear_strategies.core.conflicts import Products, Weights
+from clear_strategies.core.gradients import Grads, Shot
+from clear_strategies.core.step import Step
+from clear_strategies.core.view import ExtraView, Photo, View
+from clear_strategies.core.work_log import WorkLog
+from clear_strategies.errors import StrategyConflict
+from clear_strategies.merging.logs import IterationLogs
+from clear_strategies.merging.objective import Objective
+from clear_strategies.strategies import answers
+from clear_strategies.strategies.base import LAMBDA_HR, ScreenGradients, Strategy, by_class, misspelled, overrides
+from rasterizers.guards import iteration
+from rasterizers.interface import Camera, Color
+from rasterizers.modes import apart_from_the_loop
+
+_log = logging.getLogger(__name__)
+
+_ONE_ANSWER: Final = ("densifier", "background", "gate", "observe", "route", "reconcile", "score")
+_ALL_ANSWER: Final = ("regularize", "draw", "extra_views", "may_densify", "after_step")
+_ALSO_BY: Final = {"reconcile": ("correct",)}  # hooks that may be overridden instead
+
+
+class Hooks:
+    """Calls the strategies, in the order of the methods. It knows no loss and merges nothing; `Conductor` does.
+
+    Args:
+        strategies: in any order, which has no effect.
+        objective: the losses and their weights.
+
+    Attributes:
+        regularizers: the strategies that override `regularize`.
+        showing: the strategies that override `extra_views`.
+        views: the argument of `on_fit_start`.
+        logs: the scalars that the strategies log.
+        work_log: which work was done, and which was skipped.
+
+    Raises:
+        StrategyConflict: two strategies answer a question that only one may.
+    """
+
+    def __init__(self, strategies: Sequence[Strategy], objective: Objective) -> None:
+        self.strategies = tuple(strategies)
+        self.objective = objective
+        self.views: tuple[View, ...] = ()
+        self.logs = IterationLogs(strategies)
+        self.work_log = WorkLog()
+        self.regularizers = [s for s in strategies if overrides(s, "regularize")]
+        self.showing = [s for s in strategies if overrides(s, "extra_views")]
+        self._answering = {hook: _only(strategies, hook) for hook in _ONE_ANSWER}
+        for s in strategies:
+            if not any(overrides(s, hook) for hook in (*_ONE_ANSWER, "correct", *_ALL_ANSWER)):
+                _log.warning("%s implements no hook; it has no effect.", type(s).__name__)
+            for hook, name in misspelled(type(s)).items():
+                _log.warning("%s.%s() is no hook: nothing calls it. There is %s().", type(s).__name__, name, hook)
+
+    def owner(self, hook: str) -> Strategy | None:
+        """The strategy that answers a hook which only one may answer; None: no strategy does."""
+        s = self._answering[hook]
+        return None if type(s) is Strategy else s
+
+    @apart_from_the_loop
+    def on_fit_start(
+        self, n_views: int, seed: int, device: torch.device | str = "cpu", views: Sequence[View] = ()
+    ) -> None:
+        """Once, before the first iteration.
+
+        Args:
+            device: of the field. views: all training views, where the caller has them.
+        """
+        self.work_log.device, self.views = torch.device(device), tuple(views)
+        for s in self.strategies:
+            s.on_fit_start(n_views, seed)
+            answers.require_started(s, seed)
+            s.to(device)
+            s.cache[LAMBDA_HR] = self.objective.lambda_hr
+            if overrides(s, "on_views"):
+                with self.work_log.stage("views prepared"):
+                    s.on_views(views)
+
+    @apart_from_the_loop
+    def gate(self, t: int, n: int) -> Float[Tensor, " N"] | Float[Tensor, "2 N"] | None:
+        """zᵗ, before render; None: every Gaussian takes part."""
+        s = self._answering["gate"]
+        z = s.gate(t, n)
+        answers.require_gate(s, z, n)
+        if z is None and self.owner("gate") is not None:
+            self.work_log.skip("gate", "no Gaussian is dropped at this rate")
+        return None if z is None else z.detach().float()  # kernels read no other type
+
+    def background(self, t: int) -> Color | None:
+        """The colour behind every rendering of iteration t; None: the scene's own."""
+        s = self._answering["background"]
+        color = s.background(t)
+        answers.require_background(s, color)
+        return color
+
+    def looked_up(self, view: View) -> Tensor | None:
+        """`Strategy.looked_up` of the strategy that observes, for `Step.looked_up`."""
+        return self._answering["observe"].looked_up(view)
+
+    def observed(self, step: Step, hr: Shot) -> Step:
+        """The step with the evidence q, a, w of the HR render.  Eq. 9, 10"""
+        s = self._answering["observe"]
+        evidence = s.observe(step, hr)
+        answers.require_evidence(s, evidence, len(hr.visible))
+        return replace(step, evidence=evidence)
+
+    def route(self, step: Step, n: int) -> float | Float[Tensor, " N"]:
+        """m, how much of its high-frequency gradient each of the n Gaussians gets.  Eq. 12"""
+        s = self._answering["route"]
+        m = s.route(step)
+        answers.require_route(s, m, n)
+        return m
+
+    def score(self, step: Step, screen: ScreenGradients) -> Float[Tensor, " N"]:
+        """The densification score; the ordinary one where no strategy has another.  Eq. 14"""
+        s = self._answering["score"]
+        score = s.score(step, screen)
+        answers.require_score(s, score, len(screen.ordinary))
+        return screen.ordinary if score is None else score
+
+    def reconciled(
+        self, products: Products, step: Step | None, both: Callable[[], tuple[Grads, Grads]], *, finite: bool = False
+    ) -> Weights | Grads:  # fmt: skip
+        """How the strategies reconcile g_HR with g_LR: the weights of `reconcile`, or ĝ_HR if one overrides `correct`.
+
+        Args:
+            both: returns g_LR and g^HR in full, which only `correct` needs.
+            finite: check also that the answer is finite.
+
+        Raises:
+            AnswerError: the answer is not valid.
+        """
+        s = self._answering["reconcile"]
+        if overrides(s, "correct"):
+            g_lr, g_hr = both()
+            return answers.corrected(s, s.correct(g_lr, g_hr, step), g_hr, finite=finite)
+        weights = s.reconcile(products, step)
+        answers.require_weights(s, weights, *products.dot.shape, finite=finite)
+        return weights
+
+    def regularized(self, params: Mapping[str, Tensor], t: int, *, finite: bool = False) -> Grads:
+        """What the strategies add to the merged gradient; empty: nothing.  Eq. 16
+
+        Args:
+            finite: check also that the answers are finite.
+        """
+        total = Grads()
+        for s in self.regularizers:
+            g = answers.regularized(s, s.regularize(params, iteration(t)), params, finite=finite)
+            if g is None:
+                self.work_log.skip("regularize", "no anchor yet")
+            else:
+                total = g if not total else total + g
+        return total
+
+    @apart_from_the_loop
+    def pulls(self, params: Mapping[str, Tensor], t: int) -> bool:
+        """Whether a strategy adds a gradient at t, which moves even Gaussians that no view draws."""
+        return any(s.regularize(params, t) is not None for s in self.regularizers)
+
+    @apart_from_the_loop
+    def draw(self, t: int, means: Float[Tensor, "N 3"], enlarged: Callable[[Camera, int], Photo]) -> None:
+        """Let the strategies render the field, before `extra_views`."""
+        for s in self.strategies:
+            s.draw(t, means, enlarged)
+
+    @apart_from_the_loop
+    def extra_views(self, t: int) -> list[ExtraView]:
+        """The pictures that the field should match at t in addition to the view; each gets a step on the LR loss."""
+        if self.objective.lambda_lr == 0 or not self.showing:
+            return []
+        with self.work_log.stage("pictures of extra views"):  # a pseudo view is made when it is first asked for
+            return [extra for s in self.showing for extra in answers.extra_views(s, s.extra_views(t))]
+
+    @apart_from_the_loop
+    def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
+        """After the optimizer steps of an iteration."""
+        params = MappingProxyType(params)  # to replace an entry would have no effect
+        for s in self.strategies:
+            s.after_step(params, step)
+            answers.require_state(s, params)
+
+    def may_densify(self, t: int) -> bool:
+        return all(s.may_densify(t) for s in self.strategies)
+
+    @apart_from_the_loop
+    def on_resize(self, parents: Int[Tensor, " M"]) -> None:
+        for s in self.strategies:
+            s.on_resize(parents)
+
+    def on_fit_end(self) -> None:
+        """Once, after the last iteration."""
+        self.views = ()
+        for s in self.strategies:
+            s.on_fit_end()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Every strategy's per-Gaussian tensors, as "<class>.<name>" ("<class>2.<name>" for a second of one class)."""
+        return {
+            f"{owner}.{name}": rows for owner, s in by_class(self.strategies).items() for name, rows in s.state.items()
+        }
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Give each strategy its tensors back.
+
+        Raises:
+            ValueError: a tensor belongs to no strategy of this conductor.
+        """
+        by_name = by_class(self.strategies)
+        for s in self.strategies:
+            s.state.clear()
+        for key, rows in tensors.items():
+            owner, _, name = key.partition(".")
+            if owner not in by_name:
+                raise ValueError(f"state {key!r} belongs to no strategy of this run ({', '.join(by_name) or 'none'}).")
+            by_name[owner].state[name] = rows.to(by_name[owner].device, copy=True)
+
+
+def _only(strategies: Sequence[Strategy], hook: str) -> Strategy:
+    """The one strategy that answers the hook, or `Strategy` itself with its default."""
+    hooks = [hook, *_ALSO_BY.get(hook, ())]
+    owners = [s for s in strategies if any(overrides(s, name) for name in hooks)]
+    if len(owners) > 1:
+        first, second = (type(s).__name__ for s in owners[:2])
+        raise StrategyConflict(
+            f"{first} and {second} both implement {'() or '.join(hooks)}(); exactly one strategy may. Remove one, or write a "
+            "strategy that combines them."
+        )
+    return owners[0] if owners else Strategy()
