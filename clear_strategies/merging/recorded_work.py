@@ -14,7 +14,7 @@ from clear_strategies.core import deferred
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.strategies.base import Strategy, describes, overrides
+from clear_strategies.strategies.base import Strategy, overrides
 from rasterizers.guards import Guarded
 from rasterizers.recording import Recording
 from rasterizers.replays import Recorded, Replays, can_record
@@ -117,9 +117,10 @@ def replays_on(device: torch.device, work_log: WorkLog, name: str) -> Replays | 
 
 
 def why_not_recorded(conductor: Conductor) -> Iterator[str]:
-    """A reason for each strategy that may depend on more of the view than it states."""
-    for strategy in conductor.strategies:
-        if any(overrides(strategy, hook) for hook in ("observe", "route", "score")) and not describes(
-            strategy, "looked_up"
-        ):
-            yield f"{type(strategy).__name__} does not state what it looks up of a view"
+    """A reason for each strategy that may depend on more of a view than `looked_up` returns. A class that overrides it speaks for
+    its own hooks, and not for those that a subclass overrides.
+    """
+    for cls in map(type, conductor.strategies):
+        stated_by: Any = next(base for base in cls.__mro__ if "looked_up" in vars(base))
+        if any(getattr(cls, hook) is not getattr(stated_by, hook) for hook in ("observe", "route", "score")):
+            yield f"{cls.__name__} does not state what it looks up of a view"

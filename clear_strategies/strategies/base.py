@@ -226,8 +226,10 @@ class Strategy:
         return None
 
     def looked_up(self, view: View) -> Tensor | None:
-        """All that `observe` and `route` read of a view, as a tensor. It allows iterations to be recorded: a replay passes it as
-        `Step.looked_up`. They and `score` must then depend on view and iteration only by it and by their arguments.
+        """All that `observe`, `route` and `score` know of a view, as one tensor, e.g. P2G's patch maps; None: they read the view.
+
+        On a GPU, iterations are then recorded. A replay is for another view: it copies the tensor of that view to where the
+        recorded hooks read, which is `Step.looked_up`. A subclass that overrides one of the three hooks overrides this one, too.
         """
         return None
 
@@ -282,20 +284,6 @@ def misspelled(cls: type[Strategy]) -> dict[str, str]:
         if name[0] != "_" and not hasattr(Strategy, name):
             found |= dict.fromkeys(get_close_matches(name, hooks, n=1, cutoff=_ALIKE), name)
     return found
-
-
-def describes(strategy: Strategy, fact: str) -> bool:
-    """Whether `fact` ("looked_up") holds for the strategy's class.
-
-    The class that defines it states it for its own methods. A subclass that overrides one of these must define it anew.
-    """
-    cls = type(strategy)
-    stated_by = next(base for base in cls.__mro__ if fact in vars(base))
-    return stated_by is not Strategy and all(
-        getattr(cls, name) is method
-        for name, method in inspect.getmembers(stated_by, inspect.isfunction)
-        if not name.startswith("__") or name == "__post_init__"  # others are the dataclass decorator's
-    )
 
 
 def by_class(strategies: Sequence[Strategy]) -> dict[str, Strategy]:

@@ -68,8 +68,9 @@ class P2G(Strategy):
 
     def observe(self, step: Step, hr: Shot) -> Evidence:
         """q_i and a_i of every Gaussian that is visible in this view."""
-        visible, maps = hr.visible, self.looked_up(step.view) if step.looked_up is None else step.looked_up
-        e = per_gaussian.evidence(maps, hr.means2d, visible, self.patch * step.view.factor)  # R and A at p(u_i)  Eq. 10
+        maps = self.looked_up(step.view) if step.looked_up is None else step.looked_up
+        edge, visible = self.patch * step.view.factor, hr.visible
+        e = per_gaussian.evidence(maps, hr.means2d, visible, edge)  # R and A at p(u_i)  Eq. 10
         self.log("mean_q", lambda: e.means(visible)[0])
         self.log("mean_w", lambda: e.means(visible)[1])
         return e
