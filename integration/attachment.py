@@ -119,10 +119,10 @@ class Attachment:
             z = z.to(means)
         # HR and extra views leave torch's random numbers as they were, so a dropout of the host drops the same at LR.
         apart = torch.random.fork_rng([means.device] if means.device.type == "cuda" else [])(render_at)
-        hr = routed = None
+        hr = None
         if self._hr.wanted(t):
             view = conductor.skips.view(view, t)
-            hr, routed = self._hr.hr(view, t, z, apart, params)
+            hr = self._hr.hr(view, t, z, apart, params)
         self._step = Step(t, view, params=params) if hr is None else hr.step
         if self.passes == 0:  # once per step of the host, however many passes it accumulates
             extra_views = conductor.extra_views(t)
@@ -137,7 +137,7 @@ class Attachment:
                 "parameters."
             )
         self.counts["LR renders"] += 1
-        self._pending = Pending(self.counts["LR renders"], view.name, output, hr, routed)
+        self._pending = Pending(self.counts["LR renders"], view.name, output, hr)
         self._pending.listen(WeakMethod(self._reached), to_screen=hr is not None and self._hr.is_scored)
         return output.returned
 
@@ -274,7 +274,7 @@ class Attachment:
         if names or not (trained or pending.merged):
             self._merge(pending, done, names)
         if pending.merged >= trained:
-            pending.output = pending.hr = pending.routed = None
+            pending.output = pending.hr = None
 
     def _merge(self, pending: Pending, done: BackwardPass, names: Sequence[str]) -> None:
         first = not pending.merged

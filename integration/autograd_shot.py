@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, NamedTuple
 
 import torch
@@ -106,10 +106,14 @@ class AutogradShot:
         return self.drawings[0] if len(self.drawings) == 1 else None
 
     @property
+    def inputs(self) -> Mapping[str, Tensor] | None:
+        """The tensors by whose names `gradients` are; None: the raw parameters."""
+        return self.drawn if self.drawing is None else self.drawing.inputs
+
+    @property
     def is_in_order(self) -> bool:
         """Whether the rasterizer's rows are in the order of the parameters, see `are_in_order`."""
-        drawn = self.drawn if self.drawing is None else self.drawing.inputs
-        return drawn is None or are_in_order(drawn, self.params)
+        return self.inputs is None or are_in_order(self.inputs, self.params)
 
     @property
     def gradient_slot(self) -> ScreenGradientSlot:
@@ -118,10 +122,8 @@ class AutogradShot:
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
         """∇θ of every cotangent, each with `.screen`; the graph is kept. Frozen parameters have gradient 0."""
-        return [
-            Grads(every_number(self._raw(g) + self._detail(g), self.params), screen=g.screen)
-            for g in self.gradients(cotangents)
-        ]
+        parts = [(g, to_parameters(g, self.inputs, self.params)) for g in self.gradients(cotangents)]
+        return [Grads(every_number(raw + self._detail(g), self.params), screen=g.screen) for g, raw in parts]
 
     def gradients(
         self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
@@ -152,19 +154,6 @@ class AutogradShot:
             results.append(Grads(values, screen=slot.per_gaussian(screen, len(self.visible))))
         return results
 
-    def routed(self, hr: HrSide) -> Grads:
-        """g^HR of the raw parameters, and the gradient of f_det."""
-        g = self._raw(hr.g)
-        return Grads({**g, **(hr.detail or {})}, colour=g.colour) if "detail" in self.params else g
-
-    def _raw(self, g: Grads) -> Grads:
-        """The second part, without f_det."""
-        if self.drawing is not None:
-            return to_parameters(g, self.drawing.inputs, self.params)
-        if self.drawn is not None:
-            return to_parameters(g, self.drawn, self.params)
-        return Grads({name: g[name] for name in _trained(self.params)})  # which hooks may have changed
-
     def _detail(self, g: Grads) -> Grads:
         """The gradient of f_det, which is that of the colour."""
         if "detail" not in self.params:
@@ -184,13 +173,29 @@ class AutogradShot:
         return torch.stack([torch.autograd.grad(image, drawn, c, retain_graph=True)[0] for c in cotangents])
 
 
-def to_parameters(g: Grads, drawn: Mapping[str, Tensor], params: Mapping[str, Tensor]) -> Grads:
+def side_of_parameters(hr: HrSide, drawn: Mapping[str, Tensor] | None, params: Mapping[str, Tensor]) -> HrSide:
+    """The HR side with the gradients of the raw parameters in place of those of the drawn tensors, each with its `.screen`.
+
+    Args:
+        params: without "detail", f_det has no gradient.
+    """
+    g, detail = to_parameters(hr.g, drawn, params), hr.detail
+    g.screen = hr.g.screen
+    if detail is not None and "detail" not in params:
+        detail = Grads(screen=detail.screen)
+    return replace(hr, g=g, detail=detail)
+
+
+def to_parameters(g: Grads, drawn: Mapping[str, Tensor] | None, params: Mapping[str, Tensor]) -> Grads:
     """The gradients of the raw parameters, without f_det, from those of the drawn tensors, through the host's own graph.
 
     Args:
         g: by the names of `drawn`; the colours' gradient as factors if this package drew them. It stays so if `are_joined`.
+        drawn: None: the raw parameters.
     """
     raw, colour = _trained(params), None
+    if drawn is None:
+        return Grads({name: g[name] for name in raw})  # which hooks may have changed
     if g.colour is not None:
         if are_joined(drawn["colors"], params):
             colour = g.colour

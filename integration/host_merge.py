@@ -64,8 +64,10 @@ class HostMerge:
             params["detail"] = detail
             if detail.grad is not None:  # the host's own gradient of it stays
                 done.before["detail"] = detail.grad
+        λ = self._conductor.objective.lambda_hr(t)
+        g_hr = pending.routed_of(names, done.params) if λ > 0 else None
         conflict = merge_in_place(
-            self._conductor, params, pending.routed_of(names, done.params), None if hr is None else hr.step, t,
+            self._conductor, params, g_hr, None if hr is None else hr.step, t,
             before=done.before, lr_colour=done.colour, scale=scale, must_be_finite=not skips_steps, merge=self._replayed,
         )  # fmt: skip
         if "detail" in params:

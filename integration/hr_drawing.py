@@ -24,7 +24,7 @@ from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide
 from clear_strategies.merging.recorded_work import RecordedWork, replays_on, why_not_recorded
-from integration.autograd_shot import AutogradShot, HostOutput, Target, every_number, to_parameters
+from integration.autograd_shot import AutogradShot, HostOutput, Target, every_number, side_of_parameters, to_parameters
 from integration.host import Host
 from integration.views import enlarged_mask
 from rasterizers.autograd import BackwardHook, Drawing
@@ -151,15 +151,13 @@ class HrDrawing:
 
     def hr(
         self, view: View, t: int, gate: Float[Tensor, " N"] | None, render_at: RenderAt, params: Mapping[str, Tensor]
-    ) -> tuple[HrSide, Grads | None]:
-        """The gradients of HR, and the same with respect to the raw parameters if HR takes part in the merge."""
+    ) -> HrSide:
+        """The gradients of HR, of the raw parameters if HR takes part in the merge."""
         self._counts["HR renders"] += 1
         conductor, mask, drawn = self._conductor, self._masks.get(view.name), render_at("hr", gate, view)
-        merges = conductor.objective.lambda_hr(t) > 0
         fine = None if mask is None else enlarged_mask(mask.to(params["means"]), view.factor)[..., None]
         if isinstance(drawn, Drawable):
-            hr, routed = self._own_hr(drawn, view, t, fine)
-            return hr, routed if merges else None
+            return self._own_hr(drawn, view, t, fine)
         shot = drawn.shot
         if (n := len(shot.drawings)) > 1:
             self._counts["HR renders in parts"] += 1
@@ -173,7 +171,7 @@ class HrDrawing:
             shot = replace(shot, image=shot.image * fine.to(shot.image))
         apart = shot.drawing is not None or "detail" in shot.params
         hr = conductor.hr_gradients(shot, view, t, AutogradShot.gradients, apart=apart, params=params)
-        return hr, shot.routed(hr) if merges else None
+        return side_of_parameters(hr, shot.inputs, shot.params) if conductor.objective.lambda_hr(t) > 0 else hr
 
     def extra_view(self, extra: ExtraView, view: View, t: int, render_at: RenderAt) -> Grads:
         """The gradient of an extra view, which is drawn without gate and f_det."""
@@ -185,30 +183,25 @@ class HrDrawing:
 
     @in_full_precision
     @torch.no_grad()
-    def _own_hr(
-        self, asked: Drawable, view: View, t: int, mask: Float[Tensor, "H W 1"] | None
-    ) -> tuple[HrSide, Grads]:  # fmt: skip
-        """As `hr`, drawn by this package; g^HR also where HR takes no part in the merge."""
+    def _own_hr(self, asked: Drawable, view: View, t: int, mask: Float[Tensor, "H W 1"] | None) -> HrSide:
+        """As `hr`, drawn by this package."""
         conductor = self._conductor
         photo = view.hr.over(conductor.background(t), view.background)
         looked_up = None if self._replays is None else conductor.looked_up(view)
         inputs = _RenderInputs(asked.inputs, asked.background, asked.camera, photo, looked_up, None, mask)
 
-        def work(inputs: _RenderInputs) -> tuple[tuple[HrSide, Grads], dict[str, Number]]:
+        def work(inputs: _RenderInputs) -> tuple[HrSide, dict[str, Number]]:
             shown = view if inputs.photo is photo else replace(view, hr=inputs.photo)
             shot = inputs.shot(asked)
             hr = conductor.hr_gradients(shot, shown, t, AutogradShot.gradients, looked_up=inputs.looked_up)
-            return (hr, hr.g if asked.offset is None else hr.routed), {**hr.losses}  # Eq. 9, 10, 12, 13
+            return hr, {**hr.losses}  # Eq. 9, 10, 12, 13
 
-        (hr, g), losses = self._done(asked, inputs, t, ("hr", view.factor), work)
+        hr, losses = self._done(asked, inputs, t, ("hr", view.factor), work)
         params = {name: p.detach() for name, p in asked.params.items()}
         losses = {name: x.vector[x.k] if isinstance(x, Element) else x for name, x in losses.items()}
         step = hr.step if self._replays is None else hr.step.copied()
         hr = replace(hr, step=replace(step, t=t, view=view, params=params), losses=losses)
-        routed = to_parameters(g, asked.drawn, asked.params)
-        if "detail" in g:
-            routed["detail"] = g["detail"]
-        return hr, routed
+        return side_of_parameters(hr, asked.drawn, asked.params)
 
     @in_full_precision
     @torch.no_grad()

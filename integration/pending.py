@@ -70,7 +70,7 @@ class Pending:
 
     Args:
         nth: its number. output: None once all trained parameters are merged.
-        hr: the gradients of HR. routed: the same of the raw parameters. None if HR takes no part.
+        hr: the gradients of HR; None: HR takes no part.
         screen: the screen gradient of LR by the number of its pass, if a densifier reads it.
         merged: the parameters whose gradients are merged.
     """
@@ -79,7 +79,6 @@ class Pending:
     view: str
     output: HostOutput | None
     hr: HrSide | None
-    routed: Grads | None
     screen: dict[int, Tensor] = field(default_factory=dict)
     merged: set[str] = field(default_factory=set)
 
@@ -119,10 +118,10 @@ class Pending:
             return False
         return are_joined(drawing.inputs["colors"], params) and are_accumulated(params)
 
-    def routed_of(self, names: Iterable[str], params: Mapping[str, Tensor]) -> Grads | None:
+    def routed_of(self, names: Iterable[str], params: Mapping[str, Tensor]) -> Grads:
         """g^HR of these parameters only, and the gradient of f_det."""
-        g, wanted = self.routed, {*names, "detail"}
-        if g is None or wanted.issuperset(params):
+        g, wanted = Grads() if self.hr is None else self.hr.routed, {*names, "detail"}
+        if wanted.issuperset(params):
             return g
         if g.colour is not None:
             bands = {name: params[name].detach() for name in ("sh0", "shN")}
