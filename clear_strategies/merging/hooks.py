@@ -94,8 +94,7 @@ class Hooks:
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | Float[Tensor, "2 N"] | None:
         """zᵗ, before render; None: every Gaussian takes part."""
         s = self._answering["gate"]
-        z = s.gate(t, n)
-        answers.require_gate(s, z, n)
+        z = answers.gate(s, s.gate(t, n), n)
         if z is None and self.owner("gate") is not None:
             self.work_log.skip("gate", "no Gaussian is dropped at this rate")
         return None if z is None else z.detach().float()  # kernels read no other type
@@ -103,9 +102,7 @@ class Hooks:
     def background(self, t: int) -> Color | None:
         """The colour behind every rendering of iteration t; None: the scene's own."""
         s = self._answering["background"]
-        color = s.background(t)
-        answers.require_background(s, color)
-        return color
+        return answers.background(s, s.background(t))
 
     def looked_up(self, view: View) -> Tensor | None:
         """`Strategy.looked_up` of the strategy that observes, for `Step.looked_up`."""
@@ -114,22 +111,17 @@ class Hooks:
     def observed(self, step: Step, hr: Shot) -> Step:
         """The step with the evidence q, a, w of the HR render.  Eq. 9, 10"""
         s = self._answering["observe"]
-        evidence = s.observe(step, hr)
-        answers.require_evidence(s, evidence, len(hr.visible))
-        return replace(step, evidence=evidence)
+        return replace(step, evidence=answers.evidence(s, s.observe(step, hr), len(hr.visible)))
 
     def route(self, step: Step, n: int) -> float | Float[Tensor, " N"]:
         """m, how much of its high-frequency gradient each of the n Gaussians gets.  Eq. 12"""
         s = self._answering["route"]
-        m = s.route(step)
-        answers.require_route(s, m, n)
-        return m
+        return answers.route(s, s.route(step), n)
 
     def score(self, step: Step, screen: ScreenGradients) -> Float[Tensor, " N"]:
         """The densification score; the ordinary one where no strategy has another.  Eq. 14"""
         s = self._answering["score"]
-        score = s.score(step, screen)
-        answers.require_score(s, score, len(screen.ordinary))
+        score = answers.score(s, s.score(step, screen), len(screen.ordinary))
         return screen.ordinary if score is None else score
 
     def reconciled(
@@ -148,9 +140,7 @@ class Hooks:
         if overrides(s, "correct"):
             g_lr, g_hr = both()
             return answers.corrected(s, s.correct(g_lr, g_hr, step), g_hr, finite=finite)
-        weights = s.reconcile(products, step)
-        answers.require_weights(s, weights, *products.dot.shape, finite=finite)
-        return weights
+        return answers.weights(s, s.reconcile(products, step), *products.dot.shape, finite=finite)
 
     def regularized(self, params: Mapping[str, Tensor], t: int, *, finite: bool = False) -> Grads:
         """What the strategies add to the merged gradient; empty: nothing.  Eq. 16

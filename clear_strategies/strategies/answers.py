@@ -1,4 +1,4 @@
-"""Checks of the strategies' answers. Each error names the strategy, the hook, the rule, and what was found.
+"""Checks of the strategies' answers, by hook; each returns the answer. An error names strategy, hook, rule, and what was found.
 
 Types and shapes are checked, and with `finite` also numbers in the CPU's memory; to read those of a device, the host would wait.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from numbers import Real
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import torch
 from torch import Tensor
@@ -22,6 +22,8 @@ from clear_strategies.core.gradients import Grads
 from clear_strategies.core.view import ExtraView
 from clear_strategies.errors import AnswerError
 from clear_strategies.strategies.base import Strategy
+
+T = TypeVar("T")
 
 
 def require_started(s: Strategy, seed: int) -> None:
@@ -47,65 +49,67 @@ def require_state(s: Strategy, params: Mapping[str, Tensor]) -> None:
             )
 
 
-def require_gate(s: Strategy, z: Any, n: int) -> None:
+def gate(s: Strategy, z: T, n: int) -> T:
     shape = (n,) if s.shares_gate else (2, n)
     if z is not None and not _is_real(z, shape):
         scales = "" if s.shares_gate else ", a row for LR and one for HR,"
         _refuse(s, "gate", f"a tensor {[*shape]}{scales} or None", z)
     _require_numbers(s, "gate", "z", z)
+    return z
 
 
-def require_background(s: Strategy, color: Any) -> None:
+def background(s: Strategy, color: T) -> T:
     if color is not None and not is_color(color):
         _refuse(s, "background", "three numbers in [0, 1] or None", color)
+    return color
 
 
-def require_evidence(s: Strategy, e: Any, n: int) -> None:
-    if e is None:
-        return
-    if not isinstance(e, Evidence):
+def evidence(s: Strategy, e: T, n: int) -> T:
+    if not (e is None or isinstance(e, Evidence)):
         _refuse(s, "observe", "an Evidence or None", e)
-    for name in ("reliability", "demand"):
+    for name in () if e is None else ("reliability", "demand"):
         if not _is_real(getattr(e, name), (n,)):
             _refuse(s, "observe", f"an Evidence whose {name} is a tensor [{n}]", getattr(e, name))
+    return e
 
 
-def require_route(s: Strategy, m: Any, n: int) -> None:
+def route(s: Strategy, m: T, n: int) -> T:
     if not (isinstance(m, Real) or _is_real(m, (n,))):
         _refuse(s, "route", f"a number or a tensor [{n}]", m)
     if not isinstance(m, Tensor):
         _require_finite(s, "route", {"m": m})
+    return m
 
 
-def require_weights(s: Strategy, weights: Any, n: int, groups: int, *, finite: bool) -> None:
-    if not isinstance(weights, Weights):
-        _refuse(s, "reconcile", "Weights(keep, remove)", weights)
-    for name, w in weights._asdict().items():
+def weights(s: Strategy, answer: Any, n: int, groups: int, *, finite: bool) -> Weights:
+    if not isinstance(answer, Weights):
+        _refuse(s, "reconcile", "Weights(keep, remove)", answer)
+    for name, w in answer._asdict().items():
         if not (isinstance(w, Real) or _is_real(w, (), (n,), (n, groups))):
             _refuse(s, "reconcile", f"Weights whose {name} is a number or a tensor [{n}] or [{n}, {groups}]", w)
     if finite:
-        _require_finite(s, "reconcile", weights._asdict())
+        _require_finite(s, "reconcile", answer._asdict())
+    return answer
 
 
 def corrected(s: Strategy, answer: Any, g_hr: Mapping[str, Tensor], *, finite: bool) -> Grads:
-    """The answer of `correct`, by attributes of g_HR; those that it leaves out are 0."""
+    """By attributes of g_HR; those that it leaves out are 0."""
     return _rows_like(s, "correct", answer, g_hr, "of g_HR", finite)
 
 
 def regularized(s: Strategy, answer: Any, params: Mapping[str, Tensor], *, finite: bool) -> Grads | None:
-    """The answer of `regularize`."""
     return None if answer is None else _rows_like(s, "regularize", answer, params, "of the parameters", finite)
 
 
-def require_score(s: Strategy, score: Any, n: int) -> None:
-    """Check the numbers, too: a Gaussian whose score is NaN never grows."""
-    if score is not None and not _is_real(score, (n,)):
-        _refuse(s, "score", f"a tensor [{n}] or None", score)
-    _require_finite(s, "score", {"S": score})
+def score(s: Strategy, answer: T, n: int) -> T:
+    """Its numbers are always checked: a Gaussian whose score is NaN never grows."""
+    if answer is not None and not _is_real(answer, (n,)):
+        _refuse(s, "score", f"a tensor [{n}] or None", answer)
+    _require_finite(s, "score", {"S": answer})
+    return answer
 
 
 def extra_views(s: Strategy, answer: Any) -> list[ExtraView]:
-    """The answer of `extra_views`."""
     extras = [*answer] if isinstance(answer, Iterable) else _refuse(s, "extra_views", "a sequence of ExtraView", answer)
     for extra in extras:
         if not isinstance(extra, ExtraView):
@@ -131,7 +135,7 @@ def _may_be_finite(x: Any) -> bool:
     return not isinstance(x, Real) or math.isfinite(x)
 
 
-def _require_numbers(s: Strategy, hook: str, name: str, x: Tensor | None) -> None:
+def _require_numbers(s: Strategy, hook: str, name: str, x: Any) -> None:
     """Finite numbers >= 0."""
     if x is None or x.numel() == 0 or not deferred.is_immediate(x):
         return
