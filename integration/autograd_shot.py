@@ -18,7 +18,7 @@ from integration.structure import rows_drawn
 from rasterizers.autograd import Drawing, Rendered, outer
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, summed_vjp
-from rasterizers.torch_internals import is_hooked
+from rasterizers.torch_internals import is_hooked, leaf_of
 
 _GOLDEN: Final = 0.6180339887498949  # its multiples modulo 1 differ most for neighbouring rows
 _SAME_CODE: Final = 0.1  # tolerance of the ratio of a row's gradients, which e.g. the mean of all rows changes a little
@@ -277,7 +277,7 @@ def graph_of(x: Tensor) -> Graph:
         if (node := nodes.pop()) is None or node in seen:
             continue
         seen.add(node)
-        if (leaf := getattr(node, "variable", None)) is not None:
+        if (leaf := leaf_of(node)) is not None:
             graph.leaves.append(leaf)
         elif isinstance(drawn := getattr(node, "rendered", None), Rendered):
             graph.cameras.append(drawn.camera)

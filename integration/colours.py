@@ -17,20 +17,18 @@ Torch does not list hooks of nodes (`tensor.grad_fn.register_hook`); such a hook
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any
 
 from torch import Tensor
 
-from rasterizers.torch_internals import accumulates, accumulator, is_hooked
-
-_JOINS: Final = "CatBackward0"
+from rasterizers.torch_internals import accumulates, accumulator, is_cat, is_hooked
 
 
 def are_joined(colors: Tensor, params: Mapping[str, Tensor]) -> bool:
     """Condition 3: whether the gradient of `colors` is that of the leaves sh0 and shN side by side, without any hook."""
     leaves = [params[name] for name in ("sh0", "shN") if name in params]
     node: Any = colors.grad_fn
-    if node is None or node.name() != _JOINS:  # with these shapes, it can only join bands
+    if node is None or not is_cat(node):  # with these shapes, it can only join bands
         return False
     if len(leaves) != 2 or any(not p.requires_grad or p.dtype != colors.dtype for p in leaves):
         return False

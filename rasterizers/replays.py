@@ -163,4 +163,4 @@ def write(static: Sequence[Tensor | None], inputs: Sequence[Tensor | None]) -> N
         else:
             x.copy_(y)
     for pairs in alike.values():
-        copy_each(*zip(*pairs, strict=True))
+        copy_each(pairs)

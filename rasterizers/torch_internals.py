@@ -1,7 +1,7 @@
-"""All that this package uses of torch without a public name. torch 2.6 to 2.13 have it; none of them has a public name for it.
+"""All that this package uses of torch without a public name.
 
-Each entry says what it relies on, and in brackets since which version it is so. Where a later torch has changed it,
-tests/rasterizers/test_torch_internals.py fails under the name of the entry.
+torch has each since 2.6, the oldest version that is supported, or longer, unless a later one is named; up to 2.13, none has a
+public name. Where a torch has changed what an entry says, tests/rasterizers/test_torch_internals.py fails under the entry's name.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from torch import Tensor
 from torch.utils import _python_dispatch, _pytree
 
 TorchDispatchMode = _python_dispatch.TorchDispatchMode
-"""A context that sees every operation of its thread below autograd. torch's tutorials name it (1.13)."""
+"""A context that sees every operation of its thread below autograd. torch's tutorials name it."""
 
 tree_leaves = _pytree.tree_leaves
-"""The values in nested tuples, lists and dictionaries (2.2)."""
+"""The values in nested tuples, lists and dictionaries."""
 
 
 def current_pass() -> int:
-    """The number of the backward pass that runs in this thread, another one for each pass; -1: none runs (2.0)."""
+    """The number of the backward pass that runs in this thread, another one for each pass; -1: none runs."""
     number: int = torch._C._current_graph_task_id()
     return number
 
 
 def when_pass_ends(call: Callable[[], None]) -> None:
     """Have the running backward pass call this once, after all of its gradients and before `backward()` returns, as torch's
-    DistributedDataParallel does. A pass that fails does not call it (1.0).
+    DistributedDataParallel does. A pass that fails does not call it.
     """
     torch.autograd.Variable._execution_engine.queue_callback(call)
 
@@ -39,8 +39,19 @@ def accumulator(leaf: Tensor) -> Any:
     return torch.autograd.graph.get_gradient_edge(leaf).node
 
 
+def leaf_of(node: Any) -> Tensor | None:
+    """The leaf of an `accumulator`; None: another node."""
+    leaf: Tensor | None = getattr(node, "variable", None)
+    return leaf
+
+
+def is_cat(node: Any) -> bool:
+    """Whether a node is that of `torch.cat`."""
+    return bool(node.name() == "CatBackward0")
+
+
 def accumulates(leaf: Tensor) -> bool:
-    """Whether the running backward pass adds to a leaf's `.grad` (2.0)."""
+    """Whether the running backward pass adds to a leaf's `.grad`."""
     try:
         return torch._C._will_engine_execute_node(accumulator(leaf))
     except RuntimeError:  # raised in a pass of `torch.autograd.grad` for this leaf
@@ -48,32 +59,32 @@ def accumulates(leaf: Tensor) -> bool:
 
 
 def is_hooked(x: Tensor) -> bool:
-    """Whether the gradient of a tensor has a hook, which may change it (2.1)."""
+    """Whether the gradient of a tensor has a hook, which may change it."""
     return bool(x._backward_hooks or getattr(x, "_post_accumulate_grad_hooks", None))
 
 
 def version(x: Tensor) -> int:
-    """How often a tensor was written in place, by itself or by a view of it (1.0)."""
+    """How often a tensor was written in place, by itself or by a view of it."""
     return x._version
 
 
 def is_transformed() -> bool:
-    """Whether a transform of torch.func runs: grad, vmap, jvp … (2.0)."""
+    """Whether a transform of torch.func runs: grad, vmap, jvp …."""
     return torch._C._functorch.peek_interpreter_stack() is not None
 
 
-def copy_each(to: Sequence[Tensor], of: Sequence[Tensor]) -> None:
-    """`copy_` of each pair, on a device by one kernel for those of one type and layout (2.2)."""
-    torch._foreach_copy_(to, of)
+def copy_each(pairs: Sequence[tuple[Tensor, Tensor]]) -> None:
+    """`x.copy_(y)` of each pair, on a device by one kernel for those of one type and layout."""
+    torch._foreach_copy_([x for x, _ in pairs], [y for _, y in pairs])
 
 
 def writes(operation: Any) -> bool:
-    """Whether an operation, as a `TorchDispatchMode` gets it, writes to one of its arguments (1.13)."""
+    """Whether an operation, as a `TorchDispatchMode` gets it, writes to one of its arguments."""
     return bool(operation._schema.is_mutable)
 
 
 def reads_number(operation: Any) -> bool:
-    """Whether an operation, as a `TorchDispatchMode` gets it, is that of `item()`, `bool()`, `int()`, `float()` (1.13)."""
+    """Whether an operation, as a `TorchDispatchMode` gets it, is that of `item()`, `bool()`, `int()`, `float()`."""
     return operation.overloadpacket is torch.ops.aten._local_scalar_dense
 
 

@@ -60,7 +60,14 @@ def test_a_pass_adds_to_a_leaf_or_returns_its_gradient(by, expected):
     x = Parameter(torch.ones(3))
     assert in_a_pass(lambda: of_torch.accumulates(x), x, by=lambda y: by(y, x)) == [expected]
     assert of_torch.accumulator(x) is of_torch.accumulator(x)
-    assert of_torch.accumulator(x).variable is x
+    assert of_torch.leaf_of(of_torch.accumulator(x)) is x
+
+
+def test_a_node_is_that_of_a_leaf_or_of_cat_or_another():
+    x = Parameter(torch.ones(3))
+    joined, added = torch.cat((x, x)).grad_fn, (x + x).grad_fn
+    assert [of_torch.is_cat(node) for node in (joined, added)] == [True, False]
+    assert (of_torch.leaf_of(joined), of_torch.leaf_of(added)) == (None, None)
 
 
 def test_hooks_of_both_kinds_are_found():
@@ -87,7 +94,7 @@ def test_a_transform_is_seen_inside_of_it():
 
 def test_pairs_are_copied():
     to, of = [torch.zeros(2), torch.zeros(3)], [torch.ones(2), torch.ones(3)]
-    of_torch.copy_each(to, of)
+    of_torch.copy_each([*zip(to, of, strict=True)])
     assert all(map(torch.equal, to, of))
 
 
