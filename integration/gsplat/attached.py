@@ -171,6 +171,8 @@ class Attached:
             view = self._poses.find(call["viewmats"]) if self._named is None else self._named[0]
             if view is None:  # a viewer, a camera without a photo
                 return rasterization(**self._with_detail(call, trained=False))
+            if self._named is None:
+                calls.require_intrinsics(call, view)
             calls.require_pinhole(call, self.attachment.conductor.showing)
 
             def render_at(target: Target, gate: Tensor | None, sized: View) -> HostOutput | Drawable:

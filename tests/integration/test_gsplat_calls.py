@@ -117,6 +117,20 @@ def test_the_nearest_camera_is_the_one_that_is_rendered_if_the_next_is_ten_times
         assert Poses(views).find(pose[None]) is views[0]
 
 
+def test_other_intrinsics_than_those_of_the_photo_are_refused_unless_the_view_is_named():
+    host, clear, _ = started()
+    view = clear.views[0]
+    shifted = replace(view.lr.camera, cx=view.lr.camera.cx + 1)
+    with clear.rendering(view):
+        gsplat_host.drawn(host.rasterization, host.splats, shifted)
+    with torch.no_grad():
+        gsplat_host.drawn(host.rasterization, host.splats, shifted)
+    with pytest.raises(
+        HostError, match=r"view0 is rendered with .*cx=13\.0.*its photo has .*cx=12\.00.*view\(\) the K"
+    ):
+        gsplat_host.drawn(host.rasterization, host.splats, shifted)
+
+
 @pytest.mark.parametrize("by_name", [False, True])
 def test_the_detail_feature_is_trained_in_a_loop_that_tells_every_optimizer_what_is_visible(by_name):
     host, _, render = started()
