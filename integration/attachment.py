@@ -197,7 +197,7 @@ class Attachment:
         if has_merged:
             self._merging.fading.before_step()
             return
-        trained = [name for name, p in self._host.params().items() if p.requires_grad and name != "detail"]
+        trained = _trained(self._host.params())
         cause, remedy = why_nothing_was_merged(self._pending, trained)
         if not self.counts["merges"]:
             raise HostError(
@@ -264,8 +264,14 @@ class Attachment:
         A pass that leaves every `.grad` as it was (`torch.autograd.grad`) is ignored.
         """
         pending, self._pass = self._pending, None
-        trained = {name for name, p in done.params.items() if p.requires_grad and name != "detail"}
-        accumulated = done.accumulated()
+        self._merge_pass(pending, done)
+        for hook in done.hooks:
+            hook()
+        if pending is not None and pending.merged.issuperset(_trained(done.params)):
+            pending.output = pending.hr = None
+
+    def _merge_pass(self, pending: Pending | None, done: BackwardPass) -> None:
+        trained, accumulated = _trained(done.params), done.accumulated()
         if pending is None or (trained and not accumulated):
             return
         pending.require_alone(done)
@@ -274,8 +280,6 @@ class Attachment:
         names = [name for name in accumulated if name not in pending.merged]
         if names or not (trained or pending.merged):
             self._merge(pending, done, names)
-        if pending.merged >= trained:
-            pending.output = pending.hr = None
 
     def _merge(self, pending: Pending, done: BackwardPass, names: Sequence[str]) -> None:
         first = not pending.merged
@@ -310,6 +314,10 @@ class Attachment:
             "number of views in a step, and divide each loss by n.",
             self._host.accumulation + 1, self._host.accumulation,
         )  # fmt: skip
+
+
+def _trained(params: Mapping[str, Tensor]) -> list[str]:
+    return [name for name, p in params.items() if p.requires_grad and name != "detail"]
 
 
 def _to_change(p: Tensor) -> Tensor:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from weakref import WeakMethod
+from functools import partial
+from typing import Any, Final
+from weakref import WeakMethod, WeakValueDictionary
 
 from torch import Tensor
 
@@ -15,7 +17,7 @@ from clear_strategies.merging.iteration import HrSide
 from integration.autograd_shot import HostOutput
 from integration.colours import are_accumulated, are_joined
 from rasterizers.autograd import TakeColours
-from rasterizers.torch_internals import current_pass, version
+from rasterizers.torch_internals import current_pass, hooks_after_accumulation, version
 
 Reached = Callable[[int], TakeColours | None]
 """Called when a backward pass has reached the nth rendering and no parameter yet; returns the same as
@@ -23,9 +25,10 @@ Reached = Callable[[int], TakeColours | None]
 """
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, weakref_slot=True)
 class BackwardPass:
-    """A backward pass of the host that has reached a rendering.
+    """A backward pass of the host that has reached a rendering. The host's hooks on what it accumulates are called at its end, so
+    that they see the merged gradients.
 
     Args:
         task: torch's number of the pass.
@@ -35,6 +38,7 @@ class BackwardPass:
 
     Attributes:
         before: `.grad` when it reached the rendering, by name, of parameters that had one.
+        hooks: of the parameters that it has accumulated.
     """
 
     task: int
@@ -42,12 +46,16 @@ class BackwardPass:
     renderings: set[int] = field(default_factory=set)
     colour: Colour | None = None
     before: dict[str, Tensor] = field(init=False)
+    hooks: list[Callable[[], Any]] = field(default_factory=list)
     _found: dict[str, tuple[Tensor | None, int]] = field(init=False)
 
     def __post_init__(self) -> None:
         grads = {name: p.grad for name, p in self.params.items()}
         self.before = {name: g.detach().clone() for name, g in grads.items() if g is not None}
         self._found = {name: (g, 0 if g is None else version(g)) for name, g in grads.items()}
+        _PASSES[self.task] = self
+        for hooks in filter(None, map(hooks_after_accumulation, self.params.values())):
+            hooks.update({key: hook if isinstance(hook, _AtTheEnd) else _AtTheEnd(hook) for key, hook in hooks.items()})
 
     def take(self, rgb: Tensor, basis: Tensor) -> None:
         """Keep the gradient of the colours."""
@@ -62,6 +70,22 @@ class BackwardPass:
         before, written = self._found[name]
         now = self.params[name].grad
         return now is not before or (now is not None and version(now) != written)
+
+
+_PASSES: Final = WeakValueDictionary[int, BackwardPass]()
+"""Those that run, by their task."""
+
+
+@dataclass(frozen=True, slots=True)
+class _AtTheEnd:
+    """A hook on an accumulated gradient, called at the end of a pass that has reached a rendering, and at once in others."""
+
+    hook: Callable[[Tensor], Any]
+
+    def __call__(self, p: Tensor) -> Any:
+        if (running := _PASSES.get(current_pass())) is None:
+            return self.hook(p)
+        return running.hooks.append(partial(self.hook, p))
 
 
 @dataclass(slots=True, eq=False)

@@ -6,7 +6,7 @@ public name. Where a torch has changed what an entry says, tests/rasterizers/tes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, MutableMapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -61,6 +61,11 @@ def accumulates(leaf: Tensor) -> bool:
 def is_hooked(x: Tensor) -> bool:
     """Whether the gradient of a tensor has a hook, which may change it."""
     return bool(x._backward_hooks or getattr(x, "_post_accumulate_grad_hooks", None))
+
+
+def hooks_after_accumulation(leaf: Tensor) -> MutableMapping[int, Callable[[Tensor], Any]]:
+    """The hooks of `register_post_accumulate_grad_hook`, by their handles' numbers; torch calls what it finds in the mapping."""
+    return getattr(leaf, "_post_accumulate_grad_hooks", None) or {}
 
 
 def version(x: Tensor) -> int:

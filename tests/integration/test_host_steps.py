@@ -178,6 +178,31 @@ def test_a_step_begins_after_each_merge_whichever_optimizers_take_part():
     assert clear.attachment.counts["steps of the host alone"] == 1
 
 
+def test_hooks_that_run_after_accumulation_change_the_merged_gradient():
+    """Of a hook on the gradient itself, each scale is an argument."""
+    gradients = []
+
+    def limit(p):
+        p.grad.clamp_(-1e-3, 1e-3)
+
+    for late in (False, True):
+        host, _, render = started(toy.Recorder())
+        for p in host.splats.values():
+            if p.requires_grad and late:
+                p.register_post_accumulate_grad_hook(limit)
+        for _ in range(2):  # the hooks are still there in the second step
+            host.optimizers["means"].zero_grad()
+            render().mean().backward()
+            if not late:
+                limit(host.splats["means"])
+        gradients.append(host.splats["means"].grad)
+    assert float(gradients[0].abs().max()) == pytest.approx(1e-3)
+    assert torch.equal(*gradients)
+    host.optimizers["means"].zero_grad()
+    (1e3 * host.splats["means"].sum()).backward()  # a pass without a rendering
+    assert float(host.splats["means"].grad.abs().max()) == pytest.approx(1e-3)
+
+
 def test_a_step_inside_of_the_backward_pass_is_refused():
     host, _, render = started()
     host.splats["means"].register_post_accumulate_grad_hook(lambda p: host.optimizers["means"].step())
