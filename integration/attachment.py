@@ -54,6 +54,7 @@ from rasterizers.torch_internals import current_pass, when_pass_ends
 
 _log = logging.getLogger(__name__)
 _LOGGED_EVERY: Final = 100  # merges between two lines of the log
+_PATIENCE: Final = 10  # renderings that are not merged, one after the other, before a warning
 
 
 class Attachment:
@@ -94,6 +95,7 @@ class Attachment:
         self._step: Step | None = None  # of the rendering, until `after_step`
         self._pending: Pending | None = None  # the last rendering
         self._pass: BackwardPass | None = None  # the last one that has reached a rendering
+        self._in_vain = 0  # renderings, one after the other, that were not merged
         self._logged: dict[str, deferred.Number | Callable[[], deferred.Number]] = {}
         self._has_warned_of_accumulation = False
         conductor.on_fit_start(len(views), seed, means.device, views)
@@ -112,6 +114,7 @@ class Attachment:
                 "and the loss be that of another picture. Checkpoint what comes before the rendering, or after it."
             )
         self._finish_step()  # not every optimizer may have stepped, and the structure may have changed
+        self._warn_of_renderings_in_vain()
         conductor, t, params = self.conductor, self.t, {name: p.detach() for name, p in self._host.params().items()}
         means = params["means"]
         conductor.logs.forget()
@@ -298,6 +301,18 @@ class Attachment:
             now = self.log
             losses_now = ", ".join(f"L_{name} {now[name]:.4f}" for name in losses) or "no HR"
             _log.info("t=%d: %s, lambda_HR %.3f, %s Gaussians.", self.t, losses_now, λ, f"{self._n:,}")
+
+    def _warn_of_renderings_in_vain(self) -> None:
+        """Warn if no backward pass has merged the last renderings: nobody may tell otherwise that a loop steps other tensors."""
+        if self._pending is None:
+            return
+        self._in_vain = 0 if self._pending.merged else self._in_vain + 1
+        if self._in_vain == _PATIENCE:
+            cause, remedy = why_nothing_was_merged(self._pending, _trained(self._host.params()))
+            _log.warning(
+                "CLEAR has no part in the last %d renderings of training views: %s. %s Evaluate under torch.no_grad().",
+                _PATIENCE, cause, remedy,
+            )  # fmt: skip
 
     def _warn_of_accumulation(self, before: Sequence[Tensor]) -> None:
         """Warn once if a step sums more passes than `accumulation` names.

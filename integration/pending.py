@@ -203,5 +203,6 @@ def why_nothing_was_merged(pending: Pending | None, trained: Sequence[str]) -> t
         )
     return (
         f"no backward() has given {names} a gradient by the rendering of {pending.view}",
-        "Take the gradients by loss.backward(), not by torch.autograd.grad, of a loss of that rendering.",
+        "Take the gradients by loss.backward(), not by torch.autograd.grad, of a loss of that rendering, and render the "
+        "parameters that were passed, not copies of them.",
     )

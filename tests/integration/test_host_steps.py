@@ -203,6 +203,17 @@ def test_hooks_that_run_after_accumulation_change_the_merged_gradient():
     assert float(host.splats["means"].grad.abs().max()) == pytest.approx(1e-3)
 
 
+def test_a_loop_that_trains_a_copy_of_what_was_attached_is_told_once(caplog):
+    host, clear, render = started()
+    render().mean().backward()
+    host.step()
+    clear.attachment.hook([])  # as the optimizers of the copy have no hooks
+    copies = {name: torch.nn.Parameter(p.detach().clone()) for name, p in host.splats.items()}
+    for _ in range(14):
+        gsplat_host.drawn(host.rasterization, copies, host.photos["view0"].camera)[0].mean().backward()
+    assert caplog.text.count("no part in the last 10 renderings of training views: no backward() has given means") == 1
+
+
 def test_a_step_inside_of_the_backward_pass_is_refused():
     host, _, render = started()
     host.splats["means"].register_post_accumulate_grad_hook(lambda p: host.optimizers["means"].step())
