@@ -11,7 +11,6 @@ from typing import Any, Final
 from weakref import WeakSet
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.gradients import PARAMETERS
@@ -119,7 +118,6 @@ class Attached:
         self._poses = calls.Poses(views)
         self._named: tuple[View | None] | None = None  # see `rendering`; None: a view is found by its pose
         self._has_drawn_bands = False  # after a call with spherical harmonics, one without them draws no colours
-        self._product: tuple[Tensor, Tensor, Tensor] | None = None  # see `_gated`
         self._trains_detail = detail
         self._hr_by, self._logged_by = hr_by, ""  # what draws HR, and the last log line about it
         self._is_ours = False  # whether the wrapped function is this package's, see `wrap`
@@ -175,8 +173,14 @@ class Attached:
                 calls.require_intrinsics(call, view)
             calls.require_pinhole(call, self.attachment.conductor.showing)
 
+            @functools.cache  # the product is the same tensor at both scales, and none is kept for longer
+            def gated(gate: Tensor) -> Tensor:
+                opacities: Tensor = call["opacities"]
+                return opacities * gate.to(opacities)
+
             def render_at(target: Target, gate: Tensor | None, sized: View) -> HostOutput | Drawable:
-                return self._render(rasterization, call, sized, target, gate)
+                shown = call if gate is None else {**call, "opacities": gated(gate)}
+                return self._render(rasterization, shown, sized, target, gate)
 
             self._follow_optimizers()
             with self._together(call):
@@ -248,8 +252,6 @@ class Attached:
                 f"{view.name} is rendered with {len(call['means']):,} of {len(params['means']):,} Gaussians, and it is unknown "
                 "which. Render all of them, or for a pass that shows a part: with clear.rendering(None): …"
             )
-        if gate is not None:
-            call["opacities"] = self._gated(call["opacities"], gate)
         own = None if target == "lr" else self._own_rasterizer(call)
         if target == "hr":
             call = calls.enlarged(self._with_detail(call, trained=True) if own is None else call, view.factor)
@@ -288,12 +290,6 @@ class Attached:
             _log.info("HR and extra views are drawn by %s", by)
             self._logged_by = by
         return rasterizer
-
-    def _gated(self, opacities: Float[Tensor, " N"], gate: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-        """Opacities times the gate, computed once for both scales."""
-        if self._product is None or self._product[0] is not opacities or self._product[1] is not gate:
-            self._product = opacities, gate, opacities * gate.to(opacities)
-        return self._product[2]
 
     def _background(self, call: Mapping[str, Any]) -> dict[str, Tensor]:
         """The `backgrounds` that the strategies choose for a call; empty if it names its own."""

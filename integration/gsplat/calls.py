@@ -111,7 +111,7 @@ def with_offset(call: Call, detail: Float[Tensor, "*B N 3"], *, is_ours: bool) -
     """
     colors, as_bands = call["colors"], call.get("sh_degree") is not None
     if is_ours and as_bands:
-        return {**call, "rgb_offset": detail}
+        return {**call, "rgb_offset": detail.to(call["means"].dtype)}
     if detail.dim() > 2:  # of several scenes, whose cameras may have colours of their own
         cameras = [1] * (colors.dim() - detail.dim() - as_bands)
         detail = detail.view(*detail.shape[:-2], *cameras, *detail.shape[-2:])

@@ -245,6 +245,28 @@ def test_a_dropout_inside_of_the_hosts_function_drops_the_same_in_all_renderings
     assert torch.equal(extra, lr)
 
 
+def test_the_gated_opacities_of_a_step_are_not_kept_with_their_graph():
+    """A leaf whose data a loop replaces by fewer rows gets a new node of its gradient, unless an old graph is alive."""
+    host, _, render = started(SVS(dropout=Ramp(full=2)))
+    render().mean().backward()
+    host.step()
+    for p in host.splats.values():
+        p.grad, p.data = None, p.data[3:].clone()
+    render().mean().backward()
+    assert host.splats["opacities"].grad.shape == (17,)
+
+
+def test_the_detail_feature_has_the_type_of_what_is_drawn():
+    scene = toy.scene(20)
+    host = Host(scene)
+    host.splats["means"] = torch.nn.Parameter(host.splats["means"].detach().double())
+    clear = gsplat_host.attached(host, scene, Conductor(objective=HR_FROM_START))
+    drawn = {**host.splats, "means": host.splats["means"].float()}
+    gsplat_host.drawn(host.rasterization, drawn, host.photos["view0"].camera)[0].mean().backward()
+    assert clear.attachment.counts["merges"] == 1
+    assert bool(host.splats["detail"].grad.any())
+
+
 def test_opacities_that_a_loop_keeps_are_multiplied_by_the_gate_of_each_step():
     seen = []
 
