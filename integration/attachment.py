@@ -84,7 +84,7 @@ class Attachment:
         self.undo = ExitStack()
         self._host = host
         self._views = {view.name: view for view in views}
-        means = host.params()["means"]
+        means = host.leaves()["means"]
         self._n = len(means)
         self._hr = HrDrawing(conductor, host, means.device, self.counts)
         self._merging = HostMerge(conductor, host, means.device, self.counts)
@@ -115,7 +115,7 @@ class Attachment:
             )
         self._finish_step()  # not every optimizer may have stepped, and the structure may have changed
         self._warn_of_renderings_in_vain()
-        conductor, t, params = self.conductor, self.t, {name: p.detach() for name, p in self._host.params().items()}
+        conductor, t, params = self.conductor, self.t, {name: p.detach() for name, p in self._host.leaves().items()}
         means = params["means"]
         conductor.logs.forget()
         z = conductor.gate(t, self._n)
@@ -130,7 +130,7 @@ class Attachment:
         self._step = Step(t, view, params=params) if hr is None else hr.step
         if self.passes == 0:  # once per step of the host, however many passes it accumulates
             extra_views = conductor.extra_views(t)
-            self._steps.follow_by(self._host.params(), (self._hr.extra_view(x, view, t, apart) for x in extra_views))
+            self._steps.follow_by(self._host.leaves(), (self._hr.extra_view(x, view, t, apart) for x in extra_views))
         output = render_at("lr", z, view)
         if isinstance(output, Drawable):
             raise TypeError("an adapter renders LR by the host's own function, got a Drawable.")
@@ -157,7 +157,7 @@ class Attachment:
     def state_dict(self) -> dict[str, Any]:
         """The iteration and the strategies' state, for the host's checkpoint."""
         if not self.removed:
-            self._follow_structure(len(self._host.params()["means"]))  # the host may have densified since it rendered
+            self._follow_structure(len(self._host.leaves()["means"]))  # the host may have densified since it rendered
         return {
             "t": self.t, "passes": self.passes, "strategies": self.conductor.state_dict(),
             "view": None if self._step is None else self._step.view.name, "step": _rows_of(self._step),
@@ -169,9 +169,9 @@ class Attachment:
         self.t, self.passes = int(state["t"]), int(state["passes"])
         self.conductor.load_state_dict(state["strategies"])
         self._host.restart_parents()
-        self._n = len(self._host.params()["means"])
+        self._n = len(self._host.leaves()["means"])
         if (view := self._views.get(state.get("view") or "")) is not None:  # its `after_step` is still to come
-            rows = {name: x.to(self._host.params()["means"].device) for name, x in state.get("step", {}).items()}
+            rows = {name: x.to(self._host.leaves()["means"].device) for name, x in state.get("step", {}).items()}
             evidence = Evidence(rows["reliability"], rows["demand"]) if "demand" in rows else None
             self._step = Step(self.t, view, rows.get("visible"), evidence)
         if self._merging.scaler is not None and state.get("score") is not None:
@@ -200,7 +200,7 @@ class Attachment:
         if has_merged:
             self._merging.fading.before_step()
             return
-        trained = _trained(self._host.params())
+        trained = _trained(self._host.leaves())
         cause, remedy = why_nothing_was_merged(self._pending, trained)
         if not self.counts["merges"]:
             raise HostError(
@@ -226,7 +226,7 @@ class Attachment:
         """Call `on_resize` and `after_step`, after the host has stepped and perhaps densified. Passes whose gradients the loop
         dropped before a step, e.g. after an error, do not count.
         """
-        params = self._host.params()
+        params = self._host.leaves()
         self._follow_structure(len(params["means"]))
         if not self.passes:
             return
@@ -255,7 +255,7 @@ class Attachment:
         if self.removed or self._pending is None:
             return None
         if self._pass is None or self._pass.task != current_pass():
-            self._pass = now = BackwardPass(current_pass(), self._host.params())
+            self._pass = now = BackwardPass(current_pass(), self._host.leaves())
             when_pass_ends(lambda: self._on_backward_end(now))
         self._pass.renderings.add(nth)
         return self._pass.take if self._pending.may_take_factors(self._pass.params) else None
@@ -308,7 +308,7 @@ class Attachment:
             return
         self._in_vain = 0 if self._pending.merged else self._in_vain + 1
         if self._in_vain == _PATIENCE:
-            cause, remedy = why_nothing_was_merged(self._pending, _trained(self._host.params()))
+            cause, remedy = why_nothing_was_merged(self._pending, _trained(self._host.leaves()))
             _log.warning(
                 "CLEAR has no part in the last %d renderings of training views: %s. %s Evaluate under torch.no_grad().",
                 _PATIENCE, cause, remedy,

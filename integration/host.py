@@ -9,6 +9,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from clear_strategies.core.checks import require_whole
+from clear_strategies.errors import HostError
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,6 +50,22 @@ class Host:
 
     def __post_init__(self) -> None:
         require_whole("accumulation", self.accumulation, least=1)
+
+    def leaves(self) -> Mapping[str, Tensor]:
+        """The parameters now.
+
+        Raises:
+            HostError: one of them was computed from other tensors, so that its `.grad` would be lost.
+        """
+        params = self.params()
+        for name, p in params.items():
+            if p.requires_grad and not p.is_leaf:
+                raise HostError(
+                    f"{name} must be a leaf, whose .grad becomes the merged gradient, but it was computed from other tensors (a "
+                    "slice or a product of a parameter, torch.func.functional_call). Make it a Parameter of its own and compute "
+                    "with that in the call of the rasterizer, or use joint_loss."
+                )
+        return params
 
     def scale(self) -> float:
         """The factor of the gradients of one backward pass. A gradient scaler reads its own from the device."""

@@ -22,18 +22,19 @@ def is_finite(x: Tensor) -> bool:
     return x.numel() == 0 or math.isfinite(float(x.sum())) or bool(torch.isfinite(x).all())
 
 
-def require_finite(where: str, tensors: Mapping[str, Tensor], *, waits: bool = False) -> None:
+def require_finite(where: str, tensors: Mapping[str, Tensor], *, waits: bool = False, remedy: str = "") -> None:
     """Check tensors with one row per Gaussian; those on a device are not read, unless the host waits for it anyway.
 
     Args:
         where: what they belong to, e.g. "t=12, view b.jpg: ∇L_LR". tensors: by name.
+        remedy: a sentence at the end of the error.
 
     Raises:
         DivergedError: names the tensor and the first such Gaussian.
     """
     for name, x in tensors.items():
         if (waits or deferred.is_immediate(x)) and not is_finite(x):
-            raise DivergedError(f"{where} of {name} {rows_not_finite(x)}.")
+            raise DivergedError(f"{where} of {name} {rows_not_finite(x)}. {remedy}".rstrip())
 
 
 def rows_not_finite(x: Tensor) -> str:

@@ -70,7 +70,8 @@ def merge_in_place(
     if must_be_finite and not isinstance(merged.finite, Tensor) and not merged.finite:
         by_host = all(map(is_finite, [*high.values(), *(high.colour or ())]))
         hint = " (that of HR is finite: look at the loop's own loss)" if by_host else ""
-        require_finite(f"t={t}: the merged gradient{hint}", merged.grads)
+        remedy = "If the loop skips such steps, attach with loss_scale=lambda: 1.0."
+        require_finite(f"t={t}: the merged gradient{hint}", merged.grads, remedy=remedy)
     for name, p in trained.items():
         g = out[name] if scale == 1 else out[name].mul_(scale)
         _set_grad(p, g.add_(before[name]) if name in before else g)

@@ -68,8 +68,9 @@ class Attached:
 
     Raises:
         ValueError: there is no view, a parameter is missing, or `params["detail"]` has another number of rows.
-        HostError: a network makes the colours; `params` are attached already.
-        SettingError: densification outlasts the anchor; a single optimizer has a learning rate scheduler already.
+        HostError: a network makes the colours; `params` are no dict, hold a tensor that is no leaf, or are attached already.
+        SettingError: densification outlasts the anchor; `optimizers` are something else, or a single one that has a learning rate
+            scheduler already.
     """
 
     def __init__(
@@ -97,6 +98,11 @@ class Attached:
             )
         self._names = {name: name for name in PARAMETERS} | dict(names or {})
         self._params = params
+        if not isinstance(params, MutableMapping | torch.nn.ParameterDict):
+            raise HostError(
+                f"params must be a dict or a torch.nn.ParameterDict, to which f_det is added, got {type(params).__name__}. Pass "
+                "the dict of which your loop renders."
+            )
         require_bands(params)
         if missing := [name for name in self._names.values() if name not in params]:
             raise ValueError(f"params must hold {', '.join(self._names.values())}; {missing[0]} is missing.")

@@ -23,9 +23,17 @@ def optimizers_of(
 
     Args:
         given: the host's optimizers, by the names of its parameters or by any other names, or a single one.
+
+    Raises:
+        SettingError: they are neither.
     """
     if isinstance(given, torch.optim.Optimizer):
         return [given]
+    if not isinstance(given, Mapping):
+        raise SettingError(
+            f"optimizers must be a dict of optimizers or one of torch's, got {type(given).__name__}. Give each a name, e.g. "
+            "{'all': optimizer}."
+        )
     leaves, known = {id(p) for p in params.values()}, {*names, _DETAIL}
     found = [o for name, o in given.items() if name in known or not leaves.isdisjoint(map(id, _stepped(o)))]
     return list({id(o): o for o in found}.values())
@@ -41,12 +49,17 @@ def step_detail(
     becomes a group of it. Otherwise f_det gets an Adam of its own in the host's dictionary.
 
     Raises:
-        SettingError: the single optimizer has a learning rate scheduler, which counts its groups.
+        SettingError: the single optimizer has a learning rate scheduler, which counts its groups; or it takes no groups.
     """
     if any(p is detail for o in found for p in _stepped(o)):
         return found
     if isinstance(given, torch.optim.Optimizer) or (len(found) == 1 and len(_stepped(found[0])) > 1):
         only = found[0]
+        if not hasattr(only, "add_param_group"):
+            raise SettingError(
+                f"optimizers: f_det becomes a group of the only optimizer, but {type(only).__name__} has no add_param_group. "
+                "Derive it from torch.optim.Optimizer, or attach(detail=False)."
+            )
         if getattr(only.step, "_wrapped_by_lr_sched", False):
             raise SettingError(
                 "optimizers: f_det becomes a group of the optimizer, whose learning rate scheduler exists already and counts its "

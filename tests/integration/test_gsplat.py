@@ -17,7 +17,7 @@ from integration.autograd_shot import HostOutput
 from integration.gsplat import attach
 from rasterizers import autograd
 from tests.helpers import toy
-from tests.helpers.gsplat_host import RASTERIZER, Host, attached, in_double, rasterization, started, trained
+from tests.helpers.gsplat_host import RASTERIZER, Host, attached, drawn, in_double, rasterization, started, trained
 from tests.helpers.host_parts import HR_FROM_START
 
 STEPS = 50
@@ -217,12 +217,34 @@ def test_what_cannot_be_attached_or_drawn_is_refused():
         render()
     with pytest.raises(ValueError, match="at least one view"):
         attach(host.splats, host.optimizers, (), Conductor())
+    with pytest.raises(HostError, match=r"must be a dict or a torch\.nn.ParameterDict.*got list"):
+        attach([*host.splats.values()], host.optimizers, scene.train, Conductor())
     del host.splats["sh0"]
     with pytest.raises(ValueError, match="sh0 is missing"):
         attach(host.splats, host.optimizers, scene.train, Conductor())
     host.splats["features"] = host.splats.pop("shN")
     with pytest.raises(HostError, match=r"harmonic textures.* train with simple_trainer\.py"):
         attach(host.splats, host.optimizers, scene.train, Conductor())
+
+
+def test_parameters_that_are_computed_from_others_are_refused():
+    """Their gradient would be lost: torch gives it to the leaves."""
+    scene = toy.scene(20)
+    host = Host(scene)
+    colors = torch.nn.Parameter(torch.cat((host.splats["sh0"], host.splats["shN"]), 1).detach())
+    slices = {**host.splats, "sh0": colors[:, :1], "shN": colors[:, 1:]}
+    with pytest.raises(HostError, match=r"sh0 must be a leaf.*a Parameter of its own"):
+        attach(slices, host.optimizers, scene.train, Conductor())
+    model = torch.nn.Module()
+    model.splats = torch.nn.ParameterDict(host.splats)
+    clear = attach(model.splats, host.optimizers, scene.train, Conductor())
+    host.rasterization = clear.wrap(host.rasterization)
+    model.forward = lambda camera: drawn(host.rasterization, model.splats, camera)[0].mean()
+    camera = (scene.train[0].lr.camera,)
+    torch.func.functional_call(model, dict(model.named_parameters()), camera).backward()
+    assert clear.attachment.counts["merges"] == 1
+    with pytest.raises(HostError, match="means must be a leaf"):
+        torch.func.functional_call(model, {name: p * 2 for name, p in model.named_parameters()}, camera)
 
 
 @pytest.mark.parametrize("last_one_has_backward", [True, False])

@@ -158,6 +158,27 @@ def test_more_backward_passes_than_accumulation_names_are_told_once(backwards, a
     assert caplog.text.count(f"but accumulation={accumulation}: HR weighs too much") == told
 
 
+class Descent:
+    """An optimizer that is not derived from torch's."""
+
+    def __init__(self, params):
+        self.param_groups = [{"params": [*params]}]
+
+
+@pytest.mark.parametrize(
+    ("optimizers", "rule"),
+    [
+        (lambda host: [*host.optimizers.values()], "must be a dict of optimizers or one of torch's, got list"),
+        (lambda host: {"all": Descent(host.splats.values())}, "Descent has no add_param_group"),
+    ],
+)
+def test_optimizers_that_f_det_cannot_join_are_refused(optimizers, rule):
+    scene = toy.scene(20)
+    host = Host(scene)
+    with pytest.raises(SettingError, match=rule):
+        attach(host.splats, optimizers(host), scene.train, Conductor())
+
+
 def test_optimizers_of_other_tensors_than_those_that_were_passed_are_refused():
     scene = toy.scene(20)
     host = Host(scene)
