@@ -41,6 +41,7 @@ from clear_strategies.data.scene import require_shown
 from clear_strategies.errors import HostError, SettingError
 from clear_strategies.merging.conductor import Conductor
 from integration.announcement import announce, warn_without_hr
+from integration.autograd_shot import HostOutput, Target, require_named
 from integration.host import Host
 from integration.host_merge import HostMerge
 from integration.host_steps import HostSteps
@@ -115,7 +116,9 @@ class Attachment:
             )
         self._finish_step()  # not every optimizer may have stepped, and the structure may have changed
         self._warn_of_renderings_in_vain()
-        conductor, t, params = self.conductor, self.t, {name: p.detach() for name, p in self._host.leaves().items()}
+        conductor, t, leaves = self.conductor, self.t, self._host.leaves()
+        render_at = _checked(render_at, leaves)
+        params = {name: p.detach() for name, p in leaves.items()}
         means = params["means"]
         conductor.logs.forget()
         z = conductor.gate(t, self._n)
@@ -130,7 +133,7 @@ class Attachment:
         self._step = Step(t, view, params=params) if hr is None else hr.step
         if self.passes == 0:  # once per step of the host, however many passes it accumulates
             extra_views = conductor.extra_views(t)
-            self._steps.follow_by(self._host.leaves(), (self._hr.extra_view(x, view, t, apart) for x in extra_views))
+            self._steps.follow_by(leaves, (self._hr.extra_view(x, view, t, apart) for x in extra_views))
         output = render_at("lr", z, view)
         if isinstance(output, Drawable):
             raise TypeError("an adapter renders LR by the host's own function, got a Drawable.")
@@ -329,6 +332,20 @@ class Attachment:
             "number of views in a step, and divide each loss by n.",
             self._host.accumulation + 1, self._host.accumulation,
         )  # fmt: skip
+
+
+def _checked(render_at: RenderAt, params: Mapping[str, Tensor]) -> RenderAt:
+    """The function of an adapter, which raises an error if what it returns is none of the two types, or of other tensors."""
+
+    def render(target: Target, gate: Tensor | None, view: View) -> HostOutput | Drawable:
+        output = render_at(target, gate, view)
+        if not isinstance(output, HostOutput | Drawable):
+            raise TypeError(f"render_at must return a HostOutput for {target!r}, got {type(output).__name__}.")
+        if isinstance(output, HostOutput):
+            require_named(output.shot, params)
+        return output
+
+    return render
 
 
 def _trained(params: Mapping[str, Tensor]) -> list[str]:

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from clear_strategies.core.gradients import Grads, gradients_of, summed
+from clear_strategies.errors import HostError
 from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.iteration import HrSide
 from integration.colours import are_joined
@@ -261,6 +262,27 @@ def _is_in_order(x: Tensor, p: Tensor) -> bool | None:
 
 def _trained(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name: p for name, p in params.items() if p.requires_grad and name != "detail"}
+
+
+def require_leaves(params: Mapping[str, Tensor]) -> None:
+    """Raise a HostError if torch would give the gradient of a parameter to another tensor."""
+    for name, p in params.items():
+        if p.requires_grad and not p.is_leaf:
+            raise HostError(
+                f"{name} must be a leaf, whose .grad becomes the merged gradient, but it was computed from other tensors (a "
+                "slice or a product of a parameter, torch.func.functional_call). Make it a Parameter of its own, and compute "
+                "with that in the call of the renderer."
+            )
+
+
+def require_named(shot: object, params: Mapping[str, Tensor]) -> None:
+    """Raise a HostError if a rendering names other tensors as its parameters, whose gradients the parameters would get."""
+    of_shot = shot.params if isinstance(shot, AutogradShot) else {}
+    if other := [name for name, p in of_shot.items() if name in params and p is not params[name]]:
+        raise HostError(
+            f"AutogradShot.params must hold the parameters themselves, got other tensors as {', '.join(other)}. Pass what is "
+            "computed from them, e.g. activated scales, as drawn=."
+        )
 
 
 class Graph(NamedTuple):

@@ -9,7 +9,9 @@ from jaxtyping import Int
 from torch import Tensor
 
 from clear_strategies.core.checks import require_whole
+from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.errors import HostError
+from integration.autograd_shot import require_leaves
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,16 +57,12 @@ class Host:
         """The parameters now.
 
         Raises:
-            HostError: one of them was computed from other tensors, so that its `.grad` would be lost.
+            HostError: one of them is missing, or was computed from other tensors, so that its `.grad` would be lost.
         """
         params = self.params()
-        for name, p in params.items():
-            if p.requires_grad and not p.is_leaf:
-                raise HostError(
-                    f"{name} must be a leaf, whose .grad becomes the merged gradient, but it was computed from other tensors (a "
-                    "slice or a product of a parameter, torch.func.functional_call). Make it a Parameter of its own and compute "
-                    "with that in the call of the rasterizer, or use joint_loss."
-                )
+        if missing := [name for name in PARAMETERS if name not in params]:
+            raise HostError(f"params must return {', '.join(PARAMETERS)}, got none of the name {missing[0]}.")
+        require_leaves(params)
         return params
 
     def scale(self) -> float:

@@ -51,6 +51,8 @@ class HostSteps:
 
     def hook(self, optimizers: Sequence[torch.optim.Optimizer]) -> None:
         """Hook the steps of these optimizers, and remove the hooks of earlier ones. Only torch's optimizers have hooks."""
+        if isinstance(optimizers, Mapping):
+            raise TypeError("optimizers must be a sequence, got a dict: hook([*optimizers.values()]).")
         distinct = list({id(o): o for o in optimizers if isinstance(o, torch.optim.Optimizer)}.values())
         if list(map(id, distinct)) == list(map(id, self._hooked)):
             return

@@ -7,6 +7,7 @@ that must stay as it is, see attachment.py.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -16,12 +17,14 @@ from torch import Tensor
 from clear_strategies.core.deferred import Scalar
 from clear_strategies.core.gradients import Grads, Shot
 from clear_strategies.core.view import ExtraView, View
+from clear_strategies.errors import HostError
+from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Update
 from clear_strategies.strategies.base import overrides
-from integration.autograd_shot import AutogradShot, Graph, graph_of
+from integration.autograd_shot import AutogradShot, Graph, graph_of, require_leaves, require_named
 from integration.densification import ScoreScaler, score_for_host
-from integration.views import SAME_POSE
+from integration.views import SAME_POSE, require_intrinsics
 from rasterizers.interface import Camera
 
 
@@ -48,16 +51,22 @@ def joint_loss(
         The loss, and the `Update`: the step for `Conductor.after_step`, densification scores, conflict ratios.
 
     Raises:
+        HostError: a parameter is no leaf, or a rendering names another tensor as it; a rendering has no gradients, or other
+            intrinsics than its photo.
         ValueError: `params` and the renderings have different parameters, or one without a row for each Gaussian; f_det is drawn
             at LR, or not at HR; this package drew another training view than `view`; a strategy has not started.
     """
     values = {name: p.detach() for name, p in params.items()}
     _require_rows(values)
+    require_leaves(params)
+    _require_shots(params, lr=lr, hr=hr)
     of_lr, of_hr = graph_of(lr.image), graph_of(hr.image) if hr is not None and hr.image.grad_fn is not None else None
     _require_detail(params.get("detail"), of_lr, of_hr)
     _require_view(conductor, view, lr=of_lr, hr=of_hr)
     _require_started(conductor)
-    update = conductor.update(values, lr, hr, view, t)
+    with _without_hooks([*of_lr.leaves, *(() if of_hr is None else of_hr.leaves)]):
+        update = conductor.update(values, lr, hr, view, t)
+        others = [*_others(conductor, params, lr, of_lr.leaves, view, t)]
     objective, λ = conductor.objective, conductor.objective.lambda_hr(t)
     losses = update.losses
     value = objective.lambda_lr * losses["lr"] + λ * (
@@ -69,7 +78,7 @@ def joint_loss(
             f"the renderings must name their parameters as params does; they have no gradient of {', '.join(lost)}."
         )
     trained = [(p, merged[name].to(p)) for name, p in params.items() if name in merged]
-    leaves, gradients = zip(*trained, *_others(conductor, params, lr, of_lr.leaves, view, t), strict=True)
+    leaves, gradients = zip(*trained, *others, strict=True)
 
     loss = with_gradients(value, gradients, *leaves)
     if scaler is not None and isinstance(lr, AutogradShot):
@@ -99,6 +108,33 @@ def with_gradients(value: Scalar, gradients: Sequence[Tensor], *tensors: Tensor)
     """A scalar that has these gradients with respect to the tensors; scaling it scales them."""
     scalar: Tensor = _WithGradients.apply(value, gradients, *tensors)  # type: ignore[no-untyped-call]
     return scalar
+
+
+@contextmanager
+def _without_hooks(leaves: Sequence[Tensor]) -> Iterator[None]:
+    """A context in which gradients reach these leaves past their hooks, which `backward()` calls with the merged gradient."""
+    held = [(hooks, dict(hooks)) for x in leaves if (hooks := x._backward_hooks)]
+    for hooks, _ in held:
+        hooks.clear()
+    try:
+        yield
+    finally:
+        for hooks, each in held:
+            hooks.update(each)
+
+
+def _require_shots(params: Mapping[str, Tensor], **shots: Shot | None) -> None:
+    for name, shot in shots.items():
+        if shot is not None and not hasattr(shot, "vjp"):
+            raise TypeError(
+                f"{name} must be a Shot, e.g. AutogradShot(image, means2d, visible, params), got {type(shot).__name__}."
+            )
+        require_named(shot, params)
+        trains = isinstance(shot, AutogradShot) and any(p.requires_grad for p in params.values())
+        if trains and not (shot.drawings or shot.image.requires_grad):
+            raise HostError(
+                f"{name} must be drawn with gradients: leave torch.no_grad(), and do not detach what is drawn."
+            )
 
 
 def _require_rows(params: Mapping[str, Tensor]) -> None:
@@ -138,6 +174,10 @@ def _require_view(conductor: Conductor, view: View, **graphs: Graph | None) -> N
                 raise ValueError(
                     f"{name} must be drawn by the camera of its view {view.name}, got that of {drawn[0].name}. Pass its view."
                 )
+            photo = view.lr if name == "lr" else view.hr
+            if (camera.width, camera.height) == (photo.camera.width, photo.camera.height):
+                remedy = "Draw it by the camera of its view, whose K is that of the photo."
+                require_intrinsics(f"{name} of {view.name}", intrinsics(camera), photo.camera, remedy)
 
 
 def _require_started(conductor: Conductor) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from operator import attrgetter
 from typing import Any, Final
 from weakref import WeakMethod, WeakValueDictionary
 
@@ -124,7 +125,12 @@ class Pending:
         def on_gradient(_: Tensor) -> None:  # returns None, so that the gradient stays
             called()
 
-        for mark in self.output.marks:
+        if any(mark.is_leaf and mark.requires_grad for mark in self.output.marks):
+            raise HostError(
+                f"a mark of {self.view} is a leaf, which a backward pass may reach after other parameters. Mark what the loop "
+                "gets, e.g. the image."
+            )
+        for mark in filter(attrgetter("requires_grad"), self.output.marks):
             mark.register_hook(on_gradient)  # type: ignore[no-untyped-call]
         centres = self.output.shot.gradient_slot.tensor
         if to_screen and centres.requires_grad:

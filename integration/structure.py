@@ -49,6 +49,10 @@ def resized(
         return None if step is None else Step(step.t, step.view)  # its rows cannot be gathered
     if len(parents) != now:
         raise HostError(f"the host says of {len(parents):,} Gaussians which they come from, but has {now:,}.")
+    if now and int(parents.max()) >= before:
+        raise HostError(
+            f"the host says that a Gaussian comes from row {int(parents.max()):,}, but had {before:,} rows from 0."
+        )
     if (unknown := int((parents < 0).sum())) and state:
         raise HostError(
             f"{unknown:,} new Gaussians come from no other, but {state} is stored of each Gaussian. {remedy}"

@@ -197,6 +197,22 @@ def enlarged_mask(mask: Float[Tensor, "h w"], factor: int) -> Float[Tensor, "H W
     return mask.repeat_interleave(factor, 0).repeat_interleave(factor, 1)
 
 
+def require_intrinsics(name: str, K: Float[Tensor, "3 3"], photo: Camera, remedy: str) -> None:
+    """Raise a HostError if a rendering has other intrinsics than its photo, and so shows other pixels.
+
+    Args:
+        name: of the rendering. remedy: a sentence.
+    """
+    given, known = K.detach().cpu().double(), intrinsics(photo).double()
+    if bool((given - known).abs().max() > SAME_POSE * known.abs().max()):
+        drawn, own = (
+            "fx={:.6g}, fy={:.6g}, cx={:.6g}, cy={:.6g}".format(*x[(0, 1, 0, 1), (0, 1, 2, 2)]) for x in (given, known)
+        )
+        raise HostError(
+            f"{name} is rendered with {drawn}, but its photo has {own}, so that they show other pixels. {remedy}"
+        )
+
+
 def no_stereo(problem: str) -> HostError:
     """The error of a host whose points cannot be replaced, with the remedy."""
     remedy = "Leave points at own, and write points3D.ply for the host to read: docs/how-to/stereo.md shows how."

@@ -338,8 +338,9 @@ def _require_size(view: View, scale: str, render: Tensor, image: Tensor) -> None
     if render.shape != image.shape:
         (h, w, *_), (height, width, *_) = render.shape, image.shape
         rule = f"must have the {width}x{height} pixels of its {scale} image"
+        found = f"{w}x{h}" if render.shape[2:] == image.shape[2:] else f"the shape {[*render.shape]}"
         raise ValueError(
-            f"view {view.name}: the {scale} rendering {rule}, got {w}x{h}. Draw it by view.{scale.lower()}.camera."
+            f"view {view.name}: the {scale} rendering {rule}, got {found}. Draw it by view.{scale.lower()}.camera."
         )
 
 

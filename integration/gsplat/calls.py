@@ -61,20 +61,6 @@ class Poses:
         return self._views[near[0][1]] if near else None
 
 
-def require_intrinsics(call: Call, view: View) -> None:
-    """Raise a HostError if a call of the photo's size has other intrinsics than its view, whose SR image HR is compared with."""
-    lr = view.lr.camera
-    given, known = call["Ks"].detach().reshape(3, 3).cpu().double(), intrinsics(lr).double()
-    is_whole = (call["width"], call["height"]) == (lr.width, lr.height)  # other sizes are refused where they are drawn
-    if is_whole and float((given - known).abs().max()) > SAME_POSE * float(known.abs().max()):
-        fx, fy, cx, cy = (round(float(given[i]), 2) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        raise HostError(
-            f"{view.name} is rendered with fx={fx}, fy={fy}, cx={cx}, cy={cy}, but its photo has fx={lr.fx:.2f}, fy={lr.fy:.2f}, "
-            f"cx={lr.cx:.2f}, cy={lr.cy:.2f}, so that HR would show other pixels than its SR image. Pass view() the K of the "
-            "loop and cut a crop out of the whole picture. Where the loop optimizes K: with clear.rendering(view): …"
-        )
-
-
 def enlarged(call: Call, factor: int) -> dict[str, Any]:
     """The call with `factor` times as many pixels along an edge, for colours only."""
     Ks = torch.cat((call["Ks"][..., :2, :] * factor, call["Ks"][..., 2:, :]), -2)

@@ -125,9 +125,7 @@ def test_other_intrinsics_than_those_of_the_photo_are_refused_unless_the_view_is
         gsplat_host.drawn(host.rasterization, host.splats, shifted)
     with torch.no_grad():
         gsplat_host.drawn(host.rasterization, host.splats, shifted)
-    with pytest.raises(
-        HostError, match=r"view0 is rendered with .*cx=13\.0.*its photo has .*cx=12\.00.*view\(\) the K"
-    ):
+    with pytest.raises(HostError, match=r"view0 is rendered with .*cx=13, .*its photo has .*cx=12, .*view\(\) the K"):
         gsplat_host.drawn(host.rasterization, host.splats, shifted)
 
 

@@ -1,13 +1,15 @@
 """`joint_loss` in the smallest host: torch parameters, torch.optim, and a renderer with autograd."""
 
 from contextlib import nullcontext
+from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 
 from clear_strategies import GCO, P2G, SVS, Conductor
 from clear_strategies.training.field import GaussianField
-from integration import AutogradShot, ScoreScaler, extra_loss, joint_loss
+from integration import AutogradShot, HostError, ScoreScaler, extra_loss, joint_loss
 from rasterizers import Splats, autograd
 from tests.helpers import toy
 from tests.helpers.host_parts import HR_FROM_START
@@ -102,6 +104,56 @@ def test_what_else_the_rendering_depends_on_gets_the_gradient_of_lr():
     ):
         assert expected.abs().max() > 1e-4
         torch.testing.assert_close(leaf.grad, 3 * expected)
+
+
+def test_a_hook_of_a_parameter_is_called_once_with_the_merged_gradient():
+    found = []
+    for hooked in (False, True):
+        scene = toy.scene(20)
+        host, view, conductor = Host(scene), scene.train[0], Conductor(GCO(), objective=HR_FROM_START)
+        if hooked:
+            host.params["means"].register_hook(lambda g: 3 * g)
+        lr, hr = host.render(view.lr.camera, detail=False), host.render(view.hr.camera)
+        joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
+        found.append({name: p.grad for name, p in host.params.items()})
+    plain, tripled = found
+    for name, g in plain.items():
+        torch.testing.assert_close(tripled[name], 3 * g if name == "means" else g)
+    host.params["means"].grad = None
+    (2 * host.params["means"].sum()).backward()
+    assert bool((host.params["means"].grad == 6).all())  # the hook is still there
+
+
+def test_what_is_no_rendering_of_the_parameters_is_refused():
+    scene = toy.scene(20)
+    host, view, conductor = Host(scene), scene.train[0], Conductor(objective=HR_FROM_START)
+    lr, hr = host.render(view.lr.camera, detail=False), host.render(view.hr.camera)
+    joint = partial(joint_loss, conductor, view=view, t=5)
+    with pytest.raises(HostError, match="sh0 must be a leaf"):
+        joint(host.params | {"sh0": host.params["sh0"] * 2}, lr, hr)
+    with pytest.raises(
+        HostError, match=r"must hold the parameters themselves, got other tensors as scales\. Pass .*drawn="
+    ):
+        joint(host.params, replace(lr, params=lr.params | {"scales": lr.params["scales"].exp()}), hr)
+    with pytest.raises(TypeError, match=r"hr must be a Shot, e\.g\. AutogradShot.*, got Tensor"):
+        joint(host.params, lr, hr.image)
+    with torch.no_grad():
+        frozen = host.render(view.hr.camera)
+    with pytest.raises(HostError, match=r"hr must be drawn with gradients: leave torch\.no_grad\(\)"):
+        joint(host.params, lr, frozen)
+    with pytest.raises(ValueError, match=r"must have the 24x16 pixels of its LR image, got the shape \[16, 24, 4\]"):
+        joint(host.params, replace(lr, image=torch.cat((lr.image, lr.image[..., :1]), -1)), hr)
+
+
+@pytest.mark.parametrize("scale", ["lr", "hr"])
+def test_a_rendering_with_other_intrinsics_than_its_photo_is_refused(scale):
+    scene = toy.scene(20)
+    host, view, conductor = Host(scene), scene.train[0], Conductor(objective=HR_FROM_START)
+    cameras = {"lr": view.lr.camera, "hr": view.hr.camera}
+    cameras[scale] = replace(cameras[scale], fx=cameras[scale].fx * 1.1)
+    lr, hr = host.render(cameras["lr"], detail=False), host.render(cameras["hr"])
+    with pytest.raises(HostError, match=f"{scale} of view0 is rendered with fx=.*but its photo has fx="):
+        joint_loss(conductor, host.params, lr, hr, view, 5)
 
 
 def test_parameters_without_a_row_for_each_gaussian_or_of_other_names_are_refused():

@@ -1,0 +1,87 @@
+"""An adapter of one's own, as docs/how-to/own-host.md shows it, and what is refused where it is written in another way."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from clear_strategies import Conductor
+from integration import AutogradShot, HostError
+from integration.attachment import Attachment
+from integration.autograd_shot import HostOutput
+from rasterizers import Splats
+from rasterizers.autograd import draw
+from tests.helpers import toy
+from tests.helpers.gsplat_host import Host
+from tests.helpers.host_parts import HR_FROM_START
+
+
+class Adapter:
+    """A host, and the three things that an `Attachment` needs of it."""
+
+    def __init__(self, params=lambda p: p, parents=lambda: None):
+        self.scene = toy.scene(20)
+        self.splats = Host(self.scene).splats
+        self.attachment = Attachment(
+            Conductor(objective=HR_FROM_START),
+            lambda: params(self.splats),
+            views=self.scene.train,
+            poll_parents=parents,
+        )
+
+    def render_at(self, target, gate, view):
+        p, camera = self.splats, view.lr.camera if target == "lr" else view.hr.camera
+        splats = Splats(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"])
+        drawn = draw(toy.RASTERIZER, splats, camera)
+        return HostOutput(AutogradShot(drawn.image, drawn.means2d, drawn.visible, p), drawn.image, [drawn.image])
+
+    def step(self, change=lambda output: output):
+        def render_at(*asked):
+            return change(self.render_at(*asked))
+
+        self.attachment.render_view(self.scene.train[0], render_at).mean().backward()
+        return self.attachment.counts["merges"]
+
+
+def activated(output):
+    p = output.shot.params
+    return replace(output, shot=replace(output.shot, params={**p, "scales": p["scales"].exp()}))
+
+
+def marked(output):
+    return replace(output, marks=[output.shot.params["means"]])
+
+
+def test_it_merges():
+    assert Adapter().step() == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "rule"),
+    [
+        (lambda output: output.returned, TypeError, "render_at must return a HostOutput for 'hr', got Tensor"),
+        (activated, HostError, "must hold the parameters themselves, got other tensors as scales"),
+        (marked, HostError, "a mark of view0 is a leaf.*Mark what the loop gets"),
+    ],
+)
+def test_another_output_is_refused(change, error, rule):
+    with pytest.raises(error, match=rule):
+        Adapter().step(change)
+
+
+@pytest.mark.parametrize(
+    "change", [lambda p: {k: x for k, x in p.items() if k != "shN"}, lambda p: {"xyz": p["means"]}]
+)
+def test_parameters_of_other_names_are_refused(change):
+    with pytest.raises(
+        HostError, match="params must return means, quats, scales, opacities, sh0, shN, got none of the name"
+    ):
+        Adapter(change)
+
+
+def test_rows_that_come_from_none_and_optimizers_in_a_dict_are_refused():
+    with pytest.raises(HostError, match="comes from row 39, but had 20 rows"):
+        Adapter(parents=lambda: torch.arange(20) + 20).step()
+    adapter = Adapter()
+    with pytest.raises(TypeError, match="optimizers must be a sequence, got a dict"):
+        adapter.attachment.hook({"means": torch.optim.SGD([adapter.splats["means"]])})
