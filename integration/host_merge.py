@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from typing import Final
 
 import torch
 from torch import Tensor
@@ -20,6 +22,10 @@ from integration.detail import Fading
 from integration.host import Host
 from integration.pending import BackwardPass, Pending
 from integration.replayed_merge import ReplayedMerge
+
+_log = logging.getLogger(__name__)
+_PATIENCE: Final = 10  # merges, one after the other, in which the loop's gradients outweigh those of HR, before a warning
+_OUTWEIGHS: Final = 30.0  # their ratio; in gsplat's loop on the demo it lies between 0.5 and 1.4
 
 
 class HostMerge:
@@ -38,6 +44,7 @@ class HostMerge:
         self.scaler = None if host.threshold is None else ScoreScaler(host.threshold)
         self.fading = Fading(conductor.detail, host.accumulation)
         self._replayed = ReplayedMerge(conductor, device)
+        self._outweighed: int | None = 0  # of the first merges with HR; None: in one of them HR had a part
 
     def merge(self, pending: Pending, done: BackwardPass, names: Sequence[str], t: int) -> Mapping[str, Number]:
         """Merge the gradients of these parameters; with the first of the rendering, merge that of f_det and write the score.
@@ -66,6 +73,8 @@ class HostMerge:
                 done.before["detail"] = detail.grad
         λ = self._conductor.objective.lambda_hr(t)
         g_hr = pending.routed_of(names, done.params) if λ > 0 else None
+        if g_hr is not None:
+            self._warn_if_outweighed(done, g_hr, scale)
         conflict = merge_in_place(
             self._conductor, params, g_hr, None if hr is None else hr.step, t,
             before=done.before, lr_colour=done.colour, scale=scale, must_be_finite=not skips_steps, merge=self._replayed,
@@ -77,6 +86,26 @@ class HostMerge:
         if first and hr is not None and pending.output is not None and done.task in pending.screen:
             self._write_score(pending.output.shot, pending.screen[done.task], hr, t, scale)
         return conflict
+
+    def _warn_if_outweighed(self, done: BackwardPass, g_hr: Mapping[str, Tensor], scale: float) -> None:
+        """Warn if the loss of the loop has another scale than that of HR, which is a mean over pixels in [0, 1]."""
+        if self._outweighed is None:
+            return
+        ratios = list[float]()
+        for name, h in g_hr.items():
+            g = done.params[name].grad
+            if g is not None and name != "detail":
+                own = g - done.before[name] if name in done.before else g
+                ratios.append(float(own.norm() / (scale * h.norm())))
+        if not ratios:
+            return
+        self._outweighed = self._outweighed + 1 if min(ratios) > _OUTWEIGHS else None
+        if self._outweighed == _PATIENCE:
+            self._outweighed = None
+            _log.warning(
+                "the gradients of the loop's loss are %.0f times those of HR, which then has no effect. Let the loss be a mean "
+                "over the pixels of images in [0, 1], and with a gradient scaler pass loss_scale=scaler.get_scale.", min(ratios),
+            )  # fmt: skip
 
     def _write_score(self, shot: AutogradShot, screen: Tensor, hr: HrSide, t: int, scale: float) -> None:
         """Write the score to the tensor that the host's densifier reads, if it reads one and a strategy has a score."""

@@ -235,6 +235,15 @@ def test_a_loop_that_trains_a_copy_of_what_was_attached_is_told_once(caplog):
     assert caplog.text.count("no part in the last 10 renderings of training views: no backward() has given means") == 1
 
 
+@pytest.mark.parametrize(("factor", "loss_scale", "told"), [(1024, None, 1), (1024, lambda: 1024.0, 0), (1, None, 0)])
+def test_a_loss_of_another_scale_than_that_of_hr_is_told_once(factor, loss_scale, told, caplog):
+    host, _, render = started(loss_scale=loss_scale)
+    for i in range(12):
+        (factor * photometric(render(i % 3)[0], host.photos[f"view{(0, 2, 3)[i % 3]}"].image)).backward()
+        host.step()
+    assert caplog.text.count("times those of HR, which then has no effect") == told
+
+
 def test_a_step_inside_of_the_backward_pass_is_refused():
     host, _, render = started()
     host.splats["means"].register_post_accumulate_grad_hook(lambda p: host.optimizers["means"].step())
