@@ -107,8 +107,10 @@ class Attachment:
         """Render a training view at both scales; returns what the host's render function returns at LR.
 
         Raises:
-            HostError: a backward pass is running.
+            HostError: a backward pass is running; `render_at` renders other parameters, or its Gaussians in another order.
+            SettingError: several processes train.
         """
+        _require_one_process()
         if current_pass() >= 0:
             raise HostError(
                 f"{view.name} is rendered inside of a backward pass, as torch.utils.checkpoint does it: HR would be drawn twice, "
@@ -374,6 +376,11 @@ def _require_supported(conductor: Conductor) -> None:
             "objective: a host renders LR itself, so lambda_lr must be > 0 and lr_from must be lr, got "
             f"lambda_lr={conductor.objective.lambda_lr}, lr_from={conductor.objective.lr_from!r}."
         )
+    _require_one_process()
+
+
+def _require_one_process() -> None:
+    """Raise a SettingError where each process would train f_det and the strategies' state by itself."""
     distributed = torch.distributed
     if distributed.is_available() and distributed.is_initialized() and (n := distributed.get_world_size()) > 1:
         raise SettingError(

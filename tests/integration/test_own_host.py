@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from clear_strategies import Conductor
+from clear_strategies.errors import SettingError
 from integration import AutogradShot, HostError
 from integration.attachment import Attachment
 from integration.autograd_shot import HostOutput
@@ -41,6 +42,14 @@ class Adapter:
 
         self.attachment.render_view(self.scene.train[0], render_at).mean().backward()
         return self.attachment.counts["merges"]
+
+
+def test_a_process_that_joins_others_after_the_attachment_is_refused(monkeypatch):
+    adapter = Adapter()
+    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
+    with pytest.raises(SettingError, match="CLEAR trains in one process, got 2"):
+        adapter.step()
 
 
 def activated(output):
