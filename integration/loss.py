@@ -130,8 +130,9 @@ def _require_shots(params: Mapping[str, Tensor], **shots: Shot | None) -> None:
                 f"{name} must be a Shot, e.g. AutogradShot(image, means2d, visible, params), got {type(shot).__name__}."
             )
         require_named(shot, params)
-        trains = isinstance(shot, AutogradShot) and any(p.requires_grad for p in params.values())
-        if trains and not (shot.drawings or shot.image.requires_grad):
+        if not isinstance(shot, AutogradShot) or shot.drawings or shot.image.requires_grad:
+            continue
+        if any(p.requires_grad for p in params.values()):
             raise HostError(
                 f"{name} must be drawn with gradients: leave torch.no_grad(), and do not detach what is drawn."
             )
