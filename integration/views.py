@@ -203,11 +203,9 @@ def require_intrinsics(name: str, K: Float[Tensor, "3 3"], photo: Camera, remedy
     Args:
         name: of the rendering. remedy: a sentence.
     """
-    given, known = K.detach().cpu().double(), intrinsics(photo).double()
+    given, known = (x.detach().cpu().double()[(0, 1, 0, 1), (0, 1, 2, 2)] for x in (K, intrinsics(photo)))
     if bool((given - known).abs().max() > SAME_POSE * known.abs().max()):
-        drawn, own = (
-            "fx={:.6g}, fy={:.6g}, cx={:.6g}, cy={:.6g}".format(*x[(0, 1, 0, 1), (0, 1, 2, 2)]) for x in (given, known)
-        )
+        drawn, own = ("fx={:.6g}, fy={:.6g}, cx={:.6g}, cy={:.6g}".format(*x.tolist()) for x in (given, known))
         raise HostError(
             f"{name} is rendered with {drawn}, but its photo has {own}, so that they show other pixels. {remedy}"
         )
