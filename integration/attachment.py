@@ -235,9 +235,8 @@ class Attachment:
         self._follow_structure(len(params["means"]))
         if not self.passes:
             return
-        has_stepped = (
-            self._steps.has_begun or self.passes >= self._host.accumulation
-        )  # a gradient scaler may skip the step
+        # A gradient scaler may skip the step.
+        has_stepped = self._steps.has_begun or self.passes >= self._host.accumulation
         if has_stepped:
             if self._step is not None:
                 self.conductor.after_step({name: _to_change(p) for name, p in params.items()}, self._step)

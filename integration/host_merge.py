@@ -24,7 +24,7 @@ from integration.pending import BackwardPass, Pending
 from integration.replayed_merge import ReplayedMerge
 
 _log = logging.getLogger(__name__)
-_PATIENCE: Final = 10  # merges, one after the other, in which the loop's gradients outweigh those of HR, before a warning
+_PATIENCE: Final = 10  # merges in which the loop's gradients outweigh those of HR, before a warning
 _OUTWEIGHS: Final = 30.0  # their ratio; in gsplat's loop on the demo it lies between 0.5 and 1.4
 
 

@@ -26,6 +26,7 @@ from integration.autograd_shot import AutogradShot, Graph, graph_of, require_lea
 from integration.densification import ScoreScaler, score_for_host
 from integration.views import SAME_POSE, require_intrinsics
 from rasterizers.interface import Camera
+from rasterizers.torch_internals import hooks_on_gradient
 
 
 def joint_loss(
@@ -113,7 +114,7 @@ def with_gradients(value: Scalar, gradients: Sequence[Tensor], *tensors: Tensor)
 @contextmanager
 def _without_hooks(leaves: Sequence[Tensor]) -> Iterator[None]:
     """A context in which gradients reach these leaves past their hooks, which `backward()` calls with the merged gradient."""
-    held = [(hooks, dict(hooks)) for x in leaves if (hooks := x._backward_hooks)]
+    held = [(hooks, dict(hooks)) for hooks in map(hooks_on_gradient, leaves)]
     for hooks, _ in held:
         hooks.clear()
     try:

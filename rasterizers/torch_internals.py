@@ -60,7 +60,12 @@ def accumulates(leaf: Tensor) -> bool:
 
 def is_hooked(x: Tensor) -> bool:
     """Whether the gradient of a tensor has a hook, which may change it."""
-    return bool(x._backward_hooks or getattr(x, "_post_accumulate_grad_hooks", None))
+    return bool(hooks_on_gradient(x) or hooks_after_accumulation(x))
+
+
+def hooks_on_gradient(x: Tensor) -> MutableMapping[int, Callable[[Tensor], Any]]:
+    """The hooks of `register_hook`, by their handles' numbers; torch calls what it finds in the mapping."""
+    return x._backward_hooks or {}
 
 
 def hooks_after_accumulation(leaf: Tensor) -> MutableMapping[int, Callable[[Tensor], Any]]:

@@ -35,13 +35,22 @@ def test_a_pass_calls_once_at_its_end_before_backward_returns():
     assert seen == [[2.0] * 3]
 
 
-def test_a_pass_calls_the_hooks_after_accumulation_that_it_finds_in_their_mapping():
+@pytest.mark.parametrize(
+    ("register", "hooks"),
+    [
+        (torch.Tensor.register_hook, of_torch.hooks_on_gradient),
+        (torch.Tensor.register_post_accumulate_grad_hook, of_torch.hooks_after_accumulation),
+    ],
+)
+def test_a_pass_calls_the_hooks_that_it_finds_in_their_mapping(register, hooks):
     x, seen = Parameter(torch.ones(3)), []
-    assert not of_torch.hooks_after_accumulation(x)
-    handle = x.register_post_accumulate_grad_hook(lambda p: seen.append("the hook"))
-    of_torch.hooks_after_accumulation(x)[handle.id] = lambda p: seen.append(p.grad.tolist())
+    assert not hooks(x)
+    handle = register(x, lambda _: seen.append("the hook"))
+    hooks(x)[handle.id] = lambda _: seen.append("another")
     (2 * x).sum().backward()
-    assert seen == [[2.0] * 3]
+    hooks(x).clear()
+    (2 * x).sum().backward()
+    assert seen == ["another"]
 
 
 def test_a_pass_that_fails_calls_nothing():
