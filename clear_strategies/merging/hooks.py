@@ -34,7 +34,7 @@ _ALSO_BY: Final = {"reconcile": ("correct",)}  # hooks that may be overridden in
 
 
 class Hooks:
-    """Calls the strategies, in the order of the methods. It knows no loss and merges nothing; `Conductor` does.
+    """Calls the strategies, in the order of the methods. `Conductor` computes losses and merges gradients.
 
     Args:
         strategies: in any order, which has no effect.
