@@ -10,10 +10,10 @@ from clear_strategies.errors import SettingError
 from integration import AutogradShot, HostError
 from integration.attachment import Attachment
 from integration.autograd_shot import HostOutput
+from integration.host import Host
 from rasterizers import Splats
 from rasterizers.autograd import draw
-from tests.helpers import toy
-from tests.helpers.gsplat_host import Host
+from tests.helpers import gsplat_host, toy
 from tests.helpers.host_parts import HR_FROM_START
 
 
@@ -22,13 +22,9 @@ class Adapter:
 
     def __init__(self, params=lambda p: p, parents=lambda: None):
         self.scene = toy.scene(20)
-        self.splats = Host(self.scene).splats
-        self.attachment = Attachment(
-            Conductor(objective=HR_FROM_START),
-            lambda: params(self.splats),
-            views=self.scene.train,
-            poll_parents=parents,
-        )
+        self.splats = gsplat_host.Host(self.scene).splats
+        host = Host(lambda: params(self.splats), parents)
+        self.attachment = Attachment(Conductor(objective=HR_FROM_START), host, self.scene.train)
 
     def render_at(self, target, gate, view):
         p, camera = self.splats, view.lr.camera if target == "lr" else view.hr.camera
