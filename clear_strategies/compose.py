@@ -36,7 +36,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConductorSettings:
-    """What a conductor is made of.
+    """Settings of a conductor.
 
     Args:
         strategies: by the names that the configuration gives them.
@@ -187,7 +187,7 @@ def quoted(value: str) -> str:
 
 
 def _is_itself(value: str) -> bool:
-    """Whether Hydra and OmegaConf read the unquoted value as this string."""
+    """Return True if Hydra and OmegaConf read the unquoted value as this string."""
     try:
         parsed = OverridesParser.create().parse_override(f"key={value}")
     except HydraException:

@@ -10,7 +10,7 @@ class ClearError(Exception):
 
     @property
     def exit_code(self) -> int:
-        """Of the process that ends by it."""
+        """The exit code of a process that ends by the error."""
         return 2
 
 

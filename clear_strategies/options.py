@@ -63,13 +63,13 @@ def strategies_of(option: str) -> list[str]:
 
 
 def sweeps(experiment: str) -> bool:
-    """Whether an option of conf/experiment, or one that it consists of, names settings that are swept."""
+    """Return True if an option of conf/experiment, or one that it consists of, names settings that are swept."""
     content, parts = _content_and_parts("experiment", experiment)
     return bool("sweeper" in content.get("hydra", {})) or any(map(sweeps, parts))
 
 
 def _content_and_parts(group: str, option: str) -> tuple[dict[str, Any], list[str]]:
-    """What the file of an option says, nothing where there is none, and the options of the same group that it begins with."""
+    """The content of an option's file, empty if there is none, and the options of the same group in its defaults list."""
     file = CONF / group / f"{option}.yaml"
     content: Any = OmegaConf.to_container(OmegaConf.load(file)) if file.is_file() else {}
     parts = [part for part in content.get("defaults", []) if isinstance(part, str)]

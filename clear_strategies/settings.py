@@ -88,7 +88,7 @@ def flat(node: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def build(node: Any, key: str = "") -> Any:
-    """What a node describes: the result of its call, with the nodes inside it built first.
+    """Build the object that a node describes, by calling its `_target_` after building the nodes inside it.
 
     Args:
         key: of the node in the configuration, for messages.
@@ -111,7 +111,7 @@ def build(node: Any, key: str = "") -> Any:
 
 
 def absent(tree: Mapping[str, Any]) -> str | None:
-    """The key of the first value that has to be given and is not; None where there is none."""
+    """The key of the first required value that is not given; None if all are."""
     return next((key for key, value in flat(tree).items() if value == _MISSING), None)
 
 
@@ -192,7 +192,7 @@ def _located(target: Any) -> Callable[..., Any]:
 
 
 def has_parameter(target: str, name: str) -> bool:
-    """Whether the class or function of a dotted name can be imported and takes this."""
+    """Return True if the class or function of a dotted name can be imported and takes this."""
     try:
         return name in _parameters(_located(target))
     except Exception:  # whatever a module does when it is imported: `build` tells
@@ -291,7 +291,7 @@ def _of_type(value: Any, hint: Any, key: str) -> Any:
 
 
 def _is_of(value: Any, hint: Any) -> bool:
-    """Whether every entry is of the annotated type. Beartype looks at one entry of a sequence, which it draws by `random`: a
+    """True if every entry is of the annotated type. Beartype looks at one entry of a sequence, which it draws by `random`: a
     wrong one may pass, and the program's own random numbers change.
     """
     origin, parts = get_origin(hint), get_args(hint)
@@ -303,7 +303,7 @@ def _is_of(value: Any, hint: Any) -> bool:
 
 
 def _takes_bool(hint: Any) -> bool:
-    """Whether true and false are values of the annotation; to Python a bool is an int, to a user it is not."""
+    """Return True if true and false are values of the annotation; to Python a bool is an int, to a user it is not."""
     if get_origin(hint) in (Union, types.UnionType):
         return any(_takes_bool(part) for part in get_args(hint))
     if get_origin(hint) is Literal:

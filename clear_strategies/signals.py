@@ -46,7 +46,7 @@ _collected: Final = list[list[int]]()  # by each `deferred_signals`
 
 
 def asked() -> bool:
-    """Whether a signal waits for the end of the step in progress."""
+    """Return True if a signal waits for the end of the step in progress."""
     return any(_collected)
 
 

@@ -1,4 +1,4 @@
-"""What a host's log says about the strategies when they are attached, and at the end of a loop without HR."""
+"""Messages in a host's log about the strategies, when they are attached, and at the end of a loop without HR."""
 
 from __future__ import annotations
 

@@ -221,7 +221,7 @@ def every_number(g: Grads, params: Mapping[str, Tensor]) -> Grads:
 
 
 def are_in_order(drawn: Mapping[str, Tensor], params: Mapping[str, Tensor]) -> bool:
-    """Whether row i of the drawn tensors is computed from row i of the parameters.
+    """Return True if row i of the drawn tensors is computed from row i of the parameters.
 
     A tensor with the parameter's memory is. Any other is tested by two cotangents, whose rows i are 1 and c_i: in the same order,
     the gradients of the parameter's row i are g and c_i g, otherwise g and c_j g. If no tensor has a gradient, positions are

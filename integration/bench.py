@@ -1,4 +1,4 @@
-"""What the strategies cost in another trainer: `python -m clear_strategies.bench host`.
+"""The cost of the strategies in another trainer: `python -m clear_strategies.bench host`.
 
 A gsplat-style loop on the demo's photos, enlarged, alone and with a conductor attached; on CUDA with LR drawn by gsplat and by
 this package. The Gaussians are the demo's points with noise, as many as asked for. The loops take turns, step by step, so that

@@ -1,4 +1,4 @@
-"""When the gradient of the colours may stay the factors Y ⊗ ∇rgb, instead of a tensor as wide as the colours.
+"""Conditions under which the gradient of the colours may stay the factors Y ⊗ ∇rgb, instead of a tensor as wide as the colours.
 
 In a backward pass, all of these conditions must hold:
     1. the pass has queued the merge of the rendering that it has reached,

@@ -1,4 +1,4 @@
-"""How strategies change a host's densification: its end (SVS: anchor_start), and the score that it reads.  Eq. 14"""
+"""Changes of a host's densification by strategies: its end (SVS: anchor_start), and the score that it reads.  Eq. 14"""
 
 from __future__ import annotations
 

@@ -72,12 +72,12 @@ class HostSteps:
 
     @property
     def has_begun(self) -> bool:
-        """Whether an optimizer has stepped since the last merge."""
+        """True if an optimizer has stepped since the last merge."""
         return bool(self._stepped)
 
     @property
     def is_complete(self) -> bool:
-        """Whether all optimizers have stepped since the last merge."""
+        """True if all optimizers have stepped since the last merge."""
         return len(self._stepped) == len(self._hooked)
 
     def follow_by(self, params: Mapping[str, Tensor], gradients: Iterable[Grads]) -> None:

@@ -144,7 +144,7 @@ class HrDrawing:
             _log.info("HR is not replayed: %s.", reason)
 
     def wanted(self, t: int) -> bool:
-        """Whether HR takes part at t. No iteration is skipped while the host's densifier reads a score."""
+        """Return True if HR takes part at t. No iteration is skipped while the host's densifier reads a score."""
         conductor = self._conductor
         scores = self.is_scored and conductor.may_densify(t)
         return conductor.wants_hr(t) and (scores or not conductor.skips.leaves_out_hr(t, conductor.work_log))

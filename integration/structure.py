@@ -16,7 +16,7 @@ _HASH_FACTOR: Final = 0x2545F4914F6CDD1D
 
 
 def is_same(parents: Int[Tensor, " M"], n: int) -> bool:
-    """Whether the M rows are the N rows that they come from, in the same order."""
+    """Return True if the M rows are the N rows that they come from, in the same order."""
     return len(parents) == n and bool((parents == torch.arange(n, device=parents.device)).all())
 
 

@@ -116,7 +116,7 @@ class Camera:
 
 
 def _is_rigid(world_to_camera: list[list[float]]) -> bool:
-    """Whether R Rᵀ = I, det R = 1 and the last row is (0, 0, 0, 1). Without tensors, which would take five times as long."""
+    """True if R Rᵀ = I, det R = 1 and the last row is (0, 0, 0, 1). Without tensors, which would take five times as long."""
     *rows, last = world_to_camera
     a, b, c = (row[:3] for row in rows)
 

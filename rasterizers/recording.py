@@ -78,7 +78,7 @@ class Recording(Generic[T]):
         self._watch.keep(tensors)
 
     def holds_at(self, t: int) -> bool:
-        """Whether Python decides at t as it did in the recording: all guards hold."""
+        """Return True if Python decides at t as it did in the recording: all guards hold."""
         return all(guard(t) for guard in self.guards)
 
     def replay(self) -> bool:

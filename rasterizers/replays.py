@@ -50,7 +50,7 @@ class GraphKey:
 
 
 def can_record(device: torch.device) -> bool:
-    """Whether work on the device can be recorded."""
+    """Return True if work on the device can be recorded."""
     return device.type in DEVICES
 
 
@@ -65,7 +65,7 @@ class Recorded(Generic[In, T]):
         self._recording, self._write = recording, write
 
     def holds_at(self, t: int) -> bool:
-        """Whether Python decides at t as it did in the recording, e.g. in a strategy that compares the iteration."""
+        """Return True if Python decides at t as it did in the recording, e.g. in a strategy that compares the iteration."""
         return self._recording.holds_at(t)
 
     def replay(self, inputs: In) -> bool:

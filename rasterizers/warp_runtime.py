@@ -55,7 +55,7 @@ def require_warp(what: str, device: str, otherwise: str) -> None:
 
 @cache
 def runs_warp(device: str) -> bool:
-    """Whether Warp runs on "cuda", or on "cpu"."""
+    """Return True if Warp runs on "cuda", or on "cpu"."""
     try:
         require_warp("a kernel", device, "torch computes the same")
     except BackendUnavailable:

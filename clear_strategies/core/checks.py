@@ -57,7 +57,7 @@ def as_color(name: str, value: object) -> Color:
 
 
 def is_color(value: object) -> TypeGuard[Sequence[Any]]:
-    """Whether it is three numbers in [0, 1]."""
+    """Return True if the value is three numbers in [0, 1]."""
     parts = value if isinstance(value, list | tuple) else ()
     return len(parts) == 3 and all(isinstance(x, Real) and 0 <= float(x) <= 1 for x in parts)
 

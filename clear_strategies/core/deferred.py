@@ -57,7 +57,7 @@ Number = Scalar | Deferred | Element | Derived
 
 
 def is_immediate(x: Tensor) -> bool:
-    """Whether scalars computed from x are read at once: x is in the CPU's memory."""
+    """Return True if scalars computed from x are read at once: x is in the CPU's memory."""
     return x.device.type == "cpu"
 
 

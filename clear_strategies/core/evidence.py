@@ -1,4 +1,4 @@
-"""How reliable the SR image of a view is, and how much it is needed: per patch, and per Gaussian."""
+"""Evidence about the SR image of a view, its reliability and the demand for it: per patch, and per Gaussian."""
 
 from __future__ import annotations
 

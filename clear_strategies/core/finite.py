@@ -18,7 +18,7 @@ from clear_strategies.errors import DivergedError, counted
 
 
 def is_finite(x: Tensor) -> bool:
-    """Whether every number is finite. The sum of finite numbers may overflow, which is checked one by one."""
+    """Return True if every number is finite. The sum of finite numbers may overflow, which is checked one by one."""
     return x.numel() == 0 or math.isfinite(float(x.sum())) or bool(torch.isfinite(x).all())
 
 
@@ -38,7 +38,7 @@ def require_finite(where: str, tensors: Mapping[str, Tensor], *, waits: bool = F
 
 
 def rows_not_finite(x: Tensor) -> str:
-    """In words, which rows of a tensor are not finite."""
+    """Describe the rows of a tensor that are not finite."""
     bad = ~torch.isfinite(x)
     rows = bad.flatten(1).any(1) if x.dim() > 1 else bad
     return f"is not finite for {counted(int(rows.sum()), 'Gaussian')}, first Gaussian {int(rows.nonzero()[0])}"

@@ -34,6 +34,6 @@ class Progress:
 
 
 def duration(seconds: float) -> str:
-    """As a person says it: "50 s", "7 min 12 s"."""
+    """Format a duration: "50 s", "7 min 12 s"."""
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes} min {rest} s" if minutes else f"{rest} s"

@@ -46,7 +46,7 @@ class Photo:
 
     @property
     def shows_something(self) -> bool:
-        """Whether its mask leaves a pixel."""
+        """True if its mask leaves a pixel."""
         return self.shown is None or bool(self.shown.any())
 
     def to(self, device: torch.device | str) -> Photo:
@@ -162,7 +162,7 @@ class View:
 
     @property
     def hr_is_photo(self) -> bool:
-        """Whether HR is the photo itself in place of an SR image (`data.views.photos_are=both`)."""
+        """True if HR is the photo itself in place of an SR image (`data.views.photos_are=both`)."""
         return self.truth is self.hr.image
 
     @property

@@ -1,4 +1,4 @@
-"""How often each stage ran, how long it took, and what was skipped and why; a run writes it as timing.csv.
+"""Counts and times of the stages of a run, and of skipped work with the reason; a run writes them as timing.csv.
 
 On CUDA nothing waits while training: stages are timed by CUDA events, skips on the device are summed there, and both are
 read when the log is read or once the device has passed them.

@@ -14,7 +14,7 @@ from rasterizers.native import empty, load_kernels
 
 
 def available() -> bool:
-    """Whether the kernels were compiled and run on this processor."""
+    """Return True if the kernels were compiled and run on this processor."""
     try:
         module()
     except BackendUnavailable:
@@ -36,10 +36,10 @@ def times(a: Float[Tensor, "N G"], b: Tensor) -> Float[Tensor, "N G"]:
 
 
 def runs(x: Tensor) -> bool:
-    """Whether the kernels take this tensor: float32 in the CPU's memory."""
+    """Return True if the kernels take this tensor: float32 in the CPU's memory."""
     return x.device.type == "cpu" and x.dtype == torch.float32 and available()
 
 
 def all_finite(tensors: Collection[Tensor]) -> bool:
-    """Whether every number is known to be finite, in one call; False if the kernels do not support all of the tensors."""
+    """Return True if every number is known to be finite, in one call; False if the kernels do not support all of the tensors."""
     return all(runs(x) and x.is_contiguous() for x in tensors) and bool(module().all_finite([*tensors]))

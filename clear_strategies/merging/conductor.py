@@ -90,17 +90,17 @@ class Conductor(Hooks):
 
     @property
     def wants_lr(self) -> bool:
-        """Whether the LR render has any use; else Î_LR is the area mean of Î_HR."""
+        """True if the LR render has any use; else Î_LR is the area mean of Î_HR."""
         return self.objective.draws_lr
 
     @property
     def uses_hr(self) -> bool:
-        """Whether HR has any use in some iteration, see `wants_hr`."""
+        """True if HR has any use in some iteration, see `wants_hr`."""
         λ = self.objective.lambda_hr
         return λ.peak > 0 or λ.final > 0 or not self.wants_lr or self.owner("score") is not None
 
     def wants_hr(self, t: int) -> bool:
-        """Whether the HR render is used at t: λ_HR > 0, Î_LR is its area mean, or a densification score needs it."""
+        """Return True if the HR render is used at t: λ_HR > 0, Î_LR is its area mean, or a densification score needs it."""
         if self.objective.lambda_hr(t) > 0 or not self.wants_lr:
             return True
         collecting = self.statistics_from is not None and t > self.statistics_from

@@ -14,7 +14,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class DetailRates:
-    """How fast f_det learns and fades.
+    """Learning rate and decay of f_det.
 
     Args:
         rate: Adam's, of f_det as an offset of RGB (F34).

@@ -159,7 +159,7 @@ class Hooks:
 
     @apart_from_the_loop
     def pulls(self, params: Mapping[str, Tensor], t: int) -> bool:
-        """Whether a strategy adds a gradient at t, which moves even Gaussians that no view draws."""
+        """Return True if a strategy adds a gradient at t, which moves even Gaussians that no view draws."""
         return any(s.regularize(params, t) is not None for s in self.regularizers)
 
     @apart_from_the_loop

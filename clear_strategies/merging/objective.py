@@ -73,7 +73,7 @@ class Objective:
 
     @property
     def draws_lr(self) -> bool:
-        """Whether Î_LR is rendered; else it is the area mean of Î_HR, which is then needed at every iteration."""
+        """True if Î_LR is rendered; else it is the area mean of Î_HR, which is then needed at every iteration."""
         return self.lr_from == "lr" and self.lambda_lr > 0
 
     def weights(self, t: int) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""What recordings of strategies add to `rasterizers.replays`: logs, counts of skipped work, and what can be recorded."""
+"""Recording of strategies, on top of `rasterizers.replays`: logs, counts of skipped work, and checks of what can be recorded."""
 
 from __future__ import annotations
 

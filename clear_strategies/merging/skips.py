@@ -35,7 +35,7 @@ _GATED: Final = 0.5  # an opacity is drawn up to twice as high where up to half 
 
 @dataclass(frozen=True, slots=True)
 class Skips:
-    """Which work is skipped. The defaults skip nothing.
+    """Settings of skipped work. The defaults skip nothing.
 
     Args:
         coarse_until: until this iteration HR is rendered and compared at half its size, and LR is not rendered where that is
@@ -118,14 +118,14 @@ class SkipPolicy:
         return self._coarse[view.name]
 
     def leaves_out_hr(self, t: int, work_log: WorkLog) -> bool:
-        """Whether HR is left out of iteration t: with `hr_every=2` of even ones, in which pseudo views come, too."""
+        """Return True if HR is left out of iteration t: with `hr_every=2` of even ones, in which pseudo views come, too."""
         if t > self.skips.coarse_until or (t - 1) % self.skips.hr_every == 0:
             return False
         work_log.skip("render LR + HR", f"HR in one of {self.skips.hr_every} iterations (skips.hr_every)")
         return True
 
     def lr_due(self, view: View, hr_due: bool, work_log: WorkLog) -> bool:
-        """Whether LR is rendered: not if HR at half its size is as large as the photo, since one render then serves both."""
+        """True if LR is rendered: not if HR at half its size is as large as the photo, since one render then serves both."""
         if view.factor > 1 or not hr_due or view is not self._coarse.get(view.name):
             return True
         work_log.skip("render LR", "HR at half its size is as large (skips.coarse_until)")
@@ -146,14 +146,14 @@ class SkipPolicy:
         return rows
 
     def measured(self, t: int) -> bool:
-        """Whether the training views are drawn whole after iteration t, to find a plateau."""
+        """Return True if the training views are drawn whole after iteration t, to find a plateau."""
         s = self.skips
         if s.plateau_gain == 0 or s.plateau_window == 0:
             return False
         return t % s.plateau_window == 0 and s.plateau_from <= t < s.plateau_to
 
     def settled(self, history: Sequence[dict[str, Number]], t: int) -> bool:
-        """Whether the training views have stopped improving by iteration t, the last of the history; `plateau_to` then follows.
+        """True if the training views have stopped improving by iteration t, the last of the history; `plateau_to` then follows.
         False if it is unknown: iterations were left out within the window, or at one end of it the structure has changed or
         another loss was measured.
         """
@@ -169,12 +169,12 @@ class SkipPolicy:
         return now[PLATEAU_LOSS] > (1 - self.skips.plateau_gain) * before[PLATEAU_LOSS]
 
     def _measured_loss(self, row: Mapping[str, float]) -> str:
-        """Which loss `PLATEAU_LOSS` of a row is."""
+        """The name of the loss in `PLATEAU_LOSS` of a row."""
         if row["lambda_hr"] == 0:
             return "LR"
         return "HR at half its size" if row["t"] <= self.skips.coarse_until else "HR"
 
 
 def _halves(view: View) -> bool:
-    """Whether its SR image has a coarse version that is a whole multiple of the photo."""
+    """Return True if the view's SR image has a coarse version that is a whole multiple of the photo."""
     return view.factor % _REDUCED == 0

@@ -145,7 +145,7 @@ def _require_numbers(s: Strategy, hook: str, name: str, x: Any) -> None:
 
 
 def _is_real(x: Any, *shapes: tuple[int, ...]) -> bool:
-    """Whether it is a tensor of one of the shapes. A conversion of complex numbers drops their imaginary part."""
+    """Return True if it is a tensor of one of the shapes. A conversion of complex numbers drops their imaginary part."""
     return isinstance(x, Tensor) and x.shape in shapes and not x.is_complex()
 
 

@@ -218,7 +218,7 @@ class Strategy:
 
     @property
     def shares_gate(self) -> bool:
-        """Whether `gate` answers for both scales at once."""
+        """True if `gate` answers for both scales at once."""
         return True
 
     def patch_maps(self, view: View) -> PatchMaps | None:
@@ -271,7 +271,7 @@ class Strategy:
 
 
 def overrides(strategy: Strategy, hook: str) -> bool:
-    """Whether the strategy's class overrides `hook`."""
+    """Return True if the strategy's class overrides `hook`."""
     return getattr(type(strategy), hook) is not getattr(Strategy, hook)
 
 

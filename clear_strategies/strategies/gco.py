@@ -147,5 +147,5 @@ class GCO(Strategy):
 
 
 def _turns_something(squares: Float[Tensor, "N G"]) -> Bool[Tensor, " N"]:
-    """Whether a gradient of the rotation is more than rounding noise, see `_ROTATION_NOISE`."""
+    """True where a gradient of the rotation is more than rounding noise, see `_ROTATION_NOISE`."""
     return squares[:, _QUATS] > _ROTATION_NOISE**2 * squares[:, _SCALES]

@@ -73,7 +73,7 @@ class RandomBackground(Strategy):
 
 
 def _transparent(view: View) -> bool:
-    """Whether the photo is transparent where it has the colour of the background."""
+    """Return True if the photo is transparent where it has the colour of the background."""
     if view.lr.transparency is None:
         return False
     behind = is_background(view.lr.image, view.background)

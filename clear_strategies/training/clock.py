@@ -1,4 +1,4 @@
-"""How long training has taken."""
+"""The clock of training time."""
 
 from __future__ import annotations
 

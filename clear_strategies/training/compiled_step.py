@@ -208,7 +208,7 @@ class CompiledStep:
         return kernel.StepSettings(BETA1, BETA2, bias2, self.optimizer.rates.eps, λ, skips, width, changing)
 
     def _has_no_momentum_above(self, active: int, *, moved: bool) -> bool:
-        """Whether bands above the active degree have no momentum.
+        """Return True if bands above the active degree have no momentum.
 
         The moments are read once after a checkpoint has restored them. After that the answer holds: a pass that skips the bands
         gives them no momentum, momentum does not vanish, and a change of the structure gathers rows and zeroes some.

@@ -33,7 +33,7 @@ class Densifier:
         return None
 
     def collects(self, t: int) -> bool:
-        """Whether `accumulate` reads the scores of iteration t; else they are not computed."""
+        """Return True if `accumulate` reads the scores of iteration t; else they are not computed."""
         return True
 
     def accumulate(self, update: Update, shot: Shot, t: int) -> None:
@@ -56,14 +56,14 @@ class Densifier:
         raise NotImplementedError
 
     def settled(self, t: int) -> bool:
-        """Whether the structure does not change after t."""
+        """Return True if the structure does not change after t."""
         return False
 
     def gather(self, parents: Int[Tensor, " M"]) -> None:
         """Gather its own tensors after a change of structure by others: row i comes from row parents[i]."""
 
     def reset_due(self, t: int) -> bool:
-        """Whether opacities are lowered at t. Renders right after that do not show the quality of the field."""
+        """Return True if opacities are lowered at t. Renders right after that do not show the quality of the field."""
         return False
 
     def state_dict(self) -> dict[str, Tensor]:

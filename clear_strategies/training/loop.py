@@ -255,5 +255,5 @@ def fit(
 
 
 def _passed(every: int, before: int, t: int) -> bool:
-    """Whether a multiple of `every` lies in (before, t]: skips may jump over it."""
+    """Return True if a multiple of `every` lies in (before, t]: skips may jump over it."""
     return t // every > before // every

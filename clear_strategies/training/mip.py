@@ -29,7 +29,7 @@ _MARGIN: Final = 0.15  # of the image: a centre counts up to this share outside 
 
 @dataclass(frozen=True, slots=True)
 class MipFilter:
-    """When the 3D filter is computed, and from which cameras.
+    """Settings of the 3D filter: when it is computed, and from which cameras.
 
     Args:
         variance: of the filter, in squared sampling intervals (px² at the finest camera); 0 switches it off.

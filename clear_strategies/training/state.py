@@ -226,11 +226,11 @@ class TrainState:
         self.refilter()
 
     def reset_due(self, t: int) -> bool:
-        """Whether opacities are lowered at t, see `Densifier.reset_due`."""
+        """Return True if opacities are lowered at t, see `Densifier.reset_due`."""
         return self.conductor.may_densify(t) and self.density.reset_due(t)
 
     def filter_due(self) -> bool:
-        """Whether the 3D filter is recomputed at t; every change of structure also recomputes it."""
+        """Return True if the 3D filter is recomputed at t; every change of structure also recomputes it."""
         return self.t % self.mip.every == 0 and self.t <= self.settings.iterations - self.mip.last
 
     def checkpoint(self, config: Mapping[str, Any]) -> Checkpoint:

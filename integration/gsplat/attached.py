@@ -248,7 +248,7 @@ class Attached:
         return drawing_ahead(pose, K, call["width"], call["height"])
 
     def _draws_colors(self, call: Mapping[str, Any]) -> bool:
-        """Whether a call draws the colours of the scene, and not only depth, normals or other features."""
+        """Return True if a call draws the colours of the scene, and not only depth, normals or other features."""
         as_bands = call.get("sh_degree") is not None
         self._has_drawn_bands |= as_bands
         if "RGB" not in call.get("render_mode", "RGB") or call["colors"].shape[-1] != 3:

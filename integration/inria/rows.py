@@ -157,7 +157,7 @@ def find_change(before: Mapping[str, Tensor], after: Mapping[str, Tensor]) -> Ch
 
 
 def _are_copies(rows: Mapping[str, Tensor], of: Mapping[str, Tensor], parents: Int[Tensor, " M"]) -> bool:
-    """Whether each of M rows has the rotation and colour of its parent; a row without a parent (-1) may have any."""
+    """Return True if each of M rows has the rotation and colour of its parent; a row without a parent (-1) may have any."""
     known = (parents >= 0).nonzero()[:, 0]
     return all(bool((bits(rows[name][known]) == bits(of[name][parents[known]])).all()) for name in _COPIED)
 

@@ -1,4 +1,4 @@
-"""Trainers as they are, where there is no GPU:
+"""Runs unchanged trainers on machines without a GPU:
 
     python -m integration.on_cpu simple_trainer.py default --data_dir data
 

@@ -156,7 +156,7 @@ class WarpFrame:
         self.resolved = True
 
     def _fits(self) -> bool:
-        """Whether the lists of a recorded frame have space for its replay's pairs, and its numbers are finite."""
+        """Return True if the lists of a recorded frame have space for its replay's pairs, and its numbers are finite."""
         *pairs, not_finite, _, _ = self.totals.tolist()
         for view, count in zip(self.views, pairs, strict=True):
             if not self.settings.allows(count):

@@ -91,7 +91,7 @@ class WarpSettings(Backend):
         self.capacities[camera.width, camera.height] = capacity if self.allows(capacity) else pairs
 
     def allows(self, pairs: int) -> bool:
-        """Whether the lists of this many pairs, which are counted in 32 bits, fit the budget."""
+        """Return True if the lists of this many pairs, which are counted in 32 bits, fit the budget."""
         return mebibytes(pairs) <= self.memory and pairs < 2**31
 
 

@@ -14,7 +14,7 @@ _IN_WORDS: Final = {"cpu": "the CPU", "cuda": "CUDA"}
 
 
 def supported(devices: Collection[str], *images: Tensor) -> bool:
-    """Whether kernels for `devices` support the type, shape and device of these images."""
+    """Return True if kernels for `devices` support the type, shape and device of these images."""
     return all(
         image.dtype == torch.float32
         and image.device.type in devices

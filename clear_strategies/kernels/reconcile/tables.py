@@ -19,7 +19,7 @@ FIRST_BANDS: Final = {"sh0": 0, "shN": 1}
 
 
 def has(g: Grads, name: str) -> bool:
-    """Whether there is a gradient of the attribute, by name or as factors."""
+    """Return True if there is a gradient of the attribute, by name or as factors."""
     return name in g or (g.colour is not None and name in FIRST_BANDS)
 
 
