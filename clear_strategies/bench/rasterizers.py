@@ -126,7 +126,7 @@ def figure(time: pd.DataFrame, error: pd.DataFrame) -> Figure:
     rows["name"] = (rows["backend"] + " " + rows["module"].fillna("")).str.strip()  # empty in a CSV
     rows["ms"] = rows["forward_ms"] + rows["backward_k1_ms"]
     scenes, names = rows["scene"].unique(), rows["name"].unique()
-    drawn, (panels,) = new_figure(1, len(scenes), 1.2 + 3 * len(scenes), 4.2)
+    drawn, (panels,) = new_figure(1, len(scenes), 1.2 + 2 * len(scenes), 3.2)
     for axis, scene in zip(panels, scenes, strict=True):
         for i, name in enumerate(names):
             points = rows[(rows["scene"] == scene) & (rows["name"] == name)]
@@ -137,9 +137,10 @@ def figure(time: pd.DataFrame, error: pd.DataFrame) -> Figure:
         axis.set(title=scene, xlabel="forward + backward, ms", yscale="log")
         if axis is not panels[0]:
             axis.sharey(panels[0])
-        axis.margins(x=0.25, y=0.15)
+        axis.label_outer()
+        axis.margins(x=0.4, y=0.15)
         axis.grid(alpha=0.25)
-    panels[0].set_ylabel("error of the gradient of the means,\nrelative L2, against float64")
+    panels[0].set_ylabel("error of the means' gradient,\nrelative L2, against float64")
     drawn.legend(loc="outside lower left", fontsize=8, ncols=max(1, min(len(names), 2 * len(scenes))))
     return drawn
 
