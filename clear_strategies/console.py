@@ -29,8 +29,8 @@ _LEFT: Final = (errno.EPIPE, errno.EIO, errno.EINVAL)  # the last of a pipe of W
 _PREFIXES: Final = {logging.WARNING: "warning: ", logging.ERROR: "error: ", logging.CRITICAL: "error: "}
 
 
-class _Readerless(io.FileIO):
-    """The descriptor of an output. What follows after who reads it has left is dropped."""
+class _ClosableOutput(io.FileIO):
+    """A file descriptor that drops what is written after its reader has closed it."""
 
     def write(self, data: Any) -> int:
         try:
@@ -44,23 +44,24 @@ class _Readerless(io.FileIO):
             return len(data)
 
 
-def steady() -> None:
-    """Make stdout and stderr those of a program that goes on after who reads it has left, as head does, or after its terminal was
-    closed; letters that the console does not have are escaped. Every program begins with this.
+def harden_output() -> None:
+    """Make stdout and stderr survive a closed pipe or terminal: later output is dropped, as `| head` requires.
+
+    Characters that the console cannot encode are escaped. Every entry point calls this first.
     """
     for name in ("stdout", "stderr"):
         if (stream := getattr(sys, name)) is None:  # the program was started without it
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115 - as long as the program
         elif stream is getattr(sys, f"__{name}__"):  # else of a test or a notebook
-            setattr(sys, name, _steady(stream))
+            setattr(sys, name, _hardened(stream))
 
 
-def _steady(stream: io.TextIOWrapper) -> io.TextIOWrapper:
+def _hardened(stream: io.TextIOWrapper) -> io.TextIOWrapper:
     if not isinstance(getattr(stream.buffer, "raw", stream.buffer), io.FileIO):  # the console of Windows
         stream.reconfigure(errors="backslashreplace")
         return stream
     stream.flush()
-    raw, at_once = _Readerless(stream.fileno(), "w", closefd=False), stream.write_through
+    raw, at_once = _ClosableOutput(stream.fileno(), "w", closefd=False), stream.write_through
     return io.TextIOWrapper(
         raw if at_once else io.BufferedWriter(raw),
         stream.encoding, errors="backslashreplace", line_buffering=stream.line_buffering, write_through=at_once,
@@ -77,7 +78,7 @@ class Console(logging.StreamHandler[Any]):
 
     def __init__(self, stream: TextIO | io.TextIOBase | None = None, *, verbose: bool = False) -> None:
         if stream is None:
-            steady()  # a launcher's processes do not pass `run.main`
+            harden_output()  # a launcher's processes do not pass `run.main`
         super().__init__(stream if stream is not None else sys.stdout)
         self.setLevel(logging.DEBUG if verbose else logging.INFO)
         self.addFilter(lambda record: record.levelno > logging.WARNING or record.name.split(".")[0] not in _LIBRARIES)

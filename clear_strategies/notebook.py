@@ -97,7 +97,7 @@ def train(photos: str | Path | None = None, *settings: str, folder: str | Path |
         DataError: a photo or a file cannot be used.
     """
     exit_codes.require("train")
-    console.steady()
+    console.harden_output()
     console.show()
     require_text(settings)
     words = [readable(word) for word in settings]

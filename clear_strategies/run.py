@@ -23,7 +23,7 @@ def main() -> None:
     atexit.register(gc.freeze)  # else Python looks through all of torch's objects before it ends, for 0.3 s
     atexit.register(signals.handle, signal.SIG_DFL)  # else one more Ctrl-C shows a traceback of Python's own end
     logging.captureWarnings(True)  # of libraries: they are for run.log
-    console.steady()
+    console.harden_output()
     signals.handle(signals.stop)  # else the system ends us at once, and joblib's workers go on without us
     try:
         command = commands.named(sys.argv[1:])

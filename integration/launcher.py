@@ -77,7 +77,7 @@ def run(options: argparse.Namespace, prepared: Callable[[], Host]) -> int:
         options: of `parser`; with `strategies` None the script runs without CLEAR.
         prepared: called when `sys.argv` and `sys.path` are the script's.
     """
-    console.steady()
+    console.harden_output()
     console.show_in_host()
     try:
         if not options.script.is_file():

@@ -227,7 +227,7 @@ REFUSED = {
 def test_a_setting_that_cannot_be_used_is_named_by_its_key(overrides, message):
     with pytest.raises(SettingError) as refused:  # noqa: PT012
         settings = settings_of(tree(composed(*overrides.split())))
-        device.drawing(settings.rasterizer, settings.fit.device)
+        device.load_rasterizer(settings.rasterizer, settings.fit.device)
     assert message in str(refused.value)
 
 

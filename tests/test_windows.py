@@ -134,7 +134,7 @@ class PipeOfWindows(io.FileIO):
         raise OSError(errno.EINVAL, "Invalid argument")
 
 
-class Output(console._Readerless, PipeOfWindows):
+class Output(console._ClosableOutput, PipeOfWindows):
     pass
 
 

@@ -68,7 +68,7 @@ QUESTIONS: Final[Mapping[str, tuple[str, Options]]] = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    console.steady()
+    console.harden_output()
     options = vars(parser().parse_args(arguments))
     question, threads = options.pop("question"), options.pop("threads")
     results = Results(_log.info, options.pop("out"))

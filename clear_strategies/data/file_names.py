@@ -21,34 +21,34 @@ def normalized(name: str) -> str:
     return unicodedata.normalize("NFC", name)
 
 
-def alike(name: str) -> str:
+def name_key(name: str) -> str:
     """Return a key that is equal for names that differ only in case and in Unicode's form."""
     return normalized(name).lower()
 
 
 def named(folder: Path, name: str) -> Path:
-    """Return the path of a folder's entry whose name is `alike`; `folder / name` if there is none."""
+    """Return the path of a folder's entry whose name has the same `name_key`; `folder / name` if there is none."""
     path = folder / name
     if path.exists() or not folder.is_dir():
         return path
-    wanted = alike(name)
-    return next((folder / other for other in sorted(os.listdir(folder)) if alike(other) == wanted), path)  # noqa: PTH208 - faster
+    wanted = name_key(name)
+    return next((folder / other for other in sorted(os.listdir(folder)) if name_key(other) == wanted), path)  # noqa: PTH208 - faster
 
 
 def finder(folder: Path) -> Callable[[str], Path]:
     """Return a function that finds the files that a capture names, in or below a folder.
 
-    A name is first used literally, then with ".png" appended. If there is no such file, backslashes separate folders, names need
-    only be `alike`, leading folders of an absolute path are ignored, the folder's own name may come first, and the suffix may
-    differ if only one image has that stem. If nothing is found, the returned path does not exist.
+    A name is first used literally, then with ".png" appended. If there is no such file, backslashes separate folders, only the
+    `name_key` of each name counts, leading folders of an absolute path are ignored, the folder's own name may come first, and the
+    suffix may differ if only one image has that stem. If nothing is found, the returned path does not exist.
     """
 
     @cache
     def entries(parent: Path) -> dict[str, list[Path]]:
-        """The entries of a folder by `alike` of their names, images also by that of their stems."""
+        """The entries of a folder by `name_key` of their names, images also by that of their stems."""
         found: dict[str, list[Path]] = {}
         for path in sorted(parent.iterdir()) if parent.is_dir() else ():
-            for key in {alike(path.name), alike(path.stem if path.suffix.lower() in SUFFIXES else path.name)}:
+            for key in {name_key(path.name), name_key(path.stem if path.suffix.lower() in SUFFIXES else path.name)}:
                 found.setdefault(key, []).append(path)
         return found
 
@@ -56,10 +56,10 @@ def finder(folder: Path) -> Callable[[str], Path]:
         parent, last = folder, PureWindowsPath(parts[-1])
         for part in parts[:-1]:
             there = parent / part
-            same = [] if os.path.isdir(there) else entries(parent).get(alike(part), [])  # noqa: PTH112 - as in `is_file`
+            same = [] if os.path.isdir(there) else entries(parent).get(name_key(part), [])  # noqa: PTH112 - as in `is_file`
             parent = next((path for path in same if path.is_dir()), there)
         for key in (last.name, last.stem) if last.suffix[1:2].isalpha() else (last.name,):  # "rgb.0001" has no ending
-            files = [path for path in entries(parent).get(alike(key), []) if path.is_file()]
+            files = [path for path in entries(parent).get(name_key(key), []) if path.is_file()]
             if len(files) == 1:
                 return files[0]
         return None
@@ -71,7 +71,7 @@ def finder(folder: Path) -> Callable[[str], Path]:
                 return folder / exact.relative_to(inside) if exact.is_relative_to(inside) else exact
         path = PureWindowsPath(name)
         parts = [part for part in path.parts if part != path.anchor]
-        twice = len(parts) > 1 and alike(parts[0]) == alike(folder.absolute().name)
+        twice = len(parts) > 1 and name_key(parts[0]) == name_key(folder.absolute().name)
         starts = range(len(parts) if path.anchor else min(1 + twice, len(parts)))
         missing = folder.joinpath(*(parts[-1:] if path.anchor else parts))
         return next(filter(None, (below(parts[i:]) for i in starts)), missing)

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool
 from torch import Tensor
 
-from clear_strategies.data.file_names import alike, some
+from clear_strategies.data.file_names import name_key, some
 from clear_strategies.data.lenses import Lens
 from clear_strategies.data.photo_files import SUFFIXES, image_size, is_lossy, read_image
 from clear_strategies.data.photo_folders import images_in
@@ -45,7 +45,7 @@ def masks_of(root: Path, paths: Iterable[Path], given: Mapping[Path, Path] = Map
         for folder in filter(Path.is_dir, dict.fromkeys(_mask_folders(root, parent))):
             masks = folders.setdefault(folder, _by_name(folder))
             for photo in images_in(parent):
-                names = (alike(photo.stem), alike(photo.name))
+                names = (name_key(photo.stem), name_key(photo.name))
                 if mask := next((masks[name] for name in names if name in masks), None):
                     found.setdefault(photo, mask)
                     used.add(mask)
@@ -60,8 +60,8 @@ def masks_of(root: Path, paths: Iterable[Path], given: Mapping[Path, Path] = Map
 
 def masks_among(photos: Sequence[Path]) -> dict[Path, Path]:
     """Find the masks among the images of a folder, by their photos: 0001.jpg.mask.png (RealityCapture), 0001_mask.png."""
-    named = {alike(name): photo for photo in photos for name in (photo.stem, photo.name)}
-    marked = {file: _MARKED.sub(r"\g<1>", stem) for file in photos if (stem := alike(file.stem))}
+    named = {name_key(name): photo for photo in photos for name in (photo.stem, photo.name)}
+    marked = {file: _MARKED.sub(r"\g<1>", stem) for file in photos if (stem := name_key(file.stem))}
     return {named[name]: file for file, name in marked.items() if named.get(name, file).stem != file.stem}
 
 
@@ -83,7 +83,7 @@ def _by_name(folder: Path) -> dict[str, Path]:
     files = sorted(images_in(folder), key=lambda file: file.suffix.lower() != SUFFIXES[0])
     for names in (r"\g<0>", r"\g<1>"):
         for file in files:
-            masks.setdefault(_MARKED.sub(names, alike(file.stem)), file)
+            masks.setdefault(_MARKED.sub(names, name_key(file.stem)), file)
     return masks
 
 

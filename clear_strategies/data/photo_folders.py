@@ -62,7 +62,7 @@ def image_folder(root: Path, name: str | None = None) -> Path:
     )
     if len(others := folders_of_images(root)) == 1:
         return next(iter(others))
-    raise DataError(root, "images", f"{problem}, but {counted(root, others)}" if others else problem, remedy)
+    raise DataError(root, "images", f"{problem}, but {photo_counts(root, others)}" if others else problem, remedy)
 
 
 def folder_note(folder: Path) -> str:
@@ -81,7 +81,7 @@ def list_images(folder: Path) -> list[Path]:
         return images
     problem, remedy = f"holds no image ({', '.join(SUFFIXES)})", "check the path"
     if inside := folders_of_images(folder):
-        problem = f"{problem}, but {counted(folder, inside)}"
+        problem = f"{problem}, but {photo_counts(folder, inside)}"
         remedy = "give one of these folders, or put all photos of the scene into one"
     elif other := in_place_of_photos(path for pattern in ("*", *_BELOW) for path in sorted(folder.glob(pattern))):
         problem, remedy = f"{problem}, but {other[0]}", other[1]
@@ -94,7 +94,7 @@ def folders_of_images(root: Path) -> dict[Path, int]:
     return dict(Counter(path.parent for path in images if path.parent.name.lower() not in _NO_PHOTOS))
 
 
-def counted(root: Path, folders: Mapping[Path, int]) -> str:
+def photo_counts(root: Path, folders: Mapping[Path, int]) -> str:
     """Describe folders and the numbers of their photos, the largest first."""
     most = sorted(folders.items(), key=lambda item: -item[1])
     return some([f"{folder.relative_to(root).as_posix()} holds {count}" for folder, count in most])

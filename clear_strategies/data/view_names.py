@@ -10,7 +10,7 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.data.file_names import alike, named, normalized
+from clear_strategies.data.file_names import name_key, named, normalized
 from clear_strategies.data.photo_files import SUFFIXES, image_size, png_bytes
 from clear_strategies.data.photo_folders import list_images
 from clear_strategies.errors import DataError
@@ -28,12 +28,12 @@ def file_stems(names: Iterable[str]) -> dict[str, str]:
     without regard to case keep their suffixes: "0000.jpg" and "0000.png".
     """
     stems = {name: bare(name).replace("/", "_") for name in names}
-    shared, taken = Counter(map(alike, stems.values())), set[str]()
+    shared, taken = Counter(map(name_key, stems.values())), set[str]()
     for name, stem in sorted(stems.items()):
-        stems[name] = name.replace("/", "_") if shared[alike(stem)] > 1 else stem
-        while alike(stems[name]) in taken:
+        stems[name] = name.replace("/", "_") if shared[name_key(stem)] > 1 else stem
+        while name_key(stems[name]) in taken:
             stems[name] += "_"
-        taken.add(alike(stems[name]))
+        taken.add(name_key(stems[name]))
     return stems
 
 
@@ -55,14 +55,14 @@ def write_pngs(folder: Path, images: Iterable[tuple[str, Float[Tensor, "h w 3"]]
     """
     written = dict[str, str]()
     for name, image in images:
-        stem = bare(name) if alike(bare(name)) not in written.values() else name
+        stem = bare(name) if name_key(bare(name)) not in written.values() else name
         file, png = folder / f"{stem}.png", png_bytes(image)
-        if name in written or alike(stem) in written.values():
+        if name in written or name_key(stem) in written.values():
             raise DataError(file, "file name", "is that of two photos", "give every photo its own name")
         if file.exists() and read_bytes(file) != png:
             raise DataError(file, "file", "is there, and holds another image", "give another folder, or move the file")
         write_bytes(file, png)
-        written[name] = alike(stem)
+        written[name] = name_key(stem)
     return len(written)
 
 

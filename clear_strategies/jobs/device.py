@@ -114,7 +114,9 @@ class ReadyRasterizer:
         return self.having(near=_SHARED.near * size)
 
 
-def drawing(settings: RasterizerSettings | functools.partial[Rasterizer], asked: Device | None) -> ReadyRasterizer:
+def load_rasterizer(
+    settings: RasterizerSettings | functools.partial[Rasterizer], asked: Device | None
+) -> ReadyRasterizer:
     """Make the rasterizer of the settings on the device that was asked for."""
     if asked == "cuda" and not torch.cuda.is_available():
         raise SettingError(

@@ -65,7 +65,7 @@ def run(
     if settings.fit.viewer:
         exit_codes.require("view")
     conductor = settings.conductor(settings.fit.stretch)
-    drawing = device.drawing(settings.rasterizer, settings.fit.device)
+    ready = device.load_rasterizer(settings.rasterizer, settings.fit.device)
     with files.hold(folder), signals.interrupted("before training began"):
         begun = resume.begun(folder)
         if begun and settings.fit.resume is None and not settings.fit.overwrite and settings.data.save_lr is None:
@@ -73,7 +73,7 @@ def run(
             raise DataError(folder, "folder", f"holds the {begun} of a run, which this one would remove", remedy)
         if not begun:
             claim()
-        return _Job(settings, conductor, drawing, resume.comparable(values), folder, overrides, claim).run()
+        return _Job(settings, conductor, ready, resume.comparable(values), folder, overrides, claim).run()
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ class _Job:
 
     settings: JobSettings
     conductor: Conductor
-    drawing: device.ReadyRasterizer
+    ready: device.ReadyRasterizer
     compared: Mapping[str, Any]
     folder: Path
     overrides: Sequence[str] | None
@@ -118,15 +118,15 @@ class _Job:
         if settings.data.save_lr is not None:
             save_lr(scene, Path(settings.data.save_lr))
             return None
-        device.log_choice(settings.rasterizer, self.drawing)
-        drawing = self.drawing.over(scene.background).among(scene.cloud.means)
-        there = scene.to(drawing.device)
-        state = self._start(scene, there, drawing)
+        device.log_choice(settings.rasterizer, self.ready)
+        ready = self.ready.over(scene.background).among(scene.cloud.means)
+        there = scene.to(ready.device)
+        state = self._start(scene, there, ready)
         self.claim()
         files.sweep(folder)
-        self._announce(scene, state, drawing, f"{threads} ({reason})", level)
+        self._announce(scene, state, ready, f"{threads} ({reason})", level)
         results.remove_earlier(folder, all_files=state.t == 1)
-        evaluation, training = self._train(scene, there, state, drawing)
+        evaluation, training = self._train(scene, there, state, ready)
         seconds = time.perf_counter() - self.began
         _log.log(level, "%s", metrics.describe(folder, evaluation, seconds, _parts(scene, state, training)))
         if in_sweep():
@@ -136,7 +136,7 @@ class _Job:
         mean = evaluation.mean("test") or evaluation.mean("train")
         return None if mean is None else mean.psnr
 
-    def _start(self, scene: Scene, there: Scene, drawing: device.ReadyRasterizer) -> TrainState:
+    def _start(self, scene: Scene, there: Scene, ready: device.ReadyRasterizer) -> TrainState:
         """The state that training starts from: the initial one, or the checkpoint that `fit.resume` names.
 
         Args:
@@ -146,18 +146,18 @@ class _Job:
         rates = scaled(settings.optim, stretch).of_run(settings.fit.iterations)
         state = TrainState.start(
             there, self.conductor, settings=scaled(settings.fit, stretch), density=scaled(settings.density, stretch),
-            rates=rates, mip=scaled(settings.mip, stretch), rules=drawing.rules,
+            rates=rates, mip=scaled(settings.mip, stretch), rules=ready.rules,
         )  # fmt: skip
         resume.resume(state, scene, settings.fit.resume, self.folder, self.compared)
         return state
 
     def _announce(
-        self, scene: Scene, state: TrainState, drawing: device.ReadyRasterizer, threads: str, level: int
+        self, scene: Scene, state: TrainState, ready: device.ReadyRasterizer, threads: str, level: int
     ) -> None:
         """Log the plan, and settings without effect. A SettingError if the run does not fit into memory."""
         memory.release()
         machine = {
-            "rasterizer": f"{drawing.name}, kernel {drawing.rules.kernel} px²",
+            "rasterizer": f"{ready.name}, kernel {ready.rules.kernel} px²",
             "threads": threads,
             "memory": memory.require(state, self.settings.fit.memory),
         }
@@ -181,11 +181,11 @@ class _Job:
         )  # fmt: skip
 
     def _train(
-        self, scene: Scene, there: Scene, state: TrainState, drawing: device.ReadyRasterizer
+        self, scene: Scene, there: Scene, state: TrainState, ready: device.ReadyRasterizer
     ) -> tuple[Evaluation, float]:
         """Train to the end and write the files; return the scores and the seconds of training in this command."""
         title, alone = self.chosen.title, device.jobs_at_once() == 1
-        painter = Painter(state.field, drawing.make)
+        painter = Painter(state.field, ready.make)
         before = state.seconds  # of the run that was resumed
         began = time.perf_counter()
         with signals.interrupted("before the run was finished", lambda: resume.newest(self.folder)):
@@ -195,14 +195,14 @@ class _Job:
                 plan.progress_bar(state, after_step, title, shown=alone) as progress,
             ):
                 checkpoints = self.folder / CHECKPOINTS
-                fit(state, there, drawing.rasterizer, checkpoints=checkpoints, config=self.compared, progress=progress)
+                fit(state, there, ready.rasterizer, checkpoints=checkpoints, config=self.compared, progress=progress)
             training = time.perf_counter() - began
             self.conductor.on_fit_end()  # frees memory for the results
             memory.release()
             evaluation = results.write_results(
-                self.folder, scene, state, drawing.rasterizer, painter, self.chosen, backend=drawing.name,
+                self.folder, scene, state, ready.rasterizer, painter, self.chosen, backend=ready.name,
                 down=self.settings.data.views.downsample, seconds=before + training, config=self.compared,
-                antialiased=drawing.rules.antialiased, own=self.settings.metrics,
+                antialiased=ready.rules.antialiased, own=self.settings.metrics,
             )  # fmt: skip
         return evaluation, training
 

@@ -85,7 +85,7 @@ def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
 
     Args:
         rasterizer: by name, or by the dotted name of another package's class; None: that of the run, if it is known here (see
-            `_drawing`), else the fastest.
+            `_load_rasterizer`), else the fastest.
     """
     folder, above = folder_of(path), 0
     is_ply = path.is_file() and path.suffix != checkpoint.SUFFIX
@@ -111,8 +111,8 @@ def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
         name = folder.name if ply.name == PLY else ply.stem
     cameras = _cameras_near(folder, above)
     background = cameras[0].background if cameras else (0.0, 0.0, 0.0)
-    drawing = _drawing(settings, rasterizer).over(background).among(field.means.data)
-    painter = Painter(field.to(drawing.device), drawing.make)
+    ready = _load_rasterizer(settings, rasterizer).over(background).among(field.means.data)
+    painter = Painter(field.to(ready.device), ready.make)
     source += f", {counted(len(field), 'Gaussian')}"
     return SavedSplat(folder, name or "splat", source, painter, cameras, bool(settings.get("antialiased", True)))
 
@@ -152,7 +152,7 @@ def _ply_in(folder: Path, path: Path) -> Path:
     return ply
 
 
-def _drawing(settings: Mapping[str, Any], name: str | None) -> ReadyRasterizer:
+def _load_rasterizer(settings: Mapping[str, Any], name: str | None) -> ReadyRasterizer:
     """Make the rasterizer with the settings of a run, or the one that was asked for.
 
     The class is one of this repository, one that the configuration of an installed package names, or the one that was asked for:
@@ -165,21 +165,21 @@ def _drawing(settings: Mapping[str, Any], name: str | None) -> ReadyRasterizer:
     own = {key: value for key, value in settings.items() if not key.startswith("_")}
     if name is not None:
         named = {TARGET: name} if "." in name else {TARGET: device.BY_NAME, "name": name}
-        return _made({**(own if named[TARGET] == target != device.BY_NAME else shared), **named})
+        return _rasterizer_of({**(own if named[TARGET] == target != device.BY_NAME else shared), **named})
     try:
         if target != device.BY_NAME and target not in [node.get(TARGET) for node in options("rasterizer").values()]:
             rule = f"{target} is a class that only the file names, and a file never says what is imported"
             raise SettingError(
                 f"{_OF_RASTERIZER}{TARGET}: {rule}. If you trust it, --rasterizer {target} draws with it."
             )
-        return _made({**own, TARGET: target})
+        return _rasterizer_of({**own, TARGET: target})
     except SettingError as error:
         _log.warning("%s The fastest rasterizer of this machine draws instead.", error)
-        return _made({**shared, TARGET: device.BY_NAME})
+        return _rasterizer_of({**shared, TARGET: device.BY_NAME})
 
 
-def _made(node: Mapping[str, Any]) -> ReadyRasterizer:
-    return device.drawing(build(device.rasterizer_node(with_defaults(node)), "rasterizer"), None)
+def _rasterizer_of(node: Mapping[str, Any]) -> ReadyRasterizer:
+    return device.load_rasterizer(build(device.rasterizer_node(with_defaults(node)), "rasterizer"), None)
 
 
 def _cameras_near(folder: Path, above: int) -> list[SavedCamera]:

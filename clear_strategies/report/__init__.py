@@ -23,7 +23,7 @@ import numpy as np
 
 from clear_strategies import console, files
 from clear_strategies.commands import path_of
-from clear_strategies.data.file_names import alike
+from clear_strategies.data.file_names import name_key
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.errors import ClearError, DataError, counted
 from clear_strategies.jobs import exit_codes
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("folders", nargs="+", type=path_of, metavar="DIR", help="a run's folder, or a folder of runs")
     parser.add_argument("--out", type=path_of, metavar="FOLDER", help="where the report goes (default: the first DIR)")
-    console.steady()
+    console.harden_output()
     logging.captureWarnings(True)  # as `run.main`: matplotlib warns of each letter that its font lacks
     options = parser.parse_args(arguments)
     console.show()
@@ -106,7 +106,7 @@ def _file_names(scenes: Iterable[str]) -> dict[str, str]:
     words: dict[str, str] = {}
     for scene in dict.fromkeys(scenes):
         word = re.sub(r"\W+", "_", scene).strip("_")[:_LONGEST] or "scene"
-        while alike(word) in map(alike, words.values()):
+        while name_key(word) in map(name_key, words.values()):
             word += "_"
         words[scene] = word
     return words

@@ -29,7 +29,7 @@ def settings(*overrides: str) -> JobSettings:
 def test_a_device_that_is_not_there_or_that_the_rasterizer_does_not_draw_on_is_refused(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(SettingError, match=r"fit\.device: is cuda, and torch finds no CUDA device"):
-        device.drawing(RasterizerSettings(), "cuda")
+        device.load_rasterizer(RasterizerSettings(), "cuda")
     with pytest.raises(SettingError, match="is cuda, and the rasterizer cpp draws on cpu alone"):
         drawn_on(frozenset({"cpu"}), "cpp", "cuda")
 
@@ -53,29 +53,31 @@ def test_warp_gets_the_device_of_the_job(monkeypatch):
 
     monkeypatch.setattr("rasterizers.load", load)
     for asked, expected in (("cpu", "cpu"), (None, None)):
-        drawing = device.drawing(RasterizerSettings(name="warp"), asked)
-        assert (drawing.name, drawing.device) == ("warp", "cpu")
+        ready = device.load_rasterizer(RasterizerSettings(name="warp"), asked)
+        assert (ready.name, ready.device) == ("warp", "cpu")
         assert given["warp"].get("device") == expected
 
 
 @pytest.mark.parametrize("chosen", [(), ("+method=3dgs_lr",)])
 def test_the_method_says_whether_opacities_are_compensated(chosen: tuple[str, ...]):
-    assert device.drawing(settings(*chosen).rasterizer, None).rules.antialiased == (not chosen)
+    assert device.load_rasterizer(settings(*chosen).rasterizer, None).rules.antialiased == (not chosen)
 
 
 def test_a_rasterizer_of_another_package_is_a_target_with_the_same_settings():
     target = f"rasterizer._target_={__name__}.Theirs"
     found = settings(target, "rasterizer.kernel=0.3", "rasterizer.near=1e-5", "+rasterizer.sharpness=2").rasterizer
-    drawing = device.drawing(found, None).over((1.0, 1.0, 1.0))
-    assert (type(drawing.rasterizer), drawing.name) == (Theirs, "Theirs")
-    assert (drawing.rules.kernel, drawing.rules.near) == (0.3, 1e-5)
-    assert (drawing.rasterizer.sharpness, drawing.rasterizer.background) == (2, (1.0, 1.0, 1.0))
-    assert drawing.make().background == (1.0, 1.0, 1.0)
-    own = device.drawing(settings(target, "rasterizer.background=[0,0,1]").rasterizer, None).over((1.0, 1.0, 1.0))
+    ready = device.load_rasterizer(found, None).over((1.0, 1.0, 1.0))
+    assert (type(ready.rasterizer), ready.name) == (Theirs, "Theirs")
+    assert (ready.rules.kernel, ready.rules.near) == (0.3, 1e-5)
+    assert (ready.rasterizer.sharpness, ready.rasterizer.background) == (2, (1.0, 1.0, 1.0))
+    assert ready.make().background == (1.0, 1.0, 1.0)
+    own = device.load_rasterizer(settings(target, "rasterizer.background=[0,0,1]").rasterizer, None).over(
+        (1.0, 1.0, 1.0)
+    )
     assert own.rasterizer.background == (0, 0, 1)
     with pytest.raises(SettingError, match=r"rasterizer.sharp: .* Did you mean rasterizer.sharpness\?"):
         settings(target, "+rasterizer.sharp=2")
     with pytest.raises(SettingError, match="rasterizer: kernel must be"):
-        device.drawing(settings(target, "rasterizer.kernel=-1").rasterizer, None)
+        device.load_rasterizer(settings(target, "rasterizer.kernel=-1").rasterizer, None)
     with pytest.raises(SettingError, match="rasterizer: Path is no Rasterizer"):
-        device.drawing(device.functools.partial(Path), None)
+        device.load_rasterizer(device.functools.partial(Path), None)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.data.photo_files import has_alpha, read_image
-from clear_strategies.data.priors.interface import AS_EXPECTED, compared, require_path
+from clear_strategies.data.priors.interface import AS_EXPECTED, checked_sr, require_path
 from clear_strategies.data.view_names import ViewFiles
 
 
@@ -46,4 +46,4 @@ class Images:
         file = self._files.file(name, lr.shape[1] * factor, lr.shape[0] * factor)
         over_black = "its transparent pixels are black in the photos, too; else save it without alpha"
         check = over_black if has_alpha(file) else AS_EXPECTED
-        return compared(file.name, read_image(file), lr, factor, check)
+        return checked_sr(file.name, read_image(file), lr, factor, check)

@@ -117,7 +117,7 @@ def warn_if_far_from_lr(
         )  # fmt: skip
 
 
-def compared(
+def checked_sr(
     what: str, sr: Float[Tensor, "H W 3"], lr: Float[Tensor, "h w 3"], factor: int, check: str = AS_EXPECTED
 ) -> Float[Tensor, "H W 3"]:
     """Round `sr` to 8-bit steps, move it to the device of `lr`, and compare it by `warn_if_far_from_lr`."""

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.checks import refuse, require_choice
-from clear_strategies.data.priors.interface import compared
+from clear_strategies.data.priors.interface import checked_sr
 from clear_strategies.data.priors.tiling import require_tiles, tiled
 from clear_strategies.errors import DataError, SettingError
 
@@ -103,7 +103,7 @@ class Ncnn:
         model = _MODELS[self.model]
         network = _read_network(model)  # anew for each image: its weights take more memory than the image
         large = tiled(lambda part: _upscale(network, model, part, factor), lr.cpu(), factor, self.tile, self.overlap)
-        return compared(self.label, large, lr, factor)
+        return checked_sr(self.label, large, lr, factor)
 
 
 def factors(model: str) -> tuple[int, ...]:

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.data.priors.interface import compared, require_path
+from clear_strategies.data.priors.interface import checked_sr, require_path
 from clear_strategies.data.priors.tiling import require_tiles, tiled
 from clear_strategies.errors import DataError
 from clear_strategies.files import read_bytes
@@ -56,7 +56,7 @@ class Onnx:
     def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
         network = _read_network(Path(self.path))
         large = tiled(lambda part: self._run(network, part, factor), lr.cpu(), factor, self.tile, self.overlap)
-        return compared(self.label, large, lr, factor)
+        return checked_sr(self.label, large, lr, factor)
 
     def _run(self, network: Any, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
         import cv2

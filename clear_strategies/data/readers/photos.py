@@ -17,11 +17,11 @@ from clear_strategies.data.file_names import named, require_text, some
 from clear_strategies.data.masks import masks_among
 from clear_strategies.data.photo_files import SUFFIXES, optics
 from clear_strategies.data.photo_folders import (
-    counted,
     folders_of_images,
     images_in,
     in_place_of_photos,
     list_images,
+    photo_counts,
     usable,
 )
 from clear_strategies.data.priors import cache_folder
@@ -142,7 +142,7 @@ def _photos_in(root: Path) -> tuple[Path, list[Path]]:
     found = {folder: images_in(folder) for folder in (root, images, *(below if len(below) == 1 else ()))}
     folder = max(found, key=lambda folder: min(len(found[folder]), sfm.FEWEST))  # the first of these
     if folder == root and below:
-        _log.info("%s: the images in folders below it are not used: %s.", root, counted(root, below))
+        _log.info("%s: the images in folders below it are not used: %s.", root, photo_counts(root, below))
     if folder not in (root, images) or (folder != root and found[root]):
         there = f"too few images ({len(found[root])})" if found[root] else "no image"
         _log.warning("%s holds %s; those in %s are used.", root, there, folder.relative_to(root).as_posix())

@@ -95,7 +95,7 @@ def _given(override: str) -> Callable[[Path], object]:
             config, key.lstrip("+"), OmegaConf.create(f"v: {value}")["v"], merge=not added, force_add=added
         )
         settings = settings_of(tree(config))
-        return device.drawing(settings.rasterizer, settings.fit.device)
+        return device.load_rasterizer(settings.rasterizer, settings.fit.device)
 
     return give
 
