@@ -81,10 +81,11 @@ def _columns(rendered: Rendered, splats: Inputs, rows: Int[Tensor, " M"]) -> dic
 
 
 class _Info(dict[str, Any]):
-    """Gsplat's `info`. What not every loop reads is made when it is asked for, also by what goes through all of it.
+    """Gsplat's `info`, a dictionary that computes some of its values when they are first read, also by an iteration over all.
 
     Args:
-        later: what makes each of these values, and no other.
+        values: known from the start.
+        later: the function that computes each remaining value; it may return values of other names with it.
     """
 
     def __init__(self, values: Mapping[str, Any], later: Mapping[str, Callable[[], dict[str, Any]]]) -> None:

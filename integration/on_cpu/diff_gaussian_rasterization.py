@@ -174,7 +174,7 @@ class GaussianRasterizer(torch.nn.Module):
         parts = view.parts()
         drawn = parts[0].rendered.rendering
         absgrad = None if s.kernel_size is None else torch.zeros_like(drawn.means2d)
-        centres = drawn.means2d + _in_pixels(means2D, camera, absgrad)
+        centres = drawn.means2d + _gradient_probe(means2D, camera, absgrad)
         image, alpha = view.picture(parts, centres, None, absgrad)
         image = image.permute(2, 0, 1).contiguous()
         radii = _radii(drawn.visible, inputs, camera, kernel)
@@ -185,10 +185,13 @@ class GaussianRasterizer(torch.nn.Module):
         return (image, radii, depth) if s.confidence is None else (image, radii, depth, alpha[None])
 
 
-def _in_pixels(
+def _gradient_probe(
     points: Float[Tensor, "N C"], camera: Camera, absgrad: Float[Tensor, "N 2"] | None
 ) -> Float[Tensor, "N 2"]:
-    """0, whose gradient goes to the points, in NDC; and into their third column the sum of `absgrad`, which is used up."""
+    """Zeros in px that pass the gradient of the projected centres on to `points`, in NDC.
+
+    With `absgrad`, the gradient's third column is the sum of the absolute gradients, which are then reset to 0.
+    """
     half = points.new_tensor((camera.width / 2, camera.height / 2))
     offset = points - points.detach()
     if absgrad is not None and offset.requires_grad:

@@ -29,7 +29,7 @@ HUGE = 1e30  # such an ellipse, of 1e-15 px, covers no pixel centre, and the squ
 
 @wp.func
 def half_box(f: Footprint, reach: wp.float32) -> wp.vec2:
-    """Of the box that reaches so many standard deviations from the centre, px."""
+    """Half the width and height, px, of the box around the ellipse `reach` standard deviations from the centre."""
     return reach * f.size * wp.vec2(wp.sqrt(f.a + f.kernel), wp.sqrt(f.c + f.kernel))
 
 
