@@ -9,7 +9,7 @@ import functools
 import inspect
 from collections.abc import Mapping, Sequence
 from enum import Enum
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import torch
 from jaxtyping import Float
@@ -21,7 +21,7 @@ from rasterizers.geometry import depths
 from rasterizers.gsplat_info import info_of_all, info_of_visible
 from rasterizers.gsplat_picture import CameraView
 from rasterizers.inputs import Inputs
-from rasterizers.interface import Camera, Rasterizer
+from rasterizers.interface import Camera, Rasterizer, RasterSettings
 from rasterizers.modes import in_full_precision, uncompiled
 from rasterizers.reference.projection import footprints
 
@@ -101,8 +101,6 @@ def rasterization(
     """
     _require_supported(render_mode, rasterize_mode, more)
     batch, n, cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3] if viewmats.dim() > 2 else 1
-    replays = replay and not absgrad and torch.is_grad_enabled()
-    n_scenes = batch.numel()
     _require_geometry(batch, n, cameras, quats, scales, opacities, viewmats, Ks, rgb_offset)
     if "RGB" in render_mode:
         _require_colors(batch, n, cameras, colors, sh_degree, backgrounds)
@@ -111,38 +109,44 @@ def rasterization(
             "rgb_offset is an offset of spherical harmonics, give sh_degree; RGB takes it as colors + rgb_offset."
         )
     colors = colors.to(means.dtype)  # gsplat takes float16, too
+    by_camera = colors.dim() == len(batch) + 3 + (sh_degree is not None)
+    replays = replay and not absgrad and torch.is_grad_enabled()
     rasterizer = _loaded(backend, means.device.type, near_plane, eps2d, rasterize_mode == "antialiased")
 
-    def of_scene(x: Tensor, scene: int) -> Tensor:
-        return x if not batch else x.reshape(n_scenes, *x.shape[len(batch) :])[scene]
-
-    by_camera = colors.dim() == len(batch) + 3 + (sh_degree is not None)
     views = []
-    for scene in range(n_scenes):
-        poses, K = of_scene(viewmats, scene), of_scene(Ks, scene)
-        own, behind = of_scene(colors, scene), None if backgrounds is None else of_scene(backgrounds, scene)
-        mu, q, s, opacity = (of_scene(x, scene) for x in (means, quats, scales, opacities))
-        offset = None if rgb_offset is None else of_scene(rgb_offset, scene)
+    batched = (means, quats, scales, opacities, colors, rgb_offset, viewmats, Ks, backgrounds)
+    for mu, q, s, opacity, color, offset, poses, K, behind in zip(*(_scenes(x, batch) for x in batched), strict=True):
         for c, camera in enumerate(cameras_of(poses, K, width, height)):
-            left_in = _left_in(mu, q, s, opacity, camera, far_plane, radius_clip, eps2d, rasterize_mode)
-            inputs = Inputs(mu, q, s, left_in, own[c] if by_camera else own, offset)
-            views.append(
-                CameraView(
-                    rasterizer, camera, poses[c], inputs, sh_degree,
-                    None if behind is None else behind[c], render_mode, replays,
-                )
-            )  # fmt: skip
+            inputs = Inputs(mu, q, s, opacity, color[c] if by_camera else color, offset)
+            inputs = _left_in(inputs, camera, rasterizer, far_plane, radius_clip)
+            background = None if behind is None else behind[c]
+            views.append(CameraView(rasterizer, camera, poses[c], inputs, sh_degree, background, render_mode, replays))
+    learns = viewmats.requires_grad or any(x.requires_grad for v in views for x in v.inputs if x is not None)
+    images, alphas, info = _drawn(views, (*batch, cameras), learns, packed, absgrad)
+    info |= {"width": width, "height": height, "n_cameras": cameras, "n_batches": batch.numel(), "tile_size": tile_size}
+    return images, alphas, info
+
+
+def _scenes(x: Tensor | None, batch: torch.Size) -> Sequence[Any]:
+    """The tensor of each scene. Without a batch it is `x` itself, so that no view comes into the graph."""
+    if x is None or not batch:
+        return [x] * batch.numel()
+    flat = x.reshape(batch.numel(), *x.shape[len(batch) :])
+    return [flat[scene] for scene in range(len(flat))]
+
+
+def _drawn(
+    views: Sequence[CameraView], lead: tuple[int, ...], learns: bool, packed: bool, absgrad: bool
+) -> tuple[Float[Tensor, "*B C H W X"], Float[Tensor, "*B C H W 1"], dict[str, Any]]:
+    """Images, alphas, and what `info` has of each Gaussian; `lead` and `learns` as of `info_of_all`."""
     drawn = [view.parts() for view in views]
-    lead = (*batch, cameras)
     # The parts of a picture have the same centres.
     each = [(parts[0].rendered, view.inputs) for parts, view in zip(drawn, views, strict=True)]
     rows: Sequence[Tensor | None]
-    learns = any(x.requires_grad for x in (*(x for inputs in each for x in inputs[1] if x is not None), viewmats))
     if packed:
-        info, centres, rows = info_of_visible(each, cameras, learns)
+        info, centres, rows = info_of_visible(each, lead[-1], learns)
     else:
         info, centres, rows = info_of_all(each, lead, learns)
-    info |= {"width": width, "height": height, "n_cameras": cameras, "n_batches": n_scenes, "tile_size": tile_size}
     absolute: Sequence[Tensor | None] = [None] * len(views)
     if absgrad:
         total = info["means2d"].absgrad = torch.zeros_like(info["means2d"])
@@ -199,21 +203,19 @@ def _camera(
     return Camera(torch.tensor(pose, dtype=dtype, device="cpu"), fx, fy, cx, cy, width, height)
 
 
-def _left_in(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, camera: Camera, far_plane: float, radius_clip: float,
-    kernel: float, rasterize_mode: str,
-) -> Float[Tensor, " N"]:  # fmt: skip
-    """The opacities, 0 for what is too far or too small."""
+def _left_in(inputs: Inputs, camera: Camera, rasterizer: Rasterizer, far_plane: float, radius_clip: float) -> Inputs:
+    """The inputs with opacity 0 for Gaussians that are too far or too small."""
     if far_plane >= _FARTHEST and radius_clip <= 0:
-        return opacities
+        return inputs
+    settings = cast(RasterSettings, rasterizer)
     with torch.no_grad():
-        keep = depths(means, camera.world_to_camera.to(means)) <= far_plane
+        keep = depths(inputs.means, camera.world_to_camera.to(inputs.means)) <= far_plane
         if radius_clip > 0:
-            f = footprints(means, quats, scales, camera, kernel)
-            reach = opacities * f.compensation if rasterize_mode == "antialiased" else opacities
-            radii = f.radii(reach, 1 / 255)  # NaN of those behind the camera, which are not drawn
+            f = footprints(inputs.means, inputs.quats, inputs.scales, camera, settings.kernel)
+            opacities = inputs.opacities * f.compensation if settings.antialiased else inputs.opacities
+            radii = f.radii(opacities, 1 / 255)  # NaN of those behind the camera, which are not drawn
             keep &= ~(radii <= radius_clip).all(-1)
-    return opacities * keep
+    return inputs._replace(opacities=inputs.opacities * keep)
 
 
 def _require_geometry(
