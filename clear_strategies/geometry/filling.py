@@ -155,37 +155,48 @@ def completed(
         confidence: c ≥ 0 of the known pixels.
         image: the photo, in [0, 1].
     """
+    d, c = known.double().cpu().numpy().ravel(), confidence.double().cpu().numpy().ravel()
+    is_known = np.isfinite(d)
+    scale = np.median(d[is_known])
+    level, bends = _smoothness(image.double().cpu().numpy())
+    u = _minimiser(np.where(is_known, d / scale, 0.0), np.where(is_known, c, 0.0), level, bends)
+    return torch.from_numpy((scale * u).reshape(known.shape))
+
+
+def _smoothness(colors: np.ndarray) -> tuple[Any, list[tuple[Any, np.ndarray]]]:
+    """The matrix of the quadratic terms of u, 3·10⁻³ Σ e ∂ᵀ∂ and `_HELD`; and (∂∂, e) of ∂xx, ∂yy and ∂xy."""
     import scipy.sparse as sp
-    from scipy.sparse.linalg import splu
 
     def difference(n: int) -> Any:
         identity = sp.eye(n, format="csr")
         return identity[1:] - identity[:-1]
 
-    (h, w), colors = known.shape, image.double().cpu().numpy()
-    d = known.double().cpu().numpy().ravel()
-    is_known = np.isfinite(d)
-    scale = np.median(d[is_known])
-    d = np.where(is_known, d / scale, 0.0)
-    c = np.where(is_known, confidence.double().cpu().numpy().ravel(), 0.0)
+    h, w, _ = colors.shape
     across, down = (np.exp(-np.abs(np.diff(colors, axis=axis)).mean(-1) / _EDGE) for axis in (1, 0))
     dx, dy = sp.kron(sp.eye(h), difference(w)), sp.kron(difference(h), sp.eye(w))
     dxx, dyy = sp.kron(sp.eye(h), difference(w - 1)) @ dx, sp.kron(difference(h - 1), sp.eye(w)) @ dy
     dxy = sp.kron(difference(h), difference(w))
-    bends = (
+    level = sum(_LEVEL * D.T @ sp.diags(e.ravel()) @ D for D, e in ((dx, across), (dy, down))) + _HELD * sp.eye(h * w)
+    along_xy = np.minimum(np.minimum(across[1:], across[:-1]), np.minimum(down[:, 1:], down[:, :-1]))
+    return level, [
         (dxx, np.minimum(across[:, 1:], across[:, :-1]).ravel()),
         (dyy, np.minimum(down[1:], down[:-1]).ravel()),
-        (dxy, np.minimum(np.minimum(across[1:], across[:-1]), np.minimum(down[:, 1:], down[:, :-1])).ravel()),
-    )
-    level = sum(_LEVEL * D.T @ sp.diags(e.ravel()) @ D for D, e in ((dx, across), (dy, down)))
-    level += _HELD * sp.eye(h * w)
-    missed, bent = np.zeros(h * w), [np.zeros(D.shape[0]) for D, _ in bends]
+        (dxy, along_xy.ravel()),
+    ]
+
+
+def _minimiser(d: np.ndarray, c: np.ndarray, level: Any, bends: list[tuple[Any, np.ndarray]]) -> np.ndarray:
+    """The minimum u, by iteratively reweighted least squares; d in units of its median."""
+    import scipy.sparse as sp
+    from scipy.sparse.linalg import splu
+
+    residuals, curvatures = np.zeros(len(d)), [np.zeros(len(e)) for _, e in bends]
     for _ in range(_ROUNDS):
-        trust = c / (1 + (missed / _OUTLIER) ** 2) ** 2
+        trust = c / (1 + (residuals / _OUTLIER) ** 2) ** 2  # c ρ'(u − d) / (u − d)
         H = sp.diags(trust) + level
-        for (D, e), bend in zip(bends, bent, strict=True):
-            H += D.T @ sp.diags(e / np.hypot(bend / _BEND, 1)) @ D
+        for (D, e), curvature in zip(bends, curvatures, strict=True):
+            H += D.T @ sp.diags(e / np.hypot(curvature / _BEND, 1)) @ D
         solver = splu(H.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         u = solver.solve(trust * d + _HELD)
-        missed, bent = u - d, [D @ u for D, _ in bends]
-    return torch.from_numpy((scale * u).reshape(h, w))
+        residuals, curvatures = u - d, [D @ u for D, _ in bends]
+    return u
