@@ -101,28 +101,47 @@ def read(
         raise DataError(root, "photos", "is a file", _instead_of(root))
     _warn_of_other_poses(root)
     root, images = _photos_in(root)
-    base = Path(cache) if cache is not None else cache_folder() / "sfm"
-    if base.resolve().is_relative_to(root.resolve()):
-        raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
+    base = _cache_outside(root, cache)
     paths = usable(root, _without_masks_and_twins(images), lambda path: path, skip_faulty=skip_faulty)
     require_text((name, *(path.name for path in paths)))
     if len(paths) < sfm.FEWEST:
         raise DataError(root, "images", f"there are {len(paths)}, poses need at least {sfm.FEWEST}", MORE_PHOTOS)
-    photos = {path: optics(path) for path in paths}  # unreadable photos are refused before the long work
     precise = len(paths) <= _FEW if precise == "auto" else precise
-    folder = base / _cache_key(paths, max_side, max_features, precise, seed)
+    folder = _estimate_poses(root, paths, base, sfm.SfmSettings(max_side, max_features, precise, threads, seed))
+    capture = _capture(root, paths, folder)
+    sfm.warn_unplaced(root, capture.unplaced, len(paths))
+    sfm.require_placed(root, len(capture.frames), len(paths), least_placed)
+    return replace(capture, name=name)
+
+
+def _cache_outside(root: Path, cache: str | Path | None) -> Path:
+    """The folder of the cache; a DataError if it lies among the photos."""
+    base = Path(cache) if cache is not None else cache_folder() / "sfm"
+    if base.resolve().is_relative_to(root.resolve()):
+        raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
+    return base
+
+
+def _estimate_poses(root: Path, paths: Sequence[Path], cache: Path, settings: sfm.SfmSettings) -> Path:
+    """Estimate the poses unless the cache has them; return their folder."""
+    photos = {path: optics(path) for path in paths}  # unreadable photos are refused before the long work
+    key = _cache_key(paths, settings.max_side, settings.max_features, settings.precise, settings.seed)
+    folder = cache / key
     if (folder / sfm.MODEL).is_file():
         _log.debug("%s: poses from the cache %s.", root, folder)
     else:
-        sfm.reconstruct(root, photos, folder, sfm.SfmSettings(max_side, max_features, precise, threads, seed))
+        sfm.reconstruct(root, photos, folder, settings)
+    return folder
+
+
+def _capture(root: Path, paths: Sequence[Path], folder: Path) -> Capture:
+    """The capture of the photos that have a pose in `folder`."""
     model, photo_of = read_model(folder), {sfm.copy_name(i): path for i, path in enumerate(paths)}
     posed = {image.name: photo_of[image.name] for image in model.images}
     capture = colmap.capture(root, model, root, posed, upright=True, points="estimated here by pycolmap")
-    unplaced, placed = read_object(folder / sfm.UNPLACED), len(capture.frames)
-    sfm.warn_unplaced(root, unplaced, len(paths))
-    sfm.require_placed(root, placed, len(paths), least_placed)
-    poses = f"estimated by pycolmap from all {len(paths)} photos, {placed} could be placed"
-    return replace(capture, name=name, notes={**capture.notes, "poses": poses, "photos": root.name}, unplaced=unplaced)
+    poses = f"estimated by pycolmap from all {len(paths)} photos, {len(capture.frames)} could be placed"
+    notes = {**capture.notes, "poses": poses, "photos": root.name}
+    return replace(capture, notes=notes, unplaced=read_object(folder / sfm.UNPLACED))
 
 
 def _instead_of(file: Path) -> str:
