@@ -51,6 +51,7 @@ _COLOURS: Final = (BLUE, RED, GREEN, YELLOW, CYAN, PURPLE)
 _STYLES: Final = [{"color": color, "linestyle": dash} for dash, color in product(("-", "--", ":"), _COLOURS)]
 
 ERROR_MAX: Final = 0.25  # the colours of an error map end here
+_ERRORS: Final[dict[str, Any]] = {"cmap": "magma", "vmin": 0, "vmax": ERROR_MAX}  # without effect on RGB
 _GAP: Final = 8  # px
 _LINE: Final = 16  # height of a line of small print, px
 _NARROW, _WIDE, _TALL = 240, 512, 384  # the least and the greatest width and the greatest height of a shown image, px
@@ -147,6 +148,12 @@ class SheetRow:
     compared: Collection[str] = ()
     truth: str | None = None
 
+    def part(self) -> tuple[slice, slice] | None:
+        """The part that is outlined and shown below."""
+        if not self.compared:
+            return None
+        return window([self.images[name] for name in self.compared], self.images.get(self.truth or ""))
+
 
 def magnification(height: int, width: int) -> float:
     """The factor at which an image is shown: a whole number, so that pixels stay squares, or less than 1 for a large image."""
@@ -197,59 +204,69 @@ class _Sheet:
     def image(self, pixels: np.ndarray, x: int, y: int, **colors: Any) -> Any:
         return self.figure.figimage(pixels, x, self._height - y - len(pixels), **colors)
 
-    def box(self, x: float, y: float, w: float, h: float) -> tuple[float, float, float, float]:
+    def outline(self, part: tuple[slice, slice], times: float, x: int, y: int) -> None:
+        """Outline a part of the image that is shown at (x, y), `times` as large."""
+        from matplotlib.patches import Rectangle
+
+        top, bottom, left, right = (times * edge for along in part for edge in (along.start, along.stop))
+        u, v, w, h = self._box(x + left, y + top, right - left, bottom - top)
+        self.figure.add_artist(Rectangle((u, v), w, h, fill=False, color="white", linewidth=1))
+
+    def color_bar(self, error: Any, x: int, y: int, height: int) -> None:
+        """Draw the colours of an error map beside the images."""
+        beside = self.figure.add_axes(self._box(x, y, 12, height))
+        bar = self.figure.colorbar(error, cax=beside, extend="max", extendfrac=0.03)
+        bar.set_label("mean |difference| over RGB", fontsize=8 * self._larger, color=INK)
+        bar.ax.tick_params(labelsize=8 * self._larger, colors=INK)
+        bar.outline.set_visible(False)
+
+    def _box(self, x: float, y: float, w: float, h: float) -> tuple[float, float, float, float]:
         """A rectangle of w x h px in matplotlib's units: fractions of the figure, from its lower left corner."""
         return x / self._width, 1 - (y + h) / self._height, w / self._width, h / self._height
 
 
+class _Layout:
+    """Where a contact sheet has its elements, px; the last of `lefts` and `tops` is the end of the images."""
+
+    def __init__(self, rows: Sequence[SheetRow]) -> None:
+        self.columns = list(dict.fromkeys(column for row in rows for column in row.images))
+        h, w = (max(image.shape[axis] for row in rows for image in row.images.values()) for axis in (0, 1))
+        self.times = times = magnification(h, w)
+        self.cell_h, self.cell_w = round(times * h), round(times * w)
+        self.parts = [row.part() for row in rows]
+        self.zoom = 1 if times < 1 else int(times) * _ENLARGED  # of the parts
+        self.part_h = [0 if part is None else self.zoom * (part[0].stop - part[0].start) + _GAP for part in self.parts]
+        size = max(len(self.columns) * self.cell_w, len(rows) * self.cell_h + sum(self.part_h))
+        self.larger = max(1.0, size / _SCREEN)
+        self.line = line = round(_LINE * self.larger)
+        self.heads = [textwrap.wrap(column, round(self.cell_w / 7 / self.larger)) or [""] for column in self.columns]
+        self.lefts = [2 * line + i * (self.cell_w + _GAP) for i in range(len(self.columns) + 1)]
+        top, pitch = (4 + max(map(len, self.heads))) * line, self.cell_h + 2 * line + _GAP
+        self.tops = [top + j * pitch + sum(self.part_h[:j]) for j in range(len(rows) + 1)]
+
+
 def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: str = "") -> None:
     """Draw the rows below the names of their columns, a colour bar beside them if there are errors, and `note` below them."""
-    from matplotlib.patches import Rectangle
-
-    columns = list(dict.fromkeys(column for row in rows for column in row.images))
-    shapes = [image.shape for row in rows for image in row.images.values()]
-    times = magnification(*(max(shape[axis] for shape in shapes) for axis in (0, 1)))
-    cell_h, cell_w = (round(times * max(shape[axis] for shape in shapes)) for axis in (0, 1))
-    parts = [
-        window([row.images[name] for name in row.compared], row.images.get(row.truth or "")) if row.compared else None
-        for row in rows
-    ]
-    zoom = 1 if times < 1 else int(times) * _ENLARGED
-    part_h = [0 if part is None else zoom * (part[0].stop - part[0].start) + _GAP for part in parts]
-    larger = max(1.0, max(len(columns) * cell_w, len(rows) * cell_h + sum(part_h)) / _SCREEN)
-    line = round(_LINE * larger)
-    heads = [textwrap.wrap(column, round(cell_w / 7 / larger)) or [""] for column in columns]
-    left, top = 2 * line, (4 + max(map(len, heads))) * line
-    tops = [top + j * (cell_h + 2 * line + _GAP) + sum(part_h[:j]) for j in range(len(rows) + 1)]
-    right, with_bar = left + len(columns) * (cell_w + _GAP), any(len(shape) == 2 for shape in shapes)
-    width, height = right + 5 * line * with_bar, tops[-1] + line
-    sheet, error = _Sheet(width, height, larger), None
-    errors = {"cmap": "magma", "vmin": 0, "vmax": ERROR_MAX}
-    sheet.text(_GAP, 1.5 * line, title, 12, ha="left")
-    for i, lines in enumerate(heads):
-        x = left + i * (cell_w + _GAP)
-        sheet.text(x + cell_w / 2, top - line / 2, "\n".join(lines), 10, va="bottom")
-        for y, row, part, below in zip(tops, rows, parts, part_h, strict=False):
-            if (pixels := row.images.get(columns[i])) is not None:
-                drawn = sheet.image(_resized(pixels, times), x, y, **errors)
+    at, error = _Layout(rows), None
+    with_bar = any(image.ndim == 2 for row in rows for image in row.images.values())
+    height = at.tops[-1] + at.line
+    sheet = _Sheet(at.lefts[-1] + 5 * at.line * with_bar, height, at.larger)
+    sheet.text(_GAP, 1.5 * at.line, title, 12, ha="left")
+    for x, column, head in zip(at.lefts, at.columns, at.heads, strict=False):
+        sheet.text(x + at.cell_w / 2, at.tops[0] - at.line / 2, "\n".join(head), 10, va="bottom")
+        for y, row, part, below in zip(at.tops, rows, at.parts, at.part_h, strict=False):
+            if (pixels := row.images.get(column)) is not None:
+                drawn = sheet.image(_resized(pixels, at.times), x, y, **_ERRORS)
                 error = drawn if pixels.ndim == 2 else error
                 if part is not None:
-                    sheet.image(_resized(pixels[part], zoom), x, y + cell_h + _GAP, **errors)
-                    down, across = (slice(times * s.start, times * s.stop) for s in part)
-                    place = sheet.box(
-                        x + across.start, y + down.start, across.stop - across.start, down.stop - down.start
-                    )
-                    sheet.figure.add_artist(Rectangle(place[:2], *place[2:], fill=False, color="white", linewidth=1))
-            sheet.text(x + cell_w / 2, y + cell_h + below + line, row.captions.get(columns[i], ""))
-    for y, row in zip(tops, rows, strict=False):
-        sheet.text(line, y + cell_h / 2, row.name, rotation=90, color=FAINT)
-    sheet.text(left, height - line, note, ha="left", color=FAINT)
+                    sheet.image(_resized(pixels[part], at.zoom), x, y + at.cell_h + _GAP, **_ERRORS)
+                    sheet.outline(part, at.times, x, y)
+            sheet.text(x + at.cell_w / 2, y + at.cell_h + below + at.line, row.captions.get(column, ""))
+    for y, row in zip(at.tops, rows, strict=False):
+        sheet.text(at.line, y + at.cell_h / 2, row.name, rotation=90, color=FAINT)
+    sheet.text(at.lefts[0], height - at.line, note, ha="left", color=FAINT)
     if error is not None:
-        beside = sheet.figure.add_axes(sheet.box(right, top, 12, cell_h))
-        bar = sheet.figure.colorbar(error, cax=beside, extend="max", extendfrac=0.03)
-        bar.set_label("mean |difference| over RGB", fontsize=8 * larger, color=INK)
-        bar.ax.tick_params(labelsize=8 * larger, colors=INK)
-        bar.outline.set_visible(False)
+        sheet.color_bar(error, at.lefts[-1], at.tops[0], at.cell_h)
     save(sheet.figure, path)
 
 
