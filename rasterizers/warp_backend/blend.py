@@ -30,6 +30,8 @@ wp.set_module_options({"enable_backward": False})
 
 Near: Final[Any] = wp.types.vector(length=9, dtype=wp.float32)
 """A Gaussian as a tile's pixels see it: its centre from the tile's first pixel, px; A, B and C; opacity; colour."""
+Moments: Final[Any] = wp.types.vector(length=SUMS, dtype=wp.float32)
+"""Sums over pixels of q = ∂L/∂(log α) times 1, d_x, d_y, d_x², d_x d_y and d_y², see `offset_of`."""
 
 
 @wp.func
@@ -46,8 +48,9 @@ def inside(pixel: wp.vec2i, grid: Grid) -> wp.bool:
 
 
 @wp.func
-def near(ellipse: Ellipse, tile: wp.int32, grid: Grid) -> Near:
-    first = pixel_of(tile, 0, grid)
+def near(pair: wp.int32, tile: wp.int32, listed: wp.array[wp.int32], ellipses: wp.array[Ellipse], grid: Grid) -> Near:
+    """The Gaussian of a pair."""
+    ellipse, first = ellipses[listed[pair]], pixel_of(tile, 0, grid)
     centre = ellipse.whole - wp.vec2(wp.float32(first[0]), wp.float32(first[1])) + (ellipse.rest - wp.vec2(0.5, 0.5))
     rgb = wp.max(ellipse.rgb, wp.vec3(0.0, 0.0, 0.0))
     return Near(centre[0], centre[1], ellipse.A, ellipse.B, ellipse.C, ellipse.opacity, rgb[0], rgb[1], rgb[2])
@@ -69,6 +72,21 @@ def alpha_of(g: Near, d: wp.vec2) -> wp.float32:
 def piece_of(segment: wp.int32, tile: wp.int32) -> wp.int32:
     """The number of the piece that a tile has in a segment: pairs are sorted by tile, so that each has another."""
     return segment + tile
+
+
+@wp.func
+def loaded(
+    pair: wp.int32, first: wp.int32, last: wp.int32, tiles: wp.array[wp.int32], listed: wp.array[wp.int32],
+    ellipses: wp.array[Ellipse], grid: Grid,
+) -> tuple[wp.int32, Near]:  # fmt: skip
+    """The tile of a pair, or the number of tiles where the pair is not in [first, last), and its Gaussian."""
+    n_tiles = grid.tiles[0] * grid.tiles[1]
+    if pair < first or pair >= last:
+        return n_tiles, Near()
+    tile = tiles[pair]
+    if tile >= n_tiles:
+        return n_tiles, Near()
+    return tile, near(pair, tile, listed, ellipses, grid)
 
 
 @cache
@@ -114,12 +132,8 @@ def blend_pieces(depth: bool, lanes: int) -> Any:
         tile_of = wp.tile_empty(shape=(both,), dtype=wp.int32, storage="shared")
         light, sums, tile, half = Lights(), Depths(), wp.int32(n_tiles), wp.int32(0)
         for start in range(first, last, lanes):
-            loaded, found, mine = Near(), wp.int32(n_tiles), start + lane
-            if mine < last:
-                found = tiles[mine]
-                if found < n_tiles:
-                    loaded = near(ellipses[listed[mine]], found, grid)
-            wp.tile_assign(batch, wp.tile(loaded, preserve_type=True), offset=(half,))
+            found, gaussian = loaded(start + lane, first, last, tiles, listed, ellipses, grid)
+            wp.tile_assign(batch, wp.tile(gaussian, preserve_type=True), offset=(half,))
             wp.tile_assign(tile_of, wp.tile(found), offset=(half,))
             for nth in range(wp.min(lanes, last - start)):
                 g = batch[half + nth]
@@ -148,12 +162,37 @@ def blend_pieces(depth: bool, lanes: int) -> Any:
     return blend_pieces
 
 
+@wp.func
+def blend_to_end(
+    first: wp.int32, last: wp.int32, end: wp.int32, tile: wp.int32, within: wp.int32, through: wp.float32, sums: wp.vec2,
+    depth: wp.bool, cuts: Cuts, ellipses: wp.array[Ellipse], depths: wp.array[wp.float32], listed: wp.array[wp.int32], grid: Grid,
+) -> tuple[wp.int32, wp.float32, wp.vec3, wp.vec2]:  # fmt: skip
+    """Blend the piece in which a pixel ends pair by pair. Returns the first pair that is not blended, T, light, the sums of E."""
+    stop, light = wp.int32(end), wp.vec3()
+    for pair in range(first, last):
+        if stop == end:
+            g = near(pair, tile, listed, ellipses, grid)
+            free = alpha_of(g, offset_of(within, g))
+            if free >= cuts.alpha_min:
+                share = wp.min(free, cuts.alpha_max)
+                after = through * (1.0 - share)
+                if after < cuts.transmittance_min:
+                    stop = pair
+                else:
+                    weight = through * share
+                    light += weight * wp.vec3(g[6], g[7], g[8])
+                    if depth:
+                        sums += weight * wp.vec2(depths[listed[pair]], 1.0)
+                    through = after
+    return stop, through, light, sums
+
+
 @cache
-def blend(depth: bool) -> Any:  # noqa: PLR0915 - a kernel
+def blend(depth: bool) -> Any:
     """The kernel that draws the image of pieces; with `depth` also E, which is 0 where nothing is drawn."""
 
     @wp.kernel(module="unique", enable_backward=False)
-    def blend(  # noqa: PLR0912
+    def blend(
         grids: wp.array[Grid],
         cuts: Cuts,
         backgrounds: wp.array[wp.vec3],
@@ -171,8 +210,6 @@ def blend(depth: bool) -> Any:  # noqa: PLR0915 - a kernel
     ) -> None:
         """One thread per pixel of a tile. `ended` receives the first pair that the pixel did not blend, and a piece the mark of
         its start: the light from behind, and T.
-
-        A pixel that ends within a piece blends it once more, pair by pair.
         """
         tile, within = wp.tid()
         grid = grids[0]
@@ -181,38 +218,24 @@ def blend(depth: bool) -> Any:  # noqa: PLR0915 - a kernel
             return
         begin, end = starts[tile], ends[tile]
         first, stop, last = begin / SEGMENT, wp.int32(end), begin / SEGMENT
-        through, light, weighted, weights = wp.float32(1.0), wp.vec3(), wp.float32(0.0), wp.float32(0.0)
+        through, light, sums = wp.float32(1.0), wp.vec3(), wp.vec2()
         for segment in range(first, (end + SEGMENT - 1) / SEGMENT):
             if stop == end:
                 at, last = piece_of(segment, tile), segment
                 piece = pieces[at, within]
                 # The light is that of the segment before.
                 pieces[at, within] = wp.vec4(light[0], light[1], light[2], through)
-                light = through * wp.vec3(piece[0], piece[1], piece[2])
                 after = through * piece[3]
                 if after >= cuts.transmittance_min:
+                    light = through * wp.vec3(piece[0], piece[1], piece[2])
                     if depth:
-                        weighted += through * sums_of_pieces[at, within][0]
-                        weights += through * sums_of_pieces[at, within][1]
+                        sums += through * sums_of_pieces[at, within]
                     through = after
                 else:
-                    light = wp.vec3()
-                    for pair in range(wp.max(segment * SEGMENT, begin), wp.min((segment + 1) * SEGMENT, end)):
-                        if stop == end:
-                            g = near(ellipses[listed[pair]], tile, grid)
-                            free = alpha_of(g, offset_of(within, g))
-                            if free >= cuts.alpha_min:
-                                share = wp.min(free, cuts.alpha_max)
-                                after = through * (1.0 - share)
-                                if after < cuts.transmittance_min:
-                                    stop = pair
-                                else:
-                                    weight = through * share
-                                    light += weight * wp.vec3(g[6], g[7], g[8])
-                                    if depth:
-                                        weighted += weight * depths[listed[pair]]
-                                        weights += weight
-                                    through = after
+                    low, high = wp.max(segment * SEGMENT, begin), wp.min((segment + 1) * SEGMENT, end)
+                    stop, through, light, sums = blend_to_end(
+                        low, high, end, tile, within, through, sums, depth, cuts, ellipses, depths, listed, grid
+                    )
         rgb = light + through * backgrounds[0]
         for back in range(last - first):
             at = piece_of(last - back, tile)
@@ -224,9 +247,9 @@ def blend(depth: bool) -> Any:  # noqa: PLR0915 - a kernel
         ended[pixel[1], pixel[0]] = stop
         if depth:
             over = wp.float32(0.0)
-            if weights > 0.0:
-                over = 1.0 / weights
-            expected[pixel[1], pixel[0]] = weighted * over
+            if sums[1] > 0.0:
+                over = 1.0 / sums[1]
+            expected[pixel[1], pixel[0]] = sums[0] * over
 
     return blend
 
@@ -257,6 +280,12 @@ def warp_sum(width: int) -> Any:
     part = wp.types.vector(length=width, dtype=wp.float32)
     warp_sum.__annotations__ = {"part": part, "place": wp.int32, "sums": wp.array2d[wp.float32]}
     return wp.func_native(source)(warp_sum)
+
+
+@wp.func
+def moments_of(q: wp.float32, d: wp.vec2) -> Moments:
+    """The sums of a pair of which the geometry's gradients are made, of one pixel at d."""
+    return Moments(q, q * d[0], q * d[1], q * d[0] * d[0], q * d[0] * d[1], q * d[1] * d[1])
 
 
 @cache
@@ -296,21 +325,19 @@ def blend_vjp(K: int, lanes: int, shuffles: bool, absolute: bool = False) -> Any
     ) -> None:
         segment, lane = wp.tid()
         grid, background, pairs = grids[0], backgrounds[0], wp.int32(total[0])
-        tile, n_tiles, after = wp.int32(-1), grid.tiles[0] * grid.tiles[1], (segment + 1) * SEGMENT
+        tile, n_tiles, first = wp.int32(-1), grid.tiles[0] * grid.tiles[1], segment * SEGMENT
         batch = wp.tile_empty(shape=(both,), dtype=Near, storage="shared")
         where = wp.tile_empty(shape=(both,), dtype=wp.vec2i, storage="shared")
         through, stop, behind, v = Pixels(), Ends(), Behind(), Cotangents()
-        last, half = wp.min(after, pairs), wp.int32(0)
-        for done in range(0, last - segment * SEGMENT, lanes):
-            loaded, found = Near(), wp.vec2i(n_tiles, 0)
-            mine = last - 1 - done - lane
-            if mine >= segment * SEGMENT:
-                found = wp.vec2i(tiles[mine], places[mine])
-                if found[0] < n_tiles:
-                    loaded = near(ellipses[listed[mine]], found[0], grid)
-            wp.tile_assign(batch, wp.tile(loaded, preserve_type=True), offset=(half,))
-            wp.tile_assign(where, wp.tile(found, preserve_type=True), offset=(half,))
-            for nth in range(wp.min(lanes, last - segment * SEGMENT - done)):
+        last, half = wp.min(first + SEGMENT, pairs), wp.int32(0)
+        for done in range(0, last - first, lanes):
+            mine, place = last - 1 - done - lane, wp.int32(0)
+            found, gaussian = loaded(mine, first, last, tiles, listed, ellipses, grid)
+            if mine >= first:
+                place = places[mine]
+            wp.tile_assign(batch, wp.tile(gaussian, preserve_type=True), offset=(half,))
+            wp.tile_assign(where, wp.tile(wp.vec2i(found, place), preserve_type=True), offset=(half,))
+            for nth in range(wp.min(lanes, last - first - done)):
                 at, g, tile_and_place = last - 1 - done - nth, batch[half + nth], where[half + nth]
                 if tile_and_place[0] != tile:
                     tile = tile_and_place[0]
@@ -319,10 +346,10 @@ def blend_vjp(K: int, lanes: int, shuffles: bool, absolute: bool = False) -> Any
                         pixel = pixel_of(tile, within, grid)
                         stop[j] = 0
                         if tile < n_tiles and inside(pixel, grid):
-                            through[j] = transmittance[pixel[1], pixel[0]]
                             stop[j] = ended[pixel[1], pixel[0]]
+                            through[j] = transmittance[pixel[1], pixel[0]]
                             light = through[j] * background
-                            if ends[tile] > after and stop[j] > after:
+                            if wp.min(ends[tile], stop[j]) > first + SEGMENT:
                                 mark = marks[piece_of(segment + 1, tile), within]
                                 through[j] = mark[3]
                                 light = wp.vec3(mark[0], mark[1], mark[2])
@@ -346,12 +373,9 @@ def blend_vjp(K: int, lanes: int, shuffles: bool, absolute: bool = False) -> Any
                             light_k = wp.dot(v[j * K + k], rgb)
                             if free <= cuts.alpha_max:  # where α is capped, the image does not depend on the ellipse
                                 q = share * (through[j] * light_k - behind[j, k] * over)
-                                part[W * k] += q
-                                part[W * k + 1] += q * d[0]
-                                part[W * k + 2] += q * d[1]
-                                part[W * k + 3] += q * d[0] * d[0]
-                                part[W * k + 4] += q * d[0] * d[1]
-                                part[W * k + 5] += q * d[1] * d[1]
+                                moments = moments_of(q, d)
+                                for m in range(SUMS):
+                                    part[W * k + m] += moments[m]
                                 if wp.static(absolute):
                                     part[W] += wp.abs(q * (2.0 * g[2] * d[0] + g[3] * d[1]))
                                     part[W + 1] += wp.abs(q * (g[3] * d[0] + 2.0 * g[4] * d[1]))
