@@ -70,6 +70,27 @@ def map_at(maps: wp.array3d[wp.float32], nth: wp.int32, row: wp.int32, column: w
 
 
 @wp.func
+def dissimilarity(
+    about: wp.vec4, y0: wp.float32, d0: wp.float32, row: wp.int32, column: wp.int32, maps: wp.array3d[wp.float32]
+) -> wp.float32:
+    """Compute 1 - SSIM of a pixel, and store its maps; `about` holds the means of y, d, xy and d² about y0 and d0."""
+    my, md = about[0] + y0, about[1] + d0
+    cxy = about[2] - (about[0] - about[1]) * about[0]
+    vd = about[3] - about[1] * about[1]
+    A1 = 2.0 * (my - md) * my + C1
+    A2 = 2.0 * cxy + C2
+    over_B1, over_B2 = 1.0 / (A1 + md * md), 1.0 / (A2 + vd)
+    u, not_u = md * md * over_B1, A1 * over_B1
+    n, not_n = vd * over_B2, A2 * over_B2
+    maps[0, row, column] = my
+    maps[1, row, column] = md
+    maps[2, row, column] = 2.0 * not_n * (not_u * md + u * my) * over_B1
+    maps[3, row, column] = 2.0 * not_u * over_B2 * n
+    maps[4, row, column] = 2.0 * not_u * over_B2 * not_n
+    return u + n - u * n
+
+
+@wp.func
 def blocks_across(width: wp.int32) -> wp.int32:
     return (width + STRIDE - 1) / STRIDE
 
@@ -115,28 +136,13 @@ def similarity(lanes: int) -> Any:
         for at in range(HALO + lane, wp.min(WIDTH - HALO, width - left), lanes):
             for r in range(wp.min(ROWS, height - top)):
                 y0, d0 = mean_y[r, at], mean_d[r, at]
-                my, md, cxy, vd = wp.float32(0.0), wp.float32(0.0), wp.float32(0.0), wp.float32(0.0)
+                means = wp.vec4()  # about y0 and d0
                 for k in range(TAPS):
                     neighbour = at + (k - REACH) * 3
                     dy, dd = mean_y[r, neighbour] - y0, mean_d[r, neighbour] - d0
-                    my += WINDOW[k] * dy
-                    md += WINDOW[k] * dd
-                    cxy += WINDOW[k] * (cov_xy[r, neighbour] + (dy - dd) * dy)
-                    vd += WINDOW[k] * (var_d[r, neighbour] + dd * dd)
-                cxy -= (my - md) * my
-                vd -= md * md
-                my += y0
-                md += d0
-                A1, A2 = 2.0 * (my - md) * my + C1, 2.0 * cxy + C2
-                over_B1, over_B2 = 1.0 / (A1 + md * md), 1.0 / (A2 + vd)
-                u, n, not_u, not_n = md * md * over_B1, vd * over_B2, A1 * over_B1, A2 * over_B2
-                row, column = top + r, left + at
-                maps[0, row, column] = my
-                maps[1, row, column] = md
-                maps[2, row, column] = 2.0 * not_n * (not_u * md + u * my) * over_B1
-                maps[3, row, column] = 2.0 * not_u * over_B2 * n
-                maps[4, row, column] = 2.0 * not_u * over_B2 * not_n
-                total += wp.float64(u + n - u * n)
+                    cxy, vd = cov_xy[r, neighbour] + (dy - dd) * dy, var_d[r, neighbour] + dd * dd
+                    means += WINDOW[k] * wp.vec4(dy, dd, cxy, vd)
+                total += wp.float64(dissimilarity(means, y0, d0, top + r, left + at, maps))
         wp.tile_store(parts, wp.tile_sum(wp.tile(weight * total)), offset=(group * blocks_across(width) + across,))
 
     return similarity
