@@ -71,22 +71,7 @@ def read(
         transforms = [_sized(transform, find) for transform in transforms]
         find = _in_place_of_first(image_folder(folder, images))
     paths = [find(transform.file_path) for transform in transforms]
-    lists = typed(file, content, _Shared)
-    splits: dict[Path, str] = {}
-    removed = list[str]()
-    for key, split in _SPLIT_LISTS.items():
-        for name in getattr(lists, key):
-            if find(name) not in paths:
-                removed.append(name)
-            elif splits.setdefault(find(name), split) != split:
-                raise DataError(file, key, f"{name!r} is for training, too", "list each photo once")
-    if removed:
-        _log.warning(
-            "%s: %s in its split lists, and no frame's file_path: %s.",
-            file,
-            counted(len(removed), "photo"),
-            some(removed),
-        )
+    splits = _splits_of(file, typed(file, content, _Shared), paths, find)
     listed = [
         Listed(transform, name, path, splits.get(path))
         for transform, name, path in zip(transforms, names_below(paths), paths, strict=True)
@@ -100,6 +85,22 @@ def read(
             message = "%s: %s in none of its split lists, so not used; data.views.own_split=false uses all."
             _log.warning(message, file, counted(counts[None], "frame"))
     return Capture(folder.resolve().name, sorted_by_name(frames, file), points_of(file, content), background, notes)
+
+
+def _splits_of(file: Path, lists: _Shared, paths: Sequence[Path], find: Callable[[str], Path]) -> dict[Path, str]:
+    """The split of each photo that the file's lists name; warns of names that are no frame's."""
+    splits: dict[Path, str] = {}
+    removed = list[str]()
+    for key, split in _SPLIT_LISTS.items():
+        for name in getattr(lists, key):
+            if find(name) not in paths:
+                removed.append(name)
+            elif splits.setdefault(find(name), split) != split:
+                raise DataError(file, key, f"{name!r} is for training, too", "list each photo once")
+    if removed:
+        message = "%s: %s in its split lists, and no frame's file_path: %s."
+        _log.warning(message, file, counted(len(removed), "photo"), some(removed))
+    return splits
 
 
 def _in_place_of_first(folder: Path) -> Callable[[str], Path]:

@@ -143,44 +143,64 @@ def require_placed(root: Path, placed: int, count: int, least: float = 0.0) -> N
 
 def _models(pycolmap: Any, photos: Mapping[Path, Optics], work: Path, settings: SfmSettings) -> list[Any]:
     """Run COLMAP's incremental pipeline: extract features, match all pairs, and map; returns the models."""
-    copies, database = work / _COPIES, work / _DATABASE
-    count, root = len(photos), next(iter(photos)).parent
+    database, root = work / _DATABASE, next(iter(photos)).parent
     level = pycolmap.logging.minloglevel
     # COLMAP's progress is hundreds of lines, and its errors are raised.
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     try:
         pycolmap.set_random_seed(settings.seed)
-        groups = _write_copies(photos, copies, settings.max_side)
-        if shutil.disk_usage(work).free < count * settings.max_features * _PER_FEATURE + _PER_DATABASE:
+        groups = _write_copies(photos, work / _COPIES, settings.max_side)
+        if shutil.disk_usage(work).free < len(photos) * settings.max_features * _PER_FEATURE + _PER_DATABASE:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(work.parent))  # COLMAP would end the process
-        find = functools.partial(_find_features, pycolmap, database, groups, settings)
-        if min(width * height for width, height, *_ in groups) <= _LARGE:
-            found = find(octave=-1)
-        elif (found := find(octave=0)) < _ENOUGH * settings.max_features:
-            _log.info(
-                "half of the photos have %d features or fewer: they are found again, in photos enlarged twice.", found
-            )
-            database.unlink()
-            found = find(octave=-1)
-        if found < _FEW_FEATURES:
-            why = "they are small, blurred, dark, or without texture"
-            _log.warning("%s: half of the photos have %d features or fewer: %s.", root, found, why)
-        _keep_coarsest(pycolmap, database, settings.max_features)
+        _extract_features(pycolmap, database, groups, settings, root)
         _match(pycolmap, database, [name for names in groups.values() for name in names], settings.threads)
         _require_parallax(pycolmap, database, root)
-        models = _mapped(pycolmap, work, count, settings)
+        models = _mapped(pycolmap, work, len(photos), settings)
         lengths = sorted({said.focal_35mm for said in photos.values() if said.focal_35mm is not None})
-        if (placed := _most_placed(models)) < count and lengths:
-            _log.info("%d of %d photos are placed: again, without EXIF's focal length.", placed, count)
-            _forget_focal_lengths(pycolmap, database, settings.threads)
-            free = _mapped(pycolmap, work, count, settings)
-            if (more := _most_placed(free)) > placed:
-                models, told = free, some([f"{focal:g} mm" for focal in lengths])
-                message = "%s: EXIF's focal length (%s on 35 mm film) is not used: %d of %d photos are placed with it, %d without"
-                _log.warning(message, root, told, placed, count, more)
+        if _most_placed(models) < len(photos) and lengths:
+            models = _mapped_without_exif(pycolmap, work, models, len(photos), lengths, settings, root)
     finally:
         pycolmap.logging.minloglevel = level
     return models
+
+
+def _extract_features(pycolmap: Any, database: Path, groups: _Groups, settings: SfmSettings, root: Path) -> None:
+    """Find features and keep the coarsest; in enlarged copies, too, where photos are small or have few. Warns of few."""
+    find = functools.partial(_find_features, pycolmap, database, groups, settings)
+    if min(width * height for width, height, *_ in groups) <= _LARGE:
+        found = find(octave=-1)
+    elif (found := find(octave=0)) < _ENOUGH * settings.max_features:
+        _log.info(
+            "half of the photos have %d features or fewer: they are found again, in photos enlarged twice.", found
+        )
+        database.unlink()
+        found = find(octave=-1)
+    if found < _FEW_FEATURES:
+        why = "they are small, blurred, dark, or without texture"
+        _log.warning("%s: half of the photos have %d features or fewer: %s.", root, found, why)
+    _keep_coarsest(pycolmap, database, settings.max_features)
+
+
+def _mapped_without_exif(
+    pycolmap: Any,
+    work: Path,
+    models: list[Any],
+    count: int,
+    lengths: Sequence[float],
+    settings: SfmSettings,
+    root: Path,
+) -> list[Any]:
+    """Map again without EXIF's focal lengths; returns these models if they place more photos, else the given ones."""
+    placed = _most_placed(models)
+    _log.info("%d of %d photos are placed: again, without EXIF's focal length.", placed, count)
+    _forget_focal_lengths(pycolmap, work / _DATABASE, settings.threads)
+    free = _mapped(pycolmap, work, count, settings)
+    if (more := _most_placed(free)) <= placed:
+        return models
+    told = some([f"{focal:g} mm" for focal in lengths])
+    message = "%s: EXIF's focal length (%s on 35 mm film) is not used: %d of %d photos are placed with it, %d without"
+    _log.warning(message, root, told, placed, count, more)
+    return free
 
 
 def _mapped(pycolmap: Any, work: Path, count: int, settings: SfmSettings) -> list[Any]:
