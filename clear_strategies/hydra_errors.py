@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from hydra.errors import HydraException
@@ -79,20 +79,27 @@ def not_composed(error: Exception, overrides: Sequence[str], config: str) -> Set
             f"{key}: no choice of this group is there to be replaced, so it is added: +{key}={value or '…'}."
         )
     others, group = [o for o in overrides if _key(o) != key], key.partition(".")[0]
-
-    def settings(*chosen: str) -> dict[str, Any]:
-        try:
-            return OmegaConf.to_container(composed_by_hydra([*others, *chosen], config))  # type: ignore[return-value]
-        except (HydraException, OmegaConfBaseException):  # another override is wrong as well
-            return {}
-
-    if having := [option for option in options(group) if key in flat(settings(f"{group}={option}"))]:
+    having = [o for o in options(group) if key in flat(_composed([*others, f"{group}={o}"], config))]
+    if having:
         train = ", or let the command find it: clear-strategies train FOLDER" if key == "data.path" else ""
         return SettingError(
             f"{key}: there is no such setting without one of {', '.join(f'{group}={o}' for o in having)}. Add it{train}."
         )
-    known = settings()
-    remedy = "clear-strategies --cfg job prints all of them."
+    return SettingError(
+        f"{key}: there is no such setting. {_remedy(key, value, overrides, _composed(others, config), config)}"
+    )
+
+
+def _composed(overrides: Sequence[str], config: str) -> dict[str, Any]:
+    """The settings of overrides, none if another one is wrong as well."""
+    try:
+        return OmegaConf.to_container(composed_by_hydra(overrides, config))  # type: ignore[return-value]
+    except (HydraException, OmegaConfBaseException):
+        return {}
+
+
+def _remedy(key: str, value: str, overrides: Sequence[str], known: Mapping[str, Any], config: str) -> str:
+    """What to write in place of an unknown setting; `known` are the settings of the other overrides."""
     parent, _, name = key.rpartition(".")
     beside = {".".join(k.split(".")[: key.count(".") + 1]) for k in flat(known) if k.startswith(f"{parent}.")}
     if value.partition(",")[0] in options(name):  # as data.scene=fern
@@ -116,7 +123,9 @@ def not_composed(error: Exception, overrides: Sequence[str], config: str) -> Set
         remedy = f"Did you mean {near[0]}?"
     elif known and config == "conductor":
         remedy = f"A conductor has settings of {', '.join(known)}."
-    return SettingError(f"{key}: there is no such setting. {remedy}")
+    else:
+        remedy = "clear-strategies --cfg job prints all of them."
+    return remedy
 
 
 def _key(override: str) -> str:

@@ -7,13 +7,18 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from clear_strategies import console
 from clear_strategies.commands import parser_of
 from clear_strategies.errors import SettingError, counted, one_line
 from clear_strategies.jobs.exit_codes import NEEDED
 from clear_strategies.outputs.provenance import origin
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from rasterizers.interface import Camera, Splats
 
 # The extras of pyproject.toml: modules that are imported if it is installed, and its purpose.
 EXTRAS: Final = {
@@ -127,38 +132,46 @@ def _backends(broken: list[str], *, slow: bool) -> Iterator[tuple[str, str]]:
 
     import rasterizers
     from rasterizers import native
-    from rasterizers.interface import BackendUnavailable, Camera, Splats
+    from rasterizers.interface import Camera, Splats
 
     g, shapes = torch.Generator().manual_seed(0), ((3,), (4,), (3,), (), (1, 3), (3, 3))
     means, quats, scales, opacities, sh0, shN = (torch.randn(300, *shape, generator=g) for shape in shapes)
     splats = Splats(means, quats, (scales * 0.3 - 2).exp(), opacities.sigmoid(), sh0, shN * 0.2)
     pose = torch.eye(4)
     pose[2, 3] = 5
-    camera, on_cuda = Camera(pose, 76.0, 76.0, 32.0, 32.0, 64, 64), torch.cuda.is_available()
+    camera = Camera(pose, 76.0, 76.0, 32.0, 32.0, 64, 64)
     # For pictures this small, torch's own threads cost more than they bring.
     with native.kernel_threads(native.threads()):
         exact = rasterizers.load("torch")(splats, camera).image  # by the default cut-offs, as gsplat has no others
         for name in rasterizers.names():
-            if name in _SLOW_TO_COMPILE and find_spec(name) is not None and not on_cuda and not slow:
+            slow_here = name in _SLOW_TO_COMPILE and not torch.cuda.is_available() and not slow
+            if slow_here and find_spec(name) is not None:
                 yield name, "installed, not tested: it compiles for a minute first (--all tests it); slow without CUDA"
                 continue
-            try:
-                rasterizer = rasterizers.load(name)
-                device = "cuda" if on_cuda and "cuda" in rasterizer.traits.devices else "cpu"
-                there = splats.to(device)
-                rasterizer(there, camera)
-                began = time.perf_counter()
-                image = rasterizer(there, camera).image.cpu()
-                milliseconds = 1e3 * (time.perf_counter() - began)
-            except BackendUnavailable as reason:
-                yield name, f"not here: {reason}"
-                continue
-            except (RuntimeError, ValueError) as error:
+            correct, verdict = _verdict(name, splats, camera, exact)
+            if not correct:
                 broken.append(name)
-                yield name, f"FAILS: {one_line(error)[:_LONGEST]}"
-                continue
-            difference, module = float((image - exact).abs().max()), getattr(rasterizer, "module", None)
-            if not difference <= _TOLERANCE:
-                broken.append(name)
-            verdict = ("WRONG" if name in broken else "works") + (f" ({module})" if isinstance(module, str) else "")
-            yield name, f"{verdict}: differs from the reference by {difference:.1e}, {milliseconds:.1f} ms"
+            yield name, verdict
+
+
+def _verdict(name: str, splats: Splats, camera: Camera, exact: Tensor) -> tuple[bool, str]:
+    """Whether a backend draws the image `exact` or is not here, and what to say of it."""
+    import torch
+
+    import rasterizers
+
+    try:
+        rasterizer = rasterizers.load(name)
+        there = splats.to("cuda" if torch.cuda.is_available() and "cuda" in rasterizer.traits.devices else "cpu")
+        rasterizer(there, camera)
+        began = time.perf_counter()
+        image = rasterizer(there, camera).image.cpu()
+        milliseconds = 1e3 * (time.perf_counter() - began)
+    except rasterizers.BackendUnavailable as reason:
+        return True, f"not here: {reason}"
+    except (RuntimeError, ValueError) as error:
+        return False, f"FAILS: {one_line(error)[:_LONGEST]}"
+    difference, module = float((image - exact).abs().max()), getattr(rasterizer, "module", None)
+    correct = difference <= _TOLERANCE
+    verdict = ("works" if correct else "WRONG") + (f" ({module})" if isinstance(module, str) else "")
+    return correct, f"{verdict}: differs from the reference by {difference:.1e}, {milliseconds:.1f} ms"
