@@ -73,17 +73,8 @@ def grid_points(
     """
 
     def points_in(i: int) -> tuple[Tensor, Tensor]:
-        photo, grid = photos[i], pixel_grid(photos[i], stride)
-        depth_map = None if maps is None else maps[i]
-        x, y = grid.long().unbind(dim=1)
-        wanted = torch.ones(photo.image.shape[:2], dtype=torch.bool) if photo.shown is None else photo.shown.cpu()
-        if depth_map is not None:
-            wanted = wanted & ~depth_map.known.cpu()
-        grid = grid[wanted[y, x]]
-        shade = sample_colors(photo.image, grid)
-        if background is not None:
-            surface = ~is_background(shade, background)
-            grid, shade = grid[surface], shade[surface]
+        photo, depth_map = photos[i], None if maps is None else maps[i]
+        grid, shade = _pixels_to_fill(photo, depth_map, stride, background)
         inverse_depth = _completed(means, photo, grid, 2 * stride, depth_map) if len(grid) else None
         if inverse_depth is None:
             return torch.zeros(0, 3), torch.zeros(0, 3)
@@ -102,6 +93,23 @@ def grid_points(
         colors.append(shades)
         progress(len(added) - 1)
     return torch.cat(added), torch.cat(colors)
+
+
+def _pixels_to_fill(
+    photo: Photo, depth_map: DepthMap | None, stride: int, background: Color | None
+) -> tuple[Float[Tensor, "G 2"], Float[Tensor, "G 3"]]:
+    """The grid's shown pixels of unknown depth that are not of the background's colour, and their colours."""
+    grid = pixel_grid(photo, stride)
+    x, y = grid.long().unbind(dim=1)
+    wanted = torch.ones(photo.image.shape[:2], dtype=torch.bool) if photo.shown is None else photo.shown.cpu()
+    if depth_map is not None:
+        wanted = wanted & ~depth_map.known.cpu()
+    grid = grid[wanted[y, x]]
+    colors = sample_colors(photo.image, grid)
+    if background is None:
+        return grid, colors
+    surface = ~is_background(colors, background)
+    return grid[surface], colors[surface]
 
 
 def pixel_grid(photo: Photo, stride: int) -> Float[Tensor, "G 2"]:
