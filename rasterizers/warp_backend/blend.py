@@ -98,13 +98,8 @@ def blend_pieces(depth: bool, lanes: int) -> Any:
 
     @wp.func
     def keep(
-        piece: wp.int32,
-        lane: wp.int32,
-        light: Any,
-        sums: Any,
-        pieces: wp.array2d[wp.vec4],
-        expected: wp.array2d[wp.vec2],
-    ) -> None:
+        piece: wp.int32, lane: wp.int32, light: Any, sums: Any, pieces: wp.array2d[wp.vec4], expected: wp.array2d[wp.vec2]
+    ) -> None:  # fmt: skip
         for j in range(per_lane):
             pieces[piece, j * lanes + lane] = wp.vec4(light[j, 0], light[j, 1], light[j, 2], light[j, 3])
             if depth:
