@@ -24,6 +24,7 @@ from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide
 from clear_strategies.merging.recorded_work import RecordedWork, replays_on, why_not_recorded
+from clear_strategies.strategies.base import stored
 from integration.autograd_shot import AutogradShot, HostOutput, Target, every_number, side_of_parameters, to_parameters
 from integration.host import Host
 from integration.views import enlarged_mask
@@ -226,8 +227,8 @@ class HrDrawing:
         conductor, rasterizer = self._conductor, asked.rasterizer
         if self._replays is None or not can_be_recorded(rasterizer):
             return work(inputs)
-        called = (conductor.owner(hook) for hook in ("observe", "route"))
-        state = [rows.data_ptr() for s in called if s is not None for rows in s.state.values()]
+        called = *conductor.comparing, conductor.owner("observe"), conductor.owner("route")
+        state = [x.data_ptr() for s in called if s is not None for x in stored(s)]
         key = GraphKey((len(asked.drawn["means"]), *state), inputs.shapes, (rasterizer, *constants))
 
         def record() -> RecordedWork[_RenderInputs, _Made]:
@@ -236,6 +237,7 @@ class HrDrawing:
             return RecordedWork(
                 inputs.background.device, conductor, lambda: work(static),
                 write=lambda new: write(tensors, new.tensors(rasterizer)), outcome=lambda _, made, row: (made, row),
+                calls=conductor.comparing,
             )  # fmt: skip
 
         return self._replays.do(key, t, inputs, live=lambda: work(inputs), record=record)

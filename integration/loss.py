@@ -67,7 +67,7 @@ def joint_loss(
     _require_started(conductor)
     with _without_hooks([*of_lr.leaves, *(() if of_hr is None else of_hr.leaves)]):
         update = conductor.update(values, lr, hr, view, t)
-        others = [*_others(conductor, params, lr, of_lr.leaves, view, t)]
+        others = [*_others(params, lr, of_lr.leaves, update)]
     objective, λ = conductor.objective, conductor.objective.lambda_hr(t)
     losses = update.losses
     value = objective.lambda_lr * losses["lr"] + λ * (
@@ -191,14 +191,14 @@ def _require_started(conductor: Conductor) -> None:
 
 
 def _others(
-    conductor: Conductor, params: Mapping[str, Tensor], lr: Shot, leaves_of_lr: Sequence[Tensor], view: View, t: int
+    params: Mapping[str, Tensor], lr: Shot, leaves_of_lr: Sequence[Tensor], update: Update
 ) -> Iterator[tuple[Tensor, Tensor]]:  # fmt: skip
     """The other leaves of the LR rendering, each with its gradient of λ_LR L_LR."""
     slot = lr.gradient_slot.tensor if isinstance(lr, AutogradShot) else lr.means2d
     known = {id(slot), *map(id, params.values())}
-    if leaves := [leaf for leaf in leaves_of_lr if id(leaf) not in known]:
-        photo = view.lr.over(conductor.background(t), view.background)
-        (cotangent,) = conductor.objective.lr(lr.image.detach(), photo.image, photo.shown).cotangents
+    leaves = [leaf for leaf in leaves_of_lr if id(leaf) not in known]
+    if leaves and update.cotangents_lr is not None:
+        (cotangent,) = update.cotangents_lr
         found = torch.autograd.grad(lr.image, leaves, cotangent, retain_graph=True, allow_unused=True)
         yield from ((leaf, g) for leaf, g in zip(leaves, found, strict=True) if g is not None)
 

@@ -19,6 +19,7 @@ from clear_strategies.core.step import Step
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Merged
 from clear_strategies.merging.recorded_work import RecordedWork, merging_strategies, replays_on
+from clear_strategies.strategies.base import stored
 from rasterizers.guards import iteration, unread
 from rasterizers.replays import GraphKey, write
 
@@ -113,8 +114,8 @@ class ReplayedMerge:
 
     def _key(self, inputs: _MergeInputs) -> GraphKey:
         called = self._conductor.owner("reconcile"), *self._conductor.regularizers
-        stored = [rows for s in called if s is not None for rows in s.state.values()]
-        addresses = [x.data_ptr() for x in (*inputs.params.values(), *inputs.step.params.values(), *stored)]
+        saved = [x for s in called if s is not None for x in stored(s)]
+        addresses = [x.data_ptr() for x in (*inputs.params.values(), *inputs.step.params.values(), *saved)]
         shapes = [(name, None if x is None else x.shape) for name, x in inputs.tensors.items()]
         return GraphKey((len(next(iter(inputs.out.values()))), *addresses), tuple(shapes), tuple(inputs.out))
 

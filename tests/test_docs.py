@@ -22,7 +22,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from PIL import Image
 
-from clear_strategies import Conductor, options
+from clear_strategies import Conductor, Objective, Photo, options
 from clear_strategies.commands import train
 from clear_strategies.files import write_text
 from clear_strategies.options import CONF
@@ -158,18 +158,25 @@ def test_the_notebook_runs_and_has_saved_what_it_shows(run_block):
 def test_the_guides_loss_and_densifier_train_as_they_say(run_block):
     found = {}
     for block in blocks(DOCS / "how-to" / "own-strategy.md", "python"):
-        if "WithSpectrum" in block or "ByBudget" in block:
+        if "Spectrum" in block or "ByBudget" in block or "Exposures" in block:
             found |= vars(run_block(block))
-    state = short_run.start((), more=[found["Compact"](), found["Budget"](budget=30, every=2, stop=12)])
-    objective = state.conductor.objective = found["WithSpectrum"](lambda_hr=ALWAYS)
+    spectrum, exposures = found["Spectrum"](start=0), found["Exposures"]()
+    state = short_run.start(
+        (), more=[found["Compact"](), spectrum, exposures, found["Budget"](budget=30, every=2, stop=12)]
+    )
+    objective = state.conductor.objective = Objective(lambda_hr=ALWAYS)
     shown = torch.arange(16 * 16).view(16, 16) % 3 > 0
-    hidden = objective.hr(*torch.rand(2, 16, 16, 3), shown=shown).cotangents[0][~shown]
-    assert not hidden.any()
+    image, target = torch.rand(2, 16, 16, 3)
+    photo = Photo(toy.camera(0, 16, 16), target, shown)
+    compared = spectrum.compare("hr", image, photo, toy.step(), lambda image: objective.hr(image, target, shown))
+    assert not compared.cotangents[0][~shown].any()
     n = len(state.field)
     while state.t <= 12:
         loop.iterate(state, toy.RASTERIZER)
     assert (n, len(state.field)) == (16, 30)
     assert all(row["loss_spectrum"] > 0 for row in state.history_as_floats())
+    gains = exposures.run_state["gains"]
+    assert ((gains != 1) & ((gains - 1).abs() < 0.1)).all()
 
 
 def test_the_guides_reader_reads_a_folder_and_is_chosen_for_it(tmp_path, monkeypatch):

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from clear_strategies.core.deferred import Scalar
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.view import View
 
@@ -45,3 +47,15 @@ class Step:
         e = self.evidence
         evidence = None if e is None else Evidence(e.reliability[parents], e.demand[parents])
         return replace(self, visible=visible, evidence=evidence, params={})
+
+
+class Losses(NamedTuple):
+    """The losses of one image.
+
+    Args:
+        values: the losses by name, columns of the history.
+        cotangents: their gradients with respect to the image: of L_LR; or of L_base, and of L_HF where λ_HF > 0.
+    """
+
+    values: Mapping[str, Scalar]
+    cotangents: Float[Tensor, "K H W 3"]

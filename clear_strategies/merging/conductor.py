@@ -17,7 +17,7 @@ from clear_strategies.core.conflicts import Weights
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import require_finite, require_finite_losses
 from clear_strategies.core.gradients import Grads, Shot, screen_norm, screen_of, summed, to_ndc
-from clear_strategies.core.step import Step
+from clear_strategies.core.step import Losses, Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.kernels import per_gaussian, reconcile
 from clear_strategies.kernels.reconcile import dense
@@ -32,7 +32,7 @@ from clear_strategies.merging.iteration import (
     guarded,
     require_finite_parts,
 )
-from clear_strategies.merging.objective import Losses, Objective
+from clear_strategies.merging.objective import Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
 from clear_strategies.strategies.base import ScreenGradients, Strategy
 from rasterizers.guards import iteration
@@ -50,7 +50,7 @@ class Conductor(Hooks):
     """Merges the gradients of a view. Methods that call the strategies are those of `Hooks`.
 
     Args:
-        strategies: in any order, which has no effect. None at all is the paper's baseline.
+        strategies: in any order, which has an effect on `compare` alone. None at all is the paper's baseline.
         objective: the losses and their weights.
         statistics_from: iteration from which densification statistics need the HR render although λ_HR = 0; None:
             as soon as λ_HR > 0 (F11).
@@ -145,10 +145,12 @@ class Conductor(Hooks):
                 "and wants_hr(t) ask for."
             )
         self.logs.keep()
+        step = self._step(view, t, params=params)
         with stage("losses LR"):
             low, photo = rendered.image.detach(), self._over_background(view.lr, t, view.background)
             _require_size(view, "HR" if reduced else "LR", low, view.hr.image if reduced else photo.image)
-            l_lr = o.lr(images.area_mean(low, view.factor) if reduced else low, photo.image, photo.shown)  # Eq. 4
+            compare = self.comparison("lr", photo, step, lambda image: o.lr(image, photo.image, photo.shown))
+            l_lr = compare(images.area_mean(low, view.factor) if reduced else low)  # Eq. 4
         require_finite_losses(where, l_lr.values, {"the LR photo": photo.image, "the LR render": low})
         g_lr: Any = None
         from_hr: HrSide | None = None
@@ -157,7 +159,6 @@ class Conductor(Hooks):
                 (g_lr,) = vjp(rendered, l_lr.cotangents)
         if hr is None:
             self.work_log.skip("backward HR", "HR was not drawn")
-            step = self._step(view, t, params=params)
         else:
             # Where Î_LR is the area mean of Î_HR, the cotangent of L_LR passes through the same HR render.
             through_mean = images.area_mean_transposed(l_lr.cotangents, view.factor) if reduced else None
@@ -180,7 +181,7 @@ class Conductor(Hooks):
                 grads, conflict = None, stepper.step(params, rendered, g_lr, from_hr, t)
         losses = {} if from_hr is None else from_hr.losses
         logs = self.logs.counted_since_kept()
-        return Update(step, grads, score, ordinary, conflict, {**l_lr.values, **losses}, logs)
+        return Update(step, grads, score, ordinary, conflict, {**l_lr.values, **losses}, logs, l_lr.cotangents)
 
     @apart_from_the_loop
     def hr_gradients(
@@ -207,8 +208,11 @@ class Conductor(Hooks):
         with stage("losses HR"):
             sr = self._over_background(view.hr, t, view.background)
             _require_size(view, "HR", hr.image, sr.image)
+            step = self._step(view, t, visible=hr.visible, params=params, looked_up=looked_up)
             # The memory is reused: an allocator would map tens of megabytes anew each time, with a page fault for every 4 KB.
-            losses = self.objective.hr(hr.image.detach(), sr.image, sr.shown, reuse=self._hr_cotangents)  # Eq. 5
+            objective, reuse = self.objective, self._hr_cotangents
+            compare = self.comparison("hr", sr, step, lambda image: objective.hr(image, sr.image, sr.shown, reuse))
+            losses = compare(hr.image.detach())  # Eq. 5
             self._hr_cotangents = losses.cotangents
         require_finite_losses(_where(view, t), losses.values, {"the SR image": sr.image, "the HR render": hr.image})
         of_hr = losses.cotangents
@@ -219,7 +223,6 @@ class Conductor(Hooks):
             of_hr = torch.add(of_hr[:1], of_hr[1:], alpha=λ_hf)
         has_hf, n = len(of_hr) == 2, len(hr.visible)
         with stage("evidence"):
-            step = self._step(view, t, visible=hr.visible, params=params, looked_up=looked_up)
             step = self.observed(step, hr)  # q, a, w        Eq. 9, 10
             m = self.route(step, n) if has_hf else 1.0  # m              Eq. 12
         with stage("backward HR"):  # one pass for all cotangents

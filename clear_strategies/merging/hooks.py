@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 from typing import Final
 
@@ -14,14 +16,22 @@ from torch import Tensor
 
 from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.gradients import Grads, Shot
-from clear_strategies.core.step import Step
+from clear_strategies.core.step import Losses, Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import StrategyConflict
 from clear_strategies.merging.logs import IterationLogs
 from clear_strategies.merging.objective import Objective
 from clear_strategies.strategies import answers
-from clear_strategies.strategies.base import LAMBDA_HR, ScreenGradients, Strategy, by_class, misspelled, overrides
+from clear_strategies.strategies.base import (
+    LAMBDA_HR,
+    Scale,
+    ScreenGradients,
+    Strategy,
+    by_class,
+    misspelled,
+    overrides,
+)
 from rasterizers.guards import iteration
 from rasterizers.interface import Camera, Color
 from rasterizers.modes import apart_from_the_loop
@@ -29,7 +39,7 @@ from rasterizers.modes import apart_from_the_loop
 _log = logging.getLogger(__name__)
 
 _ONE_ANSWER: Final = ("densifier", "background", "gate", "observe", "route", "reconcile", "score")
-_ALL_ANSWER: Final = ("regularize", "draw", "extra_views", "may_densify", "after_step")
+_ALL_ANSWER: Final = ("compare", "regularize", "draw", "extra_views", "may_densify", "after_step")
 _ALSO_BY: Final = {"reconcile": ("correct",)}  # hooks that may be overridden instead
 
 
@@ -37,10 +47,11 @@ class Hooks:
     """Calls the strategies, in the order of the methods. `Conductor` computes losses and merges gradients.
 
     Args:
-        strategies: in any order, which has no effect.
+        strategies: in any order, which has an effect on `compare` alone.
         objective: the losses and their weights.
 
     Attributes:
+        comparing: the strategies that override `compare`, the outermost first.
         regularizers: the strategies that override `regularize`.
         showing: the strategies that override `extra_views`.
         views: the argument of `on_fit_start`.
@@ -57,6 +68,7 @@ class Hooks:
         self.views: tuple[View, ...] = ()
         self.logs = IterationLogs(strategies)
         self.work_log = WorkLog()
+        self.comparing = [s for s in strategies if overrides(s, "compare")]
         self.regularizers = [s for s in strategies if overrides(s, "regularize")]
         self.showing = [s for s in strategies if overrides(s, "extra_views")]
         self._answering = {hook: _only(strategies, hook) for hook in _ONE_ANSWER}
@@ -107,6 +119,14 @@ class Hooks:
     def looked_up(self, view: View) -> Tensor | None:
         """`Strategy.looked_up` of the strategy that observes, for `Step.looked_up`."""
         return self._answering["observe"].looked_up(view)
+
+    def comparison(
+        self, scale: Scale, photo: Photo, step: Step, losses: Callable[[Tensor], Losses]
+    ) -> Callable[[Tensor], Losses]:
+        """The comparison of an image with its photo: `losses`, the objective's, within those of the strategies."""
+        for s in reversed(self.comparing):
+            losses = partial(answers.compared, s, scale, photo, step, losses)
+        return losses
 
     def observed(self, step: Step, hr: Shot) -> Step:
         """The step with the evidence q, a, w of the HR render.  Eq. 9, 10"""
@@ -183,6 +203,7 @@ class Hooks:
         for s in self.strategies:
             s.after_step(params, step)
             answers.require_state(s, params)
+            answers.require_run_state(s)
 
     def may_densify(self, t: int) -> bool:
         return all(s.may_densify(t) for s in self.strategies)
@@ -199,9 +220,14 @@ class Hooks:
             s.on_fit_end()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Every strategy's per-Gaussian tensors, as "<class>.<name>" ("<class>2.<name>" for a second of one class)."""
+        """Every strategy's `state`, as "<class>.<name>", and `run_state`, as "<class>:<name>" ("<class>2" for a second of one
+        class).
+        """
         return {
-            f"{owner}.{name}": rows for owner, s in by_class(self.strategies).items() for name, rows in s.state.items()
+            f"{owner}{mark}{name}": x
+            for owner, s in by_class(self.strategies).items()
+            for mark, tensors in ((".", s.state), (":", s.run_state))
+            for name, x in tensors.items()
         }
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
@@ -213,11 +239,13 @@ class Hooks:
         by_name = by_class(self.strategies)
         for s in self.strategies:
             s.state.clear()
+            s.run_state.clear()
         for key, rows in tensors.items():
-            owner, _, name = key.partition(".")
+            owner, mark, name = re.split(r"([.:])", key, maxsplit=1)
             if owner not in by_name:
                 raise ValueError(f"state {key!r} belongs to no strategy of this run ({', '.join(by_name) or 'none'}).")
-            by_name[owner].state[name] = rows.to(by_name[owner].device, copy=True)
+            s = by_name[owner]
+            (s.state if mark == "." else s.run_state)[name] = rows.to(s.device, copy=True)
 
 
 def _only(strategies: Sequence[Strategy], hook: str) -> Strategy:

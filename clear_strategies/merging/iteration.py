@@ -76,6 +76,7 @@ class Update:
             densification reads them.
         conflict: share of Gaussians in conflict before correction, by group and as "gaussian"; empty without HR.
         losses: scalars by name. logs: the scalars that the strategies logged in the update.
+        cotangents_lr: the gradient of λ_LR L_LR with respect to the LR image, [1, H, W, 3].
 
     On a device, losses, conflict and logs become floats by `deferred.read`.
     """
@@ -87,6 +88,7 @@ class Update:
     conflict: Mapping[str, Number] = field(default_factory=dict)
     losses: Mapping[str, Scalar] = field(default_factory=dict)
     logs: Mapping[str, Number] = field(default_factory=dict)
+    cotangents_lr: Float[Tensor, "1 H W 3"] | None = None
 
 
 @runtime_checkable

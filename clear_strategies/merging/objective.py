@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,20 +12,13 @@ from torch import Tensor
 
 from clear_strategies.core import deferred
 from clear_strategies.core.checks import require_choice, require_number, require_whole
-from clear_strategies.core.deferred import Scalar
+from clear_strategies.core.step import Losses
 from clear_strategies.errors import SettingError
 from clear_strategies.kernels import losses as kernels
 from clear_strategies.kernels.losses import Choice, LossAndGradient
 from clear_strategies.schedules import WarmupDecay
 
 LowFrom = Literal["lr", "hr"]
-
-
-class Losses(NamedTuple):
-    """Losses by name, and their cotangents of one image in the same order."""
-
-    values: Mapping[str, Scalar]
-    cotangents: Float[Tensor, "K H W 3"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -93,11 +93,13 @@ def merging_strategies(conductor: Conductor) -> Iterator[Strategy]:
 
 
 def _stored_by(strategy: Strategy) -> Any:
-    """All that a strategy stores apart from `state`, in a form that `==` compares, and the CPU numbers in `state`, which a replay
-    would repeat. A tensor that is written in place stays equal to itself.
+    """All that a strategy stores apart from what checkpoints save, in a form that `==` compares, and the CPU numbers among that,
+    which a replay would repeat. A tensor that is written in place stays equal to itself.
     """
-    of_host = [x.item() for x in strategy.state.values() if x.dim() == 0 and not can_record(x.device)]
-    return of_host + [_comparable(x) for name, x in vars(strategy).items() if name not in ("state", "logs")]
+    numbers = [x for x in strategy.state.values() if x.dim() == 0] + [*strategy.run_state.values()]
+    of_host = [x.tolist() for x in numbers if not can_record(x.device)]
+    saved = ("state", "run_state", "logs")
+    return of_host + [_comparable(x) for name, x in vars(strategy).items() if name not in saved]
 
 
 def _comparable(x: Any) -> Any:

@@ -6,11 +6,12 @@ Types and shapes are checked, and with `finite` also numbers in the CPU's memory
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from numbers import Real
 from typing import Any, NoReturn, TypeVar
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import deferred
@@ -19,9 +20,10 @@ from clear_strategies.core.conflicts import Weights
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.finite import is_finite, rows_not_finite
 from clear_strategies.core.gradients import Grads
-from clear_strategies.core.view import ExtraView
+from clear_strategies.core.step import Losses, Step
+from clear_strategies.core.view import ExtraView, Photo
 from clear_strategies.errors import AnswerError
-from clear_strategies.strategies.base import Strategy
+from clear_strategies.strategies.base import Scale, Strategy
 
 T = TypeVar("T")
 
@@ -40,13 +42,54 @@ def require_state(s: Strategy, params: Mapping[str, Tensor]) -> None:
         if not isinstance(rows, Tensor) or (n and rows.dim() > 0 and len(rows) not in n):
             raise AnswerError(
                 f"{type(s).__name__}.state[{name!r}] must be a tensor with a row for each Gaussian, {min(n, default=0)}, or "
-                f"without dimensions, got {_shown(rows)}. What can be computed again belongs in cache."
+                f"without dimensions, got {_shown(rows)}. Other tensors belong in run_state, and what can be computed again in "
+                "cache."
             )
         if rows.data_ptr() in memory:  # a resumed run would have a copy
             raise AnswerError(
                 f"{type(s).__name__}.state[{name!r}] must be a tensor of its own, got the memory of a parameter, which changes "
                 "with it. Store parameter.clone()."
             )
+
+
+def require_run_state(s: Strategy) -> None:
+    for name, x in s.run_state.items():
+        if not isinstance(x, Tensor) or x.requires_grad:
+            raise AnswerError(
+                f"{type(s).__name__}.run_state[{name!r}] must be a tensor that requires no gradient, got {_shown(x)}. Hooks turn "
+                "autograd on for a copy, x.detach().requires_grad_()."
+            )
+
+
+def compared(
+    s: Strategy,
+    scale: Scale,
+    photo: Photo,
+    step: Step,
+    losses: Callable[[Tensor], Losses],
+    image: Float[Tensor, "H W 3"],
+) -> Losses:
+    """The answer of `compare`."""
+    inner: list[Losses] = []
+
+    def noted(image: Float[Tensor, "H W 3"]) -> Losses:
+        if inner:  # the memory of the first cotangents is used again
+            raise AnswerError(f"{_named(s, 'compare')} must call losses(image) once, but calls it again.")
+        inner.append(losses(image))
+        return inner[0]
+
+    found = s.compare(scale, image, photo, step, noted)
+    if not inner or not isinstance(found, Losses):
+        _refuse(s, "compare", "the Losses that losses(image) returns, or these with changes", found)
+    shape = inner[0].cotangents.shape
+    if not _is_real(found.cotangents, tuple(shape)):
+        _refuse(
+            s,
+            "compare",
+            f"Losses whose cotangents are a tensor {[*shape]}; add a loss to one of them",
+            found.cotangents,
+        )
+    return found
 
 
 def gate(s: Strategy, z: T, n: int) -> T:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from numbers import Real
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -22,7 +22,7 @@ from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.deferred import Deferred, Derived, Element, Number
 from clear_strategies.core.evidence import Evidence, PatchMaps
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, Shot, gathered
-from clear_strategies.core.step import Step
+from clear_strategies.core.step import Losses, Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.errors import AnswerError
 from clear_strategies.kernels import reconcile
@@ -33,7 +33,9 @@ _DEVICE, _SEED = "device", "seed"  # in the cache
 LAMBDA_HR: Final = "lambda_hr"
 """In the cache: the schedule of the run's objective, from `on_fit_start` on."""
 _ALIKE: Final = 0.85  # "regularise" to "regularize" 0.9, "densify" to "densifier" 0.75
-_OWN_NAMES: Final = {"state", "cache", "logs", "device", "seed", "lambda_hr"}
+_OWN_NAMES: Final = {"state", "run_state", "cache", "logs", "device", "seed", "lambda_hr"}
+
+Scale = Literal["lr", "hr"]
 
 Logged = Number | Callable[[], Number]
 """A scalar, or a function that computes it."""
@@ -61,6 +63,7 @@ class Strategy:
     Args:
         state: tensors [N, …] of the Gaussians, which `on_resize` gathers, and tensors without dimensions, numbers of the run;
             nothing else. Checkpoints save them.
+        run_state: other tensors that checkpoints save, of any shape: parameters of the strategy's own, by view or by group.
         cache: values that can be computed again (patch maps, keyed by view); never saved.
         logs: scalars of this iteration, see `log`.
 
@@ -68,6 +71,7 @@ class Strategy:
     """
 
     state: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
+    run_state: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
     cache: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
     logs: dict[str, Logged] = field(default_factory=dict, init=False, repr=False, compare=False)
 
@@ -94,6 +98,7 @@ class Strategy:
     def on_fit_start(self, n_views: int, seed: int) -> None:
         """Start a run, or resume one. Overriders call `super()`."""
         self.state.clear()
+        self.run_state.clear()
         self.cache.clear()
         self.logs.clear()
         self.cache[_SEED] = seed
@@ -115,6 +120,21 @@ class Strategy:
     def background(self, t: int) -> Color | None:
         """Before render: over which colour are both scales and the extra views rendered? None: the scene's own."""
         return None
+
+    def compare(
+        self, scale: Scale, image: Float[Tensor, "H W 3"], photo: Photo, step: Step, losses: Callable[[Tensor], Losses]
+    ) -> Losses:
+        """After render: how is the image compared with its photo? Each strategy adds a loss, or changes the image.  Eq. 4, 5
+
+        Other trainers call it for HR alone, unless they use `joint_loss`, since their LR loss is their own. Extra views are
+        compared by the objective alone.
+
+        Args:
+            photo: the photo of LR, or the SR image, over the background of the iteration. step: without `visible` and evidence.
+            losses: compares an image with the photo, by the strategies after this one and the objective. To be called once; the
+                cotangents that it returns may be changed in place.
+        """
+        return losses(image)
 
     def observe(self, step: Step, hr: Shot) -> Evidence | None:
         """After render: what is I_HR worth for each Gaussian?  Eq. 9, 10
@@ -249,9 +269,10 @@ class Strategy:
         self.logs[name] = value
 
     def to(self, device: torch.device | str) -> None:
-        """Move `state` to the device of the field; answers are expected there."""
+        """Move `state` and `run_state` to the device of the field; answers are expected there."""
         self.cache[_DEVICE] = torch.device(device)
-        self.state.update({name: rows.to(device) for name, rows in self.state.items()})
+        for tensors in (self.state, self.run_state):
+            tensors.update({name: x.to(device) for name, x in tensors.items()})
 
     @property
     def device(self) -> torch.device:
@@ -268,6 +289,11 @@ class Strategy:
     def seed(self) -> int:
         """The seed of the run; 0 before it starts."""
         return int(self.cache.get(_SEED, 0))
+
+
+def stored(strategy: Strategy) -> list[Tensor]:
+    """The tensors of a strategy that checkpoints save."""
+    return [*strategy.state.values(), *strategy.run_state.values()]
 
 
 def overrides(strategy: Strategy, hook: str) -> bool:

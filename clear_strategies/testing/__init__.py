@@ -159,16 +159,21 @@ def check_state_is_all_there_is(make: Make) -> None:
 
 
 def check_state_follows_its_gaussians(make: Make) -> None:
-    """A reordering takes the rows of `state` along; that each tensor has a row a Gaussian, the conductor asks after a step."""
+    """A reordering takes the rows of `state` along, and leaves `run_state` as it is. That each tensor of `state` has a row a
+    Gaussian, the conductor asks after a step.
+    """
     conductor = given.conductor(make)
     for _ in given.trace(conductor, 1, given.STEPS):
         pass
-    before = {name: rows.clone() for name, rows in conductor.state_dict().items()}
+    (strategy,) = conductor.strategies
+    before, of_run = copy.deepcopy((strategy.state, strategy.run_state))
     order = torch.randperm(given.N, generator=torch.Generator().manual_seed(0))
     conductor.on_resize(order)
-    for name, rows in conductor.state_dict().items():
+    for name, rows in strategy.state.items():
         followed = before[name][order] if rows.dim() > 0 else before[name]
         require(torch.equal(rows, followed), f"state {name!r} did not follow its Gaussians")
+    for name, x in strategy.run_state.items():
+        require(torch.equal(x, of_run[name]), f"run_state {name!r} changed with the structure")
 
 
 def check_goes_on_with_another_number_of_gaussians(make: Make) -> None:

@@ -152,7 +152,8 @@ def _recorded(
         return update, row
 
     write_static(inputs)
-    calls = merging_strategies(s.conductor) if isinstance(inputs, ViewInputs) else ()
+    merging, comparing = merging_strategies(s.conductor), s.conductor.comparing
+    calls = (*merging, *comparing) if isinstance(inputs, ViewInputs) else ()
     return RecordedWork(
         s.device, s.conductor, lambda: learn(s, drawn_by, static), write=write_static, outcome=outcome, calls=calls
     )

@@ -1,13 +1,13 @@
 """`joint_loss` in the smallest host: torch parameters, torch.optim, and a renderer with autograd."""
 
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import pytest
 import torch
 
-from clear_strategies import GCO, P2G, SVS, Conductor
+from clear_strategies import GCO, P2G, SVS, Conductor, Strategy
 from clear_strategies.training.field import GaussianField
 from integration import AutogradShot, HostError, ScoreScaler, extra_loss, joint_loss
 from rasterizers import Splats, autograd
@@ -85,9 +85,20 @@ def test_an_extra_view_is_learned_from_in_a_step_of_its_own():
     assert losses[-1] < 0.8 * losses[0]
 
 
-def test_what_else_the_rendering_depends_on_gets_the_gradient_of_lr():
-    scene = toy.scene(20)
-    host, view, conductor = Host(scene), scene.train[0], Conductor(GCO(), objective=HR_FROM_START)
+@dataclass(frozen=True)
+class Halved(Strategy):
+    """Compares half of the brightness."""
+
+    def compare(self, scale, image, photo, step, losses):
+        found = losses(image * 0.5)
+        found.cotangents.mul_(0.5)
+        return found
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_what_else_the_rendering_depends_on_gets_the_gradient_of_lr(share):
+    scene, comparing = toy.scene(20), [Halved()] * (share < 1)
+    host, view, conductor = Host(scene), scene.train[0], Conductor(GCO(), *comparing, objective=HR_FROM_START)
     exposure, offset = torch.eye(3).requires_grad_(), torch.zeros(1, 1, 3, requires_grad=True)
 
     def render(camera, detail=None):
@@ -98,7 +109,7 @@ def test_what_else_the_rendering_depends_on_gets_the_gradient_of_lr():
 
     lr, hr = render(view.lr.camera), render(view.hr.camera, host.params["detail"])
     (3 * joint_loss(conductor, host.params, lr, hr, view, 5)[0]).backward()
-    (cotangent,) = conductor.objective.lr(lr.image.detach(), view.lr.image, None).cotangents
+    (cotangent,) = share * conductor.objective.lr(share * lr.image.detach(), view.lr.image, None).cotangents
     for leaf, expected in zip(
         (exposure, offset), torch.autograd.grad(lr.image, (exposure, offset), cotangent), strict=True
     ):

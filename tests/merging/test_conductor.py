@@ -680,3 +680,90 @@ def test_two_strategies_of_one_class_keep_their_states_apart():
     second = Conductor(Remember(1.0), Remember(2.0))
     second.load_state_dict(first.state_dict())
     assert [s.state["kept"][0].item() for s in second.strategies] == [1.0, 2.0]
+
+
+@dataclass(frozen=True)
+class Darker(Strategy):
+    """Compares the render at half its brightness, which it learns: a parameter of its own."""
+
+    rate: float = 0.0
+
+    def compare(self, scale, image, photo, step, losses):
+        gain = self.run_state.setdefault("gain", torch.full((3,), 0.5))
+        found = losses(image * gain)
+        slope = (found.cotangents[0] * image).sum((0, 1))
+        found.cotangents.mul_(gain)
+        gain -= self.rate * slope
+        return found
+
+
+@dataclass(frozen=True)
+class Brightness(Strategy):
+    """A loss of its own: the mean of what is compared."""
+
+    def compare(self, scale, image, photo, step, losses):
+        found = losses(image)
+        found.cotangents[0] += 1 / image.numel()
+        return found._replace(values={**found.values, f"mean_{scale}": float(image.mean())})
+
+
+@pytest.mark.parametrize("make", [Darker, lambda: Darker(0.01), Brightness], ids=["image", "learned", "loss"])
+def test_a_comparison_keeps_the_contract(make):
+    check_strategy(make)
+
+
+def test_comparisons_change_the_image_and_add_losses_each_around_the_next(drawn):
+    """As one objective of both would: what comes first sees the render, and what follows sees what that passes on."""
+    field, view, lr, hr = drawn
+    objective = Objective(lambda_hr=ALWAYS)
+
+    def update(*strategies):
+        conductor = Conductor(*strategies, objective=objective)
+        conductor.on_fit_start(1, 0, views=[view])
+        return conductor.update(field.raw(), lr, hr, view, 5)
+
+    plain, darker, outside, inside = (
+        update(*strategies) for strategies in ((), (Darker(),), (Brightness(), Darker()), (Darker(), Brightness()))
+    )
+    dark = objective.lr(lr.image * 0.5, view.lr.image)
+    assert darker.losses["lr"] == pytest.approx(dark.values["lr"])
+    torch.testing.assert_close(darker.cotangents_lr, dark.cotangents * 0.5)
+    assert plain.losses["lr"] != darker.losses["lr"] == outside.losses["lr"] == inside.losses["lr"]
+    for found, seen in ((outside, 1.0), (inside, 0.5)):
+        for scale, shot in (("lr", lr), ("hr", hr)):
+            assert found.losses[f"mean_{scale}"] == pytest.approx(seen * float(shot.image.mean()), rel=1e-5)
+        torch.testing.assert_close(found.cotangents_lr, darker.cotangents_lr + seen / lr.image.numel())
+        assert not torch.equal(found.grads["means"], darker.grads["means"])
+
+
+def test_a_comparison_must_pass_on_the_losses_of_one_image(drawn):
+    field, view, lr, hr = drawn
+    twice = "must call losses.image. once, but calls it again"
+    faults = {
+        "must give the Losses that losses": lambda scale, image, photo, step, losses: losses(image).values,
+        "must give the Losses": lambda scale, image, photo, step, losses: None,
+        twice: lambda scale, image, photo, step, losses: losses(image) and losses(image),
+        "must give Losses whose cotangents are a tensor": lambda scale, image, photo, step, losses: losses(
+            image
+        )._replace(cotangents=torch.zeros(3, *image.shape)),
+    }
+    for message, compare in faults.items():
+        conductor = Conductor(answering("compare", compare)(), objective=Objective(lambda_hr=ALWAYS))
+        with pytest.raises(AnswerError, match=rf"compare\(\) {message}"):
+            conductor.update(field.raw(), lr, hr, view, 5)
+
+
+def test_tensors_of_the_run_have_any_shape_stay_when_the_structure_changes_and_are_given_back():
+    first, second = Conductor(Darker()), Conductor(Darker())
+    kept = first.strategies[0].run_state["gain"] = torch.rand(5, 3)
+    first.on_resize(torch.arange(2))
+    first.after_step({"means": torch.zeros(30, 3)}, toy.step())
+    second.load_state_dict(first.state_dict())
+    assert torch.equal(second.strategies[0].run_state["gain"], kept)
+    assert not second.strategies[0].state
+    first.on_fit_start(1, 0)
+    assert not first.strategies[0].run_state
+    for wrong in (0.5, torch.zeros(3, requires_grad=True)):
+        first.strategies[0].run_state["gain"] = wrong
+        with pytest.raises(AnswerError, match=r"Darker.run_state\['gain'\] must be a tensor that requires no gradient"):
+            first.after_step({}, toy.step())
