@@ -25,6 +25,7 @@ from clear_strategies.merging.objective import Objective
 from clear_strategies.strategies import answers
 from clear_strategies.strategies.base import (
     LAMBDA_HR,
+    SPLATS,
     Scale,
     ScreenGradients,
     Strategy,
@@ -33,7 +34,7 @@ from clear_strategies.strategies.base import (
     overrides,
 )
 from rasterizers.guards import iteration
-from rasterizers.interface import Camera, Color
+from rasterizers.interface import Camera, Color, Splats
 from rasterizers.modes import apart_from_the_loop
 
 _log = logging.getLogger(__name__)
@@ -85,12 +86,14 @@ class Hooks:
 
     @apart_from_the_loop
     def on_fit_start(
-        self, n_views: int, seed: int, device: torch.device | str = "cpu", views: Sequence[View] = ()
-    ) -> None:
+        self, n_views: int, seed: int, device: torch.device | str = "cpu", views: Sequence[View] = (),
+        splats: Callable[[Mapping[str, Tensor]], Splats] | None = None,
+    ) -> None:  # fmt: skip
         """Once, before the first iteration.
 
         Args:
             device: of the field. views: all training views, where the caller has them.
+            splats: see `Strategy.splats`; None: exp and sigmoid.
         """
         self.work_log.device, self.views = torch.device(device), tuple(views)
         for s in self.strategies:
@@ -98,6 +101,8 @@ class Hooks:
             answers.require_started(s, seed)
             s.to(device)
             s.cache[LAMBDA_HR] = self.objective.lambda_hr
+            if splats is not None:
+                s.cache[SPLATS] = splats
             if overrides(s, "on_views"):
                 with self.work_log.stage("views prepared"):
                     s.on_views(views)
@@ -218,6 +223,7 @@ class Hooks:
         self.views = ()
         for s in self.strategies:
             s.on_fit_end()
+            s.cache.pop(SPLATS, None)  # it keeps the field
 
     def state_dict(self) -> dict[str, Tensor]:
         """Every strategy's `state`, as "<class>.<name>", and `run_state`, as "<class>:<name>" ("<class>2" for a second of one

@@ -26,14 +26,16 @@ from clear_strategies.core.step import Losses, Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.errors import AnswerError
 from clear_strategies.kernels import reconcile
-from rasterizers.interface import Camera, Color
+from rasterizers.interface import Camera, Color, Splats
 from rasterizers.native import empty_for
 
 _DEVICE, _SEED = "device", "seed"  # in the cache
 LAMBDA_HR: Final = "lambda_hr"
 """In the cache: the schedule of the run's objective, from `on_fit_start` on."""
 _ALIKE: Final = 0.85  # "regularise" to "regularize" 0.9, "densify" to "densifier" 0.75
-_OWN_NAMES: Final = {"state", "run_state", "cache", "logs", "device", "seed", "lambda_hr"}
+SPLATS: Final = "splats"
+"""In the cache: the activation of raw parameters, where the trainer has its own."""
+_OWN_NAMES: Final = {"state", "run_state", "cache", "logs", "device", "seed", "lambda_hr", "splats"}
 
 Scale = Literal["lr", "hr"]
 
@@ -285,10 +287,23 @@ class Strategy:
         schedule: Callable[[int], float] | None = self.cache.get(LAMBDA_HR)
         return 0.0 if schedule is None else schedule(t)
 
+    def splats(self, params: Mapping[str, Tensor]) -> Splats:
+        """Raw parameters of as many Gaussians as the field has, activated as the run draws them, without f_det. Differentiable.
+
+        In this trainer the 3D filter of the field makes them larger and fainter; other trainers' own filters are left out.
+        """
+        activate: Callable[[Mapping[str, Tensor]], Splats] = self.cache.get(SPLATS, _unfiltered)
+        return activate(params)
+
     @property
     def seed(self) -> int:
         """The seed of the run; 0 before it starts."""
         return int(self.cache.get(_SEED, 0))
+
+
+def _unfiltered(params: Mapping[str, Tensor]) -> Splats:
+    scales, opacities = params["scales"].exp(), params["opacities"].sigmoid()
+    return Splats(params["means"], params["quats"], scales, opacities, params["sh0"], params["shN"])
 
 
 def stored(strategy: Strategy) -> list[Tensor]:

@@ -16,6 +16,7 @@ from clear_strategies.core.gradients import ATTRIBUTES, Grads, gathered
 from clear_strategies.core.points import PointCloud, spread
 from clear_strategies.core.view import View
 from clear_strategies.kernels import per_gaussian
+from clear_strategies.kernels.per_gaussian import reference
 from clear_strategies.training.mip import NEAR, filter_std
 from rasterizers.geometry import constant_band
 from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, summed_vjp
@@ -148,6 +149,12 @@ class GaussianField(nn.Module):
     def baked(self) -> Splats:
         """Splats for exports and viewers: the filter in scales and opacities, f_det in the colour."""
         return self._activate().splats(detail=True)
+
+    def splats_of(self, raw: Mapping[str, Tensor]) -> Splats:
+        """Other raw parameters as those of the field are drawn, without f_det; differentiable."""
+        _, filtered, *_, opacities = reference.activate(raw["scales"], raw["opacities"], self.filter_3d, None)
+        shN = raw["shN"][:, : (self.degree + 1) ** 2 - 1]
+        return Splats(raw["means"], raw["quats"], filtered, opacities, raw["sh0"], shN)
 
     def _activate(self, gate: Tensor | None = None) -> Activation:
         raw, bands = self.raw(), (self.degree + 1) ** 2 - 1

@@ -27,7 +27,7 @@ from clear_strategies.training.history import History
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
 from clear_strategies.training.settings import FitSettings
-from rasterizers.interface import RasterSettings
+from rasterizers.interface import RasterSettings, Splats
 from rasterizers.replays import Replays
 
 _log = logging.getLogger(__name__)
@@ -115,9 +115,13 @@ class TrainState:
                 len(theta), extent=extent, seed=settings.seed, white_background=white, device=device
             )
         optimizer = Adam(theta.raw(), rates, extent)
-        conductor.on_fit_start(len(scene.train), settings.seed, device, scene.train)
         photos = fingerprints(scene)
         state = cls(theta, conductor, optimizer, densifier, settings, mip, scene.train, rules, photos=photos)
+
+        def splats(raw: Mapping[str, Tensor]) -> Splats:
+            return state.field.splats_of(raw)  # a checkpoint brings another field
+
+        conductor.on_fit_start(len(scene.train), settings.seed, device, scene.train, splats=splats)
         state.compiled_step = compiled_step_for(conductor, optimizer, settings.fused)
         state.refilter()
         return state

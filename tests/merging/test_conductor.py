@@ -1,6 +1,7 @@
 """The conductor: Eq. 8 and 13, exclusivity, and the strategies' contract."""
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -767,3 +768,34 @@ def test_tensors_of_the_run_have_any_shape_stay_when_the_structure_changes_and_a
         first.strategies[0].run_state["gain"] = wrong
         with pytest.raises(AnswerError, match=r"Darker.run_state\['gain'\] must be a tensor that requires no gradient"):
             first.after_step({}, toy.step())
+
+
+def test_a_strategy_draws_raw_parameters_as_the_run_does_and_gets_their_gradients():
+    """Also after a checkpoint, which brings another field."""
+    strategy = Darker()
+    state = short_run.start((), more=[strategy])
+    for _ in range(4):
+        loop.iterate(state, toy.RASTERIZER)
+    resumed = short_run.start((), more=[other := Darker()])
+    resumed.restore(state.checkpoint({}), Path("checkpoint"))
+    shot = state.field.shot(toy.RASTERIZER, view := state.views[0].lr.camera)
+    assert state.field.filter_3d.min() > 0
+    for s in (strategy, other):
+        leaves = {name: p.clone().requires_grad_() for name, p in state.field.raw().items()}
+        found = autograd.draw(toy.RASTERIZER, s.splats(leaves), view)
+        torch.testing.assert_close(found.image, shot.image)
+        cotangent = torch.rand(shot.image.shape, generator=torch.Generator().manual_seed(0))
+        (expected,) = shot.vjp(cotangent[None])
+        names = [name for name in leaves if name != "detail"]
+        gradients = torch.autograd.grad(found.image, [leaves[name] for name in names], cotangent)
+        for name, gradient in zip(names, gradients, strict=True):
+            torch.testing.assert_close(gradient, expected[name], rtol=1e-4, atol=1e-6)
+
+
+def test_a_host_activates_raw_parameters_by_exp_and_sigmoid():
+    params = {**field_and_view()[0].raw()}
+    conductor = Conductor(strategy := Darker())
+    conductor.on_fit_start(1, 0)
+    splats = strategy.splats(params)
+    assert torch.equal(splats.scales, params["scales"].exp())
+    assert torch.equal(splats.opacities, params["opacities"].sigmoid())
