@@ -713,6 +713,12 @@ def test_a_comparison_keeps_the_contract(make):
     check_strategy(make)
 
 
+def test_the_contract_finds_a_comparison_that_changes_the_render_in_place():
+    halved = answering("compare", lambda scale, image, photo, step, losses: losses(image.mul_(0.5)))
+    with pytest.raises(ContractError, match="an image was changed in place by a hook"):
+        check_strategy(halved)
+
+
 def test_comparisons_change_the_image_and_add_losses_each_around_the_next(drawn):
     """As one objective of both would: what comes first sees the render, and what follows sees what that passes on."""
     field, view, lr, hr = drawn
