@@ -5,6 +5,7 @@ import pytest
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay, milestones, scaled
+from clear_strategies.training.settings import FitSettings
 
 
 def test_lambda_hr_by_the_papers_milestones_and_the_position_rate():
@@ -31,3 +32,9 @@ def test_milestones_stretch_with_the_run_and_nothing_else_does():
 @pytest.mark.parametrize(("of_10_000", "of_100"), [(3_000, 92), (0, 0)])
 def test_opacities_are_not_reset_again_before_they_can_have_returned(of_10_000, of_100):
     assert scaled(DensitySettings(reset_every=of_10_000), 0.01).reset_every == of_100
+
+
+@pytest.mark.parametrize(("of_10_000", "of_60"), [(20, 1), (2_500, 15), (0, 0)])
+def test_a_short_run_does_not_turn_checkpoints_and_evaluations_off(of_10_000, of_60):
+    short = scaled(FitSettings(checkpoint_every=of_10_000, probe_every=of_10_000), 60 / 10_000)
+    assert (short.checkpoint_every, short.probe_every) == (of_60, of_60)

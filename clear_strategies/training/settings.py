@@ -51,9 +51,9 @@ class FitSettings:
     seed: int = 0
     max_degree: int = 3
     degree_every: int = milestone(1_000)
-    probe_every: int = milestone(1_000)
+    probe_every: int = milestone(1_000, least=1)
     probe_views: int = 3
-    checkpoint_every: int = milestone(2_500)
+    checkpoint_every: int = milestone(2_500, least=1)
     keep: int = 3
     memory: int | None = None
     fused: FusedMode = "auto"
