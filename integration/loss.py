@@ -18,7 +18,6 @@ from clear_strategies.core.deferred import Scalar
 from clear_strategies.core.gradients import Grads, Shot
 from clear_strategies.core.view import ExtraView, View
 from clear_strategies.errors import HostError
-from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Update
 from clear_strategies.strategies.base import overrides
@@ -179,7 +178,8 @@ def _require_view(conductor: Conductor, view: View, **graphs: Graph | None) -> N
             photo = view.lr if name == "lr" else view.hr
             if (camera.width, camera.height) == (photo.camera.width, photo.camera.height):
                 remedy = "Draw it by the camera of its view, whose K is that of the photo."
-                require_intrinsics(f"{name} of {view.name}", intrinsics(camera), photo.camera, remedy)
+                drawn_by = camera.fx, camera.fy, camera.cx, camera.cy
+                require_intrinsics(f"{name} of {view.name}", drawn_by, photo.camera, remedy)
 
 
 def _require_started(conductor: Conductor) -> None:

@@ -197,17 +197,17 @@ def enlarged_mask(mask: Float[Tensor, "h w"], factor: int) -> Float[Tensor, "H W
     return mask.repeat_interleave(factor, 0).repeat_interleave(factor, 1)
 
 
-def require_intrinsics(name: str, K: Float[Tensor, "3 3"], photo: Camera, remedy: str) -> None:
+def require_intrinsics(name: str, drawn: Sequence[float], photo: Camera, remedy: str) -> None:
     """Raise a HostError if a rendering has other intrinsics than its photo, and so shows other pixels.
 
     Args:
-        name: of the rendering. remedy: a sentence.
+        name: of the rendering. drawn: its fx, fy, cx, cy. remedy: a sentence.
     """
-    given, known = (x.detach().cpu().double()[(0, 1, 0, 1), (0, 1, 2, 2)] for x in (K, intrinsics(photo)))
-    if bool((given - known).abs().max() > SAME_POSE * known.abs().max()):
-        drawn, own = ("fx={:.6g}, fy={:.6g}, cx={:.6g}, cy={:.6g}".format(*x.tolist()) for x in (given, known))
+    known = (photo.fx, photo.fy, photo.cx, photo.cy)
+    if not all(abs(a - b) <= SAME_POSE * max(map(abs, known)) for a, b in zip(drawn, known, strict=True)):
+        given, own = ("fx={:.6g}, fy={:.6g}, cx={:.6g}, cy={:.6g}".format(*numbers) for numbers in (drawn, known))
         raise HostError(
-            f"{name} is rendered with {drawn}, but its photo has {own}, so that they show other pixels. {remedy}"
+            f"{name} is rendered with {given}, but its photo has {own}, so that they show other pixels. {remedy}"
         )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import multiprocessing
 import os
 import re
@@ -16,9 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Final
 
-from hydra._internal.config_loader_impl import ConfigLoaderImpl, get_overrides_dirname
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -44,45 +41,6 @@ stopped: Final = list[int]()
 def in_sweep() -> bool:
     """Return True if this job is one of a sweep."""
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
-
-
-class SharedCompositions(ConfigLoaderImpl):
-    """Hydra's loader, which composes the files of conf/ once for all jobs of a sweep that choose the same ones.
-
-    A composition takes 0.2 s, and the values of a job, set in a copy of it, a tenth of that.
-    """
-
-    def __init__(self, loader: ConfigLoader) -> None:
-        super().__init__(loader.get_search_path())
-        self._compositions: dict[tuple[str, ...], DictConfig] = {}
-
-    def load_sweep_config(self, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
-        given = [*master_config.hydra.overrides.hydra, *sweep_overrides]
-        words = OverridesParser.create().parse_overrides(given)
-        task = [word for word in words if not word.is_hydra_override()]
-        values = [word for word in task if not self._is_option(word)]
-        if not all("." in word.key_or_group for word in values):  # perhaps an option of a folder in hydra.searchpath
-            return super().load_sweep_config(master_config, sweep_overrides)
-        options = tuple(str(word.input_line) for word in words if word not in values)
-        if options not in self._compositions:
-            name = master_config.hydra.job.config_name
-            self._compositions[options] = self.load_configuration(name, [*options], RunMode.RUN)
-        config = copy.deepcopy(self._compositions[options])
-        self._apply_overrides_to_config(values, config)
-        config.hydra.overrides.task = [word.input_line for word in task]
-        config.hydra.job.override_dirname = get_overrides_dirname(task, **config.hydra.job.config.override_dirname)
-        OmegaConf.copy_cache(from_config=master_config, to_config=config)
-        return config
-
-    def _is_option(self, word: Override) -> bool:
-        """Whether an override chooses files of conf/, by Hydra's own rule."""
-        return self.repository.group_exists(word.key_or_group) and not isinstance(word.value(), dict)
-
-
-def share_compositions() -> None:
-    """Have the sweep that begins take its jobs' configurations from `SharedCompositions`."""
-    if (application := GlobalHydra.instance().hydra) is not None:
-        application.config_loader = SharedCompositions(application.config_loader)
 
 
 def refusal(config: DictConfig) -> str | None:

@@ -29,7 +29,6 @@ from integration.host import Host
 from integration.hr_drawing import Drawable
 from integration.replacing import replaced_attribute, replaced_everywhere
 from integration.structure import rows_drawn
-from integration.views import require_intrinsics
 from rasterizers.ahead import drawing_ahead
 from rasterizers.as_gsplat import rasterizer_of
 from rasterizers.interface import BackendUnavailable, Camera, Rasterizer
@@ -178,16 +177,8 @@ class Attached:
             view = self._poses.find(call["viewmats"]) if self._named is None else self._named[0]
             if view is None:  # a viewer, a camera without a photo
                 return rasterization(**self._with_detail(call, trained=False))
-            lr = view.lr.camera
-            if self._named is None and (call["width"], call["height"]) == (
-                lr.width,
-                lr.height,
-            ):  # others are refused below
-                remedy = (
-                    "Pass view() the K of the loop, and cut a crop out of the whole picture. A loop that optimizes K names the "
-                    "view: with clear.rendering(view): …"
-                )
-                require_intrinsics(view.name, call["Ks"].reshape(3, 3), lr, remedy)
+            if self._named is None:
+                calls.require_own_intrinsics(call, view)
             calls.require_pinhole(call, self.attachment.conductor.showing)
 
             @functools.cache  # the product is the same tensor at both scales, and none is kept for longer

@@ -17,7 +17,7 @@ from clear_strategies.errors import HostError
 from clear_strategies.geometry.projection import intrinsics
 from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot
 from integration.hr_drawing import Drawable
-from integration.views import SAME_POSE
+from integration.views import SAME_POSE, require_intrinsics
 from rasterizers.as_gsplat import cameras_of
 from rasterizers.autograd import collected_drawings
 from rasterizers.geometry import SH_C0
@@ -59,6 +59,18 @@ class Poses:
             names = " and ".join(self._views[i].name for _, i in near[:2])
             raise HostError(f"{names} have the same pose. Say which is rendered: with clear.rendering(view): …")
         return self._views[near[0][1]] if near else None
+
+
+def require_own_intrinsics(call: Call, view: View) -> None:
+    """Raise a HostError if a call of the photo's size has other intrinsics; other sizes are refused where they are drawn."""
+    lr = view.lr.camera
+    if (call["width"], call["height"]) == (lr.width, lr.height):
+        (fx, _, cx), (_, fy, cy), _ = call["Ks"].detach().reshape(3, 3).cpu().numpy().tolist()
+        remedy = (
+            "Pass view() the K of the loop, and cut a crop out of the whole picture. A loop that optimizes K names the view: "
+            "with clear.rendering(view): …"
+        )
+        require_intrinsics(view.name, (fx, fy, cx, cy), lr, remedy)
 
 
 def enlarged(call: Call, factor: int) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import OmegaConf, open_dict
 
@@ -22,7 +21,7 @@ from clear_strategies.hydra_app import FAILED, SweepCallback
 from clear_strategies.jobs import device, sweep
 from clear_strategies.training import checkpoint
 from tests.helpers.command_line import TINY, run, started, stopped_by, wait_for
-from tests.helpers.configs import composed, jobs_of, loader
+from tests.helpers.configs import composed, loader
 from tests.helpers.finished_run import make_run
 
 AUTO = ["fit.resume=auto", *TINY]
@@ -131,48 +130,6 @@ def test_the_folders_of_a_sweeps_jobs_are_named_by_all_in_which_they_differ(aske
             job.hydra.job.num = number
         named.append(job.hydra.sweep.subdir)
     assert sorted(map(str, named)) == sorted(folders)
-
-
-@pytest.mark.parametrize(
-    "asked",
-    [
-        [
-            "experiment=table1",
-            "data.root=a,b",
-            "+method=srgs,[]",
-            "fit.seed=0,1",
-            "data.scene=fern",
-            "hydra.job.name=mine",
-        ],
-        ["+strategy=gco,[gco,svs]", "~fit.video", "+strategies.mine={a:1}", "fit.seed=0,1", "~optim", "+method=[]"],
-        ["fit={seed:3}", "fit.seed=1,2", "readings=paper,measured", "rasterizer@other=auto,cpp"],
-        ["hydra.searchpath=[clear://docs/template/clear_veto/conf]", "+strategy=veto,gco", "fit.seed=0,1"],
-    ],
-)
-def test_jobs_that_share_a_composition_have_the_configuration_that_hydra_composes_for_each(asked):
-    whole = loader().load_configuration("config", asked, run_mode=RunMode.MULTIRUN, validate_sweep_overrides=False)
-    shared = sweep.SharedCompositions(loader())
-
-    def composed_by(loader) -> list[str]:
-        return [of_job(loader, list(job)) for job in jobs_of(whole, asked)]
-
-    def of_job(loader, job: list[str]) -> str:
-        try:
-            return OmegaConf.to_yaml(loader.load_sweep_config(whole, job))
-        except HydraException as error:
-            return str(error)
-
-    assert composed_by(shared) == composed_by(loader())
-    assert composed_by(shared) == composed_by(loader())  # setting values has left the compositions as they were
-
-
-def test_a_wrong_setting_of_the_last_job_is_told_before_the_first_trains(tmp_path):
-    result = run(
-        "-m", "hydra.sweep.dir=all", "+strategy=gco,p2g", "strategies.gco.tolerance=0.1,0.2", *TINY, cwd=tmp_path
-    )
-    assert result.returncode == 2
-    assert "strategies.gco.tolerance: there is no such setting." in result.stdout + result.stderr
-    assert not list(tmp_path.rglob("run.log"))
 
 
 @pytest.mark.slow
