@@ -41,7 +41,7 @@ from clear_strategies.data.scene import require_shown
 from clear_strategies.errors import HostError, SettingError
 from clear_strategies.merging.conductor import Conductor
 from integration.announcement import announce, warn_without_hr
-from integration.autograd_shot import HostOutput, Target, require_named
+from integration.autograd_shot import HostOutput, Target, require_named, trained
 from integration.host import Host
 from integration.host_merge import HostMerge
 from integration.host_steps import HostSteps
@@ -205,8 +205,8 @@ class Attachment:
         if has_merged:
             self._merging.fading.before_step()
             return
-        trained = _trained(self._host.leaves())
-        cause, remedy = why_nothing_was_merged(self._pending, trained)
+        names = [*trained(self._host.leaves())]
+        cause, remedy = why_nothing_was_merged(self._pending, names)
         if not self.counts["merges"]:
             raise HostError(
                 f"the host makes its first optimizer step, but {cause}, so that no strategy would take part. {remedy}"
@@ -215,7 +215,7 @@ class Attachment:
         if self.counts["steps of the host alone"] == 1:
             _log.warning(
                 "the host makes a step in which no strategy takes part: %s, and %s changed without CLEAR or not at all. %s",
-                cause, ", ".join(trained) or "nothing", remedy,
+                cause, ", ".join(names) or "nothing", remedy,
             )  # fmt: skip
 
     def _after_optimizer(self) -> None:
@@ -274,18 +274,18 @@ class Attachment:
         self._merge_pass(pending, done)
         for hook in done.hooks:
             hook()
-        if pending is not None and pending.merged.issuperset(_trained(done.params)):
+        if pending is not None and pending.merged.issuperset(trained(done.params)):
             pending.output = pending.hr = None
 
     def _merge_pass(self, pending: Pending | None, done: BackwardPass) -> None:
-        trained, accumulated = _trained(done.params), done.accumulated()
-        if pending is None or (trained and not accumulated):
+        expected, accumulated = trained(done.params), done.accumulated()
+        if pending is None or (expected and not accumulated):
             return
         pending.require_alone(done)
         using = [type(s).__name__ for s in map(self.conductor.owner, ("reconcile", "score")) if s is not None]
         pending.require_first(accumulated, " and ".join(using))
         names = [name for name in accumulated if name not in pending.merged]
-        if names or not (trained or pending.merged):
+        if names or not (expected or pending.merged):
             self._merge(pending, done, names)
 
     def _merge(self, pending: Pending, done: BackwardPass, names: Sequence[str]) -> None:
@@ -312,7 +312,7 @@ class Attachment:
             return
         self._in_vain = 0 if self._pending.merged else self._in_vain + 1
         if self._in_vain == _PATIENCE:
-            cause, remedy = why_nothing_was_merged(self._pending, _trained(self._host.leaves()))
+            cause, remedy = why_nothing_was_merged(self._pending, [*trained(self._host.leaves())])
             _log.warning(
                 "CLEAR has no part in the last %d renderings of training views: %s. %s Evaluate under torch.no_grad().",
                 _PATIENCE, cause, remedy,
@@ -347,10 +347,6 @@ def _checked(render_at: RenderAt, params: Mapping[str, Tensor]) -> RenderAt:
         return output
 
     return render
-
-
-def _trained(params: Mapping[str, Tensor]) -> list[str]:
-    return [name for name, p in params.items() if p.requires_grad and name != "detail"]
 
 
 def _to_change(p: Tensor) -> Tensor:

@@ -194,7 +194,7 @@ def to_parameters(g: Grads, drawn: Mapping[str, Tensor] | None, params: Mapping[
         g: by the names of `drawn`; the colours' gradient as factors if this package drew them. It stays so if `are_joined`.
         drawn: None: the raw parameters.
     """
-    raw, colour = _trained(params), None
+    raw, colour = trained(params), None
     if drawn is None:
         return Grads({name: g[name] for name in raw})  # which hooks may have changed
     if g.colour is not None:
@@ -260,7 +260,8 @@ def _is_in_order(x: Tensor, p: Tensor) -> bool | None:
     return bool((off.abs_().sum(1) <= _SAME_CODE * plain.abs_().sum(1)).all())
 
 
-def _trained(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def trained(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The parameters, except for f_det, that require gradients."""
     return {name: p for name, p in params.items() if p.requires_grad and name != "detail"}
 
 
