@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core.deferred import Element, Number
+from clear_strategies.core.deferred import Number
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.merging.conductor import Conductor
@@ -199,7 +199,6 @@ class HrDrawing:
 
         hr, losses = self._done(asked, inputs, t, ("hr", view.factor), work)
         params = {name: p.detach() for name, p in asked.params.items()}
-        losses = {name: x.vector[x.k] if isinstance(x, Element) else x for name, x in losses.items()}
         step = hr.step if self._replays is None else hr.step.copied()
         hr = replace(hr, step=replace(step, t=t, view=view, params=params), losses=losses)
         return side_of_parameters(hr, asked.drawn, asked.params)

@@ -14,10 +14,9 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
 from itertools import accumulate, islice, takewhile
 from operator import itemgetter
-from typing import Final, NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -25,34 +24,16 @@ from torch import Tensor
 
 
 class Deferred(NamedTuple):
-    """A function of scalars that have not been read yet. The function may log."""
+    """A function of numbers that have not been read yet, which may log. A vector among them is given to it as a list."""
 
     recipe: Callable[..., float]
     parts: tuple[Number, ...]
 
 
-class Element(NamedTuple):
-    """The k-th number of a vector on a device that is never written to again. Many elements cost less than a tensor each, and are
-    fetched together.
-    """
-
-    vector: Float[Tensor, " K"] | Int[Tensor, " K"]
-    k: int
-
-
-class Derived(NamedTuple):
-    """A function of the numbers of a vector on a device that is never written to again."""
-
-    vector: Float[Tensor, " K"]
-    of: Callable[[Sequence[float]], float]
-
-
-_UNREAD: Final = (Tensor, Deferred, Element, Derived)
-
 Scalar = float | Tensor
 """For arithmetic: a float, or a 0-dim tensor on a device that is never written to again."""
 
-Number = Scalar | Deferred | Element | Derived
+Number = Scalar | Deferred
 """For logs and tables: a scalar, or a function of scalars."""
 
 
@@ -68,13 +49,16 @@ def scalar(x: Tensor) -> Scalar:
 
 def elements(x: Int[Tensor, " K"] | Float[Tensor, " K"]) -> Sequence[Number]:
     """The numbers of a vector; read at once on the CPU."""
-    return x.tolist() if is_immediate(x) else [Element(x, k) for k in range(x.shape[0])]
+    if is_immediate(x):
+        return x.tolist()
+    parts = (x,)  # many numbers of one vector cost less than a tensor each, and are fetched together
+    return [Deferred(itemgetter(k), parts) for k in range(x.shape[0])]
 
 
 def defer(recipe: Callable[..., float], *numbers: Number) -> Number:
     """recipe(*numbers), at once if all numbers are floats."""
     for x in numbers:
-        if isinstance(x, _UNREAD):
+        if isinstance(x, (Tensor, Deferred)):
             return Deferred(recipe, numbers)
     return recipe(*numbers)
 
@@ -83,14 +67,10 @@ def read(numbers: Sequence[Number]) -> list[float]:
     """The numbers as floats; those on the device are fetched in one transfer."""
     values = _transferred([x for number in numbers for x in _tensors(number)])
 
-    def value(x: Number) -> float:
+    def value(x: Number) -> Any:
         if isinstance(x, Deferred):
             return x.recipe(*map(value, x.parts))
-        if isinstance(x, Element):
-            return values[id(x.vector)][x.k]
-        if isinstance(x, Derived):
-            return x.of(values[id(x.vector)])
-        return values[id(x)][0] if isinstance(x, Tensor) else x
+        return values[id(x)] if isinstance(x, Tensor) else x
 
     return [value(x) for x in numbers]
 
@@ -103,30 +83,27 @@ def gathered(row: Mapping[str, Number]) -> tuple[Float[Tensor, " K"], Callable[[
     device = parts[0].device if parts else None
     vector = torch.cat([*parts, torch.empty(0, dtype=torch.float64, device=device)])
 
-    def position(number: Number) -> int | None:
-        vector = number if isinstance(number, Tensor) else getattr(number, "vector", None)
-        return None if vector is None else firsts[id(vector)] + getattr(number, "k", 0)
-
-    def reader(number: Number) -> Callable[[Sequence[float]], float]:
+    def reader(number: Number) -> Callable[[Sequence[float]], Any]:
         if isinstance(number, Deferred):
             recipe, each = number.recipe, [*map(reader, number.parts)]
             return lambda values: recipe(*(one(values) for one in each))
-        if (k := position(number)) is None:
-            return lambda _: cast(float, number)
-        return (lambda values: number.of(values[k:])) if isinstance(number, Derived) else itemgetter(k)
+        if isinstance(number, Tensor):
+            k = firsts[id(number)]
+            return itemgetter(slice(k, k + len(number)) if number.dim() else k)
+        return lambda _: number
 
-    def maker(number: Number) -> Callable[[Tensor], Number]:
-        if isinstance(number, (Deferred, Derived)):  # one tuple, of however many numbers
-            return partial(Derived, of=reader(number))
-        return (lambda _: number) if (k := position(number)) is None else partial(Element, k=k)
+    readers = {name: reader(x) for name, x in row.items() if isinstance(x, (Tensor, Deferred))}
 
-    makers = {name: maker(number) for name, number in row.items()}
-    return vector, lambda copy: {name: make(copy) for name, make in makers.items()}
+    def row_of(copy: Tensor) -> dict[str, Number]:
+        parts = (copy,)
+        return {name: Deferred(readers[name], parts) if name in readers else x for name, x in row.items()}
+
+    return vector, row_of
 
 
 def resolve(rows: Sequence[dict[str, Number]]) -> Sequence[dict[str, float]]:
     """Turn every number of the rows into a float, in place. Rows before a resolved one are resolved already."""
-    unread = list(takewhile(lambda row: any(isinstance(x, _UNREAD) for x in row.values()), reversed(rows)))
+    unread = list(takewhile(lambda row: any(isinstance(x, (Tensor, Deferred)) for x in row.values()), reversed(rows)))
     values = iter(read([x for row in unread for x in row.values()]))
     for row in unread:
         for name in row:
@@ -154,14 +131,14 @@ def _tensors(x: Number) -> Iterator[Tensor]:
     if isinstance(x, Deferred):
         for part in x.parts:
             yield from _tensors(part)
-    elif isinstance(x, (Element, Derived)):
-        yield x.vector
     elif isinstance(x, Tensor):
         yield x
 
 
-def _transferred(tensors: Sequence[Tensor]) -> dict[int, Sequence[float]]:
-    """Each tensor's numbers by its id. Tensors of one type are joined first, so that few kernels fetch many numbers."""
+def _transferred(tensors: Sequence[Tensor]) -> dict[int, float | Sequence[float]]:
+    """Each tensor's number, or those of a vector, by its id. Tensors of one type are joined first, so that few kernels fetch many
+    numbers.
+    """
     by_type: defaultdict[torch.dtype, list[Tensor]] = defaultdict(list)
     for x in {id(x): x for x in tensors}.values():
         by_type[x.dtype].append(x)
@@ -169,4 +146,4 @@ def _transferred(tensors: Sequence[Tensor]) -> dict[int, Sequence[float]]:
         return {}
     joined = torch.cat([torch.cat([x.view(-1) for x in alike]).double() for alike in by_type.values()])
     values = iter(joined.tolist())
-    return {id(x): [*islice(values, x.numel())] for alike in by_type.values() for x in alike}
+    return {id(x): [*islice(values, len(x))] if x.dim() else next(values) for alike in by_type.values() for x in alike}

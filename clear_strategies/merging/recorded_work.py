@@ -53,8 +53,7 @@ class RecordedWork(Recorded[In, T]):
             self._logged = [(s, name) for s, name, _ in logged]
             row = {**numbers, **{f"log {k}": x() if callable(x) else x for k, (*_, x) in enumerate(logged)}}
             self._of_t = {name: x for name, x in row.items() if isinstance(x, Guarded)}
-            counts = {f"skip {k}": count for k, (*_, count) in enumerate(self._skips) if isinstance(count, Tensor)}
-            return made, *deferred.gathered({name: x for name, x in row.items() if name not in self._of_t} | counts)
+            return made, *deferred.gathered({name: x for name, x in row.items() if name not in self._of_t})
 
         conductor.logs.keep()
         try:
@@ -77,11 +76,8 @@ class RecordedWork(Recorded[In, T]):
         """The result of the last replay. The strategies' logs are those of the work afterwards."""
         made, numbers, row_of = self._recording.result
         row: dict[str, Number] = row_of(numbers.clone()) | {name: x.at(self._t) for name, x in self._of_t.items()}
-        for k, (name, reason, count) in enumerate(self._skips):
-            counted = row.pop(f"skip {k}", None)
-            self._work_log.skip(
-                name, reason, counted.vector[counted.k] if isinstance(counted, deferred.Element) else count
-            )
+        for skip in self._skips:
+            self._work_log.skip(*skip)
         for k, (s, name) in enumerate(self._logged):
             s.logs[name] = row.pop(f"log {k}")
         return self._outcome(inputs, made, row)

@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.core.conflicts import Products, Weights
-from clear_strategies.core.deferred import Deferred, Derived, Element, Number
+from clear_strategies.core.deferred import Deferred, Number
 from clear_strategies.core.evidence import Evidence, PatchMaps
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, Shot, gathered
 from clear_strategies.core.step import Losses, Step
@@ -262,9 +262,7 @@ class Strategy:
         host calls it in every hundredth. A 0-dim tensor on a device is read later, see `core.deferred`. If another strategy has
         logged the same name, the column is "<class>.<name>".
         """
-        is_number = (
-            value.dim() == 0 if isinstance(value, Tensor) else isinstance(value, (Real, Deferred, Derived, Element))
-        )
+        is_number = value.dim() == 0 if isinstance(value, Tensor) else isinstance(value, (Real, Deferred))
         if not (is_number or callable(value)):
             found = f"a tensor {[*value.shape]}" if isinstance(value, Tensor) else f"{value!r:.80}"
             raise AnswerError(f"{type(self).__name__}.log({name!r}, …) takes one number, got {found}.")

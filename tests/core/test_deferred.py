@@ -50,7 +50,7 @@ def test_a_row_of_a_copied_vector_has_its_numbers_in_the_rows_order(on_a_device)
         vector, row_of = deferred.gathered(row)
         row = row_of(doubled * vector)
         assert [type(number) for number in row.values()] == [
-            deferred.Derived, float, deferred.Element, deferred.Element
+            deferred.Deferred, float, deferred.Deferred, deferred.Deferred
         ]  # fmt: skip
         assert [*row] == ["share", "one", "x", "second"]
         expected = [8 * doubled / (3 * doubled + 1), 1, 3 * doubled, 8 * doubled]
