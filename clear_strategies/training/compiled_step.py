@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Final, Literal
 
 import torch
@@ -21,7 +22,7 @@ from torch import Tensor
 
 from clear_strategies.core.conflicts import Weights
 from clear_strategies.core.deferred import Number
-from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, gradients_of
+from clear_strategies.core.gradients import Colour, Grads, gradients_of
 from clear_strategies.kernels import gaussian_step as kernel
 from clear_strategies.kernels import native
 from clear_strategies.kernels.gaussian_step import cpp
@@ -30,7 +31,6 @@ from clear_strategies.merging.iteration import HrSide, LossWeights
 from clear_strategies.training.field import LOG_SCALE_LIMIT, LOGIT_LIMIT, Activation, FieldShot
 from clear_strategies.training.optim import BETA1, BETA2, Adam
 from rasterizers.interface import BackendUnavailable
-from rasterizers.native import empty_for
 from rasterizers.recording import running
 from rasterizers.warp_runtime import require_warp
 
@@ -119,7 +119,8 @@ class CompiledStep:
         if hr is not None and λ > 0:
             products = gaussians.products()
             conflict = products.conflict()  # before correction
-            answer = self.conductor.reconciled(products, hr.step, lambda: _dense(gaussians, params), finite=True)
+            both = partial(_both_dense, shot.activation, g_lr, hr.g)
+            answer = self.conductor.reconciled(products, hr.step, both, finite=True)
             if isinstance(answer, Weights):
                 weights = answer  # ĝ^HR           Eq. 6, 7, 11
             else:
@@ -237,11 +238,11 @@ def _basis(g_lr: Grads, g_hr: Grads | None = None) -> Float[Tensor, "N B1"]:
     return torch.where((low.rgb != 0).any(1, keepdim=True), low.basis, high.basis)
 
 
-def _dense(gaussians: kernel.GaussianStep, params: Mapping[str, Tensor]) -> tuple[Grads, Grads]:
+def _both_dense(a: Activation, g_lr: Grads, g_hr: Grads) -> tuple[Grads, Grads]:
     """g_LR and g^HR in full, for strategies that override `correct`."""
-    both = [Grads({name: empty_for(params[name]) for name in CONFLICT_GROUPS}) for _ in range(2)]
-    gaussians.dense(*both)
-    return both[0], both[1]
+    basis = _basis(g_lr, g_hr)
+    low, high = (a.vjp(Grads(g, colour=Colour(g.tensors["rgb"], basis))) for g in (g_lr, g_hr))
+    return low, high
 
 
 def _rows_like(p: Tensor, g: Tensor | None) -> Tensor | None:

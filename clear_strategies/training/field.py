@@ -12,11 +12,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from clear_strategies.core.gradients import ATTRIBUTES, Grads, gathered
+from clear_strategies.core.gradients import ATTRIBUTES, PARAMETERS, Grads, gathered, gradients_of
 from clear_strategies.core.points import PointCloud, spread
 from clear_strategies.core.view import View
 from clear_strategies.kernels import per_gaussian
 from clear_strategies.kernels.per_gaussian import reference
+from clear_strategies.kernels.reconcile import dense
 from clear_strategies.training.mip import NEAR, filter_std
 from rasterizers.geometry import constant_band
 from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, summed_vjp
@@ -187,26 +188,16 @@ class Activation:
             self.raw["detail"] if detail else None,
         )  # fmt: skip
 
-    def vjp(self, g: SplatGradients, k: int, *, detail: bool) -> Grads:
-        """Chain rule through the filter, exp and sigmoid, for gradient k."""
-        d_opacity = g.opacities[k]
+    def vjp(self, g: Grads) -> Grads:
+        """Chain rule through the filter, exp and sigmoid, for a gradient of the splats; the result has no factors."""
+        d_opacity = g["opacities"]
         # ∂ log(coefficient) / ∂ log(s) = f² / (s² + f²): the opacity's gradient reaches the scales.
         share = (self.filter_3d[:, None] / self.filtered).square()
-        d_scales = g.scales[k] * self.scales.square() / self.filtered
+        d_scales = g["scales"] * self.scales.square() / self.filtered
         d_scales = d_scales + (d_opacity * self.opacities)[:, None] * share
-        d_shN = torch.zeros_like(self.raw["shN"])
-        d_shN[:, : self.shN.shape[1]] = g.basis[:, 1:, None] * g.rgb[k, :, None]
-        grads = {
-            "means": g.means[k],
-            "quats": g.quats[k],
-            "scales": d_scales,
-            "opacities": d_opacity * self.factor * self.sigmoid * (1 - self.sigmoid),
-            "sh0": g.basis[:, :1, None] * g.rgb[k, :, None],
-            "shN": d_shN,
-        }
-        if detail:
-            grads["detail"] = g.rgb[k]
-        return Grads(grads, screen=g.screen[k])
+        d_opacity = d_opacity * self.factor * self.sigmoid * (1 - self.sigmoid)
+        raw = Grads({**g, "scales": d_scales, "opacities": d_opacity}, colour=g.colour, screen=g.screen)
+        return dense(raw, {name: self.raw[name] for name in PARAMETERS})
 
 
 class FieldShot:
@@ -225,14 +216,17 @@ class FieldShot:
         return summed_vjp(self._rendering, cotangents, weight)
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
-        g = self.gradients(cotangents)
-        return [self.activation.vjp(g, k, detail=self._detail) for k in range(len(cotangents))]
+        each = gradients_of(self.gradients(cotangents))
+        raw = [*map(self.activation.vjp, each)]
+        if self._detail:
+            for g, drawn in zip(raw, each, strict=True):
+                g["detail"] = drawn.tensors["rgb"]
+        return raw
 
     def summed_vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"]) -> list[Grads]:
         """The result of `core.gradients.summed`, which is summed before the projection's VJP."""
-        g = self.gradients(cotangents, weight)
-        each = [self.activation.vjp(g, k, detail=False) for k in range(len(g.means))]
-        return [*each, Grads({"detail": g.rgb[-1]} if self._detail else {}, screen=g.screen[-1])]
+        *each, hf = gradients_of(self.gradients(cotangents, weight))
+        return [*map(self.activation.vjp, each), hf if self._detail else Grads(screen=hf.screen)]
 
 
 def _neighbour_distance(means: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:

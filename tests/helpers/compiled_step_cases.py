@@ -57,13 +57,9 @@ class Case:
     def grads(self, use: int, hr: str = "both") -> tuple:
         """The same for the readable path."""
         a = self.fields[use]._activate(self.z)
-        both = self.hr.summed(self.weight)
-        of_hr = {
-            "none": [],
-            "base": [a.vjp(self.hr, 0, detail=False)],
-            "both": [a.vjp(both, 0, detail=False), gradients_of(both)[1]],
-        }
-        return a.vjp(self.lr, 0, detail=False), self._side(of_hr[hr])
+        base, (both, detail) = gradients_of(self.hr)[0], gradients_of(self.hr.summed(self.weight))
+        of_hr = {"none": [], "base": [a.vjp(base)], "both": [a.vjp(both), detail]}
+        return a.vjp(gradients_of(self.lr)[0]), self._side(of_hr[hr])
 
     def _side(self, of_hr) -> HrSide | None:
         g, detail, *_ = *of_hr, None, None

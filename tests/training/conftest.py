@@ -46,10 +46,6 @@ class Elsewhere:
         dot, l2, h2 = (x.cpu() for x in (found.dot, found.l2, found.h2))
         return replace(found, dot=dot, l2=l2, h2=h2)
 
-    def dense(self, lr, hr):
-        self.passes.dense(*({name: self.bring(x) for name, x in g.items()} for g in (lr, hr)))
-        self.fetch(*lr.values(), *hr.values())
-
     def step(self, attributes, weights, step):
         brought = {name: Attribute(*map(self.bring, a)) for name, a in attributes.items()}
         found = self.passes.step(brought, Weights(*map(self.bring, weights)), step)

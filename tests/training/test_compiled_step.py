@@ -13,6 +13,7 @@ import torch
 from clear_strategies import CONFLICT_GROUPS, GCO, P2G, SVS, Conductor, Grads, Objective
 from clear_strategies.core import deferred
 from clear_strategies.core.conflicts import Weights
+from clear_strategies.core.gradients import gradients_of
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.kernels.gaussian_step.cpp import CppGaussianStep
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
@@ -43,7 +44,7 @@ EPS = torch.finfo(torch.float32).eps
 def assert_same_gradient(c: Case, expected, found, λ=1.0, hr="both"):
     g_lr, from_hr = c.grads(0, hr)
     a = c.fields[0]._activate(c.z)
-    parts = [g_lr] if from_hr is None else [g_lr, from_hr.g, *(a.vjp(c.hr, k, detail=True) for k in (0, 1))]
+    parts = [g_lr] if from_hr is None else [g_lr, from_hr.g, *map(a.vjp, gradients_of(c.hr))]
     for name, value in expected.items():
         size = sum(abs(g[name]).double() for g in parts if g is not None and name in g) + abs(value).double()
         norm = size.flatten(1).norm(dim=1).view(-1, *[1] * (value.dim() - 1)) if value.dim() > 1 else size

@@ -69,10 +69,6 @@ class GaussianStep(Protocol):
         """The inner products of g_LR and g^HR."""
         ...
 
-    def dense(self, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor]) -> None:
-        """Write g_LR and g^HR of the raw parameters into contiguous tensors of their shapes."""
-        ...
-
     def step(
         self, attributes: Mapping[str, Attribute], weights: Weights, settings: StepSettings
     ) -> int | Int[Tensor, ""]:  # fmt: skip

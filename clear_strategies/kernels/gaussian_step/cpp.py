@@ -41,9 +41,6 @@ class CppGaussianStep:
         table = empty((3, len(CONFLICT_GROUPS), self._n), torch.float64)
         return Products(CONFLICT_GROUPS, *(x.T for x in table), *self._passes.products(table.data_ptr(), threads()))
 
-    def dense(self, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor]) -> None:
-        self._passes.dense(dict(lr), dict(hr), math.prod(lr["shN"].shape[1:]), threads())
-
     def step(self, attributes: Mapping[str, Attribute], weights: Weights, settings: StepSettings) -> int:
         tables = {name: a._asdict() | {"width": math.prod(a.p.shape[1:])} for name, a in attributes.items()}
         numbers = {slot: getattr(settings, slot) for slot in StepSettings.__slots__ if slot != "changing"}

@@ -26,27 +26,11 @@ class GaussianStep {
 
   // Writes the inner products of both gradients to `to`, float64 [3, 6, n]; returns `counts`.
   nb::tuple products(Address to, int threads) const {
-    require_hr();
+    if (g_.n && !g_.hr) throw nb::value_error("there is no HR gradient to reconcile");
     nb::gil_scoped_release release;
     Conflicts found = clear::products(g_, {at<double>(to), g_.n}, threads);
     nb::gil_scoped_acquire acquire;
     return counts(found);
-  }
-
-  // Writes both gradients into tables {name: tensor} of the six groups, where shN has `width` numbers a row.
-  void dense(nb::dict lr, nb::dict hr, int width, int threads) const {
-    require_hr();
-    if (width % 3 || width < 3 * (g_.bases - 1) || width > 45) throw nb::value_error("shN must hold the active bands");
-    Tensors tensors;
-    auto rows = [&](const nb::dict& t) {
-      std::int64_t n = g_.n;
-      return DenseRows{{tensors.rows<float>(t, "means", n, 3), tensors.rows<float>(t, "sh0", n, 3), tensors.rows<float>(t, "shN", n, width),
-                        tensors.rows<float>(t, "opacities", n, 1), tensors.rows<float>(t, "scales", n, 3),
-                        tensors.rows<float>(t, "quats", n, 4)}, width};
-    };
-    DenseRows low = rows(lr), high = rows(hr);
-    nb::gil_scoped_release release;
-    clear::dense(g_, low, high, threads);
   }
 
   // Steps `attributes` {name: {p, m, v, hr, plus, width, rate, keep, limit}} in place; returns the number of still rows.
@@ -74,10 +58,6 @@ class GaussianStep {
   Gradients g_{};
   Tensors tensors_;
 
-  void require_hr() const {
-    if (g_.n && !g_.hr) throw nb::value_error("there is no HR gradient to reconcile");
-  }
-
   SplatGradient gradient(const nb::dict& t) {
     std::int64_t n = g_.n;
     return {tensors_.rows<const float>(t, "means", n, 3), tensors_.rows<const float>(t, "quats", n, 4),
@@ -104,7 +84,6 @@ inline void bind_step(nb::module_& m) {
       .def(nb::init<nb::dict, nb::dict, nb::object, std::int64_t>(), nb::arg("activation"), nb::arg("lr"), nb::arg("hr").none(),
            nb::arg("bases"))
       .def("products", &GaussianStep::products, nb::arg("to"), nb::arg("threads"))
-      .def("dense", &GaussianStep::dense, nb::arg("lr"), nb::arg("hr"), nb::arg("width"), nb::arg("threads"))
       .def("step", &GaussianStep::step, nb::arg("attributes"), nb::arg("weights"), nb::arg("settings"), nb::arg("threads"));
 }
 

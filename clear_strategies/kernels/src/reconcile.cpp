@@ -114,7 +114,7 @@ class Passes {
   // Sixteen longer rows: where they lie, or a copy of them.
   static const float* read(const Rows& a, const RowPlan& plan, const float* rows, const Colour& colour, std::int64_t i, int count, float* copy) {
     if (a.first_band != 1 || !colour.rgb) return block_of(rows, i, count, a.width, copy);
-    expand(colour.rgb + 3 * i, colour.basis + colour.bases * i, colour.bases, plan, count, kLanes, copy);
+    expand(colour.rgb + 3 * i, colour.basis + colour.bases * i, colour.bases, plan, count, copy);
     if (rows)
       for (int j = 0; j < count * a.width; ++j) copy[j] += rows[i * a.width + j];
     return copy;
@@ -155,7 +155,7 @@ class Passes {
       for (int c = 0; c < 3; ++c) l[c] += h[c] * Floats(λ);
       alignas(64) float rgb[3 * kLanes];
       join_rows(rgb, l);
-      expand(rgb, g.lr.basis + g.lr.bases * i, g.lr.bases, plan, count, kLanes, merged);
+      expand(rgb, g.lr.basis + g.lr.bases * i, g.lr.bases, plan, count, merged);
       return write(a, merged, i, count, finite);
     }
     Sixteen b;

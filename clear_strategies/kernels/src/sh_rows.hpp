@@ -30,8 +30,8 @@ CLEAR_INLINE Floats outer(const Floats& Y, const Floats& rgb, const RowPlan& pla
   return pick(Y, plan.band[v]) * pick(rgb, plan.channel[v]);
 }
 
-// `count` rows Y ⊗ ∇rgb from the rows of its factors; those beyond, up to `rows`, become 0.
-CLEAR_INLINE void expand(const float* rgb_rows, const float* basis, int bases, const RowPlan& plan, int count, int rows, float* to) {
+// `count` rows Y ⊗ ∇rgb from the rows of its factors; those beyond, up to sixteen, become 0.
+CLEAR_INLINE void expand(const float* rgb_rows, const float* basis, int bases, const RowPlan& plan, int count, float* to) {
   float colour[4 * kLanes] = {};  // padded, because reads are sixteen wide
   std::copy_n(rgb_rows, 3 * count, colour);
   for (int k = 0; k < count; ++k, to += plan.width) {
@@ -41,7 +41,7 @@ CLEAR_INLINE void expand(const float* rgb_rows, const float* basis, int bases, c
     for (int v = 0; v < plan.sixteens; ++v) outer(Y, rgb, plan, v).store(row + plan.offset[v]);
     if (plan.width < kLanes) std::copy_n(few, plan.width, to);
   }
-  std::fill_n(to, (rows - count) * plan.width, 0.0f);
+  std::fill_n(to, (kLanes - count) * plan.width, 0.0f);
 }
 
 }  // namespace clear

@@ -23,34 +23,6 @@ CLEAR_INLINE void group_products(const Gradients& g, const Block& b, std::int64_
   p[kShN] = {Y2 * rgb.dot, Y2 * rgb.l2, Y2 * rgb.h2};
 }
 
-// The rows of a chunk of Gaussians in dense form.
-class ChunkDense {
- public:
-  ChunkDense(const Gradients& g, const DenseRows& lr, const DenseRows& hr) : g(g), lr(lr), hr(hr), plan(lr.width) {}
-
-  void run(std::int64_t number) const {
-    each_sixteen(g.n, number, [&](std::int64_t i, int count) {
-      Block b;
-      load(g, i, count, b);
-      write(b.lr, lr, i, count), write(b.hr, hr, i, count);
-    });
-  }
-
- private:
-  const Gradients& g;
-  const DenseRows &lr, &hr;
-  const RowPlan plan;
-
-  void write(const RawGradients& raw, const DenseRows& to, std::int64_t i, int count) const {
-    store_rows(to.of[kMeans], i, count, raw.means), store_rows(to.of[kSh0], i, count, raw.sh0);
-    store_rows(to.of[kOpacities], i, count, raw.opacities), store_rows(to.of[kScales], i, count, raw.scales);
-    store_rows(to.of[kQuats], i, count, raw.quats);
-    float rgb[3 * kLanes];
-    join_rows(rgb, raw.rgb);
-    expand(rgb, g.basis + g.bases * i, g.bases, plan, count, count, to.of[kShN] + i * plan.width);
-  }
-};
-
 class ChunkStep {
  public:
   ChunkStep(const Gradients& g, const Weights& w, const Step& s) : g(g), w(w), s(s), plan(s.width) {}
@@ -214,11 +186,6 @@ Conflicts products(const Gradients& g, ProductTable to, int threads) {
   Conflicts total;
   for (const Conflicts& part : parts) total.add(part);
   return total;
-}
-
-void dense(const Gradients& g, const DenseRows& lr, const DenseRows& hr, int threads) {
-  ChunkDense chunk(g, lr, hr);
-  Pool::instance().run(threads, chunks(g.n), [&](std::int64_t k) { chunk.run(k); });
 }
 
 std::int64_t step(const Gradients& g, const Weights& w, const Step& s, int threads) {

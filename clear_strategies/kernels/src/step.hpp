@@ -18,17 +18,8 @@ struct Step {
   int width = 0;      // numbers of an shN row that are stepped, a multiple of 3: the active bands', or all
 };
 
-// Where the gradients of the raw parameters [n, width] go, in the order of the groups; shN's has `bands` bands.
-struct DenseRows {
-  float* of[kGroups];
-  int width;  // of shN
-};
-
 // Writes the inner products of g_LR and g^HR, and counts conflicts.
 Conflicts products(const Gradients& g, ProductTable to, int threads);
-
-// Writes g_LR and g^HR, for a strategy that corrects them number by number.
-void dense(const Gradients& g, const DenseRows& lr, const DenseRows& hr, int threads);
 
 // Steps every attribute in place; returns the number of rows that were skipped, because they would not change.
 std::int64_t step(const Gradients& g, const Weights& w, const Step& s, int threads);

@@ -67,21 +67,14 @@ class WarpGaussianStep:
         )
 
     def products(self) -> Products:
-        self._require_hr()
+        if self._n and not self._has_hr:
+            raise ValueError("there is no HR gradient to reconcile.")
         lanes, device = self._lanes, self._like.device
         blocks = -(-self._n // lanes)
         table, counts = product_table(self._like, self._n, blocks)
         with on_stream(device):
             launch(passes.compare, [blocks], (*self._gradients, table, counts), device, block=lanes, together=True)
         return products_of(CONFLICT_GROUPS, table, counts)
-
-    def dense(self, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor]) -> None:
-        self._require_hr()
-        width = math.prod(lr["shN"].shape[1:])
-        widths = {name: _WIDTHS.get(name, width) for name in CONFLICT_GROUPS}
-        rows = (self._rows(passes.Rows, g, widths) for g in (lr, hr))
-        with on_stream(self._like.device):
-            launch(passes.write_dense, [self._n], (*self._gradients, *rows), self._like.device, block=self._lanes)
 
     def step(
         self, attributes: Mapping[str, Attribute], weights: Weights, settings: StepSettings
@@ -112,10 +105,6 @@ class WarpGaussianStep:
             launch(passes.step, [blocks], step, device, block=lanes, together=True)
             launch(passes.step_bands, [self._n, settings.width], of_bands, device, block=lanes)
         return stills.sum() if settings.skips else 0
-
-    def _require_hr(self) -> None:
-        if self._n and not self._has_hr:
-            raise ValueError("there is no HR gradient to reconcile.")
 
     @property
     def _lanes(self) -> int:

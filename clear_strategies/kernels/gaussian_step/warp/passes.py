@@ -1,5 +1,5 @@
 """The kernels of the step: `compare` writes the products of both gradients, `step` merges and applies Adam, and `step_bands` does
-this for the rows of shN; `write_dense` writes both gradients.
+this for the rows of shN.
 
 They use one thread per Gaussian, `step_bands` one per number, because shN has three quarters of all numbers and neighbouring
 threads then access neighbouring memory. `step` passes it a table of colours: the merged gradient of shN is Y ⊗ colour.
@@ -284,42 +284,6 @@ def compare(
         store(p, table, i)
         tally = counted(p)
     wp.tile_store(counts, wp.tile_sum(wp.tile(tally, preserve_type=True)), offset=(block,))
-
-
-@wp.struct
-class Rows:
-    """The gradient of the raw parameters with every number."""
-
-    means: wp.array[wp.vec3]
-    quats: wp.array[wp.vec4]
-    scales: wp.array[wp.vec3]
-    opacities: wp.array[wp.float32]
-    sh0: wp.array[wp.vec3]
-    shN: wp.array2d[wp.vec3]  # noqa: N815 - gsplat's name
-
-
-@wp.func
-def write_rows(g: RawGradient, basis: wp.array2d[wp.float32], i: wp.int32, to: Rows) -> None:
-    to.means[i] = g.means
-    to.quats[i] = g.quats
-    to.scales[i] = g.scales
-    to.opacities[i] = g.opacity
-    to.sh0[i] = g.sh0
-    for band in range(to.shN.shape[1]):
-        basis_of_band = wp.float32(0.0)
-        if 1 + band < basis.shape[1]:
-            basis_of_band = basis[i, 1 + band]
-        to.shN[i, band] = basis_of_band * g.rgb
-
-
-@wp.kernel
-def write_dense(
-    activation: Activation, lr: Gradient, hr: Gradient, view: View, to_lr: Rows, to_hr: Rows
-) -> None:  # fmt: skip
-    i = wp.tid()
-    g_lr, g_hr = load(activation, lr, hr, view, i)
-    write_rows(g_lr, activation.basis, i, to_lr)
-    write_rows(g_hr, activation.basis, i, to_hr)
 
 
 @wp.kernel
