@@ -93,6 +93,7 @@ class CompiledStep:
 
     Attributes:
         records: whether a step can be part of a recording.
+        bands: how many bands of shN the last step could change, the lowest ones.
     """
 
     def __init__(
@@ -102,8 +103,7 @@ class CompiledStep:
         self._passes = gaussian_pass(optimizer) if passes is None else passes
         self.records = getattr(self._passes, "records", False)
         self._numbers: Tensor | None = None  # see `_recorded_numbers`
-        self._momentum_read: tuple[int, int] | None = None  # the active degree's bands and `restored`, then
-        self._has_no_momentum = False
+        self.bands, self._restored = 0, -1  # see `_find_bands`; `Adam.restored`, then
 
     def vjp(
         self, shot: FieldShot, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
@@ -185,14 +185,14 @@ class CompiledStep:
         }  # fmt: skip
         all_bands, active = params["shN"].shape[1], _basis(g_lr).shape[1] - 1
         moved = "shN" in plus or "shN" in corrected
-        bands = active if self.skips and self._has_no_momentum_above(active, moved=moved) else all_bands
-        settings = self._settings(t, bias2, self.skips, 3 * bands, numbers)
+        self._find_bands(active, moved=moved)
+        settings = self._settings(t, bias2, self.skips, 3 * self.bands, numbers)
         unchanged = gaussians.step(attributes, weights, settings)
         skip = self.conductor.work_log.skip
         if isinstance(unchanged, Tensor) or unchanged:  # a number on the device is not read here
             skip("optimizer rows", "gradient and moments are 0", unchanged)
-        if bands < all_bands:
-            skip("SH bands in the optimizer", "above the active degree", all_bands - bands)
+        if self.bands < all_bands:
+            skip("SH bands in the optimizer", "above the active degree", all_bands - self.bands)
 
     def _gaussians(self, a: Activation, g_lr: Grads, hr: HrSide | None) -> kernel.GaussianStep:
         """The passes over the gradients of one view."""
@@ -208,24 +208,22 @@ class CompiledStep:
         λ = self.conductor.objective.lambda_hr(t)
         return kernel.StepSettings(BETA1, BETA2, bias2, self.optimizer.rates.eps, λ, skips, width, changing)
 
-    def _has_no_momentum_above(self, active: int, *, moved: bool) -> bool:
-        """Return True if bands above the active degree have no momentum.
+    def _find_bands(self, active: int, *, moved: bool) -> None:
+        """Set `bands`: up to the highest that may have a gradient or momentum.
 
-        The moments are read once after a checkpoint has restored them. After that the answer holds: a pass that skips the bands
-        gives them no momentum, momentum does not vanish, and a change of the structure gathers rows and zeroes some.
+        The moments are read once, and again where a checkpoint has restored them. After that, only a step gives a band momentum.
 
         Args:
-            moved: a strategy gives them a gradient, which is not read, since on a device the host would wait.
+            moved: a strategy gives all of them a gradient.
         """
-        restored = self.optimizer.restored
-        if self._momentum_read is not None and not moved:
-            read_at, same = self._momentum_read
-            if same == restored and (read_at <= active if self._has_no_momentum else read_at == active):
-                return self._has_no_momentum
-        moments = (self.optimizer.first["shN"], self.optimizer.second["shN"])
-        self._has_no_momentum = not moved and not any(bool(x[:, active:].any()) for x in moments)
-        self._momentum_read = active, restored
-        return self._has_no_momentum
+        first, second = (moments["shN"] for moments in (self.optimizer.first, self.optimizer.second))
+        all_bands = first.shape[1]
+        if moved or not self.skips:
+            self.bands = all_bands
+        elif self._restored != self.optimizer.restored:
+            has_momentum = ((first != 0) | (second != 0)).any(2).any(0).tolist()
+            self.bands = max((k + 1 for k in range(all_bands) if has_momentum[k]), default=0)
+        self._restored, self.bands = self.optimizer.restored, max(self.bands, active)
 
 
 def _basis(g_lr: Grads, g_hr: Grads | None = None) -> Float[Tensor, "N B1"]:

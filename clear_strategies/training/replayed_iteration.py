@@ -127,7 +127,7 @@ def _key(s: TrainState, inputs: IterationInputs) -> GraphKey:
         constants += [inputs.gate is None, *inputs.scales.values(), s.density.collects(inputs.t)]
         constants += [x is None for x in (inputs.view.depth, inputs.view.disagreement, inputs.view.truth)]
     else:
-        constants.append(inputs.view.robust)
+        constants += [inputs.view.robust, cast(CompiledStep, s.compiled_step).bands]
     shapes = [(photo.image.shape, photo.shown is None, photo.transparency is None) for photo in inputs.photos]
     return GraphKey((len(s.field), *addresses), tuple(shapes), tuple(constants))
 

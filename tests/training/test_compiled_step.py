@@ -233,10 +233,10 @@ def test_bands_with_momentum_are_not_left_out(passes):
 
 @pytest.mark.parametrize(
     ("degrees", "moved", "skipped"),
-    [((1, 1), {1: 10}, 12), ((2, 1), {}, 7), ((0, 1), {0: 1}, 12)],
+    [((1, 1), {1: 10}, 12 + 4), ((2, 1), {}, 7 + 7), ((0, 1), {0: 1}, 13 + 12)],
     ids=["restored moments", "a lower degree", "a higher degree"],
 )
-def test_bands_are_examined_again_where_their_momentum_may_be_another(passes, degrees, moved, skipped):
+def test_bands_are_left_out_above_the_highest_that_has_momentum(passes, degrees, moved, skipped):
     """`moved`: before which step a band of restored moments has momentum."""
     states = []
     for skips in (True, False):

@@ -205,8 +205,21 @@ def test_what_differs_between_iterations_is_copied_or_makes_them_of_two_kinds(di
     assert live_in(replayed).keys() == {FIRST}
 
 
+@dataclass(frozen=True)
+class PullsLate(cs.Strategy):
+    """Moves all bands from t=8 on, with nothing stored that tells."""
+
+    def regularize(self, params, t):
+        return cs.Grads({"shN": 1e-3 * (1 + params["shN"])}) if t >= 8 else None
+
+
+def test_a_recorded_step_on_an_extra_view_steps_every_band_that_has_momentum_by_then():
+    replayed = both(lambda: start(PullsLate(), cs.PseudoViews(count=8, reach=0.1), density=False), 14)
+    assert live_in(replayed).keys() == {FIRST}
+
+
 def test_an_anchored_step_and_that_of_an_extra_view_are_both_recorded():
-    """Whether bands above the active degree are still is asked of the device once for each of the two."""
+    """Which bands have momentum is asked of the device once."""
     replayed = both(
         lambda: start(
             cs.PseudoViews(count=8, reach=0.1), density=False, anchor_start=5, anchor_weights=cs.SVS().anchor_weights
