@@ -42,6 +42,7 @@ Metric = Callable[[Tensor, Tensor], Any]
 PSNR_CAP: Final = 100.0  # dB, the PSNR of identical images
 _GMSD_C: Final = 170 / 255**2
 _LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
+_REACH: Final = 5  # of the window of SSIM: those that lie inside the image count
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +122,9 @@ def _measured(name: str, metric: Metric, image: Float[Tensor, "H W 3"], truth: F
 def _ssim(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None) -> float:
     """Mean SSIM: without a mask by the loss's kernel, in a thirtieth of scikit-image's time; they differ by less than 1e-6."""
     if shown is None and native.available():
-        return float(native.module().mean_ssim(x.float().contiguous(), y.float().contiguous(), threads()))
+        images = x.float().contiguous(), y.float().contiguous()
+        _, dissimilarity = native.module().photometric(*images, None, 0.0, 1.0, _REACH, threads())
+        return float(1 - dissimilarity)
     from skimage.metrics import structural_similarity
 
     how = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0, "channel_axis": 2}

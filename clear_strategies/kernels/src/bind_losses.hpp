@@ -1,9 +1,11 @@
 // Python bindings of the image losses. Images are contiguous float32 [H, W, 3] on the CPU, as is the gradient's output.
 #pragma once
 
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
 
 #include <algorithm>
+#include <optional>
 #include <stdexcept>
 #include <utility>
 
@@ -18,11 +20,11 @@ using Image = Tensor<T, nanobind::shape<-1, -1, kChannels>, nanobind::c_contig, 
 using ImageIn = Image<const float>;
 using ImageOut = Image<float>;
 
-inline ImagePair same_size(const ImageIn& x, const ImageIn& y, const ImageOut& gradient) {
+inline ImagePair same_size(const ImageIn& x, const ImageIn& y, const std::optional<ImageOut>& gradient) {
   for (std::size_t axis : {0, 1})
-    if (x.shape(axis) != y.shape(axis) || x.shape(axis) != gradient.shape(axis) || x.shape(axis) == 0)
+    if (x.shape(axis) != y.shape(axis) || (gradient && x.shape(axis) != gradient->shape(axis)) || x.shape(axis) == 0)
       throw std::invalid_argument("the images and the gradient must have the same size, at least one pixel.");
-  return {x.data(), y.data(), gradient.data(), int(x.shape(0)), int(x.shape(1)) * kChannels};
+  return {x.data(), y.data(), gradient ? gradient->data() : nullptr, int(x.shape(0)), int(x.shape(1)) * kChannels};
 }
 
 inline void bind_losses(nanobind::module_& m) {
@@ -30,7 +32,7 @@ inline void bind_losses(nanobind::module_& m) {
   using namespace nb::literals;
   m.def(
       "photometric",
-      [](const ImageIn& x, const ImageIn& y, const ImageOut& gradient, float l1, float dssim, int inset, int threads) {
+      [](const ImageIn& x, const ImageIn& y, const std::optional<ImageOut>& gradient, float l1, float dssim, int inset, int threads) {
         ImagePair images = same_size(x, y, gradient);
         if (inset < 0 || 2 * inset >= int(std::min(x.shape(0), x.shape(1))))
           throw std::invalid_argument("no window lies so far inside the images.");
@@ -38,18 +40,8 @@ inline void bind_losses(nanobind::module_& m) {
         PhotometricMeans means = photometric(images, {l1, dssim}, inset, threads);
         return std::pair(means.l1, means.dssim);
       },
-      "x"_a.noconvert(), "y"_a.noconvert(), "gradient"_a.noconvert(), "l1"_a, "dssim"_a, "inset"_a, "threads"_a,
-      "Writes the gradient of l1 * mean|x - y| + dssim * (1 - SSIM); returns (mean|x - y|, 1 - SSIM).");
-  m.def(
-      "mean_ssim",
-      [](const ImageIn& x, const ImageIn& y, int threads) {
-        if (x.shape(0) != y.shape(0) || x.shape(1) != y.shape(1) || std::min(x.shape(0), x.shape(1)) < ssim::kTaps)
-          throw std::invalid_argument("the images must have the same size, at least 11 pixels.");
-        ImagePair images{x.data(), y.data(), nullptr, int(x.shape(0)), int(x.shape(1)) * kChannels};
-        nb::gil_scoped_release free;
-        return mean_ssim(images, threads);
-      },
-      "x"_a.noconvert(), "y"_a.noconvert(), "threads"_a, "Returns the mean SSIM over the windows inside the images.");
+      "x"_a.noconvert(), "y"_a.noconvert(), "gradient"_a.noconvert().none(), "l1"_a, "dssim"_a, "inset"_a, "threads"_a,
+      "Writes the gradient of l1 * mean|x - y| + dssim * (1 - SSIM); returns (mean|x - y|, 1 - SSIM), without a gradient (0, 1 - SSIM).");
   m.def(
       "haar_l1",
       [](const ImageIn& x, const ImageIn& y, const ImageOut& gradient, int levels, int threads) {

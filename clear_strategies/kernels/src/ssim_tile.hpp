@@ -112,27 +112,18 @@ class TileRun {
     mark(inset * kChannels, im_.row - inset * kChannels, inside_), mark(tile.left, tile.right, mine_);
   }
 
-  // Writes the tile's part of the gradient; returns its part of the sums.
+  // Writes the tile's part of the gradient, if there is one; returns its part of the sums, without a gradient that of SSIM alone.
   PhotometricMeans run() {
-    int q = tile_.top + kReach;  // after the maps of this group, the gradient of the group five rows above has all its inputs
-    while (q > tile_.top - kReach) q -= kDown;
+    const int beyond = im_.gradient ? kReach : 0;  // rows of maps above and below the tile that the gradient needs
+    int q = tile_.top + beyond;  // after the maps of this group, the gradient of the group five rows above has all its inputs
+    while (q > tile_.top - beyond) q -= kDown;
     for (int r = q - kReach; r < q + kReach; ++r) read(r);
-    for (; q - kReach < tile_.bottom; q += kDown) {
+    for (; q - beyond < tile_.bottom; q += kDown) {
       for (int r = 0; r < kDown; ++r) read(q + kReach + r);
       forward(q);
-      if (q - kReach >= tile_.top) backward(q - kReach);
+      if (im_.gradient && q - kReach >= tile_.top) backward(q - kReach);
     }
     return totals_;
-  }
-
-  // Σ (1 - SSIM) of the tile's numbers, without a gradient.
-  double dissimilarity() {
-    for (int r = tile_.top - kReach; r < tile_.top + kReach; ++r) read(r);
-    for (int q = tile_.top; q < tile_.bottom; q += kDown) {
-      for (int r = 0; r < kDown; ++r) read(q + kReach + r);
-      forward(q);
-    }
-    return totals_.dssim;
   }
 
  private:
