@@ -8,7 +8,6 @@ import torch
 from clear_strategies import MCMC
 from clear_strategies.density.mcmc import Sampler, relocation
 from clear_strategies.errors import DensityError, DivergedError
-from clear_strategies.kernels import native
 from clear_strategies.training import checkpoint
 from clear_strategies.training.densifier import Densifier
 from clear_strategies.training.field import GaussianField
@@ -16,7 +15,6 @@ from clear_strategies.training.loop import iterate
 from clear_strategies.training.optim import Adam, LearningRates
 from rasterizers import Camera, load
 from tests.helpers import toy
-from tests.helpers.backends import needs
 from tests.helpers.short_run import start, tensors
 
 N = 60
@@ -202,18 +200,3 @@ def test_a_densifier_without_state_resumes(tmp_path):
     saved = checkpoint.load(checkpoint.save(tmp_path, state.checkpoint({})))
     state.restore(saved, tmp_path)
     assert state.t == 2
-
-
-@needs("cpp")
-def test_compiled_noise_is_that_of_torch(monkeypatch):
-    theta, optimizer, densifier = start_of_run(noise=1e3, start=9, opacity=-6.0)
-    generator = torch.Generator().manual_seed(3)
-    theta.quats.data[:] = torch.randn(len(theta), 4, generator=generator)
-    theta.quats.data[0] = 0  # stands for the identity
-    theta.scales.data[:] = torch.randn(len(theta), 3, generator=generator)
-    theta.opacities.data[::3] = 3.0  # these stay
-    compiled = displacement(theta, optimizer, densifier)
-    monkeypatch.setattr(native, "available", lambda: False)
-    in_torch = displacement(theta, optimizer, densifier)
-    assert float(in_torch.norm(dim=1).max()) > 0.1
-    assert torch.allclose(compiled, in_torch, rtol=1e-5, atol=1e-6 * float(in_torch.abs().max()))

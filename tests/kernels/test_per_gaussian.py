@@ -1,4 +1,4 @@
-"""Warp's kernels between the renderings and the step, on a CPU, beside what they stand for in torch."""
+"""C++ and Warp's kernels between the renderings and the step, on a CPU, beside what they stand for in torch."""
 
 from typing import NamedTuple
 
@@ -11,31 +11,37 @@ from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import Grads, to_ndc
 from clear_strategies.core.step import Step
 from clear_strategies.density.adaptive import DensitySettings
-from clear_strategies.kernels import per_gaussian
-from clear_strategies.kernels.per_gaussian import activate, evidence_score, route, wander
+from clear_strategies.kernels import native, per_gaussian
+from clear_strategies.kernels.per_gaussian import activate, evidence_score, reference, route, wander
 from clear_strategies.merging.iteration import HrSide, Update
-from clear_strategies.training.field import GaussianField
+from rasterizers.native import kernel_threads
 from tests.helpers import toy
 from tests.helpers.backends import needs
 
-pytestmark = needs("warp")
 N = 700
+OF_ACTIVATION = ("scales", "filtered", "sigmoid", "coefficient", "factor", "opacities")
 
 
-@pytest.fixture(params=[1, 32], ids="{}_lanes".format)
-def by_warp(request, monkeypatch, blocks_of):
-    """What a function returns in torch, and by Warp's kernels with so many threads per block."""
+@pytest.fixture(params=[pytest.param(x, marks=needs("cpp" if x == "cpp" else "warp")) for x in ("cpp", 1, 32)])
+def lanes(request, monkeypatch):
+    """C++, or Warp's kernels with so many threads per block."""
+    if request.param == "cpp":
+        return request.param
     from clear_strategies.kernels.per_gaussian import warp
 
-    def both(function):
-        monkeypatch.setattr(per_gaussian.native, "available", lambda: False)  # not C++
-        expected = function()
-        monkeypatch.setattr(per_gaussian, "DEVICES", {"cpu"})
-        if request.param > 1:
-            blocks_of(warp.LANES, request.param)
-        return function(), expected
+    monkeypatch.setattr(native, "available", lambda: False)
+    monkeypatch.setattr(per_gaussian, "DEVICES", {"cpu"})
+    if request.param > 1:
+        request.getfixturevalue("blocks_of")(warp.LANES, request.param)
+    return request.param
 
-    return both
+
+def both(function):
+    """What a function returns by the kernels of `lanes`, and in torch."""
+    with pytest.MonkeyPatch.context() as in_torch:
+        found = function()
+        in_torch.setattr(per_gaussian, "_kernels", lambda tensors: None)
+        return found, function()
 
 
 class Seen(NamedTuple):
@@ -55,22 +61,44 @@ def require_close(found, expected) -> None:
     torch.testing.assert_close(found, expected, rtol=2e-6, atol=1e-30)
 
 
-@pytest.mark.parametrize("gated", [False, True])
-def test_the_activation(by_warp, gated):
-    field = GaussianField.from_cloud(toy.cloud(N))
-    field.scales.data += 3 * numbers(N, 3)
-    field.scales.data[0] = -60  # squares vanish
-    field.opacities.data += 5 * numbers(N)
-    field.filter_3d = numbers(N).abs() * (numbers(N) > 0)
-    gate = (numbers(N) > 0) * 1.25 if gated else None
-    found, expected = by_warp(lambda: field._activate(gate))
-    for name in ("scales", "filtered", "sigmoid", "coefficient", "factor", "opacities"):
-        require_close(getattr(found, name), getattr(expected, name))
+@pytest.mark.parametrize("gate", [None, torch.float32, torch.float64])
+@pytest.mark.parametrize("n", [0, 1, 16, 1_043])
+def test_the_activation(lanes, n, gate):
+    for size in (1.0, 6.0):
+        parameters = size * numbers(n, 3), 2 * size * numbers(n), numbers(n).clamp_min(0)
+        parameters[0][:1] = -60  # squares vanish
+        z = None if gate is None else (1.25 * (numbers(n) > 0)).to(gate)
+        with kernel_threads(2):
+            found = activate(*parameters, z)
+        expected = reference.activate(*(x.double() for x in parameters), z)
+        rtol = 8e-7 if lanes == "cpp" else 2e-6
+        for name, x, y in zip(OF_ACTIVATION, found, expected, strict=True):
+            torch.testing.assert_close(x.double(), y, rtol=rtol, atol=1e-36, msg=name)
+
+
+@needs("cpp")
+def test_what_is_out_of_range_is_activated_as_in_torch():
+    scales = torch.tensor([[-60.0, 0.0, 1.0], [torch.nan, 0.0, 1.0], [torch.inf, 0.0, 1.0], [0.0, 0.0, 0.0]])
+    logits, filters = torch.tensor([200.0, -80.0, 0.0, torch.nan]), torch.tensor([0.0, 0.0, 1.0, 1.0])
+    # The reference takes float64 tensors; these fit float32 as well.
+    expected = [x.float() for x in reference.activate(scales.double(), logits.double(), filters.double(), None)]
+    for name, x, y in zip(OF_ACTIVATION, activate(scales, logits, filters, None), expected, strict=True):
+        torch.testing.assert_close(x, y, rtol=8e-7, atol=1e-34, equal_nan=True, msg=name)
+
+
+@needs("cpp")
+def test_shapes_that_do_not_belong_together_are_refused():
+    module, (scales, logits, filters) = native.module(), (numbers(5, 3), numbers(5), numbers(5))
+    rows, columns = torch.empty(2, 5, 3), torch.empty(4, 5)
+    with pytest.raises(ValueError, match=r"scales must be \[N, 3\]"):
+        module.activate(scales, logits, filters[:4], None, rows, columns, 1)
+    with pytest.raises(ValueError, match=r"columns \[4, N\]"):
+        module.activate(scales, logits, filters, None, rows, torch.empty(4, 6), 1)
 
 
 @pytest.mark.parametrize("normalize", [False, True])
 @pytest.mark.parametrize("share", [0.0, 0.6])
-def test_the_evidence_and_its_routing(by_warp, normalize, share):
+def test_the_evidence_and_its_routing(lanes, normalize, share):
     p2g, visible = (
         cs.P2G(patch=4, normalize=normalize),
         torch.rand(N, generator=torch.Generator().manual_seed(1)) < share,
@@ -85,13 +113,13 @@ def test_the_evidence_and_its_routing(by_warp, normalize, share):
         routed = [p2g.route(Step(1, view, visible, one))[visible] for one in (e, Evidence(e.reliability, e.demand))]
         return e.reliability, e.demand, *routed, torch.tensor(logged)
 
-    for found, expected in zip(*by_warp(answers), strict=True):
-        torch.testing.assert_close(found, expected, rtol=2e-6, atol=0, equal_nan=True)
+    for found, expected in zip(*both(answers), strict=True):
+        torch.testing.assert_close(found, expected, rtol=0 if lanes == "cpp" else 2e-6, atol=0, equal_nan=True)
 
 
 @pytest.mark.parametrize("score_by", ["sum", "evidence", "gradient"])
 @pytest.mark.parametrize("hf", [False, True])
-def test_scores_and_their_sum(by_warp, score_by, hf):
+def test_scores_and_their_sum(lanes, score_by, hf):
     g = torch.Generator().manual_seed(3)
     q, a, visible = torch.rand(N, generator=g), torch.rand(N, generator=g), torch.rand(N, generator=g) < 0.5
     lr, base, detail = (Grads(screen=1e-4 * numbers(N + k, 2)[:N]) for k in range(3))
@@ -111,39 +139,42 @@ def test_scores_and_their_sum(by_warp, score_by, hf):
             found += density.state_dict().values()
         return found
 
-    for found, expected in zip(*by_warp(statistics), strict=True):
+    for found, expected in zip(*both(statistics), strict=True):
         require_close(found, expected)
 
 
 @pytest.mark.slow
-def test_the_noise_of_mcmc(by_warp):
+def test_the_noise_of_mcmc(lanes):
     quats, log_scales, gate, eta = numbers(N, 4) * 10, numbers(N, 3), numbers(N).sigmoid(), numbers(N // 2, 3)
     quats[0], quats[2] = 0, 1e-25
     rows = torch.arange(0, N, 2)
 
     def moved():
-        means = numbers(N, 3)
+        means = torch.zeros(N, 3)
         wander(means, quats, log_scales, gate, rows, eta, 3.0)
         return means
 
-    found, expected = by_warp(moved)
-    size = torch.linalg.vector_norm(expected - numbers(N, 3), dim=1, keepdim=True)
-    assert (
-        float(((found - expected).abs() / (1 + size)).max()) <= 1e-5
-    )  # a small part of a rotated row has the rounding of its largest
+    found, expected = both(moved)
+    # A small part of a rotated row has the rounding of its largest.
+    size = torch.linalg.vector_norm(expected, dim=1, keepdim=True)
+    assert float(((found - expected).abs() / (1 + size)).max()) <= 1e-5
+    if lanes == "cpp":
+        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6 * float(expected.abs().max()))
 
 
+@needs("warp")
 def test_the_kernels_compile_for_cuda_on_a_machine_without(ptx_of):
     from clear_strategies.kernels.per_gaussian import warp
 
     ptx_of(warp._activate.module, warp.LANES["cuda"])  # the module of all kernels
 
 
+@needs("warp")
 def test_other_tensors_take_torch(monkeypatch):
     from clear_strategies.kernels.per_gaussian import warp
 
     monkeypatch.setattr(warp, "activate", lambda *_: "Warp's")
-    monkeypatch.setattr(per_gaussian.native, "available", lambda: False)  # not C++
+    monkeypatch.setattr(native, "available", lambda: False)  # not C++
     x = [torch.zeros(1, 3), torch.zeros(1), torch.zeros(1)]
     assert activate(*x, None) != "Warp's"
     monkeypatch.setattr(per_gaussian, "DEVICES", {"cpu"})
@@ -151,13 +182,10 @@ def test_other_tensors_take_torch(monkeypatch):
     assert activate(*x, torch.zeros(1, dtype=torch.float64)) != "Warp's"
 
 
-def test_evidence_of_another_type_than_the_kernels_is_computed_in_torch(by_warp):
+def test_evidence_of_another_type_than_the_kernels_is_computed_in_torch(lanes):
     """A strategy's own, where the other tensors are the trainer's."""
     visible, screen, ordinary = numbers(N) > 0, numbers(N, 2), numbers(N).abs()
     e = Evidence(numbers(N).double().sigmoid(), numbers(N).double().sigmoid())
 
-    def both():
-        return route(e, visible, 0.25, True), evidence_score(e, screen, ordinary, True)
-
-    found, expected = by_warp(both)
+    found, expected = both(lambda: (route(e, visible, 0.25, True), evidence_score(e, screen, ordinary, True)))
     assert all(map(torch.equal, found, expected))

@@ -9,11 +9,9 @@ from hypothesis import strategies as st
 
 from clear_strategies import P2G, Evidence, ScreenGradients, Step
 from clear_strategies.core import images
-from clear_strategies.kernels import native
 from clear_strategies.kernels.per_gaussian import lift
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
-from tests.helpers.backends import needs
 
 
 @pytest.mark.parametrize("scale", [0.01, "relative:1"])
@@ -131,13 +129,3 @@ def test_without_a_high_frequency_loss_there_is_nothing_to_route():
     weights = {"lambda_lr": 1.0, "lambda_hr": 1.0}
     assert P2G().without_effect(**weights, lambda_hf=0.2) is None
     assert "lambda_HF is 0" in P2G().without_effect(**weights, lambda_hf=0.0)
-
-
-@needs("cpp")
-def test_compiled_lifting_has_the_bits_of_torch(monkeypatch):
-    g = torch.Generator().manual_seed(0)
-    maps, u = torch.rand(2, 5, 7, generator=g), 300 * torch.randn(999, 2, generator=g)
-    visible = torch.rand(999, generator=g) > 0.3
-    compiled = lift(maps, u, visible, 64)
-    monkeypatch.setattr(native, "available", lambda: False)
-    assert torch.equal(compiled, lift(maps, u, visible, 64))
