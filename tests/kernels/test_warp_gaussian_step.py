@@ -2,10 +2,8 @@
 
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from clear_strategies import GCO, P2G, SVS
-from clear_strategies.core import deferred
 from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.optim import Adam, LearningRates
 from tests.helpers import toy
@@ -51,36 +49,6 @@ def test_blocks_of_many_threads_give_the_same_bits(warp_step, blocks_of):
     assert again[2] == pytest.approx(readings, rel=1e-12)
     assert again[3] == skipped
     assert all(skipped.values())
-
-
-class Synchronisations(TorchDispatchMode):
-    """Records the operations that would make the host wait if the tensors were on CUDA."""
-
-    WAITING = ("aten::_local_scalar_dense", "aten::nonzero", "aten::equal", "aten::_to_copy", "aten::masked_select")
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.operations: list[str] = []
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        name = func._schema.name
-        kwargs = kwargs or {}
-        moved = name != "aten::_to_copy" or kwargs.get("device") is not None  # else of another type, on its device
-        masked = name == "aten::index" and any(i is not None and i.dtype == torch.bool for i in args[1])
-        if (name in self.WAITING and moved) or masked:
-            self.operations.append(name)
-        return func(*args, **kwargs)
-
-
-def test_the_host_does_not_wait_for_the_device(warp_step, monkeypatch):
-    monkeypatch.setattr(deferred, "is_immediate", lambda x: False)
-    c, step = started(warp_step)
-    factors = c.factors(1)
-    step.step(c.fields[1].raw(), *factors, T)  # reads what changes only with the number of Gaussians
-    with Synchronisations() as recorded:
-        conflict = step.step(c.fields[1].raw(), *factors, T + 1)
-    assert recorded.operations == []
-    assert all(0 <= share <= 1 for share in as_floats(conflict).values())
 
 
 @pytest.mark.slow
