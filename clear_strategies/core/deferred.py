@@ -55,12 +55,14 @@ def elements(x: Int[Tensor, " K"] | Float[Tensor, " K"]) -> Sequence[Number]:
     return [Deferred(itemgetter(k), parts) for k in range(x.shape[0])]
 
 
+def is_unread(x: Number) -> bool:
+    """Return True if the number is on a device, or a function of such numbers."""
+    return isinstance(x, (Tensor, Deferred))
+
+
 def defer(recipe: Callable[..., float], *numbers: Number) -> Number:
     """recipe(*numbers), at once if all numbers are floats."""
-    for x in numbers:
-        if isinstance(x, (Tensor, Deferred)):
-            return Deferred(recipe, numbers)
-    return recipe(*numbers)
+    return Deferred(recipe, numbers) if any(map(is_unread, numbers)) else recipe(*numbers)
 
 
 def read(numbers: Sequence[Number]) -> list[float]:
@@ -92,7 +94,7 @@ def gathered(row: Mapping[str, Number]) -> tuple[Float[Tensor, " K"], Callable[[
             return itemgetter(slice(k, k + len(number)) if number.dim() else k)
         return lambda _: number
 
-    readers = {name: reader(x) for name, x in row.items() if isinstance(x, (Tensor, Deferred))}
+    readers = {name: reader(x) for name, x in row.items() if is_unread(x)}
 
     def row_of(copy: Tensor) -> dict[str, Number]:
         parts = (copy,)
@@ -103,7 +105,7 @@ def gathered(row: Mapping[str, Number]) -> tuple[Float[Tensor, " K"], Callable[[
 
 def resolve(rows: Sequence[dict[str, Number]]) -> Sequence[dict[str, float]]:
     """Turn every number of the rows into a float, in place. Rows before a resolved one are resolved already."""
-    unread = list(takewhile(lambda row: any(isinstance(x, (Tensor, Deferred)) for x in row.values()), reversed(rows)))
+    unread = list(takewhile(lambda row: any(map(is_unread, row.values())), reversed(rows)))
     values = iter(read([x for row in unread for x in row.values()]))
     for row in unread:
         for name in row:

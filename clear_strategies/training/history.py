@@ -7,6 +7,7 @@ from array import array
 from collections.abc import Iterable, Sequence
 from typing import Final, overload
 
+from clear_strategies.core import deferred
 from clear_strategies.core.deferred import Number
 
 _LOOSE: Final = 64  # rows at the end that stay dicts and may change
@@ -26,7 +27,7 @@ class History(Sequence[dict[str, Number]]):
 
     def append(self, row: dict[str, Number]) -> None:
         self._loose.append(row)
-        while len(self._loose) > _LOOSE and all(isinstance(x, float) for x in self._loose[0].values()):
+        while len(self._loose) > _LOOSE and not any(deferred.is_unread(x) for x in self._loose[0].values()):
             oldest = self._loose.pop(0)
             for name in oldest:
                 if name not in self._columns:

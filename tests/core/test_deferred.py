@@ -103,5 +103,8 @@ def test_rows_come_back_as_they_were_by_any_index_and_the_newest_may_change():
     for beyond in (500, -501):
         with pytest.raises(IndexError):
             history[beyond]
+    counts = History({"count": t} for t in range(500))  # of a strategy that logs whole numbers
+    assert len(counts._loose) == len(history._loose) == 64
+    assert [row["count"] for row in counts] == list(range(500))
     history[-1]["seconds"], history[-60]["loss"] = 3.0, 9.0
     assert (history[499]["seconds"], history[440]["loss"]) == (3.0, 9.0)
