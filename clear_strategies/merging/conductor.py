@@ -179,7 +179,7 @@ class Conductor(Hooks):
                 grads, conflict = merged.grads, merged.conflict
             else:
                 grads, conflict = None, stepper.step(params, rendered, g_lr, from_hr, t)
-        losses = {} if from_hr is None else from_hr.losses
+        losses: Mapping[str, Any] = {} if from_hr is None else from_hr.losses
         logs = self.logs.counted_since_kept()
         return Update(step, grads, score, ordinary, conflict, {**l_lr.values, **losses}, logs, l_lr.cotangents)
 
