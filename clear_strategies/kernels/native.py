@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from types import ModuleType
 
 import torch
@@ -38,8 +37,3 @@ def times(a: Float[Tensor, "N G"], b: Tensor) -> Float[Tensor, "N G"]:
 def runs(x: Tensor) -> bool:
     """Return True if the kernels take this tensor: float32 in the CPU's memory."""
     return x.device.type == "cpu" and x.dtype == torch.float32 and available()
-
-
-def all_finite(tensors: Collection[Tensor]) -> bool:
-    """Return True if every number is known to be finite, in one call; False if the kernels do not support all of the tensors."""
-    return all(runs(x) and x.is_contiguous() for x in tensors) and bool(module().all_finite([*tensors]))

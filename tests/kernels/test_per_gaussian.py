@@ -114,7 +114,7 @@ def test_the_evidence_and_its_routing(lanes, normalize, share):
         return e.reliability, e.demand, *routed, torch.tensor(logged)
 
     for found, expected in zip(*both(answers), strict=True):
-        torch.testing.assert_close(found, expected, rtol=0 if lanes == "cpp" else 2e-6, atol=0, equal_nan=True)
+        torch.testing.assert_close(found, expected, rtol=2e-6, atol=0, equal_nan=True)
 
 
 @pytest.mark.parametrize("score_by", ["sum", "evidence", "gradient"])

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from clear_strategies import P2G, Evidence, ScreenGradients, Step
 from clear_strategies.core import images
-from clear_strategies.kernels.per_gaussian import lift
+from clear_strategies.kernels.per_gaussian.reference import lift
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
 

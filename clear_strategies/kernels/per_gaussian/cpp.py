@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core.evidence import Evidence
 from clear_strategies.kernels import native
 from rasterizers.native import empty, threads
 
@@ -25,20 +24,6 @@ def nearest_depths(means: Float[Tensor, "N 3"], cameras: Float[Tensor, "V 20"], 
     z_min = means.new_full((len(means),), float("inf"))
     native.module().nearest_depths(means, cameras, near, z_min, threads())
     return z_min
-
-
-def lift(
-    patch_maps: Float[Tensor, "C ph pw"], centers: Float[Tensor, "N 2"], visible: Bool[Tensor, " N"], patch: float
-) -> Float[Tensor, "C N"]:
-    lifted = patch_maps.new_empty(len(patch_maps), len(centers))
-    native.module().lift(patch_maps, centers.detach(), visible, patch, lifted, threads())
-    return lifted
-
-
-def evidence(
-    maps: Float[Tensor, "2 ph pw"], centers: Float[Tensor, "N 2"], visible: Bool[Tensor, " N"], patch: float
-) -> Evidence:
-    return Evidence(*lift(maps, centers, visible, patch))
 
 
 def wander(*arguments: Any) -> None:

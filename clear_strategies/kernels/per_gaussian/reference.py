@@ -60,10 +60,11 @@ def lift(
         centers: u_i in pixels of the image that the patches tile; of invisible Gaussians anything, since gsplat leaves their
             rows uninitialised. patch: edge of a patch in those pixels.
     """
-    column, row = (centers / patch).long().unbind(-1)  # of NaN or infinity any number, which the clamps bring inside
+    # Of NaN or infinity it is any number, which the clamps bring inside. In 32 bits it takes two thirds of the time of 64.
+    column, row = (centers / patch).to(torch.int32).unbind(-1)
     height, width = patch_maps.shape[1:]
-    column, row = column.clamp(0, width - 1), row.clamp(0, height - 1)
-    return patch_maps.flatten(1).index_select(1, row * width + column) * visible
+    at = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
+    return patch_maps.flatten(1).index_select(1, at) * visible
 
 
 def evidence(

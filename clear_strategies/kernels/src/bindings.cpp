@@ -8,9 +8,7 @@
 #include "bind_reconcile.hpp"
 #include "bind_step.hpp"
 #include "filter.hpp"
-#include "finite.hpp"
 #include "isa.hpp"
-#include "lift.hpp"
 #include "smooth.hpp"
 #include "sweep.hpp"
 #include "wander.hpp"
@@ -28,6 +26,4 @@ NB_MODULE(CLEAR_MODULE, m) {
   clear::bind_sweep(m);
   clear::bind_smooth(m);
   clear::bind_wander(m);
-  clear::bind_finite(m);
-  clear::bind_lift(m);
 }
