@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from clear_strategies import P2G, Evidence, ScreenGradients, Step
 from clear_strategies.core import images
-from clear_strategies.kernels.per_gaussian.reference import lift
+from clear_strategies.kernels.per_gaussian import evidence
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
 
@@ -55,20 +55,20 @@ def test_a_patch_with_the_mean_detail_demands_one_half():
     assert torch.allclose(A, torch.full_like(A, 0.5), atol=0.03)
 
 
-def test_lifting_takes_the_patch_of_the_centre_and_the_border_outside():
+def test_the_evidence_is_that_of_the_patch_of_the_centre_and_of_the_border_outside():
     patches = torch.tensor([[[0.1, 0.2], [0.3, 0.4]], [[1.0, 2.0], [3.0, 4.0]]])
     u = torch.tensor([[0.0, 0.0], [15.9, 15.9], [16.0, 0.0], [3.0, 20.0], [-50.0, 40.0], [99.0, 99.0], [20.0, 20.0]])
     visible = torch.tensor([True] * 6 + [False])
-    result, second = lift(patches, u, visible, 16)
-    assert second.tolist() == pytest.approx([10 * value for value in result.tolist()])
-    assert result.tolist() == pytest.approx([0.1, 0.1, 0.2, 0.3, 0.3, 0.4, 0.0])
+    e = evidence(patches, u, visible, 16)
+    assert e.demand.tolist() == pytest.approx([10 * value for value in e.reliability.tolist()])
+    assert e.reliability.tolist() == pytest.approx([0.1, 0.1, 0.2, 0.3, 0.3, 0.4, 0.0])
 
 
 @pytest.mark.parametrize("garbage", [math.nan, math.inf, -1e30])
 def test_rows_of_invisible_gaussians_may_hold_anything(garbage):
     """Gsplat leaves the centres of culled Gaussians uninitialised: on CUDA they were an index outside the map."""
     visible, u = torch.tensor([True, False]), torch.tensor([[5.0, 5.0], [garbage, garbage]])
-    assert lift(torch.ones(2, 3, 4), u, visible, 16).tolist() == [[1.0, 0.0]] * 2
+    assert evidence(torch.ones(2, 3, 4), u, visible, 16).reliability.tolist() == [1.0, 0.0]
 
 
 @given(q=st.floats(0, 1, width=32), a=st.floats(0, 1, width=32), floor=st.floats(0, 1))

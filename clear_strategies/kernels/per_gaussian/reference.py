@@ -49,10 +49,10 @@ def nearest_depths(means: Float[Tensor, "N 3"], cameras: Float[Tensor, "V 20"], 
     return z_min
 
 
-def lift(
-    patch_maps: Float[Tensor, "C ph pw"], centers: Float[Tensor, "N 2"], visible: Bool[Tensor, " N"], patch: float
-) -> Float[Tensor, "C N"]:
-    """Look up the patch p(u_i) that contains each projected centre, in several maps at once.  Eq. 10
+def evidence(
+    maps: Float[Tensor, "2 ph pw"], centers: Float[Tensor, "N 2"], visible: Bool[Tensor, " N"], patch: float
+) -> Evidence:
+    """q_i and a_i: R and A of the patch p(u_i) that contains each projected centre.  Eq. 10
 
     A centre outside the image has the border patch, an invisible Gaussian 0 (F24).
 
@@ -62,16 +62,9 @@ def lift(
     """
     # Of NaN or infinity it is any number, which the clamps bring inside. In 32 bits it takes two thirds of the time of 64.
     column, row = (centers / patch).to(torch.int32).unbind(-1)
-    height, width = patch_maps.shape[1:]
+    height, width = maps.shape[1:]
     at = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
-    return patch_maps.flatten(1).index_select(1, at) * visible
-
-
-def evidence(
-    maps: Float[Tensor, "2 ph pw"], centers: Float[Tensor, "N 2"], visible: Bool[Tensor, " N"], patch: float
-) -> Evidence:
-    """q_i and a_i: R and A, lifted.  Eq. 10"""
-    return Evidence(*lift(maps, centers, visible, patch))
+    return Evidence(*(maps.flatten(1).index_select(1, at) * visible))
 
 
 def route(e: Evidence, visible: Bool[Tensor, " N"], floor: float, normalize: bool) -> Float[Tensor, " N"]:
