@@ -12,13 +12,14 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Final
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from clear_strategies.data.file_names import normalized
 from clear_strategies.data.lenses import Lens
 from clear_strategies.data.masks import check_mask, read_mask
-from clear_strategies.data.photo_files import has_alpha, image_size, is_on_its_side, read_image
+from clear_strategies.data.photo_files import has_alpha, image_size, read_image
 from clear_strategies.data.priors.interface import Prior
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera, Color
@@ -97,6 +98,11 @@ class SfmPoints:
     track_image: Int[Tensor, " M"]
     source: str
 
+    @staticmethod
+    def without_tracks(means: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"], source: str) -> SfmPoints:
+        none = torch.zeros(0, dtype=torch.long)
+        return SfmPoints(means, colors, none, none, source)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
@@ -160,10 +166,10 @@ def lens_notes(frames: Sequence[Frame]) -> dict[str, str]:
 
 def _turned_as(path: Path, lens: Lens) -> bool | None:
     """Choose `turn` of `read_image` by the aspect ratio of the lens; None where the ratio does not decide it."""
-    if lens.width == lens.height or not is_on_its_side(path):
+    if lens.width == lens.height:
         return None
-    width, height = image_size(path, turn=False)
-    return None if width == height else (width > height) != (lens.width > lens.height)
+    (width, height), upright = (image_size(path, turn=turn) for turn in (False, True))
+    return None if (width, height) == upright else (width > height) != (lens.width > lens.height)
 
 
 def _load(path: Path, lens: Lens, pinhole: Lens, turn: bool | None, background: Color | None) -> Float[Tensor, "H W 3"]:

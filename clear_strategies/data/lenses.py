@@ -20,16 +20,19 @@ FARTHEST: Final = 1e12
 """The largest coordinate, world units: float32 cannot resolve a scene beyond it."""
 _LARGEST_SIDE: Final = 1 << 20
 _SHORTEST: Final = 0.1  # focal length in sides of the image: a pinhole of 157 degrees, a fisheye of more than 360
-# The coefficients of COLMAP's camera models that OpenCV undistorts, in OpenCV's order; all others must be 0.
+_ONE, _TWO = "f cx cy ", "fx fy cx cy "
+# COLMAP's camera models in the order of its numbers, with their parameters; p and k are counted from 1 here.
+CAMERA_MODELS: Final = {
+    "SIMPLE_PINHOLE": _ONE, "PINHOLE": _TWO, "SIMPLE_RADIAL": _ONE + "k1", "RADIAL": _ONE + "k1 k2",
+    "OPENCV": _TWO + "k1 k2 p1 p2", "OPENCV_FISHEYE": _TWO + "k1 k2 k3 k4", "FULL_OPENCV": _TWO + "k1 k2 p1 p2 k3 k4 k5 k6",
+    "FOV": _TWO + "omega", "SIMPLE_RADIAL_FISHEYE": _ONE + "k1", "RADIAL_FISHEYE": _ONE + "k1 k2",
+    "THIN_PRISM_FISHEYE": _TWO + "k1 k2 p1 p2 k3 k4 sx1 sy1",
+    "RAD_TAN_THIN_PRISM_FISHEYE": _TWO + "k1 k2 k3 k4 k5 k6 p1 p2 s0 s1 s2 s3", "SIMPLE_DIVISION": _ONE + "k",
+    "DIVISION": _TWO + "k", "SIMPLE_FISHEYE": _ONE, "FISHEYE": _TWO, "EUCM": _TWO + "alpha beta", "EQUIRECTANGULAR": "",
+}  # fmt: skip
+# The coefficients that OpenCV undistorts, in its order; those that a model has beside them must be 0.
 _PERSPECTIVE: Final = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE: Final = ("k1", "k2", "k3", "k4")
-_TERMS: Final = {
-    "SIMPLE_PINHOLE": (), "PINHOLE": (), "SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2"), "FULL_OPENCV": _PERSPECTIVE,
-    "OPENCV": ("k1", "k2", "p1", "p2", "k3"),  # nerfstudio adds k3, and a k4 that is not OpenCV's
-    "FOV": (), "SIMPLE_DIVISION": (), "DIVISION": (), "EUCM": (),
-    "SIMPLE_FISHEYE": (), "FISHEYE": (), "SIMPLE_RADIAL_FISHEYE": ("k1",), "RADIAL_FISHEYE": ("k1", "k2"),
-    "OPENCV_FISHEYE": _FISHEYE, "THIN_PRISM_FISHEYE": _FISHEYE, "RAD_TAN_THIN_PRISM_FISHEYE": _FISHEYE,
-}  # fmt: skip
 _UNDISTORT: Final = "colmap image_undistorter --image_path images --input_path sparse/0 --output_path undistorted"
 _CUT: Final = (
     "cut panoramas into flat photos: "
@@ -149,8 +152,9 @@ def lens_of(
 
 def terms_of(file: Path, where: str, model: str) -> tuple[str, ...]:
     """Return the coefficients of a camera model that need not be 0; a DataError if the model is not supported."""
-    if model in _TERMS:
-        return _TERMS[model]
+    if parameters := CAMERA_MODELS.get(model, "").split():
+        extra = ["k3"] if model == "OPENCV" else []  # nerfstudio adds k3, and a k4 that is not OpenCV's
+        return tuple(k for k in (_FISHEYE if "FISHEYE" in model else _PERSPECTIVE) if k in [*parameters, *extra])
     remedy = _CUT if model == "EQUIRECTANGULAR" else f"undistort the photos first: {_UNDISTORT}"
     raise DataError(file, where, f"has the camera model {model[:40]}, which is not supported", remedy)
 

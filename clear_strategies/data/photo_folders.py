@@ -6,9 +6,9 @@ import logging
 import os
 import shlex
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final
 
 from clear_strategies.data.file_names import LISTED, is_file, named, some
 from clear_strategies.data.photo_files import SUFFIXES, read_image
@@ -38,8 +38,6 @@ _OTHER_KINDS: Final = {
         "save them as PNG or JPEG: mogrify -format png FILE",
     ),
 }  # fmt: skip
-
-_Entry = TypeVar("_Entry")
 
 
 def image_folder(root: Path, name: str | None = None) -> Path:
@@ -120,15 +118,8 @@ def images_in(folder: Path, pattern: str = "*") -> list[Path]:
     return [p for p in images if not any(part.startswith(".") for part in p.relative_to(folder).parts)]
 
 
-def usable(
-    listing: Path,
-    entries: Sequence[_Entry],
-    path_of: Callable[[_Entry], Path],
-    *,
-    skip_faulty: bool,
-    scene: Path | None = None,
-) -> list[_Entry]:
-    """Select the entries whose photos can be used, in order.
+def usable(listing: Path, paths: Sequence[Path], *, skip_faulty: bool, scene: Path | None = None) -> list[Path]:
+    """Select the photos that can be used, in order.
 
     Args:
         listing: the file or folder that lists the photos, for messages.
@@ -137,24 +128,24 @@ def usable(
             Else no photo is decoded: a damaged one fails when it is loaded, and a missing one is a DataError.
     """
 
-    def decodes(entry: _Entry) -> bool:
+    def decodes(path: Path) -> bool:
         try:
-            read_image(path_of(entry), turn=True)
+            read_image(path, turn=True)
         except DataError as error:
             _log.warning("skipped: %s", error)
             return False
         return True
 
-    absent = [path_of(entry) for entry in entries if not is_file(path_of(entry))]
-    if absent and len(absent) == len(entries):
+    absent = [path for path in paths if not is_file(path)]
+    if absent and len(absent) == len(paths):
         raise _none_found(listing, absent, scene)
     if absent and not skip_faulty:
-        problem = f"{len(absent)} of {len(entries)} are not there: {some([path.name for path in absent])}"
+        problem = f"{len(absent)} of {len(paths)} are not there: {some([path.name for path in absent])}"
         remedy = "put them back, or train without them: data.reader.skip_faulty=true"
         raise DataError(listing, "photos", problem, remedy)
-    kept = [entry for entry in entries if decodes(entry)] if skip_faulty else list(entries)
-    if entries and not kept:
-        raise DataError(listing, "photos", f"none of {len(entries)} can be used", "check the path")
+    kept = list(filter(decodes, paths) if skip_faulty else paths)
+    if paths and not kept:
+        raise DataError(listing, "photos", f"none of {len(paths)} can be used", "check the path")
     return kept
 
 

@@ -17,11 +17,10 @@ from functools import cache
 from itertools import islice, repeat
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from clear_strategies.data import ply
-from clear_strategies.data.capture import Capture
+from clear_strategies.data.capture import Capture, SfmPoints
 from clear_strategies.data.lenses import Lens
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.readers import colmap, colmap_model, nerfstudio
@@ -146,10 +145,10 @@ def _require_images(images: Sequence[colmap_model.Image]) -> None:
     _require(len({image.id for image in images}) == len(images))
 
 
-def _require_points(points: colmap_model.Points) -> None:
+def _require_points(points: SfmPoints) -> None:
     n = len(points.means)
-    _require(bool(np.isfinite(points.means).all()) and len(points.colors) == n)
-    _require(not len(points.track) or 0 <= points.track[:, 0].min() <= points.track[:, 0].max() < n)
+    _require(bool(points.means.isfinite().all()) and len(points.colors) == n)
+    _require(not len(points.track_point) or 0 <= int(points.track_point.min()) <= int(points.track_point.max()) < n)
 
 
 def _require_capture(capture: Capture) -> None:

@@ -8,11 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-import torch
-
 from clear_strategies.core.checks import as_color
-from clear_strategies.data.capture import BLACK, Capture, Frame, SfmPoints, lens_notes, sorted_by_name
+from clear_strategies.data.capture import BLACK, Capture, Frame, lens_notes, sorted_by_name
 from clear_strategies.data.file_names import finder, is_file
 from clear_strategies.data.masks import masks_of
 from clear_strategies.data.photo_folders import folder_note, image_folder, images_in, usable
@@ -81,11 +78,13 @@ def capture(
         DataError: an image cannot be used.
     """
     listing = model.listing
-    kept = usable(listing, model.images, lambda image: paths[image.name], skip_faulty=skip_faulty, scene=root)
+    listed = [paths[image.name] for image in model.images]
+    kept = set(usable(listing, listed, skip_faulty=skip_faulty, scene=root))
     masks = masks_of(folder.parent, paths.values())
     frames = []
-    for image in kept:
-        path = paths[image.name]
+    for image, path in zip(model.images, listed, strict=True):
+        if path not in kept:
+            continue
         inside = path.relative_to(folder) if path.is_relative_to(folder) else path  # which `sorted_by_name` refuses
         frames.append(Frame.of_photo(
             inside.as_posix(), path, model.lenses[image.camera], image.pose,
@@ -106,17 +105,11 @@ def capture(
     notes |= lens_notes(frames)
     if uneven := sum(abs(math.hypot(*image.quat) - 1) > _UNEVEN for image in model.images):
         notes["rotations"] = f"{uneven} quaternions were not of length 1 and were normalised"
-    if not len(model.points.means):
+    sfm = None
+    if count := len(model.points.means):
+        source = f"COLMAP {points or label}, {count:,} points, triangulated from all {len(model.images)} images"
+        sfm = replace(model.points, source=source)
+    else:
         notes["points"] = "the model has none"
     lost = dict.fromkeys(unposed, "has no pose in the model")
-    sfm = _sfm_points(model, points or label)
     return Capture(root.resolve().name, sorted_by_name(frames, listing), sfm, background, notes, unplaced=lost)
-
-
-def _sfm_points(model: Model, label: str) -> SfmPoints | None:
-    if not len(model.points.means):
-        return None
-    means, colors = torch.from_numpy(model.points.means).float(), torch.from_numpy(model.points.colors).float() / 255
-    point, image = (torch.from_numpy(np.ascontiguousarray(ids)) for ids in model.points.track.T)
-    source = f"COLMAP {label}, {len(means):,} points, triangulated from all {len(model.images)} images"
-    return SfmPoints(means, colors, point, image, source)

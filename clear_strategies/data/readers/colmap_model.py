@@ -11,32 +11,24 @@ import math
 import re
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies.data.capture import SfmPoints
 from clear_strategies.data.file_names import named
-from clear_strategies.data.lenses import FARTHEST, Lens, lens_of, terms_of
+from clear_strategies.data.lenses import CAMERA_MODELS, FARTHEST, Lens, lens_of, terms_of
 from clear_strategies.errors import DataError
 from clear_strategies.files import read_bytes
 from rasterizers.geometry import rotation_matrix
 
 _log = logging.getLogger(__name__)
 
-_ONE, _TWO = "f cx cy ", "fx fy cx cy "
-_MODELS: Final = {  # by COLMAP's numbers, with their parameters; p and k are counted from 1 here
-    "SIMPLE_PINHOLE": _ONE, "PINHOLE": _TWO, "SIMPLE_RADIAL": _ONE + "k1", "RADIAL": _ONE + "k1 k2",
-    "OPENCV": _TWO + "k1 k2 p1 p2", "OPENCV_FISHEYE": _TWO + "k1 k2 k3 k4", "FULL_OPENCV": _TWO + "k1 k2 p1 p2 k3 k4 k5 k6",
-    "FOV": _TWO + "omega", "SIMPLE_RADIAL_FISHEYE": _ONE + "k1", "RADIAL_FISHEYE": _ONE + "k1 k2",
-    "THIN_PRISM_FISHEYE": _TWO + "k1 k2 p1 p2 k3 k4 sx1 sy1",
-    "RAD_TAN_THIN_PRISM_FISHEYE": _TWO + "k1 k2 k3 k4 k5 k6 p1 p2 s0 s1 s2 s3", "SIMPLE_DIVISION": _ONE + "k",
-    "DIVISION": _TWO + "k", "SIMPLE_FISHEYE": _ONE, "FISHEYE": _TWO, "EUCM": _TWO + "alpha beta", "EQUIRECTANGULAR": "",
-}  # fmt: skip
 _LONGEST_NAME: Final = 4096
 _RECORD_COUNT: Final = re.compile(r"^# Number of \w+: (\d+)", re.MULTILINE)  # in a text file's header
 _NUMERIC: Final = "0123456789.+-eE \t"  # characters of a line of numbers
@@ -70,14 +62,6 @@ _Point = tuple[int, Sequence[float], Sequence[int], np.ndarray]
 """Id, position, 8-bit colour, and the ids of the images that observe it; a plain tuple, because there may be millions."""
 
 
-class Points(NamedTuple):
-    """Positions, 8-bit colours, and the tracks: point `track[j, 0]` is observed in image `track[j, 1]`."""
-
-    means: Float[np.ndarray, "N 3"]
-    colors: UInt8[np.ndarray, "N 3"]
-    track: Int[np.ndarray, "M 2"]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Model:
     """The content of a sparse model's files; `listing` is the file of the images, .bin or .txt."""
@@ -86,7 +70,7 @@ class Model:
     listing: Path
     lenses: dict[int, Lens]
     images: list[Image]
-    points: Points
+    points: SfmPoints
 
 
 def model_folders(root: Path) -> Iterator[Path]:
@@ -154,12 +138,13 @@ def read_model(folder: Path) -> Model:
         if image.camera not in lenses:
             raise _damaged(listing, image.name, f"has the unknown camera {image.camera}")
     points = read_points(points3d)
-    listed = np.isin(points.track[:, 1], [image.id for image in images])
+    listed = torch.isin(points.track_image, torch.tensor([image.id for image in images]))
     if not listed.all():
         message = "%s: %s of %s entries of the tracks name images that %s does not list, such as %d, and are left out."
-        count, unlisted = (f"{n:,}" for n in ((~listed).sum(), len(listed))), points.track[~listed, 1]
-        _log.warning(message, points3d, *count, listing.name, unlisted[0])
-    return Model(folder, listing, lenses, images, points._replace(track=points.track[listed]))
+        unlisted = points.track_image[~listed]
+        _log.warning(message, points3d, f"{len(unlisted):,}", f"{len(listed):,}", listing.name, unlisted[0])
+        points = replace(points, track_point=points.track_point[listed], track_image=points.track_image[listed])
+    return Model(folder, listing, lenses, images, points)
 
 
 def read_cameras(path: Path, used: Set[int] | None = None) -> dict[int, Lens]:
@@ -181,13 +166,13 @@ def read_images(path: Path) -> list[Image]:
     return list(images.values())
 
 
-def read_points(path: Path) -> Points:
-    """Read the points with their tracks; empty if the file does not exist."""
+def read_points(path: Path) -> SfmPoints:
+    """Read the points with their tracks; none if the file does not exist."""
     records: list[_Point] = []
     if path.exists():
         records = list(_binary_points(path) if path.suffix == ".bin" else _text_points(path))
     if not records:
-        return Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 2), np.int64))
+        return SfmPoints.without_tracks(torch.zeros(0, 3), torch.zeros(0, 3), "")
     ids, positions, colors, tracks = zip(*records, strict=True)
     if len(set(ids)) != len(ids):
         raise _damaged(path, "point id", "occurs twice")
@@ -195,9 +180,10 @@ def read_points(path: Path) -> Points:
     near = np.abs(means) < FARTHEST
     if not near.all():
         raise DataError(path, f"point {np.argwhere(~near)[0, 0]}", "is not finite", "remove the point")
-    point = np.repeat(np.arange(len(means)), [len(images) for images in tracks])
-    track = np.stack((point, np.concatenate(tracks).astype(np.int64)), axis=1)
-    return Points(means, np.array(colors, np.uint8), track)
+    levels = torch.from_numpy(np.array(colors, np.uint8)).float()
+    point = torch.arange(len(means)).repeat_interleave(torch.tensor([len(images) for images in tracks]))
+    image = torch.from_numpy(np.concatenate(tracks).astype(np.int64))
+    return SfmPoints(torch.from_numpy(means).float(), levels / 255, point, image, "")
 
 
 def _by_id(path: Path, records: Iterable[tuple[int, _T]]) -> dict[int, _T]:
@@ -210,7 +196,7 @@ def _by_id(path: Path, records: Iterable[tuple[int, _T]]) -> dict[int, _T]:
 
 
 def _lens(path: Path, where: str, model: str, size: tuple[int, int], parameters: Iterable[float]) -> Lens:
-    terms = dict(zip(_MODELS[model].split(), parameters, strict=True))
+    terms = dict(zip(CAMERA_MODELS[model].split(), parameters, strict=True))
     f = terms.pop("f", 0.0)
     pinhole = (terms.pop("fx", f), terms.pop("fy", f), terms.pop("cx"), terms.pop("cy"))
     if model == "EUCM" and terms["alpha"] == 0:
@@ -263,11 +249,11 @@ def _binary_cameras(path: Path, used: Set[int] | None) -> Iterator[tuple[int, Le
     for i in range(file.count("number of cameras")):
         number, kind, width, height = file.take(_CAMERA, f"camera {i}")
         where = f"camera {number}"
-        model = dict(enumerate(_MODELS)).get(kind, f"number {kind}")
+        model = dict(enumerate(CAMERA_MODELS)).get(kind, f"number {kind}")
         wanted = used is None or number in used
-        if wanted or model not in _MODELS:  # of an unknown model the length is unknown, too
+        if wanted or model not in CAMERA_MODELS:  # of an unknown model the length is unknown, too
             terms_of(path, where, model)  # refuses those that are not supported
-        layout = struct.Struct(f"<{len(_MODELS[model].split())}d")
+        layout = struct.Struct(f"<{len(CAMERA_MODELS[model].split())}d")
         parameters = file.take(layout, f"parameters of {where}")
         if wanted:
             yield number, _lens(path, where, model, (width, height), parameters)
@@ -302,7 +288,7 @@ def _text_cameras(path: Path, used: Set[int] | None) -> Iterator[tuple[int, Lens
             raise _damaged(path, f"line {line}", f"has {len(cells)} of at least 5 columns")
         width, height = _numbers(path, line, cells[2:4], _whole)
         terms_of(path, f"line {line}", cells[1])  # refuses those that are not supported
-        expected = len(_MODELS[cells[1]].split())
+        expected = len(CAMERA_MODELS[cells[1]].split())
         if len(cells) != 4 + expected:
             raise _damaged(path, f"line {line}", f"has {len(cells) - 4} parameters, {cells[1]} has {expected}")
         yield number, _lens(path, f"line {line}", cells[1], (width, height), _numbers(path, line, cells[4:], float))

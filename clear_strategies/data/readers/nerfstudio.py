@@ -11,7 +11,6 @@ from pathlib import Path, PureWindowsPath
 from typing import Any, Final, NamedTuple
 
 import msgspec
-import torch
 
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import BLACK, Capture, Frame, SfmPoints, lens_notes, sorted_by_name
@@ -212,9 +211,11 @@ def frames_of(
     own = {entry.path: find(entry.transform.mask_path) for entry in every if entry.transform.mask_path}
     masks = masks_of(folder, [entry.path for entry in every], own)
     for file, entries in listed.items():
-        numbered = list(enumerate(entries))
-        for i, entry in usable(file, numbered, lambda item: item[1].path, skip_faulty=skip_faulty, scene=scene):
+        kept = set(usable(file, [entry.path for entry in entries], skip_faulty=skip_faulty, scene=scene))
+        for i, entry in enumerate(entries):
             where, path = f"frames[{i}]", entry.path
+            if path not in kept:
+                continue
             pose = pose_from_opengl(file, f"{where}.transform_matrix", entry.transform.transform_matrix)
             lens, mask = entry.transform.lens(file, where, path), masks.get(path)
             frames.append(
@@ -227,5 +228,5 @@ def points_of(file: Path, content: Mapping[str, Any]) -> SfmPoints | None:
     """Read the points of the PLY file that a file names; None if it names none."""
     if not (name := typed(file, content, _Shared).ply_file_path):
         return None
-    cloud, none = read_points(finder(file.parent)(name)), torch.zeros(0, dtype=torch.long)
-    return SfmPoints(cloud.means, cloud.colors, none, none, f"{name}, {len(cloud):,} points without tracks")
+    cloud = read_points(finder(file.parent)(name))
+    return SfmPoints.without_tracks(cloud.means, cloud.colors, f"{name}, {len(cloud):,} points without tracks")
