@@ -40,6 +40,7 @@ _LOSSLESS: Final = ("PNG", "TIFF")
 _HEIF_BRANDS: Final = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1")  # bytes 8 to 12, behind "ftyp"
 _MAX_PIXELS: Final = 100_000_000  # of an image as it is returned, 1.2 GB; of larger photos, means of 2x2 or more pixels
 _LARGEST: Final = 500_000_000  # pixels of a file with 8 bits, since a header may state any number
+_PNG_END: Final = b"\0\0\0\0IEND\xaeB`\x82"  # the last chunk: size, kind and checksum
 PNG_LEVEL: Final = 3  # a third of the time of zlib's default, for 5 % more bytes
 _ADOBE_RGB: Final = "R03"  # EXIF's index of interoperability
 _ON_THE_SIDE: Final = (5, 6, 7, 8)  # EXIF orientations that exchange width and height
@@ -79,17 +80,14 @@ def read_image(
     """
     with _opened(path, turn) as image:
         sixteen_bits = _has_sixteen_bits(image)  # unknown after decoding
-        # Pillow forgets the orientation of a TIFF as it decodes it, and decodes a PNG to find its EXIF block.
-        orientation = 1 if image.format == "PNG" else _orientation_of(image)
+        orientation = _orientation_of(image)  # Pillow forgets that of a TIFF as it decodes it
         try:
             image.load()
         except Exception as error:  # PIL's decoders raise many types of error on damaged bytes
             remedy = "replace the damaged file, or go on without it: data.reader.skip_faulty=true"
             raise DataError(path, "pixels", f"cannot be decoded ({error})", remedy) from error
-        if image.format == "PNG":
-            orientation = _orientation_of(image)
         decoded_upright = image.format == "TIFF"  # by Pillow and by OpenCV
-        as_asked = {None: False, True: decoded_upright or not sixteen_bits, False: not decoded_upright}[turn]
+        as_asked = decoded_upright or not sixteen_bits if turn else not decoded_upright
         if orientation != 1 and not as_asked:
             raise _rotation_error(path, orientation)
         if orientation != 1 and turn and not decoded_upright:
@@ -117,12 +115,6 @@ def image_size(path: Path, *, turn: bool | None = None) -> tuple[int, int]:
         factor = _reduction_factor(width * height)
         width, height = -(-width // factor), -(-height // factor)
         return (height, width) if turn and _orientation_of(image) in _ON_THE_SIDE else (width, height)
-
-
-def is_on_its_side(path: Path) -> bool:
-    """Return True if the EXIF rotation exchanges width and height. Reads only the header; errors as of `read_image`."""
-    with _opened(path, False) as image:
-        return _orientation_of(image) in _ON_THE_SIDE
 
 
 def has_alpha(path: Path) -> bool:
@@ -187,7 +179,7 @@ def _opened(path: Path, turn: bool | None) -> Iterator[Image.Image]:
         if image.width * image.height > (most := _MAX_PIXELS if _has_sixteen_bits(image) else _LARGEST):
             problem = f"{image.width}x{image.height} is more than {most:,} pixels"
             raise DataError(path, "size", problem, f"reduce it: mogrify -resize 50% {shlex.quote(str(path))}")
-        if turn is None and image.format != "PNG" and (orientation := _orientation_of(image)) != 1:
+        if turn is None and (orientation := _orientation_of(image)) != 1:
             raise _rotation_error(path, orientation)
         yield image
 
@@ -238,11 +230,25 @@ def _orientation_of(image: Image.Image) -> int:
 def _tags(image: Image.Image, *blocks: int) -> dict[int, Any]:
     """The tags of an image's EXIF block, and of the given blocks in it; empty if it cannot be read."""
     try:
-        exif = image.getexif()
+        # The method of PNG files decodes them, to find a block that lies behind the pixels.
+        exif = Image.Image.getexif(_without_pixels(image) if image.format == "PNG" else image)
         return {**exif, **{tag: value for block in blocks for tag, value in exif.get_ifd(block).items()}}
     except Exception as error:  # PIL raises many types of error on damaged blocks
         _log.debug("%s: its EXIF block cannot be read (%s) and is not used.", image.filename, error)  # type: ignore[attr-defined]
         return {}
+
+
+def _without_pixels(image: Image.Image) -> Image.Image:
+    """Open the file of a PNG image again, without the chunks that hold pixels."""
+    with Path(image.filename).open("rb") as file:  # type: ignore[attr-defined]
+        chunks = [file.read(8)]
+        while len(head := file.read(8)) == 8 and head[4:] != _PNG_END[4:8]:
+            size = int.from_bytes(head[:4], "big") + 4  # with its checksum
+            if head[4:] in (b"IDAT", b"fdAT"):
+                file.seek(size, io.SEEK_CUR)
+            else:
+                chunks += [head, file.read(size)]
+    return Image.open(io.BytesIO(b"".join([*chunks, _PNG_END])), formats=("PNG",))
 
 
 def _rotation_error(path: Path, orientation: int) -> DataError:

@@ -107,6 +107,18 @@ def test_a_turned_photo_is_read_as_it_is_stored_or_upright(ending: str, orientat
         assert photo_files.image_size(path, turn=turn) == found.shape[1::-1]
 
 
+def test_a_rotation_that_a_png_file_has_behind_its_pixels_is_known_before_they_are_decoded(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    path = save(tmp_path / "a.png", np.zeros((12, 16, 3), np.uint8), exif=exif)
+    data = path.read_bytes()
+    first, last = data.index(b"eXIf") - 4, data.index(b"IDAT") - 4
+    path.write_bytes(data[:first] + data[last:-12] + data[first:last] + data[-12:])  # IEND has 12 bytes
+    assert photo_files.image_size(path, turn=True) == (12, 16)
+    with pytest.raises(DataError, match="EXIF orientation: is 6"):
+        photo_files.image_size(path)
+
+
 def test_images_are_listed_by_name_and_ending_and_the_first_of_the_usual_folders_is_taken(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="has none of the folders"):
         photo_folders.image_folder(tmp_path)

@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 import pytest
 import torch
 from PIL import Image
+from PIL.PngImagePlugin import PngImageFile
 
 from clear_strategies.commands.train import detect
 from clear_strategies.data.capture import Capture
@@ -70,12 +71,16 @@ def test_a_photo_on_its_side_is_turned_where_the_camera_is_not_that_of_the_store
 
 
 @pytest.mark.parametrize("kind", GOOD)
-def test_reading_poses_decodes_no_photo(kind: str, tmp_path: Path) -> None:
+def test_reading_poses_decodes_no_photo(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Truncated photos still have their headers: they are read, and refused when they are loaded."""
+    decoded, load = [], PngImageFile.load
+    monkeypatch.setattr(PngImageFile, "load", lambda image: decoded.append(image.filename) or load(image))
     root = GOOD[kind](tmp_path)
     for path in root.rglob("*.png"):
         path.write_bytes(path.read_bytes()[:-60])
-    for frame in READERS[kind](root).frames:
+    frames = READERS[kind](root).frames
+    assert not decoded
+    for frame in frames:
         with pytest.raises(DataError, match="pixels: cannot be decoded"):
             frame.load()
 
