@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import unicodedata
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache
 from pathlib import Path, PureWindowsPath
 from typing import Final
 
@@ -42,8 +42,9 @@ def finder(folder: Path) -> Callable[[str], Path]:
     `name_key` of each name counts, leading folders of an absolute path are ignored, the folder's own name may come first, and the
     suffix may differ if only one image has that stem. If nothing is found, the returned path does not exist.
     """
+    subfolder = functools.cache(named)
 
-    @cache
+    @functools.cache
     def entries(parent: Path) -> dict[str, list[Path]]:
         """The entries of a folder by `name_key` of their names, images also by that of their stems."""
         found: dict[str, list[Path]] = {}
@@ -53,11 +54,7 @@ def finder(folder: Path) -> Callable[[str], Path]:
         return found
 
     def below(parts: Sequence[str]) -> Path | None:
-        parent, last = folder, PureWindowsPath(parts[-1])
-        for part in parts[:-1]:
-            there = parent / part
-            same = [] if os.path.isdir(there) else entries(parent).get(name_key(part), [])  # noqa: PTH112 - as in `is_file`
-            parent = next((path for path in same if path.is_dir()), there)
+        parent, last = functools.reduce(subfolder, parts[:-1], folder), PureWindowsPath(parts[-1])
         for key in (last.name, last.stem) if last.suffix[1:2].isalpha() else (last.name,):  # "rgb.0001" has no ending
             files = [path for path in entries(parent).get(name_key(key), []) if path.is_file()]
             if len(files) == 1:

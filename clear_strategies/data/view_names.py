@@ -80,21 +80,19 @@ class ViewFiles:
 
     def file(self, name: str, width: int, height: int) -> Path:
         """Find the image of the view; a DataError if there is none or several, it has another size or is that of another view."""
-        name = normalized(name)
-        view = bare(name)
-        below = named(self.folder, view.rpartition("/")[0])
-        folder = below if below.is_dir() else self.folder
-        stem, whole = _file_name(view) + self.suffix, _file_name(name) + self.suffix
-        if self._listed.get(folder, {}).keys().isdisjoint((stem, whole)):
-            self._listed[folder] = {}
-            for path in list_images(folder):
-                self._listed[folder].setdefault(normalized(path.stem), []).append(path)
-        files = self._listed[folder].get(whole) or self._listed[folder].get(stem, [])
-        if not files:
-            raise DataError(folder, _file_name(view), f"has no {self.what} {stem} ({', '.join(SUFFIXES)})", self.remedy)
-        if len(files) > 1:
-            twins = " and ".join(file.name for file in files)
-            raise DataError(folder, _file_name(view), f"has {twins} for one view", "keep one of them")
+        folder, _, stem = bare(name := normalized(name)).rpartition("/")
+        below, whole = named(self.folder, folder), _file_name(name) + self.suffix
+        inside, file_stem = below if below.is_dir() else self.folder, stem + self.suffix
+        if self._listed.get(inside, {}).keys().isdisjoint((file_stem, whole)):
+            self._listed[inside] = {}
+            for path in list_images(inside):
+                self._listed[inside].setdefault(normalized(path.stem), []).append(path)
+        files = self._listed[inside].get(whole) or self._listed[inside].get(file_stem, [])
+        if len(files) != 1:
+            problem, remedy = f"has no {self.what} {file_stem} ({', '.join(SUFFIXES)})", self.remedy
+            if files:
+                problem, remedy = f"has {' and '.join(file.name for file in files)} for one view", "keep one of them"
+            raise DataError(inside, stem, problem, remedy)
         if (other := self._view_of.setdefault(files[0], name)) != name:
             problem = f"would be that of two views, {other} and {name}"
             remedy = f"put the {self.what}s into subfolders like those of the photos"

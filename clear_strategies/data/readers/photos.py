@@ -101,37 +101,24 @@ def read(
         raise DataError(root, "photos", "is a file", _instead_of(root))
     _warn_of_other_poses(root)
     root, images = _photos_in(root)
-    base = _cache_outside(root, cache)
-    paths = usable(root, _without_masks_and_twins(images), lambda path: path, skip_faulty=skip_faulty)
+    base = Path(cache) if cache is not None else cache_folder() / "sfm"
+    if base.resolve().is_relative_to(root.resolve()):
+        raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
+    paths = usable(root, _without_masks_and_twins(images), skip_faulty=skip_faulty)
     require_text((name, *(path.name for path in paths)))
     if len(paths) < sfm.FEWEST:
         raise DataError(root, "images", f"there are {len(paths)}, poses need at least {sfm.FEWEST}", MORE_PHOTOS)
     precise = len(paths) <= _FEW if precise == "auto" else precise
-    folder = _estimate_poses(root, paths, base, sfm.SfmSettings(max_side, max_features, precise, threads, seed))
+    photos = {path: optics(path) for path in paths}  # unreadable photos are refused before the long work
+    folder = base / _cache_key(paths, max_side, max_features, precise, seed)
+    if (folder / sfm.MODEL).is_file():
+        _log.debug("%s: poses from the cache %s.", root, folder)
+    else:
+        sfm.reconstruct(root, photos, folder, sfm.SfmSettings(max_side, max_features, precise, threads, seed))
     capture = _capture(root, paths, folder)
     sfm.warn_unplaced(root, capture.unplaced, len(paths))
     sfm.require_placed(root, len(capture.frames), len(paths), least_placed)
     return replace(capture, name=name)
-
-
-def _cache_outside(root: Path, cache: str | Path | None) -> Path:
-    """The folder of the cache; a DataError if it lies among the photos."""
-    base = Path(cache) if cache is not None else cache_folder() / "sfm"
-    if base.resolve().is_relative_to(root.resolve()):
-        raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
-    return base
-
-
-def _estimate_poses(root: Path, paths: Sequence[Path], cache: Path, settings: sfm.SfmSettings) -> Path:
-    """Estimate the poses unless the cache has them; return their folder."""
-    photos = {path: optics(path) for path in paths}  # unreadable photos are refused before the long work
-    key = _cache_key(paths, settings.max_side, settings.max_features, settings.precise, settings.seed)
-    folder = cache / key
-    if (folder / sfm.MODEL).is_file():
-        _log.debug("%s: poses from the cache %s.", root, folder)
-    else:
-        sfm.reconstruct(root, photos, folder, settings)
-    return folder
 
 
 def _capture(root: Path, paths: Sequence[Path], folder: Path) -> Capture:

@@ -142,7 +142,9 @@ def require_placed(root: Path, placed: int, count: int, least: float = 0.0) -> N
 
 
 def _models(pycolmap: Any, photos: Mapping[Path, Optics], work: Path, settings: SfmSettings) -> list[Any]:
-    """Run COLMAP's incremental pipeline: extract features, match all pairs, and map; returns the models."""
+    """Run COLMAP's incremental pipeline: extract features, match all pairs, and map; returns the models. If photos are left over,
+    those mapped without EXIF's focal lengths are returned where they place more photos.
+    """
     database, root = work / _DATABASE, next(iter(photos)).parent
     level = pycolmap.logging.minloglevel
     # COLMAP's progress is hundreds of lines, and its errors are raised.
@@ -155,10 +157,16 @@ def _models(pycolmap: Any, photos: Mapping[Path, Optics], work: Path, settings: 
         _extract_features(pycolmap, database, groups, settings, root)
         _match(pycolmap, database, [name for names in groups.values() for name in names], settings.threads)
         _require_parallax(pycolmap, database, root)
-        models = _mapped(pycolmap, work, len(photos), settings)
+        models, count = _mapped(pycolmap, work, len(photos), settings), len(photos)
         lengths = sorted({said.focal_35mm for said in photos.values() if said.focal_35mm is not None})
-        if _most_placed(models) < len(photos) and lengths:
-            models = _mapped_without_exif(pycolmap, work, models, len(photos), lengths, settings, root)
+        if (placed := _most_placed(models)) < count and lengths:
+            _log.info("%d of %d photos are placed: again, without EXIF's focal length.", placed, count)
+            _forget_focal_lengths(pycolmap, database, settings.threads)
+            free = _mapped(pycolmap, work, count, settings)
+            if (more := _most_placed(free)) > placed:
+                models, told = free, some([f"{focal:g} mm" for focal in lengths])
+                message = "%s: EXIF's focal length (%s on 35 mm film) is not used: %d of %d photos are placed with it, %d without"
+                _log.warning(message, root, told, placed, count, more)
     finally:
         pycolmap.logging.minloglevel = level
     return models
@@ -179,28 +187,6 @@ def _extract_features(pycolmap: Any, database: Path, groups: _Groups, settings: 
         why = "they are small, blurred, dark, or without texture"
         _log.warning("%s: half of the photos have %d features or fewer: %s.", root, found, why)
     _keep_coarsest(pycolmap, database, settings.max_features)
-
-
-def _mapped_without_exif(
-    pycolmap: Any,
-    work: Path,
-    models: list[Any],
-    count: int,
-    lengths: Sequence[float],
-    settings: SfmSettings,
-    root: Path,
-) -> list[Any]:
-    """Map again without EXIF's focal lengths; returns these models if they place more photos, else the given ones."""
-    placed = _most_placed(models)
-    _log.info("%d of %d photos are placed: again, without EXIF's focal length.", placed, count)
-    _forget_focal_lengths(pycolmap, work / _DATABASE, settings.threads)
-    free = _mapped(pycolmap, work, count, settings)
-    if (more := _most_placed(free)) <= placed:
-        return models
-    told = some([f"{focal:g} mm" for focal in lengths])
-    message = "%s: EXIF's focal length (%s on 35 mm film) is not used: %d of %d photos are placed with it, %d without"
-    _log.warning(message, root, told, placed, count, more)
-    return free
 
 
 def _mapped(pycolmap: Any, work: Path, count: int, settings: SfmSettings) -> list[Any]:
