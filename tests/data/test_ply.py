@@ -1,6 +1,7 @@
 """PLY: bytes by hand, roundtrips as a property, and a table of malformed files that each get one line."""
 
 import struct
+from codecs import BOM_UTF8
 from pathlib import Path
 
 import hypothesis.extra.numpy as hnp
@@ -31,13 +32,6 @@ def header(*lines: str, form: str = "binary_little_endian") -> bytes:
 
 
 XYZ = ("property float x", "property float y", "property float z")
-
-
-def test_a_file_may_be_named_by_a_text(tmp_path: Path) -> None:
-    file, one = str(tmp_path / "one.ply"), gaussians(1, 3)
-    write_gaussians(file, one)
-    assert torch.equal(read_gaussians(file).means, one.means)
-    assert torch.equal(read_points(file).means, one.means)
 
 
 def test_gaussians_and_points_are_written_byte_for_byte_as_3dgs_reads_them(tmp_path: Path) -> None:
@@ -106,10 +100,11 @@ FOLLOWED = (*POINT, "element face 1", "property list uchar int vertex_indices")
     ids=["little endian", "big endian", "ascii", "doubles and 16 bits", "other elements", "other elements in ascii"],
 )
 def test_a_point_is_read_from_every_layout(tmp_path, form, lines, body):
-    (tmp_path / "p.ply").write_bytes(header(*lines, form=form).replace(b"\n", b"\r\n") + body)
-    cloud = read_points(tmp_path / "p.ply")
-    assert cloud.means.tolist() == [[1, 2, 3]]
-    torch.testing.assert_close(cloud.colors, torch.tensor([[1, 0, 0.2]]))
+    for mark in (b"", BOM_UTF8):
+        (tmp_path / "p.ply").write_bytes(mark + header(*lines, form=form).replace(b"\n", b"\r\n") + body)
+        cloud = read_points(tmp_path / "p.ply")
+        assert cloud.means.tolist() == [[1, 2, 3]]
+        torch.testing.assert_close(cloud.colors, torch.tensor([[1, 0, 0.2]]))
     (tmp_path / "p.ply").write_bytes(header(*lines, form=form).replace(b"vertex 1", b"vertex 0"))
     if lines is POINT:
         assert len(read_points(tmp_path / "p.ply")) == 0
@@ -118,9 +113,9 @@ def test_a_point_is_read_from_every_layout(tmp_path, form, lines, body):
 def test_colours_of_a_gaussian_file_and_of_none_and_properties_outside_the_layout(tmp_path, caplog):
     g = gaussians(1, 3)
     g.sh0[:] = torch.tensor([0.0, 1.0, -9.0])
-    write_gaussians(tmp_path / "g.ply", g)
+    write_gaussians(f"{tmp_path}/g.ply", g)
     # 0.5 + f_dc · 1 / (2 √π), then into [0, 1]
-    assert torch.allclose(read_points(tmp_path / "g.ply").colors, torch.tensor([[0.5, 0.7820948, 0.0]]))
+    assert torch.allclose(read_points(f"{tmp_path}/g.ply").colors, torch.tensor([[0.5, 0.7820948, 0.0]]))
     (tmp_path / "p.ply").write_bytes(header("element vertex 1", *XYZ) + struct.pack("<3f", 1, 2, 3))
     assert read_points(tmp_path / "p.ply").colors.tolist() == [[0.5, 0.5, 0.5]]
     assert "no colours, so its points are grey" in caplog.text
@@ -128,13 +123,13 @@ def test_colours_of_a_gaussian_file_and_of_none_and_properties_outside_the_layou
     content = (tmp_path / "g.ply").read_bytes()
     extra = content.replace(b"end_header", b"property float filter_3D\nend_header") + struct.pack("<f", 1)
     (tmp_path / "g.ply").write_bytes(extra)
-    read_gaussians(tmp_path / "g.ply")
+    read_gaussians(f"{tmp_path}/g.ply")
     assert "filter_3D" in caplog.text
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     file = tmp_path / "g.ply"
-    write_gaussians(file, gaussians(2, 3))
+    write_gaussians(str(file), gaussians(2, 3))
     before = file.read_bytes()
     bad = gaussians(2, 3)
     bad.scales[1, 2] = torch.nan
@@ -142,12 +137,6 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> 
         write_gaussians(file, bad)
     assert file.read_bytes() == before
     assert list(tmp_path.iterdir()) == [file]
-
-
-def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
-    for path, problem in ((tmp_path / "absent.ply", "is not there"), (tmp_path, "cannot be read")):
-        with pytest.raises(DataError, match=f"file: {problem}"):
-            read_points(path)
 
 
 def test_opacities_of_exactly_0_and_1_and_scales_of_0_are_read(tmp_path: Path) -> None:

@@ -59,14 +59,6 @@ def opengl(view: int) -> list[list[float]]:
     return (np.linalg.inv(world_to_camera(view)) @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
 
 
-def largest_turn(a: Sequence[Frame], b: Sequence[Frame]) -> float:
-    """The largest angle, degrees, between two estimates of the cameras' rotations relative to the first camera."""
-    found, real = (torch.stack([frame.camera.world_to_camera[:3, :3] for frame in frames]) for frames in (a, b))
-    relative = (found[1:] @ found[:1].mT) @ (real[1:] @ real[:1].mT).mT
-    cosine = (relative.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
-    return float(torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).max())
-
-
 def in_a_row(*sizes: tuple[int, int], image: torch.Tensor | None = None) -> Capture:
     """Photos of these sizes, (width, height), from places side by side; gradients, unless an image is given."""
     frames = []
@@ -111,14 +103,6 @@ def turn(path: Path, orientation: int, *, rotate: bool = True) -> np.ndarray:
     stored = {3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90, 8: Image.Transpose.ROTATE_270}[orientation]
     (upright.transpose(stored) if rotate else upright).save(path, exif=exif)
     return np.array(upright)
-
-
-def link(folder: Path, elsewhere: Path) -> None:
-    """Move a folder of photos, and leave links in its place."""
-    folder.rename(elsewhere)
-    folder.mkdir()
-    for name in NAMES:
-        (folder / name).symlink_to(elsewhere / name)
 
 
 def colmap_bin(root: Path, model: str = "PINHOLE", parameters: tuple[float, ...] = (FOCAL, FOCAL, 8, 6)) -> Path:
