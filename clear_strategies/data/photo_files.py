@@ -120,7 +120,7 @@ def image_size(path: Path, *, turn: bool | None = None) -> tuple[int, int]:
 def has_alpha(path: Path) -> bool:
     """Return True if the image may have transparent pixels. Reads only the header; errors as of `read_image`."""
     with _opened(path, False) as image:
-        return _has_alpha(image)
+        return bool(image.has_transparency_data)
 
 
 def is_lossy(path: Path) -> bool:
@@ -268,7 +268,7 @@ def _to_float(path: Path, image: Image.Image, sixteen_bits: bool) -> Float[np.nd
     to_srgb = _to_srgb_of(image)
     if sixteen_bits and to_srgb is None:
         return _read_sixteen_bits(path)
-    pixels = np.array(_reduced(image.convert("RGBA" if _has_alpha(image) else "RGB")), np.float32) / 255
+    pixels = np.array(_reduced(image.convert("RGBA" if image.has_transparency_data else "RGB")), np.float32) / 255
     if to_srgb is not None:
         pixels[..., :3] = np.asarray(_reduced(to_srgb.apply(image.convert(to_srgb.input_mode))), np.float32) / 255
     return pixels
@@ -314,10 +314,6 @@ def _to_srgb(profile: bytes, grey: bool) -> Any:
 def _warn_of_colors(colors: str) -> None:
     """Warn once of photos whose files state other colours than sRGB, without a profile to convert them."""
     _log.warning("photos have the colours of %s, and are taken as sRGB. Export them in sRGB.", colors)
-
-
-def _has_alpha(image: Image.Image) -> bool:
-    return image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info
 
 
 def _read_sixteen_bits(path: Path) -> Float[np.ndarray, "H W C"]:

@@ -174,7 +174,13 @@ def _rgb(path: Path, table: np.ndarray) -> Float[Tensor, "N 3"]:
 def _read_vertices(path: Path) -> tuple[np.ndarray, str]:
     """Read the vertices, which must be the file's first element, as a structured array; also returns the header."""
     data = read_bytes(path)
-    header, start = _split_header(path, data[:_LONGEST_HEADER])
+    head = data[:_LONGEST_HEADER]
+    if not (first := re.match(rb"(?:\xef\xbb\xbf)?\s*ply\s*\n", head)):
+        raise DataError(path, "header", "does not begin with a line `ply`", "give a .ply file")
+    if not (last := re.search(rb"^[ \t]*end_header[ \t\r]*\n", head, re.MULTILINE)):
+        problem = f"has no line `end_header` in its first {_LONGEST_HEADER} bytes"
+        raise DataError(path, "header", problem, "the file is truncated; write it again")
+    header, start = head[first.end() : last.start()].decode("latin-1"), last.end()
     form, count, row, alone = _parse_header(path, header)
     dtype = np.dtype(row).newbyteorder(_BYTE_ORDERS[form])
     lines: list[str] = []
@@ -195,16 +201,6 @@ def _read_vertices(path: Path) -> tuple[np.ndarray, str]:
     except (ValueError, OverflowError, Warning) as error:
         problem = f"cannot be read ({str(error).partition(';')[0]})"
         raise DataError(path, "element vertex", problem, "export it again") from error
-
-
-def _split_header(path: Path, head: bytes) -> tuple[str, int]:
-    """Return the lines between `ply` and `end_header`, and the offset of the data."""
-    if not (first := re.match(rb"(?:\xef\xbb\xbf)?\s*ply\s*\n", head)):
-        raise DataError(path, "header", "does not begin with a line `ply`", "give a .ply file")
-    if not (last := re.search(rb"^[ \t]*end_header[ \t\r]*\n", head, re.MULTILINE)):
-        problem = f"has no line `end_header` in its first {_LONGEST_HEADER} bytes"
-        raise DataError(path, "header", problem, "the file is truncated; write it again")
-    return head[first.end() : last.start()].decode("latin-1"), last.end()
 
 
 def _parse_header(path: Path, header: str) -> tuple[str, int, list[tuple[str, str]], bool]:

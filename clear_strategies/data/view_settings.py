@@ -6,7 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -22,7 +22,6 @@ _log = logging.getLogger(__name__)
 
 Sizes = Literal["crop", "round"]
 PhotosAre = Literal["lr", "hr", "both"]
-_TWICE: Final = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,8 +174,8 @@ def within_limit(
         return capture, views
     size = f"{photo.width // views.shrink}x{photo.height // views.shrink}"
     why = f"x{views.sr_scale} of {size} is {views.sr_scale**2 * pixels:.3g} megapixels, data.views.max_hr_megapixels is {limit:g}"
-    if views.sr_scale > _TWICE and _TWICE**2 * pixels <= limit and reaches(_TWICE):
-        return _noted(capture, f"{why}: x{_TWICE} instead"), replace(views, sr_scale=_TWICE)
+    if views.sr_scale > 2 and 4 * pixels <= limit and reaches(2):
+        return _noted(capture, f"{why}: x2 instead"), replace(views, sr_scale=2)
     factor = views.sr_scale**2 if super_resolve else 1
     multiple = 1 if super_resolve else views.sr_scale
     ratios = [views.shrink * max(1.0, math.sqrt(factor * _megapixels(f.camera, views) / limit)) for f in capture.frames]

@@ -151,8 +151,6 @@ def test_missing_points_are_refused_and_sfm_points_are_marked_as_using_test_view
     none = torch.zeros(0, dtype=torch.long)
     with pytest.raises(DataError, match="come without tracks"):
         from_tracks(replace(sfm(), track_point=none, track_image=none), [1], 1)
-    with pytest.raises(DataError, match="there are none, but init=sfm_train"):
-        initial_points(CloudSettings(init="sfm_train"), [photo()])
     for init in ("sfm", "sfm_train"):
         cloud = initial_points(CloudSettings(init=init, densify=False), [photo()], sfm=sfm(), train_ids=[1, 2, 3]).cloud
         assert cloud.uses_test_views == "yes"

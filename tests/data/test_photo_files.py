@@ -120,15 +120,11 @@ def test_a_rotation_that_a_png_file_has_behind_its_pixels_is_known_before_they_a
 
 
 def test_images_are_listed_by_name_and_ending_and_the_first_of_the_usual_folders_is_taken(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="has none of the folders"):
-        photo_folders.image_folder(tmp_path)
     (tmp_path / "images_8").mkdir()
     (tmp_path / "images_4").mkdir()
     found = photo_folders.image_folder(tmp_path)
     assert photo_folders.folder_note(found) == "images_4 (there are also images_8)"
     assert photo_folders.image_folder(tmp_path, "images_8").name == "images_8"
-    with pytest.raises(DataError, match="choose one of images_4, images_8"):
-        photo_folders.image_folder(tmp_path, "images")
     for name in ("b.JPG", "a.png", "notes.txt", "c.tif"):
         (tmp_path / name).touch()
     (tmp_path / "folder.png").mkdir()

@@ -89,12 +89,12 @@ def read(
 def _splits_of(file: Path, lists: _Shared, paths: Sequence[Path], find: Callable[[str], Path]) -> dict[Path, str]:
     """The split of each photo that the file's lists name; warns of names that are no frame's."""
     splits: dict[Path, str] = {}
-    removed = list[str]()
+    removed, listed = list[str](), set(paths)
     for key, split in _SPLIT_LISTS.items():
         for name in getattr(lists, key):
-            if find(name) not in paths:
+            if (path := find(name)) not in listed:
                 removed.append(name)
-            elif splits.setdefault(find(name), split) != split:
+            elif splits.setdefault(path, split) != split:
                 raise DataError(file, key, f"{name!r} is for training, too", "list each photo once")
     if removed:
         message = "%s: %s in its split lists, and no frame's file_path: %s."

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.data.priors import Bicubic, Cached, Corrupted, Ncnn, fingerprint, ncnn, network_of
@@ -90,19 +89,13 @@ def test_the_network_behind_a_prior_is_found_and_named_by_its_weights(fake: Path
     assert fingerprint(network).endswith(f", WAIFU2X_PHOTO_UP2X.bin {repeat}")
 
 
-def truth_and_lr() -> tuple[Tensor, Tensor]:
-    """A photo of the demo."""
-    truth = images.crop_to_multiple(demo.read(width=192, height=128, views=3, train=2).frames[0].load(), 4)
-    return truth, images.downsample(truth, 4)
-
-
 @real
 def test_waifu2x_is_nearer_to_the_truth_than_bicubic_and_realesrgan_is_another(caplog):
-    truth, lr = truth_and_lr()
+    truth = images.crop_to_multiple(demo.read(width=192, height=128, views=3, train=2).frames[0].load(), 4)
+    lr = images.downsample(truth, 4)
     assert psnr(Ncnn()("view", lr, 4), truth) > psnr(Bicubic()("view", lr, 4), truth) + 0.5
     half = images.downsample(truth, 2)
     assert psnr(Ncnn()("view", half, 2), truth) > psnr(Bicubic()("view", half, 2), truth) + 0.5
-    _, lr = truth_and_lr()
     sr = Ncnn("realesrgan")("view", lr, 4)
     assert psnr(images.downsample(sr, 4, "area"), lr) > 25
     assert not torch.equal(sr, Ncnn()("view", lr, 4))
