@@ -110,7 +110,7 @@ def _programs() -> Iterator[tuple[str, str]]:
 
 
 def _cache() -> Iterator[tuple[str, str]]:
-    from clear_strategies.data.priors.cache import cache_folder
+    from clear_strategies.data.priors import cache_folder
 
     folder = cache_folder()
     files = [path for path in folder.rglob("*") if path.is_file()] if folder.is_dir() else []

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Final
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -122,6 +123,20 @@ class Capture:
     notes: dict[str, str] = field(default_factory=dict)
     own_prior: Callable[[Mapping[str, Callable[[], Float[Tensor, "H W 3"]]]], Prior] | None = None
     unplaced: Mapping[str, str] = field(default_factory=dict)
+
+
+def rigid_inverse(file: Path, where: str, rotation: np.ndarray, center: np.ndarray) -> Float[Tensor, "4 4"]:
+    """World-to-camera of a camera with these axes (columns) and centre; a DataError unless the axes are orthonormal and
+    right-handed within 1e-3.
+    """
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or abs(np.linalg.det(rotation) - 1) > 1e-3:
+        problem = f"holds no rotation (determinant {np.linalg.det(rotation):.4g})"
+        raise DataError(file, where, problem, "remove scale and reflection from the camera-to-world matrices")
+    left, _, right = np.linalg.svd(rotation)  # the nearest exact rotation, because files keep six digits
+    pose = np.eye(4)
+    pose[:3, :3] = (left @ right).T
+    pose[:3, 3] = -pose[:3, :3] @ center
+    return torch.from_numpy(pose)
 
 
 def sorted_by_name(frames: Sequence[Frame], file: Path) -> tuple[Frame, ...]:

@@ -26,8 +26,7 @@ from clear_strategies.data.cloud import CloudSettings, initial_points, require_s
 from clear_strategies.data.lenses import forget_maps
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.priors import Bicubic, Prior
-from clear_strategies.data.priors.cache import kept_network_of
-from clear_strategies.data.priors.interface import super_resolved, warn_if_far_from_lr
+from clear_strategies.data.priors.interface import kept_network_of, super_resolved, warn_if_far_from_lr
 from clear_strategies.data.scene import Scene, require_shown
 from clear_strategies.data.scene_notes import scene_notes, size_of
 from clear_strategies.data.view_names import ViewFiles, write_pngs

@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from clear_strategies import files
 from clear_strategies.data import strict_json
-from clear_strategies.data.poses import rigid_inverse
+from clear_strategies.data.capture import rigid_inverse
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.strict_json import Number, typed
 from clear_strategies.data.view_settings import resized

@@ -86,7 +86,7 @@ def binary(folder: Path) -> dict[str, Target]:
         _require(bool((found.tensors["field/means"] == 1.0).all()) and found.t == 100)
 
     return {
-        "COLMAP cameras.bin": ([cameras], lambda: _require_lenses(colmap_model.read_cameras(cameras).values())),
+        "COLMAP cameras.bin": ([cameras], lambda: _require_lenses(colmap_model.read_cameras(cameras, {1}).values())),
         "COLMAP images.bin": ([images], lambda: _require_images(colmap_model.read_images(images))),
         "COLMAP points3D.bin": ([points], lambda: _require_points(colmap_model.read_points(points))),
         "PLY": ([cloud], read_gaussians),
@@ -105,7 +105,7 @@ def text(folder: Path) -> dict[str, Target]:
         _require(image.dim() == 3 and bool(image.isfinite().all()))
 
     return {
-        "COLMAP cameras.txt": ([cameras], lambda: _require_lenses(colmap_model.read_cameras(cameras).values())),
+        "COLMAP cameras.txt": ([cameras], lambda: _require_lenses(colmap_model.read_cameras(cameras, {1}).values())),
         "COLMAP images.txt": ([images], lambda: _require_images(colmap_model.read_images(images))),
         "COLMAP points3D.txt": ([points], lambda: _require_points(colmap_model.read_points(points))),
         "transforms.json": ([shared / "transforms.json"], lambda: _require_capture(nerfstudio.read(shared))),

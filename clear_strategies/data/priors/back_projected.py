@@ -11,8 +11,7 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.core.checks import require_choice, require_whole
 from clear_strategies.core.images import DownKernel
-from clear_strategies.data.priors.cache import cached
-from clear_strategies.data.priors.interface import Prior, SuperResolved, super_resolved
+from clear_strategies.data.priors.interface import Prior, SuperResolved, cached, super_resolved
 
 _MOST_ROUNDS: Final = 100  # each about halves the difference, which is below float32's resolution after 30
 

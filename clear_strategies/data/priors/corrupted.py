@@ -19,8 +19,7 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.core.checks import require_number, require_whole
-from clear_strategies.data.priors.cache import cached
-from clear_strategies.data.priors.interface import Prior
+from clear_strategies.data.priors.interface import Prior, cached
 from clear_strategies.errors import DataError
 
 _ROUNDS: Final = 20  # of back-projection: the LR pixels then agree to less than a grey level

@@ -147,8 +147,8 @@ def read_model(folder: Path) -> Model:
     return Model(folder, listing, lenses, images, points)
 
 
-def read_cameras(path: Path, used: Set[int] | None = None) -> dict[int, Lens]:
-    """Read the lenses of the cameras in `used`, None: of all, by id; others are not checked. Errors as of `read_model`."""
+def read_cameras(path: Path, used: Set[int]) -> dict[int, Lens]:
+    """Read the lenses of the cameras in `used`, by id; others are not checked. Errors as of `read_model`."""
     return _by_id(path, _binary_cameras(path, used) if path.suffix == ".bin" else _text_cameras(path, used))
 
 
@@ -244,18 +244,17 @@ class _Bytes:
             raise _damaged(self.path, "end", f"{left} bytes are left over")
 
 
-def _binary_cameras(path: Path, used: Set[int] | None) -> Iterator[tuple[int, Lens]]:
+def _binary_cameras(path: Path, used: Set[int]) -> Iterator[tuple[int, Lens]]:
     file = _Bytes(path)
     for i in range(file.count("number of cameras")):
         number, kind, width, height = file.take(_CAMERA, f"camera {i}")
         where = f"camera {number}"
         model = dict(enumerate(CAMERA_MODELS)).get(kind, f"number {kind}")
-        wanted = used is None or number in used
-        if wanted or model not in CAMERA_MODELS:  # of an unknown model the length is unknown, too
+        if number in used or model not in CAMERA_MODELS:  # of an unknown model the length is unknown, too
             terms_of(path, where, model)  # refuses those that are not supported
         layout = struct.Struct(f"<{len(CAMERA_MODELS[model].split())}d")
         parameters = file.take(layout, f"parameters of {where}")
-        if wanted:
+        if number in used:
             yield number, _lens(path, where, model, (width, height), parameters)
     file.finish()
 
@@ -279,10 +278,10 @@ def _binary_points(path: Path) -> Iterator[_Point]:
     file.finish()
 
 
-def _text_cameras(path: Path, used: Set[int] | None) -> Iterator[tuple[int, Lens]]:
+def _text_cameras(path: Path, used: Set[int]) -> Iterator[tuple[int, Lens]]:
     for line, cells in _rows(path):
         (number,) = _numbers(path, line, cells[:1], _whole)
-        if used is not None and number not in used:
+        if number not in used:
             continue
         if len(cells) < 4:
             raise _damaged(path, f"line {line}", f"has {len(cells)} of at least 5 columns")

@@ -8,19 +8,22 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PureWindowsPath
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import msgspec
+import numpy as np
+from jaxtyping import Float
+from msgspec import Meta
+from torch import Tensor
 
 from clear_strategies.core.checks import as_color
-from clear_strategies.data.capture import BLACK, Capture, Frame, SfmPoints, lens_notes, sorted_by_name
+from clear_strategies.data.capture import BLACK, Capture, Frame, SfmPoints, lens_notes, rigid_inverse, sorted_by_name
 from clear_strategies.data.file_names import finder, named, names_below, some
-from clear_strategies.data.lenses import Lens, lens_of
+from clear_strategies.data.lenses import FARTHEST, Lens, lens_of
 from clear_strategies.data.masks import masks_of
 from clear_strategies.data.photo_files import image_size
 from clear_strategies.data.photo_folders import image_folder, usable
 from clear_strategies.data.ply import read_points
-from clear_strategies.data.poses import pose_from_opengl
 from clear_strategies.data.strict_json import Number, read_object, typed
 from clear_strategies.errors import DataError, counted
 from rasterizers.interface import Color
@@ -30,6 +33,11 @@ _log = logging.getLogger(__name__)
 _FILE: Final = "transforms.json"
 _SPLIT_LISTS: Final = {"train_filenames": "train", "val_filenames": "test", "test_filenames": "test"}
 _COEFFICIENTS: Final = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+_Coordinate = Annotated[float, Meta(gt=-FARTHEST, lt=FARTHEST)]
+_Rows = Annotated[
+    list[Annotated[list[_Coordinate], Meta(min_length=4, max_length=4)]], Meta(min_length=3, max_length=4)
+]
 
 
 class _Shared(msgspec.Struct):
@@ -216,12 +224,25 @@ def frames_of(
             where, path = f"frames[{i}]", entry.path
             if path not in kept:
                 continue
-            pose = pose_from_opengl(file, f"{where}.transform_matrix", entry.transform.transform_matrix)
+            pose = _pose_of(file, f"{where}.transform_matrix", entry.transform.transform_matrix)
             lens, mask = entry.transform.lens(file, where, path), masks.get(path)
             frames.append(
                 Frame.of_photo(entry.name, path, lens, pose, background=background, split=entry.split, mask=mask)
             )
     return frames
+
+
+def _pose_of(file: Path, where: str, matrix: object) -> Float[Tensor, "4 4"]:
+    """Convert a camera-to-world matrix with OpenGL axes (x right, y up, z back) to world-to-camera with OpenCV axes."""
+    remedy = "write camera-to-world matrices: a rotation, a translation, last row 0 0 0 1"
+    try:
+        rows = np.array(msgspec.convert(matrix, _Rows))
+    except msgspec.ValidationError as error:
+        raise DataError(file, where, "is no 3x4 or 4x4 matrix of finite numbers", remedy) from error
+    if len(rows) == 4 and np.abs(rows[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise DataError(file, where, f"has the last row {rows[3].tolist()}", remedy)
+    rotation = rows[:3, :3] * np.array([1.0, -1.0, -1.0])  # OpenGL's y and z axes are opposite
+    return rigid_inverse(file, where, rotation, rows[:3, 3])
 
 
 def points_of(file: Path, content: Mapping[str, Any]) -> SfmPoints | None:

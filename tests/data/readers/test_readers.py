@@ -207,18 +207,6 @@ def test_photos_may_all_lie_in_subfolders_with_masks_in_subfolders_of_the_same_n
     assert (bool(a().any()), bool(b().all()), c) == (False, True, None)
 
 
-def test_of_several_models_the_one_with_most_photos_is_read(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    tiny.colmap_txt(tmp_path)
-    small = tmp_path / "sparse/0"
-    shutil.copytree(small, tmp_path / "sparse/1")
-    lines = (small / "images.txt").read_text().splitlines(keepends=True)
-    (small / "images.txt").write_text("".join(lines[:-2]))  # an image has two lines
-    (small / "points3D.txt").unlink()
-    with caplog.at_level("WARNING"):
-        assert len(colmap.read(tmp_path).frames) == 3
-    assert "The largest, 1 with 3 photos, is used; the others are not: 0 with 2." in caplog.text
-
-
 def test_a_missing_file_of_points_and_a_quaternion_of_another_length_are_noted(tmp_path: Path) -> None:
     file = tiny.colmap_txt(tmp_path) / "sparse/0/images.txt"
     file.write_text(file.read_text().replace("1 1.0 0.0 0.0 0.0", "1 1.5 0.0 0.0 0.0"))

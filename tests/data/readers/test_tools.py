@@ -277,7 +277,7 @@ def test_other_models_are_refused_by_name(model, parameters, command, layout, tm
 
     root = with_model(tmp_path, model, parameters, layout)
     with pytest.raises(DataError, match=command):
-        read_cameras(root / "cameras.bin" if layout == "bin" else root / "sparse/0/cameras.txt")
+        read_cameras(root / "cameras.bin" if layout == "bin" else root / "sparse/0/cameras.txt", {1})
 
 
 # ---- too little to train on

@@ -138,7 +138,7 @@ POSED: dict[str, tuple[str, Callable[[Path], object], str]] = {
             shutil.copytree(root / "sparse/0", root / "sparse/1"),
             (root / "sparse/0/images.bin").write_bytes(struct.pack("<Q", 0)),
         ],
-        "The largest, 1 with 3 photos, is used",
+        "The largest, 1 with 3 photos, is used; the others are not: 0 with 0.",
     ),
     "an unused panoramic camera": ("colmap_txt", appended(CAMERAS, "2 EQUIRECTANGULAR 100 50\n"), ""),
     "an unused camera of an unknown model": ("colmap_txt", appended(CAMERAS, "2 PANORAMIC 100 50 x\n"), ""),
