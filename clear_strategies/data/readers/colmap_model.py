@@ -294,25 +294,13 @@ def _text_cameras(path: Path, used: Set[int]) -> Iterator[tuple[int, Lens]]:
 
 
 def _text_images(path: Path) -> Iterator[Image]:
-    """Parse a line for each image's pose, and the line of its 2D points after it, which is ignored and may be empty or missing.
-
-    Lines that could be either are poses if the number of images in the file's header says so.
-    """
-    poses, either = list[tuple[int, str]](), list[tuple[int, str]]()
+    """Parse the pose of each image, and the line of its 2D points after it, which is ignored and may be empty or missing."""
+    poses, after_pose = list[tuple[int, str]](), False
     stated, lines = _lines(path)
-    after_pose = False  # the line before is a pose
     for line, text in lines:
-        pose = _could_be_pose(text)
-        points = after_pose and len(text.split()) % 3 == 0 and not (pose and text.strip(_NUMERIC))
-        if points and pose:
-            either.append((line, text))
-        elif text.strip() and not points:
+        points = after_pose and len(text.split()) % 3 == 0 and not text.strip(_NUMERIC)
+        if after_pose := bool(text.strip()) and not points:
             poses.append((line, text))
-        after_pose = bool(text.strip()) and not points
-    if either and stated not in (len(poses), len(poses) + len(either)):
-        raise _damaged(path, f"line {either[0][0]}", "could be an image's pose or the 2D points of the image above")
-    if either and stated > len(poses):
-        poses = sorted(poses + either)
     _warn_if_truncated(path, stated, len(poses))
     for line, text in poses:
         cells = text.split(maxsplit=9)
@@ -321,17 +309,6 @@ def _text_images(path: Path) -> Iterator[Image]:
         number, camera = _numbers(path, line, (cells[0], cells[8]), _whole)
         numbers = _numbers(path, line, cells[1:8], float)
         yield Image(number, tuple(numbers[:4]), tuple(numbers[4:]), camera, cells[9].strip())
-
-
-def _could_be_pose(text: str) -> bool:
-    """Return True if a line has the columns of an image: id, quaternion of a length in (0.5, 2), camera id and name."""
-    cells = text.split(maxsplit=9)
-    if len(cells) < 10 or not (cells[0].isdecimal() and cells[8].isdecimal()):
-        return False
-    try:
-        return 0.5 < math.hypot(*map(float, cells[1:5])) < 2
-    except ValueError:
-        return False
 
 
 def _text_points(path: Path) -> Iterator[_Point]:

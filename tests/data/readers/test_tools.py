@@ -179,18 +179,6 @@ def test_images_without_a_line_of_points_are_all_read(names: tuple[str, ...], po
     tiny.require_poses(colmap.read(root))
 
 
-def test_of_a_line_that_could_be_a_pose_or_points_the_header_decides(tmp_path: Path) -> None:
-    root, names = tiny.colmap_txt(tmp_path), ("0 0 1", "0 0 2", "0 0 3")
-    for old, new in zip(NAMES, names, strict=True):
-        (root / "images" / old).rename(root / "images" / f"{new}.png")
-    listing, header = root / "sparse/0/images.txt", "# Number of images: 3, mean observations per image: 0\n"
-    listing.write_text(tiny.images_txt(names, "", header))
-    tiny.require_poses(colmap.read(root))
-    listing.write_text(tiny.images_txt(names, ""))
-    with pytest.raises(DataError, match=r"images\.txt: line 2: could be an image's pose or the 2D points"):
-        colmap.read(root)
-
-
 def test_a_text_model_that_has_fewer_images_than_its_header_says_is_told(tmp_path: Path, caplog) -> None:
     root = tiny.colmap_txt(tmp_path)
     (root / "sparse/0/points3D.txt").unlink()

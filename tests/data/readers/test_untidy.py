@@ -325,6 +325,15 @@ def test_untidy_photos_that_can_be_read_are_read(of_photos, name, caplog):
     assert all(bool(frame.load().isfinite().all()) for frame in capture.frames)
 
 
+def only(folder: Path, *names: str) -> None:
+    """Only these files, in place of the photos."""
+    for photo in folder.iterdir():
+        photo.unlink()
+    for name in names:
+        (folder / name).parent.mkdir(exist_ok=True, parents=True)
+        (folder / name).write_bytes(b"never opened")
+
+
 SKIP, BROKEN = {"skip_faulty": True}, "data.reader.skip_faulty=true"
 # What is done to the folder, parts of the message, and the setting that goes on without the photo, if there is one.
 REFUSED: dict[str, tuple[Callable[[Path], object], tuple[str, ...], dict[str, object] | None]] = {
@@ -334,6 +343,18 @@ REFUSED: dict[str, tuple[Callable[[Path], object], tuple[str, ...], dict[str, ob
     ),
     "two files of one name": (lambda f: image_of(f / "a.png").save(f / "a.jpg"), ("'a' has several files", "keep one"), None),
     "two photos": (lambda f: (f / "b.png").unlink(), ("there are 2, poses need at least 3", "take more photos"), None),
+    # No photo: what there is, and what makes photos of it; tests/mistakes.csv has more.
+    "raw photos on a card": (
+        lambda f: only(f, "DCIM/100CANON/IMG_1.CR3"), ("but raw photos (1): IMG_1.CR3: develop them",), None
+    ),
+    "an archive": (
+        lambda f: only(f, "my photos.zip"), ("unpack them, and give the folder: unzip 'my photos.zip' -d FOLDER",), None
+    ),
+    "a video": (lambda f: only(f, "clip.MOV"), ("ffmpeg -i VIDEO -vf thumbnail=15",), None),
+    "another format": (
+        lambda f: only(f, "a.avif", "b.avif", "c.bmp"), ("save them as PNG or JPEG: mogrify -format png a.avif",), None
+    ),
+    "what a Mac leaves of raw photos": (lambda f: only(f, "._IMG_1.CR2"), ("check the path",), None),
 }  # fmt: skip
 
 
@@ -375,34 +396,6 @@ def test_photos_in_the_only_folder_that_holds_enough_are_used_with_a_line(place,
     capture = photos.read(root, folder.parent / "cache")
     assert (capture.name, [frame.name for frame in capture.frames]) == ("scene", ALL)
     assert told in caplog.text if told else not caplog.text
-
-
-def beside_each_other(folder: Path, *names: str) -> None:
-    """Only these files, in place of the photos."""
-    for photo in folder.iterdir():
-        photo.unlink()
-    for name in names:
-        (folder / name).parent.mkdir(exist_ok=True, parents=True)
-        (folder / name).write_bytes(b"never opened")
-
-
-# What lies in the folder, and what the message says of it; tests/mistakes.csv has more.
-NO_PHOTOS: dict[str, tuple[tuple[str, ...], str]] = {
-    "raw photos on a card": (("DCIM/100CANON/IMG_1.CR3",), r"but raw photos \(1\): IMG_1.CR3: develop them"),
-    "an archive": (("my photos.zip",), "unpack them, and give the folder: unzip 'my photos.zip' -d FOLDER"),
-    "a video": (("clip.MOV",), "ffmpeg -i VIDEO -vf thumbnail=15"),
-    "another format": (("a.avif", "b.avif", "c.bmp"), "save them as PNG or JPEG: mogrify -format png a.avif"),
-    "what a Mac leaves of raw photos": (("._IMG_1.CR2",), "check the path"),
-}
-
-
-@pytest.mark.parametrize("name", NO_PHOTOS)
-def test_where_there_is_no_photo_the_message_says_what_there_is_and_what_makes_photos_of_it(name, of_photos):
-    folder, read = of_photos
-    names, message = NO_PHOTOS[name]
-    beside_each_other(folder, *names)
-    with pytest.raises(DataError, match=message):
-        read()
 
 
 # A file in place of a folder, and what the message says; tests/mistakes.csv has more.
