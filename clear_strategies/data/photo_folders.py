@@ -45,8 +45,6 @@ def image_folder(root: Path, name: str | None = None) -> Path:
     exists, else `root` itself, else the only folder below it that contains images.
     """
     present = [folder for name in _FOLDERS if (folder := named(root, name)).is_dir()]
-    if not root.is_dir():
-        raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
     if name is not None:
         if not (folder := named(root, name)).is_dir():
             remedy = f"choose one of {', '.join(path.name for path in present)}" if present else "check the path"

@@ -42,6 +42,10 @@ def test_auto_triangulates_where_it_can_then_takes_stereo_then_random_points(cap
     assert cloud.source.startswith("random")
     assert cloud.uses_test_views == "no"
     assert "auto chose random points: the training LR images give only 0 (data.cloud.enough: 50)" in caplog.text
+    chosen = CloudSettings(enough=2, densify=False, outlier_neighbours=0)
+    cloud = initial_points(chosen, flat_photos(), sfm=sfm(), train_ids=[1, 2, 3], sfm_is_train=True).cloud
+    assert torch.equal(cloud.means, sfm().means[[0, 2]])  # those that two views observe
+    assert cloud.uses_test_views == "no"
 
 
 @pytest.mark.parametrize(

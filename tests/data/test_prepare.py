@@ -10,7 +10,7 @@ from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.prepare import check_headers, prepare, save_lr
-from clear_strategies.data.priors import Bicubic
+from clear_strategies.data.priors import Bicubic, Images
 from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split, within_limit
 from clear_strategies.errors import DataError, SettingError
 from rasterizers import Camera
@@ -135,6 +135,15 @@ def test_a_ready_made_lr_image_that_is_not_like_its_photo_gives_a_warning(tmp_pa
     assert made.notes["LR"] == f"4x4, read from {tmp_path} (D is taken to be bicubic)"
     with pytest.raises(SettingError, match=r"data\.views\.lr_folder: must be null"):
         ViewSettings(photos_are="lr", lr_folder="here")
+
+
+def test_bicubic_replaces_a_missing_sr_image_of_a_test_view_and_of_no_other(tmp_path):
+    write_png(tmp_path / "0001.png", torch.full((16, 16, 3), 0.5))  # of the training view
+    made = prepare(capture(2), papers(train=1), Images(str(tmp_path)), POINTS)
+    assert [view.sr_source for view in (*made.train, *made.test)] == [f"images {tmp_path}", Bicubic().label]
+    (tmp_path / "0001.png").rename(tmp_path / "0000.png")
+    with pytest.raises(DataError, match="has no SR image 0001"):
+        prepare(capture(2), papers(train=1), Images(str(tmp_path)), POINTS)
 
 
 RIG = ("cam1/0001.png", "cam1/0002.png", "cam2/0001.png", "cam2/rgb.0003.png")
