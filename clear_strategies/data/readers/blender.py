@@ -12,6 +12,7 @@ from clear_strategies.data.file_names import finder, named, names_below
 from clear_strategies.data.readers.nerfstudio import Listed, frames_of, points_of, transforms_of
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.data.view_names import bare
+from clear_strategies.errors import DataError
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
@@ -40,6 +41,8 @@ def read(root: str | Path, *, background: Color = _WHITE, skip_faulty: bool = Fa
         DataError: something is missing or not what it should be.
     """
     root, background = Path(root), as_color("data.reader.background", background)
+    if not root.is_dir():
+        raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
     find, splits = finder(root), {named(root, _TRAIN): "train"}
     if (test := named(root, "transforms_test.json")).exists():
         splits[test] = "test"
