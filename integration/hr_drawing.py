@@ -12,7 +12,8 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from functools import partial
+from typing import Any, NamedTuple, cast
 
 import torch
 from jaxtyping import Float
@@ -30,9 +31,9 @@ from integration.host import Host
 from integration.views import enlarged_mask
 from rasterizers.autograd import BackwardHook, Drawing
 from rasterizers.inputs import Inputs
-from rasterizers.interface import Camera, Rasterizer, Recordable, can_be_recorded, over
+from rasterizers.interface import Camera, Rasterizer, can_be_recorded, over
 from rasterizers.modes import in_full_precision
-from rasterizers.replays import GraphKey, copied, write
+from rasterizers.replays import GraphKey, shapes_of
 
 _log = logging.getLogger(__name__)
 
@@ -56,10 +57,10 @@ class Drawable:
     background: Float[Tensor, "1 3"]
     params: Mapping[str, Tensor]
 
-    @property
-    def inputs(self) -> Inputs:
-        """The tensors that are drawn, without their graph."""
-        return Inputs(**self.drawn, rgb_offset=self.offset).drawn(self.bands)
+    def compared_with(self, photo: Photo, **more: Any) -> _RenderInputs:
+        """What is drawn, without its graph, and the photo that it is compared with."""
+        drawn = Inputs(**self.drawn, rgb_offset=self.offset).drawn(self.bands)
+        return _RenderInputs(*drawn, self.background, self.camera, photo.image, photo.shown, **more)
 
 
 RenderAt = Callable[[Target, Float[Tensor, " N"] | None, View], HostOutput | Drawable]
@@ -69,43 +70,34 @@ return a `Drawable`, which `HrDrawing` then renders.
 """
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _RenderInputs:
+class _RenderInputs(NamedTuple):
     """All tensors that the work on one picture reads.
 
     Args:
-        drawn: see `Drawable.inputs`.
-        photo: what the picture is compared with.
+        means, quats, scales, opacities, colors, rgb_offset: see `Drawable`.
+        image, shown: of the photo that the picture is compared with.
         looked_up: see `Step.looked_up`; None for an extra view.
         weight: of the pixels of an extra view; None at HR.
         mask: by which the host multiplies the picture.
     """
 
-    drawn: Inputs
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+    rgb_offset: Tensor | None
     background: Float[Tensor, "1 3"]
     camera: Camera
-    photo: Photo
-    looked_up: Tensor | None
-    weight: Tensor | None
-    mask: Float[Tensor, "H W 1"] | None
+    image: Tensor
+    shown: Tensor | None
+    looked_up: Tensor | None = None
+    weight: Tensor | None = None
+    mask: Float[Tensor, "H W 1"] | None = None
 
-    def copied(self) -> _RenderInputs:
-        photo = Photo(self.photo.camera, self.photo.image.clone(), copied(self.photo.shown))
-        drawn, background = self.drawn.copied(), self.background.clone()
-        rest = map(copied, (self.looked_up, self.weight, self.mask))
-        return _RenderInputs(drawn, background, replace(self.camera), photo, *rest)
-
-    @property
-    def of_the_scene(self) -> list[Tensor | None]:
-        return [*self.drawn, self.photo.image, self.photo.shown, self.looked_up, self.weight, self.mask]
-
-    def tensors(self, rasterizer: Recordable) -> list[Tensor | None]:
-        numbers = rasterizer.numbers_of(self.camera, self.background.device)
-        return [*self.of_the_scene, self.background, *numbers]
-
-    @property
-    def shapes(self) -> tuple[Any, ...]:
-        return tuple(None if x is None else x.shape for x in self.of_the_scene)
+    def over(self, photo: Photo) -> Photo:
+        """The photo with this image."""
+        return Photo(photo.camera, self.image, self.shown)
 
     def shot(self, asked: Drawable) -> AutogradShot:
         rasterizer = asked.rasterizer
@@ -114,7 +106,8 @@ class _RenderInputs:
         else:
             red, green, blue = self.background[0].tolist()
             rasterizer = over(rasterizer, (red, green, blue))
-        r = rasterizer(self.drawn.splats(), self.camera)
+        drawn = Inputs(self.means, self.quats, self.scales, self.opacities, self.colors, self.rgb_offset)
+        r = rasterizer(drawn.splats(), self.camera)
         drawing = Drawing(r, asked.drawn, r.image, BackwardHook())
         image = r.image if self.mask is None else r.image * self.mask
         return AutogradShot(image, r.means2d, r.visible, asked.params, drawings=(drawing,), mask=self.mask)
@@ -189,14 +182,14 @@ class HrDrawing:
         conductor = self._conductor
         photo = view.hr.over(conductor.background(t), view.background)
         looked_up = None if self._replays is None else conductor.looked_up(view)
-        inputs = _RenderInputs(asked.inputs, asked.background, asked.camera, photo, looked_up, None, mask)
 
         def work(inputs: _RenderInputs) -> tuple[HrSide, dict[str, Number]]:
-            shown = view if inputs.photo is photo else replace(view, hr=inputs.photo)
+            shown = view if inputs.image is photo.image else replace(view, hr=inputs.over(photo))
             shot = inputs.shot(asked)
             hr = conductor.hr_gradients(shot, shown, t, AutogradShot.gradients, looked_up=inputs.looked_up)
             return hr, {**hr.losses}  # Eq. 9, 10, 12, 13
 
+        inputs = asked.compared_with(photo, looked_up=looked_up, mask=mask)
         hr, losses = self._done(asked, inputs, t, ("hr", view.factor), work)
         params = {name: p.detach() for name, p in asked.params.items()}
         step = hr.step if self._replays is None else hr.step.copied()
@@ -209,14 +202,14 @@ class HrDrawing:
         """As `extra_view`, drawn by this package."""
         conductor = self._conductor
         photo = extra.photo.over(conductor.background(t), extra.background)
-        inputs = _RenderInputs(asked.inputs, asked.background, asked.camera, photo, None, extra.weight, None)
 
         def work(inputs: _RenderInputs) -> tuple[Grads, dict[str, Number]]:
             shot = inputs.shot(asked)
-            shown = replace(extra, photo=inputs.photo, weight=cast(Tensor, inputs.weight))
+            shown = replace(extra, photo=inputs.over(photo), weight=cast(Tensor, inputs.weight))
             (g,) = shot.gradients(conductor.extra_loss(shot.image, shown, t).cotangents)
             return g, {}
 
+        inputs = asked.compared_with(photo, weight=extra.weight)
         g, _ = self._done(asked, inputs, t, ("extra", extra.robust), work)
         found = every_number(to_parameters(g, asked.drawn, asked.params), asked.params)
         return Grads({name: x.clone() for name, x in found.items()})  # the next replay overwrites some of them
@@ -228,15 +221,13 @@ class HrDrawing:
             return work(inputs)
         called = *conductor.comparing, conductor.owner("observe"), conductor.owner("route")
         state = [x.data_ptr() for s in called if s is not None for x in stored(s)]
-        key = GraphKey((len(asked.drawn["means"]), *state), inputs.shapes, (rasterizer, *constants))
+        key = GraphKey((len(inputs.means), *state), shapes_of(inputs), (rasterizer, *constants))
+        device = inputs.means.device
 
-        def record() -> RecordedWork[_RenderInputs, _Made]:
-            static = inputs.copied()
-            tensors = static.tensors(rasterizer)
+        def record() -> RecordedWork[Any]:
             return RecordedWork(
-                inputs.background.device, conductor, lambda: work(static),
-                write=lambda new: write(tensors, new.tensors(rasterizer)), outcome=lambda _, made, row: (made, row),
-                calls=conductor.comparing,
+                device, conductor, lambda copies: work(_RenderInputs(*copies)), inputs, t,
+                numbers_of=partial(rasterizer.numbers_of, device=device), calls=conductor.comparing,
             )  # fmt: skip
 
         return self._replays.do(key, t, inputs, live=lambda: work(inputs), record=record)

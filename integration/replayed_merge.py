@@ -6,14 +6,17 @@ tensors. It reads in place the parameters, and what strategies that reconcile or
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Final
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any, Final
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.deferred import Number
+from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import Colour, Grads
 from clear_strategies.core.step import Step
 from clear_strategies.merging.conductor import Conductor
@@ -21,70 +24,11 @@ from clear_strategies.merging.iteration import Merged
 from clear_strategies.merging.recorded_work import RecordedWork, merging_strategies, replays_on
 from clear_strategies.strategies.base import stored
 from rasterizers.guards import iteration, unread
-from rasterizers.replays import GraphKey, write
+from rasterizers.recording import running
+from rasterizers.replays import GraphKey, shapes_of, write
 
 _FINITE: Final = "finite"
-_CONFLICT: Final = "conflict of "
-"""Keys of a replay's numbers; a group's name follows the second."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _MergeInputs:
-    """The arguments of `Conductor.merge_routed` where HR takes part."""
-
-    params: Mapping[str, Tensor]
-    lr: Grads
-    hr: Grads
-    step: Step
-    out: Mapping[str, Tensor]
-
-    @property
-    def tensors(self) -> dict[str, Tensor | None]:
-        """The tensors that a recording copies, each by a name."""
-        found = dict[str, Tensor | None](visible=self.step.visible)
-        for side, g in {"lr": self.lr, "hr": self.hr}.items():
-            found |= {f"{side} {name}": x for name, x in g.items()}
-            if g.colour is not None:
-                found |= {f"{side} {name}": x for name, x in g.colour._asdict().items()}
-        if (e := self.step.evidence) is not None:
-            found |= {"reliability": e.reliability, "demand": e.demand, "sums": e.sums}
-        return found
-
-    def copied(self) -> _MergeInputs:
-        """Copies, whose view must not be read, since each replay has another one."""
-        own = replace(self.step.copied(), view=unread(self.step.view, "the view"), looked_up=None)
-        return _MergeInputs(self.params, _copied(self.lr), _copied(self.hr), own, self.out)
-
-
-def _recorded(conductor: Conductor, inputs: _MergeInputs) -> RecordedWork[_MergeInputs, Merged]:
-    """The recording of a merge, which reads its inputs from static tensors."""
-    static, first, lambda_hr = inputs.copied(), next(iter(inputs.out.values())), conductor.objective.lambda_hr
-    tensors, λ = [*static.tensors.values()], first.new_empty(1)
-    λ_now = -1.0  # the value on the device
-
-    def work() -> tuple[list[Tensor], dict[str, Number]]:
-        step = replace(static.step, t=iteration(inputs.step.t))
-        out = {name: torch.empty_like(x, memory_format=torch.contiguous_format) for name, x in inputs.out.items()}
-        merged = conductor.merge_routed(static.params, static.lr, static.hr, step, inputs.step.t, out, λ)
-        conflict = {f"{_CONFLICT}{group}": share for group, share in merged.conflict.items()}
-        return [*out.values()], {_FINITE: merged.finite, **conflict}
-
-    def write_static(new: _MergeInputs) -> None:
-        nonlocal λ_now
-        write(tensors, [*new.tensors.values()])
-        if (λ_new := lambda_hr(new.step.t)) != λ_now:
-            λ_now = λ_new
-            λ.fill_(λ_new)
-
-    def outcome(new: _MergeInputs, made: list[Tensor], row: dict[str, Number]) -> Merged:
-        write([*new.out.values()], made)
-        conflict = {name.removeprefix(_CONFLICT): x for name, x in row.items() if name.startswith(_CONFLICT)}
-        return Merged(Grads(new.out), conflict, row[_FINITE])
-
-    write_static(inputs)
-    return RecordedWork(
-        first.device, conductor, work, write=write_static, outcome=outcome, calls=merging_strategies(conductor)
-    )
+"""The key of `Merged.finite` among a merge's numbers; the others are conflict ratios."""
 
 
 class ReplayedMerge:
@@ -95,31 +39,59 @@ class ReplayedMerge:
     """
 
     def __init__(self, conductor: Conductor, device: torch.device) -> None:
-        self._conductor = conductor
+        self._conductor, self._device = conductor, device
         self._replays = replays_on(device, conductor.work_log, "the replay of the merge")
 
     def __call__(
         self, params: Mapping[str, Tensor], g_lr: Grads, g_hr: Grads, step: Step | None, t: int, out: Mapping[str, Tensor]
     ) -> Merged:  # fmt: skip
         """See `Conductor.merge_routed`."""
-        conductor = self._conductor
-
-        def live() -> Merged:
+        conductor, λ = self._conductor, self._conductor.objective.lambda_hr(t)
+        if self._replays is None or step is None or not g_hr.tensors or λ == 0:
             return conductor.merge_routed(params, g_lr, g_hr, step, t, out)
+        of_lr, of_hr, e, first = _named(g_lr), _named(g_hr), step.evidence, next(iter(out.values()))
+        evidence = () if e is None else (e.reliability, e.demand, e.sums)
+        λ_there = _on_device(λ, first.dtype, first.device)
+        inputs = λ_there, *of_lr.values(), *of_hr.values(), step.visible, *evidence
 
-        if self._replays is None or step is None or not g_hr.tensors or conductor.objective.lambda_hr(t) == 0:
-            return live()
-        inputs = _MergeInputs(params, g_lr, g_hr, step, out)
-        return self._replays.do(self._key(inputs), t, inputs, live=live, record=lambda: _recorded(conductor, inputs))
+        def work(given: Iterable[Any], out: Mapping[str, Tensor]) -> tuple[Mapping[str, Tensor], dict[str, Number]]:
+            λ, *rest = given
+            numbers = iter(rest)
+            lr, hr = (_gradient(dict(zip(names, numbers, strict=False))) for names in (of_lr, of_hr))
+            visible, seen = next(numbers), None if e is None else Evidence(*numbers)
+            view = unread(step.view, "the view")
+            known = replace(step, t=iteration(t), view=view, visible=visible, evidence=seen, looked_up=None)
+            merged = conductor.merge_routed(params, lr, hr, known, t, out, None if running() is None else λ)
+            return out, {_FINITE: merged.finite, **merged.conflict}
 
-    def _key(self, inputs: _MergeInputs) -> GraphKey:
-        called = self._conductor.owner("reconcile"), *self._conductor.regularizers
+        def recorded(copies: Iterable[Any]) -> tuple[Mapping[str, Tensor], dict[str, Number]]:
+            contiguous = torch.contiguous_format
+            return work(copies, {name: torch.empty_like(x, memory_format=contiguous) for name, x in out.items()})
+
+        def record() -> RecordedWork[Mapping[str, Tensor]]:
+            return RecordedWork(self._device, conductor, recorded, inputs, t, calls=merging_strategies(conductor))
+
+        called = conductor.owner("reconcile"), *conductor.regularizers
         saved = [x for s in called if s is not None for x in stored(s)]
-        addresses = [x.data_ptr() for x in (*inputs.params.values(), *inputs.step.params.values(), *saved)]
-        shapes = [(name, None if x is None else x.shape) for name, x in inputs.tensors.items()]
-        return GraphKey((len(next(iter(inputs.out.values()))), *addresses), tuple(shapes), tuple(inputs.out))
+        addresses = [x.data_ptr() for x in (*params.values(), *step.params.values(), *saved)]
+        key = GraphKey((len(first), *addresses), shapes_of(inputs), (*of_lr, None, *of_hr, None, *out))
+        made, row = self._replays.do(key, t, inputs, live=lambda: work(inputs, out), record=record)
+        if made is not out:
+            write([*out.values()], [*made.values()])
+        return Merged(Grads(out), row, row.pop(_FINITE))
 
 
-def _copied(g: Grads) -> Grads:
-    colour = None if g.colour is None else Colour(*(x.clone() for x in g.colour))
-    return Grads({name: x.clone() for name, x in g.items()}, colour=colour)
+@lru_cache(maxsize=1)
+def _on_device(number: float, dtype: torch.dtype, device: torch.device) -> Float[Tensor, " 1"]:
+    return torch.full((1,), number, dtype=dtype, device=device)
+
+
+def _named(g: Grads) -> dict[str, Tensor]:
+    """Every tensor of a gradient, its factors included."""
+    return {**g, **({} if g.colour is None else g.colour._asdict())}
+
+
+def _gradient(named: dict[str, Tensor]) -> Grads:
+    """The gradient of which `_named` gives these."""
+    colour = Colour(named.pop("rgb"), named.pop("basis")) if "rgb" in named else None
+    return Grads(named, colour=colour)

@@ -66,9 +66,9 @@ class Guarded(Unread):
         super().__init__(value, what)
         self._of = of
 
-    def at(self, t: int | None) -> Any:
-        """The number at another iteration; None: at this one."""
-        return self._value if t is None else self._of(t)
+    def at(self, t: int) -> Any:
+        """The number at another iteration."""
+        return self._of(t)
 
     def _made(self, by: Callable[..., Any], *other: Any) -> Guarded:
         return Guarded(by(self._value, *other), self._what, lambda t: by(self._of(t), *other))
@@ -118,5 +118,5 @@ def iteration(t: int) -> int:
 
 
 def unread(value: R, what: str, but: Collection[str] = ()) -> R:
-    """A proxy of a value that recorded work must not read, see `Unread`."""
-    return cast(R, Unread(value, what, but))
+    """The value; in a recording, which must not read it, a proxy of it, see `Unread`."""
+    return value if running() is None else cast(R, Unread(value, what, but))

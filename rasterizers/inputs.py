@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -36,7 +35,3 @@ class Inputs(NamedTuple):
         """`drawn`, as `Splats`."""
         means, quats, scales, opacities, colors, offset = self.drawn(bands)
         return Splats(means, quats, scales, opacities, colors[:, :1], colors[:, 1:], offset)
-
-    def copied(self) -> Inputs:
-        """Contiguous copies."""
-        return Inputs(*(x if x is None else x.clone(memory_format=torch.contiguous_format) for x in self))  # type: ignore[arg-type]

@@ -12,7 +12,7 @@ import threading
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Final, cast
 
 import torch
@@ -23,7 +23,7 @@ from rasterizers.checks import drawing
 from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, WithTraits, can_be_recorded, over
 from rasterizers.recording import Recording, on_side_stream, running
-from rasterizers.replays import GraphKey, Recorded, Replays, can_record, write
+from rasterizers.replays import Given, GraphKey, Recorded, Replays, StaticInputs, can_record, shapes_of, write
 
 _BLACK: Final = (0.0, 0.0, 0.0)
 _GRADIENTS: Final = tuple(f.name for f in fields(SplatGradients) if f.name != "absgrad")
@@ -50,21 +50,18 @@ class _Call:
 
     @property
     def key(self) -> GraphKey:
-        shapes = tuple(None if x is None else x.shape for x in self.inputs)
-        size = self.camera.width, self.camera.height
-        return GraphKey((len(self.inputs.means),), (*shapes, size), (_over_black(self.rasterizer), self.depth))
+        return GraphKey((len(self.inputs.means),), shapes_of(self.given), (_over_black(self.rasterizer), self.depth))
 
     @property
-    def tensors(self) -> list[Tensor | None]:
-        """All tensors that the drawing reads."""
-        r, device = self.rasterizer, self.inputs.means.device
-        return [*self.inputs, *r.numbers_of(self.camera, device), r.background_on(device)]
+    def given(self) -> Given:
+        """All that the drawing reads."""
+        return [*self.inputs, self.camera, self.rasterizer.background_on(self.inputs.means.device)]
 
     def live(self) -> Rendering:
         return drawing(self.rasterizer, self.depth)(self.inputs.splats(), self.camera)
 
 
-class _RecordedDrawing(Recorded[_Call, Rendering]):
+class _RecordedDrawing(Recorded[Rendering]):
     """Both passes of a drawing.
 
     Attributes:
@@ -72,12 +69,10 @@ class _RecordedDrawing(Recorded[_Call, Rendering]):
     """
 
     def __init__(self, call: _Call) -> None:
-        device, camera = call.inputs.means.device, replace(call.camera)  # replays write other cameras' numbers to it
-        background = call.rasterizer.background_on(device).clone()
-        static = replace(
-            call, rasterizer=call.rasterizer.over_changing(background), inputs=call.inputs.copied(), camera=camera
-        )
-        tensors = static.tensors
+        device, r = call.inputs.means.device, call.rasterizer
+        copied = StaticInputs(call.given, partial(r.numbers_of, device=device))
+        *inputs, camera, background = copied.copies
+        static = replace(call, rasterizer=r.over_changing(background), inputs=Inputs(*inputs), camera=camera)
         self._cotangent = background.new_ones(1, camera.height, camera.width, 3)
         self.replays = 0
 
@@ -92,15 +87,15 @@ class _RecordedDrawing(Recorded[_Call, Rendering]):
         with on_side_stream(device):  # live, which also compiles the kernels of the backward pass
             rendering, live = forward()
             live += backward(rendering)
-        super().__init__(Recording(device, forward), lambda call: write(tensors, call.tensors))
+        super().__init__(Recording(device, forward), copied)
         rendering, made = self._recording.result
         self._backward = Recording(device, lambda: backward(rendering))
         _require_same_bits([*made, *self._backward.result], live)
 
-    def outcome(self, call: _Call) -> Rendering:
+    def outcome(self) -> Rendering:
         self.replays += 1
         rendering, made = self._recording.result
-        return _Replayed(self, call, self.replays, rendering, _copied(made))
+        return _Replayed(self, self.replays, rendering, _copied(made))
 
     def vjp(self, cotangents: Float[Tensor, "1 H W 3"]) -> SplatGradients:
         """The gradients of the last replay."""
@@ -110,24 +105,30 @@ class _RecordedDrawing(Recorded[_Call, Rendering]):
 
 
 class _Replayed:
-    """The `Rendering` of a replay."""
+    """The `Rendering` of a replay.
 
-    def __init__(self, of: _RecordedDrawing, call: _Call, number: int, last: Rendering, made: Sequence[Any]) -> None:
+    Attributes:
+        call: what was drawn, to draw it once more.
+    """
+
+    call: _Call
+
+    def __init__(self, of: _RecordedDrawing, number: int, last: Rendering, made: Sequence[Any]) -> None:
         self.image, self.alpha, self.depth, self.means2d, self.visible = made
-        self._of, self._call, self._number, self._recorded = of, call, number, last
+        self._of, self._number, self._recorded = of, number, last
         self.awaits_backward = True
 
     @property
     def radii(self) -> Int[Tensor, "N 2"]:
         """See `WithTraits`."""
-        return cast(WithTraits, self._recorded if self._is_last else self._call.live()).radii
+        return cast(WithTraits, self._recorded if self._is_last else self.call.live()).radii
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"], **more: Any) -> SplatGradients:
         """See `WithTraits`."""
         self.awaits_backward = False
         if self._is_last and len(cotangents) == 1 and not more:
             return self._of.vjp(cotangents)
-        gradients: SplatGradients = cast(Any, self._call.live()).vjp(cotangents, **more)
+        gradients: SplatGradients = cast(Any, self.call.live()).vjp(cotangents, **more)
         return gradients
 
     @property
@@ -149,8 +150,10 @@ class _Drawings:
         if last is not None and last.awaits_backward:
             return call.live()
         self._count += 1
-        drawn = self._replays.do(key, self._count, call, live=call.live, record=lambda: _RecordedDrawing(call))
+        record = partial(_RecordedDrawing, call)
+        drawn = self._replays.do(key, self._count, call.given, live=call.live, record=record)
         if isinstance(drawn, _Replayed):
+            drawn.call = call
             self._last = {k: one for k, one in self._last.items() if one() is not None} | {key: weakref.ref(drawn)}
         return drawn
 

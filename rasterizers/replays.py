@@ -10,12 +10,13 @@ from __future__ import annotations
 import logging
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, Generic, TypeVar
 
 import torch
 from torch import Tensor
 
+from rasterizers.interface import Camera
 from rasterizers.recording import Recording, on_side_stream
 from rasterizers.torch_internals import copy_each
 
@@ -30,8 +31,10 @@ _MOST_RECORDINGS: Final = 8  # a recording keeps the memory of its work
 _MOST_GUARD_FAILURES: Final = 8  # that replays have not paid for
 _PAYS_AFTER: Final = 2  # replays
 
-In = TypeVar("In")
 T = TypeVar("T")
+
+Given = Sequence[Tensor | Camera | None]
+"""The inputs of work that differ between replays, in a fixed order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +44,7 @@ class GraphKey:
     Args:
         addresses: of the tensors that the work reads in place, and their number of rows. When they change, every recording is
             dropped.
-        shapes, constants: whatever else Python looks at.
+        shapes: see `shapes_of`. constants: whatever else Python looks at.
     """
 
     addresses: tuple[int, ...]
@@ -54,26 +57,63 @@ def can_record(device: torch.device) -> bool:
     return device.type in DEVICES
 
 
-class Recorded(Generic[In, T]):
-    """Recorded work, which reads its inputs from static tensors.
+def shapes_of(inputs: Given) -> tuple[Any, ...]:
+    """The shape of each input, and the size of each camera."""
+    return tuple(x if x is None else x.shape if isinstance(x, Tensor) else (x.width, x.height) for x in inputs)
+
+
+class StaticInputs:
+    """Copies of the inputs of recorded work, which stay at their addresses, so that a replay reads what was written to them.
 
     Args:
-        recording: of the work. write: copies the inputs of a replay to the static tensors.
+        numbers_of: the numbers of a camera on the device, see `rasterizers.interface.Recordable`.
+
+    Attributes:
+        copies: of the inputs, for the work that is recorded.
     """
 
-    def __init__(self, recording: Recording[Any], write: Callable[[In], None]) -> None:
-        self._recording, self._write = recording, write
+    def __init__(self, inputs: Given, numbers_of: Callable[[Camera], Sequence[Tensor]] = lambda _: ()) -> None:
+        self._numbers_of = numbers_of
+        self.copies: list[Any] = [_copy(x) for x in inputs]
+        self._tensors = self._tensors_of(self.copies)
+
+    def write(self, inputs: Given) -> None:
+        """Copy other inputs of the same shapes to `copies`."""
+        write(self._tensors, self._tensors_of(inputs))
+
+    def _tensors_of(self, inputs: Given) -> list[Tensor | None]:
+        tensors: list[Tensor | None] = []
+        for x in inputs:
+            tensors += self._numbers_of(x) if isinstance(x, Camera) else (x,)
+        return tensors
+
+
+def _copy(x: Tensor | Camera | None) -> Tensor | Camera | None:
+    if isinstance(x, Camera):
+        return replace(x)  # numbers belong to a camera object
+    return None if x is None else x.clone(memory_format=torch.contiguous_format)
+
+
+class Recorded(Generic[T]):
+    """Recorded work.
+
+    Args:
+        recording: of the work. inputs: those that it reads.
+    """
+
+    def __init__(self, recording: Recording[Any], inputs: StaticInputs) -> None:
+        self._recording, self._inputs = recording, inputs
 
     def holds_at(self, t: int) -> bool:
         """Return True if Python decides at t as it did in the recording, e.g. in a strategy that compares the iteration."""
         return self._recording.holds_at(t)
 
-    def replay(self, inputs: In) -> bool:
+    def replay(self, inputs: Given) -> bool:
         """Do the work with these inputs; False if the recording does not hold for them, before anything has changed."""
-        self._write(inputs)
+        self._inputs.write(inputs)
         return self._recording.replay()
 
-    def outcome(self, inputs: In) -> T:
+    def outcome(self) -> T:
         """The result of the last replay."""
         raise NotImplementedError
 
@@ -96,7 +136,7 @@ class Replays:
         self._failed = False
 
     def do(
-        self, key: GraphKey, t: int, inputs: Any, *, live: Callable[[], T], record: Callable[[], Recorded[Any, T]]
+        self, key: GraphKey, t: int, inputs: Given, *, live: Callable[[], T], record: Callable[[], Recorded[T]]
     ) -> T:
         """Do the work live, while it is recorded, or by a replay."""
         if self._failed:
@@ -141,15 +181,11 @@ class Replays:
             cause = f"{type(error).__name__}: {error}".partition("\n")[0]
             _log.warning("%s ends at t=%d, and iterations are live from now on: %s", self._name, t, cause)
         self._recorded[key] = recorded
-        return self._live(live, reason) if recorded is None else recorded.outcome(inputs)
+        return self._live(live, reason) if recorded is None else recorded.outcome()
 
     def _live(self, live: Callable[[], T], reason: str) -> T:
         self._count(reason)
         return live()
-
-
-def copied(x: Tensor | None) -> Tensor | None:
-    return None if x is None else x.clone()
 
 
 def write(static: Sequence[Tensor | None], inputs: Sequence[Tensor | None]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, Final, TypeVar
 
@@ -16,39 +16,41 @@ from clear_strategies.core.work_log import WorkLog
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.strategies.base import Strategy, overrides
 from rasterizers.guards import Guarded
+from rasterizers.interface import Camera
 from rasterizers.recording import Recording
-from rasterizers.replays import Recorded, Replays, can_record
+from rasterizers.replays import Given, Recorded, Replays, StaticInputs, can_record
 
-In = TypeVar("In")
 T = TypeVar("T")
 
 LIVE: Final = "live in place of a replay"
 """The work log's entry for work that was not replayed. It counts reasons and no runs, so that no work seems to be saved."""
 
 
-class RecordedWork(Recorded[In, T]):
+class RecordedWork(Recorded[tuple[T, dict[str, Number]]]):
     """Recorded work, with counts of what it skips, numbers for the history, and the logs of strategies.
 
+    Its outcome is the result of the work, whose tensors the next replay overwrites, and a copy of the numbers.
+
     Args:
-        work: returns its result, and numbers by name. See `Recording`.
-        write: copies the inputs of a replay to the static tensors that the work reads.
-        outcome: makes the result of a replay from its inputs, the result of the work, whose tensors the next replay overwrites,
-            and a copy of the numbers.
+        work: is given copies of the inputs, and returns its result, and numbers by name. See `Recording`.
+        inputs, numbers_of: see `StaticInputs`. t: the iteration.
         calls: the strategies that the work calls. The recording holds while they store what they stored before it.
+        count: called with the iteration before the recording and before each replay; it writes to the device what depends on it.
     """
 
     def __init__(
-        self, device: torch.device, conductor: Conductor, work: Callable[[], tuple[Any, Mapping[str, Number]]], *,
-        write: Callable[[In], None], outcome: Callable[[In, Any, dict[str, Number]], T], calls: Iterable[Strategy] = (),
+        self, device: torch.device, conductor: Conductor, work: Callable[[Any], tuple[T, Mapping[str, Number]]], inputs: Given,
+        t: int, *, numbers_of: Callable[[Camera], Sequence[Tensor]] = lambda _: (), calls: Iterable[Strategy] = (),
+        count: Callable[[int], None] = lambda _: None,
     ) -> None:  # fmt: skip
-        self._outcome = outcome
+        static, self._t, self._count = StaticInputs(inputs, numbers_of), t, count
+        count(t)
         self._work_log, self._strategies, self._calls = conductor.work_log, conductor.strategies, [*calls]
         self._stored = [*map(_stored_by, self._calls)]  # before the work, which may change it
         self._of_t: dict[str, Any] = {}  # numbers that Python computes from the iteration
-        self._t: int | None = None  # the iteration of the replay; None: that of the recording
 
         def gathered() -> tuple[Any, Tensor, Callable[[Tensor], dict[str, Number]]]:
-            made, numbers = work()
+            made, numbers = work(static.copies)
             logged = [(s, name, x) for s in self._strategies for name, x in s.logs.items()]
             self._logged = [(s, name) for s, name, _ in logged]
             row = {**numbers, **{f"log {k}": x() if callable(x) else x for k, (*_, x) in enumerate(logged)}}
@@ -58,7 +60,7 @@ class RecordedWork(Recorded[In, T]):
         conductor.logs.keep()
         try:
             with self._work_log.noted() as self._skips:
-                super().__init__(Recording(device, gathered), write)
+                super().__init__(Recording(device, gathered), static)
         finally:
             for s in self._strategies:
                 s.logs.clear()  # they hold tensors of the recording
@@ -67,12 +69,12 @@ class RecordedWork(Recorded[In, T]):
         self._t = t
         return self._stored == [*map(_stored_by, self._calls)] and super().holds_at(t)
 
-    def replay(self, inputs: In) -> bool:
-        self._write(inputs)
+    def replay(self, inputs: Given) -> bool:
+        self._count(self._t)
         with self._work_log.stage("replayed"):
-            return self._recording.replay()
+            return super().replay(inputs)
 
-    def outcome(self, inputs: In) -> T:
+    def outcome(self) -> tuple[T, dict[str, Number]]:
         """The result of the last replay. The strategies' logs are those of the work afterwards."""
         made, numbers, row_of = self._recording.result
         row: dict[str, Number] = row_of(numbers.clone()) | {name: x.at(self._t) for name, x in self._of_t.items()}
@@ -80,7 +82,7 @@ class RecordedWork(Recorded[In, T]):
             self._work_log.skip(*skip)
         for k, (s, name) in enumerate(self._logged):
             s.logs[name] = row.pop(f"log {k}")
-        return self._outcome(inputs, made, row)
+        return made, row
 
 
 def merging_strategies(conductor: Conductor) -> Iterator[Strategy]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeVar, cast
 
 from torch import Tensor
@@ -24,7 +25,7 @@ from clear_strategies.merging.recorded_work import RecordedWork, merging_strateg
 from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Color, Rasterizer, Recordable, can_be_recorded, over
-from rasterizers.replays import GraphKey, Replays, copied, write
+from rasterizers.replays import Given, GraphKey, Replays, shapes_of
 
 _log = logging.getLogger(__name__)
 
@@ -93,16 +94,29 @@ def run_or_replay(
     """The result of `learn`, run live, recorded, or replayed if `replays_for` has found that it can be."""
     if s.replays is None:
         return learn(s, rasterizer, inputs)
-    steps = s.optimizer.steps
+    steps, given, drawn_by = s.optimizer.steps, _given(s, rasterizer, inputs), cast(Recordable, rasterizer)
 
-    def live() -> L:
+    def live() -> tuple[Update | None, dict[str, Number]]:
         s.optimizer.steps = steps  # a failed recording or replay has counted one
         return learn(s, rasterizer, inputs)
 
-    def record() -> RecordedWork[IterationInputs, L]:
-        return _recorded(s, cast(Recordable, rasterizer), inputs, learn)
+    def recorded(copies: list[Any]) -> L:
+        background, *rest = copies
+        return learn(s, drawn_by.over_changing(background), _reading(inputs, rest))
 
-    return s.replays.do(_key(s, inputs), inputs.t, inputs, live=live, record=record)
+    def record() -> RecordedWork[Update | None]:
+        merging, comparing = merging_strategies(s.conductor), s.conductor.comparing
+        return RecordedWork(
+            s.device, s.conductor, recorded, given, inputs.t, numbers_of=partial(drawn_by.numbers_of, device=s.device),
+            calls=(*merging, *comparing) if isinstance(inputs, ViewInputs) else (),
+            count=cast(CompiledStep, s.compiled_step).count,
+        )  # fmt: skip
+
+    update, row = s.replays.do(_key(s, inputs, given), inputs.t, given, live=live, record=record)
+    if isinstance(inputs, ViewInputs) and update is not None:
+        # A strategy may store tensors of the step, which the next replay overwrites.
+        update = replace(update, step=replace(update.step.copied(), t=inputs.t, view=inputs.view))
+    return cast(L, (update, row))
 
 
 def _why_not(s: TrainState, rasterizer: Rasterizer) -> Iterator[str]:
@@ -116,7 +130,7 @@ def _why_not(s: TrainState, rasterizer: Rasterizer) -> Iterator[str]:
     yield from why_not_recorded(s.conductor)
 
 
-def _key(s: TrainState, inputs: IterationInputs) -> GraphKey:
+def _key(s: TrainState, inputs: IterationInputs, given: Given) -> GraphKey:
     λ = s.conductor.objective.lambda_hr(inputs.t)
     tables = s.field.raw(), s.optimizer.first, s.optimizer.second, s.conductor.state_dict()
     statistics = [x for x in s.density.state_dict().values() if x.dim() > 0]  # numbers are made for a checkpoint
@@ -124,70 +138,34 @@ def _key(s: TrainState, inputs: IterationInputs) -> GraphKey:
     addresses = [x.data_ptr() for x in stored]
     constants: list[Any] = [s.field.degree, inputs.view.background, λ > 0]
     if isinstance(inputs, ViewInputs):
-        constants += [inputs.gate is None, *inputs.scales.values(), s.density.collects(inputs.t)]
+        constants += [*inputs.scales.values(), s.density.collects(inputs.t)]
         constants += [x is None for x in (inputs.view.depth, inputs.view.disagreement, inputs.view.truth)]
     else:
         constants += [inputs.view.robust, cast(CompiledStep, s.compiled_step).bands]
-    shapes = [(photo.image.shape, photo.shown is None, photo.transparency is None) for photo in inputs.photos]
-    return GraphKey((len(s.field), *addresses), tuple(shapes), tuple(constants))
+    constants += [photo.transparency is None for photo in inputs.photos]
+    return GraphKey((len(s.field), *addresses), shapes_of(given), tuple(constants))
 
 
-def _recorded(
-    s: TrainState, rasterizer: Recordable, inputs: IterationInputs, learn: Callable[[TrainState, Rasterizer, Any], L]
-) -> RecordedWork[IterationInputs, L]:
-    """The recording of an iteration, which reads its inputs from static tensors."""
-    static, background = _copied(s, inputs), _background(s, rasterizer, inputs).clone()
-    drawn_by = rasterizer.over_changing(background)
-    tensors = [*_tensors_of(s, rasterizer, static), background]
-    step = cast(CompiledStep, s.compiled_step)
-
-    def write_static(new: IterationInputs) -> None:
-        write(tensors, [*_tensors_of(s, rasterizer, new), _background(s, rasterizer, new)])
-        step.count(new.t)
-
-    def outcome(new: IterationInputs, update: Update | None, row: dict[str, Number]) -> Any:
-        if isinstance(new, ViewInputs) and update is not None:
-            # A strategy may store tensors of the step, which the next replay overwrites.
-            update = replace(update, step=replace(update.step.copied(), t=new.t, view=new.view))
-        return update, row
-
-    write_static(inputs)
-    merging, comparing = merging_strategies(s.conductor), s.conductor.comparing
-    calls = (*merging, *comparing) if isinstance(inputs, ViewInputs) else ()
-    return RecordedWork(
-        s.device, s.conductor, lambda: learn(s, drawn_by, static), write=write_static, outcome=outcome, calls=calls
-    )
-
-
-def _copied(s: TrainState, inputs: IterationInputs) -> IterationInputs:
-    """Copies of the tensors and cameras, with the photos over the background of the iteration."""
-    images = (p.over(inputs.background, inputs.view.background).image.clone() for p in inputs.photos)
-    photos = [
-        Photo(replace(p.camera), image, copied(p.shown), p.transparency)
-        for p, image in zip(inputs.photos, images, strict=True)
-    ]
+def _given(s: TrainState, rasterizer: Rasterizer, inputs: IterationInputs) -> Given:
+    """What a replay reads in place of an iteration's own: the background, the gate or an extra view's weight, what is looked up,
+    and each photo over the background, with its camera.
+    """
+    background = cast(Recordable, over(rasterizer, inputs.background)).background_on(s.device)
+    each = [p.over(inputs.background, inputs.view.background) for p in inputs.photos]
+    photos = [x for p in each for x in (p.camera, p.image, p.shown)]
     if isinstance(inputs, ExtraViewInputs):
-        extra = replace(inputs.view, photo=photos[0], weight=inputs.view.weight.clone())
-        return replace(inputs, view=extra, background=None)
+        return background, inputs.view.weight, None, *photos
+    return background, inputs.gate, s.conductor.looked_up(inputs.view), *photos
+
+
+def _reading(inputs: IterationInputs, given: list[Any]) -> IterationInputs:
+    """The inputs of an iteration that reads these, except for the background."""
+    gate, looked_up, *of_photos = given
+    each = zip(inputs.photos, of_photos[::3], of_photos[1::3], of_photos[2::3], strict=True)
+    photos = [Photo(camera, image, shown, p.transparency) for p, camera, image, shown in each]
+    if isinstance(inputs, ExtraViewInputs):
+        return replace(inputs, view=replace(inputs.view, photo=photos[0], weight=gate), background=None)
     lr, hr = photos[0], photos[1] if inputs.scales["hr"] else inputs.view.hr  # without HR, only its size is read
     truth = hr.image if inputs.view.hr_is_photo else inputs.view.truth
     view = replace(inputs.view, lr=lr, hr=hr, truth=truth)
-    looked_up = copied(s.conductor.looked_up(inputs.view))
-    return replace(inputs, view=view, gate=copied(inputs.gate), background=None, looked_up=looked_up)
-
-
-def _background(s: TrainState, rasterizer: Recordable, inputs: IterationInputs) -> Tensor:
-    """The background of the iteration, or the scene's own."""
-    return cast(Recordable, over(rasterizer, inputs.background)).background_on(s.device)
-
-
-def _tensors_of(s: TrainState, rasterizer: Recordable, inputs: IterationInputs) -> list[Tensor | None]:
-    """All other tensors of the inputs that an iteration reads."""
-    tensors: list[Tensor | None] = []
-    for photo in inputs.photos:
-        image = photo.over(inputs.background, inputs.view.background).image
-        tensors += [image, photo.shown, *rasterizer.numbers_of(photo.camera, s.device)]
-    if isinstance(inputs, ExtraViewInputs):
-        return [*tensors, inputs.view.weight]
-    looked_up = s.conductor.looked_up(inputs.view) if inputs.looked_up is None else inputs.looked_up
-    return [*tensors, inputs.gate, looked_up]
+    return replace(inputs, view=view, gate=gate, background=None, looked_up=looked_up)

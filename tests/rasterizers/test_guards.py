@@ -29,15 +29,15 @@ def test_numbers_made_of_the_iteration_are_known_at_another_one_and_it_can_be_pu
     t = Guarded(7, "the iteration")
     made = 10 * -(-t // 5) - 1
     assert isinstance(made, int)
-    assert [made.at(None), made.at(7), made.at(11)] == [19, 19, 29]
+    assert [made.at(7), made.at(11)] == [19, 29]
     assert (f"t={t}", t > 5, bool(t % 2)) == ("t=7", True, True)
-    assert type(iteration(7)) is int  # nothing is recorded here
-    name = unread("view0", "the name")
+    assert type(iteration(7)) is type(unread(7, "the seed")) is int  # nothing is recorded here
+    name = Unread("view0", "the name")
     assert f"{name}: {name!r}" == "view0: view0"
 
 
 def test_what_is_the_same_in_every_replay_may_be_read():
-    camera = unread(complex(3, 4), "the camera", ("real",))
+    camera = Unread(complex(3, 4), "the camera", ("real",))
     assert camera.real == 3
     with pytest.raises(RuntimeError, match="must not read the camera"):
         camera.conjugate()

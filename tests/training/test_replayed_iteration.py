@@ -267,12 +267,12 @@ def test_recordings_of_an_earlier_structure_are_dropped():
     kept, made = Replays(DEVICE, ""), []
 
     def recorded():
-        made.append(SimpleNamespace(holds_at=lambda t: True, replay=lambda _: True, outcome=lambda _: "replayed"))
+        made.append(SimpleNamespace(holds_at=lambda t: True, replay=lambda _: True, outcome=lambda: "replayed"))
         return made[-1]
 
     for address in range(2 * replays._MOST_RECORDINGS):
         key = GraphKey((address,), (), ())
-        found = [kept.do(key, 1, None, live=lambda: "live", record=recorded) for _ in range(3)]
+        found = [kept.do(key, 1, [], live=lambda: "live", record=recorded) for _ in range(3)]
         assert found == ["replayed" if address else "live", "replayed", "replayed"]
         assert len(made) == address + 1
 
@@ -293,10 +293,10 @@ def test_work_is_recorded_anew_as_long_as_recordings_pay_off(lasts, pays):
     def do(t: int) -> str:
         def record():
             return SimpleNamespace(
-                holds_at=lambda now: now // lasts == t // lasts, replay=lambda _: True, outcome=lambda _: "replayed"
+                holds_at=lambda now: now // lasts == t // lasts, replay=lambda _: True, outcome=lambda: "replayed"
             )
 
-        return kept.do(GraphKey((), (), ()), t, None, live=lambda: "live", record=record)
+        return kept.do(GraphKey((), (), ()), t, [], live=lambda: "live", record=record)
 
     found = [do(t) for t in range(240)]
     assert found[1] == "replayed"
@@ -305,7 +305,7 @@ def test_work_is_recorded_anew_as_long_as_recordings_pay_off(lasts, pays):
 
 def test_memory_that_is_new_in_each_iteration_is_told_and_not_recorded(caplog):
     kept = Replays(DEVICE, "")
-    found = [kept.do(GraphKey((k,), (), ()), k, None, live=lambda: "live", record=fails) for k in range(30)]
+    found = [kept.do(GraphKey((k,), (), ()), k, [], live=lambda: "live", record=fails) for k in range(30)]
     assert set(found) == {"live"}
     assert caplog.text.count("Write to Strategy.state in place") == 1
 
