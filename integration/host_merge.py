@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
 import torch
 from torch import Tensor
 
 from clear_strategies.core.deferred import Number
-from clear_strategies.core.gradients import to_ndc
+from clear_strategies.core.finite import is_finite, require_finite
+from clear_strategies.core.gradients import Grads, to_ndc
+from clear_strategies.core.step import Step
 from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.merging.in_place import merge_in_place
 from clear_strategies.merging.iteration import HrSide
 from integration.autograd_shot import AutogradShot
 from integration.densification import ScoreScaler, score_for_host
 from integration.detail import Fading
 from integration.host import Host
-from integration.pending import BackwardPass, Pending
+from integration.pending import BackwardPass, Pending, widened
 from integration.replayed_merge import ReplayedMerge
 
 _log = logging.getLogger(__name__)
@@ -57,7 +58,7 @@ class HostMerge:
             DivergedError: a merged gradient is not finite, and no gradient scaler would skip the step.
         """
         params, hr, first = {name: done.params[name] for name in names}, pending.hr, not pending.merged
-        scale, skips_steps = self._host.scale(), self._host.loss_scale is not None
+        scale = self._host.scale()
         for name, p in params.items():
             if p.grad is not None and p.grad.is_sparse:
                 raise HostError(
@@ -67,25 +68,47 @@ class HostMerge:
             if p.grad is not None and p.grad.requires_grad:
                 p.grad = p.grad.detach()  # create_graph=True: the merged gradient has no graph
         detail = done.params.get("detail") if first else None
-        if detail is not None and detail.requires_grad:
-            params["detail"] = detail
-            if detail.grad is not None:  # the host's own gradient of it stays
-                done.before["detail"] = detail.grad
+        if detail is not None and not detail.requires_grad:
+            detail = None
+        if detail is not None and detail.grad is not None:  # the host's own gradient of it stays
+            done.before["detail"] = detail.grad
         λ = self._conductor.objective.lambda_hr(t)
-        g_hr = pending.routed_of(names, done.params) if λ > 0 else None
-        if g_hr is not None:
-            self._warn_if_outweighed(done, g_hr, scale)
-        conflict = merge_in_place(
-            self._conductor, params, g_hr, None if hr is None else hr.step, t,
-            before=done.before, lr_colour=done.colour, scale=scale, must_be_finite=not skips_steps, merge=self._replayed,
-        )  # fmt: skip
-        if "detail" in params:
-            self._finish_detail(params.pop("detail"), params, t, by_hf=hr is not None and hr.detail is not None)
+        g_hr = pending.routed_of(names, done.params) if λ > 0 else Grads()
+        self._warn_if_outweighed(done, g_hr, scale)
+        of_all = [*names] if detail is None else [*names, "detail"]
+        conflict = self.merge_gradients(done, of_all, g_hr, None if hr is None else hr.step, t, scale)
+        if detail is not None:
+            self._finish_detail(detail, params, t, by_hf=hr is not None and hr.detail is not None)
         pending.merged.update(names or ("detail",))
         self._counts["merges"] += 1
         if first and hr is not None and pending.output is not None and done.task in pending.screen:
             self._write_score(pending.output.shot, pending.screen[done.task], hr, t, scale)
         return conflict
+
+    def merge_gradients(
+        self, done: BackwardPass, names: Iterable[str], g_hr: Grads, step: Step | None, t: int, scale: float
+    ) -> Mapping[str, Number]:  # fmt: skip
+        """Merge what the pass has added to `.grad` of these parameters, in place.
+
+        Args:
+            g_hr: of the raw parameters after routing, and the gradient of f_det; empty without HR.  Eq. 12, 13
+            step: the iteration, with the evidence; None without HR.
+            scale: of the gradients of the pass: of a gradient scaler, or 1 / the number of accumulated passes.
+
+        Raises:
+            DivergedError: a merged gradient in the CPU's memory is not finite, and no gradient scaler would skip the step.
+        """
+        g_lr, out = done.added(names, scale)
+        params = {name: done.params[name].detach() for name in out}
+        high = Grads({name: widened(g) for name, g in g_hr.items()}, colour=g_hr.colour)
+        merged = self._replayed(params, g_lr, high, step, t, out)
+        if self._host.loss_scale is None and not isinstance(merged.finite, Tensor) and not merged.finite:
+            by_host = all(map(is_finite, [*high.values(), *(high.colour or ())]))
+            hint = " (that of HR is finite: look at the loop's own loss)" if by_host else ""
+            remedy = "If the loop skips such steps, attach with loss_scale=lambda: 1.0."
+            require_finite(f"t={t}: the merged gradient{hint}", merged.grads, remedy=remedy)
+        done.replace(out, scale)
+        return merged.conflict
 
     def _warn_if_outweighed(self, done: BackwardPass, g_hr: Mapping[str, Tensor], scale: float) -> None:
         """Warn if the loss of the loop has another scale than that of HR, which is a mean over pixels in [0, 1]."""

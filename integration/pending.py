@@ -9,6 +9,7 @@ from operator import attrgetter
 from typing import Any, Final
 from weakref import WeakMethod, WeakValueDictionary
 
+import torch
 from torch import Tensor
 
 from clear_strategies.core.gradients import Colour, Grads
@@ -18,6 +19,7 @@ from clear_strategies.merging.iteration import HrSide
 from integration.autograd_shot import HostOutput
 from integration.colours import are_accumulated, are_joined
 from rasterizers.autograd import TakeColours
+from rasterizers.native import empty_for
 from rasterizers.torch_internals import current_pass, hooks_after_accumulation, version
 
 Reached = Callable[[int], TakeColours | None]
@@ -71,6 +73,42 @@ class BackwardPass:
         before, written = self._found[name]
         now = self.params[name].grad
         return now is not before or (now is not None and version(now) != written)
+
+    def added(self, names: Iterable[str], scale: float) -> tuple[Grads, dict[str, Tensor]]:
+        """∇(λ_LR L_LR), which the pass has added to `.grad` of these parameters times `scale`, and memory for the merged gradient
+        of those that are not frozen, in float32 or float64. f_det has no gradient of LR.
+        """
+        factored = ("detail",) if self.colour is None else ("detail", "sh0", "shN")
+        g_lr, out = Grads(), {}
+        if self.colour is not None:
+            g_lr.colour = self.colour if scale == 1 else Colour(self.colour.rgb * (1 / scale), self.colour.basis)
+        for name in names:
+            p = self.params[name]
+            g = None if p.grad is None or name == "detail" else widened(p.grad.detach())
+            if g is not None:
+                g = g - self.before[name] if name in self.before else g
+                g_lr[name] = g = g if scale == 1 else g * (1 / scale)
+            if p.grad is not None or name in factored:
+                out[name] = g if g is not None and g.is_contiguous() else empty_for(widened(p.detach()))
+        return g_lr, out
+
+    def replace(self, merged: Mapping[str, Tensor], scale: float) -> None:
+        """Set `.grad` to what it was before the pass plus the merged gradient times `scale`, in its present memory if there is."""
+        for name, gradient in merged.items():
+            p, scaled = self.params[name], gradient if scale == 1 else gradient.mul_(scale)
+            g = scaled.add_(self.before[name]) if name in self.before else scaled
+            if p.grad is None:
+                p.grad = g.to(p.dtype)
+            elif p.grad.data_ptr() != g.data_ptr() or p.grad.dtype != g.dtype:
+                p.grad.copy_(g)
+
+
+_HALF: Final = (torch.float16, torch.bfloat16)
+
+
+def widened(x: Tensor) -> Tensor:
+    """The tensor in the type in which gradients are merged: float32 in place of half precision."""
+    return x.float() if x.dtype in _HALF else x
 
 
 _PASSES: Final = WeakValueDictionary[int, BackwardPass]()

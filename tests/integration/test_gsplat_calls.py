@@ -10,10 +10,10 @@ from torch.utils.checkpoint import checkpoint
 
 from clear_strategies import P2G, SVS, Conductor, PseudoViews, RandomBackground, View
 from clear_strategies.geometry.projection import intrinsics
-from clear_strategies.merging.in_place import merge_in_place
 from clear_strategies.schedules import Ramp
 from integration import HostError
 from integration.gsplat.calls import Poses
+from integration.host_merge import HostMerge
 from rasterizers import autograd
 from rasterizers.geometry import SH_C0
 from tests.helpers import gsplat_host, toy
@@ -140,13 +140,13 @@ def test_the_detail_feature_is_trained_in_a_loop_that_tells_every_optimizer_what
 
 @pytest.mark.parametrize("penalty", [0.0, 1e-3])
 def test_the_gradient_of_the_colours_comes_by_its_factors_but_where_a_hook_looks_at_it(penalty, monkeypatch):
-    by_factors = []
+    by_factors, merge_gradients = [], HostMerge.merge_gradients
 
-    def spied(*arguments, lr_colour, **settings):
-        by_factors.append(lr_colour is not None)
-        return merge_in_place(*arguments, lr_colour=lr_colour, **settings)
+    def spied(self, done, *arguments):
+        by_factors.append(done.colour is not None)
+        return merge_gradients(self, done, *arguments)
 
-    monkeypatch.setattr("integration.host_merge.merge_in_place", spied)
+    monkeypatch.setattr(HostMerge, "merge_gradients", spied)
     merged = []
     for hooked in (False, True):
         host, _, render = started()

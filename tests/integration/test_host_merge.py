@@ -1,4 +1,4 @@
-"""The merge in place against `Conductor.merge` in float64, by every pass that runs here."""
+"""The merge in a host's `.grad` against `Conductor.merge_routed` in float64, by every pass that runs here."""
 
 from collections import Counter
 from functools import partial
@@ -13,8 +13,10 @@ from clear_strategies.core.gradients import CONFLICT_GROUPS, Colour
 from clear_strategies.errors import DivergedError
 from clear_strategies.kernels import reconcile
 from clear_strategies.kernels.reconcile import dense, reference
-from clear_strategies.merging.in_place import merge_in_place
 from clear_strategies.schedules import WarmupDecay
+from integration.host import Host
+from integration.host_merge import HostMerge
+from integration.pending import BackwardPass
 from tests.helpers import toy
 from tests.helpers.backends import needs
 
@@ -69,12 +71,24 @@ def anchor(made: Conductor, params) -> None:
     made.after_step({name: p.detach() * 0.9 for name, p in params.items()}, toy.step(1))
 
 
+def merging(made, params, *, before, lr_colour=None, **of_host):
+    """The merge at the end of a backward pass that has added to `.grad`, which held `before`."""
+    host, device = Host(lambda: params, lambda: None, **of_host), params["means" if "means" in params else "sh0"].device
+    done = BackwardPass(0, params, colour=lr_colour)
+    done.before = before
+    return partial(HostMerge(made, host, device, Counter()).merge_gradients, done, params)
+
+
+def merge_in_place(made, params, g_hr, step, t, *, scale=1.0, **of_pass):
+    return merging(made, params, **of_pass)(g_hr, step, t, scale)
+
+
 def by_the_conductor(made, params, g_hr, step, t, *, before, scale):
     """What `merge_in_place` should do, written down."""
     passed = {name: p.grad - before.get(name, 0) for name, p in params.items() if p.grad is not None}
     lr, values = Grads(passed) * (1 / scale), {name: p.detach() for name, p in params.items()}
     out = {name: torch.empty_like(p) for name, p in values.items()}
-    merged = made.merge_routed(values, lr, Grads() if g_hr is None else g_hr, step, t, out)
+    merged = made.merge_routed(values, lr, g_hr, step, t, out)
     for name, g in out.items():
         params[name].grad = before.get(name, 0) + scale * g
     return merged.conflict
@@ -120,7 +134,7 @@ def test_the_lr_gradient_of_the_colours_may_come_by_its_factors(passes, accumula
         if exact:
             for name, g in dense(Grads(colour=lr), {name: params[name].detach() for name in ("sh0", "shN")}).items():
                 params[name].grad = g if params[name].grad is None else params[name].grad + g
-        made, routed = conductor(), None if hr == "none" else routed
+        made, routed = conductor(), Grads() if hr == "none" else routed
         merge = by_the_conductor if exact else partial(merge_in_place, lr_colour=lr)
         merge(made, params, routed, step, T, before=before, scale=scale)
         assert hr == "none" or deferred.read([made.logs.counted()["corrected"]])[0] > 0.1
@@ -203,7 +217,7 @@ def test_frozen_attributes_stay_frozen(passes, names):
 def test_without_hr_the_authentic_gradient_passes_and_that_of_f_det_is_zero(passes):
     params, before, *_ = setting(torch.float32, accumulated=False, factors=False, scale=1.0)
     expected = {name: p.grad.clone() for name, p in params.items() if name != "detail"}
-    assert merge_in_place(conductor(), params, None, None, T, before=before) == {}
+    assert merge_in_place(conductor(), params, Grads(), None, T, before=before) == {}
     assert all(torch.equal(params[name].grad, g) for name, g in expected.items())
     assert not params["detail"].grad.any()
 
@@ -229,7 +243,7 @@ def test_what_is_not_finite_is_refused_but_under_a_gradient_scaler(side, hint):
     params, before, hr, step = setting(torch.float32, accumulated=False, factors=False, scale=1.0)
     (params["scales"].grad if side == "lr" else hr["scales"])[17, 1] = torch.nan
     run = partial(merge_in_place, conductor(), params, hr, step, T, before=before)
-    run(must_be_finite=False)
+    run(loss_scale=lambda: 1.0)
     where = f"the merged gradient{hint} of scales"
     with pytest.raises(DivergedError, match=f"{where} is not finite for 1 Gaussian, first Gaussian 17"):
         run()
@@ -267,10 +281,10 @@ def operations(n: int, device: str = "cpu") -> Counter[str]:
     params, before, hr, step = moved(
         *setting(torch.float32, n=n, accumulated=False, factors=True, scale=1.0), device=device
     )
-    merge = partial(merge_in_place, conductor())
-    merge(params, hr, step, T, before=before)
+    merge_in_place(made := conductor(), params, hr, step, T, before=before)
+    merge = merging(made, params, before=before)
     with toy.Operations() as done:
-        merge(params, hr, step, T, before=before)
+        merge(hr, step, T, 1.0)
     return +done.count
 
 
