@@ -12,7 +12,7 @@ One training iteration:
    stepped, `after_step` of the strategies is called.
 
 What the adapter tells of the host is in host.py, HR and extra views in hr_drawing.py, what waits for `backward()` in
-pending.py, the merge in host_merge.py, the optimizers' steps in host_steps.py, changes of the structure in structure.py, and the
+pending.py, the backward passes and the merge in host_merge.py, the optimizers' steps in host_steps.py, changes of the structure in structure.py, and the
 first lines of the log in announcement.py.
 
 The merge runs at the end of `backward()`, not in an optimizer hook. Gradient clipping therefore sees the merged gradient,
@@ -24,15 +24,16 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any, Final
-from weakref import WeakMethod, finalize
+from weakref import finalize
 
 import torch
 from torch import Tensor
 
 from clear_strategies.core import deferred
+from clear_strategies.core.deferred import Number
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import conflict_columns
 from clear_strategies.core.step import Step
@@ -40,22 +41,21 @@ from clear_strategies.core.view import View
 from clear_strategies.data.scene import require_shown
 from clear_strategies.errors import HostError, SettingError
 from clear_strategies.merging.conductor import Conductor
+from clear_strategies.strategies.base import Logged
 from integration.announcement import announce, warn_without_hr
 from integration.autograd_shot import HostOutput, Target, require_named, trained
 from integration.host import Host
 from integration.host_merge import HostMerge
 from integration.host_steps import HostSteps
 from integration.hr_drawing import Drawable, HrDrawing, RenderAt
-from integration.pending import BackwardPass, Pending, why_nothing_was_merged
+from integration.pending import Pending, why_nothing_was_merged
 from integration.structure import resized
 from integration.views import require_unique
-from rasterizers.autograd import TakeColours
 from rasterizers.interface import Color
-from rasterizers.torch_internals import current_pass, when_pass_ends
+from rasterizers.torch_internals import current_pass
 
 _log = logging.getLogger(__name__)
 _LOGGED_EVERY: Final = 100  # merges between two lines of the log
-_PATIENCE: Final = 10  # renderings that are not merged, one after the other, before a warning
 
 
 class Attachment:
@@ -88,16 +88,13 @@ class Attachment:
         means = host.leaves()["means"]
         self._n = len(means)
         self._hr = HrDrawing(conductor, host, means.device, self.counts)
-        self._merging = HostMerge(conductor, host, means.device, self.counts)
+        self._merging = HostMerge(conductor, host, means.device, self.counts, self._merged)
         self._steps = HostSteps(
-            is_waiting=lambda: self._pending is not None and self._pending.output is not None,
-            begins=self._step_begins, after=self._after_optimizer, counts=self.counts,
+            is_waiting=lambda: self._merging.is_waiting, begins=self._step_begins, after=self._after_optimizer,
+            counts=self.counts,
         )  # fmt: skip
         self._step: Step | None = None  # of the rendering, until `after_step`
-        self._pending: Pending | None = None  # the last rendering
-        self._pass: BackwardPass | None = None  # the last one that has reached a rendering
-        self._in_vain = 0  # renderings, one after the other, that were not merged
-        self._logged: dict[str, deferred.Number | Callable[[], deferred.Number]] = {}
+        self._logged: dict[str, Logged] = {}
         self._has_warned_of_accumulation = False
         conductor.on_fit_start(len(views), seed, means.device, views)
         announce(conductor, views, host)
@@ -117,7 +114,6 @@ class Attachment:
                 "and the loss be that of another picture. Checkpoint what comes before the rendering, or after it."
             )
         self._finish_step()  # not every optimizer may have stepped, and the structure may have changed
-        self._warn_of_renderings_in_vain()
         conductor, t, leaves = self.conductor, self.t, self._host.leaves()
         render_at = _checked(render_at, leaves)
         params = {name: p.detach() for name, p in leaves.items()}
@@ -146,8 +142,8 @@ class Attachment:
                 "parameters."
             )
         self.counts["LR renders"] += 1
-        self._pending = Pending(self.counts["LR renders"], view.name, output, hr)
-        self._pending.listen(WeakMethod(self._reached), to_screen=hr is not None and self._hr.is_scored)
+        pending = Pending(self.counts["LR renders"], t, view.name, output, hr)
+        self._merging.await_passes(pending, to_screen=hr is not None and self._hr.is_scored)
         return output.returned
 
     @property
@@ -193,7 +189,7 @@ class Attachment:
 
     def remove(self) -> None:
         """Restore the host: its renderings pass through, and the gradients of a pending one are not merged."""
-        self.removed, self._pending, self._pass = True, None, None
+        self.removed, self._merging.pending = True, None
         self.hook([])
         self._steps.follow_by({}, [])
         self.conductor.on_fit_end()
@@ -206,7 +202,7 @@ class Attachment:
             self._merging.fading.before_step()
             return
         names = [*trained(self._host.leaves())]
-        cause, remedy = why_nothing_was_merged(self._pending, names)
+        cause, remedy = why_nothing_was_merged(self._merging.pending, names)
         if not self.counts["merges"]:
             raise HostError(
                 f"the host makes its first optimizer step, but {cause}, so that no strategy would take part. {remedy}"
@@ -254,47 +250,12 @@ class Attachment:
             self._n = n
             self.counts["structure changes"] += 1
 
-    def _reached(self, nth: int) -> TakeColours | None:
-        """Called when a backward pass of the host has reached the nth rendering, but no parameter yet."""
-        if self.removed or self._pending is None:
-            return None
-        if self._pass is None or self._pass.task != current_pass():
-            self._pass = now = BackwardPass(current_pass(), self._host.leaves())
-            when_pass_ends(lambda: self._on_backward_end(now))
-        self._pass.renderings.add(nth)
-        return self._pass.take if self._pending.may_take_factors(self._pass.params) else None
-
-    @torch.no_grad()
-    def _on_backward_end(self, done: BackwardPass) -> None:
-        """At the end of a backward pass of the host, replace the gradients that it added by the merged ones.
-
-        A pass that leaves every `.grad` as it was (`torch.autograd.grad`) is ignored.
-        """
-        pending, self._pass = self._pending, None
-        self._merge_pass(pending, done)
-        for hook in done.hooks:
-            hook()
-        if pending is not None and pending.merged.issuperset(trained(done.params)):
-            pending.output = pending.hr = None
-
-    def _merge_pass(self, pending: Pending | None, done: BackwardPass) -> None:
-        expected, accumulated = trained(done.params), done.accumulated()
-        if pending is None or (expected and not accumulated):
-            return
-        pending.require_alone(done)
-        using = [type(s).__name__ for s in map(self.conductor.owner, ("reconcile", "score")) if s is not None]
-        pending.require_first(accumulated, " and ".join(using))
-        names = [name for name in accumulated if name not in pending.merged]
-        if names or not (expected or pending.merged):
-            self._merge(pending, done, names)
-
-    def _merge(self, pending: Pending, done: BackwardPass, names: Sequence[str]) -> None:
-        first = not pending.merged
-        conflict = self._merging.merge(pending, done, names, self.t)
-        if first and self.passes == 0 and not self._steps.has_begun:
-            self._warn_of_accumulation([done.before[name] for name in names if name in done.before])
+    def _merged(self, pending: Pending, conflict: Mapping[str, Number] | None, before: Sequence[Tensor]) -> None:
+        """Called when gradients of a rendering were merged: the first of them with their conflict ratios, or more of them."""
+        if conflict is not None and self.passes == 0 and not self._steps.has_begun:
+            self._warn_of_accumulation(before)
         self._steps.on_merge()
-        if not first:
+        if conflict is None:
             return
         self.passes += 1
         λ = self.conductor.objective.lambda_hr(self.t)
@@ -305,18 +266,6 @@ class Attachment:
             now = self.log
             losses_now = ", ".join(f"L_{name} {now[name]:.4f}" for name in losses) or "no HR"
             _log.info("t=%d: %s, lambda_HR %.3f, %s Gaussians.", self.t, losses_now, λ, f"{self._n:,}")
-
-    def _warn_of_renderings_in_vain(self) -> None:
-        """Warn if no backward pass has merged the last renderings: nobody may tell otherwise that a loop steps other tensors."""
-        if self._pending is None:
-            return
-        self._in_vain = 0 if self._pending.merged else self._in_vain + 1
-        if self._in_vain == _PATIENCE:
-            cause, remedy = why_nothing_was_merged(self._pending, [*trained(self._host.leaves())])
-            _log.warning(
-                "CLEAR has no part in the last %d renderings of training views: %s. %s Evaluate under torch.no_grad().",
-                _PATIENCE, cause, remedy,
-            )  # fmt: skip
 
     def _warn_of_accumulation(self, before: Sequence[Tensor]) -> None:
         """Warn once if a step sums more passes than `accumulation` names.

@@ -21,7 +21,6 @@ from tqdm import tqdm
 from clear_strategies.bench.rasterizers import relative, require_device
 from clear_strategies.bench.results import Results
 from clear_strategies.compose import conductor
-from clear_strategies.core.deferred import Number
 from clear_strategies.data.priors import Bicubic
 from clear_strategies.errors import counted
 from clear_strategies.geometry import stereo
@@ -99,17 +98,16 @@ class Loop:
 
     def _time(self, host_merge: HostMerge) -> None:
         """Sum up the seconds of its merges: of the processor, on a device by the wall clock."""
-        device, merge = self.photos.device, host_merge.merge
+        device, merge = self.photos.device, host_merge._merge
         clock = time.perf_counter if device.type == "cuda" else time.process_time
 
-        def timed(*arguments: Any, **keywords: Any) -> Mapping[str, Number]:
+        def timed(*arguments: Any) -> None:
             began = clock()
-            result = merge(*arguments, **keywords)
+            merge(*arguments)
             _wait(device)
             self.merging += clock() - began
-            return result
 
-        host_merge.merge = timed  # type: ignore[method-assign]
+        host_merge._merge = timed  # type: ignore[method-assign, assignment]
 
 
 def measure(

@@ -1,11 +1,12 @@
-"""The merge at the end of a host's backward pass: the merged gradients replace those that the pass has added."""
+"""The host's backward passes: at the end of each, the merged gradients replace those that it has added."""
 
 from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Final
+from weakref import WeakMethod
 
 import torch
 from torch import Tensor
@@ -17,45 +18,104 @@ from clear_strategies.core.step import Step
 from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide
-from integration.autograd_shot import AutogradShot
+from integration.autograd_shot import AutogradShot, trained
 from integration.densification import ScoreScaler, score_for_host
 from integration.detail import Fading
 from integration.host import Host
-from integration.pending import BackwardPass, Pending, widened
+from integration.pending import BackwardPass, Pending, why_nothing_was_merged, widened
 from integration.replayed_merge import ReplayedMerge
+from rasterizers.autograd import TakeColours
+from rasterizers.torch_internals import current_pass, when_pass_ends
 
 _log = logging.getLogger(__name__)
+_IN_VAIN: Final = 10  # renderings that are not merged, one after the other, before a warning
 _PATIENCE: Final = 10  # merges in which the loop's gradients outweigh those of HR, before a warning
 _OUTWEIGHS: Final = 30.0  # their ratio; in gsplat's loop on the demo it lies between 0.5 and 1.4
 
 
 class HostMerge:
-    """Merges the gradients of a rendering, after one backward pass, or after several with different parameters.
+    """Merges the gradients of the last rendering, after one backward pass of the host, or after several to different parameters.
 
     Args:
         device: of the Gaussians. counts: `Attachment.counts`, to which this class adds.
+        merged: called after each merge, with the conflict ratios by group before correction if it is the first of its rendering,
+            and what `.grad` of the parameters held before the pass.
 
     Attributes:
+        pending: the last rendering; None: there is none, or none is to be merged any more.
         scaler: of the densification score; None: the score is not scaled.
         fading: of f_det.
     """
 
-    def __init__(self, conductor: Conductor, host: Host, device: torch.device, counts: Counter[str]) -> None:
-        self._conductor, self._host, self._counts = conductor, host, counts
+    def __init__(
+        self, conductor: Conductor, host: Host, device: torch.device, counts: Counter[str],
+        merged: Callable[[Pending, Mapping[str, Number] | None, Sequence[Tensor]], None] = lambda *_: None,
+    ) -> None:  # fmt: skip
+        self._conductor, self._host, self._counts, self._merged = conductor, host, counts, merged
+        self.pending: Pending | None = None
         self.scaler = None if host.threshold is None else ScoreScaler(host.threshold)
         self.fading = Fading(conductor.detail, host.accumulation)
         self._replayed = ReplayedMerge(conductor, device)
+        self._pass: BackwardPass | None = None  # the last one that has reached a rendering
+        self._in_vain = 0  # renderings, one after the other, that were not merged
         self._outweighed: int | None = 0  # of the first merges with HR; None: in one of them HR had a part
 
-    def merge(self, pending: Pending, done: BackwardPass, names: Sequence[str], t: int) -> Mapping[str, Number]:
-        """Merge the gradients of these parameters; with the first of the rendering, merge that of f_det and write the score.
+    @property
+    def is_waiting(self) -> bool:
+        """Whether gradients of the last rendering are still to be merged."""
+        return self.pending is not None and self.pending.output is not None
 
-        Returns:
-            The conflict ratios by group, before correction.
+    def await_passes(self, pending: Pending, *, to_screen: bool) -> None:
+        """Merge this rendering in place of the last one; warn if no backward pass has merged the last ones: nobody may tell
+        otherwise that a loop steps other tensors.
+        """
+        if self.pending is not None:
+            self._in_vain = 0 if self.pending.merged else self._in_vain + 1
+            if self._in_vain == _IN_VAIN:
+                cause, remedy = why_nothing_was_merged(self.pending, [*trained(self._host.leaves())])
+                _log.warning(
+                    "CLEAR has no part in the last %d renderings of training views: %s. %s Evaluate under torch.no_grad().",
+                    _IN_VAIN, cause, remedy,
+                )  # fmt: skip
+        self.pending = pending
+        pending.listen(WeakMethod(self._reached), to_screen=to_screen)
+
+    def _reached(self, nth: int) -> TakeColours | None:
+        """Called when a backward pass of the host has reached the nth rendering, but no parameter yet."""
+        if self.pending is None:
+            return None
+        if self._pass is None or self._pass.task != current_pass():
+            self._pass = now = BackwardPass(current_pass(), self._host.leaves())
+            when_pass_ends(lambda: self._on_backward_end(now))
+        self._pass.renderings.add(nth)
+        return self._pass.take if self.pending.may_take_factors(self._pass.params) else None
+
+    @torch.no_grad()
+    def _on_backward_end(self, done: BackwardPass) -> None:
+        """At the end of a backward pass of the host, replace the gradients that it added by the merged ones.
+
+        A pass that leaves every `.grad` as it was (`torch.autograd.grad`) is ignored.
+        """
+        pending, self._pass = self.pending, None
+        expected, accumulated = trained(done.params), done.accumulated()
+        if pending is not None and (accumulated or not expected):
+            pending.require_alone(done)
+            using = [type(s).__name__ for s in map(self._conductor.owner, ("reconcile", "score")) if s is not None]
+            pending.require_first(accumulated, " and ".join(using))
+            names = [name for name in accumulated if name not in pending.merged]
+            if names or not (expected or pending.merged):
+                self._merge(pending, done, names)
+        for hook in done.hooks:
+            hook()
+        if pending is not None and pending.merged.issuperset(expected):
+            pending.output = pending.hr = None
+
+    def _merge(self, pending: Pending, done: BackwardPass, names: Sequence[str]) -> None:
+        """Merge the gradients of these parameters; with the first of the rendering, merge that of f_det and write the score.
 
         Raises:
             HostError: a gradient is sparse.
-            DivergedError: a merged gradient is not finite, and no gradient scaler would skip the step.
+            DivergedError: see `merge_gradients`.
         """
         params, hr, first = {name: done.params[name] for name in names}, pending.hr, not pending.merged
         scale = self._host.scale()
@@ -72,6 +132,7 @@ class HostMerge:
             detail = None
         if detail is not None and detail.grad is not None:  # the host's own gradient of it stays
             done.before["detail"] = detail.grad
+        t, before = pending.t, [done.before[name] for name in names if name in done.before]
         λ = self._conductor.objective.lambda_hr(t)
         g_hr = pending.routed_of(names, done.params) if λ > 0 else Grads()
         self._warn_if_outweighed(done, g_hr, scale)
@@ -83,7 +144,7 @@ class HostMerge:
         self._counts["merges"] += 1
         if first and hr is not None and pending.output is not None and done.task in pending.screen:
             self._write_score(pending.output.shot, pending.screen[done.task], hr, t, scale)
-        return conflict
+        self._merged(pending, conflict if first else None, before)
 
     def merge_gradients(
         self, done: BackwardPass, names: Iterable[str], g_hr: Grads, step: Step | None, t: int, scale: float

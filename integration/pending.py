@@ -93,7 +93,7 @@ class BackwardPass:
         return g_lr, out
 
     def replace(self, merged: Mapping[str, Tensor], scale: float) -> None:
-        """Set `.grad` to what it was before the pass plus the merged gradient times `scale`, in its present memory if there is."""
+        """Set `.grad`, in its present memory if there is one, to what it was before the pass plus the merged gradient times `scale`."""
         for name, gradient in merged.items():
             p, scaled = self.params[name], gradient if scale == 1 else gradient.mul_(scale)
             g = scaled.add_(self.before[name]) if name in self.before else scaled
@@ -132,13 +132,14 @@ class Pending:
     """A rendering of a training view that waits for the host's backward pass.
 
     Args:
-        nth: its number. output: None once all trained parameters are merged.
+        nth: its number. t: the iteration. output: None once all trained parameters are merged.
         hr: the gradients of HR; None: HR takes no part.
         screen: the screen gradient of LR by the number of its pass, if a densifier reads it.
         merged: the parameters whose gradients are merged.
     """
 
     nth: int
+    t: int
     view: str
     output: HostOutput | None
     hr: HrSide | None
