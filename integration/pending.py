@@ -93,7 +93,7 @@ class BackwardPass:
         return g_lr, out
 
     def replace(self, merged: Mapping[str, Tensor], scale: float) -> None:
-        """Set `.grad`, in its present memory if there is one, to what it was before the pass plus the merged gradient times `scale`."""
+        """Set `.grad`, in its memory, to what it was before the pass plus the merged gradient times `scale`."""
         for name, gradient in merged.items():
             p, scaled = self.params[name], gradient if scale == 1 else gradient.mul_(scale)
             g = scaled.add_(self.before[name]) if name in self.before else scaled

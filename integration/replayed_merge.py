@@ -32,7 +32,7 @@ _FINITE: Final = "finite"
 
 
 class ReplayedMerge:
-    """Called as `Conductor.merge_routed` with all its arguments.
+    """Called as `Conductor.merge` with all its arguments.
 
     Args:
         device: of the Gaussians. On CUDA a merge in which HR takes part is recorded and replayed.
@@ -45,10 +45,10 @@ class ReplayedMerge:
     def __call__(
         self, params: Mapping[str, Tensor], g_lr: Grads, g_hr: Grads, step: Step | None, t: int, out: Mapping[str, Tensor]
     ) -> Merged:  # fmt: skip
-        """See `Conductor.merge_routed`."""
+        """See `Conductor.merge`."""
         conductor, λ = self._conductor, self._conductor.objective.lambda_hr(t)
         if self._replays is None or step is None or not g_hr.tensors or λ == 0:
-            return conductor.merge_routed(params, g_lr, g_hr, step, t, out)
+            return conductor.merge(params, g_lr, g_hr, step, t, out)
         of_lr, of_hr, e, first = _named(g_lr), _named(g_hr), step.evidence, next(iter(out.values()))
         evidence = () if e is None else (e.reliability, e.demand, e.sums)
         λ_there = _on_device(λ, first.dtype, first.device)
@@ -61,7 +61,7 @@ class ReplayedMerge:
             visible, seen = next(numbers), None if e is None else Evidence(*numbers)
             view = unread(step.view, "the view")
             known = replace(step, t=iteration(t), view=view, visible=visible, evidence=seen, looked_up=None)
-            merged = conductor.merge_routed(params, lr, hr, known, t, out, None if running() is None else λ)
+            merged = conductor.merge(params, lr, hr, known, t, out, None if running() is None else λ)
             return out, {_FINITE: merged.finite, **merged.conflict}
 
         def recorded(copies: Iterable[Any]) -> tuple[Mapping[str, Tensor], dict[str, Number]]:

@@ -174,7 +174,8 @@ class Conductor(Hooks):
                 score, ordinary = self.scores(screen_lr, from_hr, weights)  # S^dens   Eq. 14
             require_finite_parts(where, g_lr, from_hr)
             if stepper is None:
-                merged = self.merge(params, g_lr, from_hr, t)
+                g_hr = Grads() if from_hr is None else from_hr.routed
+                merged = self.merge(params, g_lr.without_detail(), g_hr, step, t, finite=True)
                 require_finite(f"{where}: the merged gradient", merged.grads)
                 grads, conflict = merged.grads, merged.conflict
             else:
@@ -270,23 +271,15 @@ class Conductor(Hooks):
         screen = ScreenGradients(screen_lr, *per_gaussian.screens(screen_lr, screen_of(hr.g), hf, hr.size, weights))
         return self.score(hr.step, screen), screen.ordinary
 
-    def merge(self, params: Mapping[str, Tensor], g_lr: Grads, hr: HrSide | None, t: int) -> Merged:
-        """The merge: g_LR + λ_HR ĝ_HR + λ∇L_stab.
-
-        Args:
-            params: raw parameters by attribute. g_lr: ∇(λ_LR L_LR). hr: None where HR was not rendered.
-        """
-        g_hr, step = (Grads(), None) if hr is None else (hr.routed, hr.step)
-        return self.merge_routed(params, g_lr.without_detail(), g_hr, step, t, finite=True)
-
     @apart_from_the_loop
-    def merge_routed(
+    def merge(
         self, params: Mapping[str, Tensor], g_lr: Grads, g_hr: Grads, step: Step | None, t: int,
         out: Mapping[str, Tensor] | None = None, lambda_hr: Float[Tensor, " 1"] | None = None, finite: bool = False,
     ) -> Merged:  # fmt: skip
-        """The merge after routing.
+        """The merge: g_LR + λ_HR ĝ_HR + λ∇L_stab.
 
         Args:
+            params: raw parameters by attribute. g_lr: ∇(λ_LR L_LR), without f_det.
             g_hr: g^HR of Eq. 13, and m λ_HF ∇L_HF of f_det; empty without HR. step: the iteration, with the evidence.
             out: receives the merged gradient, by attribute, contiguous; None: new tensors, for what has a gradient.
             lambda_hr: λ_HR(t) > 0 on the device, in a recording.

@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 import torch
 
-from clear_strategies import SVS, Conductor, Evidence, Objective
+from clear_strategies import SVS, Conductor, Evidence, Grads, Objective
 from clear_strategies.core import deferred
 from clear_strategies.core.gradients import gradients_of
 from clear_strategies.merging.iteration import HrSide
@@ -68,7 +68,8 @@ class Case:
 
 def readable_merge(conductor, params, g_lr, hr, t) -> tuple:
     """The merged gradient and the conflict ratios of the readable path."""
-    merged = conductor.merge(params, g_lr, hr, t)
+    g_hr, step = (Grads(), None) if hr is None else (hr.routed, hr.step)
+    merged = conductor.merge(params, g_lr.without_detail(), g_hr, step, t)
     return merged.grads, merged.conflict
 
 

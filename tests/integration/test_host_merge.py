@@ -1,4 +1,4 @@
-"""The merge in a host's `.grad` against `Conductor.merge_routed` in float64, by every pass that runs here."""
+"""The merge in a host's `.grad` against `Conductor.merge` in float64, by every pass that runs here."""
 
 from collections import Counter
 from functools import partial
@@ -88,7 +88,7 @@ def by_the_conductor(made, params, g_hr, step, t, *, before, scale):
     passed = {name: p.grad - before.get(name, 0) for name, p in params.items() if p.grad is not None}
     lr, values = Grads(passed) * (1 / scale), {name: p.detach() for name, p in params.items()}
     out = {name: torch.empty_like(p) for name, p in values.items()}
-    merged = made.merge_routed(values, lr, g_hr, step, t, out)
+    merged = made.merge(values, lr, g_hr, step, t, out)
     for name, g in out.items():
         params[name].grad = before.get(name, 0) + scale * g
     return merged.conflict
