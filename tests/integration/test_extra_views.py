@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import rasterizers
-from clear_strategies import Conductor, FadingOpacity
+from clear_strategies import Conductor
 from integration.inria.attached import _ATTRIBUTES
 from rasterizers import Splats
 from tests.helpers import gsplat_host, host_parts, toy
@@ -141,17 +141,6 @@ def test_gaussians_that_were_replaced_since_make_no_step_on_an_extra_view():
     assert clear.attachment.counts["extra views"] == 0
 
 
-def test_extra_views_that_no_optimizer_steps_on_give_a_warning(caplog):
-    trainer = Host(toy.scene(20))
-    unknown = torch.optim.Adam(list(trainer.splats.values()))
-    _, clear, render = started(toy.ShowsDark(), host=trainer, detail=False)
-    for _ in range(11):
-        render().mean().backward()
-        unknown.step()
-    assert caplog.text.count("extra views have no effect") == 1
-    assert clear.attachment.counts["extra views"] == 0
-
-
 def test_an_inria_style_host_draws_any_camera(inria_host, inria_capture, drawn):
     opt = host_parts.options(inria_host, inria_capture, iterations=1)
     _, clear, _ = trained_inria(inria_host, inria_capture, [toy.ShowsDark()], iterations=1)
@@ -161,17 +150,6 @@ def test_an_inria_style_host_draws_any_camera(inria_host, inria_capture, drawn):
     before = copy.copy(clear.params())
     before |= {name: getattr(start, attribute) for name, attribute in _ATTRIBUTES.items()}
     assert torch.allclose(image.double(), reference(before, camera, 0), atol=1e-4)
-
-
-def test_opacities_fade_in_a_gsplat_host():
-    scene, after = toy.scene(20), {}
-    for strategies in ((), (FadingOpacity(rate=0.5),)):
-        a_host = Host(scene)
-        names = [scene.train[i % 3].name for i in range(4)]
-        gsplat_host.trained(a_host, scene, Conductor(*strategies, objective=host_parts.HR_FROM_START), names)
-        after[len(strategies)] = a_host.splats["opacities"].detach().sigmoid()
-    assert after[1].mean() < 0.4 * after[0].mean()  # three steps, and what the optimizer gives back
-    assert after[1].min() > 0.005
 
 
 @pytest.mark.parametrize(

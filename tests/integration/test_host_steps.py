@@ -179,16 +179,6 @@ def test_optimizers_that_f_det_cannot_join_are_refused(optimizers, rule):
         attach(host.splats, optimizers(host), scene.train, Conductor())
 
 
-def test_optimizers_of_other_tensors_than_those_that_were_passed_are_refused():
-    scene = toy.scene(20)
-    host = Host(scene)
-    copies = {name: torch.nn.Parameter(p.detach().clone()) for name, p in host.splats.items()}
-    host.rasterization = attach(copies, host.optimizers, scene.train, Conductor()).wrap(host.rasterization)
-    host.render(scene.train[0].lr.camera)[0].mean().backward()
-    with pytest.raises(HostError, match=r"no backward\(\) has given means"):
-        host.optimizers["means"].step()
-
-
 def test_a_step_begins_after_each_merge_whichever_optimizers_take_part():
     host, clear, render = started()
     for name in ("means", "scales"):

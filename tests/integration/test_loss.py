@@ -36,6 +36,13 @@ class Host:
         return AutogradShot(shot.image, shot.means2d, shot.visible, params)
 
 
+def drawn(*strategies):
+    """A host, a conductor, a view, and both of its renderings."""
+    host, view = Host(scene := toy.scene(20)), scene.train[0]
+    conductor = Conductor(*strategies, objective=HR_FROM_START)
+    return host, conductor, view, host.render(view.lr.camera, detail=False), host.render(view.hr.camera)
+
+
 @pytest.mark.parametrize("strategies", [(), (GCO(),), (P2G(),), (SVS(),), (GCO(), P2G(), SVS())], ids=len)
 def test_backward_gives_the_conductors_gradient(strategies):
     scene = toy.scene(20)
@@ -56,10 +63,7 @@ def test_backward_gives_the_conductors_gradient(strategies):
 
 
 def test_its_value_is_the_sum_of_the_losses_and_backward_writes_the_score_for_a_densifier():
-    scene = toy.scene(20)
-    host, view = Host(scene), scene.train[0]
-    conductor = Conductor(GCO(), objective=HR_FROM_START)
-    lr, hr = host.render(view.lr.camera, detail=False), host.render(view.hr.camera)
+    host, conductor, view, lr, hr = drawn(GCO())
     loss, update = joint_loss(conductor, host.params, lr, hr, view, 50, ScoreScaler(1e-4))
     l = update.losses
     assert loss.item() == pytest.approx(l["lr"] + l["base"] + 0.2 * l["hf"], rel=1e-6)
@@ -120,11 +124,9 @@ def test_what_else_the_rendering_depends_on_gets_the_gradient_of_lr(share):
 def test_a_hook_of_a_parameter_is_called_once_with_the_merged_gradient():
     found = []
     for hooked in (False, True):
-        scene = toy.scene(20)
-        host, view, conductor = Host(scene), scene.train[0], Conductor(GCO(), objective=HR_FROM_START)
+        host, conductor, view, lr, hr = drawn(GCO())
         if hooked:
             host.params["means"].register_hook(lambda g: 3 * g)
-        lr, hr = host.render(view.lr.camera, detail=False), host.render(view.hr.camera)
         joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
         found.append({name: p.grad for name, p in host.params.items()})
     plain, tripled = found
@@ -136,9 +138,7 @@ def test_a_hook_of_a_parameter_is_called_once_with_the_merged_gradient():
 
 
 def test_what_is_no_rendering_of_the_parameters_is_refused():
-    scene = toy.scene(20)
-    host, view, conductor = Host(scene), scene.train[0], Conductor(objective=HR_FROM_START)
-    lr, hr = host.render(view.lr.camera, detail=False), host.render(view.hr.camera)
+    host, conductor, view, lr, hr = drawn()
     joint = partial(joint_loss, conductor, view=view, t=5)
     with pytest.raises(HostError, match="sh0 must be a leaf"):
         joint(host.params | {"sh0": host.params["sh0"] * 2}, lr, hr)
@@ -158,8 +158,7 @@ def test_what_is_no_rendering_of_the_parameters_is_refused():
 
 @pytest.mark.parametrize("scale", ["lr", "hr"])
 def test_a_rendering_with_other_intrinsics_than_its_photo_is_refused(scale):
-    scene = toy.scene(20)
-    host, view, conductor = Host(scene), scene.train[0], Conductor(objective=HR_FROM_START)
+    host, conductor, view, *_ = drawn()
     cameras = {"lr": view.lr.camera, "hr": view.hr.camera}
     cameras[scale] = replace(cameras[scale], fx=cameras[scale].fx * 1.1)
     lr, hr = host.render(cameras["lr"], detail=False), host.render(cameras["hr"])
@@ -168,9 +167,7 @@ def test_a_rendering_with_other_intrinsics_than_its_photo_is_refused(scale):
 
 
 def test_parameters_without_a_row_for_each_gaussian_or_of_other_names_are_refused():
-    scene = toy.scene(20)
-    host, view, conductor = Host(scene), scene.train[0], Conductor(objective=HR_FROM_START)
-    lr, hr = host.render(view.lr.camera, detail=False), host.render(view.hr.camera)
+    host, conductor, view, lr, hr = drawn()
     with pytest.raises(ValueError, match=r"params\['pose'\] must have a row for each of the 20 .*, got \[1, 6\]"):
         joint_loss(conductor, host.params | {"pose": torch.zeros(1, 6)}, lr, hr, view, 5)
     renamed = {("xyz" if name == "scales" else name): p for name, p in host.params.items()}
@@ -179,9 +176,7 @@ def test_parameters_without_a_row_for_each_gaussian_or_of_other_names_are_refuse
 
 
 def test_f_det_at_lr_or_not_at_hr_and_a_strategy_that_has_not_started_are_refused():
-    scene = toy.scene(20)
-    host, view, conductor = Host(scene), scene.train[0], Conductor(SVS(), objective=HR_FROM_START)
-    lr, hr = host.render(view.lr.camera, detail=False), host.render(view.hr.camera)
+    host, conductor, view, lr, hr = drawn(SVS())
     with pytest.raises(ValueError, match="SVS has not started"):
         joint_loss(conductor, host.params, lr, hr, view, 5)
     conductor.on_fit_start(3, 0)
@@ -212,11 +207,9 @@ def test_a_parameter_of_another_name_is_summed():
 
 
 def test_a_rendering_of_another_size_is_refused():
-    scene = toy.scene(20)
-    host, view = Host(scene), scene.train[0]
-    small = host.render(view.lr.camera, detail=False)
+    host, conductor, view, small, _ = drawn()
     with pytest.raises(ValueError, match=r"view view0: the HR rendering must have the 96x64 .*, got 24x16"):
-        joint_loss(Conductor(objective=HR_FROM_START), host.params, small, host.render(view.lr.camera), view, 5)
+        joint_loss(conductor, host.params, small, host.render(view.lr.camera), view, 5)
 
 
 @pytest.mark.parametrize("drawn", ["lr", "hr", "a pose of no view"])
