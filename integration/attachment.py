@@ -26,6 +26,7 @@ import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from typing import Any, Final
 from weakref import finalize
 
@@ -124,11 +125,11 @@ class Attachment:
             z = z.to(means)
         # HR and extra views leave torch's random numbers as they were, so a dropout of the host drops the same at LR.
         apart = torch.random.fork_rng([means.device] if means.device.type == "cuda" else [])(render_at)
-        hr = None
+        hr, step = None, Step(t, view, params=params)
         if self._hr.wanted(t):
             view = conductor.skips.view(view, t)
-            hr = self._hr.hr(view, t, z, apart, params)
-        self._step = Step(t, view, params=params) if hr is None else hr.step
+            hr = self._hr.hr(replace(step, view=view), z, apart)
+        self._step = step if hr is None else hr.step
         if self.passes == 0:  # once per step of the host, however many passes it accumulates
             extra_views = conductor.extra_views(t)
             self._steps.follow_by(leaves, (self._hr.extra_view(x, view, t, apart) for x in extra_views))

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.gradients import Grads
+from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide
@@ -143,15 +144,14 @@ class HrDrawing:
         scores = self.is_scored and conductor.may_densify(t)
         return conductor.wants_hr(t) and (scores or not conductor.skips.leaves_out_hr(t, conductor.work_log))
 
-    def hr(
-        self, view: View, t: int, gate: Float[Tensor, " N"] | None, render_at: RenderAt, params: Mapping[str, Tensor]
-    ) -> HrSide:
+    def hr(self, step: Step, gate: Float[Tensor, " N"] | None, render_at: RenderAt) -> HrSide:
         """The gradients of HR, of the raw parameters if HR takes part in the merge."""
         self._counts["HR renders"] += 1
-        conductor, mask, drawn = self._conductor, self._masks.get(view.name), render_at("hr", gate, view)
-        fine = None if mask is None else enlarged_mask(mask.to(params["means"]), view.factor)[..., None]
+        conductor, view = self._conductor, step.view
+        mask, drawn = self._masks.get(view.name), render_at("hr", gate, view)
+        fine = None if mask is None else enlarged_mask(mask.to(step.params["means"]), view.factor)[..., None]
         if isinstance(drawn, Drawable):
-            return self._own_hr(drawn, view, t, fine)
+            return self._own_hr(drawn, step, fine)
         shot = drawn.shot
         if (n := len(shot.drawings)) > 1:
             self._counts["HR renders in parts"] += 1
@@ -164,8 +164,8 @@ class HrDrawing:
         if fine is not None:
             shot = replace(shot, image=shot.image * fine.to(shot.image))
         apart = shot.drawing is not None or "detail" in shot.params
-        hr = conductor.hr_gradients(shot, view, t, AutogradShot.gradients, apart=apart, params=params)
-        return side_of_parameters(hr, shot.inputs, shot.params) if conductor.objective.lambda_hr(t) > 0 else hr
+        hr = conductor.hr_gradients(shot, step, AutogradShot.gradients, apart=apart)
+        return side_of_parameters(hr, shot.inputs, shot.params) if conductor.objective.lambda_hr(step.t) > 0 else hr
 
     def extra_view(self, extra: ExtraView, view: View, t: int, render_at: RenderAt) -> Grads:
         """The gradient of an extra view, which is drawn without gate and f_det."""
@@ -177,23 +177,22 @@ class HrDrawing:
 
     @in_full_precision
     @torch.no_grad()
-    def _own_hr(self, asked: Drawable, view: View, t: int, mask: Float[Tensor, "H W 1"] | None) -> HrSide:
+    def _own_hr(self, asked: Drawable, step: Step, mask: Float[Tensor, "H W 1"] | None) -> HrSide:
         """As `hr`, drawn by this package."""
-        conductor = self._conductor
+        conductor, t, view = self._conductor, step.t, step.view
         photo = view.hr.over(conductor.background(t), view.background)
         looked_up = None if self._replays is None else conductor.looked_up(view)
 
         def work(inputs: _RenderInputs) -> tuple[HrSide, dict[str, Number]]:
             shown = view if inputs.image is photo.image else replace(view, hr=inputs.over(photo))
             shot = inputs.shot(asked)
-            hr = conductor.hr_gradients(shot, shown, t, AutogradShot.gradients, looked_up=inputs.looked_up)
+            hr = conductor.hr_gradients(shot, Step(t, shown, looked_up=inputs.looked_up), AutogradShot.gradients)
             return hr, {**hr.losses}  # Eq. 9, 10, 12, 13
 
         inputs = asked.compared_with(photo, looked_up=looked_up, mask=mask)
         hr, losses = self._done(asked, inputs, t, ("hr", view.factor), work)
-        params = {name: p.detach() for name, p in asked.params.items()}
-        step = hr.step if self._replays is None else hr.step.copied()
-        hr = replace(hr, step=replace(step, t=t, view=view, params=params), losses=losses)
+        seen = hr.step if self._replays is None else hr.step.copied()
+        hr = replace(hr, step=replace(seen, t=t, view=view, params=step.params), losses=losses)
         return side_of_parameters(hr, asked.drawn, asked.params)
 
     @in_full_precision

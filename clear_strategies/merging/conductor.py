@@ -6,7 +6,8 @@ It is the same in every trainer. The order of an iteration is that of `Conductor
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, TypeVar
+from dataclasses import replace
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -42,8 +43,6 @@ from rasterizers.native import empty_for
 from rasterizers.recording import running
 
 P = TypeVar("P")
-
-_UNKNOWN: Final[Mapping[str, Tensor]] = {}
 
 
 class Conductor(Hooks):
@@ -145,7 +144,8 @@ class Conductor(Hooks):
                 "and wants_hr(t) ask for."
             )
         self.logs.keep()
-        step = self._step(view, t, params=params)
+        known = Step(t, view, params=params, looked_up=looked_up)
+        step = self._told(known)
         with stage("losses LR"):
             low, photo = rendered.image.detach(), self._over_background(view.lr, t, view.background)
             _require_size(view, "HR" if reduced else "LR", low, view.hr.image if reduced else photo.image)
@@ -162,9 +162,7 @@ class Conductor(Hooks):
         else:
             # Where Î_LR is the area mean of Î_HR, the cotangent of L_LR passes through the same HR render.
             through_mean = images.area_mean_transposed(l_lr.cotangents, view.factor) if reduced else None
-            from_hr = self.hr_gradients(
-                hr, view, t, vjp, params=params, looked_up=looked_up, lr_cotangents=through_mean
-            )
+            from_hr = self.hr_gradients(hr, known, vjp, lr_cotangents=through_mean)
             g_lr, step = from_hr.lr if reduced else g_lr, from_hr.step
         with stage("strategies" if stepper is None else "per-Gaussian pass"):
             score = ordinary = None
@@ -188,28 +186,24 @@ class Conductor(Hooks):
     def hr_gradients(
         self,
         hr: Shot,
-        view: View,
-        t: int,
+        step: Step,
         vjp: Callable[..., Sequence[Grads]] | None = None,
         *,
         apart: bool = True,
-        params: Mapping[str, Tensor] = _UNKNOWN,
-        looked_up: Tensor | None = None,
         lr_cotangents: Float[Tensor, "1 H W 3"] | None = None,
     ) -> HrSide:
         """Compare Î_HR with the SR image, ask for the evidence, and backpropagate both losses in one pass.
 
         Args:
-            vjp: as `Stepper.vjp`; None: by `Shot.vjp`.
+            step: the iteration. vjp: as `Stepper.vjp`; None: by `Shot.vjp`.
             apart: False: one cotangent, of L_base + λ_HF L_HF, unless a strategy routes or scores by L_HF.
-            params, looked_up: see `Step`.
             lr_cotangents: of λ_LR L_LR, if its gradient passes through this render, too.
         """
-        stage, λ_hf = self.work_log.stage, self.objective.lambda_hf
+        stage, λ_hf, t, view = self.work_log.stage, self.objective.lambda_hf, step.t, step.view
         with stage("losses HR"):
             sr = self._over_background(view.hr, t, view.background)
             _require_size(view, "HR", hr.image, sr.image)
-            step = self._step(view, t, visible=hr.visible, params=params, looked_up=looked_up)
+            step = self._told(replace(step, visible=hr.visible))
             # The memory is reused: an allocator would map tens of megabytes anew each time, with a page fault for every 4 KB.
             objective, reuse = self.objective, self._hr_cotangents
             compare = self.comparison("hr", sr, step, lambda image: objective.hr(image, sr.image, sr.shown, reuse))
@@ -310,9 +304,10 @@ class Conductor(Hooks):
         self._hr_cotangents = None
         super().on_fit_end()
 
-    def _step(self, view: View, t: int, **known: Any) -> Step:
+    def _told(self, step: Step) -> Step:
         """The iteration as strategies see it; in a recording, they cannot read from it what differs between replays."""
-        return Step(iteration(t), guarded(view, over_changing=self.owner("background") is not None), **known)
+        view = guarded(step.view, over_changing=self.owner("background") is not None)
+        return replace(step, t=iteration(step.t), view=view)
 
     def _over_background(self, photo: Photo, t: int, background: Color) -> Photo:
         """The photo composited over the background of iteration t instead of its own. Those of a recording are so already."""

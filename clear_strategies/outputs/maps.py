@@ -31,6 +31,7 @@ from clear_strategies.core import images
 from clear_strategies.core.evidence import PatchMaps
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.progress import Progress
+from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.scene import Scene
@@ -178,7 +179,8 @@ def _gradients(
     (g_lr,) = lr.vjp(objective.lr(lr.image.detach(), view.lr.image, view.lr.shown).cotangents)
     # The field is drawn over the scene's own background, not over one of a strategy.
     opaque = replace(view, hr=replace(view.hr, transparency=None))
-    from_hr = aside.hr_gradients(hr, opaque, t, params={name: p.detach() for name, p in field.raw().items()})
+    step = Step(t, opaque, params={name: p.detach() for name, p in field.raw().items()})
+    from_hr = aside.hr_gradients(hr, step)
     g_lr, g_hr = g_lr.without_detail(), from_hr.g
     if (owner := aside.owner("reconcile")) is None:
         return g_lr, g_hr, None, hr.image.detach().cpu()
