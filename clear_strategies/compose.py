@@ -95,11 +95,6 @@ def conductor(
     if not is_named and content["strategies"].pop(_NOT_IN_HOSTS, None) is not None:
         _say_left_out()
     settings: ConductorSettings = build(content)
-    for name, s in settings.strategies.items():
-        if not s.shares_gate:
-            raise SettingError(
-                f"strategies.{name}: other trainers render both scales with one mask. Leave out shared=false."
-            )
     return settings.conductor(iterations / REFERENCE_ITERATIONS, _detail(config).of_run(iterations))
 
 

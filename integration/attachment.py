@@ -321,6 +321,8 @@ def _require_supported(conductor: Conductor) -> None:
             "objective: a host renders LR itself, so lambda_lr must be > 0 and lr_from must be lr, got "
             f"lambda_lr={conductor.objective.lambda_lr}, lr_from={conductor.objective.lr_from!r}."
         )
+    if apart := [type(s).__name__ for s in conductor.strategies if not s.shares_gate]:
+        raise SettingError(f"{apart[0]}: other trainers render both scales with one mask. Leave out shared=false.")
     _require_one_process()
 
 

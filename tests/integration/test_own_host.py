@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clear_strategies import Conductor
+from clear_strategies import SVS, Conductor
 from clear_strategies.errors import SettingError
 from integration import AutogradShot, HostError
 from integration.attachment import Attachment
@@ -46,6 +46,11 @@ def test_a_process_that_joins_others_after_the_attachment_is_refused(monkeypatch
     monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
     with pytest.raises(SettingError, match="CLEAR trains in one process, got 2"):
         adapter.step()
+
+
+def test_a_mask_for_each_scale_is_refused():
+    with pytest.raises(SettingError, match="SVS: other trainers render both scales with one mask"):
+        gsplat_host.started(SVS(shared=False))
 
 
 def activated(output):

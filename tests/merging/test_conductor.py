@@ -60,6 +60,15 @@ def test_contract(make, check):
     check(make)
 
 
+def answering(hook, answer, **facts):
+    """A strategy with this answer, a value or a function of the hook's arguments."""
+
+    def answered(self, *arguments):
+        return answer(*arguments) if callable(answer) else answer
+
+    return dataclass(frozen=True)(type("Mine", (Strategy,), {hook: answered, **facts}))
+
+
 @dataclass(frozen=True)
 class Careless(Strategy):
     """Changes what it was only shown."""
@@ -67,14 +76,6 @@ class Careless(Strategy):
     def correct(self, lr, hr, step):
         hr["means"] *= 2
         return hr
-
-
-@dataclass(frozen=True)
-class Forgetful(Strategy):
-    """Draws from global random state."""
-
-    def gate(self, t, n):
-        return (torch.rand(n) > 0.5).float()
 
 
 @dataclass(frozen=True)
@@ -94,14 +95,6 @@ class Distrusts(Strategy):
         if step.evidence is not None:
             step.evidence.reliability.mul_(0.5)
         return Weights()
-
-
-@dataclass(frozen=True)
-class NeedsHR(Strategy):
-    """Reads what an iteration without HR does not have."""
-
-    def after_step(self, params, step):
-        step.visible.float()
 
 
 @dataclass(frozen=True)
@@ -155,9 +148,10 @@ class OfFunctions(Strategy):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (Careless, "changed in place"), (Forgetful, "derive randomness"), (Secretive, "does not continue"),
+        (Careless, "changed in place"),
+        (answering("gate", lambda t, n: (torch.rand(n) > 0.5).float()), "derive randomness"), (Secretive, "does not continue"),
         (Distrusts, "the evidence was changed in place"),
-        (NeedsHR, "after_step fails in an iteration without HR"),
+        (answering("after_step", lambda p, step: step.visible.float()), "after_step fails in an iteration without HR"),
         (NeedsViews, "on_views fails where there are no views yet"), (Fixed, r"Fixed.reconcile\(\) must give .* \[37\]"),
         (Resizes, "on_resize fails from 30 Gaussians to 30"), (Untold, "summary fails"),
         (OfTensors, "settings cannot be compared"), (OfFunctions, "cannot be sent to another process"),
@@ -198,15 +192,6 @@ def test_the_contract_finds_a_parameter_of_other_memory_and_names_a_number_that_
     nowhere = answering("observe", lambda step, hr: Evidence(step.visible / step.visible, step.visible.float()))
     with pytest.raises(ContractError, match="the evidence of reliability is not finite"):
         check_strategy(nowhere)
-
-
-def answering(hook, answer, **facts):
-    """A strategy with this answer, a value or a function of the hook's arguments."""
-
-    def answered(self, *arguments):
-        return answer(*arguments) if callable(answer) else answer
-
-    return dataclass(frozen=True)(type("Mine", (Strategy,), {hook: answered, **facts}))
 
 
 def nan_of_first(rows):

@@ -6,9 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clear_strategies import SVS, AnchorError
-from clear_strategies.compose import conductor
 from clear_strategies.core.seeds import dropout_mask, generator_at, hashed_generator_at
-from clear_strategies.errors import SettingError
 from clear_strategies.schedules import Ramp
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
@@ -59,8 +57,6 @@ def test_with_a_mask_for_each_scale_each_loses_its_own_gaussians_and_gradients_a
         assert torch.equal(shot.image, alone.image)
         (grads,), (expected,) = (s.vjp(torch.ones(1, *s.image.shape)) for s in (shot, alone))
         assert all(torch.equal(g, expected[name]) for name, g in grads.items())
-    with pytest.raises(SettingError, match=r"strategies\.svs: other trainers render both scales with one mask"):
-        conductor("svs", "strategies.svs.shared=false")
 
 
 def started(n_views=3, **settings):
