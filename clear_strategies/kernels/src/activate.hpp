@@ -7,8 +7,6 @@
 #include <nanobind/stl/optional.h>
 
 #include "block.hpp"
-#include "chunks.hpp"
-#include "exponential.hpp"
 #include "pool.hpp"
 #include "tensor.hpp"
 
@@ -66,8 +64,8 @@ inline void bind_activate(nanobind::module_& m) {
         nb::gil_scoped_release free;
         activate(raw, {r, r + 3 * n, c, c + n, c + 2 * n, c + 3 * n}, threads);
       },
-      nb::arg("scales").noconvert(), nb::arg("opacities").noconvert(), nb::arg("filter").noconvert(), nb::arg("gate").noconvert().none(),
-      nb::arg("rows").noconvert(), nb::arg("columns").noconvert(), nb::arg("threads"));
+      nb::arg("scales"), nb::arg("opacities"), nb::arg("filter"), nb::arg("gate").none(), nb::arg("rows"), nb::arg("columns"),
+      nb::arg("threads"));
 }
 
 }  // namespace clear

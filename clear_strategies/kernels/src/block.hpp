@@ -1,8 +1,8 @@
-// Loads sixteen Gaussians from rows in memory into lanes, and arithmetic that only the trainer's kernels need.
+// How passes over the Gaussians are cut, rows in memory as lanes, and arithmetic that only the trainer's kernels need.
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
-#include <initializer_list>
 
 #include "rows.hpp"
 
@@ -10,6 +10,19 @@ namespace clear {
 
 using Floats = Lanes<float>;
 using Doubles = Lanes<double>;
+
+inline constexpr std::int64_t kChunk = 1024;  // Gaussians per task, a multiple of sixteen
+
+inline std::int64_t chunks(std::int64_t n) { return (n + kChunk - 1) / kChunk; }
+
+CLEAR_INLINE std::uint32_t first_bits(int count) { return count == kLanes ? 0xffffu : (1u << count) - 1; }
+
+// Calls task(i, count) for every sixteen Gaussians of chunk `number`.
+template <class Task>
+CLEAR_INLINE void each_sixteen(std::int64_t n, std::int64_t number, Task&& task) {
+  std::int64_t end = std::min(n, (number + 1) * kChunk);
+  for (std::int64_t i = number * kChunk; i < end; i += kLanes) task(i, int(std::min<std::int64_t>(kLanes, end - i)));
+}
 
 // columns[d] lane i = rows[i · stride + d] for the first `count` rows; lanes beyond are 0.
 template <int D>
@@ -61,20 +74,12 @@ CLEAR_INLINE double sum(const Doubles& a) {
   return total;
 }
 
-// a · b + c, rounded once where the processor has FMA, as torch's add_(alpha) and addcmul_ do.
-CLEAR_INLINE Floats multiply_add(const Floats& a, const Floats& b, const Floats& c) {
-#if defined(__AVX512F__)
-  Floats out;
-  out.r[0] = (Floats::Register)_mm512_fmadd_ps((__m512)a.r[0], (__m512)b.r[0], (__m512)c.r[0]);
-  return out;
-#elif defined(__FMA__)
-  Floats out;
-  for (int i = 0; i < Floats::registers; ++i)
-    out.r[i] = (Floats::Register)_mm256_fmadd_ps((__m256)a.r[i], (__m256)b.r[i], (__m256)c.r[i]);
-  return out;
-#else
-  return a * b + c;
-#endif
+// e^x, also of NaN, at least e^-87. x = n ln 2 + rest, where n times the first part of ln 2 is exact.
+CLEAR_INLINE Floats exponential(const Floats& x) {
+  const Floats bounded = minimum(Floats(89.0f), maximum(Floats(-87.0f), x)), log2_e = 1.44269504f;
+  const Floats n = nearest(bounded * log2_e);
+  const Floats rest = subtract_product(subtract_product(bounded, n, Floats(0.693359375f)), n, Floats(-2.12194440e-4f));
+  return scale_by_power(exp2(rest * log2_e), n);
 }
 
 }  // namespace clear

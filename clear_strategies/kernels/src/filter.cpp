@@ -5,7 +5,6 @@
 #include <limits>
 
 #include "block.hpp"
-#include "chunks.hpp"
 #include "pool.hpp"
 
 namespace clear {

@@ -1,7 +1,6 @@
 // Compiled with -ffp-contract=off, as step.cpp is, so that both give the same products.
 #include "reconcile.hpp"
 
-#include "chunks.hpp"
 #include "pool.hpp"
 #include "sh_rows.hpp"
 

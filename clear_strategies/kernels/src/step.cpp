@@ -5,7 +5,6 @@
 #include <numeric>
 #include <vector>
 
-#include "chunks.hpp"
 #include "pool.hpp"
 #include "sh_rows.hpp"
 

@@ -7,8 +7,6 @@
 #include <vector>
 
 #include "block.hpp"
-#include "chunks.hpp"
-#include "exponential.hpp"
 #include "pool.hpp"
 
 namespace clear {

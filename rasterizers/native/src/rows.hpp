@@ -132,84 +132,12 @@ CLEAR_INLINE void transpose(Lanes<T> (&rows)[kLanes]) {
   }
 }
 
-#if defined(__AVX512F__)
-// AVX-512 chooses any numbers of two registers: indices from D registers of rows of D numbers to D columns, and back.
-template <int D>
-struct Interleaving {
-  alignas(64) std::int32_t apart[D][D - 1][kLanes], together[D][D - 1][kLanes];
-
-  constexpr Interleaving() : apart{}, together{} {
-    for (int out = 0; out < D; ++out)
-      for (int i = 0; i < kLanes; ++i) {
-        int p = D * i + out, q = kLanes * out + i;  // what column `out` reads, and what register `out` of the rows holds
-        for (int k = 1; k < D; ++k) {
-          apart[out][k - 1][i] = p / kLanes == k ? kLanes + p % kLanes : k == 1 ? p % kLanes : i;
-          together[out][k - 1][i] = q % D == k ? kLanes + q / D : k == 1 ? q / D : i;
-        }
-      }
-  }
-};
-
-template <int D>
-CLEAR_INLINE void rearrange(const std::int32_t (&indices)[D][D - 1][kLanes], const FloatRegister (&in)[D],
-                            FloatRegister (&out)[D]) {
-  for (int d = 0; d < D; ++d) {
-    __m512 mixed = (__m512)in[0];
-    for (int k = 1; k < D; ++k)
-      mixed = _mm512_permutex2var_ps(mixed, _mm512_load_si512(indices[d][k - 1]), (__m512)in[k]);
-    out[d] = (FloatRegister)mixed;
-  }
-}
-
-template <int D>
-inline constexpr Interleaving<D> kInterleaving;
-
-// D columns, one register each, from D registers of rows of D numbers.
-template <int D>
-CLEAR_INLINE void split_registers(const float* rows, FloatRegister (&columns)[D]) {
-  FloatRegister in[D];
-  for (int d = 0; d < D; ++d) in[d] = (FloatRegister)_mm512_loadu_ps(rows + kLanes * d);
-  rearrange<D>(kInterleaving<D>.apart, in, columns);
-}
-
-template <int D>
-CLEAR_INLINE void join_registers(float* rows, const FloatRegister (&columns)[D]) {
-  FloatRegister out[D];
-  rearrange<D>(kInterleaving<D>.together, columns, out);
-  for (int d = 0; d < D; ++d) _mm512_storeu_ps(rows + kLanes * d, (__m512)out[d]);
-}
-
-// The same with four rows each at p, p + stride, …
-template <int D>
-CLEAR_INLINE void split_registers(const float* p, std::ptrdiff_t stride, FloatRegister (&columns)[D]) {
-  auto quad = [&](int q) CLEAR_LAMBDA { return _mm_loadu_ps(p + q / D * stride + q % D * kQuad); };
-  FloatRegister in[D];
-  for (int d = 0; d < D; ++d) {
-    const int q = kQuads * d;
-    const __m512 two = _mm512_insertf32x4(_mm512_castps128_ps512(quad(q)), quad(q + 1), 1);
-    in[d] = (FloatRegister)_mm512_insertf32x4(_mm512_insertf32x4(two, quad(q + 2), 2), quad(q + 3), 3);
-  }
-  if constexpr (D == 1) columns[0] = in[0];
-  else rearrange<D>(kInterleaving<D>.apart, in, columns);
-}
-
-template <int D>
-CLEAR_INLINE void join_registers(float* p, std::ptrdiff_t stride, const FloatRegister (&columns)[D]) {
-  FloatRegister out[D];
-  if constexpr (D == 1) out[0] = columns[0];
-  else rearrange<D>(kInterleaving<D>.together, columns, out);
-  auto store = [&](int q, __m128 quad) CLEAR_LAMBDA { _mm_storeu_ps(p + q / D * stride + q % D * kQuad, quad); };
-  for (int d = 0; d < D; ++d) {
-    const __m512 a = (__m512)out[d];
-    const int q = kQuads * d;
-    store(q, _mm512_castps512_ps128(a)), store(q + 1, _mm512_extractf32x4_ps(a, 1));
-    store(q + 2, _mm512_extractf32x4_ps(a, 2)), store(q + 3, _mm512_extractf32x4_ps(a, 3));
-  }
-}
-#else
 // The register whose quad q is the four numbers at p + q · stride.
 CLEAR_INLINE FloatRegister load_quads(const float* p, [[maybe_unused]] std::ptrdiff_t stride) {
-#if defined(__AVX2__)
+#if defined(__AVX512F__)
+  const __m512 two = _mm512_insertf32x4(_mm512_castps128_ps512(_mm_loadu_ps(p)), _mm_loadu_ps(p + stride), 1);
+  return _mm512_insertf32x4(_mm512_insertf32x4(two, _mm_loadu_ps(p + 2 * stride), 2), _mm_loadu_ps(p + 3 * stride), 3);
+#elif defined(__AVX2__)
   return (FloatRegister)_mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(p)), _mm_loadu_ps(p + stride), 1);
 #else
   FloatRegister out;
@@ -219,7 +147,10 @@ CLEAR_INLINE FloatRegister load_quads(const float* p, [[maybe_unused]] std::ptrd
 }
 
 CLEAR_INLINE void store_quads(float* p, [[maybe_unused]] std::ptrdiff_t stride, FloatRegister a) {
-#if defined(__AVX2__)
+#if defined(__AVX512F__)
+  _mm_storeu_ps(p, _mm512_castps512_ps128(a)), _mm_storeu_ps(p + stride, _mm512_extractf32x4_ps(a, 1));
+  _mm_storeu_ps(p + 2 * stride, _mm512_extractf32x4_ps(a, 2)), _mm_storeu_ps(p + 3 * stride, _mm512_extractf32x4_ps(a, 3));
+#elif defined(__AVX2__)
   _mm_storeu_ps(p, _mm256_castps256_ps128((__m256)a));
   _mm_storeu_ps(p + stride, _mm256_extractf128_ps((__m256)a, 1));
 #else
@@ -227,70 +158,69 @@ CLEAR_INLINE void store_quads(float* p, [[maybe_unused]] std::ptrdiff_t stride, 
 #endif
 }
 
-// D columns, one register each, from D registers of rows of D numbers: four rows each at p, p + stride, …
+// In every quad: four rows of D numbers, one after the other, become four numbers of each of D columns.
 template <int D>
-CLEAR_INLINE void split_registers(const float* p, std::ptrdiff_t stride, FloatRegister (&out)[D]) {
+CLEAR_INLINE void split_quads(FloatRegister (&r)[D]) {
   using Q = WithinQuads;
-  FloatRegister in[D];
-  for (int d = 0; d < D; ++d) in[d] = load_quads(p + kQuad * d, stride);
-  if constexpr (D == 1) {
-    out[0] = in[0];
-  } else if constexpr (D == 2) {
-    out[0] = Q::shuffle<0, 2, 0, 2>(in[0], in[1]), out[1] = Q::shuffle<1, 3, 1, 3>(in[0], in[1]);
+  if constexpr (D == 2) {
+    const FloatRegister even = Q::shuffle<0, 2, 0, 2>(r[0], r[1]);
+    r[1] = Q::shuffle<1, 3, 1, 3>(r[0], r[1]), r[0] = even;
   } else if constexpr (D == 3) {  // x0 y0 z0 x1 | y1 z1 x2 y2 | z2 x3 y3 z3
-    const FloatRegister xy = Q::shuffle<2, 3, 1, 2>(in[1], in[2]), yz = Q::shuffle<1, 2, 0, 1>(in[0], in[1]);
-    out[0] = Q::shuffle<0, 3, 0, 2>(in[0], xy), out[1] = Q::shuffle<0, 2, 1, 3>(yz, xy);
-    out[2] = Q::shuffle<1, 3, 0, 3>(yz, in[2]);
-  } else {
-    for (int d = 0; d < D; ++d) out[d] = in[d];
-    transpose_four<Q>(out[0], out[1], out[2], out[3]);
+    const FloatRegister xy = Q::shuffle<2, 3, 1, 2>(r[1], r[2]), yz = Q::shuffle<1, 2, 0, 1>(r[0], r[1]);
+    r[0] = Q::shuffle<0, 3, 0, 2>(r[0], xy), r[1] = Q::shuffle<0, 2, 1, 3>(yz, xy), r[2] = Q::shuffle<1, 3, 0, 3>(yz, r[2]);
+  } else if constexpr (D == 4) {
+    transpose_four<Q>(r[0], r[1], r[2], r[3]);
   }
 }
 
+// … and back.
 template <int D>
-CLEAR_INLINE void join_registers(float* p, std::ptrdiff_t stride, const FloatRegister (&in)[D]) {
+CLEAR_INLINE void join_quads(FloatRegister (&r)[D]) {
   using Q = WithinQuads;
-  FloatRegister out[D];
-  if constexpr (D == 1) {
-    out[0] = in[0];
-  } else if constexpr (D == 2) {
-    const FloatRegister even = Q::shuffle<0, 2, 0, 2>(in[0], in[1]), odd = Q::shuffle<1, 3, 1, 3>(in[0], in[1]);
-    out[0] = Q::shuffle<0, 2, 0, 2>(even, odd), out[1] = Q::shuffle<1, 3, 1, 3>(even, odd);
+  if constexpr (D == 2) {
+    const FloatRegister even = Q::shuffle<0, 2, 0, 2>(r[0], r[1]), odd = Q::shuffle<1, 3, 1, 3>(r[0], r[1]);
+    r[0] = Q::shuffle<0, 2, 0, 2>(even, odd), r[1] = Q::shuffle<1, 3, 1, 3>(even, odd);
   } else if constexpr (D == 3) {
-    const FloatRegister xy = Q::shuffle<0, 2, 0, 2>(in[0], in[1]), yz = Q::shuffle<1, 3, 1, 3>(in[1], in[2]);
-    const FloatRegister zx = Q::shuffle<0, 2, 1, 3>(in[2], in[0]);
-    out[0] = Q::shuffle<0, 2, 0, 2>(xy, zx), out[1] = Q::shuffle<0, 2, 1, 3>(yz, xy), out[2] = Q::shuffle<1, 3, 1, 3>(zx, yz);
-  } else {
-    for (int d = 0; d < D; ++d) out[d] = in[d];
-    transpose_four<Q>(out[0], out[1], out[2], out[3]);
+    const FloatRegister xy = Q::shuffle<0, 2, 0, 2>(r[0], r[1]), yz = Q::shuffle<1, 3, 1, 3>(r[1], r[2]);
+    const FloatRegister zx = Q::shuffle<0, 2, 1, 3>(r[2], r[0]);
+    r[0] = Q::shuffle<0, 2, 0, 2>(xy, zx), r[1] = Q::shuffle<0, 2, 1, 3>(yz, xy), r[2] = Q::shuffle<1, 3, 1, 3>(zx, yz);
+  } else if constexpr (D == 4) {
+    transpose_four<Q>(r[0], r[1], r[2], r[3]);
   }
-  for (int d = 0; d < D; ++d) store_quads(p + kQuad * d, stride, out[d]);
 }
 
+// Converts sixteen rows of D numbers, four each at p, p + stride, p + 2 stride and p + 3 stride, to D columns of sixteen.
 template <int D>
-CLEAR_INLINE void split_registers(const float* rows, FloatRegister (&columns)[D]) {
-  split_registers<D>(rows, kQuad * D, columns);
+CLEAR_INLINE void split_rows(const float* p, std::ptrdiff_t stride, Lanes<float> (&columns)[D]) {
+  for (int k = 0; k < Lanes<float>::registers; ++k) {
+    FloatRegister r[D];
+    for (int d = 0; d < D; ++d) r[d] = load_quads(p + kQuads * k * stride + kQuad * d, stride);
+    split_quads(r);
+    for (int d = 0; d < D; ++d) columns[d].r[k] = r[d];
+  }
 }
+
+// … and back.
 template <int D>
-CLEAR_INLINE void join_registers(float* rows, const FloatRegister (&columns)[D]) {
-  join_registers<D>(rows, kQuad * D, columns);
+CLEAR_INLINE void join_rows(float* p, std::ptrdiff_t stride, const Lanes<float> (&columns)[D]) {
+  for (int k = 0; k < Lanes<float>::registers; ++k) {
+    FloatRegister r[D];
+    for (int d = 0; d < D; ++d) r[d] = columns[d].r[k];
+    join_quads(r);
+    for (int d = 0; d < D; ++d) store_quads(p + kQuads * k * stride + kQuad * d, stride, r[d]);
+  }
 }
-#endif
 
 template <int D, class T>
-inline constexpr bool kByRegister = sizeof(T) == 4 && D >= 2 && D <= 4;
+inline constexpr bool kInQuads = sizeof(T) == 4 && D >= 2 && D <= 4;
 
-// Converts sixteen contiguous rows of D numbers to D columns of sixteen.
+// The same of contiguous rows.
 template <int D, class T>
 CLEAR_INLINE void split_rows(const T* rows, Lanes<T> (&columns)[D]) {
   if constexpr (D == 1) {
     columns[0] = Lanes<T>::load(rows);
-  } else if constexpr (kByRegister<D, T>) {
-    for (int k = 0; k < Lanes<T>::registers; ++k) {
-      FloatRegister out[D];
-      split_registers<D>(rows + D * Native<T>::width * k, out);
-      for (int d = 0; d < D; ++d) columns[d].r[k] = out[d];
-    }
+  } else if constexpr (kInQuads<D, T>) {
+    split_rows(rows, kQuad * D, columns);
   } else {
     T split[D][kLanes];
     for (int i = 0; i < kLanes; ++i)
@@ -299,17 +229,12 @@ CLEAR_INLINE void split_rows(const T* rows, Lanes<T> (&columns)[D]) {
   }
 }
 
-// … and back.
 template <int D, class T>
 CLEAR_INLINE void join_rows(T* rows, const Lanes<T> (&columns)[D]) {
   if constexpr (D == 1) {
     columns[0].store(rows);
-  } else if constexpr (kByRegister<D, T>) {
-    for (int k = 0; k < Lanes<T>::registers; ++k) {
-      FloatRegister in[D];
-      for (int d = 0; d < D; ++d) in[d] = columns[d].r[k];
-      join_registers<D>(rows + D * Native<T>::width * k, in);
-    }
+  } else if constexpr (kInQuads<D, T>) {
+    join_rows(rows, kQuad * D, columns);
   } else {
     T split[D][kLanes];
     for (int d = 0; d < D; ++d) columns[d].store(split[d]);
@@ -325,26 +250,6 @@ CLEAR_INLINE void store_rows(T* tensor, std::int64_t row, int count, const Lanes
   T* p = count == kLanes ? tensor + row * C : joined;
   join_rows(p, columns);
   if (count < kLanes) std::memcpy(tensor + row * C, joined, sizeof(T) * C * count);
-}
-
-// Converts sixteen rows of D numbers, four each at p, p + stride, p + 2 stride and p + 3 stride, to D columns of sixteen.
-template <int D>
-CLEAR_INLINE void split_rows(const float* p, std::ptrdiff_t stride, Lanes<float> (&columns)[D]) {
-  for (int k = 0; k < Lanes<float>::registers; ++k) {
-    FloatRegister out[D];
-    split_registers<D>(p + kQuads * k * stride, stride, out);
-    for (int d = 0; d < D; ++d) columns[d].r[k] = out[d];
-  }
-}
-
-// … and back.
-template <int D>
-CLEAR_INLINE void join_rows(float* p, std::ptrdiff_t stride, const Lanes<float> (&columns)[D]) {
-  for (int k = 0; k < Lanes<float>::registers; ++k) {
-    FloatRegister in[D];
-    for (int d = 0; d < D; ++d) in[d] = columns[d].r[k];
-    join_registers<D>(p + kQuads * k * stride, stride, in);
-  }
 }
 
 // Lane i = table[indices[i]], indices in 0 … 15.

@@ -7,6 +7,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <type_traits>
 #if defined(__SSE2__)
 #include <immintrin.h>
 #endif
@@ -31,134 +32,48 @@ inline constexpr int kRegisterBytes = 32;
 inline constexpr int kRegisterBytes = 16;
 #endif
 
-template <class T>
-struct IntegerOf;
-template <>
-struct IntegerOf<float> {
-  using type = std::int32_t;
-};
-template <>
-struct IntegerOf<double> {
-  using type = std::int64_t;
-};
-
 // One register of T: its type, the type of a comparison's result, and the operations that have no operator.
 template <class T>
-struct Native {
+struct Portable {
   static constexpr int width = kRegisterBytes / sizeof(T);
+  using Whole = std::conditional_t<sizeof(T) == 4, std::int32_t, std::int64_t>;
   typedef T Register __attribute__((vector_size(kRegisterBytes)));
-  typedef typename IntegerOf<T>::type Integer __attribute__((vector_size(kRegisterBytes)));
-
-#if defined(__AVX512F__)
-  using Mask = std::uint16_t;  // one bit per lane
-  static constexpr Mask all = Mask((1u << width) - 1);
-  static CLEAR_INLINE Mask less(Register a, Register b) {
-    if constexpr (sizeof(T) == 4) return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LT_OQ);
-    else return _mm512_cmp_pd_mask((__m512d)a, (__m512d)b, _CMP_LT_OQ);
-  }
-  static CLEAR_INLINE Mask less_equal(Register a, Register b) {
-    if constexpr (sizeof(T) == 4) return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LE_OQ);
-    else return _mm512_cmp_pd_mask((__m512d)a, (__m512d)b, _CMP_LE_OQ);
-  }
-  static CLEAR_INLINE Register select(Mask m, Register a, Register b) {
-    if constexpr (sizeof(T) == 4) return (Register)_mm512_mask_mov_ps((__m512)b, m, (__m512)a);
-    else return (Register)_mm512_mask_mov_pd((__m512d)b, __mmask8(m), (__m512d)a);
-  }
-  static CLEAR_INLINE Mask mask_and(Mask a, Mask b) { return a & b; }
-  static CLEAR_INLINE Mask mask_and_not(Mask a, Mask b) { return a & Mask(~b) & all; }
-  static CLEAR_INLINE std::uint32_t bits(Mask m) { return m & all; }
-  static CLEAR_INLINE Mask from_bits(std::uint32_t b) { return Mask(b) & all; }
-  static CLEAR_INLINE Register minimum(Register a, Register b) {
-    if constexpr (sizeof(T) == 4) return (Register)_mm512_min_ps((__m512)a, (__m512)b);
-    else return (Register)_mm512_min_pd((__m512d)a, (__m512d)b);
-  }
-  static CLEAR_INLINE Register maximum(Register a, Register b) {
-    if constexpr (sizeof(T) == 4) return (Register)_mm512_max_ps((__m512)a, (__m512)b);
-    else return (Register)_mm512_max_pd((__m512d)a, (__m512d)b);
-  }
-  static CLEAR_INLINE Register root(Register a) {
-    if constexpr (sizeof(T) == 4) return (Register)_mm512_sqrt_ps((__m512)a);
-    else return (Register)_mm512_sqrt_pd((__m512d)a);
-  }
-  static CLEAR_INLINE Register nearest(Register a) {
-    if constexpr (sizeof(T) == 4) return (Register)_mm512_roundscale_ps((__m512)a, 0);
-    else return (Register)_mm512_roundscale_pd((__m512d)a, 0);
-  }
-  // a · 2^n for an integer n.
-  static CLEAR_INLINE Register scale_by_power(Register a, Register n) {
-    if constexpr (sizeof(T) == 4) return (Register)_mm512_scalef_ps((__m512)a, (__m512)n);
-    else return (Register)_mm512_scalef_pd((__m512d)a, (__m512d)n);
-  }
-  // c - a b, rounded once.
-  static CLEAR_INLINE Register subtract_product(Register c, Register a, Register b) {
-    if constexpr (sizeof(T) == 4) return (Register)_mm512_fnmadd_ps((__m512)a, (__m512)b, (__m512)c);
-    else return (Register)_mm512_fnmadd_pd((__m512d)a, (__m512d)b, (__m512d)c);
-  }
-  // 1/a to about the precision of T.
-  static CLEAR_INLINE Register reciprocal(Register a) {
-    if constexpr (sizeof(T) == 4) {
-      Register r = (Register)_mm512_rcp14_ps((__m512)a);
-      return r * (2.0f - a * r);  // one Newton step: 28 bits
-    } else {
-      return T(1) / a;
-    }
-  }
-#else
+  typedef Whole Integer __attribute__((vector_size(kRegisterBytes)));
   using Mask = Integer;  // all bits of a lane, or none
+
   static CLEAR_INLINE Mask less(Register a, Register b) { return (Mask)(a < b); }
   static CLEAR_INLINE Mask less_equal(Register a, Register b) { return (Mask)(a <= b); }
   static CLEAR_INLINE Register select(Mask m, Register a, Register b) { return m ? a : b; }
-  static CLEAR_INLINE Mask mask_and(Mask a, Mask b) { return a & b; }
-  static CLEAR_INLINE Mask mask_and_not(Mask a, Mask b) { return a & ~b; }
   static CLEAR_INLINE std::uint32_t bits(Mask m) {
-#if defined(__AVX2__)
-    if constexpr (sizeof(T) == 4) return _mm256_movemask_ps((__m256)m);
-    else return _mm256_movemask_pd((__m256d)m);
+#if defined(__AVX512F__)
+    return _mm512_movepi64_mask((__m512i)m);  // of double; float has other masks
+#elif defined(__AVX2__)
+    return sizeof(T) == 4 ? _mm256_movemask_ps((__m256)m) : _mm256_movemask_pd((__m256d)m);
 #elif defined(__SSE2__)
-    if constexpr (sizeof(T) == 4) return _mm_movemask_ps((__m128)m);
-    else return _mm_movemask_pd((__m128d)m);
-#else
+    return sizeof(T) == 4 ? _mm_movemask_ps((__m128)m) : _mm_movemask_pd((__m128d)m);
+#endif
     std::uint32_t b = 0;
     for (int i = 0; i < width; ++i) b |= std::uint32_t(m[i] != 0) << i;
     return b;
-#endif
   }
   static CLEAR_INLINE Mask from_bits(std::uint32_t b) {
     Mask m;
-    for (int i = 0; i < width; ++i) m[i] = -(typename IntegerOf<T>::type)((b >> i) & 1);
+    for (int i = 0; i < width; ++i) m[i] = -Whole((b >> i) & 1);
     return m;
   }
   // NaN as on x86: the result is the second operand.
-  static CLEAR_INLINE Register minimum(Register a, Register b) {
-#if defined(__AVX2__)
-    if constexpr (sizeof(T) == 4) return (Register)_mm256_min_ps((__m256)a, (__m256)b);
-    else return (Register)_mm256_min_pd((__m256d)a, (__m256d)b);
-#else
-    return a < b ? a : b;
-#endif
-  }
-  static CLEAR_INLINE Register maximum(Register a, Register b) {
-#if defined(__AVX2__)
-    if constexpr (sizeof(T) == 4) return (Register)_mm256_max_ps((__m256)a, (__m256)b);
-    else return (Register)_mm256_max_pd((__m256d)a, (__m256d)b);
-#else
-    return a > b ? a : b;
-#endif
-  }
+  static CLEAR_INLINE Register minimum(Register a, Register b) { return a < b ? a : b; }
+  static CLEAR_INLINE Register maximum(Register a, Register b) { return a > b ? a : b; }
   static CLEAR_INLINE Register root(Register a) {
-#if defined(__AVX2__)
-    if constexpr (sizeof(T) == 4) return (Register)_mm256_sqrt_ps((__m256)a);
-    else return (Register)_mm256_sqrt_pd((__m256d)a);
-#else
     for (int i = 0; i < width; ++i) a[i] = std::sqrt(a[i]);
     return a;
-#endif
   }
   // Rounds by adding and subtracting 1.5 · 2^mantissa; valid for |a| < 2^22 (double: 2^51).
   static CLEAR_INLINE Register nearest(Register a) {
     constexpr T big = sizeof(T) == 4 ? T(12582912.0) : T(6755399441055744.0);
     return (a + big) - big;
   }
+  // a · 2^n for an integer n.
   static CLEAR_INLINE Register scale_by_power(Register a, Register n) {
     constexpr int mantissa = sizeof(T) == 4 ? 23 : 52;
     constexpr T limit = sizeof(T) == 4 ? T(-126) : T(-1022);
@@ -166,17 +81,48 @@ struct Native {
     Integer one = (Integer)(T(1) - Register{});
     return a * (Register)(one + (e << mantissa));
   }
-  static CLEAR_INLINE Register subtract_product(Register c, Register a, Register b) {
-#if defined(__AVX2__)
-    if constexpr (sizeof(T) == 4) return (Register)_mm256_fnmadd_ps((__m256)a, (__m256)b, (__m256)c);
-    else return (Register)_mm256_fnmadd_pd((__m256d)a, (__m256d)b, (__m256d)c);
-#else
-    return c - a * b;
-#endif
-  }
+  // a b + c and c - a b, rounded once where the processor can.
+  static CLEAR_INLINE Register multiply_add(Register a, Register b, Register c) { return a * b + c; }
+  static CLEAR_INLINE Register subtract_product(Register c, Register a, Register b) { return c - a * b; }
+  // 1/a to about the precision of T.
   static CLEAR_INLINE Register reciprocal(Register a) { return T(1) / a; }
-#endif
 };
+
+template <class T>
+struct Native : Portable<T> {};
+
+// Float in its own instructions. What the faster modules need of double is as fast as above: sums, products, comparisons, rounding.
+#if defined(__AVX512F__)
+template <>
+struct Native<float> : Portable<float> {
+  using Mask = __mmask16;  // one bit per lane
+  static CLEAR_INLINE Mask less(Register a, Register b) { return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ); }
+  static CLEAR_INLINE Mask less_equal(Register a, Register b) { return _mm512_cmp_ps_mask(a, b, _CMP_LE_OQ); }
+  static CLEAR_INLINE Register select(Mask m, Register a, Register b) { return _mm512_mask_mov_ps(b, m, a); }
+  static CLEAR_INLINE std::uint32_t bits(Mask m) { return m; }
+  static CLEAR_INLINE Mask from_bits(std::uint32_t b) { return Mask(b); }
+  static CLEAR_INLINE Register minimum(Register a, Register b) { return _mm512_min_ps(a, b); }
+  static CLEAR_INLINE Register maximum(Register a, Register b) { return _mm512_max_ps(a, b); }
+  static CLEAR_INLINE Register root(Register a) { return _mm512_sqrt_ps(a); }
+  static CLEAR_INLINE Register nearest(Register a) { return _mm512_roundscale_ps(a, 0); }
+  static CLEAR_INLINE Register scale_by_power(Register a, Register n) { return _mm512_scalef_ps(a, n); }
+  static CLEAR_INLINE Register multiply_add(Register a, Register b, Register c) { return _mm512_fmadd_ps(a, b, c); }
+  static CLEAR_INLINE Register subtract_product(Register c, Register a, Register b) { return _mm512_fnmadd_ps(a, b, c); }
+  static CLEAR_INLINE Register reciprocal(Register a) {
+    const Register r = _mm512_rcp14_ps(a);
+    return r * (2.0f - a * r);  // one Newton step: 28 bits
+  }
+};
+#elif defined(__AVX2__)
+template <>
+struct Native<float> : Portable<float> {
+  static CLEAR_INLINE Register minimum(Register a, Register b) { return _mm256_min_ps(a, b); }
+  static CLEAR_INLINE Register maximum(Register a, Register b) { return _mm256_max_ps(a, b); }
+  static CLEAR_INLINE Register root(Register a) { return _mm256_sqrt_ps(a); }
+  static CLEAR_INLINE Register multiply_add(Register a, Register b, Register c) { return _mm256_fmadd_ps(a, b, c); }
+  static CLEAR_INLINE Register subtract_product(Register c, Register a, Register b) { return _mm256_fnmadd_ps(a, b, c); }
+};
+#endif
 
 // Repeats a statement for each register i of sixteen numbers. Written out, because a compiler takes long to unroll the many
 // loops of one to eight steps, and cannot simplify what they compute before that.
@@ -202,12 +148,12 @@ struct Mask {
 
   CLEAR_INLINE Mask operator&(const Mask& o) const {
     Mask m;
-    CLEAR_EACH_REGISTER(m.r[i] = Native<T>::mask_and(r[i], o.r[i]));
+    CLEAR_EACH_REGISTER(m.r[i] = r[i] & o.r[i]);
     return m;
   }
   CLEAR_INLINE Mask and_not(const Mask& o) const {
     Mask m;
-    CLEAR_EACH_REGISTER(m.r[i] = Native<T>::mask_and_not(r[i], o.r[i]));
+    CLEAR_EACH_REGISTER(m.r[i] = r[i] & ~o.r[i]);
     return m;
   }
   CLEAR_INLINE std::uint32_t bits() const {
@@ -261,34 +207,36 @@ struct Lanes {
     store(p);
   }
 
-#define CLEAR_OPERATOR(op)                                                          \
-  friend CLEAR_INLINE Lanes operator op(const Lanes& a, const Lanes& b) {           \
-    Lanes c;                                                                        \
-    CLEAR_EACH_REGISTER(c.r[i] = a.r[i] op b.r[i]);                                 \
-    return c;                                                                       \
-  }                                                                                 \
-  CLEAR_INLINE Lanes& operator op##=(const Lanes & b) {                             \
-    CLEAR_EACH_REGISTER(r[i] = r[i] op b.r[i]);                                     \
-    return *this;                                                                   \
+#define CLEAR_EACH(result, name, parameters, ...)   \
+  friend CLEAR_INLINE result name parameters {      \
+    result out;                                     \
+    CLEAR_EACH_REGISTER(out.r[i] = __VA_ARGS__);    \
+    return out;                                     \
   }
-  CLEAR_OPERATOR(+)
-  CLEAR_OPERATOR(-)
-  CLEAR_OPERATOR(*)
-  CLEAR_OPERATOR(/)
-#undef CLEAR_OPERATOR
+  CLEAR_EACH(Lanes, operator+, (const Lanes& a, const Lanes& b), a.r[i] + b.r[i])
+  CLEAR_EACH(Lanes, operator-, (const Lanes& a, const Lanes& b), a.r[i] - b.r[i])
+  CLEAR_EACH(Lanes, operator*, (const Lanes& a, const Lanes& b), a.r[i] * b.r[i])
+  CLEAR_EACH(Lanes, operator/, (const Lanes& a, const Lanes& b), a.r[i] / b.r[i])
+  CLEAR_EACH(Mask<T>, operator<, (const Lanes& a, const Lanes& b), Native<T>::less(a.r[i], b.r[i]))
+  CLEAR_EACH(Mask<T>, operator<=, (const Lanes& a, const Lanes& b), Native<T>::less_equal(a.r[i], b.r[i]))
+  CLEAR_EACH(Mask<T>, operator>, (const Lanes& a, const Lanes& b), Native<T>::less(b.r[i], a.r[i]))
+  CLEAR_EACH(Mask<T>, operator>=, (const Lanes& a, const Lanes& b), Native<T>::less_equal(b.r[i], a.r[i]))
+  CLEAR_EACH(Lanes, minimum, (const Lanes& a, const Lanes& b), Native<T>::minimum(a.r[i], b.r[i]))
+  CLEAR_EACH(Lanes, maximum, (const Lanes& a, const Lanes& b), Native<T>::maximum(a.r[i], b.r[i]))
+  CLEAR_EACH(Lanes, root, (const Lanes& a), Native<T>::root(a.r[i]))
+  CLEAR_EACH(Lanes, nearest, (const Lanes& a), Native<T>::nearest(a.r[i]))
+  CLEAR_EACH(Lanes, scale_by_power, (const Lanes& a, const Lanes& n), Native<T>::scale_by_power(a.r[i], n.r[i]))
+  CLEAR_EACH(Lanes, reciprocal, (const Lanes& a), Native<T>::reciprocal(a.r[i]))
+  CLEAR_EACH(Lanes, multiply_add, (const Lanes& a, const Lanes& b, const Lanes& c),
+             Native<T>::multiply_add(a.r[i], b.r[i], c.r[i]))
+  CLEAR_EACH(Lanes, subtract_product, (const Lanes& c, const Lanes& a, const Lanes& b),
+             Native<T>::subtract_product(c.r[i], a.r[i], b.r[i]))
+  CLEAR_EACH(Lanes, select, (const Mask<T>& m, const Lanes& a, const Lanes& b), Native<T>::select(m.r[i], a.r[i], b.r[i]))
+#undef CLEAR_EACH
   CLEAR_INLINE Lanes operator-() const { return Lanes(T(0)) - *this; }
-
-#define CLEAR_COMPARISON(name, call)                                                \
-  friend CLEAR_INLINE Mask<T> name(const Lanes& a, const Lanes& b) {                \
-    Mask<T> m;                                                                      \
-    CLEAR_EACH_REGISTER(m.r[i] = call);                                             \
-    return m;                                                                       \
-  }
-  CLEAR_COMPARISON(operator<, Native<T>::less(a.r[i], b.r[i]))
-  CLEAR_COMPARISON(operator<=, Native<T>::less_equal(a.r[i], b.r[i]))
-  CLEAR_COMPARISON(operator>, Native<T>::less(b.r[i], a.r[i]))
-  CLEAR_COMPARISON(operator>=, Native<T>::less_equal(b.r[i], a.r[i]))
-#undef CLEAR_COMPARISON
+  CLEAR_INLINE Lanes& operator+=(const Lanes& b) { return *this = *this + b; }
+  CLEAR_INLINE Lanes& operator-=(const Lanes& b) { return *this = *this - b; }
+  CLEAR_INLINE Lanes& operator*=(const Lanes& b) { return *this = *this * b; }
 };
 
 // Comes after the last `stream` of a task.
@@ -297,46 +245,6 @@ inline void end_of_stream() {
   _mm_sfence();
 #endif
 }
-
-#define CLEAR_EACH(name, ...)                                                       \
-  constexpr int registers = Lanes<T>::registers;                                    \
-  Lanes<T> c;                                                                       \
-  CLEAR_EACH_REGISTER(c.r[i] = Native<T>::name(__VA_ARGS__));                       \
-  return c;
-
-template <class T>
-CLEAR_INLINE Lanes<T> minimum(const Lanes<T>& a, const Lanes<T>& b) {
-  CLEAR_EACH(minimum, a.r[i], b.r[i])
-}
-template <class T>
-CLEAR_INLINE Lanes<T> maximum(const Lanes<T>& a, const Lanes<T>& b) {
-  CLEAR_EACH(maximum, a.r[i], b.r[i])
-}
-template <class T>
-CLEAR_INLINE Lanes<T> root(const Lanes<T>& a) {
-  CLEAR_EACH(root, a.r[i])
-}
-template <class T>
-CLEAR_INLINE Lanes<T> nearest(const Lanes<T>& a) {
-  CLEAR_EACH(nearest, a.r[i])
-}
-template <class T>
-CLEAR_INLINE Lanes<T> scale_by_power(const Lanes<T>& a, const Lanes<T>& n) {
-  CLEAR_EACH(scale_by_power, a.r[i], n.r[i])
-}
-template <class T>
-CLEAR_INLINE Lanes<T> reciprocal(const Lanes<T>& a) {
-  CLEAR_EACH(reciprocal, a.r[i])
-}
-template <class T>
-CLEAR_INLINE Lanes<T> subtract_product(const Lanes<T>& c_, const Lanes<T>& a, const Lanes<T>& b) {
-  CLEAR_EACH(subtract_product, c_.r[i], a.r[i], b.r[i])
-}
-template <class T>
-CLEAR_INLINE Lanes<T> select(const Mask<T>& m, const Lanes<T>& a, const Lanes<T>& b) {
-  CLEAR_EACH(select, m.r[i], a.r[i], b.r[i])
-}
-#undef CLEAR_EACH
 
 // The same sixteen numbers in another precision.
 template <class To, class From>
