@@ -122,7 +122,7 @@ class _Frame:
         if self._basis is None:
             means, shN = self.shared[0], self.shared[4]
             self._basis = self.empty(len(means), shN.shape[1] + 1)
-            self.native.basis(*self.shared, self._basis, self.threads)
+            self.native.basis(self._basis, self.threads)
         return self._basis
 
 
@@ -176,7 +176,7 @@ class CppRendering:
         means, quats, scales = (frame.empty(sums, n, width) for width in (3, 4, 3))
         opacities, screen, rgb = frame.empty(sums, n), frame.empty(k, n, 2), frame.empty(k, n, 3)
         frame.native.vjp(
-            self._grid, cotangents.detach().to(self.image).contiguous(), v_alpha, v_depth, *frame.shared,
-            means, quats, scales, opacities, screen, rgb, absolute, weight, frame.threads,
+            self._grid, cotangents.detach().to(self.image).contiguous(), v_alpha, v_depth, means, quats, scales, opacities,
+            screen, rgb, absolute, weight, frame.threads,
         )  # fmt: skip
         return SplatGradients(means, quats, scales, opacities, screen, rgb, frame.basis(), absolute)

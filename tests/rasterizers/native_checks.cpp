@@ -118,8 +118,8 @@ std::vector<double> drawn(int threads) {
   std::vector<T> d_means(K * 3 * n), d_quats(K * 4 * n), d_scales(K * 3 * n), d_opacities(K * n), d_screen(K * 2 * n), d_rgb(K * 3 * n);
   const Gradients<T> out{d_means.data(), d_quats.data(), d_scales.data(), d_opacities.data(), d_screen.data(), d_rgb.data(), nullptr};
   const T* v = cotangents.data();
-  frame.vjp(0, K, {v, nullptr, nullptr}, splats, out, threads);
-  frame.vjp(0, 1, {v, v, v + width * height}, splats, out, threads);  // the first again, with those of alpha and of depth
+  frame.vjp(0, K, {v, nullptr, nullptr}, out, threads);
+  frame.vjp(0, 1, {v, v, v + width * height}, out, threads);  // the first again, with those of alpha and of depth
   std::vector<double> all;
   for (const std::vector<T>* part : {&image, &alpha, &depth, &d_means, &d_quats, &d_scales, &d_opacities, &d_screen, &d_rgb})
     all.insert(all.end(), part->begin(), part->end());

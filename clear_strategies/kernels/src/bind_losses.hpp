@@ -40,17 +40,14 @@ inline void bind_losses(nanobind::module_& m) {
         PhotometricMeans means = photometric(images, {l1, dssim}, inset, threads);
         return std::pair(means.l1, means.dssim);
       },
-      "x"_a.noconvert(), "y"_a.noconvert(), "gradient"_a.noconvert().none(), "l1"_a, "dssim"_a, "inset"_a, "threads"_a,
+      "x"_a, "y"_a, "gradient"_a.none(), "l1"_a, "dssim"_a, "inset"_a, "threads"_a,
       "Writes the gradient of l1 * mean|x - y| + dssim * (1 - SSIM); returns (mean|x - y|, 1 - SSIM), without a gradient (0, 1 - SSIM).");
-  m.def(
-      "haar_l1",
-      [](const ImageIn& x, const ImageIn& y, const ImageOut& gradient, int levels, int threads) {
-        ImagePair images = same_size(x, y, gradient);
-        nb::gil_scoped_release free;
-        return haar_l1(images, levels, threads);
-      },
-      "x"_a.noconvert(), "y"_a.noconvert(), "gradient"_a.noconvert(), "levels"_a, "threads"_a,
-      "Writes the gradient of the mean absolute Haar detail of x - y; returns its value.");
+  // Writes the gradient of the mean absolute Haar detail of x - y; returns its value.
+  m.def("haar_l1", [](const ImageIn& x, const ImageIn& y, const ImageOut& gradient, int levels, int threads) {
+    ImagePair images = same_size(x, y, gradient);
+    nb::gil_scoped_release free;
+    return haar_l1(images, levels, threads);
+  });
 }
 
 }  // namespace clear

@@ -30,27 +30,20 @@ inline TwoGradients two_gradients(std::int64_t n, const std::vector<RowsOfAttrib
 }
 
 inline void bind_reconcile(nb::module_& m) {
-  m.def(
-      "products",
-      [](std::int64_t n, const std::vector<RowsOfAttribute>& attributes, const ColourFactors& lr, const ColourFactors& hr, Address to,
-         int threads) {
-        TwoGradients g = two_gradients(n, attributes, lr, hr);
-        nb::gil_scoped_release release;
-        Conflicts found = products(g, {at<double>(to), n}, threads);
-        nb::gil_scoped_acquire acquire;
-        return counts(found);
-      },
-      nb::arg("n"), nb::arg("attributes"), nb::arg("lr"), nb::arg("hr"), nb::arg("to"), nb::arg("threads"));
-  m.def(
-      "apply",
-      [](std::int64_t n, const std::vector<RowsOfAttribute>& attributes, const ColourFactors& lr, const ColourFactors& hr,
-         const WeightTables& weights, double lambda_hr, bool keeps_lr, int threads) {
-        TwoGradients g = two_gradients(n, attributes, lr, hr);
-        nb::gil_scoped_release release;
-        return apply(g, weights_at(weights), float(lambda_hr), keeps_lr, threads);
-      },
-      nb::arg("n"), nb::arg("attributes"), nb::arg("lr"), nb::arg("hr"), nb::arg("weights"), nb::arg("lambda_hr"), nb::arg("keeps_lr"),
-      nb::arg("threads"));
+  m.def("products", [](std::int64_t n, const std::vector<RowsOfAttribute>& attributes, const ColourFactors& lr,
+                       const ColourFactors& hr, Address to, int threads) {
+    TwoGradients g = two_gradients(n, attributes, lr, hr);
+    nb::gil_scoped_release release;
+    Conflicts found = products(g, {at<double>(to), n}, threads);
+    nb::gil_scoped_acquire acquire;
+    return counts(found);
+  });
+  m.def("apply", [](std::int64_t n, const std::vector<RowsOfAttribute>& attributes, const ColourFactors& lr,
+                    const ColourFactors& hr, const WeightTables& weights, double lambda_hr, bool keeps_lr, int threads) {
+    TwoGradients g = two_gradients(n, attributes, lr, hr);
+    nb::gil_scoped_release release;
+    return apply(g, weights_at(weights), float(lambda_hr), keeps_lr, threads);
+  });
 }
 
 }  // namespace clear

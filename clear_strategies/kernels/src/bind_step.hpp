@@ -13,10 +13,9 @@ class GaussianStep {
     if (bases < 1 || bases > kLanes) throw nb::value_error("the basis must have 1 to 16 columns");
     std::int64_t n = g_.n = std::int64_t(nb::len(nb::object(activation["sigmoid"])));
     g_.bases = int(bases);
-    g_.activation = {tensors_.rows<const float>(activation, "scales", n, 3), tensors_.rows<const float>(activation, "filtered", n, 3),
-                     tensors_.rows<const float>(activation, "filter", n, 1), tensors_.rows<const float>(activation, "sigmoid", n, 1),
-                     tensors_.rows<const float>(activation, "factor", n, 1)};
-    g_.basis = tensors_.rows<const float>(activation, "basis", n, bases);
+    auto rows = [&](const char* name, std::int64_t width) { return tensors_.rows<const float>(activation, name, n, width); };
+    g_.activation = {rows("scales", 3), rows("filtered", 3), rows("filter", 1), rows("sigmoid", 1), rows("factor", 1)};
+    g_.basis = rows("basis", bases);
     g_.lr = gradient(lr);
     if (hr.is_none()) return;
     nb::dict high = nb::cast<nb::dict>(hr);
@@ -83,8 +82,8 @@ inline void bind_step(nb::module_& m) {
   nb::class_<GaussianStep>(m, "GaussianStep")
       .def(nb::init<nb::dict, nb::dict, nb::object, std::int64_t>(), nb::arg("activation"), nb::arg("lr"), nb::arg("hr").none(),
            nb::arg("bases"))
-      .def("products", &GaussianStep::products, nb::arg("to"), nb::arg("threads"))
-      .def("step", &GaussianStep::step, nb::arg("attributes"), nb::arg("weights"), nb::arg("settings"), nb::arg("threads"));
+      .def("products", &GaussianStep::products)
+      .def("step", &GaussianStep::step);
 }
 
 }  // namespace clear

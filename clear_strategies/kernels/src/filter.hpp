@@ -17,17 +17,13 @@ inline void bind_filter(nanobind::module_& m) {
   namespace nb = nanobind;
   using Rows = Tensor<const float, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
   using Depths = Tensor<float, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
-  m.def(
-      "nearest_depths",
-      [](const Rows& means, const Rows& cameras, float near, const Depths& depths, int threads) {
-        if (means.shape(1) != 3 || cameras.shape(1) != kCameraNumbers || depths.shape(0) != means.shape(0))
-          throw nb::value_error("means must be [N, 3], cameras [V, 20] and depths [N]");
-        nb::gil_scoped_release free;
-        nearest_depths(means.data(), std::int64_t(means.shape(0)), cameras.data(), std::int64_t(cameras.shape(0)), near,
-                       depths.data(), threads);
-      },
-      nb::arg("means").noconvert(), nb::arg("cameras").noconvert(), nb::arg("near"), nb::arg("depths").noconvert(),
-      nb::arg("threads"));
+  m.def("nearest_depths", [](const Rows& means, const Rows& cameras, float near, const Depths& depths, int threads) {
+    if (means.shape(1) != 3 || cameras.shape(1) != kCameraNumbers || depths.shape(0) != means.shape(0))
+      throw nb::value_error("means must be [N, 3], cameras [V, 20] and depths [N]");
+    nb::gil_scoped_release free;
+    nearest_depths(means.data(), std::int64_t(means.shape(0)), cameras.data(), std::int64_t(cameras.shape(0)), near,
+                   depths.data(), threads);
+  });
 }
 
 }  // namespace clear

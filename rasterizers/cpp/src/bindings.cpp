@@ -1,7 +1,4 @@
 // Python bindings: `Frame`, in float32 or in float64. Checks shapes and types and releases the GIL; no arithmetic.
-//
-// Tensors are taken with `noconvert`: nanobind would pass a converted copy, which is freed when the call returns, while the
-// frame keeps pointers into it.
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
@@ -22,8 +19,6 @@ template <class T, std::int64_t... shape>
 using Write = Tensor<T, nb::shape<shape...>, nb::c_contig, nb::device::cpu>;
 template <class T>
 using Rows = Tensor<const T, nb::shape<-1, -1, 3>, nb::device::cpu>;  // shN: rows need not be contiguous to each other
-
-inline auto tensor(const char* name) { return nb::arg(name).noconvert(); }
 
 inline void require(bool holds, const char* rule) {
   if (!holds) throw nb::value_error(rule);
@@ -105,9 +100,7 @@ void bind_frame(nb::module_& m) {
              }
              nb::gil_scoped_release release;
              return self.project(splats, std::move(targets), threads);
-           },
-           tensor("means"), tensor("quats"), tensor("scales"), tensor("sh0"), tensor("shN"), nb::arg("grids"),
-           tensor("opacities"), tensor("offsets"), tensor("means2d"), tensor("visible"), nb::arg("threads"))
+           })
       .def_static("empty", &empty<T>, nb::rv_policy::reference)
       .def_static("release", [] { Recycler::instance().release(); })
       .def("pairs", &F::pairs)
@@ -118,45 +111,38 @@ void bind_frame(nb::module_& m) {
              nb::gil_scoped_release release;
              self.draw(i, pixels, cover, expected, threads);
            },
-           nb::arg("grid"), tensor("image"), tensor("alpha"), tensor("depth").none(), nb::arg("threads"))
+           nb::arg("grid"), nb::arg("image"), nb::arg("alpha"), nb::arg("depth").none(), nb::arg("threads"))
       .def("radii",
            [](const F& self, int i, Write<std::int32_t, -1, 2> out, int threads) {
              std::int32_t* radii = out.data();
              nb::gil_scoped_release release;
              self.radii(i, radii, threads);
-           },
-           nb::arg("grid"), tensor("out"), nb::arg("threads"))
+           })
       .def("vjp",
            [](F& self, int i, Read<T, -1, -1, -1, 3> image, std::optional<Read<T, -1, -1, -1>> alpha,
-              std::optional<Read<T, -1, -1, -1>> depth, Read<T, -1, 3> means, Read<T, -1, 4> quats,
-              Read<T, -1, 3> scales, Read<T, -1, 1, 3> sh0, Rows<T> shN, Write<T, -1, -1, 3> d_means,
+              std::optional<Read<T, -1, -1, -1>> depth, Write<T, -1, -1, 3> d_means,
               Write<T, -1, -1, 4> d_quats, Write<T, -1, -1, 3> d_scales, Write<T, -1, -1> d_opacities,
               Write<T, -1, -1, 2> d_screen, Write<T, -1, -1, 3> d_rgb, std::optional<Write<T, -1, -1, 2>> d_absgrad,
               std::optional<Read<T, -1>> weight, int threads) {
-             Splats<T> splats = splats_of<T>(means, quats, scales, sh0, shN);
              const int K = int(image.shape(0));
-             require(!weight || (std::int64_t(weight->shape(0)) == splats.n && K > 1 && K <= F::kMostCotangents && !depth && !d_absgrad),
+             require(!weight || (std::int64_t(weight->shape(0)) == self.size() && K > 1 && K <= F::kMostCotangents && !depth && !d_absgrad),
                      "`weight` has one number per Gaussian, and sums two or three cotangents of an image without depth");
              Gradients<T> out{d_means.data(), d_quats.data(), d_scales.data(), d_opacities.data(), d_screen.data(), d_rgb.data(),
                               d_absgrad ? d_absgrad->data() : nullptr, weight ? weight->data() : nullptr};
              const Cotangents<T> v{image.data(), alpha ? alpha->data() : nullptr, depth ? depth->data() : nullptr};
              nb::gil_scoped_release release;
-             self.vjp(i, K, v, splats, out, threads);
+             self.vjp(i, K, v, out, threads);
            },
-           nb::arg("grid"), tensor("image"), tensor("alpha").none(), tensor("depth").none(), tensor("means"),
-           tensor("quats"), tensor("scales"), tensor("sh0"), tensor("shN"), tensor("d_means"), tensor("d_quats"),
-           tensor("d_scales"), tensor("d_opacities"), tensor("d_screen"), tensor("d_rgb"), tensor("d_absgrad").none(),
-           tensor("weight").none(), nb::arg("threads"))
-      .def("basis", [](F& self, Read<T, -1, 3> means, Read<T, -1, 4> quats, Read<T, -1, 3> scales,
-                       Read<T, -1, 1, 3> sh0, Rows<T> shN, Write<T, -1, -1> out, int threads) {
-        Splats<T> splats = splats_of<T>(means, quats, scales, sh0, shN);
-        T* y = out.data();
-        require(reinterpret_cast<std::uintptr_t>(y) % (kLanes * sizeof(T)) == 0, "`out` must come from `empty`");
-        nb::gil_scoped_release release;
-        self.basis(splats, y, threads);
-      },
-      tensor("means"), tensor("quats"), tensor("scales"), tensor("sh0"), tensor("shN"), tensor("out"),
-      nb::arg("threads"));
+           nb::arg("grid"), nb::arg("image"), nb::arg("alpha").none(), nb::arg("depth").none(), nb::arg("d_means"), nb::arg("d_quats"),
+           nb::arg("d_scales"), nb::arg("d_opacities"), nb::arg("d_screen"), nb::arg("d_rgb"), nb::arg("d_absgrad").none(),
+           nb::arg("weight").none(), nb::arg("threads"))
+      .def("basis",
+           [](F& self, Write<T, -1, -1> out, int threads) {
+             T* y = out.data();
+             require(reinterpret_cast<std::uintptr_t>(y) % (kLanes * sizeof(T)) == 0, "`out` must come from `empty`");
+             nb::gil_scoped_release release;
+             self.basis(y, threads);
+           });
 }
 
 }  // namespace clear

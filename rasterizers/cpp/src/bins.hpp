@@ -34,8 +34,7 @@ struct Band {
   int x0 = 0, x1 = 0, y0 = 0, y1 = 0;
   int columns() const { return x1 - x0; }
   int bins() const { return columns() * (y1 - y0); }
-  bool operator==(const Band& other) const { return x0 == other.x0 && x1 == other.x1 && y0 == other.y0 && y1 == other.y1; }
-  bool operator!=(const Band& other) const { return !(*this == other); }
+  bool operator==(const Band&) const = default;
 };
 
 // The pairs of a band.

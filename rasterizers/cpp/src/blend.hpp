@@ -35,11 +35,7 @@ struct BlockEnd {
   T transmittance[kLanes];
   std::int32_t ended[kLanes];  // INT_MAX: it blended the whole list
 
-  bool finished() const {
-    bool all = true;
-    for (std::int32_t e : ended) all &= e != INT_MAX;
-    return all;
-  }
+  bool finished() const { return std::find(ended, ended + kLanes, INT_MAX) == ended + kLanes; }
 };
 
 // What a block has blended: Σ w times each channel, and with depth Σ w, because 1 - T has no digits left where little is

@@ -21,13 +21,6 @@ CLEAR_INLINE void load_rows(const T* tensor, std::int64_t row, int count, Lanes<
   split_rows(p, columns);
 }
 
-template <class T>
-CLEAR_INLINE Lanes<T> load_row(const T* tensor, std::int64_t row, int count) {
-  Lanes<T> columns[1];
-  load_rows<1>(tensor, row, count, columns);
-  return columns[0];
-}
-
 // The same for the rows of a group's Gaussians.
 template <int C, class T>
 CLEAR_INLINE void load_rows(const T* tensor, const Group& group, Lanes<T> (&columns)[C]) {
@@ -45,13 +38,6 @@ CLEAR_INLINE void store_rows(T* tensor, const Group& group, const Lanes<T> (&col
   join_rows(joined, columns);
   for (int i = 0; i < group.count; ++i)
     std::memcpy(tensor + std::int64_t(C) * group.rows[i], joined + C * i, sizeof(T) * C);
-}
-
-template <class T>
-CLEAR_INLINE Lanes<T> load_row(const T* tensor, const Group& group) {
-  Lanes<T> columns[1];
-  load_rows<1>(tensor, group, columns);
-  return columns[0];
 }
 
 // Columns of a group's rows of `width` numbers, `stride` apart, in place: there is room for at least sixteen. Does
@@ -73,11 +59,6 @@ CLEAR_INLINE void load_rows(const T* tensor, std::int64_t stride, const Group& g
     }
     transpose(block);
   }
-}
-
-// Writes the bits as bools.
-inline void store_bits(bool* out, int count, std::uint32_t bits) {
-  for (int i = 0; i < count; ++i) out[i] = (bits >> i) & 1;
 }
 
 // The lanes in whose byte the bit is set.

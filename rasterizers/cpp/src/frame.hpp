@@ -7,7 +7,6 @@
 // is then drawn band by band, with the same bits. What the backward pass needs is checked before the forward pass begins.
 #pragma once
 
-#include <numeric>
 #include <stdexcept>
 #include <string>
 
@@ -30,20 +29,17 @@ class Frame {
   Frame(const Settings<T>& settings, const Pose& pose, std::int64_t budget)
       : settings_(settings), pose_(pose), budget_(budget) {}
 
-  // Returns false if a number that it read is not finite.
+  // Returns false if a number that it read is not finite. Keeps pointers to the tensors.
   bool project(const Splats<T>& splats, std::vector<Target<T>> targets, int threads) {
     views_.clear();
-    n_ = splats.n;
+    splats_ = splats;
     if (!clear::project(pose_, settings_, splats, targets, slopes_, depths_, drawn_, threads)) return false;
     order_by_depth<T>(drawn_, depths_, order_, threads);  // one for all grids
-    for (Target<T>& target : targets) {
-      View view;
-      view.target = std::move(target);
-      views_.push_back(std::move(view));
-    }
+    for (Target<T>& target : targets) views_.push_back({std::move(target), {}, {}});
     return true;
   }
 
+  std::int64_t size() const { return splats_.n; }
   std::int64_t pairs(int i) const { return views_.at(i).target.pairs; }
 
   // `depth` is null if it is not asked for.
@@ -64,24 +60,24 @@ class Frame {
   }
 
   // The gradients [K, n, …] for K cotangents, of which `out.weight` allows two or three in float32.
-  void vjp(int i, int K, const Cotangents<T>& v, const Splats<T>& splats, const Gradients<T>& out, int threads) {
+  void vjp(int i, int K, const Cotangents<T>& v, const Gradients<T>& out, int threads) {
     View& view = views_.at(i);
     const std::int64_t pixels = std::int64_t(view.target.grid.width) * view.target.grid.height;
     for (int k = 0; k < K;) {
       const int now = v.depth || out.absgrad ? 1 : std::min(kMostCotangents, K - k);
-      const std::int64_t at = k * n_;
+      const std::int64_t at = k * splats_.n;
       Gradients<T> part{out.means + 3 * at,  out.quats + 4 * at, out.scales + 3 * at,
                         out.opacities + at,  out.screen + 2 * at, out.rgb + 3 * at,
                         out.absgrad ? out.absgrad + 2 * at : nullptr, out.weight};
       const Cotangents<T> these{v.image + k * pixels * kColour, v.alpha ? v.alpha + k * pixels : nullptr,
                                 v.depth ? v.depth + k * pixels : nullptr};
-      if (v.depth && out.absgrad) vjp_of<1, kColourAndDepth, true>(view, these, splats, part, threads);
-      else if (v.depth) vjp_of<1, kColourAndDepth>(view, these, splats, part, threads);
-      else if (out.absgrad) vjp_of<1, kColour, true>(view, these, splats, part, threads);
-      else if (now == 1) vjp_of<1>(view, these, splats, part, threads);
+      if (v.depth && out.absgrad) vjp_of<1, kColourAndDepth, true>(view, these, part, threads);
+      else if (v.depth) vjp_of<1, kColourAndDepth>(view, these, part, threads);
+      else if (out.absgrad) vjp_of<1, kColour, true>(view, these, part, threads);
+      else if (now == 1) vjp_of<1>(view, these, part, threads);
       if constexpr (kMostCotangents > 1) {
-        if (now == 2) vjp_of<2>(view, these, splats, part, threads);
-        if (now == 3) vjp_of<3>(view, these, splats, part, threads);
+        if (now == 2) vjp_of<2>(view, these, part, threads);
+        if (now == 3) vjp_of<3>(view, these, part, threads);
       }
       k += now;
     }
@@ -93,7 +89,7 @@ class Frame {
     const Target<T>& target = views_.at(i).target;
     Pool::instance().run(threads, drawn_.chunks(), [&](std::int64_t chunk) {
       const std::int64_t first = chunk * kChunk;
-      std::fill(out + 2 * first, out + 2 * std::min(n_, first + kChunk), 0);
+      std::fill(out + 2 * first, out + 2 * std::min(splats_.n, first + kChunk), 0);
       for (const std::uint32_t* number = drawn_.begin(chunk); number < drawn_.end(chunk); ++number) {
         if (!target.ranges[*number].count()) continue;
         const Ellipse<T>& e = target.ellipses[*number];
@@ -106,9 +102,9 @@ class Frame {
   }
 
   // Y of every Gaussian that some grid draws, [n, bands + 1]; zeros for the others.
-  void basis(const Splats<T>& splats, T* out, int threads) {
+  void basis(T* out, int threads) {
     using L = Lanes<T>;
-    const int width = splats.bands + 1;
+    const int width = splats_.bands + 1;
     auto write = [&](std::int64_t row, const L& Y) CLEAR_LAMBDA {
       T* to = out + row * width;
       if (width == kLanes) return Y.stream(to);
@@ -124,10 +120,10 @@ class Frame {
       for (const std::uint32_t* number = drawn_.begin(chunk); number < drawn_.end(chunk); number += kLanes) {
         const Group group(number, drawn_.end(chunk) - number);
         L mean[3], direction[3], length, Y[kLanes];
-        load_rows<3>(splats.means, group, mean);
+        load_rows<3>(splats_.means, group, mean);
         direction_of(pose_, mean, direction, length);
         for (L& y : Y) y = T(0);
-        each_band<T>(splats.bands, direction,
+        each_band<T>(splats_.bands, direction,
                      [&](int k, const L& y, const auto&, const auto&, const auto&) CLEAR_LAMBDA { Y[k] = y; });
         transpose(Y);
         for (int i = 0; i < group.count; ++i) {
@@ -135,7 +131,7 @@ class Frame {
           write(next++, Y[i]);
         }
       }
-      zeros_until(std::min(n_, (chunk + 1) * kChunk));
+      zeros_until(std::min(splats_.n, (chunk + 1) * kChunk));
       end_of_stream();
     });
   }
@@ -157,18 +153,17 @@ class Frame {
     if (view.target.pairs <= most) return {whole(view.target.grid)};
     const std::vector<std::uint32_t> pairs = pairs_in_bins(view);
     std::vector<Band> bands;
-    int first = 0;
     std::int64_t held = 0;
-    for (int row = 0; row < rows; ++row) {
-      const std::uint32_t* in_row = pairs.data() + std::size_t(row) * columns;
-      const std::int64_t here = std::accumulate(in_row, in_row + columns, std::int64_t(0));
-      if (held + here > most && row > first) bands.push_back({0, columns, first, row}), first = row, held = 0;
-      held += here;
-      if (here <= most) continue;
-      split_row(view, row, in_row, most, bytes_per_pair, bands);
-      first = row + 1, held = 0;
-    }
-    if (first < rows) bands.push_back({0, columns, first, rows});
+    for (int row = 0; row < rows; ++row)
+      for (int first = 0, end = 0; first < columns; first = end) {
+        const std::uint32_t* in_row = pairs.data() + std::size_t(row) * columns;
+        std::int64_t here = 0;
+        while (end < columns && here + in_row[end] <= most) here += in_row[end++];
+        if (end == first) refuse(view, in_row[end], bytes_per_pair);
+        const bool joins = end - first == columns && row && bands.back().columns() == columns && held + here <= most;
+        if (joins) ++bands.back().y1, held += here;
+        else bands.push_back({first, end, row, row + 1}), held = here;
+      }
     return bands;
   }
 
@@ -182,22 +177,9 @@ class Frame {
     return pairs;
   }
 
-  void split_row(const View& view, int row, const std::uint32_t* pairs, std::int64_t most, std::int64_t bytes_per_pair,
-                 std::vector<Band>& bands) const {
-    const int columns = view.target.grid.columns();
-    int first = 0;
-    std::int64_t held = 0;
-    for (int x = 0; x < columns; ++x) {
-      if (pairs[x] > most) refuse(view, pairs[x], bytes_per_pair);
-      if (held + pairs[x] > most) bands.push_back({first, x, row, row + 1}), first = x, held = 0;
-      held += pairs[x];
-    }
-    bands.push_back({first, columns, row, row + 1});
-  }
-
   [[noreturn]] void refuse(const View& view, std::int64_t pairs, std::int64_t bytes_per_pair) const {
     std::int64_t largest = 0;
-    for (std::int64_t i = 0; i < n_; ++i)
+    for (std::int64_t i = 0; i < splats_.n; ++i)
       if (view.target.ranges[i].count() > view.target.ranges[largest].count()) largest = i;
     const Ellipse<T>& e = view.target.ellipses[largest];
     throw OverBudget("one bin of 32 px holds " + std::to_string(pairs) + " Gaussians, whose image and gradients need " +
@@ -219,26 +201,19 @@ class Frame {
     const Band& band = view.bins.band;
     const int x = band.x0 + int(bin) % band.columns(), y = band.y0 + int(bin) / band.columns();
     const std::size_t place = std::size_t(y) * s.columns() + x;
-    return {settings_,
-            s,
-            view.target.ellipses,
-            view.bins,
-            int(bin),
-            x,
-            y,
-            blocks_in_image(x, y, s.width, s.height),
+    return {settings_, s, view.target.ellipses, view.bins, int(bin), x, y, blocks_in_image(x, y, s.width, s.height),
             view.ends.data() + place * kBlocks};
   }
 
   template <int K, int C = kColour, bool Absolute = false>
-  void vjp_of(View& view, const Cotangents<T>& cotangents, const Splats<T>& splats, const Gradients<T>& out, int threads) {
+  void vjp_of(View& view, const Cotangents<T>& cotangents, const Gradients<T>& out, int threads) {
     using Sums = PairSums<T, K, C, Absolute>;
     const std::vector<Band> bands = bands_of(view, kBytesPerPair + sizeof(Sums));
     const bool whole = bands.size() == 1;
     Buffer<Sums> pair_sums, splat_sums;  // by pair; by Gaussian, when there are several bands
     if (!whole) {
-      splat_sums.reserve_lost(n_);
-      std::memset(static_cast<void*>(splat_sums.data()), 0, sizeof(Sums) * n_);
+      splat_sums.reserve_lost(splats_.n);
+      std::memset(static_cast<void*>(splat_sums.data()), 0, sizeof(Sums) * splats_.n);
     }
     for (const Band& band : bands) {
       if (view.bins.band != band) list(view, band, threads);
@@ -247,11 +222,11 @@ class Frame {
                            [&](std::int64_t bin) { blend_vjp_bin<T, K, C, Absolute>(job(view, bin), cotangents, pair_sums.data()); });
       view.bins.has_masks = true;
       if (whole) break;
-      Pool::instance().run(threads, chunks_of(n_),
+      Pool::instance().run(threads, chunks_of(splats_.n),
                            [&](std::int64_t chunk) { add_band(view, chunk, pair_sums.data(), splat_sums.data()); });
     }
-    Pool::instance().run(threads, chunks_of(n_), [&](std::int64_t chunk) {
-      vjp_of_chunk<K, C, Absolute>(view, splats, chunk, whole, (whole ? pair_sums : splat_sums).data(), out);
+    Pool::instance().run(threads, chunks_of(splats_.n), [&](std::int64_t chunk) {
+      vjp_of_chunk<K, C, Absolute>(view, chunk, whole, (whole ? pair_sums : splat_sums).data(), out);
     });
   }
 
@@ -276,11 +251,11 @@ class Frame {
 
   // The gradients of a chunk's Gaussians from `sums`, by pair where one band is the whole image, else by Gaussian.
   template <int K, int C, bool Absolute>
-  void vjp_of_chunk(const View& view, const Splats<T>& splats, std::int64_t chunk, bool whole,
-                    const PairSums<T, K, C, Absolute>* sums, const Gradients<T>& out) {
+  void vjp_of_chunk(const View& view, std::int64_t chunk, bool whole, const PairSums<T, K, C, Absolute>* sums,
+                    const Gradients<T>& out) {
     using Sums = PairSums<T, K, C, Absolute>;
     constexpr std::int64_t ahead = 6 * kLanes;
-    const std::int64_t first = chunk * kChunk, end = std::min(n_, first + kChunk);
+    const std::int64_t first = chunk * kChunk, end = std::min(splats_.n, first + kChunk);
     auto touched = [&](std::int64_t i) {
       return whole ? view.bins.first[i + 1] > view.bins.first[i] : view.target.ranges[i].count() > 0;
     };
@@ -289,16 +264,16 @@ class Frame {
     for (const std::uint32_t* i = drawn_.begin(chunk); i < drawn_.end(chunk); ++i) numbers[count] = *i, count += touched(*i);
     const bool sparse = count < (end - first) / 2;
     if (sparse) {
-      clear_gradients<T, K>(n_, first, end - first, out);
+      clear_gradients<T, K>(splats_.n, first, end - first, out);
     } else {  // most of them: contiguous rows are read and written faster than scattered ones
       count = end - first;
-      for (std::int64_t i = 0; i < kChunk + ahead; ++i) numbers[i] = std::uint32_t(std::min(first + i, n_ - 1));
+      for (std::int64_t i = 0; i < kChunk + ahead; ++i) numbers[i] = std::uint32_t(std::min(first + i, splats_.n - 1));
     }
     const std::int64_t known = sparse ? count : count + ahead;
     for (std::int64_t at = 0; at < count; at += kLanes) {
       const Group group(numbers + at, count - at);
       Lanes<T> rows[Sums::kRows][kLanes];
-      fetch_rows(splats, view.target, slopes_, numbers + std::min(known, at + 2 * kLanes),
+      fetch_rows(splats_, view.target, slopes_, numbers + std::min(known, at + 2 * kLanes),
                  numbers + std::min(known, at + 3 * kLanes));
       if (whole) {
         fetch_pair_sums(view.bins, numbers + std::min(known, at + ahead), numbers + std::min(known, at + ahead + kLanes), sums);
@@ -311,14 +286,15 @@ class Frame {
       for (auto& row : rows) transpose(row);
       std::uint32_t bits = 0;
       for (int i = 0; i < group.count; ++i) bits |= std::uint32_t(sparse || touched(group.rows[i])) << i;
-      project_vjp_group(pose_, settings_, splats, view.target, slopes_, group, K, rows[0], bits, out);
+      project_vjp_group(pose_, settings_, splats_, view.target, slopes_, group, K, rows[0], bits, out);
       if constexpr (C == kColourAndDepth) depth_vjp_group(pose_, group, rows[0][Sums::of_channel(kColour)], bits, out.means);
     }
   }
 
   Settings<T> settings_;
   Pose pose_;
-  std::int64_t budget_, n_ = 0;
+  std::int64_t budget_;
+  Splats<T> splats_{};
   Drawn drawn_;
   Buffer<Slope<T>> slopes_;  // [n]
   Buffer<double> depths_;

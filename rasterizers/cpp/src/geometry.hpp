@@ -103,7 +103,6 @@ struct Geometry {
     R[3] = two * (x_ * y_ + w * z_), R[4] = one - two * (x_ * x_ + z_ * z_), R[5] = two * (y_ * z_ - w * x_);
     R[6] = two * (x_ * z_ - w * y_), R[7] = two * (y_ * z_ + w * x_), R[8] = one - two * (x_ * x_ + y_ * y_);
   }
-  friend CLEAR_INLINE L operator*(T a, const L& b) { return L(a) * b; }
 };
 
 // The ellipse on a pixel grid. Lengths are in units of `size`, the larger of T's largest entry and √kernel, so that

@@ -39,7 +39,6 @@ class Drawn {
   void close(std::int64_t chunk, std::int64_t count) { counts_[chunk] = count; }
   const std::uint32_t* begin(std::int64_t chunk) const { return numbers_.data() + chunk * kChunk; }
   const std::uint32_t* end(std::int64_t chunk) const { return begin(chunk) + counts_[chunk]; }
-  std::int64_t count(std::int64_t chunk) const { return counts_[chunk]; }
 
  private:
   Buffer<std::uint32_t> numbers_;  // [chunks, kChunk]

@@ -68,7 +68,7 @@ void order_by_depth(const Drawn& drawn, const Buffer<double>& depths, Buffer<std
   std::int64_t count = 0;
   std::vector<std::int64_t> starts(chunks);
   for (std::int64_t c = 0; c < chunks; ++c) {
-    starts[c] = count, count += drawn.count(c);
+    starts[c] = count, count += drawn.end(c) - drawn.begin(c);
     all = {std::min(all.low, extents[c].low), std::max(all.high, extents[c].high)};
   }
   order.reserve_lost(count);

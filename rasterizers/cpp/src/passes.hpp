@@ -27,14 +27,6 @@ Segment<T>& thread_segment() {
   return segment;
 }
 
-// The expected depth of a block's pixels, 0 where nothing is drawn.
-template <class T>
-CLEAR_INLINE Lanes<T> expected_depth(const BlockBlend<T, kColourAndDepth>& blend) {
-  using L = Lanes<T>;
-  const L weight = L::load(blend.sums[kColourAndDepth]);
-  return L::load(blend.sums[kColour]) * where(weight > L(T(0)), L(T(1)) / weight);
-}
-
 // Draws the bin's pixels into an image [height, width, 3] and alpha and depth [height, width]; depth is null for C = kColour.
 template <class T, int C>
 void draw_bin(const BinJob<T>& job, T* image, T* alpha, T* depth) {
@@ -64,7 +56,8 @@ void draw_bin(const BinJob<T>& job, T* image, T* alpha, T* depth) {
     store_block<3>(image, job.grid.width, job.grid.height, job.block_x(b), job.block_y(b), pixel);
     store_block<1>(alpha, job.grid.width, job.grid.height, job.block_x(b), job.block_y(b), cover);
     if constexpr (C == kColourAndDepth) {
-      const L expected[1] = {expected_depth(blends[b])};
+      const L weight = L::load(blends[b].sums[kColourAndDepth]);  // 0 where nothing is drawn
+      const L expected[1] = {L::load(blends[b].sums[kColour]) * where(weight > L(T(0)), L(T(1)) / weight)};
       store_block<1>(depth, job.grid.width, job.grid.height, job.block_x(b), job.block_y(b), expected);
     }
   });

@@ -129,17 +129,18 @@ std::uint32_t project_group(const Pose& pose, const Settings<T>& s, const Splats
   const Mask<T> in_front = g.z > L(s.near);
   std::uint32_t any = 0;
   for (Target<T>& target : targets) {
-    const L opacity = load_row(target.opacities, first, count);
-    add_times_zero(&opacity, 1, poison);
+    L opacity[1];
+    load_rows<1>(target.opacities, first, count, opacity);
+    add_times_zero(opacity, 1, poison);
     // The grids of one pose are nearly always scaled copies of each other; they then share the geometry, too. There is one
     // call, because two copies of inlined code may round differently.
-    if (!same_view(target.grid, *placed)) g.place(target.grid), placed = &target.grid;
+    if (!target.grid.same_view(*placed)) g.place(target.grid), placed = &target.grid;
     L e[kLanes];
-    const Mask<T> shows = ellipse_of(centre, g, target.grid, s, opacity, e);
+    const Mask<T> shows = ellipse_of(centre, g, target.grid, s, opacity[0], e);
     const std::uint32_t visible = shows.bits() & real;
     const L uv[2] = {where(in_front, e[kWholeU] + e[kU]), where(in_front, e[kWholeV] + e[kV])};
     store_rows<2>(target.means2d, first, count, uv);
-    store_bits(target.visible + first, count, visible);
+    for (int i = 0; i < count; ++i) target.visible[first + i] = (visible >> i) & 1;
     bins_of(target.grid, e, visible, count, target.ranges.data() + first);
     any |= visible;
     if (!visible) continue;

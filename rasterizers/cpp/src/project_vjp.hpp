@@ -65,11 +65,11 @@ void project_vjp_group(const Pose& pose, const Settings<T>& s, const Splats<T>& 
                        const Gradients<T>& out) {
   using L = Lanes<T>;
   const Mask<T> real = Mask<T>::from_bits(touched);
-  L mean[3], quat[4], scale[3];
+  L mean[3], quat[4], scale[3], opacity[1];
   load_rows<3>(splats.means, group, mean);
   load_rows<4>(splats.quats, group, quat);
   load_rows<3>(splats.scales, group, scale);
-  const L opacity = load_row(target.opacities, group);
+  load_rows<1>(target.opacities, group, opacity);
   const Geometry<T> g(pose, target.grid, Centre(pose, mean), quat, scale);
   const Footprint<T> f(g, target.grid, s);
   std::uint8_t lit[kLanes];
@@ -90,9 +90,9 @@ void project_vjp_group(const Pose& pose, const Settings<T>& s, const Splats<T>& 
     store_rows<2>(out.screen + 2 * k * splats.n, group, screen);
   }
   if (out.weight) {  // the projection is linear in the sums
-    const L weight = load_row(out.weight, group);
-    L *last = sums + (K - 1) * width, *before = last - width;
-    for (int i = 0; i < width; ++i) before[i] += last[i] *= weight;
+    L weight[1], *last = sums + (K - 1) * width, *before = last - width;
+    load_rows<1>(out.weight, group, weight);
+    for (int i = 0; i < width; ++i) before[i] += last[i] *= weight[0];
   }
   for (int k = 0; k < K; ++k) {
     const L* sum = sums + k * width;
@@ -103,7 +103,7 @@ void project_vjp_group(const Pose& pose, const Settings<T>& s, const Splats<T>& 
     store_rows<3>(out.rgb + 3 * at, group, rgb);
     if (out.weight && k == K - 1) break;
     LaneGradients<T> gradient;
-    project_vjp(pose, target.grid, s, g, f, scale, opacity, sum[0], sum[1], sum[2], sum[3], sum[4], sum[5], gradient);
+    project_vjp(pose, target.grid, s, g, f, scale, opacity[0], sum[0], sum[1], sum[2], sum[3], sum[4], sum[5], gradient);
     for (int c = 0; c < 3 && splats.bands; ++c)
       for (int axis = 0; axis < 3; ++axis) gradient.mean[axis] += slope[3 * c + axis] * rgb[c];
     L alone[1] = {gradient.opacity};

@@ -54,13 +54,9 @@ struct Grid {
 
   int columns() const { return (width + kBin - 1) / kBin; }
   int rows() const { return (height + kBin - 1) / kBin; }
+  bool same_view(const Grid& o) const { return left == o.left && right == o.right && top == o.top && bottom == o.bottom; }
   static constexpr double kMargin = 0.3;  // share of the half field of view beyond the image
 };
-
-template <class T>
-bool same_view(const Grid<T>& a, const Grid<T>& b) {
-  return a.left == b.left && a.right == b.right && a.top == b.top && a.bottom == b.bottom;
-}
 
 // The tensors of rasterizers.interface.Splats that are shared by all grids.
 template <class T>

@@ -6,8 +6,9 @@
 
 namespace clear {
 
-// As nb::ndarray. nanobind asks a torch tensor for its DLPack capsule by a method in Python, which takes 3 µs; an iteration
-// passes 150 tensors, and torch's own function takes a fifteenth of it.
+// As nb::ndarray, but never of a converted copy, which is freed when the call returns: a frame keeps pointers to tensors, and outputs
+// are written to them. nanobind asks a torch tensor for its DLPack capsule by a method in Python, which takes 3 µs; an iteration passes
+// 150 tensors, and torch's own function takes a fifteenth of it.
 template <class... Args>
 struct Tensor : nanobind::ndarray<Args...> {
   using nanobind::ndarray<Args...>::ndarray;
@@ -30,6 +31,7 @@ struct type_caster<clear::Tensor<Args...>> {
   NB_TYPE_CASTER(clear::Tensor<Args...>, make_caster<ndarray<Args...>>::Name)
 
   bool from_python(handle source, std::uint32_t flags, cleanup_list* cleanup) noexcept {
+    flags &= ~std::uint32_t(cast_flags::convert);
     make_caster<ndarray<Args...>> array;
     object capsule = source.is_none() ? object() : clear::capsule_of(source);
     if (!array.from_python(capsule.is_valid() ? handle(capsule) : source, flags, cleanup)) return false;
