@@ -22,7 +22,7 @@ def smooth(
     cost: Float[Tensor, "H W D"], image: Float[Tensor, "H W"], small_step: float, large_step: float
 ) -> Float[Tensor, "H W D"]:
     """The mean over eight directions of L; `small_step` is P1, `large_step` the largest P2, and `image` grey in [0, 1]."""
-    total = torch.zeros_like(cost)
+    total = torch.zeros_like(cost, memory_format=torch.contiguous_format)
     if native.runs(cost):
         native.module().add_paths(cost.contiguous(), image.contiguous(), small_step, large_step, total)
         return total.mul_(1 / 8)

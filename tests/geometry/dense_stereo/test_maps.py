@@ -214,6 +214,7 @@ def test_the_compiled_sweep_is_the_readable_one(window: int, monkeypatch: pytest
 def test_the_compiled_smoothing_is_the_readable_one(shape, monkeypatch):
     volume, image = torch.rand(shape), torch.rand(shape[:2])
     compiled = smooth(volume, image, 0.08, 0.6)
+    assert torch.equal(smooth(volume.transpose(0, 1).contiguous().transpose(0, 1), image, 0.08, 0.6), compiled)
     monkeypatch.setattr(cost.native, "available", lambda: False)
     assert torch.equal(compiled, smooth(volume, image, 0.08, 0.6))
 
