@@ -138,22 +138,25 @@ def _scenes(x: Tensor | None, batch: torch.Size) -> Sequence[Any]:
 def _drawn(
     views: Sequence[CameraView], lead: tuple[int, ...], learns: bool, packed: bool, absgrad: bool
 ) -> tuple[Float[Tensor, "*B C H W X"], Float[Tensor, "*B C H W 1"], dict[str, Any]]:
-    """Images, alphas, and what `info` has of each Gaussian; `lead` and `learns` as of `info_of_all`."""
+    """Images, alphas, and what `info` has of each Gaussian.
+
+    Args:
+        lead: the dimensions of scenes and cameras, which `views` go through.
+        learns: whether a backward pass may follow, and `means2d` is to have a gradient.
+    """
     drawn = [view.parts() for view in views]
-    # The parts of a picture have the same centres.
-    each = [(parts[0].rendered, view.inputs) for parts, view in zip(drawn, views, strict=True)]
-    rows: Sequence[Tensor | None]
-    if packed:
-        info, centres, rows = info_of_visible(each, lead[-1], learns)
-    else:
-        info, centres, rows = info_of_all(each, lead, learns)
-    absolute: Sequence[Tensor | None] = [None] * len(views)
+    each = [parts[0].rendered for parts in drawn]  # the parts of a picture have the same centres
+    visible = [rendered.rendering.visible.nonzero()[:, 0] for rendered in each] if packed else []
+    info = info_of_visible(each, lead[-1], visible) if packed else info_of_all(each, lead)
+    means2d, every = info["means2d"].requires_grad_(learns), [None] * len(views)
+    sizes = [len(i) for i in visible] or [len(view.inputs.means) for view in views]
+    centres: Sequence[Tensor] = torch.split(means2d.view(-1, 2), sizes)
+    absolute: Sequence[Tensor | None] = every
     if absgrad:
-        total = info["means2d"].absgrad = torch.zeros_like(info["means2d"])
-        absolute = torch.split(total.view(-1, 2), [len(x) for x in centres])
-    pictures = [
-        view.picture(parts, u, i, a) for view, parts, u, i, a in zip(views, drawn, centres, rows, absolute, strict=True)
-    ]
+        means2d.absgrad = torch.zeros_like(means2d)
+        absolute = torch.split(means2d.absgrad.view(-1, 2), sizes)
+    of_views = zip(views, drawn, centres, visible or every, absolute, strict=True)
+    pictures = [view.picture(parts, u, rows, total) for view, parts, u, rows, total in of_views]
     images, alphas = (stacked(x) for x in zip(*pictures, strict=True))
     return images.view(*lead, *images.shape[1:]), alphas[..., None].view(*lead, *alphas.shape[1:], 1), info
 

@@ -135,14 +135,22 @@ def draw(
         means2d = rendered.rendering.means2d.clone().requires_grad_()
     else:
         means2d.data.copy_(rendered.rendering.means2d)
-    return in_graph(rendered, inputs, means2d, pose=camera.world_to_camera)
+    return in_graph(rendered, means2d, pose=camera.world_to_camera)
 
 
 class Rendered(NamedTuple):
+    """A rendering, and what it shows: the inputs, and how many bands of their colours."""
+
     rendering: Rendering
     rasterizer: Rasterizer
     camera: Camera
-    bands: int  # of the colours
+    inputs: Inputs
+    bands: int
+
+    @property
+    def splats(self) -> Splats:
+        """What is drawn, outside of any graph."""
+        return self.inputs.splats(self.bands)
 
 
 def render(
@@ -165,25 +173,24 @@ def render(
             rendering = replayed_drawing.draw(rasterizer, inputs.drawn(bands), camera, depth=depth)
         else:
             rendering = draw_or_take(rasterizer, inputs.splats(bands), camera, depth=depth)
-    return Rendered(rendering, rasterizer, camera, bands)
+    return Rendered(rendering, rasterizer, camera, inputs, bands)
 
 
 def in_graph(
     rendered: Rendered,
-    inputs: Inputs,
     means2d: Float[Tensor, "M 2"],
     rows: Int[Tensor, " M"] | None = None,
     *,
     pose: Float[Tensor, "4 4"] | None = None,
     absgrad: Float[Tensor, "M 2"] | None = None,
 ) -> Drawn:
-    """The rendering as a differentiable function of the inputs, the projected centres and the pose.
+    """The rendering as a differentiable function of its inputs, the projected centres and the pose.
 
     Args:
         rows: the Gaussians whose centres `means2d` holds; None: all.
         absgrad: each backward pass adds Σ|∂L/∂u| over the pixels, of these rows.
     """
-    hook = BackwardHook()
+    hook, inputs = BackwardHook(), rendered.inputs
     if absgrad is not None:
         require_trait(rendered.rasterizer, "absgrad")
     image, alpha, visible, depth = _Draw.apply(  # type: ignore[no-untyped-call]
@@ -220,7 +227,7 @@ class _Draw(torch.autograd.Function):
     @in_full_precision
     @once_differentiable  # a second derivative would silently be 0
     def backward(ctx: Any, d_image: Tensor | None, d_alpha: Tensor | None, _: None, d_depth: Tensor | None) -> Any:
-        rendering, rasterizer, camera, bands = ctx.rendered
+        rendering, rasterizer, camera, inputs, _ = ctx.rendered
         layers: dict[str, Any] = {"alpha": d_alpha, "depth": d_depth}
         layers = {name: d[None] for name, d in layers.items() if d is not None and bool(d.any())}
         takes_layers = rasterizer.traits.depth_gradient
@@ -230,8 +237,7 @@ class _Draw(torch.autograd.Function):
                 "traits.depth_gradient is False); detach it, draw with cpp or torch, or let rasterizers.rasterization draw it."
             )
         take_colours = ctx.hook.reached()
-        saved = ctx.saved_tensors  # raises if one was changed in place since it was drawn
-        inputs = Inputs(*saved[: len(Inputs._fields)])
+        ctx.saved_tensors  # noqa: B018 - raises if one was changed in place since it was drawn
         if d_image is None:
             d_image = torch.zeros_like(rendering.image)
         if takes_layers or not layers:
@@ -242,7 +248,7 @@ class _Draw(torch.autograd.Function):
             other = (0.0 if b[0] > 0.5 else 1.0, *b[1:])
             d_red = torch.zeros_like(d_image)
             d_red[..., 0] = layers["alpha"][0] / (other[0] - b[0])
-            over_other = over(rasterizer, other)(inputs.splats(bands), camera)
+            over_other = over(rasterizer, other)(ctx.rendered.splats, camera)
             drawn, more = [(rendering, d_image + d_red), (over_other, -d_red)], {}
         if ctx.absgrad is not None:
             more = more | {"absgrad": True}
@@ -263,7 +269,7 @@ class _Draw(torch.autograd.Function):
         if ctx.needs_input_grad[_POSE]:
             means, quats, scales, opacities = (x[None] for x in geometry)
             g = SplatGradients(means, quats, scales, opacities, screen[None], rgb[None], basis)
-            pose = pose_gradient(inputs.splats(bands), camera, g).to(*ctx.pose)
+            pose = pose_gradient(ctx.rendered.splats, camera, g).to(*ctx.pose)
         screen = screen if ctx.rows is None else screen[ctx.rows]
         return None, None, None, None, pose, screen, *geometry, colors, None if inputs.rgb_offset is None else rgb
 

@@ -10,28 +10,20 @@ from jaxtyping import Int
 from torch import Tensor
 
 from rasterizers.autograd import Rendered, stacked
-from rasterizers.inputs import Inputs
 from rasterizers.interface import RasterSettings, WithTraits
 from rasterizers.modes import in_full_precision
 from rasterizers.reference.projection import footprints
 
-Picture = tuple[Rendered, Inputs]
-"""An image, and what it shows."""
 
-
-def info_of_all(
-    each: Sequence[Picture], lead: tuple[int, ...], learns: bool
-) -> tuple[dict[str, Any], Sequence[Tensor], Sequence[None]]:
-    """What gsplat's strategies read, the centres of each image, and None for the rows of each: these are all.
+def info_of_all(each: Sequence[Rendered], lead: tuple[int, ...]) -> dict[str, Any]:
+    """What gsplat's strategies read of these images.
 
     Args:
         lead: the dimensions of scenes and cameras, which `each` goes through.
-        learns: whether a backward pass may follow, and `means2d` is to have a gradient.
     """
-    renderings = [rendered.rendering for rendered, _ in each]
+    renderings = [rendered.rendering for rendered in each]
     means2d = stacked([rendering.means2d for rendering in renderings])
     means2d = means2d.clone() if len(each) == 1 else means2d
-    means2d = means2d.view(*lead, *means2d.shape[1:]).requires_grad_(learns)
 
     def radii() -> dict[str, Tensor]:
         found = stacked([cast(WithTraits, rendering).radii for rendering in renderings])
@@ -39,40 +31,38 @@ def info_of_all(
 
     def ellipses() -> dict[str, Tensor]:
         found: dict[str, list[Tensor]] = {name: [] for name in of_ellipses}
-        for rendered, splats in each:
+        for rendered in each:
             rows = rendered.rendering.visible.nonzero()[:, 0]
-            columns = _columns(rendered, splats, rows)
+            columns = _columns(rendered, rows)
             for name, wholes in found.items():
-                whole = columns[name].new_zeros(len(splats.means), *columns[name].shape[1:])
+                whole = columns[name].new_zeros(len(rendered.inputs.means), *columns[name].shape[1:])
                 wholes.append(whole.index_copy(0, rows, columns[name]))
         return {name: torch.stack(x).view(*lead, *x[0].shape) for name, x in found.items()}
 
-    flat = means2d.view(len(each), *means2d.shape[len(lead) :])
-    values = {"means2d": means2d, "gaussian_ids": None, "camera_ids": None, "batch_ids": None}
-    own_radii = all(rendered.rasterizer.traits.radii for rendered, _ in each)
+    values = {
+        "means2d": means2d.view(*lead, *means2d.shape[1:]),
+        "gaussian_ids": None,
+        "camera_ids": None,
+        "batch_ids": None,
+    }
+    own_radii = all(rendered.rasterizer.traits.radii for rendered in each)
     of_ellipses = ("depths", "conics", "opacities", *(() if own_radii else ("radii",)))
     later = {"radii": radii, **dict.fromkeys(of_ellipses, ellipses)}
-    return _Info(values, later), flat.unbind(), [None] * len(each)
+    return _Info(values, later)
 
 
-def info_of_visible(
-    each: Sequence[Picture], cameras: int, learns: bool
-) -> tuple[dict[str, Any], Sequence[Tensor], Sequence[Tensor]]:
-    """The same of the visible alone, and which rows these are."""
-    rows = [rendered.rendering.visible.nonzero()[:, 0] for rendered, _ in each]
-    columns = [_columns(*one, i) for one, i in zip(each, rows, strict=True)]
+def info_of_visible(each: Sequence[Rendered], cameras: int, rows: Sequence[Int[Tensor, " _"]]) -> dict[str, Any]:
+    """The same of the visible alone, which are these rows of each image."""
+    columns = [_columns(*one) for one in zip(each, rows, strict=True)]
     info: dict[str, Any] = {name: torch.cat([x[name] for x in columns]) for name in columns[0]}
-    info["means2d"].requires_grad_(learns)
-    ids = torch.cat(rows)
     view = torch.cat([torch.full_like(i, k) for k, i in enumerate(rows)])
-    info |= {"gaussian_ids": ids, "camera_ids": view % cameras, "batch_ids": view // cameras}
-    return info, torch.split(info["means2d"], [len(i) for i in rows]), rows
+    return info | {"gaussian_ids": torch.cat([*rows]), "camera_ids": view % cameras, "batch_ids": view // cameras}
 
 
 @in_full_precision
-def _columns(rendered: Rendered, splats: Inputs, rows: Int[Tensor, " M"]) -> dict[str, Tensor]:
+def _columns(rendered: Rendered, rows: Int[Tensor, " M"]) -> dict[str, Tensor]:
     """The columns of gsplat's `info` for the visible Gaussians."""
-    settings = cast(RasterSettings, rendered.rasterizer)  # `over` has checked it
+    splats, settings = rendered.inputs, cast(RasterSettings, rendered.rasterizer)  # `over` has checked it
     f = footprints(splats.means[rows], splats.quats[rows], splats.scales[rows], rendered.camera, settings.kernel)
     opacities = splats.opacities[rows] * f.compensation if settings.antialiased else splats.opacities[rows]
     radii = f.radii(opacities, settings.alpha_min).int()

@@ -31,7 +31,6 @@ class Part:
     """
 
     rendered: Rendered
-    inputs: Inputs
     low: float = 0.0
     span: float = 1.0
     keeps: int = 3
@@ -84,7 +83,7 @@ class CameraView:
         self, parts: Sequence[Part], means2d: Tensor, rows: Int[Tensor, " M"] | None, absgrad: Tensor | None
     ) -> tuple[Float[Tensor, "H W X"], Float[Tensor, "H W"]]:
         """The picture, and its alpha."""
-        drawn = [in_graph(p.rendered, p.inputs, means2d, rows, pose=self.pose, absgrad=absgrad) for p in parts]
+        drawn = [in_graph(part.rendered, means2d, rows, pose=self.pose, absgrad=absgrad) for part in parts]
         pictures = [part.picture(one.image) for part, one in zip(parts, drawn, strict=True)]
         alpha, depth = drawn[0].alpha, drawn[0].depth
         if self.render_mode != "RGB":
@@ -110,4 +109,4 @@ class CameraView:
 
     def _drawn(self, inputs: Inputs, bands: int, behind: Sequence[float], *, depth: bool) -> Part:
         rasterizer = over(self.rasterizer, cast(Any, tuple(behind)))
-        return Part(render(rasterizer, inputs, bands, self.camera, depth=depth, replays=self.replays), inputs)
+        return Part(render(rasterizer, inputs, bands, self.camera, depth=depth, replays=self.replays))
