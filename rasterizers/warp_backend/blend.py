@@ -24,14 +24,12 @@ import warp as wp
 
 from rasterizers.warp_backend.bins import exponent
 from rasterizers.warp_backend.settings import SEGMENT, TILE
-from rasterizers.warp_backend.types import PIXELS, SUMS, Cuts, Ellipse, Grid, width_of
+from rasterizers.warp_backend.types import PIXELS, SUMS, Cuts, Ellipse, Grid, Moments, width_of
 
 wp.set_module_options({"enable_backward": False})
 
 Near: Final[Any] = wp.types.vector(length=9, dtype=wp.float32)
 """A Gaussian as a tile's pixels see it: its centre from the tile's first pixel, px; A, B and C; opacity; colour."""
-Moments: Final[Any] = wp.types.vector(length=SUMS, dtype=wp.float32)
-"""Sums over pixels of q = ∂L/∂(log α) times 1, d_x, d_y, d_x², d_x d_y and d_y², see `offset_of`."""
 
 
 @wp.func

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from rasterizers.warp_backend.types import Cuts, Grid, Pose
+from rasterizers.warp_backend.types import Cuts, Grid, Moments, Pose
 
 wp.set_module_options({"enable_backward": False})
 
@@ -56,26 +56,6 @@ class Footprint:
     xy: wp.float32
     yy: wp.float32
     compensation: wp.float32  # Mip-Splatting: √(det T Tᵀ / det Σ'), opacity factor that makes up for the kernel's blur
-
-
-@wp.struct
-class Sums:
-    """Sums over a Gaussian's pixels: q = ∂L/∂(log alpha) and its moments about the centre."""
-
-    q: wp.float32
-    first: wp.vec2  # Σ q (dx, dy)
-    xx: wp.float32
-    xy: wp.float32
-    yy: wp.float32
-
-
-@wp.struct
-class GaussianGradient:
-    """The gradients of one Gaussian."""
-
-    mean: wp.vec3
-    quat: wp.vec4
-    scale: wp.vec3
 
 
 @wp.func
@@ -156,11 +136,13 @@ def screen_vjp(f: Footprint, first: wp.vec2) -> wp.vec2:
 
 @wp.func
 def geometry_vjp(
-    pose: Pose, grid: Grid, cuts: Cuts, g: Geometry, f: Footprint, scale: wp.vec3, sums: Sums
-) -> GaussianGradient:
-    """The VJP of the projection, with M the second moments and ρ the compensation: ∂L/∂T = Σ'⁻¹ M Σ'⁻¹ T + q ∂ log ρ/∂T."""
-    out = GaussianGradient()
-    screen = screen_vjp(f, sums.first)
+    pose: Pose, grid: Grid, cuts: Cuts, g: Geometry, f: Footprint, scale: wp.vec3, sums: Moments
+) -> tuple[wp.vec3, wp.vec4, wp.vec3]:
+    """The VJP of the projection, with M the second moments and ρ the compensation: ∂L/∂T = Σ'⁻¹ M Σ'⁻¹ T + q ∂ log ρ/∂T.
+
+    Returns the gradients of mean, quaternion and scale.
+    """
+    screen = screen_vjp(f, wp.vec2(sums[1], sums[2]))
     du, dv = screen[0], screen[1]
 
     # ∂L/∂T, row by row, with P = Σ'⁻¹ T. The rows of P, (y × n + κ x)/det and (n × x + κ y)/det with the rows x and y of T, have
@@ -169,12 +151,12 @@ def geometry_vjp(
     x, y = f.X * shrink, f.Y * shrink
     along_x, along_y = wp.cross(y, f.normal), wp.cross(f.normal, x)
     px, py = (along_x + f.kernel * x) * (shrink / f.det), (along_y + f.kernel * y) * (shrink / f.det)
-    mx, my = sums.xx * px + sums.xy * py, sums.xy * px + sums.yy * py
+    mx, my = sums[3] * px + sums[4] * py, sums[4] * px + sums[5] * py
     dX, dY = f.xx * mx + f.xy * my, f.xy * mx + f.yy * my
     if cuts.antialiased:
         # log ρ = ½ log area² - ½ log(area² + κ tr + κ²). This form avoids the cancellation for large Gaussians:
         # ∂ log ρ/∂x = κ/det ((tr + κ)/area² (y × n) - x), and for y with n × x.
-        weight = sums.q * shrink * f.kernel / f.det
+        weight = sums[0] * shrink * f.kernel / f.det
         turn = (f.a + f.c + f.kernel) / (f.area * f.area)
         dX += weight * (turn * along_x - x)
         dY += weight * (turn * along_y - y)
@@ -188,14 +170,13 @@ def geometry_vjp(
         dty -= wp.dot(g.axes[2], gy)
     over_z = dtx * g.tan[0] + dty * g.tan[1] + wp.dot(f.X, dX) + wp.dot(f.Y, dY)
     back = wp.transpose(pose.rotation)
-    out.mean = back * (wp.vec3(dtx, dty, -over_z) * g.inverse_z)
+    d_mean = back * (wp.vec3(dtx, dty, -over_z) * g.inverse_z)
 
     # axes = W R diag(s)
     d_axes = back * wp.matrix_from_rows(gx, gy, -(g.limited[0] * gx + g.limited[1] * gy))
     along = wp.cw_mul(g.rotation, d_axes)
-    out.scale = along[0] + along[1] + along[2]
-    out.quat = rotation_vjp(g.unit, d_axes * wp.diag(scale)) * g.inverse_norm
-    return out
+    d_quat = rotation_vjp(g.unit, d_axes * wp.diag(scale)) * g.inverse_norm
+    return d_mean, d_quat, along[0] + along[1] + along[2]
 
 
 @wp.func

@@ -12,7 +12,6 @@ from rasterizers.warp_backend.bins import count_tiles, depth_key, reaches_image
 from rasterizers.warp_backend.colour import colour_of
 from rasterizers.warp_backend.geometry import (
     Footprint,
-    Sums,
     centre_of,
     footprint_of,
     geometry_of,
@@ -20,7 +19,7 @@ from rasterizers.warp_backend.geometry import (
     screen_vjp,
 )
 from rasterizers.warp_backend.settings import SEGMENT
-from rasterizers.warp_backend.types import FAR, SUMS, Cuts, Ellipse, Grid, Pose, width_of
+from rasterizers.warp_backend.types import FAR, SUMS, Cuts, Ellipse, Grid, Moments, Pose, width_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -273,19 +272,15 @@ def project_vjp(K: int, absolute: bool = False, summed: bool = False) -> Any:
             rgb = unclamped(colour, wp.vec3(total[at], total[at + 1], total[at + 2]))
             d_rgb[k, i] = rgb
             if k < J:
-                sums = Sums()
-                sums.q = total[W * k]
-                sums.first = wp.vec2(total[W * k + 1], total[W * k + 2])
-                sums.xx = total[W * k + 3]
-                sums.xy = total[W * k + 4]
-                sums.yy = total[W * k + 5]
-                out = geometry_vjp(pose, grid, cuts, g, f, scales[i], sums)
+                q = W * k
+                sums = Moments(total[q], total[q + 1], total[q + 2], total[q + 3], total[q + 4], total[q + 5])
+                d_mean, d_quat, d_scale = geometry_vjp(pose, grid, cuts, g, f, scales[i], sums)
                 if slopes.shape[0] > 0:
-                    out.mean += wp.transpose(slopes[i]) * rgb
-                d_means[k, i] = out.mean
-                d_quats[k, i] = out.quat
-                d_scales[k, i] = out.scale
-                d_opacities[k, i] = sums.q / opacities[i]
+                    d_mean += wp.transpose(slopes[i]) * rgb
+                d_means[k, i] = d_mean
+                d_quats[k, i] = d_quat
+                d_scales[k, i] = d_scale
+                d_opacities[k, i] = sums[0] / opacities[i]
         if wp.static(absolute):
             d_absolute[0, i] = wp.vec2(total[W], total[W + 1])
 

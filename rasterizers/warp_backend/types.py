@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import warp as wp
 
@@ -14,6 +14,9 @@ PIXELS: Final = TILE**2
 """Pixels of a tile."""
 SUMS: Final = 6
 """Sums of a pair for one cotangent before those of the colour: q = ∂L/∂(log alpha) and its moments."""
+
+Moments: Final[Any] = wp.types.vector(length=SUMS, dtype=wp.float32)
+"""Those sums over pixels: q times 1, d_x, d_y, d_x², d_x d_y and d_y² with the vector d from the centre to a pixel."""
 
 
 def width_of(K: int, absolute: bool) -> int:
