@@ -150,13 +150,11 @@ def cotangents(k, height, width, seed=0) -> torch.Tensor:
 def everything(rendering, v):
     g = rendering.vjp(v)
     pixels = (pixels_of(rendering), rendering.alpha, rendering.means2d, rendering.visible)
-    summed = () if len(v) == 1 else _of_sum(summed_vjp(rendering, v, torch.linspace(0, 2, len(g.rgb[0])).to(v)))
+    summed = []
+    if len(v) > 1:
+        s = summed_vjp(rendering, v, torch.linspace(0, 2, len(g.rgb[0])).to(v))
+        summed = [s.means, s.quats, s.scales, s.opacities, s.screen, s.rgb]
     return (*pixels, *(gradient_of(g, name) for name in ATTRIBUTES), *summed, g.basis)
-
-
-def _of_sum(g):
-    """The tensors of a sum."""
-    return g.means, g.quats, g.scales, g.opacities, g.screen, g.rgb
 
 
 def dense_scene(n=3000):

@@ -305,27 +305,19 @@ def test_radii_of_warp_are_those_of_the_reference_as_float32_rounds_them(mode):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_what_lies_too_far_or_is_too_small_is_left_out(backend):
-    splats, colors, (viewmats, Ks) = gaussians(), colours(False, None), cameras()
-    call = {"backend": backend}
-    _, _, info = drawn(splats, colors, viewmats, Ks, packed=True, **call)
-    far, radius = float(info["depths"].median()), float(info["radii"].amax(1).median())
-    _, _, near = drawn(splats, colors, viewmats, Ks, far_plane=far, packed=True, **call)
-    _, _, large = drawn(splats, colors, viewmats, Ks, radius_clip=radius, packed=True, **call)
-    assert near["depths"].max() <= far
-    assert len(near["depths"]) == int((info["depths"] <= far).sum())
-    assert len(large["radii"]) == int((info["radii"] > radius).any(1).sum())
-
-
-def test_radius_clip_reads_the_radii_of_info():
-    """Of antialiased Gaussians, too, whose opacity is smaller."""
+@pytest.mark.parametrize("call", [{}, {"rasterize_mode": "antialiased", "eps2d": 3.0}], ids=["classic", "antialiased"])
+def test_what_lies_too_far_or_is_too_small_is_left_out(backend, call):
+    """By the depths and radii of `info`; the opacity of antialiased Gaussians, and so their radius, is smaller."""
     splats, colors, (viewmats, Ks) = gaussians(), colours(False, None), cameras()
     splats["scales"] = splats["scales"] * 0.3
-    call = {"rasterize_mode": "antialiased", "eps2d": 3.0, "packed": True, "backend": "torch"}
-    radii = drawn(splats, colors, viewmats, Ks, **call)[2]["radii"]
-    clip = int(radii.amax(1).median())
-    left = drawn(splats, colors, viewmats, Ks, radius_clip=clip, **call)[2]["radii"]
-    assert len(radii) > len(left) == int((radii > clip).any(1).sum()) > 0
+
+    def info(**more):
+        return drawn(splats, colors, viewmats, Ks, packed=True, backend=backend, **call, **more)[2]
+
+    depths, radii = info()["depths"], info()["radii"]
+    far, clip = float(depths.median()), int(radii.amax(1).median())
+    assert sorted(info(far_plane=far)["depths"]) == sorted(depths[depths <= far])
+    assert len(radii) > len(info(radius_clip=clip)["radii"]) == int((radii > clip).any(1).sum()) > 0
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -37,11 +37,18 @@ def test_it_compiles_with_clang_where_int64_is_long_long(source, tmp_path):
     assert done.returncode == 0, done.stderr
 
 
+def built(compiler, program, *arguments):
+    """The path of a program of these sources, which needs nothing beside it."""
+    subprocess.run(
+        [compiler, "-static", "-std=c++20", *_FLAGS, *_INCLUDES, *arguments, "-o", program], check=True, cwd=_ROOT
+    )
+    return str(program)
+
+
 @pytest.mark.skipif(not all(map(shutil.which, _ARM64)), reason=f"not installed: {' or '.join(_ARM64)}")
 def test_lanes_rows_and_a_frame_agree_on_arm64(tmp_path):
-    (compiler, emulator), program = _ARM64, str(tmp_path / "checks")
-    command = [compiler, "-static", "-std=c++20", *_FLAGS, *_INCLUDES, str(_ROOT / _CHECKS), "-o", program]
-    subprocess.run(command, check=True)
+    compiler, emulator = _ARM64
+    program = built(compiler, tmp_path / "checks", _CHECKS)
     done = subprocess.run([emulator, program], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
     assert done.stdout.startswith("ok")
@@ -55,24 +62,9 @@ def test_the_kernels_have_the_same_bits_on_arm64(tmp_path):
     """Without fused multiplication, and with registers of one size, both processors compute the same sums in the same order."""
     printed = []
     for compiler, *emulator in (("g++",), _ARM64):
-        program = str(tmp_path / compiler)
-        sources = [str(_ROOT / source) for source in _RESULTS]
-        command = [
-            compiler,
-            "-static",
-            "-std=c++20",
-            *_FLAGS,
-            "-O2",
-            "-ffp-contract=off",
-            *_INCLUDES,
-            *sources,
-            "-o",
-            program,
-        ]
-        subprocess.run(command, check=True)
-        printed.append(
-            subprocess.run([*emulator, program], capture_output=True, text=True, check=True).stdout.splitlines()
-        )
+        program = built(compiler, tmp_path / compiler, "-O2", "-ffp-contract=off", *_RESULTS)
+        done = subprocess.run([*emulator, program], capture_output=True, text=True, check=True)
+        printed.append(done.stdout.splitlines())
     here, there = printed
     assert len(here) > 30
     assert "nan" not in " ".join(here)

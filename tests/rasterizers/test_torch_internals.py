@@ -44,8 +44,9 @@ def test_a_pass_calls_once_at_its_end_before_backward_returns():
 )
 def test_a_pass_calls_the_hooks_that_it_finds_in_their_mapping(register, hooks):
     x, seen = Parameter(torch.ones(3)), []
-    assert not hooks(x)
+    assert (of_torch.is_hooked(x), len(hooks(x))) == (False, 0)
     handle = register(x, lambda _: seen.append("the hook"))
+    assert of_torch.is_hooked(x)
     hooks(x)[handle.id] = lambda _: seen.append("another")
     (2 * x).sum().backward()
     hooks(x).clear()
@@ -86,14 +87,6 @@ def test_a_node_is_that_of_a_leaf_or_of_cat_or_another():
     joined, added = torch.cat((x, x)).grad_fn, (x + x).grad_fn
     assert [of_torch.is_cat(node) for node in (joined, added)] == [True, False]
     assert (of_torch.leaf_of(joined), of_torch.leaf_of(added)) == (None, None)
-
-
-def test_hooks_of_both_kinds_are_found():
-    assert not of_torch.is_hooked(Parameter(torch.ones(3)))
-    for register in ("register_hook", "register_post_accumulate_grad_hook"):
-        x = Parameter(torch.ones(3))
-        getattr(x, register)(lambda g: None)
-        assert of_torch.is_hooked(x), register
 
 
 def test_a_write_by_a_view_is_another_version():
