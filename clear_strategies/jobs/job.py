@@ -133,7 +133,7 @@ class _Job:
             _log.info("%s", metrics.describe_job(HydraConfig.get().job.num, folder, evaluation, seconds))
         if few:
             _log.warning("%s.", few)
-        mean = evaluation.mean("test") or evaluation.mean("train")
+        mean = evaluation.shown.mean.get("ours")
         return None if mean is None else mean.psnr
 
     def _start(self, scene: Scene, there: Scene, ready: device.ReadyRasterizer) -> TrainState:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -81,7 +82,7 @@ def finished(folder: Path, config: Mapping[str, Any], scene: Callable[[], Scene]
         if (last := newest(folder)) is not None:
             _require_same_photos(folder, checkpoint.load(last), fingerprints(there))
     mean = content.shown.mean.get("ours")
-    score = "no PSNR" if mean is None or mean.psnr is None else f"PSNR {mean.psnr:.2f} dB"
+    score = "no PSNR" if mean is None or math.isnan(mean.psnr) else f"PSNR {mean.psnr:.2f} dB"
     _log.info(
         "%s: this run finished on %s (%s); nothing is trained.",
         folder,

@@ -21,9 +21,9 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
 from typing import Any, Final
 
+import msgspec
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -45,8 +45,7 @@ _LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
 _REACH: Final = 5  # of the window of SSIM: those that lie inside the image count
 
 
-@dataclass(frozen=True, slots=True)
-class ImageScores:
+class ImageScores(msgspec.Struct, frozen=True, omit_defaults=True):
     """PSNR in dB, at most `PSNR_CAP`, and SSIM: more is better. GMSD: less is better. Blur: closer to 0 is better.
 
     Args:
@@ -57,7 +56,7 @@ class ImageScores:
     ssim: float
     gmsd: float
     blur: float
-    own: Mapping[str, float] = field(default_factory=dict, kw_only=True)
+    own: dict[str, float] = msgspec.field(default_factory=dict)
 
 
 class Truth:
@@ -101,13 +100,12 @@ class Truth:
         return ImageScores(psnr, _ssim(image, self.image, self.shown), gmsd, _blur(grey) - self.blur, own=own)
 
 
-def mean_scores(scores: Sequence[ImageScores]) -> ImageScores | None:
-    """The mean of each number; None for an empty sequence."""
-    if not scores:
-        return None
-    *four, _ = (f.name for f in fields(ImageScores))
-    own = {name: sum(s.own[name] for s in scores) / len(scores) for name in scores[0].own}
-    return ImageScores(*(sum(getattr(s, name) for s in scores) / len(scores) for name in four), own=own)
+def mean_scores(scores: Sequence[ImageScores]) -> ImageScores:
+    """The mean of each number of one or more images."""
+    *four, own = zip(*map(msgspec.structs.astuple, scores), strict=True)
+    means = {name: sum(numbers[name] for numbers in own) / len(own) for name in own[0]}
+    psnr, ssim, gmsd, blur = (sum(numbers) / len(numbers) for numbers in four)
+    return ImageScores(psnr, ssim, gmsd, blur, means)
 
 
 @torch.no_grad()  # the mode is per thread

@@ -24,7 +24,6 @@ import shlex
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -59,30 +58,48 @@ MOST_TRAIN: Final = 50  # largest number of training views that are scored, even
 TRAIN_RENDERS: Final = 4  # number of training views whose renders are kept if there are no test views
 
 
-class Scores(msgspec.Struct):
-    """`ImageScores` in the file; null for a number that was not finite."""
-
-    psnr: float | None
-    ssim: float | None
-    gmsd: float | None
-    blur: float | None
-    own: dict[str, float | None] = msgspec.field(default_factory=dict)
-
-    @property
-    def numbers(self) -> ImageScores:
-        *four, own = msgspec.structs.astuple(self)
-        return ImageScores(*map(as_float, four), own={name: as_float(x) for name, x in own.items()})
+Table = dict[str, dict[str, ImageScores]]
+"""view -> image ("ours", "bicubic", "prior") -> scores."""
 
 
-class Part(msgspec.Struct):
-    """TABLE of the test or the training views."""
+class Part(msgspec.Struct, omit_defaults=True):
+    """TABLE of the test or the training views.
+
+    Args:
+        mean: over the views that have the image; without views, there is none.
+        of: the number of training views, of which `views` has at most `MOST_TRAIN`; None for test views.
+    """
 
     against: str
-    views: dict[str, dict[str, Scores]]
-    mean: dict[str, Scores]
+    views: Table
+    mean: dict[str, ImageScores]
+    of: Count | None = None
+
+    @property
+    def against_lr(self) -> bool:
+        """True if views are compared with their LR photos, since their HR photos are unknown."""
+        return "LR" in self.against
 
 
-class Metrics(msgspec.Struct):
+class Scored(msgspec.Struct):
+    """The scores of both parts."""
+
+    test: Part
+    train: Part
+
+    @property
+    def shown(self) -> Part:
+        """The test views; the training views if there are none."""
+        return self.test if self.test.mean else self.train
+
+
+class Evaluation(Scored):
+    """Scores, and the renders of the test views, or of a few training views if there are none."""
+
+    renders: Mapping[str, Float[Tensor, "H W 3"]]
+
+
+class Metrics(Scored):
     """The fields of metrics.json that this package reads."""
 
     scene: str
@@ -91,58 +108,27 @@ class Metrics(msgspec.Struct):
     iterations: Count
     gaussians: Count
     seconds: Positive
-    conflict: dict[str, float | None]
+    conflict: dict[str, float]
     synthetic_prior: bool
-    test: Part
-    train: Part
     provenance: dict[str, Any]
     config: dict[str, Any] = msgspec.field(default_factory=dict)
     overrides: list[str] | None = None
 
-    @property
-    def shown(self) -> Part:
-        """The test views; the training views if there are none."""
-        return self.test if self.test.mean else self.train
-
 
 def read(path: Path, remedy: str) -> Metrics:
     """Read metrics.json."""
-    content = typed(path, read_object(path), Metrics, remedy=remedy)
-    content.config = plain_settings(path, content.config)
-    return content
+    content = read_object(path)
+    numbers = {key: _with_nan(content[key]) for key in ("test", "train", "conflict") if key in content}
+    metrics = typed(path, content | numbers, Metrics, remedy=remedy)
+    metrics.config = plain_settings(path, metrics.config)
+    return metrics
 
 
-def as_float(value: float | None) -> float:
-    """A number of the file; NaN for null."""
+def _with_nan(value: Any) -> Any:
+    """Replace null, which stands for a number that was not finite, by NaN."""
+    if isinstance(value, dict):
+        return {key: _with_nan(inner) for key, inner in value.items()}
     return math.nan if value is None else value
-
-
-Table = dict[str, dict[str, ImageScores]]
-"""view -> image ("ours", "bicubic", "prior") -> scores."""
-
-
-@dataclass(frozen=True, slots=True)
-class Evaluation:
-    """Scores of the views, the images that each part was compared with, and the renders of the test views, or of a few training
-    views if there are none.
-
-    Args:
-        train: scores of at most `MOST_TRAIN` of the `train_views` training views.
-    """
-
-    test: Table
-    train: Table
-    against: Mapping[str, str]
-    renders: Mapping[str, Float[Tensor, "H W 3"]]
-    train_views: int
-
-    def mean(self, part: str, image: str = "ours") -> ImageScores | None:
-        """Mean over the views of a part ("test", "train") that have this image."""
-        return mean_scores([row[image] for row in getattr(self, part).values() if image in row])
-
-    def against_lr(self, part: str) -> bool:
-        """Return True if views of a part are compared with their LR photos, since their HR photos are unknown."""
-        return "LR" in self.against.get(part, "")
 
 
 def evaluate(
@@ -158,60 +144,48 @@ def evaluate(
         own: as of `Truth`; called in several threads.
     """
     renders: dict[str, Tensor] = {}
-    tables: dict[str, Table] = {"test": {}, "train": {}}
-    against = {"test": _against(scene.test), "train": _against(scene.train)}
-    test = [view for view in scene.test if view.lr.shows_something]
-    train = spaced([view for view in scene.train if view.lr.shows_something], MOST_TRAIN)
-    kept = {view.name for view in test or spaced(train, TRAIN_RENDERS)}
+    test, train = Table(), Table()
+    of_test = [view for view in scene.test if view.lr.shows_something]
+    of_train = spaced([view for view in scene.train if view.lr.shows_something], MOST_TRAIN)
+    kept = {view.name for view in of_test or spaced(of_train, TRAIN_RENDERS)}
     with ThreadPoolExecutor(n := threads()) as scorers:
-        done = Progress("scores", "views", len(test) + len(train))
+        done = Progress("scores", "views", len(of_test) + len(of_train))
         scored = deque[tuple[Table, str, Future[dict[str, ImageScores]]]]()
 
         def take() -> None:
             table, name, scores = scored.popleft()
             table[name] = scores.result()
-            done(sum(map(len, tables.values())))
+            done(len(test) + len(train))
 
-        for part, view in [*(("test", view) for view in test), *(("train", view) for view in train)]:
+        for table, view in [*((test, view) for view in of_test), *((train, view) for view in of_train)]:
             image = render(view).clamp(0, 1)
             if not bool(image.isfinite().all()):
                 _log.warning("%s: its render is not finite and has no scores.", view.name)
             if view.name in kept:
                 renders[view.name] = image
-            scored.append((tables[part], view.name, scorers.submit(_scores_of, view, image, down, own)))
+            scored.append((table, view.name, scorers.submit(_scores_of, view, image, down, own)))
             if len(scored) > n:  # bounds the number of renders in memory
                 take()
         while scored:
             take()
-    for part in tables:
-        if "LR" in against[part]:
-            _log.debug("%s views: HR is unknown; images reduced by %s were compared with the LR photos.", part, down)
-    return Evaluation(tables["test"], tables["train"], against, renders, len(scene.train))
+    parts = {"test": _part(scene.test, test), "train": _part(scene.train, train, of=len(scene.train))}
+    for name, part in parts.items():
+        if part.against_lr:
+            _log.debug("%s views: HR is unknown; images reduced by %s were compared with the LR photos.", name, down)
+    return Evaluation(**parts, renders=renders)
+
+
+def _part(views: Sequence[View], table: Table, of: int | None = None) -> Part:
+    """The scores of some or all of the views, and their means."""
+    kinds = {"LR" if view.truth is None else "HR" for view in views}
+    scored = sorted({image for row in table.values() for image in row})
+    means = {image: mean_scores([row[image] for row in table.values() if image in row]) for image in scored}
+    return Part(f"{' and '.join(sorted(kinds))} photos" if kinds else "nothing", table, means, of)
 
 
 def to_json(evaluation: Evaluation, **facts: Any) -> dict[str, Any]:
     """The content of metrics.json; `facts` are its other keys."""
-    content: dict[str, Any] = {**facts, "note": NOTE}
-    for part in ("test", "train"):
-        table: Table = getattr(evaluation, part)
-        shown = sorted({image for row in table.values() for image in row})
-        means = {image: evaluation.mean(part, image) for image in shown}
-        content[part] = {
-            "against": evaluation.against[part],
-            "views": {view: {image: _in_file(s) for image, s in row.items()} for view, row in table.items()},
-            "mean": {image: _in_file(mean) for image, mean in means.items() if mean is not None},
-        }
-    content["train"]["of"] = evaluation.train_views
-    return content
-
-
-def _in_file(scores: ImageScores) -> dict[str, Any]:
-    return {name: x for name, x in asdict(scores).items() if x != {}}
-
-
-def _against(views: Sequence[View]) -> str:
-    kinds = {"LR" if view.truth is None else "HR" for view in views}
-    return f"{' and '.join(sorted(kinds))} photos" if kinds else "nothing"
+    return {**facts, "note": NOTE, "test": evaluation.test, "train": evaluation.train}
 
 
 def _scores_of(
@@ -237,29 +211,28 @@ def describe(folder: Path, evaluation: Evaluation, seconds: float, parts: Mappin
         seconds: of the whole command. parts: of its stages, by name; those of a second or more are shown.
     """
     folder = _relative(folder)
-    rows = [(part, *row) for part in ("test", "train") for row in _rows(part, evaluation)]
+    test, train = evaluation.test, evaluation.train
+    rows = [(name, *row) for name, part in (("test", test), ("train", train)) for row in _rows(part)]
     width = max((len(image) for _, image, _ in rows), default=0)
     told = ", ".join(f"{name} {duration(part)}" for name, part in parts.items() if part >= 1)
     lines = [f"done in {duration(seconds)}{f' ({told})' if told else ''}: {folder}"]
-    lines += [f"  {part:<5}  {image:<{width}}  {numbers}" for part, image, numbers in rows]
+    lines += [f"  {name:<5}  {image:<{width}}  {numbers}" for name, image, numbers in rows]
     if rows:
         lines.append(_LEGEND)
     if any(image in ("bicubic", "prior") for _, image, _ in rows):
         lines.append(f"  {NOTE}.")
-    if unknown := " and ".join(part for part in ("test", "train") if evaluation.against_lr(part)):
+    if unknown := " and ".join(["test"] * test.against_lr + ["train"] * train.against_lr):
         lines.append(f"  {unknown}: the HR photos are unknown, so reduced images are compared with the LR photos.")
-    if evaluation.train and len(evaluation.train) < evaluation.train_views:
-        lines.append(
-            f"  train: {len(evaluation.train)} of the {evaluation.train_views} views, evenly spaced, are scored."
-        )
+    if train.views and len(train.views) < (train.of or 0):
+        lines.append(f"  train: {len(train.views)} of the {train.of} views, evenly spaced, are scored.")
     look = f"{folder / 'contact_sheet.jpg'}, or clear-strategies view {shlex.quote(str(folder))}"
     return "\n".join([*lines, f"  look next: {look}"])
 
 
 def describe_job(number: int, folder: Path, evaluation: Evaluation, seconds: float) -> str:
     """The message at the end of a job of a sweep, one line."""
-    means = ((part, mean) for part in ("test", "train") if (mean := evaluation.mean(part)) is not None)
-    score = next((f", {part} views {mean.psnr:.2f} dB" for part, mean in means), "")
+    mean = evaluation.shown.mean.get("ours")
+    score = "" if mean is None else f", {'test' if evaluation.test.mean else 'train'} views {mean.psnr:.2f} dB"
     return f"job {number}: done in {duration(seconds)}{score}: {_relative(folder)}"
 
 
@@ -268,11 +241,11 @@ def _relative(folder: Path) -> Path:
     return folder.relative_to(Path.cwd()) if Path.cwd() in folder.parents else folder
 
 
-def _rows(part: str, evaluation: Evaluation) -> Iterator[tuple[str, str]]:
+def _rows(part: Part) -> Iterator[tuple[str, str]]:
     # bicubic and prior are made from the LR photos, so a comparison with these would be meaningless.
-    for image in ("ours",) if evaluation.against_lr(part) else ("ours", "bicubic", "prior"):
-        if (mean := evaluation.mean(part, image)) is not None:
-            yield image, _numbers(mean)
+    for image in ("ours",) if part.against_lr else ("ours", "bicubic", "prior"):
+        if image in part.mean:
+            yield image, _numbers(part.mean[image])
 
 
 def _numbers(m: ImageScores) -> str:

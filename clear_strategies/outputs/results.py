@@ -193,7 +193,7 @@ def _write_video(path: Path, train: Sequence[Camera], painter: Painter, frames: 
 def _write_sheet(folder: Path, scene: Scene, stems: Mapping[str, str], evaluation: Evaluation, title: str) -> None:
     """Draw the LR photo, the SR image and the render of a few views, with the truth and the error if it is known."""
     rows: list[SheetRow] = []
-    part = evaluation.test or evaluation.train
+    scored = evaluation.shown.views
     rendered = [view for view in (*scene.test, *scene.train) if view.name in evaluation.renders]
     for view in (*scene.train, *scene.test):  # the viewer shows them beside the rendering
         write_png(folder / "views" / f"{stems[view.name]}_lr.png", view.lr.image)
@@ -209,7 +209,7 @@ def _write_sheet(folder: Path, scene: Scene, stems: Mapping[str, str], evaluatio
         if view.truth is not None:
             columns["ground truth"] = view.truth
             columns["error of ours"] = (columns["ours"] - view.truth).abs().mean(-1)
-        score = part[view.name]["ours"]
+        score = scored[view.name]["ours"]
         captions = {"ours": f"{score.psnr:.2f} dB, SSIM {score.ssim:.3f}"}
         pixels = {name: image.numpy() for name, image in columns.items()}
         pictures = [name for name, image in pixels.items() if image.ndim == 3]

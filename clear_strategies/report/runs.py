@@ -6,10 +6,11 @@ import logging
 import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+import msgspec
 import pandas as pd
 
 from clear_strategies.errors import DataError, counted
@@ -76,9 +77,9 @@ class FinishedRun:
             raise DataError(path, "ours", "is missing", "train the run again")
         marks = ["synthetic prior"] * content.synthetic_prior
         marks += [] if part is content.test else ["training views"]
-        marks += [f"against {part.against}"] if "LR" in part.against else []
-        psnr = {image: scores.numbers.psnr for image, scores in part.mean.items()}
-        ours = asdict(part.mean["ours"].numbers)
+        marks += [f"against {part.against}"] if part.against_lr else []
+        psnr = {image: scores.psnr for image, scores in part.mean.items()}
+        ours = msgspec.structs.asdict(part.mean["ours"])
         own = {f"{OWN}{name}": x for name, x in ours.pop("own").items()}
         return cls(
             folder=folder,
@@ -92,7 +93,7 @@ class FinishedRun:
                 **ours,
                 **own,
                 **{image: psnr.get(image, math.nan) for image in ("bicubic", "prior")},
-                "conflict": metrics.as_float(content.conflict.get("gaussian")),
+                "conflict": content.conflict.get("gaussian", math.nan),
                 "gaussians": content.gaussians,
                 "seconds": content.seconds,
             },

@@ -3,10 +3,11 @@
 import inspect
 import json
 import math
-from dataclasses import astuple, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -20,7 +21,7 @@ from clear_strategies.core.points import PointCloud
 from clear_strategies.data.scene import Scene
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.image_scores import PSNR_CAP, ImageScores, Truth
-from clear_strategies.outputs.metrics import NOTE, Evaluation, Table, describe
+from clear_strategies.outputs.metrics import NOTE, Evaluation, Part, describe
 from rasterizers.interface import Camera
 from tests.helpers.image_files import noise
 
@@ -41,15 +42,13 @@ def test_each_view_is_scored_by_method_and_the_mean_is_over_views_if_there_are_a
     a, b = view("a", noise(0, 48, 64)), view("b", noise(1, 48, 64))
     evaluation = metrics.evaluate(scene((a,), (a, b)), lambda camera: a.truth)  # type: ignore[arg-type,return-value]
     assert set(evaluation.renders) == {"a", "b"}
-    assert evaluation.test["a"]["ours"].psnr == PSNR_CAP
-    assert evaluation.test["b"]["bicubic"] == Truth(noise(1, 48, 64)).score(images.upsample(b.lr.image, 4))
-    assert evaluation.test["b"]["prior"] == Truth(noise(1, 48, 64)).score(b.hr.image)
-    mean = evaluation.mean("test")
-    assert mean.psnr == pytest.approx((PSNR_CAP + evaluation.test["b"]["ours"].psnr) / 2)
-    assert evaluation.against == {"test": "HR photos", "train": "HR photos"}
+    assert evaluation.test.views["a"]["ours"].psnr == PSNR_CAP
+    assert evaluation.test.views["b"]["bicubic"] == Truth(noise(1, 48, 64)).score(images.upsample(b.lr.image, 4))
+    assert evaluation.test.views["b"]["prior"] == Truth(noise(1, 48, 64)).score(b.hr.image)
+    assert evaluation.test.mean["ours"].psnr == pytest.approx((PSNR_CAP + evaluation.test.views["b"]["ours"].psnr) / 2)
+    assert evaluation.test.against == evaluation.train.against == "HR photos"
     without = metrics.evaluate(scene((a,), ()), lambda camera: a.truth)  # type: ignore[arg-type,return-value]
-    assert without.mean("test") is None
-    assert metrics.to_json(without)["test"] == {"against": "nothing", "views": {}, "mean": {}}
+    assert msgspec.to_builtins(without.test) == {"against": "nothing", "views": {}, "mean": {}}
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -64,32 +63,32 @@ def test_what_a_mask_hides_has_no_part_in_the_scores(known: bool) -> None:
         image = torch.where(a.hr.shown[..., None], right, color)
         evaluations.append(metrics.evaluate(scene((a, empty), (a, empty)), lambda camera, image=image: image))
     assert evaluations[0].test == evaluations[1].test
-    assert evaluations[0].test["a"]["ours"].psnr > (99 if known else 30)
-    assert list(evaluations[0].test) == list(evaluations[0].train) == list(evaluations[0].renders) == ["a"]
+    assert evaluations[0].test.views["a"]["ours"].psnr > (99 if known else 30)
+    assert list(evaluations[0].test.views) == list(evaluations[0].train.views) == list(evaluations[0].renders) == ["a"]
 
 
 def test_of_many_training_views_a_sample_is_scored(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(metrics, "MOST_TRAIN", 3)
     views = tuple(view(str(i), noise(i, 48, 64)) for i in range(7))
     evaluation = metrics.evaluate(scene(views, ()), lambda camera: torch.zeros(48, 64, 3))
-    assert list(evaluation.train) == list(evaluation.renders) == ["0", "3", "6"]
-    assert metrics.to_json(evaluation)["train"]["of"] == 7
+    assert list(evaluation.train.views) == list(evaluation.renders) == ["0", "3", "6"]
+    assert evaluation.train.of == 7
 
 
 def test_without_hr_the_reduced_render_is_compared_with_lr_and_of_hr_photos_it_alone_is_scored() -> None:
     truth = noise(2, 48, 64)
     known, unknown = view("known", truth), view("unknown", truth, known=False)
     evaluation = metrics.evaluate(scene((known, unknown), (unknown,)), lambda camera: truth)
-    assert evaluation.test["unknown"]["ours"].psnr == PSNR_CAP
-    assert set(evaluation.test["unknown"]) == {"ours", "prior"}
-    assert evaluation.against == {"test": "LR photos", "train": "HR and LR photos"}
+    assert evaluation.test.views["unknown"]["ours"].psnr == PSNR_CAP
+    assert set(evaluation.test.views["unknown"]) == {"ours", "prior"}
+    assert (evaluation.test.against, evaluation.train.against) == ("LR photos", "HR and LR photos")
     made = view("a", noise(3, 48, 64))
     photos = replace(made, hr=replace(made.hr, image=made.truth))
     assert photos.hr_is_photo
     assert photos.to("cpu").hr_is_photo
     assert not made.hr_is_photo
     evaluation = metrics.evaluate(scene((photos,), (photos,)), lambda camera: photos.hr.image)
-    assert set(evaluation.test["a"]) == {"ours"}
+    assert set(evaluation.test.views["a"]) == {"ours"}
 
 
 def test_a_render_that_is_not_finite_has_a_warning_and_null_in_the_file(tmp_path, caplog):
@@ -112,13 +111,13 @@ def test_metrics_of_ones_own_are_in_the_file_and_the_last_lines_and_one_that_rai
     own = {"off": lambda image, truth: (image - truth).abs().mean(), "broken": lambda image, truth: image.lpips}
     content = scene((), (a.hiding(shown), replace(a, name="b")))
     evaluation = metrics.evaluate(content, lambda view: torch.full((48, 64, 3), 0.75), own=own)
-    means = [evaluation.test[name]["ours"].own["off"] for name in "ab"]
+    means = [evaluation.test.views[name]["ours"].own["off"] for name in "ab"]
     assert means == pytest.approx([0.25 * 10 / 16, 0.25])
     assert "metrics.broken: left out, AttributeError: " in caplog.text
     facts = {"scene": "s", "strategies": [], "seed": 0, "iterations": 1, "gaussians": 1, "seconds": 1, "conflict": {},
              "synthetic_prior": False, "provenance": {}}  # fmt: skip
     files.write_json(tmp_path / "metrics.json", metrics.to_json(evaluation, **facts))
-    scores = metrics.read(tmp_path / "metrics.json", "").test.mean["ours"].numbers
+    scores = metrics.read(tmp_path / "metrics.json", "").test.mean["ours"]
     assert scores.own["off"] == pytest.approx(sum(means) / 2)
     assert math.isnan(scores.own["broken"])
     assert "blur +0.0000   off  0.2031   broken     nan" in describe(Path("run"), evaluation, 1.0, {})
@@ -126,7 +125,12 @@ def test_metrics_of_ones_own_are_in_the_file_and_the_last_lines_and_one_that_rai
 
 # ---- the table of scores at the end of a run
 OURS, BICUBIC = ImageScores(23.5, 0.7, 0.1, 0.01), ImageScores(22.0, 0.5, 0.16, 0.2)
-TABLE: Table = {"view": {"ours": OURS, "bicubic": BICUBIC, "prior": BICUBIC}}
+SCORES = {"ours": OURS, "bicubic": BICUBIC, "prior": BICUBIC}
+
+
+def part(scores: dict[str, ImageScores], against: str = "HR photos", of: int | None = None) -> Part:
+    """Of one view, or of none."""
+    return Part(against, {"view": scores} if scores else {}, scores, of)
 
 
 def rows(text: str) -> dict[str, str]:
@@ -135,7 +139,7 @@ def rows(text: str) -> dict[str, str]:
 
 def test_the_images_that_ours_is_compared_with_stand_below_it() -> None:
     text = describe(
-        Path("run"), Evaluation(TABLE, {}, {}, {}, 0), 72.7, {"poses": 60.2, "points": 0.4, "training": 12.0}
+        Path("run"), Evaluation(part(SCORES), part({}), {}), 72.7, {"poses": 60.2, "points": 0.4, "training": 12.0}
     )
     assert text.startswith("done in 1 min 13 s (poses 1 min 0 s, training 12 s): run\n")
     found = rows(text)
@@ -148,16 +152,16 @@ def test_the_images_that_ours_is_compared_with_stand_below_it() -> None:
 
 
 def test_what_is_missing_has_no_row_and_no_note() -> None:
-    def told(*tables: Table, against: str = "HR photos") -> str:
-        return describe(Path("run"), Evaluation(*tables, {"train": against}, {}, 200), 12.7, {})
+    def told(test: dict[str, ImageScores], train: dict[str, ImageScores], against: str = "HR photos") -> str:
+        return describe(Path("run"), Evaluation(part(test), part(train, against, 200), {}), 12.7, {})
 
     def images(text: str) -> list[str]:
         return [line.split()[1] for line in text.splitlines() if line.startswith("  train ")]
 
-    assert images(told({}, TABLE)) == ["ours", "bicubic", "prior"]
-    assert NOTE not in told({"view": {"ours": OURS}}, {})
+    assert images(told({}, SCORES)) == ["ours", "bicubic", "prior"]
+    assert NOTE not in told({"ours": OURS}, {})
     # An SR image is not compared with the photo that it is made of.
-    reduced = told({}, TABLE, against="LR photos")
+    reduced = told({}, SCORES, against="LR photos")
     assert images(reduced) == ["ours"]
     assert NOTE not in reduced
     assert "train: the HR photos are unknown" in reduced
@@ -170,7 +174,7 @@ def score(image: Tensor, truth: Tensor, shown: Tensor | None = None) -> ImageSco
 
 
 def four(scores: ImageScores) -> tuple[float, ...]:
-    *numbers, _ = astuple(scores)
+    *numbers, _ = msgspec.structs.astuple(scores)
     return tuple(numbers)
 
 
@@ -229,7 +233,9 @@ def test_gmsd_of_one_edge_by_hand_and_as_opencv_has_it(photograph: Tensor) -> No
 @settings(max_examples=15, deadline=None)
 def test_exchanging_image_and_truth_changes_nothing_but_the_sign_of_blur(seed: int) -> None:
     there, back = score(noise(seed), noise(seed + 1)), score(noise(seed + 1), noise(seed))
-    assert four(there) == pytest.approx(four(replace(back, blur=-back.blur)), abs=1e-7)  # SSIM is in float32
+    assert four(there) == pytest.approx(
+        four(msgspec.structs.replace(back, blur=-back.blur)), abs=1e-7
+    )  # SSIM is in float32
 
 
 @pytest.mark.parametrize("poison", [math.nan, math.inf])
