@@ -1,8 +1,8 @@
 """The viewer in the browser: viser's page and nerfview's controls, with images drawn by the rasterizer of the run.
 
 nerfview ends the process on an error in a thread that draws, and part of it runs in the training thread; viser does not check
-what a browser sends. Therefore cameras (`get_camera_state`) and sizes (`_Sizes`) are checked here, and errors of drawing and
-updates caught: the browser gets the image from its last valid camera, or a black one, and one line is logged.
+what a browser sends. Therefore the sizes of images (`_Sizes`, `_ASPECT`) are clamped here, and errors of drawing and updates
+caught: the browser gets a black image, e.g. for a camera that `Camera` refuses, and one line is logged.
 
 Heavy: it imports viser and nerfview, and is itself imported only when a viewer opens.
 """
@@ -20,7 +20,6 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
-from weakref import WeakKeyDictionary
 
 import nerfview
 import numpy as np
@@ -42,12 +41,9 @@ _log = logging.getLogger(__name__)
 _SIZE: Final = 1024  # px, longest edge of a picture at first
 _SIZES: Final = {"viewer_res": (64, 2048), "render_width": (1, 4096), "render_height": (1, 4096)}  # px, least and most
 _BLACK: Final = np.zeros((2, 2, 3), np.uint8)  # the page stretches images of any size
-_FOV: Final = (1e-3, 3.1)  # radians
 _ASPECT: Final = (1 / 25, 25.0)  # width by height; beyond this range, nerfview requests images without pixels
-_FARTHEST: Final = 1e9  # world units, of a camera from the origin
 _POLL: Final = 0.02  # seconds between checks of the button while the run is paused
 _PICTURE: Final = 30.0  # seconds that closing waits for the last image
-_NONE: Final = np.zeros((1, 1, 3), np.uint8)
 _PHOTO: Final = 300  # px, the width of the panel, to which LR photos are enlarged
 _RELEASED: Final = 0.002  # seconds that the lock is free after an iteration, so that a waiting thread acquires it
 
@@ -78,7 +74,6 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
     ) -> None:  # fmt: skip
         self._painter, self._cameras, self._photo = painter, cameras, photo
         self._logged = set[tuple[str, int]]()  # lines of code whose errors have been logged
-        self._drawable = WeakKeyDictionary[Any, Any]()  # the last valid camera of each browser
         # viser's, of a browser that disconnects while its image is drawn.
         warnings.filterwarnings("ignore", message=".*it will never be delivered")
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its address, as the caller does
@@ -98,14 +93,14 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
     def get_camera_state(self, client: Any) -> Any:
-        """The camera of a browser; if it cannot be drawn, the last valid one, or a default."""
+        """The camera of a browser, its aspect clamped; a default one if viser knows none."""
         try:
             state = super().get_camera_state(client)
-            _require_drawable(state)
         except Exception as error:  # of any type, raised by viser or numpy
             self._log_once(error)
-            return self._drawable.get(client, nerfview.CameraState(fov=1.0, aspect=1.0, c2w=np.eye(4)))
-        self._drawable[client] = state
+            return nerfview.CameraState(fov=1.0, aspect=1.0, c2w=np.eye(4))
+        least, most = _ASPECT
+        state.aspect = min(most, max(least, state.aspect))  # `least` for NaN
         return state
 
     def update(self, step: int, num_train_rays_per_step: int) -> None:
@@ -166,7 +161,7 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         if self._cameras:
             chosen = gui.add_dropdown("Camera", tuple(self._cameras), order=0, hint="Look from the place of a photo.")
             again = gui.add_button("Look from it again", order=0)
-            shown = gui.add_image(_NONE, label="Its photo", order=0, visible=False)
+            shown = gui.add_image(_BLACK, label="Its photo", order=0, visible=False)
 
             def show_photo() -> None:
                 photo = self._photo(chosen.value)
@@ -241,15 +236,6 @@ def watched(
         if held:  # else interrupted by Ctrl-C while waiting for an image
             viewer.lock.release()
         viewer.close()
-
-
-def _require_drawable(state: Any) -> None:
-    """Raise a ValueError for a camera outside the range that rasterizers can draw; NaN fails every comparison."""
-    turned = abs(float(np.linalg.det(state.c2w[:3, :3])) - 1) < 1e-3 and float(np.abs(state.c2w).max()) < _FARTHEST
-    if not (turned and _FOV[0] <= state.fov <= _FOV[1] and _ASPECT[0] <= state.aspect <= _ASPECT[1]):
-        rule = f"a fov in {_FOV} rad, a width by height in {_ASPECT}, a rotation, and a position within {_FARTHEST:g}"
-        got = f"{state.fov}, {state.aspect} and {state.c2w[:3].tolist()}"
-        raise ValueError(f"a browser's camera must have {rule}, got {got}. Its last camera stays.")
 
 
 def _aim(server: viser.ViserServer, cameras: Sequence[Camera]) -> None:

@@ -224,7 +224,7 @@ NO_CAMERA = {
 def test_a_training_and_its_viewer_go_on_whatever_camera_a_browser_sends(field, browser, caplog):
     for value in NO_CAMERA[field]:
         browser.sees(**{field: value})
-    assert caplog.text.count("a browser's camera must have") <= 1
+    assert caplog.text.count("the viewer could not draw") <= len(NO_CAMERA[field])
     assert browser.sees().std() > 0
 
 
@@ -234,11 +234,6 @@ def test_a_message_that_is_none_loses_its_browser_the_connection_and_the_trainin
     other = Browser(browser.viewer, browser.after_step)
     assert other.sees().any()
     other.socket.close()
-
-
-def test_a_browser_of_which_no_camera_is_known_sees_a_picture_too(browser):
-    browser.viewer._drawable.clear()
-    assert browser.sees(fov=0).any()
 
 
 @pytest.mark.parametrize(
