@@ -16,10 +16,9 @@ from typing import Any, Final
 import pandas as pd
 import torch
 from torch.nn import functional as F
-from tqdm import tqdm
 
 from clear_strategies.bench.rasterizers import relative, require_device
-from clear_strategies.bench.results import Results
+from clear_strategies.bench.results import Results, interleaved
 from clear_strategies.compose import conductor
 from clear_strategies.data.priors import Bicubic
 from clear_strategies.errors import counted
@@ -36,7 +35,7 @@ _OURS: Final = ", ours"
 """What a loop's name ends with whose LR is drawn by this package, where gsplat draws that of the others."""
 _ITERATIONS: Final = 1_000  # of the run that the loops are a part of
 _FROM: Final = 301  # the measured steps begin here: HR takes part, at half its size where skips.coarse_until says so
-_WARM_UPS: Final = 6
+_WARM_UPS: Final = 5  # before those of `interleaved`
 _COUNTED: Final = 6  # steps whose operations are counted: pseudo views come at every second
 _IN_FLOAT64: Final = 2_000  # Gaussians of the loop whose merged gradient is compared
 
@@ -96,6 +95,16 @@ class Loop:
             optimizer.step()
             optimizer.zero_grad()
 
+    def __call__(self) -> dict[str, float]:
+        """Milliseconds of a step by the wall clock and of the processor, and of its merge, on a CPU of the processor."""
+        _wait(self.photos.device)
+        before = time.perf_counter(), time.process_time(), self.merging
+        self.step()
+        _wait(self.photos.device)
+        after = time.perf_counter(), time.process_time(), self.merging
+        times = zip(("ms", "processor_ms", "merge_ms"), before, after, strict=True)
+        return {name: 1e3 * (b - a) for name, a, b in times}
+
     def _time(self, host_merge: HostMerge) -> None:
         """Sum up the seconds of its merges: of the processor, on a device by the wall clock."""
         device, merge = self.photos.device, host_merge._merge
@@ -126,8 +135,11 @@ def measure(
         for name in names:
             chosen = name.removesuffix(_OURS)
             loops[name] = Loop(None if chosen == ALONE else chosen, gaussians, width, device, ours=chosen != name)
-        turns = _timed(loops, repeats, device)
-        rows, means = [], turns.groupby("loop").mean()
+        for loop in [*loops.values()] * _WARM_UPS:
+            loop.step()
+        # An even number of steps, since pseudo views come at every second.
+        turns = interleaved(loops, repeats + repeats % 2, device=device, label="steps")
+        rows, means = [], turns.pivot_table("ms", "contender", "stage", sort=False)
         # Of all loops together.
         memory = {"peak_mib": torch.cuda.max_memory_allocated() / 2**20} if device == "cuda" else {}
         for name, loop in loops.items():
@@ -141,24 +153,6 @@ def measure(
     results.note(
         f"{gaussians:,} Gaussians, {images}, {counted(threads, 'thread')} of torch and of the kernels; means of {repeats} steps."
     )
-
-
-def _timed(loops: Mapping[str, Loop], repeats: int, device: str) -> pd.DataFrame:
-    """Milliseconds of every step, wall clock and CPU, and of its merge, on a CPU in CPU time. The number of steps is
-    even, since pseudo views come at every second.
-    """
-    rows = []
-    for turn in tqdm(range(-_WARM_UPS, repeats + repeats % 2), desc="steps", unit="turn", leave=False):
-        for name, loop in loops.items():
-            _wait(torch.device(device))
-            before = time.perf_counter(), time.process_time(), loop.merging
-            loop.step()
-            _wait(torch.device(device))
-            after = time.perf_counter(), time.process_time(), loop.merging
-            if turn >= 0:
-                ms = [1e3 * (b - a) for a, b in zip(before, after, strict=True)]
-                rows.append({"loop": name, **dict(zip(("ms", "processor_ms", "merge_ms"), ms, strict=True))})
-    return pd.DataFrame(rows)
 
 
 class _Operations(TorchDispatchMode):  # type: ignore[no-untyped-call]
