@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import itertools
 import re
 import typing
 from collections.abc import Iterator, Mapping
@@ -71,25 +72,17 @@ def docstring(built: Any) -> tuple[str, dict[str, str]]:
 
 def _arguments(text: str) -> dict[str, str]:
     """The descriptions in the `Args:` of a docstring, by argument."""
-    block = re.search(r"^Args:\n((?:[ \t]+.*\n?|\n)+)", text, re.MULTILINE)
+    import griffe
+
+    sections = griffe.Docstring(text).parse(griffe.Parser.google, warnings=False)
+    listed = [section.value for section in sections if section.kind is griffe.DocstringSectionKind.parameters]
     described: dict[str, str] = {}
-    if block:
-        lines = block[1].splitlines()
-        margin = min(len(line) - len(line.lstrip()) for line in lines if line.strip())
-        entries: list[str] = []
-        for line in lines:
-            if not line.strip():
-                continue
-            if len(line) - len(line.lstrip()) == margin:
-                entries.append(line.strip())
-            else:
-                entries[-1] += " " + line.strip()
-        for entry in entries:
-            # "a, b: …" describes both; "a: …. b: …" in one entry describes each.
-            for part in re.split(r"(?<=[.;])\s+(?=[a-z_]\w*: )", entry):
-                names, colon, description = part.partition(":")
-                if colon:
-                    described |= {n.strip().lstrip("*"): description.strip() for n in names.split(",")}
+    for entry in itertools.chain.from_iterable(listed):
+        # "a, b: …" describes both; "a: …. b: …" in one entry describes each.
+        whole = f"{entry.name}: {' '.join(entry.description.split())}"
+        for part in re.split(r"(?<=[.;])\s+(?=[a-z_]\w*: )", whole):
+            names, _, description = part.partition(":")
+            described |= {n.strip().lstrip("*"): description.strip() for n in names.split(",")}
     return described
 
 
