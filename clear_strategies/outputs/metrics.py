@@ -112,6 +112,7 @@ class Metrics(Scored):
     synthetic_prior: bool
     provenance: dict[str, Any]
     config: dict[str, Any] = msgspec.field(default_factory=dict)
+    method: str | None = None
     overrides: list[str] | None = None
 
 

@@ -85,7 +85,7 @@ class FinishedRun:
             folder=folder,
             scene=content.scene + (f" ({', '.join(marks)})" if marks else ""),
             marks=", ".join(marks),
-            name=Chosen(None, content.strategies, overrides).title,
+            name=Chosen(content.method, content.strategies, overrides).title,
             protocol=_protocol(folder),
             settings=tuple(filter(_is_setting, overrides)),
             seed=content.seed,

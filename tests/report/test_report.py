@@ -377,8 +377,9 @@ def test_a_figure_refuses_runs_that_it_cannot_be_drawn_from(tmp_path: Path, figu
         (["+strategy=best", "strategy=clear"], {}, "clear"),
         (["+strategy=best", "~strategies.p2g", "~strategies.mcmc"], {}, "best - p2g - mcmc"),
         (["+strategies.veto._target_=your.Veto"], {}, "veto"),
+        ([], {"method": "srgs", "strategies": []}, "srgs"),
     ],
-    ids=["none", "list", "preset", "without overrides", "a method", "a choice", "left out", "one's own"],
+    ids=["none", "list", "preset", "without overrides", "a method", "a choice", "left out", "one's own", "in a file"],
 )
 def test_a_run_is_named_by_its_strategies_as_given_on_the_command_line(tmp_path, overrides, facts, name):
     folder = make_run(tmp_path, *overrides, **facts, **({} if overrides else {"overrides": None}))
