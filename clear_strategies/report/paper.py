@@ -12,7 +12,7 @@ from typing import Final
 import pandas as pd
 
 from clear_strategies.report.runs import OWN, FinishedRun
-from clear_strategies.report.table import in_all, label
+from clear_strategies.report.table import run_rows
 
 NUMBERS: Final = Path(__file__).with_name("paper.csv")
 NOTE: Final = (
@@ -48,20 +48,12 @@ def beside(runs: Sequence[FinishedRun]) -> dict[str, pd.DataFrame]:
 
 
 def _beside(printed: pd.DataFrame, runs: Sequence[FinishedRun]) -> pd.DataFrame:
-    shared = {
-        scene: in_all([run.settings for run in runs if run.scene == scene]) for scene in {run.scene for run in runs}
-    }
-    records = [
-        {
-            "row": _row(run),
-            "label": label("", run.settings, shared[run.scene]),
-            "scene": run.scene,
-            **run.numbers,
-            "lpips": run.numbers.get(f"{OWN}lpips"),
-        }
-        for run in runs
+    single = run_rows(runs).rename(columns={f"{OWN}lpips": "lpips"})
+    single["row"] = single["run"].map(_row)
+    single["label"] = [
+        method.removeprefix(run.name) for method, run in zip(single["method"], single["run"], strict=True)
     ]
-    by_scene = pd.DataFrame(records).groupby(["row", "label", "scene"], sort=False).mean(numeric_only=True)
+    by_scene = single.groupby(["row", "label", "scene"], sort=False).mean(numeric_only=True)
     means = by_scene.groupby(["row", "label"], sort=False).mean().reindex(columns=[*_COLUMNS]).reset_index()
     paper = {quantity: f"{quantity}_paper" for quantity in _COLUMNS}
     table = printed.rename(columns=paper).merge(means, "left", left_on="ours", right_on="row")

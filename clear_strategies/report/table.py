@@ -10,7 +10,7 @@ import html
 import logging
 import math
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import pandas as pd
 
@@ -39,8 +39,7 @@ def compare(runs: Sequence[FinishedRun]) -> pd.DataFrame:
         scene, `_delta`, its standard error, `_delta_error`, and the number of its pairs, `_delta_pairs`: runs of the same seed,
         in an average of the same scene and seed.
     """
-    rows = [row for of_scene in _by_scene(runs).values() for row in _run_rows(of_scene)]
-    single = _each_seed_once(pd.DataFrame(rows))
+    single = _each_seed_once(run_rows(runs))
     tables = [_summary(rows) for _, rows in single.groupby("scene", sort=False)]
     # Scores against LR photos, or of training views, are not averaged with others.
     for marks, alike in single.groupby("marks", sort=False):
@@ -85,7 +84,7 @@ def notes(table: pd.DataFrame, runs: Sequence[FinishedRun]) -> list[str]:
     if table["average"].any():
         lines.append("Averages are means of the scenes' means; their Δ is paired over scenes and seeds.")
     for scene, of_scene in _by_scene(runs).items():
-        if scene in set(table["scene"]) and (shared := in_all([run.settings for run in of_scene])):
+        if scene in set(table["scene"]) and (shared := _in_all([run.settings for run in of_scene])):
             lines.append(f"All runs of {scene}: `{' '.join(shared)}`.")
     return lines
 
@@ -130,25 +129,21 @@ def _by_scene(runs: Sequence[FinishedRun]) -> dict[str, list[FinishedRun]]:
     return {scene: [run for run in runs if run.scene == scene] for scene in dict.fromkeys(run.scene for run in runs)}
 
 
-def _run_rows(runs: Sequence[FinishedRun]) -> list[dict[str, Any]]:
-    """A row for each run of one scene.
+def run_rows(runs: Sequence[FinishedRun]) -> pd.DataFrame:
+    """A row for each run, scene by scene: the run, its scene, marks, method, seed and numbers.
 
     `key` is name and settings, a line each; `identity`, the key of an average, leaves out the `data` settings that all runs of
     the scene share, which describe the scene.
     """
-    shared = in_all([run.settings for run in runs])
     rows = []
-    for run in runs:
-        of_all = [s for s in run.settings if s not in shared or not s.lstrip("+~").startswith("data")]
-        key, identity = ("\n".join((run.name, *sorted(settings))) for settings in (run.settings, of_all))
-        facts = {
-            "scene": run.scene,
-            "marks": run.marks,
-            "method": label(run.name, run.settings, shared),
-            "seed": run.seed,
-        }
-        rows.append({**facts, "key": key, "identity": identity, "run": run, **run.numbers})
-    return rows
+    for of_scene in _by_scene(runs).values():
+        shared = _in_all([run.settings for run in of_scene])
+        for run in of_scene:
+            of_all = [s for s in run.settings if s not in shared or not s.lstrip("+~").startswith("data")]
+            key, identity = ("\n".join((run.name, *sorted(settings))) for settings in (run.settings, of_all))
+            names = {"scene": run.scene, "marks": run.marks, "method": _label(run.name, run.settings, shared)}
+            rows.append({**names, "seed": run.seed, "key": key, "identity": identity, "run": run, **run.numbers})
+    return pd.DataFrame(rows)
 
 
 def _each_seed_once(single: pd.DataFrame) -> pd.DataFrame:
@@ -191,8 +186,8 @@ def _average(single: pd.DataFrame, title: str) -> pd.DataFrame:
     )
     # A quantity that one scene lacks has no average.
     table = means.mean().where(means.count() == scenes).assign(average=True, runs=0, seeds="", scene=title)
-    shared = in_all([identity.split("\n")[1:] for identity in table.index])
-    table["method"] = [label(name, settings, shared) for name, *settings in table.index.str.split("\n")]
+    shared = _in_all([identity.split("\n")[1:] for identity in table.index])
+    table["method"] = [_label(name, settings, shared) for name, *settings in table.index.str.split("\n")]
     return table.join(_differences(single, "identity", table["psnr"])).reset_index(drop=True)
 
 
@@ -213,11 +208,11 @@ def _differences(single: pd.DataFrame, key: str, means: pd.Series[float]) -> pd.
     return table
 
 
-def in_all(lists: Sequence[Sequence[str]]) -> list[str]:
+def _in_all(lists: Sequence[Sequence[str]]) -> list[str]:
     """The items that all lists have in common, in the order of the first."""
     return [setting for setting in lists[0] if all(setting in other for other in lists)] if lists else []
 
 
-def label(name: str, settings: Sequence[str], shared: Sequence[str]) -> str:
+def _label(name: str, settings: Sequence[str], shared: Sequence[str]) -> str:
     """The name of a row: the method's, and the settings that not all of the runs share."""
     return ", ".join((name, *(s for s in settings if s not in shared)))
