@@ -72,18 +72,28 @@ def cost_volume(
     """
     height, width = photo.image.shape
     volume = photo.image.new_empty(height, width, len(inverse_depths))
-    reference = _Windows(photo.image.contiguous(), window)
+    image = photo.image.contiguous()
+    mean, deviation = (moment[0] for moment in _moments(image[None], window))
     swept = [_Swept(photo, other) for other in others]
-    if native.runs(photo.image):
+    if native.runs(image):
         native.module().cost_volume(
-            reference.image, reference.mean, reference.deviation, [(s.rotated, s.shift, s.image) for s in swept],
-            inverse_depths, window, _VARIANCE_FLOOR, volume, threads(),
+            image, mean, deviation, [(s.rotated, s.shift, s.image) for s in swept], inverse_depths, window,
+            _VARIANCE_FLOOR, volume, threads(),
         )  # fmt: skip
         return volume
+
+    def cost(other: _Swept, planes: slice) -> Float[Tensor, "P H W"]:
+        """From the correlation with the windows of the other photo warped by each plane; unseen ones correlate with 0."""
+        drawn, seen = other.through(inverse_depths[planes])
+        mean_drawn, deviation_drawn = _moments(drawn, window)
+        covariance = box_mean(image * drawn, window) - mean * mean_drawn
+        correlation = torch.where(seen, covariance, 0.0) / (deviation_drawn * deviation)
+        return (1 - correlation) / 2
+
     at_once = max(1, _BLOCK // (height * width))
     for first in range(0, len(inverse_depths), at_once):
         planes = slice(first, first + at_once)
-        costs = (_cost(reference, other, inverse_depths[planes]) for other in swept)
+        costs = (cost(other, planes) for other in swept)
         volume[:, :, planes] = mean_of_lowest(costs, (len(others) + 1) // 2).permute(1, 2, 0)
     return volume
 
@@ -99,15 +109,6 @@ def mean_of_lowest(values: Iterator[Tensor], count: int) -> Tensor:
             lowest.append(rest)
     mean: Tensor = functools.reduce(torch.add, lowest) / count
     return mean
-
-
-class _Windows:
-    """Mean and standard deviation of each pixel's window."""
-
-    def __init__(self, image: Float[Tensor, "H W"], window: int) -> None:
-        self.image, self.window = image, window
-        mean, variance = _moments(image[None], window)
-        self.mean, self.deviation = mean[0], _deviation(variance[0])
 
 
 class _Swept:
@@ -134,23 +135,11 @@ class _Swept:
         return drawn[:, 0], seen
 
 
-def _cost(reference: _Windows, other: _Swept, inverse_depths: Float[Tensor, " P"]) -> Float[Tensor, "P H W"]:
-    """The cost from the correlation with the windows of the other photo warped by each plane; unseen ones correlate with 0."""
-    drawn, seen = other.through(inverse_depths)
-    mean, variance = _moments(drawn, reference.window)
-    covariance = box_mean(reference.image * drawn, reference.window) - reference.mean * mean
-    correlation = torch.where(seen, covariance, 0.0) / (_deviation(variance) * reference.deviation)
-    return (1 - correlation) / 2
-
-
-def _deviation(variance: Tensor) -> Tensor:
-    return (variance.clamp_min(0) + _VARIANCE_FLOOR).sqrt()
-
-
 def _moments(images: Float[Tensor, "P H W"], window: int) -> tuple[Float[Tensor, "P H W"], Float[Tensor, "P H W"]]:
-    """(mean, variance) of each pixel's window."""
+    """(mean, standard deviation) of each pixel's window."""
     mean = box_mean(images, window)
-    return mean, box_mean(images * images, window) - mean * mean
+    variance = box_mean(images * images, window) - mean * mean
+    return mean, (variance.clamp_min(0) + _VARIANCE_FLOOR).sqrt()
 
 
 def box_mean(images: Float[Tensor, "P H W"], window: int) -> Float[Tensor, "P H W"]:
