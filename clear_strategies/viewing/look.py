@@ -89,7 +89,7 @@ def colored(depth: Float[Tensor, "H W"], near: float, far: float) -> UInt8[np.nd
     return np.asarray(colors(((depth - near) / (far - near)).numpy(), bytes=True)[..., :3])
 
 
-def write_video(path: Path, frames: Iterable[Pixels], *, fps: float = FPS) -> None:
+def write_video(path: Path, frames: Iterable[Pixels]) -> None:
     """Write frames to an MP4 file as the iterable yields them; the file gets its name when it is complete.
 
     Args:
@@ -111,7 +111,7 @@ def write_video(path: Path, frames: Iterable[Pixels], *, fps: float = FPS) -> No
     first = next(rest)
     with files.replacing(path.absolute()) as partial:  # ffmpeg interprets "a:" at the beginning as a protocol
         writer = imageio_ffmpeg.write_frames(
-            str(partial), first.shape[1::-1], fps=fps, codec="libx264", pix_fmt_out="yuv420p", quality=None,
+            str(partial), first.shape[1::-1], fps=FPS, codec="libx264", pix_fmt_out="yuv420p", quality=None,
             output_params=["-vf", _HD, "-crf", _QUALITY, "-preset", "veryfast", "-movflags", "+faststart"],
             macro_block_size=2, ffmpeg_log_level="error",
         )  # fmt: skip

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from clear_strategies.errors import DataError, SettingError
-from clear_strategies.geometry.cameras import looked_at
 from clear_strategies.viewing import cameras, look
 from rasterizers.interface import Camera
 from tests.helpers import toy
@@ -111,13 +110,10 @@ def test_a_path_along_an_arc_comes_back_along_it_and_not_through_the_scene():
     assert steps.max() < 0.6
 
 
-def test_many_cameras_are_thinned_and_the_point_that_they_look_at():
+def test_many_cameras_are_thinned():
     dense = [at((3 * math.cos(a), 0.0, 3 * math.sin(a))) for a in np.arange(100) * math.tau / 100]
     steps = np.linalg.norm(np.diff(centers(cameras.through(dense, 60)), axis=0), axis=1)
     assert steps.max() < 1.5 * steps.min()
-    np.testing.assert_allclose(looked_at(RING), 0, atol=1e-9)
-    parallel = [toy.camera(0.0), toy.camera(0.0)]
-    assert np.isfinite(looked_at(parallel)).all()
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
@@ -142,7 +138,7 @@ def frames_of(path):
 
 def test_an_mp4_holds_the_frames_in_a_folder_that_looks_like_a_protocol(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    look.write_video(Path("10:30/a.mp4"), iter(FRAMES), fps=10)
+    look.write_video(Path("10:30/a.mp4"), iter(FRAMES))
     found = frames_of(tmp_path / "10:30" / "a.mp4")
     assert found.shape == (10, 32, 48, 3)
     assert np.abs(found.mean((1, 2, 3)) - np.arange(10) * 20).max() < 4
@@ -155,7 +151,7 @@ def test_a_video_that_breaks_leaves_nothing(tmp_path):
         raise RuntimeError
 
     with pytest.raises(RuntimeError):
-        look.write_video(tmp_path / "a.mp4", broken(), fps=10)
+        look.write_video(tmp_path / "a.mp4", broken())
     assert not list(tmp_path.iterdir())
 
 
@@ -165,7 +161,7 @@ def test_a_missing_program_and_a_missing_library_are_named(monkeypatch, tmp_path
 
     monkeypatch.setattr(ffmpeg, "get_ffmpeg_exe", nowhere)
     with pytest.raises(SettingError, match="does not run here: install ffmpeg"):
-        look.write_video(tmp_path / "a.mp4", FRAMES, fps=10)
+        look.write_video(tmp_path / "a.mp4", FRAMES)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(SettingError, match="pip install imageio-ffmpeg"):
-        look.write_video(tmp_path / "a.mp4", FRAMES, fps=10)
+        look.write_video(tmp_path / "a.mp4", FRAMES)

@@ -9,7 +9,7 @@ import time
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from urllib.request import urlopen
 
 import msgspec
@@ -45,6 +45,11 @@ def field(saved_run) -> GaussianField:
     return saved_run[1]
 
 
+@pytest.fixture
+def server() -> ModuleType:
+    return pytest.importorskip(SERVER, exc_type=ImportError)
+
+
 def test_the_picture_is_the_one_that_is_measured(field):
     exact = field.render(make(), CAMERA).clamp(0, 1)
     assert torch.equal(Painter(field, make).color(CAMERA), exact)
@@ -78,8 +83,8 @@ def close(found, exact):
     assert np.abs(found.astype(int) - exact).max() <= 1
 
 
-def test_the_viewer_shows_what_is_measured_or_its_depth_and_closes(saved_run, tmp_path):
-    server, splat = pytest.importorskip(SERVER, exc_type=ImportError), open_splat(saved_run[0])
+def test_the_viewer_shows_what_is_measured_or_its_depth(server, saved_run, tmp_path):
+    splat = open_splat(saved_run[0])
     viewer = server.SplatViewer(splat.painter, numbered(splat), title="toy", port=8321, out=tmp_path)
     try:
         assert viewer.address.startswith("http://127.0.0.1:")
@@ -108,43 +113,55 @@ def test_missing_libraries_are_named(monkeypatch):
         exit_codes.require("view")
 
 
-def test_a_viewer_is_there_while_a_run_trains_and_draws_between_two_iterations_alone(saved_run, monkeypatch):
-    server = pytest.importorskip(SERVER, exc_type=ImportError)
-    viewers, drawn = [], threading.Event()
-    opened = server.SplatViewer
+@pytest.fixture
+def watched(server, saved_run, monkeypatch):
+    """The viewer of a run that trains, and what the run calls after each iteration. The viewer closes, whatever happens to it."""
+    viewers, splat = [], open_splat(saved_run[0])
+
+    def refuse(code: int) -> None:  # in nerfview's thread, which then ends alone
+        viewers[0].ended = True
+        raise SystemExit(code)
 
     def remembered(*arguments, **options):  # at a port that no other test's viewer takes once it is free
         viewers.append(opened(*arguments, **options, port=0))
-        return viewers[-1]
+        return viewers[0]
 
+    monkeypatch.setattr("nerfview._renderer.os._exit", refuse)
+    opened = server.SplatViewer
     monkeypatch.setattr(server, "SplatViewer", remembered)
-    splat = open_splat(saved_run[0])
+    with server.watched(splat.painter, numbered(splat), "toy") as after_step:
+        yield viewers[0], after_step
+    assert not hasattr(viewers[0], "ended"), "nerfview has ended the process"
+    assert not [t for t in threading.enumerate() if isinstance(t, server.Renderer)], "it still draws"
+    with pytest.raises(OSError, match="refused"):
+        urlopen(viewers[0].address, timeout=PATIENCE)  # noqa: S310 - our own address
+
+
+def test_a_viewer_is_there_while_a_run_trains_and_draws_between_two_iterations_alone(server, watched, monkeypatch):
+    (viewer, after_step), drawn = watched, threading.Event()
 
     def draw() -> None:  # as nerfview's threads do
-        with viewers[0].lock:
+        with viewer.lock:
             drawn.set()
 
-    with server.watched(splat.painter, numbered(splat), "toy") as after_step:
-        after_step(1)
-        assert b"<html" in urlopen(viewers[0].address, timeout=PATIENCE).read()  # noqa: S310 - our own address
-        threading.Thread(target=draw).start()
-        assert not drawn.wait(0.2)  # an iteration is under way
-        monkeypatch.setattr(viewers[0].server, "get_clients", lambda: {0: None})
-        with monkeypatch.context() as patched:  # its turn lasts until it has drawn
-            patched.setattr(server, "time", SimpleNamespace(monotonic=time.monotonic, sleep=lambda _: drawn.wait(60)))
-            after_step(2)
-        assert drawn.is_set()
-        viewers[0].state, began = "paused", time.monotonic()
-        threading.Timer(0.3, lambda: setattr(viewers[0], "state", "training")).start()
-        after_step(3)
-        assert time.monotonic() - began > 0.25
-        viewers[0].state = "paused"
-        with deferred_signals() as pending:
-            os.kill(os.getpid(), signal.SIGTERM)
-            after_step(4)  # a paused run is saved, too
-        assert pending == [signal.SIGTERM]
-    with pytest.raises(OSError, match="refused"):
-        urlopen(viewers[0].address, timeout=PATIENCE)  # noqa: S310
+    after_step(1)
+    assert b"<html" in urlopen(viewer.address, timeout=PATIENCE).read()  # noqa: S310
+    threading.Thread(target=draw).start()
+    assert not drawn.wait(0.2)  # an iteration is under way
+    monkeypatch.setattr(viewer.server, "get_clients", lambda: {0: None})
+    with monkeypatch.context() as patched:  # its turn lasts until it has drawn
+        patched.setattr(server, "time", SimpleNamespace(monotonic=time.monotonic, sleep=lambda _: drawn.wait(60)))
+        after_step(2)
+    assert drawn.is_set()
+    viewer.state, began = "paused", time.monotonic()
+    threading.Timer(0.3, lambda: setattr(viewer, "state", "training")).start()
+    after_step(3)
+    assert time.monotonic() - began > 0.25
+    viewer.state = "paused"
+    with deferred_signals() as pending:
+        os.kill(os.getpid(), signal.SIGTERM)
+        after_step(4)  # a paused run is saved, too
+    assert pending == [signal.SIGTERM]
 
 
 class Browser:
@@ -191,23 +208,10 @@ class Browser:
 
 
 @pytest.fixture
-def browser(saved_run, monkeypatch):
-    server = pytest.importorskip(SERVER, exc_type=ImportError)
-    viewers, splat = [], open_splat(saved_run[0])
-
-    def refuse(code: int) -> None:  # in nerfview's thread, which then ends alone
-        viewers[0].ended = True
-        raise SystemExit(code)
-
-    monkeypatch.setattr("nerfview._renderer.os._exit", refuse)
-    opened = server.SplatViewer
-    monkeypatch.setattr(server, "SplatViewer", lambda *a, **k: viewers.append(opened(*a, **k)) or viewers[0])
-    with server.watched(splat.painter, numbered(splat), "toy") as after_step:
-        browser = Browser(viewers[0], after_step)
-        yield browser
-        browser.socket.close()
-    assert not hasattr(viewers[0], "ended"), "nerfview has ended the process"
-    assert not [t for t in threading.enumerate() if isinstance(t, server.Renderer)], "it still draws"
+def browser(watched):
+    browser = Browser(*watched)
+    yield browser
+    browser.socket.close()
 
 
 NO_CAMERA = {
@@ -300,9 +304,8 @@ def test_a_training_goes_on_where_a_browser_leaves_while_it_is_updated(browser, 
     assert browser.sees().any()
 
 
-def test_ctrl_c_while_a_training_waits_for_a_picture_is_not_hidden_by_an_error_of_the_viewer(saved_run, monkeypatch):
-    server, splat = pytest.importorskip(SERVER, exc_type=ImportError), open_splat(saved_run[0])
-    lock = threading.Lock()
+def test_ctrl_c_while_a_training_waits_for_a_picture_is_not_hidden_by_an_error_of_the_viewer(server, saved_run, monkeypatch):
+    splat, lock = open_splat(saved_run[0]), threading.Lock()
 
     class Interrupted:
         release = lock.release
@@ -322,8 +325,8 @@ SMALL = [*TINY, "fit.probe_every=5000", "fit.threads=1", "prior=bicubic", "+stra
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("server")
 def test_a_run_with_a_viewer_has_the_bits_of_one_without(tmp_path: Path):
-    pytest.importorskip("clear_strategies.viewing.server", exc_type=ImportError)
     said = {}
     for name, overrides in {"plain": [], "viewed": ["fit.viewer=true"]}.items():
         done = run(*SMALL, *overrides, f"hydra.run.dir={name}", cwd=tmp_path)
