@@ -21,27 +21,27 @@ def photos(casts: Tensor) -> list[Photo]:
     return [replace(p, image=((0.25 + p.image / 2) * cast).clamp(0, 1)) for p, cast in zip(shown, casts, strict=True)]
 
 
-def depths(count: int = 3) -> list[DepthMap]:
-    whole = torch.full((90, 120), DEPTH)
-    return [DepthMap(whole, torch.ones_like(whole))] * count
+def depths(*each: float) -> list[DepthMap]:
+    return [planes.depth_of(photo, depth) for photo, depth in zip(planes.plane_photos(3), each, strict=False)]
+
+
+WHOLE = depths(DEPTH, DEPTH, DEPTH)
 
 
 def test_casts_are_found_up_to_their_geometric_mean_and_photos_without_keep_their_colours():
-    gains = exposure_gains(photos(CASTS), depths())
+    gains = exposure_gains(photos(CASTS), WHOLE)
     assert torch.allclose(gains * CASTS, CASTS.log().mean(0).exp().expand(3, 3), atol=1e-3)
     assert torch.allclose(gains.log().mean(0), torch.zeros(3), atol=1e-5)
-    assert torch.allclose(exposure_gains(photos(torch.ones(3, 3)), depths()), torch.ones(3, 3), atol=1e-5)
+    assert torch.allclose(exposure_gains(photos(torch.ones(3, 3)), WHOLE), torch.ones(3, 3), atol=1e-5)
     casts = torch.tensor([[1.9, 1.9, 1.9], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
     assert float((photos(casts)[0].image == 1).float().mean()) > 0.1
-    gains = exposure_gains(photos(casts), depths())
+    gains = exposure_gains(photos(casts), WHOLE)
     assert torch.allclose(gains[1] / gains[0], torch.full((3,), 1.9), atol=2e-3)
-    unknown = DepthMap(torch.full((90, 120), torch.nan), torch.zeros(90, 120))
-    gains = exposure_gains(photos(CASTS), [*depths(2), unknown])
+    gains = exposure_gains(photos(CASTS), depths(DEPTH, DEPTH, torch.nan))
     assert gains[2].tolist() == pytest.approx([1, 1, 1])
-    assert torch.allclose(gains[:2], exposure_gains(photos(CASTS)[:2], depths(2)), atol=1e-6)
-    assert exposure_gains(photos(CASTS)[:1], depths(1)).tolist() == [[1, 1, 1]]
-    behind = DepthMap(torch.full((90, 120), 1.5 * DEPTH), torch.ones(90, 120))
-    assert exposure_gains(photos(CASTS)[:2], [depths()[0], behind]).tolist() == [[1, 1, 1]] * 2
+    assert torch.allclose(gains[:2], exposure_gains(photos(CASTS)[:2], WHOLE[:2]), atol=1e-6)
+    assert exposure_gains(photos(CASTS)[:1], WHOLE[:1]).tolist() == [[1, 1, 1]]
+    assert exposure_gains(photos(CASTS)[:2], depths(DEPTH, 1.5 * DEPTH)).tolist() == [[1, 1, 1]] * 2
 
 
 def test_a_view_is_brightened_at_both_scales_and_its_photo_stays_its_truth():

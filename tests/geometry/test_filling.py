@@ -9,13 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clear_strategies.core.points import PointCloud
-from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.cleaning import averaged_in_voxels, without_outliers
 from clear_strategies.geometry.dense_stereo.cloud import points_of
 from clear_strategies.geometry.filling import densify, grid_points
 from clear_strategies.geometry.projection import project
 from rasterizers.interface import BackendUnavailable
-from tests.helpers.planes import cloud_of, photo
+from tests.helpers.planes import cloud_of, depth_of, photo
 
 
 @given(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.sampled_from((1, 2, 4)))
@@ -98,31 +97,21 @@ def test_voxels_hold_the_averages_of_their_points_or_say_what_to_install(monkeyp
 
 
 # ---- points from depth maps: their spacing, what several photos see, and what fills the rest
-def flat(view: Photo, depth: float) -> DepthMap:
-    shape = view.image.shape[:2]
-    return DepthMap(torch.full(shape, depth), torch.ones(shape))
-
-
-def unknown(view: Photo) -> DepthMap:
-    shape = view.image.shape[:2]
-    return DepthMap(torch.full(shape, torch.nan), torch.zeros(shape))
-
-
 @pytest.mark.parametrize(("spacing", "count"), [(1.0, 1600), (2.0, 400), (1.6, 625)])
 def test_there_is_one_point_per_square(spacing: float, count: int) -> None:
     view = photo()
-    means, colors = points_of([view], [flat(view, 5.0)], spacing, 0.02)
+    means, colors = points_of([view], [depth_of(view, 5.0)], spacing, 0.02)
     assert len(means) == len(colors) == count
     assert torch.allclose(means[:, 2], torch.tensor(5.0))
 
 
 def test_what_two_photos_see_gets_its_points_once_from_the_most_confident_pixel_of_a_square() -> None:
     views = [photo(), photo()]
-    assert len(points_of(views, [flat(v, 5.0) for v in views], 2.0, 0.02)[0]) == 400
-    apart = [flat(views[0], 5.0), flat(views[1], 6.0)]
+    assert len(points_of(views, [depth_of(v, 5.0) for v in views], 2.0, 0.02)[0]) == 400
+    apart = [depth_of(views[0], 5.0), depth_of(views[1], 6.0)]
     assert len(points_of(views, apart, 2.0, 0.02)[0]) == 800
     view = photo()
-    result = flat(view, 5.0)
+    result = depth_of(view, 5.0)
     result.confidence[:] = 0.5
     result.depth[1::2, 1::2] = 7.0
     result.confidence[1::2, 1::2] = 0.6
@@ -132,9 +121,9 @@ def test_what_two_photos_see_gets_its_points_once_from_the_most_confident_pixel_
 def test_only_unknown_pixels_are_filled_and_never_in_known_free_space() -> None:
     views = [photo(), photo(0.1)]
     samples = torch.cat((torch.rand(60, 2) - 0.5, torch.full((60, 1), 3.0)), dim=1)
-    assert len(grid_points(samples, views, 2, maps=[flat(v, 5.0) for v in views])[0]) == 0
-    assert len(grid_points(samples, views, 2, maps=[unknown(v) for v in views])[0]) == 800
-    floating = grid_points(samples, views, 2, maps=[unknown(views[0]), flat(views[1], 5.0)])[0]
+    assert len(grid_points(samples, views, 2, maps=[depth_of(v, 5.0) for v in views])[0]) == 0
+    assert len(grid_points(samples, views, 2, maps=[depth_of(v, torch.nan) for v in views])[0]) == 800
+    floating = grid_points(samples, views, 2, maps=[depth_of(views[0], torch.nan), depth_of(views[1], 5.0)])[0]
     assert len(floating) < 100
-    close = grid_points(samples, views, 2, maps=[unknown(views[0]), flat(views[1], 3.1)])[0]
+    close = grid_points(samples, views, 2, maps=[depth_of(views[0], torch.nan), depth_of(views[1], 3.1)])[0]
     assert len(close) == 400  # within 5 % of what the other photo knows

@@ -4,20 +4,16 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.cameras import moved_aside
 from clear_strategies.geometry.projection import back_project, project, sample_colors
 from clear_strategies.geometry.pseudo_views import PseudoView, border_view, continued, pseudo_views
 from tests.helpers import planes
+from tests.helpers.image_files import noise
+from tests.helpers.planes import depth_of
 
 DEPTH = 4.0
-
-
-def depth_of(photo: Photo, depth: float | Tensor = DEPTH) -> DepthMap:
-    values = torch.as_tensor(depth).expand(photo.camera.height, photo.camera.width).clone()
-    return DepthMap(values, values.isfinite().float())
 
 
 def plane(count: int = 3) -> dict[str, Photo]:
@@ -26,7 +22,7 @@ def plane(count: int = 3) -> dict[str, Photo]:
 
 def views_of(photos: dict[str, Photo], depths: dict[str, DepthMap] | None = None, **settings) -> list[PseudoView]:
     if depths is None:
-        depths = {name: depth_of(photo) for name, photo in photos.items()}
+        depths = {name: depth_of(photo, DEPTH) for name, photo in photos.items()}
     chosen = {"count": 6, "reach": 0.2, "tolerance": 0.02, "max_pixels": 10**6, "background": (0.0,) * 3, "seed": 0}
     return [make() for make in pseudo_views(photos, depths, **{**chosen, **settings})]
 
@@ -69,7 +65,7 @@ def test_a_plane_is_seen_as_its_photos_show_it():
 
 def test_without_two_photos_with_depth_there_are_none_and_large_ones_are_reduced():
     photos = plane(2)
-    one = {"0.png": depth_of(photos["0.png"]), "1.png": depth_of(photos["1.png"], torch.nan)}
+    one = {"0.png": depth_of(photos["0.png"], DEPTH), "1.png": depth_of(photos["1.png"], torch.nan)}
     assert views_of(photos, one) == views_of(photos, {}) == []
     view = views_of(plane(), max_pixels=3_000)[0]
     camera = view.photo.camera
@@ -117,12 +113,8 @@ def test_a_border_view_shows_its_photo_in_the_middle_of_a_wider_field(max_pixels
     assert in_wide.tolist() == pytest.approx((in_photo * scale + torch.tensor([x, y])).tolist(), abs=1e-4)
 
 
-def picture(height: int = 37, width: int = 50) -> torch.Tensor:
-    return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0))
-
-
 def test_known_pixels_stay_and_unknown_ones_are_not_read():
-    image = picture()
+    image = noise(0, 37, 50)
     for known in (torch.ones(37, 50, dtype=torch.bool), torch.zeros(37, 50, dtype=torch.bool)):
         assert torch.equal(continued(image, known), image)
     known = torch.rand(image.shape[:2], generator=torch.Generator().manual_seed(1)) > 0.6
@@ -135,7 +127,7 @@ def test_known_pixels_stay_and_unknown_ones_are_not_read():
 def test_one_known_pixel_fills_a_picture_of_any_size_with_its_colour(shape):
     known = torch.zeros(shape, dtype=torch.bool)
     known[shape[0] // 2, shape[1] // 2] = True
-    image = picture(*shape)
+    image = noise(0, *shape)
     assert torch.allclose(continued(image, known), image[known].expand(*shape, 3), atol=1e-6)
 
 
@@ -149,8 +141,8 @@ def test_a_hole_has_colours_between_those_around_it_without_an_edge_and_nothing_
     assert inside.max() <= ramp[0, 45, 0]
     assert (inside - ramp[20:44, 20:44]).abs().max() < 0.15
     assert (filled[:, 1:] - filled[:, :-1]).abs().max() < 0.1
-    noise = picture(64, 128)
+    image = noise(0, 64, 128)
     known = torch.arange(128).expand(64, 128) < 64
-    filled = continued(noise, known)
+    filled = continued(image, known)
     near, far = (filled[:, a:b].std(dim=0).mean() for a, b in ((64, 66), (110, 128)))
     assert far < 0.3 * near

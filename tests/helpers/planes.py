@@ -37,6 +37,12 @@ def plane_photos(count: int, width: int = 120, height: int = 90) -> list[Photo]:
     ]
 
 
+def depth_of(photo: Photo, depth: float | Tensor) -> DepthMap:
+    """The same depth at every pixel, or that of each; unknown where it is nan."""
+    values = torch.as_tensor(depth).expand(photo.image.shape[:2]).clone()
+    return DepthMap(values, values.isfinite().float())
+
+
 def same_maps(a: Sequence[DepthMap], b: Sequence[DepthMap]) -> bool:
     """Whether depth and confidence have the same bits."""
     return all(

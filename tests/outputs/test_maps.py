@@ -22,7 +22,7 @@ from clear_strategies.schedules import WarmupDecay
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.state import TrainState
 from clear_strategies.viewing.look import Painter
-from tests.helpers import toy
+from tests.helpers import planes, toy
 
 OBJECTIVE = Objective(lambda_hr=WarmupDecay(start=0, full=1), kernels="torch")
 SCENE = toy.scene()
@@ -168,8 +168,7 @@ def test_views_with_stereo_show_their_depth_and_maps_that_no_strategy_makes_are_
     depth = torch.rand(shape) + 1
     depth[0] = torch.nan
     some = DepthMap(depth, depth.isfinite().float() * 0.5)
-    nothing = DepthMap(torch.full(shape, torch.nan), torch.zeros(shape))
-    maps = (some, nothing, None)
+    maps = (some, planes.depth_of(state.views[0].lr, torch.nan), None)
     views = [replace(state.views[0], name=str(i), depth=found) for i, found in enumerate(maps)]
     content = written(tmp_path, state, views)
     assert (content["corrector"], content["evidence"]) == (None, None)

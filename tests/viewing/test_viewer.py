@@ -304,7 +304,9 @@ def test_a_training_goes_on_where_a_browser_leaves_while_it_is_updated(browser, 
     assert browser.sees().any()
 
 
-def test_ctrl_c_while_a_training_waits_for_a_picture_is_not_hidden_by_an_error_of_the_viewer(server, saved_run, monkeypatch):
+def test_ctrl_c_while_a_training_waits_for_a_picture_is_not_hidden_by_an_error_of_the_viewer(
+    server, saved_run, monkeypatch
+):
     splat, lock = open_splat(saved_run[0]), threading.Lock()
 
     class Interrupted:
