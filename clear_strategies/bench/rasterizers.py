@@ -104,7 +104,9 @@ def measure(
     for workload in workloads:
         results.log(f"{workload.name}: {len(workload.splats):,} Gaussians")
         affordable_here = [b for b in backends if affordable(b, workload, b, results.note)]
-        contestants = [Contestant(workload, b, p) for b in affordable_here for p in preset if p in presets_of(b)]
+        # gsplat's cut-offs are fixed.
+        pairs = [(b, p) for b in affordable_here for p in preset if b != "gsplat" or p == "fast"]
+        contestants = [Contestant(workload, *pair) for pair in pairs]
         if not contestants:
             continue
         ms = interleaved({c.label: c for c in contestants}, repeats, device=device, label=workload.name)
@@ -168,11 +170,6 @@ def usable(asked: Sequence[str], device: str, note: Callable[[str], None]) -> li
     if not names:
         raise DataError("--backend", ", ".join(asked), "cannot run here", "see the lines above")
     return names
-
-
-def presets_of(backend: str) -> Sequence[str]:
-    """The presets of a backend: gsplat's cut-offs are fixed."""
-    return ["fast"] if backend == "gsplat" else list(PRESETS)
 
 
 def random_cotangents(workload: Workload) -> Float[Tensor, "K H W 3"]:

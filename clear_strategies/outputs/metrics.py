@@ -32,6 +32,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies import files
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
 from clear_strategies.core.progress import Progress, duration
@@ -125,6 +126,11 @@ def read(path: Path, remedy: str) -> Metrics:
     return metrics
 
 
+def write(path: Path, evaluation: Evaluation, **facts: Any) -> None:
+    """Write metrics.json; `facts` are its other keys."""
+    files.write_json(path, {**facts, "note": NOTE, "test": evaluation.test, "train": evaluation.train})
+
+
 def _with_nan(value: Any) -> Any:
     """Replace null, which stands for a number that was not finite, by NaN."""
     if isinstance(value, dict):
@@ -182,11 +188,6 @@ def _part(views: Sequence[View], table: Table, of: int | None = None) -> Part:
     scored = sorted({image for row in table.values() for image in row})
     means = {image: mean_scores([row[image] for row in table.values() if image in row]) for image in scored}
     return Part(f"{' and '.join(sorted(kinds))} photos" if kinds else "nothing", table, means, of)
-
-
-def to_json(evaluation: Evaluation, **facts: Any) -> dict[str, Any]:
-    """The content of metrics.json; `facts` are its other keys."""
-    return {**facts, "note": NOTE, "test": evaluation.test, "train": evaluation.train}
 
 
 def _scores_of(

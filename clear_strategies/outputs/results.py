@@ -112,13 +112,10 @@ def write_results(
             beside.finish()
     stages = pd.DataFrame([*scene.work_log.rows(), *_two_stages(state, history), *work_log.rows()])
     _write_tables(folder, history, stages)
-    files.write_json(
-        folder / files.FINISHED,
-        metrics.to_json(
-            evaluation, scene=scene.name, **asdict(chosen), seed=settings.seed, iterations=state.t - 1,
-            gaussians=len(field), seconds=seconds, conflict=_mean_conflict(history), synthetic_prior=scene.synthetic_prior,
-            config=config, provenance=provenance(seed=settings.seed, backend=backend, plan=scene.notes),
-        ),
+    metrics.write(
+        folder / files.FINISHED, evaluation, scene=scene.name, **asdict(chosen), seed=settings.seed, iterations=state.t - 1,
+        gaussians=len(field), seconds=seconds, conflict=_mean_conflict(history), synthetic_prior=scene.synthetic_prior,
+        config=config, provenance=provenance(seed=settings.seed, backend=backend, plan=scene.notes),
     )  # fmt: skip
     return evaluation
 

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from clear_strategies import Photo, View, files
+from clear_strategies import Photo, View
 from clear_strategies.core import images
 from clear_strategies.core.points import PointCloud
 from clear_strategies.data.scene import Scene
@@ -95,7 +95,7 @@ def test_a_render_that_is_not_finite_has_a_warning_and_null_in_the_file(tmp_path
     a = view("a", noise(0, 48, 64))
     evaluation = metrics.evaluate(scene((), (a,)), lambda camera: torch.full((48, 64, 3), math.nan))
     assert "a: its render is not finite" in caplog.text
-    files.write_json(tmp_path / "metrics.json", metrics.to_json(evaluation, scene="made up", seed=3))
+    metrics.write(tmp_path / "metrics.json", evaluation, scene="made up", seed=3)
     content = json.loads((tmp_path / "metrics.json").read_text())
     assert content["test"]["mean"]["ours"] == {"psnr": None, "ssim": None, "gmsd": None, "blur": None}
     assert content["test"]["views"]["a"]["bicubic"]["psnr"] > 0
@@ -116,7 +116,7 @@ def test_metrics_of_ones_own_are_in_the_file_and_the_last_lines_and_one_that_rai
     assert "metrics.broken: left out, AttributeError: " in caplog.text
     facts = {"scene": "s", "strategies": [], "seed": 0, "iterations": 1, "gaussians": 1, "seconds": 1, "conflict": {},
              "synthetic_prior": False, "provenance": {}}  # fmt: skip
-    files.write_json(tmp_path / "metrics.json", metrics.to_json(evaluation, **facts))
+    metrics.write(tmp_path / "metrics.json", evaluation, **facts)
     scores = metrics.read(tmp_path / "metrics.json", "").test.mean["ours"]
     assert scores.own["off"] == pytest.approx(sum(means) / 2)
     assert math.isnan(scores.own["broken"])
