@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import rasterizers
-from clear_strategies.commands import export, render
+from clear_strategies.commands import export, render, view
 from clear_strategies.data.photo_files import image_size, read_image
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.errors import SettingError
@@ -176,6 +176,9 @@ def test_another_program_reads_what_is_written(saved_run, tmp_path):
         (render, ["--typo"], "unrecognized arguments: --typo"),
         (export, ["--sh", "4"], "invalid choice"),
         (export, ["--out", "a.spz"], "must end in .ply, got a.spz. splat-transform makes"),
+        (view, ["--port", "-1"], "--port: must be a whole number from 0 to 65535, got -1"),
+        (view, ["--port", "65536"], "--port: must be a whole number from 0 to 65535, got 65536"),
+        (view, ["--host", "192.0.2.1"], "--host: must be an address of this machine, got 192.0.2.1"),
     ],
 )
 def test_wrong_arguments_are_refused_in_one_line(saved_run, command, arguments, message):
