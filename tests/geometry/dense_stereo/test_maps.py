@@ -1,7 +1,10 @@
 """Depth maps: right on known surfaces, unknown where nothing tells depth, the same bits every time; their completion."""
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -14,9 +17,58 @@ from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.dense_stereo.smoothing import smooth
 from clear_strategies.geometry.filling import completed
+from rasterizers.interface import Camera
+from tests.helpers import planes
 from tests.helpers.planes import plane_photos, same_maps
-from tests.helpers.textured import Surface, bump, camera, cast, slanted
 
+# ---- photos of a textured surface z = f(x, y), cast by fixed-point iteration, with their exact depth
+Surface = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def slanted(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A plane that recedes to the right."""
+    return 4 + 0.3 * x
+
+
+def bump(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The front of a sphere of radius 3 around (0, 0, 6), with its rim continued as a plane."""
+    return 6 - np.sqrt(np.clip(9 - x**2 - y**2, 4, None))
+
+
+def camera(x: float, degrees: float = 0.0, size: tuple[int, int] = (64, 48)) -> Camera:
+    """At (x, 0, 0), turned about y by `degrees` towards -x, focal length as long as the image is wide."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    turned = torch.tensor([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1]])
+    straight = planes.camera(x, *size, float(size[0]))
+    return replace(straight, world_to_camera=turned @ straight.world_to_camera)
+
+
+def cast(surface: Surface, seen: Camera) -> tuple[Photo, Tensor]:
+    """(photo, z of each pixel)."""
+    x, y = np.meshgrid(np.arange(seen.width) + 0.5, np.arange(seen.height) + 0.5)
+    rays = np.stack(((x - seen.cx) / seen.fx, (y - seen.cy) / seen.fy, np.ones_like(x)), -1)
+    pose = seen.world_to_camera.double().numpy()
+    directions, center = rays @ pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
+    depth = np.full(x.shape, 4.0)
+    for _ in range(60):
+        at = center + depth[..., None] * directions
+        depth += 0.7 * (surface(at[..., 0], at[..., 1]) - at[..., 2])
+    at = center + depth[..., None] * directions
+    return Photo(seen, torch.from_numpy(_texture(at[..., 0], at[..., 1])).float()), torch.from_numpy(depth)
+
+
+def _texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Sums of waves in random directions, the shortest some 5 px long in the photos here."""
+    random = np.random.default_rng(0)
+    colors = np.zeros((*x.shape, 3))
+    for _ in range(40):
+        angle, frequency, phase = random.uniform(0, math.pi), random.uniform(4, 20), random.uniform(0, 7)
+        wave = np.sin(frequency * (x * math.cos(angle) + y * math.sin(angle)) + phase)
+        colors += 0.03 * wave[..., None] * random.uniform(0.3, 1, 3)
+    return np.clip(0.5 + colors, 0, 1)
+
+
+# ---- depth of known surfaces, and of photos that tell none
 NONE = torch.zeros(0, 3)
 QUICK = StereoSettings(enlarge=1, max_planes=64)
 
@@ -185,14 +237,12 @@ def test_two_surfaces_meet_where_the_colour_changes_and_one_known_pixel_is_the_d
 # ---- the cost volume and its smoothing
 def test_the_better_half_of_the_photos_decides_and_the_true_plane_costs_next_to_nothing() -> None:
     first, second, third = (Grey(p.camera, p.image.mean(2)) for p in plane_photos(3))
-    planes = torch.tensor([1 / 8, 1 / 4, 1 / 3])
-    each = torch.stack([cost_volume(first, [other], planes, 5) for other in (second, third, first, third)])
-    found = cost_volume(first, [second, third, first, third], planes, 5)
+    inverse_depths = torch.tensor([1 / 8, 1 / 4, 1 / 3])
+    each = torch.stack([cost_volume(first, [other], inverse_depths, 5) for other in (second, third, first, third)])
+    found = cost_volume(first, [second, third, first, third], inverse_depths, 5)
     assert torch.allclose(found, each.sort(0).values[:2].mean(0))
-    first, second = (Grey(p.camera, p.image.mean(2)) for p in plane_photos(2))
-    planes = torch.tensor([1 / 8, 1 / 4, 1 / 3])
     for image in (second.image, 0.5 * second.image + 0.2):
-        cost = cost_volume(first, [Grey(second.camera, image)], planes, 5)
+        cost = cost_volume(first, [Grey(second.camera, image)], inverse_depths, 5)
         seen = cost[5:-5, 20:-5]
         assert seen[..., 1].mean() < 0.03
         assert (seen[..., 0] > seen[..., 1]).float().mean() > 0.95
@@ -202,10 +252,10 @@ def test_the_better_half_of_the_photos_decides_and_the_true_plane_costs_next_to_
 @pytest.mark.parametrize("window", [3, 7])
 def test_the_compiled_sweep_is_the_readable_one(window: int, monkeypatch: pytest.MonkeyPatch) -> None:
     first, *others = (Grey(p.camera, p.image.mean(2)) for p in plane_photos(4, 77, 71))
-    planes = torch.tensor([1 / 8, 1 / 4.1, 1 / 3, 3.0, *torch.linspace(0.1, 0.5, 6)])
-    compiled = cost_volume(first, others, planes, window)
+    inverse_depths = torch.tensor([1 / 8, 1 / 4.1, 1 / 3, 3.0, *torch.linspace(0.1, 0.5, 6)])
+    compiled = cost_volume(first, others, inverse_depths, window)
     monkeypatch.setattr(cost.native, "available", lambda: False)
-    difference = (cost_volume(first, others, planes, window) - compiled).abs()
+    difference = (cost_volume(first, others, inverse_depths, window) - compiled).abs()
     assert difference.median() < 1e-6
     assert difference.max() < 0.01  # where there is next to no contrast
 
