@@ -200,7 +200,7 @@ class _Job:
             self.conductor.on_fit_end()  # frees memory for the results
             memory.release()
             evaluation = results.write_results(
-                self.folder, scene, state, ready.rasterizer, painter, self.chosen, backend=ready.name,
+                self.folder, scene, state, painter, self.chosen, backend=ready.name,
                 down=self.settings.data.views.downsample, seconds=before + training, config=self.compared,
                 antialiased=ready.rules.antialiased, own=self.settings.metrics,
             )  # fmt: skip

@@ -43,10 +43,9 @@ from clear_strategies.outputs import figures
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies import answers
 from clear_strategies.strategies.base import Strategy
-from clear_strategies.training.field import FieldShot, GaussianField
+from clear_strategies.training.field import FieldShot
 from clear_strategies.viewing.cameras import at_most
 from clear_strategies.viewing.look import Painter, depth_range
-from rasterizers.interface import Rasterizer
 
 _log = logging.getLogger(__name__)
 
@@ -88,8 +87,8 @@ class ViewMaps(NamedTuple):
 
 
 def write_maps(
-    folder: Path, stems: Mapping[str, str], views: Sequence[View], painter: Painter, conductor: Conductor,
-    rasterizer: Rasterizer, t: int, beside: Beside,
+    folder: Path, stems: Mapping[str, str], views: Sequence[View], painter: Painter, conductor: Conductor, t: int,
+    beside: Beside,
 ) -> dict[str, Float[Tensor, "H W 3"]]:  # fmt: skip
     """Write maps.json and, for each view, a folder of 8-bit grey PNGs (value = 255 × number) and maps.jpg.
 
@@ -104,7 +103,7 @@ def write_maps(
     means, renders = dict[str, Mapping[str, float]](), dict[str, Tensor]()
     done = Progress("maps", "views", len(views))
     for view in views:
-        view_folder, of_view = folder / stems[view.name], view_maps(painter, conductor, rasterizer, view, t)
+        view_folder, of_view = folder / stems[view.name], view_maps(painter, conductor, view, t)
         means[view.name], renders[view.name] = of_view.means, of_view.render
         for name, values in of_view.maps.items():
             beside(write_png, view_folder / f"{name}.png", values)
@@ -120,15 +119,15 @@ def write_maps(
     return renders
 
 
-def view_maps(painter: Painter, conductor: Conductor, rasterizer: Rasterizer, view: View, t: int) -> ViewMaps:
+def view_maps(painter: Painter, conductor: Conductor, view: View, t: int) -> ViewMaps:
     """Compute the maps of one view by the strategies of the run in their state at iteration t, without dropout.
 
     Args:
-        painter: of the run's field. rasterizer: of the run.
+        painter: of the run's field.
     """
     evidence = _evidence(conductor, view)
     patches = {} if evidence is None else _enlarged(evidence[1], view)
-    lr, hr, corrected, render = _gradients(painter.field, conductor, rasterizer, view, t)
+    lr, hr, corrected, render = _gradients(painter, conductor, view, t)
     numbers, compared = _compare(lr, hr, corrected)
     columns = [*numbers.values(), *[torch.zeros_like(numbers["conflict"])] * (3 - len(numbers))]
     pictures = painter.numbers(view.hr.camera, torch.stack(columns, dim=1).float()).clamp(0, 1).cpu().unbind(2)
@@ -170,12 +169,13 @@ def _enlarged(patches: PatchMaps, view: View) -> dict[str, Tensor]:
 
 
 def _gradients(
-    field: GaussianField, conductor: Conductor, rasterizer: Rasterizer, view: View, t: int
+    painter: Painter, conductor: Conductor, view: View, t: int
 ) -> tuple[Grads, Grads, Grads | None, Float[Tensor, "H W 3"]]:
     """(g_LR, g_HR before correction, g̃_HR or None if no strategy corrects at t, Î_HR on the CPU), with λ_HR = 1."""
     objective = replace(conductor.objective, lambda_hr=_ALWAYS_ON)
     aside = Conductor(*copy.deepcopy(conductor.strategies), objective=objective)
-    lr, hr = (cast(FieldShot, shot) for shot in field.render_scales(rasterizer, view))  # both scales are asked for
+    field = painter.field
+    lr, hr = (cast(FieldShot, shot) for shot in field.render_scales(painter.rasterizer, view))  # both are asked for
     (g_lr,) = lr.vjp(objective.lr(lr.image.detach(), view.lr.image, view.lr.shown).cotangents)
     # The field is drawn over the scene's own background, not over one of a strategy.
     opaque = replace(view, hr=replace(view.hr, transparency=None))

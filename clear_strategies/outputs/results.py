@@ -36,7 +36,7 @@ from clear_strategies.training.state import TrainState
 from clear_strategies.viewing import cameras
 from clear_strategies.viewing.look import Painter, Pixels, write_video
 from rasterizers.geometry import SH_C0
-from rasterizers.interface import Camera, Rasterizer
+from rasterizers.interface import Camera
 from rasterizers.native import kernel_threads, threads
 
 if TYPE_CHECKING:
@@ -64,14 +64,14 @@ _TRAINED_ON: Final = (
 
 
 def write_results(
-    folder: Path, scene: Scene, state: TrainState, rasterizer: Rasterizer, painter: Painter, chosen: Chosen, *, backend: str,
-    down: DownKernel, seconds: float, config: Mapping[str, Any], antialiased: bool, own: Mapping[str, Metric] | None = None,
+    folder: Path, scene: Scene, state: TrainState, painter: Painter, chosen: Chosen, *, backend: str, down: DownKernel,
+    seconds: float, config: Mapping[str, Any], antialiased: bool, own: Mapping[str, Metric] | None = None,
 ) -> Evaluation:  # fmt: skip
     """Evaluate a finished run and write its files; returns its scores.
 
     Args:
         scene: on the CPU, also if the field is on CUDA.
-        painter: of the state's field, for depth and video.
+        painter: of the state's field.
         down: D, by which the LR images were made.
         antialiased: the rasterizer compensates opacities, see `RasterSettings`.
         own: metrics, see `image_scores.Truth`.
@@ -86,14 +86,15 @@ def write_results(
     rendered: dict[str, Tensor] = {}
 
     def render(view: View) -> Tensor:
-        return rendered.pop(view.name) if view.name in rendered else field.render(rasterizer, view.hr.camera).cpu()
+        known = rendered.pop(view.name, None)
+        return field.render(painter.rasterizer, view.hr.camera).cpu() if known is None else known
 
     with kernel_threads(threads()), files.Beside() as beside:
         with work_log.stage("maps"):
             if mapped := spaced(state.views, settings.map_views):
                 try:
                     rendered |= write_maps(
-                        folder / "maps", stems, mapped, painter, state.conductor, rasterizer, state.t - 1, beside
+                        folder / "maps", stems, mapped, painter, state.conductor, state.t - 1, beside
                     )
                 except Exception as error:  # of a user's strategy; the run must not fail by it
                     _log.warning("maps: left out, %s: %s", type(error).__name__, one_line(error))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -33,26 +33,21 @@ _HD: Final = "scale=out_color_matrix=bt709:out_range=tv,setparams=color_primarie
 Pixels = UInt8[np.ndarray, "_ _ 3"]
 
 
-@dataclass(eq=False)
 class Painter:
-    """Renders a field.
+    """Renders a field, by the rasterizer of the run (`rasterizer`).
 
     Args:
-        make: returns the rasterizer of the run; takes fields of `RasterSettings`, which override the run's.
+        make: returns that rasterizer; takes fields of `RasterSettings`, which override the run's.
     """
 
-    field: GaussianField
-    make: Callable[..., Rasterizer]
-    _as_measured: Rasterizer = field(init=False)
-    _over_black: Rasterizer = field(init=False)
-
-    def __post_init__(self) -> None:
-        self._as_measured, self._over_black = self.make(), self.make(background=(0.0, 0.0, 0.0))
+    def __init__(self, field: GaussianField, make: Callable[..., Rasterizer]) -> None:
+        self.field, self.rasterizer = field, make()
+        self._over_black = make(background=(0.0, 0.0, 0.0))
 
     @torch.no_grad()
     def color(self, camera: Camera) -> Float[Tensor, "H W 3"]:
         """Render the image, in [0, 1], on the CPU."""
-        image = self._as_measured(self.field.baked(), camera).image
+        image = self.rasterizer(self.field.baked(), camera).image
         return image.clamp(0, 1).nan_to_num().cpu()
 
     @torch.no_grad()

@@ -231,7 +231,7 @@ def test_a_configuration_of_tables_in_lists_is_saved_without_tables() -> None:
 
 
 def drawn_by(folder: Path, rasterizer: str | None = None) -> type:
-    return type(open_splat(folder, rasterizer).painter.make())
+    return type(open_splat(folder, rasterizer).painter.rasterizer)
 
 
 def test_the_class_of_a_file_draws_if_an_installed_package_or_the_command_names_it(
@@ -240,10 +240,10 @@ def test_the_class_of_a_file_draws_if_an_installed_package_or_the_command_names_
     saved = checkpoint.load(saved_run[0])
     config = {"rasterizer._target_": THEIRS, "rasterizer.kernel": 0.25, "rasterizer.lanes": 4096}
     checkpoint.save(tmp_path / "checkpoints", replace(saved, config=config))
-    shared = open_splat(tmp_path).painter.make()
+    shared = open_splat(tmp_path).painter.rasterizer
     assert (type(shared) is Theirs, shared.kernel) == (False, 0.25)
     assert f"--rasterizer {THEIRS} draws with it" in caplog.text
-    named = open_splat(tmp_path, THEIRS).painter.make()
+    named = open_splat(tmp_path, THEIRS).painter.rasterizer
     assert (type(named), named.kernel, named.lanes) == (Theirs, 0.25, 4096)
     monkeypatch.setattr("clear_strategies.jobs.saved.options", lambda group: {"theirs": {"_target_": THEIRS}})
     assert drawn_by(tmp_path) is Theirs

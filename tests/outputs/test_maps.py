@@ -38,9 +38,8 @@ def trained(*strategies: Strategy) -> TrainState:
     return state
 
 
-def drawn_by(state: TrainState, **settings: Any) -> tuple[Painter, Conductor, rasterizers.Rasterizer]:
-    make = partial(rasterizers.load, "torch", **settings)
-    return Painter(state.field, make), state.conductor, make()
+def drawn_by(state: TrainState, **settings: Any) -> tuple[Painter, Conductor]:
+    return Painter(state.field, partial(rasterizers.load, "torch", **settings)), state.conductor
 
 
 def maps_of(state: TrainState, view: View | None = None, t: int = 1, **settings: Any) -> ViewMaps:

@@ -44,7 +44,7 @@ def state() -> TrainState:
 def write(folder: Path, state: TrainState, *, scene: Scene = SCENE, map_views: int = 0, video: int = 0) -> Evaluation:
     state = replace(state, settings=replace(state.settings, map_views=map_views, video=video))
     return write_results(
-        folder, scene, state, toy.RASTERIZER, Painter(state.field, lambda **_: toy.RASTERIZER), Chosen(None, ["gco", "p2g"]),
+        folder, scene, state, Painter(state.field, lambda **_: toy.RASTERIZER), Chosen(None, ["gco", "p2g"]),
         backend="torch", down="bicubic", seconds=1.5, config={"fit.seed": 0}, antialiased=False,
     )  # fmt: skip
 
