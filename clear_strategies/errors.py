@@ -8,10 +8,8 @@ from pathlib import Path
 class ClearError(Exception):
     """Base of every error that the command line shows in one line, without a traceback."""
 
-    @property
-    def exit_code(self) -> int:
-        """The exit code of a process that ends by the error."""
-        return 2
+    exit_code: int = 2
+    """The exit code of a process that ends by the error."""
 
 
 class DataError(ClearError, ValueError):

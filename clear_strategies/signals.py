@@ -24,13 +24,9 @@ class Interrupted(ClearError):
     """
 
     def __init__(self, signum: int, when: str, saved: Path | None) -> None:
-        self.signum = signum
+        self.signum, self.exit_code = signum, 128 + signum
         where = f"Go on with fit.resume={saved}" if saved else "Nothing was saved"
         super().__init__(f"stopped by {signal.Signals(signum).name} {when}. {where}.")
-
-    @property
-    def exit_code(self) -> int:
-        return 128 + self.signum
 
 
 TWICE: Final = (signal.SIGINT, signal.SIGTERM)  # a second one acts at once
