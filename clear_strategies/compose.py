@@ -21,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from clear_strategies import files
 from clear_strategies.errors import SettingError, one_line
-from clear_strategies.hydra_errors import not_composed
+from clear_strategies.hydra_errors import not_composed, require_option
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.objective import Objective
@@ -200,6 +200,7 @@ def require_each_once(overrides: Iterable[str]) -> None:
     """
     before = list[str]()
     for override in OverridesParser.create().parse_overrides(list(overrides)):
+        require_option(override)
         if override.key_or_group == "method" and before and override.value():
             message = "%s has no effect: %s replaces the strategies before it. What is written behind the method is added to it."
             _log.warning(message, " ".join(before), override.input_line)

@@ -24,16 +24,17 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep
-from hydra.errors import ConfigCompositionException, HydraException
+from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from clear_strategies import console, files, signals
 from clear_strategies.compose import quoted, require_each_once
 from clear_strategies.errors import ClearError, SettingError, counted
-from clear_strategies.hydra_errors import no_option, not_composed
+from clear_strategies.hydra_errors import not_composed, require_option
 from clear_strategies.jobs import exit_codes, sweep
-from clear_strategies.options import CONF, options, sweeps
+from clear_strategies.options import CONF, sweeps
 
 _log = logging.getLogger(__name__)
 
@@ -71,12 +72,12 @@ def main(overrides: Sequence[str] | None = None) -> None:
     exit_codes.require("train")
     try:
         hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(job)()
-    except ConfigCompositionException as error:
-        overrides = [word for word in sys.argv[1:] if not word.startswith(("-", "hydra."))]
-        raise not_composed(error, overrides, "config") from error
     except Exception as error:
         if sweep.stopped:
             raise KeyboardInterrupt(sweep.stopped[0]) from error  # a process of joblib's had not begun, and was ended
+        if isinstance(error, HydraException | OmegaConfBaseException):
+            overrides = [word for word in sys.argv[1:] if not word.startswith(("-", "hydra."))]
+            raise not_composed(error, overrides, "config") from error
         if isinstance(error, BrokenProcessPool):
             raise sweep.worker_ended(error) from error
         raise
@@ -101,11 +102,9 @@ def readable(word: str) -> str:
         chosen = OverridesParser.create().parse_override(word)
     except HydraException:
         return f"{key}={quoted(value)}"
+    require_option(chosen)
     values, group = chosen.value(), chosen.key_or_group
     each = values.list if isinstance(values, ChoiceSweep) else [values]
-    named = [option for option in each if not (chosen.is_add() and option == [])]  # +method=srgs,[]: a row without one
-    if not all(named) and (CONF / group).is_dir():
-        raise SettingError(no_option(group, "null" if None in each else value, [*options(group)]))
     if group == "experiment" and len(each) > 1 and any(isinstance(name, str) and sweeps(name) for name in each):
         alone = ", ".join(f"experiment={name}" for name in each)
         raise SettingError(

@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+from hydra.core.override_parser.types import ChoiceSweep, Override
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -15,38 +16,26 @@ from clear_strategies.errors import SettingError, one_line
 from clear_strategies.options import CONF, composed_by_hydra, options
 from clear_strategies.settings import TARGET, flat, has_parameter
 
-_NO_OPTION: Final = re.compile(
-    r"Could not find '([^']+)/([^'/]*)'\s+Available options in '[^']*':(.*?)Config search path", re.DOTALL
-)
+# What Hydra says, and what to say in place of it. Packages hydra-NAME-launcher bring launchers.
+_IN_OUR_WORDS: Final = {
+    r"Could not (?:load|find) 'hydra/launcher/((joblib|submitit|ray)(?:_local|_slurm|_aws)?)'": (
+        "hydra/launcher: {} is not installed: pip install hydra-{}-launcher."
+    ),
+    r"^Error parsing override '(.*)' missing EQUAL": "{}: is no setting. A setting is written name=value.",
+    r"^Multiple values for (\S+)\. To override a value use 'override \S+: (\S+)'$": (
+        "+{0}={1}: a choice of this group is there already. Replace it: {0}={1}."
+    ),
+}
 
-_NO_VALUE: Final = re.compile(r"Error parsing override '(.*)'\s+missing EQUAL")
-_CHOSEN: Final = re.compile(r"Multiple values for (\S+)\. To override a value use 'override \S+: (\S+)'")
 
-_LAUNCHER: Final = re.compile(
-    r"Could not (?:load|find) 'hydra/launcher/((joblib|submitit|ray)(?:_local|_slurm|_aws)?)'"
-)
-"""A launcher that a package `hydra-NAME-launcher` brings."""
-
-
-def of_hydra(error: Exception, config: str = "config") -> str:
-    """The message of an error of Hydra's, in one line: of an option that is not there, the nearest one and all others, or the
-    package that brings it.
-
-    Args:
-        config: as of `compose.composed`.
-    """
-    if (launcher := _LAUNCHER.search(str(error))) is not None:
-        name, package = launcher.groups()
-        return f"hydra/launcher: {name} is not installed: pip install hydra-{package}-launcher."
-    if (word := _NO_VALUE.match(str(error))) is not None:
-        return f"{word[1]}: is no setting. A setting is written name=value."
-    if (chosen := _CHOSEN.fullmatch(one_line(error))) is not None:
-        group, name = chosen.groups()
-        return f"+{group}={name}: a choice of this group is there already. Replace it: {group}={name}."
-    if (match := _NO_OPTION.search(str(error))) is None:
-        return one_line(error)
-    group, name, listed = match.groups()
-    return no_option(group, name, [option for option in listed.split() if not option.startswith("_")], config)
+def require_option(override: Override) -> None:
+    """Raise a SettingError for an override that chooses nothing of a group of conf/; Hydra would raise an error of Python's."""
+    chosen, group = override.value(), override.key_or_group
+    each = chosen.list if isinstance(chosen, ChoiceSweep) else [chosen]
+    nothing = [name for name in each if not name and not (override.is_add() and name == [])]  # +method=srgs,[]: a row
+    if nothing and not override.is_delete() and (CONF / group).is_dir():
+        told = "null" if None in each else (override.input_line or "").partition("=")[2]
+        raise SettingError(no_option(group, told, [*options(group)]))
 
 
 def no_option(group: str, name: object, listed: Sequence[str], config: str = "config") -> str:
@@ -66,28 +55,41 @@ _SWEEPS: Final = re.compile(r"\+?(experiment=|strategy=[^\[]*,)")  # overrides b
 
 
 def not_composed(error: Exception, overrides: Sequence[str], config: str) -> SettingError:
-    """The error for overrides that Hydra cannot compose; where there is no such setting, it names the most similar one."""
+    """The error for overrides that Hydra cannot compose, in one line; where there is no such setting or option, it names the most
+    similar one.
+
+    Args:
+        config: as of `compose.composed`.
+    """
+    text = one_line(error)
+    for theirs, ours in _IN_OUR_WORDS.items():
+        if said := re.search(theirs, text):
+            return SettingError(ours.format(*said.groups()))
+    if said := re.search(
+        r"Could not find '([^']+)/([^'/]*)' Available options in '[^']*':(.*?)Config search path", text
+    ):
+        group, name, listed = said.groups()
+        known = [option for option in listed.split() if not option.startswith("_")]
+        return SettingError(no_option(group, name, known, config))
     # Of a list of options Hydra names the file alone, and not the options that there are.
-    if listed := re.search(r"Could not load '(\w+)/([^'/]+)'", str(error)):
-        return SettingError(no_option(listed[1], listed[2], [*options(listed[1])], config))
-    if (unknown := re.match(r"Could not (?:override|delete from config\.) '([^']+)'", str(error))) is None:
-        return SettingError(of_hydra(error, config))
-    key = unknown[1]
+    if said := re.search(r"Could not load '(\w+)/([^'/]+)'", text):
+        return SettingError(no_option(said[1], said[2], [*options(said[1])], config))
+    if said := re.match(r"Could not (?:override|delete from config\.) '([^']+)'", text):
+        return SettingError(f"{said[1]}: {_no_setting(said[1], overrides, config)}")
+    return SettingError(text)
+
+
+def _no_setting(key: str, overrides: Sequence[str], config: str) -> str:
+    """What to say of a setting that is not there."""
     value = next((o.partition("=")[2] for o in overrides if _key(o) == key), "")
     if (CONF / key).is_dir():
-        return SettingError(
-            f"{key}: no choice of this group is there to be replaced, so it is added: +{key}={value or '…'}."
-        )
+        return f"no choice of this group is there to be replaced, so it is added: +{key}={value or '…'}."
     others, group = [o for o in overrides if _key(o) != key], key.partition(".")[0]
     having = [o for o in options(group) if key in flat(_composed([*others, f"{group}={o}"], config))]
     if having:
         train = ", or let the command find it: clear-strategies train FOLDER" if key == "data.path" else ""
-        return SettingError(
-            f"{key}: there is no such setting without one of {', '.join(f'{group}={o}' for o in having)}. Add it{train}."
-        )
-    return SettingError(
-        f"{key}: there is no such setting. {_remedy(key, value, overrides, _composed(others, config), config)}"
-    )
+        return f"there is no such setting without one of {', '.join(f'{group}={o}' for o in having)}. Add it{train}."
+    return f"there is no such setting. {_remedy(key, value, overrides, _composed(others, config), config)}"
 
 
 def _composed(overrides: Sequence[str], config: str) -> dict[str, Any]:

@@ -56,10 +56,13 @@ def describe(error: BaseException) -> Ending | None:
     if isinstance(error, KeyboardInterrupt):
         signum = signals.signal_of(error)
         return Ending(SIGNALS + signum, f"stopped by {signum.name}.")  # the job itself has logged what it saved
-    if isinstance(error, _library_errors()):
-        from clear_strategies.hydra_errors import of_hydra
+    from rasterizers.interface import (
+        BackendUnavailable,
+        OutdatedKernels,
+    )  # not above: a wrong argument waits for no torch
 
-        return Ending(UNUSABLE, of_hydra(error))  # before OSError: Hydra's error for an option that is not there is one
+    if isinstance(error, BackendUnavailable | OutdatedKernels):
+        return Ending(UNUSABLE, one_line(error))
     if message := _of_machine(error):
         return Ending(UNUSABLE, message)
     disk = error if isinstance(error, OSError) else error.__cause__  # logging wraps it if it cannot open its file
@@ -84,16 +87,6 @@ def _of_machine(error: BaseException) -> str | None:
         why = "memory is limited to too little (raise `ulimit -v`), or its folder's disk runs no programs (noexec)"
         return f"{one_line(error)}: {why}."
     return None
-
-
-def _library_errors() -> tuple[type[Exception], ...]:
-    """Errors whose messages are for the user; imported here, so that a wrong argument is refused without these libraries."""
-    from hydra.errors import HydraException
-    from omegaconf.errors import OmegaConfBaseException
-
-    from rasterizers.interface import BackendUnavailable, OutdatedKernels
-
-    return BackendUnavailable, HydraException, OmegaConfBaseException, OutdatedKernels
 
 
 def require(extra: str) -> None:

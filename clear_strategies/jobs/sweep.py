@@ -19,15 +19,16 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Override, OverrideType
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from clear_strategies import signals
-from clear_strategies.errors import ClearError, DataError
+from clear_strategies.errors import ClearError, DataError, SettingError
 from clear_strategies.files import FINISHED, expanded
+from clear_strategies.hydra_errors import require_option
 from clear_strategies.options import UNNAMED
 from clear_strategies.settings import absent, missing
 
@@ -44,7 +45,8 @@ def in_sweep() -> bool:
 
 
 def refusal(config: DictConfig) -> str | None:
-    """The reason why a sweep cannot begin: a job is in it twice, or all jobs lack the same value, folder or file; else None.
+    """The reason why a sweep cannot begin: a job is in it twice, a value is no option, or all jobs lack the same value,
+    folder or file; else None.
 
     Jobs are composed until one lacks nothing, or something else than the first.
 
@@ -52,6 +54,8 @@ def refusal(config: DictConfig) -> str | None:
         config: of the sweep, as Hydra passes it to callbacks.
     """
     try:
+        for word in _words(config):  # those of an experiment's file; of the others `hydra_app.readable` has told
+            require_option(word)
         jobs = Counter(map(tuple, _overrides_of_jobs(config)))
         if _has_default_folders(config) and (twice := next((job for job, count in jobs.items() if count > 1), None)):
             return (
@@ -61,6 +65,8 @@ def refusal(config: DictConfig) -> str | None:
         lacks = map(_lack, _jobs(config))
         first = next(lacks, None)
         return first if first and all(lack == first for lack in lacks) else None
+    except SettingError as error:
+        return str(error)
     except (HydraException, OmegaConfBaseException, OSError):
         return None  # Hydra, which composes all jobs next, or the jobs raise the error
 
@@ -100,9 +106,23 @@ def _overrides_of_jobs(config: DictConfig) -> list[list[str]]:
 
 
 def _jobs(config: DictConfig) -> Iterator[DictConfig]:
-    """The configuration of each job."""
+    """The configuration of each job, but for its `hydra`. Jobs that choose the same options share a composition, which takes
+    0.2 s, and the values of each are set in it.
+    """
+    shared: dict[tuple[str, ...], DictConfig] = {}
     for overrides in _overrides_of_jobs(config):
-        yield GlobalHydra.instance().config_loader().load_sweep_config(config, overrides)
+        values, choices = dict[str, Any](), list[str]()
+        for text, word in zip(overrides, OverridesParser.create().parse_overrides(overrides), strict=True):
+            is_value = word.type == OverrideType.CHANGE and "." in word.key_or_group and not word.is_hydra_override()
+            if is_value and not isinstance(word.value(), dict):
+                values[word.key_or_group] = word.value()
+            else:
+                choices.append(text)
+        if (key := (*choices, *values)) not in shared:
+            shared[key] = GlobalHydra.instance().config_loader().load_sweep_config(config, overrides)
+        for name, value in values.items():
+            OmegaConf.update(shared[key], name, value)
+        yield shared[key]
 
 
 def _lack(config: DictConfig) -> str | None:

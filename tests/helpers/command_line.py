@@ -18,6 +18,14 @@ TINY = [
 """A tiny run of the demo."""
 
 
+def read_by(function: str) -> list[str]:
+    """Overrides by which a function without arguments reads the data set in place of the demo's."""
+    return [
+        *(f"~data.reader.{name}" for name in ("width", "height", "views", "train")),
+        f"data.reader._target_={function}",
+    ]
+
+
 def environment(cwd: Path) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": python_path(), "CLEAR_CACHE": str(cwd / "cache"), "OMP_NUM_THREADS": "1"}
 
@@ -38,6 +46,11 @@ def started(*arguments: str, said: Path, cwd: Path, session: bool = False) -> Fo
     """A run that goes on; its output goes to the file `said`. `arguments` begin with those of python, `-c …` or `-m …`."""
     with said.open("w") as file:
         return Forked(*arguments, cwd=cwd, env=environment(cwd), stdout=file, stderr=file, session=session)
+
+
+def times_of_files(folder: Path) -> dict[Path, int]:
+    """When each file below a folder was written."""
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
 
 
 def stopped_by(*signals: int, after: int) -> str:
