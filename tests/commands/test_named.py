@@ -98,28 +98,6 @@ def hydra_undone(monkeypatch) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("hydra_undone")
-@pytest.mark.parametrize(
-    ("word", "message"),
-    [
-        *((f"{group}=clear", rf"^{group}: .* it is added: \+{group}=") for group in ("strategy", "method")),
-        ("fit.nothing_like_it=1", r"fit\.nothing_like_it: there is no such setting\. clear-strategies --cfg job"),
-        ("data.reader.skip_faulty=true", r"without one of data=blender, data=colmap, .*, data=photos\. Add it\."),
-        (
-            "prior.path=here",
-            r"prior\.path: there is no such setting without one of prior=images, prior=onnx\. Add it\.",
-        ),
-        ("--multrun", r"--multrun: there is no such flag\. A setting is written name=value"),
-        ("fit.iterations", r"fit.iterations: is no setting\. A setting is written name=value"),
-        ("~strategies.foo", r"strategies.foo: there is no such setting\."),
-    ],
-)
-def test_a_wrong_override_is_refused_with_what_was_meant(word, message):
-    """tests/mistakes.csv has more, with the whole line."""
-    with pytest.raises(SettingError, match=message):
-        hydra_app.main([word])
-
-
-@pytest.mark.usefixtures("hydra_undone")
 @pytest.mark.parametrize("line", ["clear-strategies fit.itera", "clear-strategies train photos fit.itera"])
 def test_the_shell_completes_settings_also_behind_train(line, monkeypatch, capsys):
     monkeypatch.setenv("COMP_LINE", line)

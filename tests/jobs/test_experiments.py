@@ -13,7 +13,6 @@ import rasterizers
 from clear_strategies import Conductor
 from clear_strategies.compose import tree
 from clear_strategies.data.view_settings import ViewSettings
-from clear_strategies.errors import SettingError
 from clear_strategies.hydra_app import readable
 from clear_strategies.jobs.settings import settings_of
 from clear_strategies.merging.skips import Skips
@@ -50,12 +49,6 @@ def pieces(config: DictConfig, stretch: float = 1.0):
 def test_the_row_of_clear_can_be_chosen_as_those_of_the_methods(word):
     """As conf/experiment/table1.yaml says."""
     assert readable(word) == word
-
-
-@pytest.mark.parametrize("word", ["objective=[]", "+method=null", "+strategy="])
-def test_an_option_that_is_nothing_is_refused_with_the_options_that_there_are(word):
-    with pytest.raises(SettingError, match=r": there is no such option\..* There are "):
-        readable(word)
 
 
 @pytest.mark.parametrize("name", options("method"))

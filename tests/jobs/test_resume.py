@@ -18,7 +18,7 @@ from clear_strategies.signals import Interrupted
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.state import fingerprints
 from tests.helpers import captures, forked, toy
-from tests.helpers.command_line import ALONE, TINY, run
+from tests.helpers.command_line import ALONE, TINY, run, times_of_files
 from tests.helpers.configs import composed
 from tests.helpers.short_run import SCENE, start
 
@@ -193,14 +193,12 @@ def test_that_few_photos_have_a_pose_is_said_first_and_last(tmp_path: Path, monk
     ["fit.iterations=-3", "fit.seed=9 fit.resume=auto", "data.path=nowhere", "+strategy=[gco,gco]", "fit.video=0"],
 )
 def test_a_command_that_is_refused_writes_nothing_into_the_folder_of_a_run(refused: str, finished_run: Path) -> None:
-    def state() -> dict[Path, int]:
-        return {path: path.stat().st_mtime_ns for path in finished_run.rglob("*") if path.is_file()}
-
-    before, words = state(), ["data=nerfstudio", f"data.path={finished_run.parent / 'photos'}", *MOVED]
+    before = times_of_files(finished_run)
+    words = ["data=nerfstudio", f"data.path={finished_run.parent / 'photos'}", *MOVED]
     assert "iterations=4" in (finished_run / ".hydra/overrides.yaml").read_text()
     ended = run(*words, "hydra.run.dir=run", *refused.split(), cwd=finished_run.parent)
     assert ended.returncode == 2, ended.stdout + ended.stderr
-    assert state() == before
+    assert times_of_files(finished_run) == before
 
 
 @pytest.mark.parametrize("left", ["results", "checkpoints"])
