@@ -103,8 +103,6 @@ def build(node: Any, key: str = "") -> Any:
         return {name: build(value, _joined(key, name)) for name, value in node.items()}
     if isinstance(node, list):
         return [build(value, f"{key}[{i}]") for i, value in enumerate(node)]
-    if node == _MISSING:
-        raise missing(key)
     if isinstance(node, float) and not math.isfinite(node):
         raise SettingError(f"{key}: must be a finite number, got {node}.")
     return node
@@ -276,8 +274,6 @@ def _of_type(value: Any, hint: Any, key: str) -> Any:
     origin = get_origin(hint)
     if isinstance(value, dict) and isinstance(origin, type) and issubclass(origin, Mapping):
         return {name: _of_type(entry, get_args(hint)[1], _joined(key, name)) for name, entry in value.items()}
-    if isinstance(value, bool) and not _takes_bool(hint):
-        raise SettingError(f"{key}: must be {_in_words(hint)}, got {value}.")
     for candidate in (value, tuple(value)) if isinstance(value, list) else (value,):
         try:
             with warnings.catch_warnings():
@@ -299,16 +295,9 @@ def _is_of(value: Any, hint: Any) -> bool:
         return any(_is_of(value, part) for part in parts)
     if isinstance(origin, type) and issubclass(origin, Sequence) and (len(parts) == 1 or parts[1:] == (...,)):
         return isinstance(value, origin) and all(_is_of(entry, parts[0]) for entry in value)
+    if isinstance(value, bool) and hint in (int, float):  # to Python a bool is an int, to a user it is not
+        return False
     return is_bearable(value, hint, conf=_NUMBERS)
-
-
-def _takes_bool(hint: Any) -> bool:
-    """Return True if true and false are values of the annotation; to Python a bool is an int, to a user it is not."""
-    if get_origin(hint) in (Union, types.UnionType):
-        return any(_takes_bool(part) for part in get_args(hint))
-    if get_origin(hint) is Literal:
-        return any(isinstance(value, bool) for value in get_args(hint))
-    return hint not in (int, float, str, None, types.NoneType)
 
 
 _WORDS: Final[Mapping[Any, str]] = {

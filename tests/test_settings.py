@@ -81,7 +81,6 @@ REFUSED = {
     "share: must be a finite number, got nan": {"share": float("nan")},
     "share: must be a finite number, got inf": {"share": float("inf")},
     "share: is needed and missing. Add +it.share=….": {},
-    "share: is needed and missing. Add it.share": {"share": "???"},
     "shape: tests.test_settings.Outer has no such setting. Did you mean it.share?": {"share": 1, "shape": 1},
     "zzz: tests.test_settings.Outer has no such setting. There is share, inner": {"share": 1, "zzz": 1},
     "inner: must be a Inner, got 3": {"share": 1, "inner": 3},
