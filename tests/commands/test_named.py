@@ -4,18 +4,16 @@ import os
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
 from functools import partial
 from importlib import metadata
 
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 
 import rasterizers
-from clear_strategies import commands, hydra_app
+from clear_strategies import commands
 from clear_strategies.commands import doctor
 from clear_strategies.errors import SettingError
-from clear_strategies.jobs import exit_codes
+from tests.helpers import command_line
 from tests.helpers.forked import ROOT
 
 SLOW = ("hydra", "numpy", "omegaconf", "torch")
@@ -88,30 +86,12 @@ def test_help_and_wrong_words_wait_for_neither_torch_nor_hydra(line, code, tmp_p
     assert result.stderr.count("\n") == (1 if code else 0), result.stderr
 
 
-@pytest.fixture
-def hydra_undone(monkeypatch) -> Iterator[None]:
-    """What Hydra's door sets is undone afterwards."""
-    monkeypatch.setattr(sys, "argv", ["clear-strategies"])
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    yield
-    GlobalHydra.instance().clear()
-
-
-@pytest.mark.usefixtures("hydra_undone")
 @pytest.mark.parametrize("line", ["clear-strategies fit.itera", "clear-strategies train photos fit.itera"])
-def test_the_shell_completes_settings_also_behind_train(line, monkeypatch, capsys):
-    monkeypatch.setenv("COMP_LINE", line)
-    monkeypatch.setenv("COMP_POINT", str(len(line)))
-    monkeypatch.setattr(sys, "argv", ["clear-strategies", "-sc", "query=bash"])
-    hydra_app.main()
-    assert capsys.readouterr().out.split() == ["fit.iterations="]
-
-
-@pytest.mark.usefixtures("hydra_undone")
-def test_without_the_trainers_libraries_the_extra_is_named(monkeypatch):
-    monkeypatch.setattr(exit_codes, "find_spec", lambda name: None if name in ("cv2", "scipy") else name)
-    with pytest.raises(SettingError, match=r"training needs cv2, scipy.* pip install 'clear-strategies\[train\]'"):
-        hydra_app.main(["+strategy=clear"])
+def test_the_shell_completes_settings_also_behind_train(line, tmp_path):
+    completing = {"COMP_LINE": line, "COMP_POINT": str(len(line))}
+    code = f"import os\nos.environ |= {completing}\nfrom clear_strategies.hydra_app import main\nmain()"
+    ended = command_line.run("-sc", "query=bash", cwd=tmp_path, code=code)
+    assert ended.stdout.split() == ["fit.iterations="], ended.stderr
 
 
 # ---- `clear-strategies doctor` says what is here, what is missing, and which backend draws something wrong
@@ -128,10 +108,8 @@ def test_doctor_names_versions_memory_backends_and_missing_extras(capsys, monkey
 
 
 def test_gsplat_which_has_cut_offs_of_its_own_alone_is_tested_by_them(capsys, monkeypatch):
-    load, here = (
-        rasterizers.load,
-        {"device": "cpu", "rasterization": partial(rasterizers.rasterization, backend="torch")},
-    )
+    load = rasterizers.load
+    here = {"device": "cpu", "rasterization": partial(rasterizers.rasterization, backend="torch")}
     monkeypatch.setattr(rasterizers, "names", lambda: ["gsplat"])
     monkeypatch.setattr(rasterizers, "load", lambda name, **s: load(name, **s, **(here if name == "gsplat" else {})))
     doctor.main([])

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from clear_strategies import commands, hydra_app, options
+from clear_strategies import commands, hydra_app
 from clear_strategies.commands import train
 from clear_strategies.compose import composed, tree
 from clear_strategies.errors import SettingError
@@ -20,15 +20,6 @@ def test_of_several_formats_the_one_that_may_hold_the_others_is_read_and_named_s
     assert "+strategy=best" not in train.overrides([str(tmp_path), "+strategy=gco"])
     assert "+strategy=best" in train.overrides([str(tmp_path)])
     assert not any(o.startswith("fit.iterations") for o in train.overrides([str(tmp_path), "+protocol=llff_x4"]))
-
-
-def test_a_reader_that_another_package_brings_is_found_by_its_yaml_alone(tmp_path, monkeypatch):
-    (tmp_path / "conf/data").mkdir(parents=True)
-    (tmp_path / "conf/data/mine.yaml").write_text("reader: {_target_: mine_reader.read}")
-    (tmp_path / "mine_reader.py").write_text("def recognises(path): return 9")
-    monkeypatch.setattr(options, "CONF", tmp_path / "conf")
-    monkeypatch.syspath_prepend(tmp_path)
-    assert train.detect(tmp_path) == "mine"
 
 
 @pytest.mark.parametrize(
@@ -49,18 +40,12 @@ def test_a_folder_of_any_name_becomes_data_path(tmp_path, name):
     }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("name", "plain"),
-    [
-        ("photos", True),
-        ("a/b-c.d", True),
-        ("1e5", False),
-        ("null", False),
-        ("my photos", True),
-        (" photos", False),
-        ("a,b", False),
-    ],
+PLAIN = dict.fromkeys(("photos", "a/b-c.d", "my photos"), True) | dict.fromkeys(
+    ("1e5", "null", " photos", "a,b"), False
 )
+
+
+@pytest.mark.parametrize(("name", "plain"), PLAIN.items())
 def test_a_path_is_quoted_only_where_hydra_would_read_something_else(tmp_path, monkeypatch, name, plain):
     monkeypatch.chdir(tmp_path)
     (tmp_path / name).mkdir(parents=True)
