@@ -2,11 +2,12 @@
 
 import ast
 import csv
-import importlib
 import inspect
+import pkgutil
 import re
 import subprocess
 from collections import Counter
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -69,7 +70,7 @@ def holds(file: Path, symbol: str) -> bool:
     if file.suffix != ".py":
         return file.is_file() and re.search(rf"\b{symbol}\b", file.read_text()) is not None
     body = ast.parse(file.read_text()).body if file.is_file() else []
-    for part in symbol.split("."):
+    for part in filter(None, symbol.split(".")):
         defined = next((node for node in body if part in names_of(node)), None)
         if defined is None:
             return False
@@ -83,23 +84,13 @@ def names_of(node: ast.stmt) -> set[str]:
 
 
 def exists(dotted: str) -> bool:
-    parts = dotted.split(".")
-    for n in range(len(parts), 0, -1):
-        file = ROOT.joinpath(*parts[:n])
-        source = file.with_suffix(".py") if file.with_suffix(".py").is_file() else file / "__init__.py"
-        if not source.is_file():
-            continue
-        try:
-            found: object = importlib.import_module(".".join(parts[:n]))
-            for part in parts[n:]:
-                found = getattr(found, part)
-        except AttributeError:
-            return False
-        except ImportError:  # a host's own module is not installed
-            tree = ast.parse(source.read_text())
-            return {getattr(node, "name", None) for node in tree.body} >= set(parts[n : n + 1])
+    with suppress(AttributeError, ImportError):
+        pkgutil.resolve_name(dotted)
         return True
-    return False
+    parts = dotted.split(".")  # perhaps of a module that imports a host which is not installed
+    paths = {n: ROOT.joinpath(*parts[:n]) for n in range(1, len(parts) + 1)}
+    sources = [(file, parts[n:]) for n, p in paths.items() for file in (p.with_suffix(".py"), p / "__init__.py")]
+    return any(file.is_file() and holds(file, ".".join(rest)) for file, rest in sources)
 
 
 def test_pages_that_the_code_names_exist():

@@ -97,15 +97,6 @@ def test_resuming_through_the_door_gives_the_same_field(finished):
     assert plys[0] == plys[1]
 
 
-def test_a_sweep_goes_on_after_a_bad_job(tmp_path):
-    result = run("+strategy=gco", "-m", "strategies.gco.tolerance=0.1,7", *TINY, "fit.iterations=3", cwd=tmp_path)
-    said = result.stdout + result.stderr
-    assert result.returncode == 2
-    assert "strategies.gco.tolerance: must lie in [0, 1), got 7" in said
-    assert "Traceback" not in said
-    assert len(list(tmp_path.glob("multirun/*/*/metrics.json"))) == 1
-
-
 def test_a_strategy_of_another_package_trains_and_the_package_itself_is_the_command_line(tmp_path):
     (tmp_path / "theirs.py").write_text(
         "from dataclasses import dataclass\n"

@@ -3,7 +3,6 @@
 import functools
 import hashlib
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -147,13 +146,11 @@ def used_by_default(folder: Path) -> tuple[int, int, int]:
     return len(capture.frames), len(pool), len(test)
 
 
-@pytest.mark.parametrize("write", [captures.colmap_bin, captures.colmap_txt, captures.llff, captures.nerfstudio])
-def test_every_readers_default_trains_on_all_photos(write: Callable[[Path], Path], tmp_path: Path) -> None:
-    assert used_by_default(write(tmp_path)) == (3, 3, 0)
-
-
-def test_a_split_of_the_data_sets_own_leaves_no_photo_out(tmp_path: Path) -> None:
-    assert used_by_default(captures.blender(tmp_path)) == (3, 2, 1)
+@pytest.mark.parametrize(
+    "write", [captures.colmap_bin, captures.colmap_txt, captures.llff, captures.nerfstudio, captures.blender]
+)
+def test_every_readers_default_uses_all_photos_and_a_split_of_the_data_sets_own_stays(write, tmp_path: Path) -> None:
+    assert used_by_default(write(tmp_path)) == ((3, 2, 1) if write is captures.blender else (3, 3, 0))
 
 
 @pytest.mark.parametrize(

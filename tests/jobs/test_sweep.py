@@ -38,16 +38,12 @@ def whole(tmp_path_factory) -> Path:
     return folder / "here"
 
 
-def test_a_finished_run_is_not_trained_again_and_one_of_another_configuration_is_refused(whole):
+def test_a_finished_run_is_not_trained_again(whole):
     before = times_of_files(whole)
     again = run("+strategy=clear", "hydra.run.dir=here", *AUTO, "fit.iterations=40", "fit.keep=1", cwd=whole.parent)
     assert again.returncode == 0, again.stderr
-    assert "this run finished on" in again.stdout + again.stderr
-    assert "nothing is trained" in again.stdout + again.stderr
+    assert re.search("this run finished on .*; nothing is trained", again.stdout + again.stderr)
     assert times_of_files(whole) == before
-    other = run("+strategy=gco", "hydra.run.dir=here", *AUTO, "fit.iterations=40", cwd=whole.parent)
-    assert other.returncode == 2
-    assert "this is not the configuration that wrote it" in other.stdout + other.stderr
 
 
 def test_a_sweeps_job_that_is_refused_leaves_the_folder_of_a_finished_run_as_it_is(whole):
@@ -58,19 +54,13 @@ def test_a_sweeps_job_that_is_refused_leaves_the_folder_of_a_finished_run_as_it_
     assert whole.with_name(f"here_{FAILED}").read_text().startswith("job 0: fit.iterations: must be")
 
 
-def test_an_experiment_without_the_folder_of_its_scenes_is_refused_once_before_any_job_starts(tmp_path):
-    result = run("experiment=llff_x4", cwd=tmp_path)
-    assert result.returncode == 2
-    assert result.stdout + result.stderr == "error: data.root: is needed and missing. Add data.root=….\n"
-    assert not list(tmp_path.iterdir())
-
-
 LLFF = ["-m", "data=llff", "+strategy=clear,gco"]
 
 
 @pytest.mark.parametrize(
     ("sweep", "reason"),
     [
+        (["experiment=llff_x4"], "data.root: is needed and missing. Add data.root=…."),
         (LLFF, "data.path: is needed and missing. Add data.path=…."),
         ([*LLFF, "data.path=gone/fern,gone/horns"], "gone: data.path: is not there: correct the path"),
         (["-m", "+strategy=clear,gco", "prior=onnx", "prior.path=gone"], "gone: prior.path: is not there: correct the path"),
@@ -101,19 +91,19 @@ def test_jobs_that_choose_the_same_options_are_composed_once_to_be_checked(monke
 
 
 @pytest.mark.parametrize(
-    ("swept", "failed"),
+    ("swept", "failed", "done"),
     [
-        ([*LLFF, "data.path=gone,here"], 4),
-        (["-m", "prior=images,demo,onnx", *TINY], 2),  # the job between those that fail
-        (
-            ["-m", "prior=images", "prior.path=gone", "data.save_lr=lr", *TINY],
-            0,
-        ),  # the SR images are made of what this writes
+        ([*LLFF, "data.path=gone,here"], 4, 0),
+        (["-m", "prior=images,demo,onnx", *TINY], 2, 1),  # the job between those that fail
+        (["-m", "prior=images", "prior.path=gone", "data.save_lr=lr", *TINY], 0, 0),  # the SR images are made of this
     ],
 )
-def test_a_sweep_whose_jobs_do_not_all_lack_the_same_begins(swept, failed, tmp_path):
+def test_a_sweep_whose_jobs_do_not_all_lack_the_same_begins_and_goes_on_after_a_bad_job(swept, failed, done, tmp_path):
     result = run(*swept, "hydra.sweep.dir=all", cwd=tmp_path)
-    assert f"{failed} jobs failed" in result.stdout if failed else not result.returncode, result.stdout
+    assert result.returncode == (2 if failed else 0), result.stdout
+    assert (f"{failed} jobs failed" in result.stdout) == bool(failed)
+    assert "Traceback" not in result.stdout + result.stderr
+    assert len(list(tmp_path.glob("all/*/metrics.json"))) == done
 
 
 @pytest.mark.parametrize(
