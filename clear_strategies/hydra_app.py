@@ -23,7 +23,6 @@ from typing import Any, Final
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import ChoiceSweep
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
@@ -34,7 +33,7 @@ from clear_strategies.compose import quoted, require_each_once
 from clear_strategies.errors import ClearError, SettingError, counted
 from clear_strategies.hydra_errors import not_composed, require_option
 from clear_strategies.jobs import exit_codes, sweep
-from clear_strategies.options import CONF, sweeps
+from clear_strategies.options import CONF
 
 _log = logging.getLogger(__name__)
 
@@ -103,14 +102,7 @@ def readable(word: str) -> str:
     except HydraException:
         return f"{key}={quoted(value)}"
     require_option(chosen)
-    values, group = chosen.value(), chosen.key_or_group
-    each = values.list if isinstance(values, ChoiceSweep) else [values]
-    if group == "experiment" and len(each) > 1 and any(isinstance(name, str) and sweeps(name) for name in each):
-        alone = ", ".join(f"experiment={name}" for name in each)
-        raise SettingError(
-            f"{word}: an experiment that sweeps settings of its own runs alone. Start each by itself: {alone}."
-        )
-    if group == "hydra.job.chdir" and values:
+    if chosen.key_or_group == "hydra.job.chdir" and chosen.value():
         raise SettingError(
             f"{word}: relative paths are those of the folder where the command was started. Leave it out; hydra.run.dir=FOLDER "
             "is where a run writes."
@@ -143,25 +135,27 @@ def job(config: DictConfig) -> float | None:
     """One job of Hydra's. Returns what `jobs.job.run` does; in a sweep also None for a job that failed, was stopped, or is left
     to another.
     """
-    if not sweep.in_worker():
-        return _job(config)
+    folder = Path(HydraConfig.get().runtime.output_dir)
     try:
         with sweep.first_signal_ends_job():
-            return None if sweep.stopped else _job(config)
+            return None if sweep.stopped else _job(config, folder)
     finally:
         with suppress(OSError):
-            Path(HydraConfig.get().runtime.output_dir).rmdir()  # where nothing was written
+            folder.rmdir()  # where nothing was written
 
 
-def _job(config: DictConfig) -> float | None:
-    hydra_config = HydraConfig.get()
-    folder, overrides = Path(hydra_config.runtime.output_dir), list(hydra_config.overrides.task)
+def _job(config: DictConfig, folder: Path) -> float | None:
+    overrides = list(HydraConfig.get().overrides.task)
     with console.logged(folder / "run.log") as log:
 
         def claim() -> None:
             log()
             (folder / FAILED).unlink(missing_ok=True)
-            written = {"config": config, "hydra": HydraConfig.instance().cfg, "overrides": hydra_config.overrides.task}
+            written = {
+                "config": config,
+                "hydra": HydraConfig.instance().cfg,
+                "overrides": HydraConfig.get().overrides.task,
+            }
             for name, content in written.items():
                 files.write_text(folder / ".hydra" / f"{name}.yaml", OmegaConf.to_yaml(content))
 
@@ -180,21 +174,17 @@ def _job(config: DictConfig) -> float | None:
 def _end(error: BaseException, ending: exit_codes.Ending, folder: Path, *, resumes: bool) -> None:
     """Log why a job ended, and exit; a job that fails in a sweep leaves a note instead, and the other jobs continue."""
     code, message = ending
-    hydra_config = HydraConfig.get()
-    in_sweep = sweep.in_sweep()
-    if in_sweep and resumes and isinstance(error, files.HeldError):
+    if sweep.in_sweep() and resumes and isinstance(error, files.HeldError):
         _log.warning("left to the other process: %s", message)
         return
     _log.log(logging.INFO if code > exit_codes.SIGNALS else logging.ERROR, "%s", message)  # a stop is no error
-    if in_sweep and code == exit_codes.UNUSABLE:
+    if sweep.in_sweep() and code == exit_codes.UNUSABLE:
         from clear_strategies.jobs import resume
 
         finished = resume.begun(folder) == "results"  # its folder stays as it is
         note = folder.with_name(f"{folder.name}_{FAILED}") if finished else folder / FAILED
-        files.write_text(note, f"job {hydra_config.job.num}: {message}\n")
+        files.write_text(note, f"job {HydraConfig.get().job.num}: {message}\n")
         return
-    with suppress(OSError):
-        folder.rmdir()  # where nothing was written
     if code > exit_codes.SIGNALS and code - exit_codes.SIGNALS not in signals.STOPS:
         signal.raise_signal(code - exit_codes.SIGNALS)  # all is saved: now the launcher's handler may resubmit the job
     if code > exit_codes.SIGNALS and sweep.in_worker():

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from clear_strategies.errors import SettingError, one_line
-from clear_strategies.options import CONF, composed_by_hydra, options
+from clear_strategies.options import CONF, composed_by_hydra, options, sweeps
 from clear_strategies.settings import TARGET, flat, has_parameter
 
 # What Hydra says, and what to say in place of it. Packages hydra-NAME-launcher bring launchers.
@@ -29,13 +29,20 @@ _IN_OUR_WORDS: Final = {
 
 
 def require_option(override: Override) -> None:
-    """Raise a SettingError for an override that chooses nothing of a group of conf/; Hydra would raise an error of Python's."""
+    """Raise a SettingError for an override that chooses nothing of a group of conf/, which is a bare error of Python's in Hydra,
+    or several experiments of which one sweeps.
+    """
     chosen, group = override.value(), override.key_or_group
     each = chosen.list if isinstance(chosen, ChoiceSweep) else [chosen]
     nothing = [name for name in each if not name and not (override.is_add() and name == [])]  # +method=srgs,[]: a row
     if nothing and not override.is_delete() and (CONF / group).is_dir():
         told = "null" if None in each else (override.input_line or "").partition("=")[2]
         raise SettingError(no_option(group, told, [*options(group)]))
+    if group == "experiment" and len(each) > 1 and any(isinstance(name, str) and sweeps(name) for name in each):
+        alone = ", ".join(f"experiment={name}" for name in each)
+        raise SettingError(
+            f"{override.input_line}: an experiment that sweeps settings of its own runs alone. Start each by itself: {alone}."
+        )
 
 
 def no_option(group: str, name: object, listed: Sequence[str], config: str = "config") -> str:

@@ -151,6 +151,9 @@ def in_worker() -> bool:
 @contextmanager
 def first_signal_ends_job() -> Iterator[None]:
     """During a job in a process of joblib's, let the first signal end the job after it has saved."""
+    if not in_worker():
+        yield
+        return
     signals.handle(_end_job)
     try:
         yield
