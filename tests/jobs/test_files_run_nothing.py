@@ -24,7 +24,6 @@ from clear_strategies.compose import tree
 from clear_strategies.data.ply import read_points
 from clear_strategies.data.readers import blender, nerfstudio
 from clear_strategies.errors import ClearError, DataError, SettingError
-from clear_strategies.hydra_app import main
 from clear_strategies.jobs import job, resume
 from clear_strategies.jobs.saved import open_splat
 from clear_strategies.notebook import Run
@@ -121,19 +120,19 @@ def in_metrics(folder: Path, trap: Trap) -> Iterator[None]:
 def in_json(name: str) -> Poisoned:
     """Each value of the file and of its first entry, and a key besides."""
 
+    def table_of(content: Any, *, of_entry: bool) -> dict[str, Any]:
+        entries = content if isinstance(content, list) else content["frames"]
+        return entries[0] if of_entry or isinstance(content, list) else content
+
     def poison(folder: Path, trap: Trap) -> Iterator[None]:
         text = (folder / name).read_text()
         for of_entry in (False, True):
-            for number in range(len(json.loads(text)) + 20):
+            for key in (*table_of(json.loads(text), of_entry=of_entry), "_target_"):
                 for value in (trap.call, trap.imported, trap.resolved):
                     content = json.loads(text)
-                    entries = content if isinstance(content, list) else content["frames"]
-                    table = entries[0] if of_entry or isinstance(content, list) else content
-                    keys = [*table, "_target_"]
-                    if number < len(keys):
-                        table[keys[number]] = value
-                        (folder / name).write_text(json.dumps(content))
-                        yield
+                    table_of(content, of_entry=of_entry)[key] = value
+                    (folder / name).write_text(json.dumps(content))
+                    yield
 
     return poison
 
@@ -265,9 +264,3 @@ def test_a_run_with_classes_that_the_users_command_names_is_resumed(tmp_path, ca
     other = resume.comparable(tree(composed(*words[:-1])))
     with pytest.raises(DataError, match=r"rasterizer\._target_: "):
         resume.restore(start(()), SCENE, checkpoint.load(tmp_path), tmp_path, other)
-
-
-def test_hydras_flag_that_unpickles_a_file_is_refused(tmp_path, monkeypatch) -> None:
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")  # `main` sets it: undone afterwards
-    with pytest.raises(SettingError, match="--experimental-rerun: there is no such flag"):
-        main([f"--experimental-rerun={tmp_path}/config.pickle"])
