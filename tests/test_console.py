@@ -110,14 +110,3 @@ def test_by_default_the_console_has_the_plan_the_bar_the_result_and_where_to_loo
     assert all(detail in loud.stdout for detail in DETAILS)
     assert "verbose: true" in (folder / "loud" / ".hydra" / "config.yaml").read_text()
     assert len({(folder / name / "point_cloud.ply").read_bytes() for name in ("quiet", "loud")}) == 1
-
-
-@pytest.mark.slow
-def test_of_many_jobs_the_console_has_a_line_each(tmp_path):
-    result = run("-m", "+strategy=gco,svs", *TINY, "fit.iterations=3", "hydra.sweep.dir=all", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
-    for job, name in enumerate(("+strategy=gco", "+strategy=svs")):
-        assert sum(line.startswith(f"job {job}: done in ") for line in result.stdout.splitlines()) == 1
-        (folder,) = (tmp_path / "all").glob(f"{name},*")
-        assert "initial points" in (folder / "run.log").read_text()
-    assert "initial points" not in result.stdout

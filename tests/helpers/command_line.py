@@ -11,10 +11,15 @@ from tests.helpers.forked import Forked, python_path
 
 ALONE = ["fit.video=0", "fit.map_views=0"]
 """A run that writes little beside its field."""
-TINY = [
-    "data.reader.width=64", "data.reader.height=48", "data.reader.views=5", "data.reader.train=2", "data.views.train=2",
-    "data.cloud.init=random", "data.cloud.random_points=60", "fit.iterations=12", "fit.max_degree=1", "skips=none", *ALONE,
-]  # fmt: skip
+OF_DEMO = [
+    "data.reader.width=64",
+    "data.reader.height=48",
+    "data.reader.views=5",
+    "data.reader.train=2",
+    "data.views.train=2",
+]
+RANDOM_POINTS = ["data.cloud.init=random", "data.cloud.random_points=60"]
+TINY = [*OF_DEMO, *RANDOM_POINTS, "fit.iterations=12", "fit.max_degree=1", "skips=none", *ALONE]
 """A tiny run of the demo."""
 
 

@@ -14,13 +14,9 @@ from PIL import Image
 
 from clear_strategies import run
 from tests.helpers import captures, networks
+from tests.helpers.command_line import ALONE, OF_DEMO, RANDOM_POINTS
 
-TINY = ["fit.iterations=4", "fit.video=0", "fit.map_views=0", "data.cloud.init=random",
-        "data.cloud.random_points=60"]  # fmt: skip
-OF_DEMO = [
-    "data.reader.width=64", "data.reader.height=48", "data.reader.views=3", "data.reader.train=2",
-    "data.views.train=2",
-]  # fmt: skip
+TINY = ["fit.iterations=4", *ALONE, *RANDOM_POINTS]
 PACKAGE = "your_package"
 CLEAR = "outputs/clear"
 

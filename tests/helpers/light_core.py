@@ -21,30 +21,22 @@ TRAINERS = ("cv2", "kornia", "skimage", "matplotlib", "msgspec", "scipy", "safet
 
 def main() -> None:
     installed = [name for name in TRAINERS if importlib.util.find_spec(name) is not None]
-    if installed:
-        raise SystemExit(f"the core brings {', '.join(installed)}")
-    if [type(s).__name__ for s in conductor("clear", iterations=30_000).strategies] != ["GCO", "P2G", "SVS"]:
-        raise SystemExit("conductor('clear') is something else")
-    if integration.gsplat.attach is None or "torch" not in rasterizers.available():
-        raise SystemExit("the hosts' functions are not there")
+    assert not installed, f"the core brings {', '.join(installed)}"
+    assert [type(s).__name__ for s in conductor("clear", iterations=30_000).strategies] == ["GCO", "P2G", "SVS"]
+    assert integration.gsplat.attach is not None
+    assert "torch" in rasterizers.available()
     ours = Conductor(GCO())
     means = torch.zeros(8, 3)
     for t in range(1, 4):
         lr, hr = (Grads({"means": torch.randn(8, 3, generator=torch.Generator().manual_seed(t + k))}) for k in (0, 9))
         corrected = ours.strategies[0].correct(lr, hr, None)
         means -= 0.1 * (lr["means"] + corrected["means"])
-    if not bool(means.isfinite().all()):
-        raise SystemExit("the loop diverged")
+    assert bool(means.isfinite().all())
     require_stereo()
-    door = subprocess.run(
-        [sys.executable, "-m", "clear_strategies.run", "+strategy=clear"], capture_output=True, text=True, check=False
-    )
-    if (
-        door.returncode != 2
-        or "pip install 'clear-strategies[train]'" not in door.stderr
-        or door.stderr.count("\n") != 1
-    ):
-        raise SystemExit(f"training without [train] says: {door.stdout}{door.stderr}")
+    command = [sys.executable, "-m", "clear_strategies.run", "+strategy=clear"]
+    door = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (door.returncode, door.stderr.count("\n")) == (2, 1), door.stdout + door.stderr
+    assert "pip install 'clear-strategies[train]'" in door.stderr
 
 
 def require_stereo() -> None:
@@ -56,8 +48,9 @@ def require_stereo() -> None:
     K = torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]])
     found = stereo([wide[:, :64], wide[:, 10:74]], poses, K.repeat(2, 1, 1))
     off = (found.means[:, 2] / 4 - 1).abs()
-    if len(found.means) < 500 or float((off < 0.03).float().mean()) < 0.9 or "without scipy" not in found.summary:
-        raise SystemExit(f"stereo without [train] gives {found.summary}")
+    assert len(found.means) >= 500, found.summary
+    assert float((off < 0.03).float().mean()) >= 0.9, found.summary
+    assert "without scipy" in found.summary
 
 
 if __name__ == "__main__":

@@ -241,9 +241,13 @@ def test_a_setting_that_changes_no_result_changes_no_folders_name(rows):
 @pytest.mark.slow
 def test_one_command_runs_all_its_report_tells_the_rows_apart_and_a_rerun_trains_nothing(tmp_path: Path):
     tiny = ["experiment=table5", "readings=paper", "~protocol", "fit.seed=0", *TINY, "fit.iterations=3"]
+    said = list[str]()
     for more in (["+strategy=baseline,clear"], ["+method=srgs"], ["+method=srgs", "-v", "fit.video=2"]):
         result = run(*tiny, *more, cwd=tmp_path)
         assert result.returncode == 0, result.stderr
+        said.append(result.stdout)
+    jobs = [line.split(" done in ")[0] for line in said[0].splitlines() if " done in " in line]
+    assert (jobs, "initial points" in said[0]) == (["job 0:", "job 1:"], False)  # a line each
     assert "nothing is trained" in result.stdout + result.stderr  # though more is said and shown
     (log,) = tmp_path.glob("multirun/table5/+method=srgs*/run.log")
     assert "strategies named before it take no part" in log.read_text()

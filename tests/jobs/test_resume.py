@@ -18,7 +18,7 @@ from clear_strategies.signals import Interrupted
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.state import fingerprints
 from tests.helpers import captures, forked, toy
-from tests.helpers.command_line import ALONE, TINY, run, times_of_files
+from tests.helpers.command_line import ALONE, RANDOM_POINTS, TINY, run, times_of_files
 from tests.helpers.configs import composed
 from tests.helpers.short_run import SCENE, start
 
@@ -99,8 +99,7 @@ def test_a_setting_of_density_has_no_effect_beside_a_strategy_that_densifies(tmp
     assert caplog.text.count("density.every=50 has no effect: MCMC densifies in place of it.") == 1
 
 
-OF_POINTS = "prior=bicubic data.cloud.init=random data.cloud.random_points=60 fit.max_degree=1 fit.iterations=4"
-MOVED = [*ALONE, *OF_POINTS.split()]
+MOVED = [*ALONE, *RANDOM_POINTS, "prior=bicubic", "fit.max_degree=1", "fit.iterations=4"]
 
 
 def train_on(photos: Path, folder: Path, *more: str) -> None:
