@@ -16,7 +16,7 @@ from tests.stress.bad_inputs import BadInput
 # What the message says beside the setting's name (nothing: that name alone), and the overrides that are refused with it.
 _REFUSED: dict[str, str] = {
     "": """
-        strategies.gco.tolerances=0.1 strategies.svs.dropout.maximum=1 +strategies.mine={} rasterizer.alpha_max=1
+        +strategies.gco.tolerances=0.1 strategies.svs.dropout.maximum=1 +strategies.mine={} rasterizer.alpha_max=1
         rasterizer.alpha_min=0 rasterizer.alpha_min=0.999 rasterizer.transmittance_min=1 rasterizer.near=0
         rasterizer.kernel=-1 rasterizer.memory=0 rasterizer.preset=best rasterizer.background=[0,0]
         rasterizer.background=[0,0,2] strategies.gco.weight_min=0.9 strategies.gco.weight_max=2
