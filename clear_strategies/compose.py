@@ -9,6 +9,7 @@ import logging
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from inspect import signature
@@ -170,20 +171,13 @@ def quoted(value: str) -> str:
     """A string of Hydra's grammar: paths may contain spaces, commas, brackets, equals signs and `${`, or look like
     numbers. A backslash is itself, except before a quote or `${`, where both libraries want two.
     """
-    if _is_itself(value):
-        return value
+    with suppress(HydraException):
+        parsed = OverridesParser.create().parse_override(f"key={value}")
+        if not parsed.is_sweep_override() and parsed.value() == value and not set("$\\") & set(value):
+            return value  # as it is, both libraries read this string
     for_omegaconf = re.sub(r"(\\*)\$\{", r"\1\1\\${", value)
     for_hydra = re.sub(r"(\\*)('|\Z)", lambda end: end[1] * 2 + ("\\'" if end[2] else ""), for_omegaconf)
     return f"'{for_hydra}'"
-
-
-def _is_itself(value: str) -> bool:
-    """Return True if Hydra and OmegaConf read the unquoted value as this string."""
-    try:
-        parsed = OverridesParser.create().parse_override(f"key={value}")
-    except HydraException:
-        return False
-    return not parsed.is_sweep_override() and parsed.value() == value and not set("$\\") & set(value)
 
 
 def require_text(overrides: Iterable[object]) -> None:
