@@ -6,8 +6,8 @@ import argparse
 import logging
 import runpy
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, NoReturn
@@ -83,17 +83,18 @@ def run(options: argparse.Namespace, prepared: Callable[[], Host]) -> int:
         if not options.script.is_file():
             raise DataError(options.script, "script", "is not there", "give the training script of your trainer")
         settings = None if options.strategies is None else _settings(options)
-        with _as_script(options.script, options.rest):
+        folder = str(options.script.parent.resolve())
+        with (  # as in `python script …`
+            replaced_attribute(sys, "argv", [str(options.script), *options.rest]),
+            replaced_attribute(sys, "path", [folder, *sys.path]),
+        ):
             host = prepared()
-            if settings is None:
-                runpy.run_path(str(options.script), run_name="__main__")
-                return 0
-            with host.hook(options.save_lr, settings) as attached:
+            with nullcontext() if settings is None else host.hook(options.save_lr, settings) as attached:
                 runpy.run_path(str(options.script), run_name="__main__")
     except ClearError as error:
         _log.error("%s", error)
         return 2
-    if any(each.attachment.counts["merges"] for each in attached):
+    if attached is None or any(each.attachment.counts["merges"] for each in attached):
         return 0
     _log.error("%s trained without CLEAR: %s.", options.script, host.otherwise)
     return 1
@@ -116,13 +117,3 @@ def _settings(options: argparse.Namespace) -> Settings:
     if options.save_lr is None:
         settings.sr_source(settings.conductor())
     return settings
-
-
-@contextmanager
-def _as_script(script: Path, arguments: Sequence[str]) -> Iterator[None]:
-    """`sys.argv` and `sys.path` as in `python script …`."""
-    with (
-        replaced_attribute(sys, "argv", [str(script), *arguments]),
-        replaced_attribute(sys, "path", [str(script.parent.resolve()), *sys.path]),
-    ):
-        yield

@@ -47,10 +47,6 @@ class Settings:
     def __post_init__(self) -> None:
         require_choice("points", self.points, get_args(Points))
 
-    @property
-    def from_stereo(self) -> bool:
-        return self.points == "stereo"
-
     def conductor(self, iterations: int = REFERENCE_ITERATIONS) -> Conductor:
         """The strategies, with milestones for a training of so many iterations.
 

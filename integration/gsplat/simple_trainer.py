@@ -20,7 +20,7 @@ from clear_strategies.errors import HostError, SettingError
 from clear_strategies.merging.conductor import Conductor
 from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
-from integration.gsplat.attached import Attached, require_bands
+from integration.gsplat.attached import Attached
 from integration.replacing import replaced_everywhere
 from integration.settings import Settings
 from integration.views import HostPhoto, no_stereo, stereo_points
@@ -71,7 +71,7 @@ def install(
     """
     show_in_host()
     wanted = replace(settings or Settings(), **changes)
-    if wanted.from_stereo:
+    if wanted.points == "stereo":
         start_from_stereo(runner_class)
     train, rasterize_splats = runner_class.train, runner_class.rasterize_splats
     last: Attached | None = None  # of the last Runner, which may be evaluated after its training
@@ -79,8 +79,7 @@ def install(
     @functools.wraps(train)
     def train_with_clear(runner: Any) -> Any:
         nonlocal last
-        require_supported(runner.cfg, from_stereo=wanted.from_stereo)
-        require_bands(runner.splats)
+        require_supported(runner.cfg, from_stereo=wanted.points == "stereo")
         chosen = wanted.conductor(runner.cfg.max_steps)
         end_with_strategies(chosen, runner.cfg.strategy, "refine_stop_iter", first=0)
         source, scale = wanted.sr_source(chosen)

@@ -61,7 +61,7 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
                 )
             if save_lr is not None:
                 launcher.save_lr(map(photo_of, scenes[-1].getTrainCameras()), save_lr)
-            if settings.from_stereo and setup.__name__ != _SETUP:
+            if settings.points == "stereo" and setup.__name__ != _SETUP:
                 raise no_stereo(f"the script calls {setup.__name__}, whose arguments belong to its own points")
             attached.append(install(gaussians, scenes[-1], opt, settings))
             undo.callback(attached[-1].remove)

@@ -44,7 +44,7 @@ def install(gaussians: Any, scene: Any, opt: Any, settings: Settings | None = No
     if iterations is None:
         raise HostError(f"{type(opt).__name__} has no iterations, which the options of training_setup have in 3DGS.")
     chosen = wanted.conductor(int(iterations))
-    if wanted.from_stereo:
+    if wanted.points == "stereo":
         start_from_stereo(gaussians, scene, opt)
     end_with_strategies(chosen, opt, "densify_until_iter")
     attached = Attached(
