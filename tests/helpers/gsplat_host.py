@@ -36,8 +36,8 @@ class Host:
     """Parameters, optimizers and LR photos (name -> camera and image) of a gsplat-style trainer."""
 
     def __init__(
-        self, scene, extent=1.0, strategy=None, scaler=None, accumulation=1, eps=1e-15, rasterization=rasterization, **call
-    ):  # fmt: skip
+        self, scene, extent=1.0, strategy=None, accumulation=1, eps=1e-15, rasterization=rasterization, **call
+    ):
         self.rasterization, self.call = rasterization, {"packed": False, **call}
         self.photos = {v.name: v.lr for v in scene.train}
         raw = GaussianField.from_cloud(scene.cloud).raw()
@@ -49,7 +49,7 @@ class Host:
         if strategy is not None:
             strategy.check_sanity(self.splats, self.optimizers)
             self.state = strategy.initialize_state(scene_scale=extent)
-        self.scaler, self.accumulation = scaler, accumulation
+        self.accumulation = accumulation
         self.grads = {}
         self.degree = lambda step: min(3, step)
 
@@ -71,15 +71,12 @@ class Host:
             renders, _, info = self.render(camera, step)
             if self.strategy is not None:
                 self.strategy.step_pre_backward(self.splats, self.optimizers, self.state, step, info)
-            loss = photometric(renders[0], target) / self.accumulation
-            (self.scaler.scale(loss) if self.scaler else loss).backward()
+            (photometric(renders[0], target) / self.accumulation).backward()
             if (step + 1) % self.accumulation == 0:
                 self.grads = {k: p.grad.clone() for k, p in self.splats.items() if p.grad is not None}
                 for optimizer in self.optimizers.values():
-                    self.scaler.step(optimizer) if self.scaler else optimizer.step()
+                    optimizer.step()
                     optimizer.zero_grad(set_to_none=True)
-                if self.scaler:
-                    self.scaler.update()
             if self.strategy is not None:
                 self.strategy.step_post_backward(
                     self.splats, self.optimizers, self.state, step, info, packed=self.call["packed"]

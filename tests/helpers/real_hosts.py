@@ -1,17 +1,21 @@
 """Checkouts of real trainers, run as programs on a CPU, and the toy scene in COLMAP's text files for them."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import write_png
+from clear_strategies.data.ply import write_points
 from tests.helpers import toy
+from tests.helpers.host_parts import FROM_START
 
 ROOT = Path(__file__).resolve().parents[2]
 HOSTS = ROOT / "tests" / "hosts"
@@ -40,6 +44,25 @@ def run(host: Path, *command: object, inside: str = "", more_paths: tuple[Path, 
     return done.stdout + done.stderr
 
 
+def clear(scene: Path, points: str = "own") -> list[object]:
+    """The launcher's options for training with the strategies."""
+    overrides = [f"--overrides={override}" for override in FROM_START]
+    return ["--strategies", "clear", "--points", points, "--sr", scene / "sr", *overrides]
+
+
+def counts(said: str) -> dict[str, int]:
+    """The summary of the work, in what a trainer said."""
+    return {what: int(n) for n, what in re.findall(r"(\d+) (merges|HR renders|structure changes)", said)}
+
+
+def stereo_points(said: str) -> int:
+    """How many initial points stereo found."""
+    (found,) = re.findall(
+        r"points=stereo: ([\d,]+) points in all: [\d,]+ points of dense stereo between the 3 photos", said
+    )
+    return int(found.replace(",", ""))
+
+
 def write_scene(folder: Path) -> None:
     """The toy scene as COLMAP text; the test view is the first, as the trainers' rule of every eighth photo wants it."""
     made = toy.scene(60)
@@ -52,20 +75,16 @@ def write_scene(folder: Path) -> None:
         lines += [f"{i + 1} {' '.join(map(str, numbers))} 1 {name}", ""]
         write_png(folder / "images" / name, images.quantize(view.lr.image))
         write_png(folder / "sr" / name, images.quantize(view.hr.image))
-    points = list(zip(made.cloud.means.tolist(), (made.cloud.colors * 255).int().tolist(), strict=True))
+    points = torch.cat((made.cloud.means, (made.cloud.colors * 255).floor()), 1).tolist()
     sparse, dense = folder / "sparse" / "0", folder / "3_views" / "dense"
     for part in (sparse, dense):
         part.mkdir(parents=True)
     (sparse / "cameras.txt").write_text(f"1 PINHOLE {c.width} {c.height} {c.fx} {c.fy} {c.cx} {c.cy}\n")
     (sparse / "images.txt").write_text("\n".join(lines) + "\n")
     (sparse / "test.txt").write_text("a0.png\n")
-    rows = [f"{i} {_words(x)} {_words(rgb)} 0" for i, (x, rgb) in enumerate(points)]
+    rows = [f"{i} {x} {y} {z} {r:.0f} {g:.0f} {b:.0f} 0" for i, (x, y, z, r, g, b) in enumerate(points)]
     (sparse / "points3D.txt").write_text("\n".join(rows) + "\n")
-    properties = [f"property float {n}" for n in ("x", "y", "z", "nx", "ny", "nz")]
-    properties += [f"property uchar {n}" for n in ("red", "green", "blue")]
-    header = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *properties, "end_header"]
-    body = [f"{_words(x)} 0 0 0 {_words(rgb)}" for x, rgb in points]
-    (dense / "fused.ply").write_text("\n".join([*header, *body]) + "\n")
+    write_points(dense / "fused.ply", made.cloud.means, made.cloud.colors)
     np.save(folder / "poses_bounds.npy", np.tile([*[0.0] * 15, 2.0, 6.0], (4, 1)))
 
 
@@ -84,7 +103,3 @@ def hide_half(folder: Path) -> None:
         image = np.array(Image.open(file).convert("RGBA"))
         image[:, image.shape[1] // 2 :, 3] = 0
         Image.fromarray(image).save(file)
-
-
-def _words(values) -> str:
-    return " ".join(map(str, values))

@@ -7,14 +7,12 @@ their examples/requirements.txt lists must be installed, but for the packages th
 and piexif.
 """
 
-import re
-
 import pytest
 import torch
 
 from clear_strategies.data.ply import read_gaussians
 from tests.helpers.host_parts import FROM_START
-from tests.helpers.real_hosts import HOSTS, checkout, run
+from tests.helpers.real_hosts import HOSTS, checkout, clear, counts, run, stereo_points
 
 STEPS = 30
 END = "    cli(main, cfg, verbose=True)\n"
@@ -44,15 +42,8 @@ def training(scene, results, **more):
 
 
 def launched(host, scene, results, densifier="default", *extra, points="own", status=0, **more):
-    overrides = [f"--overrides={override}" for override in FROM_START]
-    clear = ["--strategies", "clear", "--points", points, "--sr", scene / "sr", *overrides]
-    return start(
-        host, *clear, "simple_trainer.py", densifier, *training(scene, results, **more), *extra, status=status
-    )  # fmt: skip
-
-
-def counts(said):
-    return {what: int(n) for n, what in re.findall(r"(\d+) (merges|HR renders|structure changes)", said)}
+    options = training(scene, results, **more)
+    return start(host, *clear(scene, points), "simple_trainer.py", densifier, *options, *extra, status=status)
 
 
 def stored(results):
@@ -80,12 +71,9 @@ def test_it_trains_densifies_evaluates_and_saves_what_its_own_evaluation_reads(h
 
 def test_it_starts_from_stereo_between_its_photos(host, scene, tmp_path):
     said = launched(host, scene, tmp_path / "run", points="stereo", **{"strategy.refine-start-iter": STEPS})
-    (found,) = re.findall(
-        r"points=stereo: ([\d,]+) points in all: [\d,]+ points of dense stereo between the 3 photos", said
-    )
-    assert f"Number of GS: {found.replace(',', '')}" in said
+    assert f"Number of GS: {stereo_points(said)}" in said
     assert counts(said)["merges"] == STEPS
-    assert len(stored(tmp_path / "run")["means"]) == int(found.replace(",", ""))
+    assert len(stored(tmp_path / "run")["means"]) == stereo_points(said)
     random = launched(
         host, scene, tmp_path / "random", "default", "--init-type", "random", points="stereo", **{"init-num-pts": 80}
     )

@@ -16,7 +16,7 @@ from PIL import Image
 
 from clear_strategies.data.ply import read_gaussians
 from tests.helpers.host_parts import FROM_START
-from tests.helpers.real_hosts import checkout, hide_half, run, spoil_half
+from tests.helpers.real_hosts import checkout, clear, counts, hide_half, run, spoil_half, stereo_points
 
 HOSTS = {
     "3dgs": ["--disable_viewer"],
@@ -44,11 +44,8 @@ def training(host, **more):
 
 
 def launched(host, scene, model, *extra, points="own", status=0, **more):
-    overrides = [f"--overrides={override}" for override in FROM_START]
-    clear = ["--strategies", "clear", "--points", points, "--sr", scene / "sr", *overrides]
-    return run(
-        host, *clear, "train.py", "-s", scene, "-m", model, *training(host, **more), *extra, status=status
-    )  # fmt: skip
+    options = training(host, **more)
+    return run(host, *clear(scene, points), "train.py", "-s", scene, "-m", model, *options, *extra, status=status)
 
 
 def cloud(model):
@@ -58,10 +55,8 @@ def cloud(model):
 def test_it_trains_densifies_evaluates_saves_and_continues(host, scene, tmp_path):
     said = launched(host, scene, tmp_path / "whole")
     assert "densify_until_iter=16 instead of 25" in said  # read from the host's own options
-    counts = {what: int(n) for n, what in re.findall(r"(\d+) (merges|HR renders|structure changes)", said)}
-    assert counts["merges"] == 30
-    assert counts["HR renders"] == 30
-    assert counts["structure changes"] >= 1
+    assert counts(said)["merges"] == counts(said)["HR renders"] == 30
+    assert counts(said)["structure changes"] >= 1
     assert "Evaluating test" in said
     whole = cloud(tmp_path / "whole")
     assert len(whole) != 60
@@ -80,12 +75,9 @@ def test_it_trains_alone(host, scene, tmp_path):
 
 def test_it_starts_from_stereo_between_its_photos(host, scene, tmp_path):
     said = launched(host, scene, tmp_path / "model", points="stereo", densify_until_iter=0)
-    (found,) = re.findall(
-        r"points=stereo: ([\d,]+) points in all: [\d,]+ points of dense stereo between the 3 photos", said
-    )
-    assert f"Number of points at initialisation :  {found.replace(',', '')}" in said
+    assert f"Number of points at initialisation :  {stereo_points(said)}" in said
     assert "30 merges" in said
-    assert len(cloud(tmp_path / "model")) == int(found.replace(",", ""))
+    assert len(cloud(tmp_path / "model")) == stereo_points(said)
 
 
 def test_one_line_in_train_py_does_the_same(host, scene, tmp_path):

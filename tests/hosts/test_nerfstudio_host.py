@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from clear_strategies.data.ply import read_gaussians
-from tests.helpers.real_hosts import run
+from tests.helpers.real_hosts import counts, run
 
 if importlib.util.find_spec("nerfstudio") is None:
     pytest.skip("nerfstudio is not installed: docs/how-to/each-host.md", allow_module_level=True)
@@ -69,11 +69,10 @@ def test_clear_splatfacto_trains_densifies_and_evaluates(scene, tmp_path, strate
         scene, tmp_path / "run", "clear-splatfacto",
         **{"pipeline.model.sr": scene / "sr", "pipeline.model.strategies": strategies, "pipeline.datamanager.points": points},
     )  # fmt: skip
-    said = re.sub(r"\s+", " ", said)  # the console wraps its lines
-    counts = {what: int(n) for n, what in re.findall(r"(\d+) (merges|HR renders|structure changes)", said)}
-    assert counts["merges"] == STEPS
-    assert counts["HR renders"] >= STEPS // 2
-    assert counts["structure changes"] >= 1
+    done = counts(re.sub(r"\s+", " ", said))  # the console wraps its lines
+    assert done["merges"] == STEPS
+    assert done["HR renders"] >= STEPS // 2
+    assert done["structure changes"] >= 1
     assert evaluated(config, tmp_path) > 5
 
 

@@ -77,14 +77,6 @@ def test_all_parameters_and_states_follow_the_densifier_in_a_packed_loop_as_in_a
         assert torch.equal(packed.splats[name], p), name
 
 
-def test_an_anchor_is_taken_once_mcmc_has_ended(gsplat_strategies):
-    anchored = SVS(anchor_start=26, anchor_strength=0.01)
-    conductor = Conductor(anchored, objective=HR_FROM_START)
-    host, clear = gsplat_host.densified(conductor, mcmc(gsplat_strategies))
-    assert len(clear.attachment.conductor.state_dict()) > 0
-    assert {len(p) for p in host.splats.values()} == {len(host.splats["means"])}
-
-
 def test_a_densifier_that_forgets_a_parameter_is_an_error():
     host, _, render = gsplat_host.started()
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN", "detail"):

@@ -31,7 +31,7 @@ def separate(splats):
 @pytest.mark.parametrize("clips", [False, True])
 def test_an_overflow_is_a_step_that_the_scaler_skips_for_f_det_too(clips):
     scene, scaler = toy.scene(20), torch.amp.GradScaler("cpu", init_scale=2.0**14)
-    host = Host(scene, rasterization=functools.partial(autograd.rasterization, backend="torch"), scaler=scaler)
+    host = Host(scene, rasterization=functools.partial(autograd.rasterization, backend="torch"))
     conductor = Conductor(GCO(), objective=HR_FROM_START, detail=DetailRates(decay=0))
     attached(host, scene, conductor, loss_scale=scaler.get_scale)
     for i in range(4):

@@ -28,6 +28,7 @@ from nerfstudio.models import splatfacto
 from nerfstudio.plugins.registry import discover_methods
 
 from clear_strategies.data.photo_files import write_png
+from clear_strategies.data.ply import write_points
 from clear_strategies.errors import SettingError
 from clear_strategies.strategies import random_background
 from integration.nerfstudio import clear_splatfacto
@@ -80,11 +81,7 @@ def capture(tmp_path_factory):
         frames.append({"file_path": f"images/{view.name}.png", "transform_matrix": pose.tolist()})
     c = scene.train[0].lr.camera
     lens = {"fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "w": c.width, "h": c.height}
-    rows = torch.cat((scene.cloud.means, (scene.cloud.colors * 255).round()), 1).tolist()
-    names = [f"property float {x}" for x in "xyz"] + [f"property uchar {x}" for x in ("red", "green", "blue")]
-    header = ["ply", "format ascii 1.0", f"element vertex {len(rows)}", *names, "end_header"]
-    points = [f"{x} {y} {z} {r:.0f} {g:.0f} {b:.0f}" for x, y, z, r, g, b in rows]
-    (folder / "points.ply").write_text("\n".join((*header, *points)) + "\n")
+    write_points(folder / "points.ply", scene.cloud.means, scene.cloud.colors)
     (folder / "transforms.json").write_text(json.dumps(lens | {"frames": frames, "ply_file_path": "points.ply"}))
     return folder
 
