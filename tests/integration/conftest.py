@@ -31,10 +31,12 @@ def inria_capture(inria_host, tmp_path):
 
 @pytest.fixture
 def inria_attached(inria_host, inria_capture):
-    """`made(*strategies)`: CLEAR attached to a fresh model of the host, the model, and its scene."""
+    """`made(*strategies)`: CLEAR attached to a fresh model of the host, the model, and its scene. mask: of all photos."""
 
-    def made(*strategies, objective=host_parts.HR_FROM_START, sr=inria_capture / "sr", **settings):
+    def made(*strategies, objective=host_parts.HR_FROM_START, sr=inria_capture / "sr", mask=None, **settings):
         gaussians, scene = inria_host.setup(host_parts.options(inria_host, inria_capture))
+        for camera in scene.cameras:
+            camera.alpha_mask = mask
         conductor = Conductor(*strategies, objective=objective)
         return attach(gaussians, scene.cameras, conductor, sr=sr, **settings), gaussians, scene
 

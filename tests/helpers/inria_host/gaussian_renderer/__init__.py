@@ -10,7 +10,7 @@ ABSOLUTE = False
 RASTERIZER = load("torch", near=0.01, kernel=0.3, antialiased=False)
 
 
-def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, columns=3, indices=False, dropout=0.0):
+def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, columns=3, indices=False):
     w, h = viewpoint_camera.image_width, viewpoint_camera.image_height
     focal = [size / 2 / torch.tan(torch.tensor(fov, dtype=torch.float64) / 2)
              for size, fov in ((w, viewpoint_camera.FoVx), (h, viewpoint_camera.FoVy))]  # fmt: skip
@@ -26,8 +26,7 @@ def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, columns=3
     features = pc.get_features
     bands = (pc.active_sh_degree + 1) ** 2
     scales = pc.get_scaling * scaling_modifier
-    opacity = torch.nn.functional.dropout(pc.get_opacity[:, 0], dropout)  # DropGaussian's render does this itself
-    splats = Splats(xyz, pc.get_rotation, scales, opacity, features[:, :1], features[:, 1:bands])
+    splats = Splats(xyz, pc.get_rotation, scales, pc.get_opacity[:, 0], features[:, :1], features[:, 1:bands])
     behind = None if bg_color is None else tuple(bg_color.tolist())
     drawn = autograd.draw(over(RASTERIZER, behind), splats, camera, InNdc.apply(dummy, w, h, ABSOLUTE), colors=features)
     return {
