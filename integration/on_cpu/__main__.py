@@ -24,7 +24,7 @@ from integration import launcher
 from integration.gsplat.__main__ import HOST as GSPLAT
 from integration.inria.__main__ import HOST as INRIA
 from integration.on_cpu import cuda, diff_gaussian_rasterization, fused_ssim, gsplat_functions
-from integration.on_cpu.simple_knn import distances_and_indices, mean_distances
+from integration.on_cpu.simple_knn import distances_and_indices
 from integration.settings import Settings
 
 _log = logging.getLogger("integration.on_cpu")  # __name__ is "__main__" here
@@ -114,7 +114,7 @@ def _knn(renderer: Path | None) -> Any:
     root = Path() if renderer is None else renderer.parent
     sources = (root / "submodules" / "simple-knn" / "spatial.h", root / "scene" / "gaussian_model.py")
     indices = any(_RETURNS_INDICES.search(file.read_text(encoding="utf-8")) for file in sources if file.is_file())
-    return SimpleNamespace(distCUDA2=distances_and_indices if indices else mean_distances)
+    return SimpleNamespace(distCUDA2=lambda points: distances_and_indices(points)[slice(None) if indices else 0])
 
 
 def _given(arguments: Sequence[str]) -> Iterator[str]:

@@ -9,17 +9,12 @@ from torch import Tensor
 _K = 3
 
 
-def mean_distances(points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-    """The mean squared distance to the three nearest other points.
+def distances_and_indices(points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, " N"], Int[Tensor, "N 3"]]:
+    """The mean squared distance to the three nearest other points, and as FSGS has them, their indices.
 
     Raises:
         ValueError: there are fewer than four points.
     """
-    return distances_and_indices(points)[0]
-
-
-def distances_and_indices(points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, " N"], Int[Tensor, "N 3"]]:
-    """The same of FSGS, with the indices of the three."""
     from scipy.spatial import cKDTree  # only trainers that ask for it need it
 
     if len(points) <= _K:

@@ -12,8 +12,7 @@ from gsplat.distributed import cli
 from gsplat.rendering import rasterization
 from gsplat.strategy import DefaultStrategy
 
-from clear_strategies.core.points import PointCloud
-from clear_strategies.training.field import GaussianField
+from integration.examples.demo import splats_with_optimizers
 from tests.helpers import toy
 from tests.helpers.host_parts import as_item, photometric
 
@@ -55,10 +54,8 @@ def create_splats_with_optimizers(parser, init_type="sfm", device="cpu"):
     points, colors = torch.from_numpy(parser.points).float(), torch.from_numpy(parser.points_rgb / 255).float()
     if init_type == "random":
         points, colors = torch.rand(50, 3), torch.rand(50, 3)
-    raw = GaussianField.from_cloud(PointCloud(points, colors, init_type)).raw()
-    rates = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
-    splats = torch.nn.ParameterDict({name: torch.nn.Parameter(raw[name].clone()) for name in rates}).to(device)
-    return splats, {n: torch.optim.Adam([splats[n]], lr=lr, eps=1e-15) for n, lr in rates.items()}
+    splats, optimizers = splats_with_optimizers(points, colors)
+    return torch.nn.ParameterDict(splats).to(device), optimizers
 
 
 class Runner:

@@ -24,19 +24,6 @@ from tests.helpers.loops import FUNCTIONS
 from tests.training.test_replayed_iteration import cropped
 
 
-def with_detail():
-    """A host whose function draws depths, too, and whose f_det is 0.2; that function, CLEAR, and what renders a photo."""
-
-    @functools.wraps(autograd.rasterization)
-    def function(*args, render_mode="RGB", **kwargs):
-        image, alpha, info = gsplat_host.rasterization(*args, **kwargs)
-        return (image if "RGB" in render_mode else alpha), alpha, info
-
-    host, clear, render = started(P2G(patch=4), host=Host(toy.scene(20), rasterization=function))
-    host.splats["detail"].data += 0.2
-    return host, function, clear, render
-
-
 def features(function, host, colors):
     p, camera = host.splats, host.photos["view0"].camera
     view = camera.world_to_camera[None], intrinsics(camera)[None], camera.width, camera.height
@@ -46,24 +33,26 @@ def features(function, host, colors):
 @pytest.mark.parametrize("named", [True, False])
 @pytest.mark.parametrize("grad", [True, False])
 def test_normals_beside_the_photo_have_no_detail_feature(named, grad):
-    host, function, clear, render = with_detail()
+    host, clear, render = started(P2G(patch=4))
+    host.splats["detail"].data += 0.2
     render().mean().backward()
     normals = torch.nn.functional.normalize(host.splats["means"].detach())
     with clear.rendering(None) if named else nullcontext(), torch.set_grad_enabled(grad):
         image = features(host.rasterization, host, normals)
-    assert torch.equal(image, features(function, host, normals))
+    assert torch.equal(image, features(gsplat_host.rasterization, host, normals))
     assert clear.attachment.counts["LR renders"] == 1
 
 
 def test_a_depth_pass_is_part_of_its_step_and_colours_without_spherical_harmonics_have_the_detail_feature():
-    _, _, clear, render = with_detail()
+    _, clear, render = started(P2G(patch=4))
     (render().mean() + render(render_mode="ED").mean()).backward()
     assert clear.attachment.counts["LR renders"] == clear.attachment.counts["merges"] == 1
-    host, function, _, _ = with_detail()
+    host, _, _ = started()
+    host.splats["detail"].data += 0.2
     colors = torch.rand(20, 3)
     with torch.no_grad():
         image = features(host.rasterization, host, colors)
-        assert torch.equal(image, features(function, host, colors + host.splats["detail"]))
+        assert torch.equal(image, features(gsplat_host.rasterization, host, colors + host.splats["detail"]))
 
 
 def test_a_photo_of_a_part_of_the_gaussians_is_refused():
@@ -73,18 +62,22 @@ def test_a_photo_of_a_part_of_the_gaussians_is_refused():
         gsplat_host.drawn(host.rasterization, part, host.photos["view0"].camera)
 
 
-@pytest.mark.parametrize("origin", [0.0, 3e5], ids=["near the origin", "in coordinates of a map"])
-def test_cameras_that_lie_close_together_are_told_apart(origin):
-    scene = toy.scene(20)
-    step = 5e-4 if origin == 0 else 0.5
-    poses = [scene.train[0].lr.camera.world_to_camera.clone() for _ in range(3)]
-    views = []
-    for i, pose in enumerate(poses):
-        pose[0, 3] += origin + i * step
-        at = [
-            replace(p, camera=replace(p.camera, world_to_camera=pose)) for p in (scene.train[0].lr, scene.train[0].hr)
-        ]
-        views.append(View(f"frame{i}", *at))
+def beside(*offsets):
+    """The pose of a photo, and views whose cameras are moved from there, along x."""
+    view, views = toy.scene(20).train[0], []
+    for i, x in enumerate(offsets):
+        pose = view.lr.camera.world_to_camera.clone()
+        pose[0, 3] += x
+        lr, hr = (replace(p, camera=replace(p.camera, world_to_camera=pose)) for p in (view.lr, view.hr))
+        views.append(View(f"frame{i}", lr, hr))
+    return view.lr.camera.world_to_camera, views
+
+
+@pytest.mark.parametrize(
+    ("origin", "step"), [(0.0, 5e-4), (3e5, 0.5)], ids=["near the origin", "in coordinates of a map"]
+)
+def test_cameras_that_lie_close_together_are_told_apart(origin, step):
+    _, views = beside(*(origin + i * step for i in range(3)))
     poses = Poses(views)
     for view in views:
         rounded = torch.linalg.inv(torch.linalg.inv(view.lr.camera.world_to_camera))[None]
@@ -94,21 +87,7 @@ def test_cameras_that_lie_close_together_are_told_apart(origin):
 @pytest.mark.parametrize(("ratio", "found"), [(8, False), (12, True)])
 def test_the_nearest_camera_is_the_one_that_is_rendered_if_the_next_is_ten_times_as_far(ratio, found):
     """Poses that a loop optimizes or adds noise to lie beside those of the photos."""
-    scene, noise = toy.scene(20), 1e-5
-    pose = scene.train[0].lr.camera.world_to_camera
-    views = []
-    for i, x in enumerate((noise, -ratio * noise)):
-        at = pose.clone()
-        at[0, 3] += x
-        views.append(
-            View(
-                f"frame{i}",
-                *(
-                    replace(p, camera=replace(p.camera, world_to_camera=at))
-                    for p in (scene.train[0].lr, scene.train[0].hr)
-                ),
-            )
-        )
+    pose, views = beside(1e-5, -ratio * 1e-5)
     with nullcontext() if found else pytest.raises(HostError, match="frame0 and frame1 have the same pose"):
         assert Poses(views).find(pose[None]) is views[0]
 

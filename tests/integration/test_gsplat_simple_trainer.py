@@ -78,13 +78,6 @@ def test_options_that_do_not_work_with_two_scales_are_refused_before_the_first_s
     assert not (trainer.folder / "ckpt.pt").exists()
 
 
-def test_several_processes_are_refused_before_the_first_step(trainer, caplog, monkeypatch):
-    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
-    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
-    assert trainer.run(trainer.sr) == 2
-    assert "CLEAR trains in one process, got 2. Start the training on one device" in caplog.text
-
-
 def test_points_between_photos_are_refused_for_other_than_pinhole_cameras():
     from integration.gsplat.simple_trainer import require_supported
 

@@ -14,6 +14,7 @@ def photometric(image, target):
     return host_parts.photometric(image.permute(1, 2, 0), target.permute(1, 2, 0))
 
 
+@torch.no_grad()
 def densify(gaussians, opt, iteration, package):
     if iteration >= opt.densify_until_iter:
         return
@@ -56,13 +57,11 @@ def loop(opt, gaussians, scene, names=None, between=lambda iteration: None, firs
         loss.backward()
         between(iteration)
         if not opt.step_first:
-            with torch.no_grad():
-                densify(gaussians, opt, iteration, package)
+            densify(gaussians, opt, iteration, package)
         gaussians.optimizer.step()
         gaussians.optimizer.zero_grad(set_to_none=True)
         if opt.step_first:
-            with torch.no_grad():
-                densify(gaussians, opt, iteration, package)
+            densify(gaussians, opt, iteration, package)
         if iteration == opt.checkpoint_iteration:
             torch.save((gaussians.capture(), iteration), opt.checkpoint)
 
