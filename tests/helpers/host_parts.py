@@ -6,14 +6,17 @@ import torch
 from torch import Tensor
 
 from clear_strategies import Objective
+from clear_strategies.core import images
+from clear_strategies.data.photo_files import write_png
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.kernels import losses
 from clear_strategies.schedules import WarmupDecay
+from tests.helpers import toy
 
 FROM_START = ["objective.lambda_hr.start=0", "objective.lambda_hr.full=0", "strategies.p2g.patch=4"]
 """Settings of a run that is too short for the warm-up, and photos that are too small for P2G's patches."""
 FOLDER = Path(__file__).parent / "inria_host"
-N = 24  # Gaussians of the 3DGS-style host in FOLDER
+N = 24  # points of the scene of the 3DGS-style host in FOLDER and of simple_trainer
 HR_FROM_START = Objective(lambda_hr=WarmupDecay(start=0, full=1, decay_from=100, end=100))
 WITHOUT_HR = Objective(lambda_hr=WarmupDecay(peak=0, final=0))
 
@@ -48,6 +51,12 @@ class InNdc(torch.autograd.Function):
         elif ctx.absolute:  # and Mip-Splatting keeps their norm in the third column
             ndc[:, 2] = 3 * ndc[:, :2].norm(dim=1)
         return ndc, None, None, None
+
+
+def write_sr(folder: Path) -> None:
+    """The SR images of the scene of both trainers, in sr/."""
+    for view in toy.scene(N).train:
+        write_png(folder / "sr" / f"{view.name}.png", images.quantize(view.hr.image))
 
 
 def options(host, folder, **settings):

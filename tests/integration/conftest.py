@@ -9,7 +9,7 @@ from safetensors.torch import load_file
 from clear_strategies import Conductor
 from integration.inria import attach
 from integration.inria.__main__ import main
-from tests.helpers import host_parts, toy
+from tests.helpers import host_parts
 from tests.helpers.host_parts import FOLDER, FROM_START
 
 
@@ -23,9 +23,9 @@ def inria_host(monkeypatch):
 
 
 @pytest.fixture
-def inria_capture(inria_host, tmp_path):
-    """A folder with the LR photos and SR images of the toy scene."""
-    importlib.import_module("scene").write(tmp_path, toy.scene(host_parts.N))
+def inria_capture(tmp_path):
+    """A folder with the SR images of the host's photos."""
+    host_parts.write_sr(tmp_path)
     return tmp_path
 
 

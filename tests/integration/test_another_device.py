@@ -57,7 +57,36 @@ with Elsewhere():
 @pytest.mark.slow
 def test_strategies_train_in_a_gsplat_loop_elsewhere(tmp_path):
     pytest.importorskip("gsplat")
-    ran = run(*STRATEGIES, cwd=tmp_path, module="tests.helpers.gsplat_elsewhere")
+    code = """
+import sys
+from dataclasses import replace
+from functools import partial
+
+import torch
+import torch.distributed.tensor  # torch's own imports would not know the generator below
+
+import rasterizers.reference
+from integration.examples import gsplat_loop
+from integration.examples.demo import load_demo
+from rasterizers.autograd import rasterization
+from tests.helpers.elsewhere import NAME, Elsewhere
+
+stereo, generator = gsplat_loop.stereo, torch.Generator
+
+def few(*photos):
+    points = stereo(*photos)
+    return replace(points, means=points.means[:60], colors=points.colors[:60])
+
+rasterizers.reference._TRAITS = replace(rasterizers.reference._TRAITS, devices=frozenset({"cpu", NAME}))
+torch.Generator = lambda _="cpu": generator()  # there are none for the other device
+gsplat_loop.stereo = few
+gsplat_loop.load_demo = lambda device: load_demo(64, 48, device=NAME)
+gsplat_loop.cpu_rasterization = partial(rasterization, backend="torch")
+with Elsewhere():
+    for name in sys.argv[1:]:
+        print(name, gsplat_loop.main(4, name))
+"""
+    ran = run(*STRATEGIES, cwd=tmp_path, code=code)
     assert ran.returncode == 0, ran.stderr
     assert [line.split()[0] for line in ran.stdout.splitlines()] == STRATEGIES
 

@@ -11,12 +11,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from clear_strategies.core import images
-from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.errors import SettingError
 from tests.helpers import gsplat_host, toy
-from tests.helpers.host_parts import FROM_START
+from tests.helpers.host_parts import FROM_START, write_sr
 
 gsplat = pytest.importorskip("gsplat", reason="pip install gsplat")
 SCRIPT = Path(__file__).parents[1] / "helpers" / "simple_trainer.py"
@@ -36,8 +34,7 @@ def trainer(monkeypatch, tmp_path):
     monkeypatch.setattr(gsplat.distributed, "cli", lambda fn, cfg, verbose=False: fn(0, 0, 1, cfg))
     export = gsplat.export_splats
     monkeypatch.setattr(gsplat, "export_splats", export)
-    for view in toy.scene(24).train:
-        write_png(tmp_path / "sr" / f"{view.name}.png", images.quantize(view.hr.image))
+    write_sr(tmp_path)
 
     def run(clear, *trainers):
         monkeypatch.setattr(gsplat.rendering, "rasterization", functools.partial(gsplat_host.rasterization))
