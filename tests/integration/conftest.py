@@ -4,7 +4,6 @@ import importlib
 import sys
 
 import pytest
-from safetensors.torch import load_file
 
 from clear_strategies import Conductor
 from integration.inria import attach
@@ -44,14 +43,21 @@ def inria_attached(inria_host, inria_capture):
 
 
 @pytest.fixture
-def inria_launched(inria_host, inria_capture):
-    """`run(name, *the script's arguments, points="own")`: the file that the unchanged train.py writes with CLEAR."""
+def inria_launched(inria_host, inria_capture, caplog):
+    """`run(*arguments)`: the exit status of the host's train.py with CLEAR.
 
-    def run(name, *arguments, points="own"):
-        file = inria_capture / name
-        clear = ["--points", points, "--sr", str(inria_capture / "sr"), *(f"--overrides={row}" for row in FROM_START)]
-        script = [str(FOLDER / "train.py"), "-s", str(inria_capture), "--save", str(file)]
-        assert main([*clear, *script, "--densify_until_iter", "0", *arguments]) == 0
-        return load_file(file)
+    Args:
+        clear: more of CLEAR's options. change: (old, new), a text of the script.
+    """
+    caplog.set_level("INFO")
+
+    def run(*arguments, clear=(), change=None):
+        script = FOLDER / "train.py"
+        if change is not None:
+            changed = script.read_text().replace(*change)
+            script = inria_capture / "changed.py"
+            script.write_text(changed)
+        options = ["--sr", inria_capture / "sr", *(f"--overrides={row}" for row in FROM_START), *clear]
+        return main([*map(str, (*options, script, "-s", inria_capture, *arguments))])
 
     return run

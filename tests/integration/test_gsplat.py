@@ -17,10 +17,8 @@ from integration.autograd_shot import HostOutput
 from integration.gsplat import attach
 from rasterizers import autograd
 from tests.helpers import toy
-from tests.helpers.backends import needs
 from tests.helpers.gsplat_host import RASTERIZER, Host, attached, drawn, in_double, rasterization, started, trained
 from tests.helpers.host_parts import HR_FROM_START
-from tests.helpers.loops import FUNCTIONS
 
 STEPS = 50
 EPS = 1e-10
@@ -157,11 +155,15 @@ def test_a_renderer_without_projected_centres_and_radii_of_gsplat_1_4_are_suppor
         assert torch.equal(old[name], g), name
 
 
-@needs("cpp")
-@pytest.mark.parametrize("function", FUNCTIONS)
+def gsplats(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **call):
+    """A function of gsplat's signature, without `rgb_offset`."""
+    return rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **call)
+
+
+@pytest.mark.parametrize("function", [rasterization, gsplats], ids=["ours", "gsplat's"])
 def test_colours_in_float16_have_the_gradients_of_float32(function):
     """`sh_fp16` of gsplat 1.6 casts what is drawn; the parameters stay float32."""
-    full, halved = (first_gradient(3, rasterization=FUNCTIONS[function], sh_fp16=half) for half in (False, True))
+    full, halved = (first_gradient(3, rasterization=function, sh_fp16=half) for half in (False, True))
     for name in ("means", "scales", "opacities", "sh0", "shN", "detail"):  # round Gaussians have none of their quats
         g, in_half = full[name], halved[name]
         assert float((in_half - g).norm()) < 0.01 * float(g.norm()), name

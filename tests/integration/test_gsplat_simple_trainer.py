@@ -4,7 +4,6 @@ import copy
 import functools
 import logging
 import pickle
-import runpy
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -107,19 +106,6 @@ def test_a_script_without_a_runner_that_trains_exits_with_an_error(trainer, capl
     script.write_text("")
     assert trainer.run(trainer.sr) == 1
     assert "trained without CLEAR" in caplog.text
-
-
-def test_one_line_before_cli_does_the_same(trainer, monkeypatch, caplog):
-    line = f"install(Runner, sr={str(trainer.folder / 'sr')!r})"
-    text = SCRIPT.read_text().replace("    cli(main, cfg", f"    {line}\n    cli(main, cfg")
-    edited = trainer.folder / "edited.py"
-    edited.write_text(
-        "from integration.gsplat import install\n" + text.replace("from __future__ import annotations\n", "")
-    )
-    monkeypatch.setattr("sys.argv", ["edited.py", "--result_dir", str(trainer.folder)])
-    with caplog.at_level(logging.INFO):
-        runpy.run_path(str(edited), run_name="__main__")
-    assert "8 merges" in caplog.text
 
 
 def test_a_second_runner_in_one_process_trains_too(trainer, monkeypatch):

@@ -2,7 +2,6 @@
 
 import copy
 import importlib
-import logging
 import math
 import pickle
 import runpy
@@ -360,22 +359,21 @@ def test_views_need_unique_names_and_sr_images_of_the_right_size(inria_host, inr
 
 
 # ---- CLEAR in a 3DGS-style train.py: by one line in it, or by `python -m integration.inria train.py …` without any change
-SETUP = "    gaussians.training_setup(opt)\n"
+SETUP = "gaussians.training_setup(opt)"
+TRAINING = "    training(parser().parse_args())\n"
 
 
-def test_one_line_and_none_give_the_same_file(inria_host, inria_capture, caplog, monkeypatch):
-    settings, sr = [*FROM_START, "strategies.svs.anchor_start=7500"], str(inria_capture / "sr")
-    script = ["-s", str(inria_capture), "--iterations", "8", "--densify_until_iter", "7", "--save"]
-    clear = ["--sr", sr, *(f"--overrides={s}" for s in settings)]
-    with caplog.at_level(logging.INFO):
-        assert main([*clear, str(FOLDER / "train.py"), *script, str(inria_capture / "none")]) == 0
+def test_one_line_and_none_give_the_same_file(inria_host, inria_capture, inria_launched, caplog, monkeypatch):
+    late, sr = "strategies.svs.anchor_start=7500", str(inria_capture / "sr")
+    script = ["--iterations", "8", "--densify_until_iter", "7", "--save"]
+    assert inria_launched(*script, inria_capture / "none", clear=["--overrides", late]) == 0
     assert "8 merges" in caplog.text
     assert not hasattr(inria_host.render, "__wrapped__")
-    source = (FOLDER / "train.py").read_text()
-    line = f"    install(gaussians, scene, opt, overrides={settings!r}, sr={sr!r})\n"
+    line = f"; install(gaussians, scene, opt, overrides={[*FROM_START, late]!r}, sr={sr!r})"
     edited = inria_capture / "edited.py"
-    edited.write_text("from integration.inria import install\n" + source.replace(SETUP, SETUP + line, 1))
-    monkeypatch.setattr(sys, "argv", ["edited.py", *script, str(inria_capture / "one")])
+    source = (FOLDER / "train.py").read_text().replace(SETUP, SETUP + line, 1)
+    edited.write_text("from integration.inria import install\n" + source)
+    monkeypatch.setattr(sys, "argv", ["edited.py", "-s", str(inria_capture), *script, str(inria_capture / "one")])
     runpy.run_path(str(edited), run_name="__main__")
     one, none = load_file(inria_capture / "one"), load_file(inria_capture / "none")
     assert len(one["xyz"]) != N  # the host has densified
@@ -405,45 +403,40 @@ def test_schedules_are_those_of_the_hosts_own_options(inria_host, inria_capture)
 
 @pytest.mark.parametrize("points", ["own", "stereo"])
 def test_a_run_continues_from_the_hosts_checkpoint(points, inria_capture, inria_launched, caplog) -> None:
-    checkpoint, common = str(inria_capture / "5.pth"), ["--iterations", "8", "--sh_interval", "1"]
-    with caplog.at_level(logging.INFO):
-        whole = inria_launched(
-            "whole", *common, "--checkpoint", checkpoint, "--checkpoint_iteration", "5", points=points
-        )
+    checkpoint = inria_capture / "5.pth"
+
+    def saved(name, *arguments):
+        common = "--iterations", "8", "--sh_interval", "1", "--densify_until_iter", "0", "--save", inria_capture / name
+        assert inria_launched(*common, *arguments, clear=["--points", points]) == 0
+        return load_file(inria_capture / name)
+
+    whole = saved("whole", "--checkpoint", checkpoint, "--checkpoint_iteration", "5")
     assert caplog.text.count("points=stereo: ") == (points == "stereo")
     assert "8 merges" in caplog.text
     assert (len(whole["xyz"]) == N) == (points == "own")
-    resumed = inria_launched("resumed", *common, "--start_checkpoint", checkpoint, points=points)
+    resumed = saved("resumed", "--start_checkpoint", checkpoint)
     for name, rows in whole.items():
         assert torch.allclose(rows, resumed[name], atol=1e-5), name
 
 
-def test_a_checkpoint_without_clear_is_refused(inria_host, inria_capture, caplog):
-    opt = options(inria_host, inria_capture)
-    gaussians, _ = inria_host.setup(opt)
+def test_a_checkpoint_without_clear_is_refused(inria_host, inria_capture, inria_launched, caplog):
+    gaussians, _ = inria_host.setup(options(inria_host, inria_capture))
     torch.save((gaussians.capture(), 3), inria_capture / "3.pth")
-    command = ["--sr", str(inria_capture / "sr"), str(FOLDER / "train.py"), "-s", str(inria_capture)]
-    assert main([*command, "--start_checkpoint", str(inria_capture / "3.pth")]) == 2
+    assert inria_launched("--start_checkpoint", inria_capture / "3.pth") == 2
     assert "written without CLEAR" in caplog.text
 
 
-def test_save_lr_writes_the_photos_as_they_are_trained_on_and_stops(inria_host, inria_capture):
+def test_save_lr_writes_the_photos_as_they_are_trained_on_and_stops(inria_capture, inria_launched):
     with pytest.raises(SystemExit) as stopped:
-        main(["--save-lr", str(inria_capture / "lr"), str(FOLDER / "train.py"), "-s", str(inria_capture)])
+        inria_launched(clear=["--save-lr", inria_capture / "lr"])
     assert stopped.value.code == 0
     written = sorted((inria_capture / "lr").iterdir())
     assert [file.name for file in written] == [f"{view.name}.png" for view in toy.scene(N).train]
     assert Image.open(written[0]).size == (24, 16)
 
 
-def test_each_of_two_models_that_a_script_trains_has_the_strategies(inria_host, inria_capture, caplog):
-    source = (FOLDER / "train.py").read_text()
-    script, arguments = inria_capture / "two.py", ["-s", str(inria_capture), "--iterations", "4", "--save"]
-    script.write_text(
-        source.replace("    training(parser()", "    training(parser().parse_args())\n    training(parser()")
-    )
-    with caplog.at_level(logging.INFO):
-        assert main(["--sr", str(inria_capture / "sr"), str(script), *arguments, str(inria_capture / "it")]) == 0
+def test_each_of_two_models_that_a_script_trains_has_the_strategies(inria_host, inria_launched, caplog):
+    assert inria_launched("--iterations", "4", change=(TRAINING, 2 * TRAINING)) == 0
     assert caplog.text.count("4 merges") == 2
     assert not hasattr(inria_host.render, "__wrapped__")
 
@@ -462,38 +455,29 @@ def test_wrong_arguments_are_refused_before_the_host_starts(arguments, message, 
     assert message in caplog.text
 
 
-def script_with_setup(inria_capture, call):
-    """The host's train.py, in which `call` stands for `gaussians.training_setup(opt)`."""
-    script = inria_capture / "changed.py"
-    script.write_text((FOLDER / "train.py").read_text().replace("gaussians.training_setup(opt)", call))
-    return [str(script), "-s", str(inria_capture), "--iterations", "4"]
-
-
 def training_setup_pp(gaussians, opt, rates):
     type(gaussians).own_setup(gaussians, opt)
 
 
 @pytest.mark.parametrize("points", ["own", "stereo"])
 def test_another_method_that_sets_a_model_up_is_known_by_its_name(
-    points, inria_host, inria_capture, caplog, monkeypatch
+    points, inria_host, inria_launched, caplog, monkeypatch
 ):
     """InstantSplat's for a rate of each point, which those of stereo have not."""
     monkeypatch.setattr(inria_host.GaussianModel, "own_setup", inria_host.GaussianModel.training_setup, raising=False)
     monkeypatch.setattr(inria_host.GaussianModel, "training_setup_pp", training_setup_pp, raising=False)
-    run = script_with_setup(inria_capture, "gaussians.training_setup_pp(opt, None)")
-    with caplog.at_level(logging.INFO):
-        status = main(["--points", points, "--sr", str(inria_capture / "sr"), *run])
+    change = SETUP, "gaussians.training_setup_pp(opt, None)"
+    status = inria_launched("--iterations", "4", clear=["--points", points], change=change)
     assert (status, "4 merges" in caplog.text) == ((0, True) if points == "own" else (2, False))
     assert ("the script calls training_setup_pp" in caplog.text) == (points == "stereo")
     assert inria_host.GaussianModel.training_setup_pp is training_setup_pp
 
 
 def test_a_model_that_would_train_without_the_strategies_is_refused_at_its_first_rendering(
-    inria_host, inria_capture, caplog, monkeypatch
+    inria_host, inria_launched, caplog, monkeypatch
 ):
     monkeypatch.setattr(inria_host.GaussianModel, "own_setup", inria_host.GaussianModel.training_setup, raising=False)
-    run = script_with_setup(inria_capture, "gaussians.own_setup(opt)")
-    assert main(["--sr", str(inria_capture / "sr"), *run]) == 2
+    assert inria_launched(change=(SETUP, "gaussians.own_setup(opt)")) == 2
     assert "GaussianModel would train without CLEAR" in caplog.text
     assert not hasattr(inria_host.render, "__wrapped__")
 
