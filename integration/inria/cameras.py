@@ -38,9 +38,7 @@ class HostViews:
         all: by the order of the cameras. factor: of all views.
         masks: by the name of a view, what the host multiplies the LR image by after rendering.
 
-    Raises:
-        SettingError: there is no camera.
-        DataError: two cameras have one name; an SR image is missing, or is not `factor` times as large as its photo.
+    Raises: see `Attached`.
     """
 
     def __init__(

@@ -68,11 +68,7 @@ def seed_with_stereo(datamanager: Any) -> PointCloud:
 
 
 def photos_of(datamanager: Any, device: torch.device | str = "cpu") -> list[HostPhoto]:
-    """The photos that splatfacto trains on, undistorted and over black, in the world of the data manager's cameras.
-
-    Raises:
-        SettingError: the photos are not kept in memory.
-    """
+    """The photos that splatfacto trains on, undistorted and over black, in the world of the data manager's cameras."""
     items = _cached(datamanager)  # read first: it undistorts the photos and corrects the cameras
     cameras, files = datamanager.train_dataset.cameras, datamanager.train_dataset.image_filenames
     Ks, poses = cameras.get_intrinsics_matrices(), world_to_camera(cameras.camera_to_worlds)

@@ -2,7 +2,6 @@
 
 import copy
 import functools
-import logging
 import pickle
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,12 +16,11 @@ from tests.helpers.host_parts import FROM_START, write_sr
 
 gsplat = pytest.importorskip("gsplat", reason="pip install gsplat")
 SCRIPT = Path(__file__).parents[1] / "helpers" / "simple_trainer.py"
-OVERRIDES = [f"--overrides={override}" for override in FROM_START]
 
 
 @pytest.fixture
-def trainer(monkeypatch, tmp_path):
-    """`run(options of CLEAR, options of the trainer)`, the exit status; files go to `folder`."""
+def launched(monkeypatch, tmp_path, caplog):
+    """`run(*options of the trainer, clear=more options of CLEAR)`, the exit status; files go to `tmp_path`."""
     import gsplat.distributed
     import gsplat.rendering
 
@@ -31,47 +29,40 @@ def trainer(monkeypatch, tmp_path):
     # a function of its own, since CLEAR replaces it in every module
     monkeypatch.setattr(gsplat.rendering, "rasterization", functools.partial(gsplat_host.rasterization))
     monkeypatch.setattr(gsplat.distributed, "cli", lambda fn, cfg, verbose=False: fn(0, 0, 1, cfg))
-    export = gsplat.export_splats
-    monkeypatch.setattr(gsplat, "export_splats", export)
+    monkeypatch.setattr(gsplat, "export_splats", gsplat.export_splats)
+    caplog.set_level("INFO")
     write_sr(tmp_path)
 
-    def run(clear, *trainers):
-        monkeypatch.setattr(gsplat.rendering, "rasterization", functools.partial(gsplat_host.rasterization))
-        monkeypatch.setattr(gsplat, "export_splats", export)
-        return main([*clear, str(SCRIPT), "--result_dir", str(tmp_path), *trainers])
+    def run(*options, clear=(), script=SCRIPT):
+        ours = ["--sr", tmp_path / "sr", *(f"--overrides={override}" for override in FROM_START), *clear]
+        return main([*map(str, (*ours, script, "--result_dir", tmp_path, *options))])
 
-    return SimpleNamespace(run=run, folder=tmp_path, sr=["--sr", str(tmp_path / "sr")])
-
-
-def rendered(splats):
-    """The first training view from six tensors of gsplat's names."""
-    return gsplat_host.drawn(gsplat_host.rasterization, splats, toy.scene(24).train[0].lr.camera)[0]
+    return run
 
 
-def test_its_checkpoint_and_its_ply_are_the_model_that_was_evaluated(trainer, caplog):
-    with caplog.at_level(logging.INFO):
-        assert trainer.run([*trainer.sr, *OVERRIDES], "--pose_noise", "0.01") == 0
+def test_its_checkpoint_and_its_ply_are_the_model_that_was_evaluated(launched, tmp_path, caplog):
+    assert launched("--pose_noise", "0.01") == 0
     assert "8 merges" in caplog.text  # views are recognised by their index
     assert "refine_stop_iter=4 instead of 7" in caplog.text  # SVS ends densification at half of the steps
-    evaluated = torch.load(trainer.folder / "image.pt")
-    splats = torch.load(trainer.folder / "ckpt.pt")["splats"]
+    evaluated = torch.load(tmp_path / "image.pt")
+    splats = torch.load(tmp_path / "ckpt.pt")["splats"]
     assert set(splats) == {"means", "quats", "scales", "opacities", "sh0", "shN"}
-    assert torch.allclose(rendered(splats), evaluated, atol=1e-5)
-    stored = read_gaussians(trainer.folder / "cloud.ply")
+    rendered = gsplat_host.drawn(gsplat_host.rasterization, splats, toy.scene(24).train[0].lr.camera)[0]
+    assert torch.allclose(rendered, evaluated, atol=1e-5)
+    stored = read_gaussians(tmp_path / "cloud.ply")
     assert torch.allclose(stored.sh0.reshape(-1, 3), splats["sh0"].reshape(-1, 3), atol=1e-6)
 
 
-def test_a_strategy_that_densifies_has_no_effect_and_says_so(trainer, caplog):
-    with caplog.at_level(logging.INFO):
-        assert trainer.run([*trainer.sr, *OVERRIDES, "--strategies", "clear,mcmc"], "--refine_stop_iter", "0") == 0
+def test_a_strategy_that_densifies_has_no_effect_and_says_so(launched, caplog):
+    assert launched("--refine_stop_iter", "0", clear=["--strategies", "clear,mcmc"]) == 0
     assert "MCMC has no effect here: the host keeps its own density control" in caplog.text
     assert "structure change" not in caplog.text
 
 
-def test_options_that_do_not_work_with_two_scales_are_refused_before_the_first_step(trainer, caplog):
-    assert trainer.run(trainer.sr, "--app_opt") == 2
+def test_options_that_do_not_work_with_two_scales_are_refused_before_the_first_step(launched, tmp_path, caplog):
+    assert launched("--app_opt") == 2
     assert "app_opt: CLEAR needs False, got True: its colours are no spherical harmonics." in caplog.text
-    assert not (trainer.folder / "ckpt.pt").exists()
+    assert not (tmp_path / "ckpt.pt").exists()
 
 
 def test_points_between_photos_are_refused_for_other_than_pinhole_cameras():
@@ -84,43 +75,42 @@ def test_points_between_photos_are_refused_for_other_than_pinhole_cameras():
     require_supported(SimpleNamespace(), from_stereo=True)
 
 
-def test_save_lr_writes_the_photos_as_they_are_trained_on_and_stops(trainer):
+def test_save_lr_writes_the_photos_as_they_are_trained_on_and_stops(launched, tmp_path):
     with pytest.raises(SystemExit) as stopped:
-        trainer.run(["--save-lr", str(trainer.folder / "lr")])
+        launched(clear=["--save-lr", tmp_path / "lr"])
     assert stopped.value.code == 0
-    assert len(list((trainer.folder / "lr").iterdir())) == 3
+    assert len(list((tmp_path / "lr").iterdir())) == 3
 
 
-def test_a_script_without_a_runner_that_trains_exits_with_an_error(trainer, caplog, tmp_path, monkeypatch):
+def test_a_script_without_a_runner_that_trains_exits_with_an_error(launched, caplog, tmp_path):
     script = tmp_path / "other.py"
     script.write_text("from gsplat.distributed import cli\ncli(lambda *_: None, None)")
-    monkeypatch.setattr("tests.integration.test_gsplat_simple_trainer.SCRIPT", script)
-    assert trainer.run(trainer.sr) == 2
+    assert launched(script=script) == 2
     assert "has no Runner" in caplog.text
     trains = "import torch\np = torch.ones(1, requires_grad=True)\np.sum().backward()\ntorch.optim.SGD([p], 0.1).step()"
     script.write_text(f"{trains}\nopen({str(tmp_path / 'trained')!r}, 'w').close()")
-    assert trainer.run(trainer.sr) == 2
+    assert launched(script=script) == 2
     assert "trains, but does not call gsplat's cli" in caplog.text
     assert not (tmp_path / "trained").exists()
     torch.optim.SGD([torch.ones(1, requires_grad=True)], 0.1).step()  # a later one in the same process
     script.write_text("")
-    assert trainer.run(trainer.sr) == 1
+    assert launched(script=script) == 1
     assert "trained without CLEAR" in caplog.text
 
 
-def test_a_second_runner_in_one_process_trains_too(trainer, monkeypatch):
+def test_a_second_runner_in_one_process_trains_too(launched, tmp_path, monkeypatch):
     from integration.gsplat import install
     from tests.helpers import simple_trainer
 
     runner_class = type("Runner", (simple_trainer.Runner,), {})
     monkeypatch.setattr(simple_trainer, "rasterization", gsplat.rendering.rasterization)
-    install(runner_class, sr=trainer.folder / "sr", overrides=FROM_START)
+    install(runner_class, sr=tmp_path / "sr", overrides=FROM_START)
     drawn = []
     for name in ("first", "second"):
-        (trainer.folder / name).mkdir()
-        runner = runner_class(0, 0, 1, simple_trainer.Config(str(trainer.folder / name)))
+        (tmp_path / name).mkdir()
+        runner = runner_class(0, 0, 1, simple_trainer.Config(str(tmp_path / name)))
         runner.train()
-        drawn.append(torch.load(trainer.folder / name / "image.pt"))
+        drawn.append(torch.load(tmp_path / name / "image.pt"))
         assert runner.clear.attachment.counts["merges"] == 8
     assert torch.equal(*drawn)
     copied = copy.deepcopy(runner.splats)
