@@ -70,21 +70,15 @@ def test_fifty_steps_equal_those_of_our_own_trainer(name):
     assert clear.attachment.counts["HR renders"] == STEPS - 2  # lambda_HR is 0 until t = 2
 
 
-def test_renderings_of_no_photo_show_the_detail_feature_and_train_nothing():
+def test_renderings_of_no_photo_train_nothing_and_look_the_same_once_the_detail_feature_is_folded():
     host, clear, _ = started()
-    elsewhere = toy.camera(1.2).scaled(0.25)
-    with torch.no_grad():
-        before = host.render(elsewhere)[0]
-        host.splats["detail"] += 0.2
-        shown = host.render(elsewhere)[0]
-    with_gradients = host.render(elsewhere)[0]
-    assert torch.equal(with_gradients, shown)
-    assert float((shown - before).max()) > 0.05
-    with_gradients.sum().backward()
+    host.splats["detail"].data += 0.2
+    shown = host.render(toy.camera(1.2).scaled(0.25))[0]
+    shown.sum().backward()
     assert host.splats["detail"].grad is None
     clear.fold_detail()
-    assert torch.allclose(host.render(elsewhere)[0], shown, atol=1e-6)
-    assert float(host.splats["detail"].abs().max()) == 0
+    assert torch.allclose(host.render(toy.camera(1.2).scaled(0.25))[0], shown, atol=1e-6)
+    assert not host.splats["detail"].any()
     assert clear.attachment.counts["LR renders"] == 0
 
 
@@ -184,8 +178,6 @@ def test_what_cannot_be_attached_or_drawn_is_refused():
         render()
     with pytest.raises(ValueError, match="at least one view"):
         attach(host.splats, host.optimizers, (), Conductor())
-    with pytest.raises(HostError, match=r"in torch\.inference_mode\(\) cannot be trained"), torch.inference_mode():
-        attach(host.splats, host.optimizers, scene.train, Conductor())
     with pytest.raises(HostError, match=r"must be a dict or a torch\.nn.ParameterDict.*got list"):
         attach([*host.splats.values()], host.optimizers, scene.train, Conductor())
     del host.splats["sh0"]
