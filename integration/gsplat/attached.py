@@ -98,6 +98,8 @@ class Attached:
             )
         self._names = {name: name for name in PARAMETERS} | dict(names or {})
         self._params = params
+        if torch.is_inference_mode_enabled():
+            raise HostError("tensors that attach makes in torch.inference_mode() cannot be trained. Call it outside.")
         if not isinstance(params, MutableMapping | torch.nn.ParameterDict):
             raise HostError(
                 f"params must be a dict or a torch.nn.ParameterDict, to which f_det is added, got {type(params).__name__}. Pass "

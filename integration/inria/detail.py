@@ -59,10 +59,20 @@ class DetailFeature:
         return {"value": self.value.detach().clone(), "adam": self._adam.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state; the host has loaded its parameters already."""
+        """Continue from a state; the host has loaded its parameters already.
+
+        Raises:
+            HostError: the state holds another number of Gaussians.
+        """
         self._rows.restart()
         self._parents = None
-        self._value = torch.nn.Parameter(state["value"].to(self._means()))
+        means = self._means()
+        if len(state["value"]) != len(means):
+            raise HostError(
+                f"the checkpoint holds f_det of {len(state['value']):,} Gaussians, but {len(means):,} Gaussians were loaded. "
+                "Load both from one checkpoint."
+            )
+        self._value = torch.nn.Parameter(state["value"].to(means))
         self._adam = detail_adam(self._value, self._rates)
         self._adam.load_state_dict(state["adam"])
 

@@ -154,13 +154,15 @@ class GaussianRasterizer(torch.nn.Module):
             means2D: any values; its gradient will be that of the projected centres.
 
         Raises:
-            ValueError: shapes are given as covariances.
+            ValueError: colours or shapes are given twice, not at all, or as covariances.
         """
         if cov3D_precomp is not None or scales is None or rotations is None:
             raise ValueError(
                 "shapes must be given as scales and rotations; cov3D_precomp (--compute_cov3D_python) needs the CUDA "
                 "rasterizer."
             )
+        if (shs is None) == (colors_precomp is None):
+            raise ValueError("exactly one of shs and colors_precomp must be given.")
         s = self.raster_settings
         camera, kernel = s.camera(), _KERNEL if s.kernel_size is None else float(s.kernel_size)
         antialiased = s.kernel_size is not None or bool(s.antialiasing)

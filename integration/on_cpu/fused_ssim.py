@@ -22,7 +22,12 @@ def fused_ssim(
     Args:
         padding: "same": all windows, over zeros beyond the images; "valid": the windows inside them.
         train: without effect.
+
+    Raises:
+        ValueError: another padding.
     """
+    if padding not in ("same", "valid"):
+        raise ValueError(f"padding must be 'same' or 'valid', got {padding!r}.")
     inset = _REACH if padding == "valid" else 0
     pairs = zip(*(images.detach().permute(0, 2, 3, 1) for images in (img1, img2)), strict=True)
     values, gradients = zip(*(ssim(x, y, inset) for x, y in pairs), strict=True)

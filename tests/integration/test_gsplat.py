@@ -178,6 +178,8 @@ def test_what_cannot_be_attached_or_drawn_is_refused():
         render()
     with pytest.raises(ValueError, match="at least one view"):
         attach(host.splats, host.optimizers, (), Conductor())
+    with pytest.raises(HostError, match=r"in torch\.inference_mode\(\) cannot be trained"), torch.inference_mode():
+        attach(host.splats, host.optimizers, scene.train, Conductor())
     with pytest.raises(HostError, match=r"must be a dict or a torch\.nn.ParameterDict.*got list"):
         attach([*host.splats.values()], host.optimizers, scene.train, Conductor())
     del host.splats["sh0"]

@@ -147,6 +147,8 @@ def test_what_only_the_cuda_rasterizers_have_is_refused():
     with pytest.raises(ValueError, match="confidence must be 1"):
         GaussianRasterizer(settings("fsgs", confidence=torch.zeros(9, 1)))
     draw = GaussianRasterizer(settings("3dgs"))
+    with pytest.raises(ValueError, match="exactly one of shs and colors_precomp"):
+        draw(**cloud(), colors_precomp=torch.ones(9, 3))
     with pytest.raises(ValueError, match="cov3D_precomp"):
         draw(**{k: x for k, x in cloud().items() if k not in ("scales", "rotations")}, cov3D_precomp=torch.ones(9, 6))
 
@@ -183,6 +185,8 @@ def test_fused_ssim_and_its_gradient_are_those_of_the_definition(padding, dtype)
     (3 * ours).backward()
     (3 * value).backward()
     assert torch.allclose(a.grad.double(), b.grad, atol=2e-6 * float(b.grad.abs().max()) + 1e-9, rtol=1e-4)
+    with pytest.raises(ValueError, match="'same' or 'valid'"):
+        fused_ssim(a, y, padding="reflect")
 
 
 def test_gsplats_adam_steps_visible_rows_alone():
