@@ -34,7 +34,7 @@ ENTRY_POINTS = {
     for entry, own in re.findall(r"`(\w+)`(?: \((.*?)\))?", PAGE.split("The entry points")[1].split("\n\n")[0])
 }
 
-HEAVY = {"cv2", "kornia", "PIL", "warp", "gsplat", "hydra", "omegaconf"}
+HEAVY = {"cv2", "kornia", "open3d", "PIL", "warp", "gsplat", "hydra", "omegaconf"}
 PACKAGES = ("clear_strategies", "rasterizers", "integration")
 
 

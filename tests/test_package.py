@@ -61,15 +61,15 @@ def test_mypy_checks_a_users_file_against_the_packages_as_they_are_installed(tmp
 @pytest.mark.parametrize(
     ("system", "machine", "named"),
     [
-        ("linux", "x86_64", {"pycolmap"}),
+        ("linux", "x86_64", {"open3d-cpu", "pycolmap"}),
         ("linux", "aarch64", set()),
-        ("darwin", "arm64", {"pycolmap"}),
+        ("darwin", "arm64", {"open3d", "pycolmap"}),
     ],
 )
 def test_the_extras_name_only_what_has_a_wheel_for_the_system(system, machine, named):
-    """Of pycolmap there is no source on PyPI either: pip would install nothing of [photos] and [dev]."""
+    """Of pycolmap and of both Open3D there is no source on PyPI either: pip would install nothing of [photos] and [dev]."""
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    wanted = [Requirement(line) for line in extras["colmap"]]
+    wanted = [Requirement(line) for extra in ("open3d", "colmap") for line in extras[extra]]
     where = {"sys_platform": system, "platform_machine": machine}
     assert {each.name for each in wanted if each.marker is None or each.marker.evaluate(where)} == named
 
@@ -159,7 +159,9 @@ def test_an_entry_point_without_a_package_is_named(tmp_path: Path, monkeypatch: 
 
 
 # ---- importing the library, an adapter or the geometry brings no heavy library into the host
-HEAVY = {*["cv2", "gsplat", "hydra", "kornia", "matplotlib", "msgspec", "nerfstudio", "scipy", "skimage", "warp"]}
+HEAVY = {
+    *["cv2", "gsplat", "hydra", "kornia", "matplotlib", "msgspec", "nerfstudio", "open3d", "scipy", "skimage", "warp"]
+}
 HOSTS = [f"integration.{host}" for host in ("gsplat", "inria", "nerfstudio")]
 MODULES = ["clear_strategies", "rasterizers", "integration", *HOSTS, "clear_strategies.geometry"]
 
@@ -189,7 +191,7 @@ def test_importing_is_light_and_of_the_package_alone_imports_no_torch():
 
 
 def test_training_without_what_it_needs_says_what_to_install(tmp_path):
-    missing = HEAVY - {"gsplat", "hydra", "nerfstudio", "warp"}
+    missing = HEAVY - {"gsplat", "hydra", "nerfstudio", "open3d", "warp"}
     code = (
         f"import sys; sys.modules |= dict.fromkeys({missing}); sys.argv = ['clear-strategies', '+strategy=clear']; "
         "from clear_strategies.run import main; main()"

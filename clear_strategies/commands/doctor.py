@@ -27,6 +27,7 @@ EXTRAS: Final = {
     "colmap": (("pycolmap",), "poses for photos without any (data=photos)"),
     "heic": (("pillow_heif",), "photos as iPhones save them (HEIC)"),
     "view": (NEEDED["view"][1], "clear-strategies view, and fit.viewer"),
+    "open3d": (("open3d",), "points averaged in voxels (data.cloud.voxel)"),
     "gsplat": (("gsplat",), "gsplat's rasterizer on CUDA"),
     "warp": (("warp",), "the rasterizer on CUDA without a CUDA toolkit"),
     "sweeps": (("hydra_plugins.hydra_joblib_launcher",), "many runs at once, on one machine or a cluster"),

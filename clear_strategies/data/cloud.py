@@ -62,7 +62,7 @@ class CloudSettings:
         outlier_neighbours, outlier_ratio: a point is removed if the mean distance to its nearest `outlier_neighbours`
             points (itself included) exceeds the average by more than `outlier_ratio` standard deviations; 0
             neighbours: no point is removed.
-        voxel: points are averaged in cubes of this edge, world units; None: they are not.
+        voxel: points are averaged in cubes of this edge, world units, by Open3D (extra [open3d]); None: they are not.
         compare: the images that stereo compares. "hr": those at HR, up to `stereo.max_pixels`. Where these are photos, maps and
             points are made at their size; where a prior made them, their depth completes that of the LR photos, except before a
             plain background. "lr": the LR photos. "auto": as "hr", but SR images of at most five photos only: with more

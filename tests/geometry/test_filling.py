@@ -1,5 +1,6 @@
 """Points: densification, outliers and voxels, and those of depth maps."""
 
+import sys
 from dataclasses import replace
 
 import pytest
@@ -12,6 +13,7 @@ from clear_strategies.geometry.cleaning import averaged_in_voxels, without_outli
 from clear_strategies.geometry.dense_stereo.cloud import points_of
 from clear_strategies.geometry.filling import densify, grid_points
 from clear_strategies.geometry.projection import project
+from rasterizers.interface import BackendUnavailable
 from tests.helpers.planes import cloud_of, depth_of, photo
 
 
@@ -81,7 +83,12 @@ def test_outliers_are_removed() -> None:
         assert without_outliers(PointCloud(means, means * 0, "given"), 2, ratio).means[:, 0].tolist() == kept
 
 
-def test_voxels_hold_the_averages_of_their_points() -> None:
+def test_voxels_hold_the_averages_of_their_points_or_say_what_to_install(monkeypatch):
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "open3d", None)  # makes its import fail
+        with pytest.raises(BackendUnavailable, match=r"data\.cloud\.voxel needs Open3D.*pip install .*\[open3d\]"):
+            averaged_in_voxels(PointCloud(torch.rand(4, 3), torch.rand(4, 3), "given"), 0.1)
+    pytest.importorskip("open3d")
     means = torch.tensor([[0.0, 0, 0], [5.0, 0, 0], [0.2, 0.1, 0], [0.0, 5, 0]])
     cloud = averaged_in_voxels(PointCloud(means, means / 5, "given"), 1.0)
     assert torch.allclose(cloud.means, torch.tensor([[0.1, 0.05, 0], [0.0, 5, 0], [5.0, 0, 0]]))

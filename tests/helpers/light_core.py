@@ -16,7 +16,7 @@ from clear_strategies import GCO, Conductor, Grads
 from clear_strategies.compose import conductor
 from clear_strategies.geometry import stereo
 
-TRAINERS = ("cv2", "kornia", "skimage", "matplotlib", "msgspec", "scipy", "safetensors", "tqdm")
+TRAINERS = ("cv2", "kornia", "skimage", "matplotlib", "msgspec", "scipy", "open3d", "safetensors", "tqdm")
 
 
 def main() -> None:
