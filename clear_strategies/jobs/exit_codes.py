@@ -56,10 +56,8 @@ def describe(error: BaseException) -> Ending | None:
     if isinstance(error, KeyboardInterrupt):
         signum = signals.signal_of(error)
         return Ending(SIGNALS + signum, f"stopped by {signum.name}.")  # the job itself has logged what it saved
-    from rasterizers.interface import (
-        BackendUnavailable,
-        OutdatedKernels,
-    )  # not above: a wrong argument waits for no torch
+    # Not at the top: a wrong argument is refused without waiting for torch.
+    from rasterizers.interface import BackendUnavailable, OutdatedKernels
 
     if isinstance(error, BackendUnavailable | OutdatedKernels):
         return Ending(UNUSABLE, one_line(error))
