@@ -105,12 +105,7 @@ class Attached:
                 f"params must be a dict or a torch.nn.ParameterDict, to which f_det is added, got {type(params).__name__}. Pass "
                 "the dict of which your loop renders."
             )
-        if "features" in params and "sh0" not in params:
-            raise HostError(
-                "the splats hold features in place of sh0 and shN, of gsplat's harmonic textures or of an appearance model. The "
-                "strategies merge gradients of spherical harmonics: train with simple_trainer.py in place of "
-                "simple_trainer_nht.py, without app_opt."
-            )
+        require_bands(params)
         if missing := [name for name in self._names.values() if name not in params]:
             raise ValueError(f"params must hold {', '.join(self._names.values())}; {missing[0]} is missing.")
         if any(other._params is params and not other.attachment.removed for other in _MADE):
@@ -329,3 +324,13 @@ class Attached:
 
 attach = Attached
 _MADE: Final = WeakSet[Attached]()  # all that exist, since a loop does not show that it is attached
+
+
+def require_bands(params: Mapping[str, Any] | torch.nn.ParameterDict) -> None:
+    """Raise a HostError where a network makes the colours."""
+    if "features" in params and "sh0" not in params:
+        raise HostError(
+            "the splats hold features in place of sh0 and shN, of gsplat's harmonic textures or of an appearance model. The "
+            "strategies merge gradients of spherical harmonics: train with simple_trainer.py in place of simple_trainer_nht.py, "
+            "without app_opt."
+        )

@@ -20,7 +20,7 @@ from clear_strategies.errors import HostError, SettingError
 from clear_strategies.merging.conductor import Conductor
 from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
-from integration.gsplat.attached import Attached
+from integration.gsplat.attached import Attached, require_bands
 from integration.replacing import replaced_everywhere
 from integration.settings import Settings
 from integration.views import HostPhoto, no_stereo, stereo_points
@@ -80,6 +80,7 @@ def install(
     def train_with_clear(runner: Any) -> Any:
         nonlocal last
         require_supported(runner.cfg, from_stereo=wanted.points == "stereo")
+        require_bands(runner.splats)  # before SR images are made
         chosen = wanted.conductor(runner.cfg.max_steps)
         end_with_strategies(chosen, runner.cfg.strategy, "refine_stop_iter", first=0)
         source, scale = wanted.sr_source(chosen)

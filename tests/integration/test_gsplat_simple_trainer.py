@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from clear_strategies.data.ply import read_gaussians
-from clear_strategies.errors import SettingError
+from clear_strategies.errors import HostError, SettingError
 from tests.helpers import gsplat_host, toy
 from tests.helpers.host_parts import FROM_START, write_sr
 
@@ -63,6 +63,18 @@ def test_options_that_do_not_work_with_two_scales_are_refused_before_the_first_s
     assert launched("--app_opt") == 2
     assert "app_opt: CLEAR needs False, got True: its colours are no spherical harmonics." in caplog.text
     assert not (tmp_path / "ckpt.pt").exists()
+
+
+def test_splats_without_harmonics_are_refused_before_their_photos_are_enlarged(launched, tmp_path):
+    from integration.gsplat import install
+    from tests.helpers import simple_trainer
+
+    runner_class = type("Runner", (simple_trainer.Runner,), {})
+    install(runner_class, sr=tmp_path / "sr", overrides=FROM_START)
+    runner = runner_class(0, 0, 1, simple_trainer.Config(str(tmp_path)))
+    runner.splats, runner.trainset = {"features": runner.splats["sh0"]}, None
+    with pytest.raises(HostError, match="harmonic textures"):
+        runner.train()
 
 
 def test_points_between_photos_are_refused_for_other_than_pinhole_cameras():
