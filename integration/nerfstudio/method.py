@@ -10,7 +10,7 @@ from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -23,13 +23,14 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from clear_strategies.console import show_in_host
+from clear_strategies.core.checks import require_choice
 from clear_strategies.errors import SettingError
 from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
 from integration.gsplat import Attached, attach
 from integration.nerfstudio.data import photos_of, prior, seed_with_stereo, views_from_datamanager
 from integration.replacing import replaced_attribute
-from integration.views import save_photos
+from integration.views import Points, save_photos
 
 NAMES: Final = {"sh0": "features_dc", "shN": "features_rest"}
 """gsplat's parameter name -> splatfacto's, where they differ."""
@@ -37,11 +38,18 @@ NAMES: Final = {"sh0": "features_dc", "shN": "features_rest"}
 
 @dataclass
 class ClearDatamanagerConfig(FullImageDatamanagerConfig):  # type: ignore[misc]
-    """nerfstudio's settings, and whose points the Gaussians start from."""
+    """nerfstudio's settings, and whose points the Gaussians start from.
+
+    Raises:
+        SettingError: `points` is neither own nor stereo.
+    """
 
     _target: type = field(default_factory=lambda: ClearDatamanager)
     points: Literal["own", "stereo"] = "own"
     """own: the data set's points; stereo: dense stereo between the training photos"""
+
+    def __post_init__(self) -> None:
+        require_choice("points", self.points, get_args(Points))
 
 
 class ClearDatamanager(FullImageDatamanager):  # type: ignore[misc]

@@ -133,6 +133,8 @@ def test_the_command_line_has_its_settings():
     assert pipeline.datamanager.points == "stereo"
     assert (model.strategies, model.sr) == ("gco,svs", Path("scene/sr"))
     assert model.overrides == ("strategies.gco.tolerance=0.1", "objective=paper")
+    with pytest.raises(SettingError, match="points: must be one of own, stereo"):  # in Python, past tyro
+        type(pipeline.datamanager)(points="sterio")
 
 
 @pytest.mark.parametrize(
