@@ -136,12 +136,13 @@ def _key(s: TrainState, inputs: IterationInputs, given: Given) -> GraphKey:
     statistics = [x for x in s.density.state_dict().values() if x.dim() > 0]  # numbers are made for a checkpoint
     stored = [s.field.filter_3d, *statistics, *(x for table in tables for x in table.values())]
     addresses = [x.data_ptr() for x in stored]
-    constants: list[Any] = [s.field.degree, inputs.view.background, λ > 0]
+    bands = max(cast(CompiledStep, s.compiled_step).bands, (s.field.degree + 1) ** 2 - 1)  # that the step will change
+    constants: list[Any] = [s.field.degree, bands, inputs.view.background, λ > 0]
     if isinstance(inputs, ViewInputs):
         constants += [*inputs.scales.values(), s.density.collects(inputs.t)]
         constants += [x is None for x in (inputs.view.depth, inputs.view.disagreement, inputs.view.truth)]
     else:
-        constants += [inputs.view.robust, cast(CompiledStep, s.compiled_step).bands]
+        constants.append(inputs.view.robust)
     constants += [photo.transparency is None for photo in inputs.photos]
     return GraphKey((len(s.field), *addresses), shapes_of(given), tuple(constants))
 

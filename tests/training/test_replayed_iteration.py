@@ -218,6 +218,21 @@ def test_a_recorded_step_on_an_extra_view_steps_every_band_that_has_momentum_by_
     assert live_in(replayed).keys() == {FIRST}
 
 
+@dataclass(frozen=True)
+class PullsOnce(cs.Strategy):
+    """Moves all bands in one iteration."""
+
+    def regularize(self, params, t):
+        return cs.Grads({"shN": 1e-3 * (1 + params["shN"])}) if t == 9 else None
+
+
+def test_a_recorded_step_on_a_photo_of_another_size_does_so_too():
+    sizes = replace(SCENE, train=tuple(cropped(v, 2 * (k == 1)) for k, v in enumerate(SCENE.train)))
+    replayed = both(lambda: start(PullsOnce(), density=False, scene=sizes), 18)
+    assert replays_of(replayed) >= 7
+    assert live_in(replayed).keys() == {FIRST}
+
+
 def test_an_anchored_step_and_that_of_an_extra_view_are_both_recorded():
     """Which bands have momentum is asked of the device once."""
     replayed = both(
