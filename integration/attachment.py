@@ -144,7 +144,8 @@ class Attachment:
             )
         self.counts["LR renders"] += 1
         pending = Pending(self.counts["LR renders"], t, view.name, output, hr)
-        self._merging.await_passes(pending, to_screen=hr is not None and self._hr.is_scored)
+        if not self.removed:
+            self._merging.await_passes(pending, to_screen=hr is not None and self._hr.is_scored)
         return output.returned
 
     @property

@@ -62,8 +62,11 @@ def marked(output):
     return replace(output, marks=[output.shot.params["means"]])
 
 
-def test_it_merges():
-    assert Adapter().step() == 1
+def test_it_merges_until_it_is_removed():
+    adapter = Adapter()
+    assert adapter.step() == 1
+    adapter.attachment.remove()
+    assert adapter.step() == 1
 
 
 @pytest.mark.parametrize(
