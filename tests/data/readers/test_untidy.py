@@ -102,6 +102,15 @@ def encoded(file: str, encoding: str) -> Callable[[Path], None]:
     return lambda root: (root / file).write_text((root / file).read_text(), encoding=encoding)
 
 
+def smaller_models(root: Path) -> None:
+    """Of the first two photos in 0, and of none in 2; all are in 1."""
+    for name in ("1", "2"):
+        shutil.copytree(root / "sparse/0", root / "sparse" / name)
+    lines = (root / "sparse/0/images.txt").read_text().splitlines(keepends=True)
+    (root / "sparse/0/images.txt").write_text("".join(lines[:-2]))  # an image has two lines
+    (root / "sparse/2/images.txt").write_text("")
+
+
 def unused_cameras(root: Path) -> None:
     """A panorama and a camera of size 0 in front of the one in use."""
     file = root / "sparse/0/cameras.bin"
@@ -132,13 +141,10 @@ POSED: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "sparse/12 alone": ("colmap_txt", moved("sparse/0", "sparse/12"), ONE_IS_LEFT.format(12)),
     "colmap/sparse/2 alone": ("colmap", moved("sparse/0", "colmap/sparse/2"), ONE_IS_LEFT.format(2)),
     "Sparse with a capital letter": ("colmap", moved("sparse", "Sparse"), ""),
-    "an empty model before the right one": (
-        "colmap",
-        lambda root: [
-            shutil.copytree(root / "sparse/0", root / "sparse/1"),
-            (root / "sparse/0/images.bin").write_bytes(struct.pack("<Q", 0)),
-        ],
-        "The largest, 1 with 3 photos, is used; the others are not: 0 with 0.",
+    "an empty model and one of fewer photos beside the right one": (
+        "colmap_txt",
+        smaller_models,
+        "The largest, 1 with 3 photos, is used; the others are not: 0 with 2, 2 with 0.",
     ),
     "an unused panoramic camera": ("colmap_txt", appended(CAMERAS, "2 EQUIRECTANGULAR 100 50\n"), ""),
     "an unused camera of an unknown model": ("colmap_txt", appended(CAMERAS, "2 PANORAMIC 100 50 x\n"), ""),
