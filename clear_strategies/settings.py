@@ -295,8 +295,8 @@ def _is_of(value: Any, hint: Any) -> bool:
         return any(_is_of(value, part) for part in parts)
     if isinstance(origin, type) and issubclass(origin, Sequence) and (len(parts) == 1 or parts[1:] == (...,)):
         return isinstance(value, origin) and all(_is_of(entry, parts[0]) for entry in value)
-    if isinstance(value, bool) and hint in (int, float):  # to Python a bool is an int, to a user it is not
-        return False
+    if isinstance(value, bool) and (hint in (int, float) or (origin is Literal and not any(value is x for x in parts))):
+        return False  # to Python true is 1, to a user it is not
     return is_bearable(value, hint, conf=_NUMBERS)
 
 

@@ -15,7 +15,7 @@ from rasterizers.interface import BackendUnavailable
 @dataclass(frozen=True, slots=True)
 class Inner:
     size: int = 3
-    mode: Literal["a", "b"] = "a"
+    mode: Literal["a", "b", 1] = "a"
 
     def __post_init__(self) -> None:
         if self.size < 1:
@@ -86,7 +86,8 @@ REFUSED = {
     "inner: must be a Inner, got 3": {"share": 1, "inner": 3},
     "inner.size: must be a whole number, got 2.5": {"share": 1, "inner": target(Inner, size=2.5)},
     "inner.size: must be a whole number, got 2.0": {"share": 1, "inner": target(Inner, size=2.0)},
-    "inner.mode: must be a or b, got 'c'": {"share": 1, "inner": target(Inner, mode="c")},
+    "inner.mode: must be a or b or 1, got 'c'": {"share": 1, "inner": target(Inner, mode="c")},
+    "inner.mode: must be a or b or 1, got True": {"share": 1, "inner": target(Inner, mode=True)},
     "inner.size must be at least 1, got 0.": {"share": 1, "inner": target(Inner, size=0)},
     "inner.size: must not be 8, got 8: it.inner.size=7": {"share": 1, "inner": target(Inner, size=8)},
     "inner: it is too large.": {"share": 1, "inner": target(Inner, size=10)},
