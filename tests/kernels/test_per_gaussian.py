@@ -143,7 +143,6 @@ def test_scores_and_their_sum(lanes, score_by, hf):
         require_close(found, expected)
 
 
-@pytest.mark.slow
 def test_the_noise_of_mcmc(lanes):
     quats, log_scales, gate, eta = numbers(N, 4) * 10, numbers(N, 3), numbers(N).sigmoid(), numbers(N // 2, 3)
     quats[0], quats[2] = 0, 1e-25
