@@ -50,9 +50,6 @@ def beside(runs: Sequence[FinishedRun]) -> dict[str, pd.DataFrame]:
 def _beside(printed: pd.DataFrame, runs: Sequence[FinishedRun]) -> pd.DataFrame:
     single = run_rows(runs).rename(columns={f"{OWN}lpips": "lpips"})
     single["row"] = single["run"].map(_row)
-    single["label"] = [
-        method.removeprefix(run.name) for method, run in zip(single["method"], single["run"], strict=True)
-    ]
     by_scene = single.groupby(["row", "label", "scene"], sort=False).mean(numeric_only=True)
     means = by_scene.groupby(["row", "label"], sort=False).mean().reindex(columns=[*_COLUMNS]).reset_index()
     paper = {quantity: f"{quantity}_paper" for quantity in _COLUMNS}

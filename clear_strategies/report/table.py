@@ -130,7 +130,8 @@ def _by_scene(runs: Sequence[FinishedRun]) -> dict[str, list[FinishedRun]]:
 
 
 def run_rows(runs: Sequence[FinishedRun]) -> pd.DataFrame:
-    """A row for each run, scene by scene: the run, its scene, marks, method, seed and numbers.
+    """A row for each run, scene by scene: the run, its scene, marks, label, method, seed and numbers. The method is the run's
+    name and the label, which has the settings that not all runs of the scene share.
 
     `key` is name and settings, a line each; `identity`, the key of an average, leaves out the `data` settings that all runs of
     the scene share, which describe the scene.
@@ -141,7 +142,8 @@ def run_rows(runs: Sequence[FinishedRun]) -> pd.DataFrame:
         for run in of_scene:
             of_all = [s for s in run.settings if s not in shared or not s.lstrip("+~").startswith("data")]
             key, identity = ("\n".join((run.name, *sorted(settings))) for settings in (run.settings, of_all))
-            names = {"scene": run.scene, "marks": run.marks, "method": _label(run.name, run.settings, shared)}
+            label = _label("", run.settings, shared)
+            names = {"scene": run.scene, "marks": run.marks, "label": label, "method": run.name + label}
             rows.append({**names, "seed": run.seed, "key": key, "identity": identity, "run": run, **run.numbers})
     return pd.DataFrame(rows)
 
