@@ -49,7 +49,7 @@ class HostMerge:
 
     def __init__(
         self, conductor: Conductor, host: Host, device: torch.device, counts: Counter[str],
-        merged: Callable[[Pending, Mapping[str, Number] | None, Sequence[Tensor]], None] = lambda *_: None,
+        merged: Callable[[Pending, Mapping[str, Number] | None, Sequence[Tensor]], None],
     ) -> None:  # fmt: skip
         self._conductor, self._host, self._counts, self._merged = conductor, host, counts, merged
         self.pending: Pending | None = None

@@ -114,7 +114,9 @@ def _knn(renderer: Path | None) -> Any:
     root = Path() if renderer is None else renderer.parent
     sources = (root / "submodules" / "simple-knn" / "spatial.h", root / "scene" / "gaussian_model.py")
     indices = any(_RETURNS_INDICES.search(file.read_text(encoding="utf-8")) for file in sources if file.is_file())
-    return SimpleNamespace(distCUDA2=lambda points: distances_and_indices(points)[slice(None) if indices else 0])
+    if indices:
+        return SimpleNamespace(distCUDA2=distances_and_indices)
+    return SimpleNamespace(distCUDA2=lambda points: distances_and_indices(points)[0])
 
 
 def _given(arguments: Sequence[str]) -> Iterator[str]:

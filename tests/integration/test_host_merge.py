@@ -76,7 +76,7 @@ def merging(made, params, *, before, lr_colour=None, **of_host):
     host, device = Host(lambda: params, lambda: None, **of_host), params["means" if "means" in params else "sh0"].device
     done = BackwardPass(0, params, colour=lr_colour)
     done.before = before
-    return partial(HostMerge(made, host, device, Counter()).merge_gradients, done, params)
+    return partial(HostMerge(made, host, device, Counter(), lambda *_: None).merge_gradients, done, params)
 
 
 def merge_in_place(made, params, g_hr, step, t, *, scale=1.0, **of_pass):
