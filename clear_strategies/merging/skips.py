@@ -42,12 +42,12 @@ class Skips:
             LR's size; 0: never.
         hr_every: until then, HR is rendered and compared in one of so many iterations, and in each whose scores densification
             reads; 1: in each.
-        plateau_gain: once the loss of the training views, drawn whole, has not fallen by at least this share within
-            `plateau_window` iterations, training continues at iteration `plateau_to`; 0: never.
+        plateau_gain: once the loss of the training views, rendered with all Gaussians, has not fallen by at least this share
+            within `plateau_window` iterations, training continues at iteration `plateau_to`; 0: never.
         plateau_window: iterations between two measurements.
         plateau_from: iteration of the earliest measurement.
         plateau_to: iteration from which every run trains: the learning rates fall, and HR is at full size.
-        undrawn: once the structure has settled, Gaussians too faint to be drawn in any view are removed if they are at least
+        undrawn: once densification has ended, Gaussians too faint to be drawn in any view are removed if they are at least
             this share of all and no strategy regularizes; 0: never.
     """
 
@@ -96,7 +96,7 @@ class SkipPolicy:
         if in_host:
             return phrases
         if s.undrawn > 0:
-            phrases.append("Gaussians too faint to be drawn, once the structure has settled")
+            phrases.append("Gaussians too faint to be drawn, once densification has ended")
         if s.plateau_gain > 0 and s.plateau_window == 0:
             _log.debug("skips.plateau_gain has no effect: in this short run plateau_window is less than one iteration.")
         elif s.plateau_gain > 0:
@@ -146,7 +146,7 @@ class SkipPolicy:
         return rows
 
     def measured(self, t: int) -> bool:
-        """Return True if the training views are drawn whole after iteration t, to find a plateau."""
+        """Return True if the loss of the training views is measured after iteration t, to find a plateau."""
         s = self.skips
         if s.plateau_gain == 0 or s.plateau_window == 0:
             return False

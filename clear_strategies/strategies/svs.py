@@ -1,7 +1,7 @@
 """SVS: sparse-view stabilization.  Eq. 15, 16
 
 One dropout mask, shared by both scales, keeps Gaussians from co-adapting without making LR and HR
-disagree. Once the structure has settled, an anchor pulls the field towards its state at that moment.
+disagree. Once densification has ended, an anchor pulls the field towards its state at that moment.
 """
 
 from __future__ import annotations

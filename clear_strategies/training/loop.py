@@ -59,7 +59,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
             s.refilter()
     s.history.append(_with_logs(_row(s) | row | extra, conductor.logs.counted()))
     if s.conductor.skips.measured(t) and not (restructured or s.reset_due(t)):
-        with stage("training views drawn whole"):
+        with stage("loss of the training views"):
             s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)
     s.advance()
 

@@ -163,7 +163,7 @@ class TrainState:
         self.field.update_filter(cameras, self.mip.variance, self.rules.near)
 
     def remove_undrawn(self) -> bool:
-        """Once the structure has settled, remove the Gaussians that no view draws, see `Skips.undrawn`; returns whether there
+        """Once densification has ended, remove the Gaussians that no view draws, see `Skips.undrawn`; returns whether there
         were any. They would never return, since their gradient is 0.
         """
         if not self.density.settled(self.t):
