@@ -193,6 +193,14 @@ def test_opposed_are_gradients_of_a_cosine_below_0_where_neither_is_0(passes):
     assert deferred.read(of_means_and_whole) == [3, 3, 1, 1]
 
 
+def test_no_gaussians_have_weights_too(passes):
+    """Such a table has no strides to tell its forms apart by."""
+    none = Grads(drawn(1, SHAPES, n=0))
+    for weights in (Weights(torch.ones(0), torch.ones(0, 6)), GCO().reconcile(reconcile.products(none, none), None)):
+        out = {name: torch.empty(0, *shape) for name, shape in SHAPES.items()}
+        assert reconcile.apply(out, none, none, weights)
+
+
 @pytest.mark.parametrize("wrong", [torch.ones(N - 1), torch.ones(1), torch.ones(N, 1), torch.ones(N, 7), torch.ones(6)])
 def test_weights_of_other_shapes_are_refused(passes, wrong):
     g = Grads(drawn(1, ["means"]))

@@ -59,7 +59,7 @@ def _rows(g: Grads, name: str, width: int, like: Tensor | None = None) -> Float[
 
 
 def _weight(table: WeightTable, name: str) -> float | Float[Tensor, "N 1"]:
-    number, rows, stride = table
+    number, rows, _ = table
     if rows is None:
         return number
-    return (rows[CONFLICT_GROUPS.index(name)] if stride else rows)[:, None]
+    return (rows[CONFLICT_GROUPS.index(name)] if rows.dim() == 2 else rows)[:, None]
