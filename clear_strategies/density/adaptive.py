@@ -53,7 +53,7 @@ class DensitySettings:
         reset_every: iterations between opacity resets to 0.01, stretched to no less than 92, in which an opacity can return to
             1/2; 0: never. White backgrounds get one more reset at `start` (F14).
         max_gaussians: largest number of Gaussians; a warning is logged when it limits densification.
-        min_gaussians: pruning to fewer is an error.
+        min_gaussians: pruning to fewer is an error, unless nothing is pruned.
     """
 
     threshold: float = 5e-4
@@ -156,7 +156,7 @@ class Density(Densifier):
         """Clone, split and prune; returns parents [M]: row i of every per-Gaussian tensor comes from row parents[i].
 
         Raises:
-            DensityError: fewer than min_gaussians would be left.
+            DensityError: pruning would leave fewer than min_gaussians.
             DivergedError: a parameter or a statistic is not finite.
         """
         s, n = self.settings, len(field)
@@ -170,7 +170,7 @@ class Density(Densifier):
         keep = field.filtered_opacities() >= s.prune_opacity
         if s.prune_world is not None:
             keep &= largest <= s.prune_world * self.extent
-        if int(keep.sum()) < s.min_gaussians:
+        if int(keep.sum()) < min(s.min_gaussians, n):
             larger = "" if s.prune_world is None else f", or raise density.prune_world={s.prune_world}"
             raise DensityError(
                 f"t={t}: pruning would leave {int(keep.sum())} of {n:,} Gaussians, fewer than min_gaussians={s.min_gaussians}. "

@@ -54,7 +54,7 @@ class MCMC(Strategy):
         growth: the share of Gaussians that a round adds, up to the cap.
         per_point: the cap, as a multiple of the initial number of Gaussians, one for each initial point.
         max_gaussians: an upper bound of the cap.
-        min_gaussians: having fewer Gaussians above `dead_opacity` is an error.
+        min_gaussians: having fewer Gaussians above `dead_opacity` is an error, unless all are.
         dead_opacity: Gaussians of at most this opacity are relocated.
         noise: strength of the noise. A Gaussian of covariance Σ moves by noise(t) σ(100 (dead_opacity - opacity)) Σ η / s̃ after
             each iteration until `stop`, with η ~ N(0, I) and s̃ the median of the Gaussians' largest scales; 0: none moves.
@@ -149,7 +149,7 @@ class Sampler(Densifier):
         opacities = field.opacities.data.sigmoid()
         live = opacities > s.dead_opacity
         dead = torch.nonzero(~live)[:, 0]
-        if n - len(dead) < s.min_gaussians:
+        if n - len(dead) < min(s.min_gaussians, n):
             raise DensityError(
                 f"t={t}: {n - len(dead)} of {n:,} Gaussians have an opacity above {s.dead_opacity}, fewer than "
                 f"min_gaussians={s.min_gaussians}. Lower strategies.mcmc.dead_opacity, or start from a denser cloud."

@@ -19,7 +19,7 @@ class FitSettings:
     Args:
         iterations: optimizer steps, one view each.
         scale_schedule: stretch every milestone from 10,000 iterations to `iterations`.
-        seed: of view order, dropout and splits.
+        seed: of view order, dropout and splits, 64 bits with sign.
         max_degree: of spherical harmonics, 0 to 3.
         degree_every: iterations after which one more degree becomes active.
         probe_every: iterations between evaluations of the test views; 0: never.
@@ -69,6 +69,7 @@ class FitSettings:
 
     def __post_init__(self) -> None:
         require_whole("iterations", self.iterations, least=1)
+        require_whole("seed", self.seed, least=-(1 << 63), most=(1 << 63) - 1)  # torch's
         require_whole("max_degree", self.max_degree, least=0, most=3)
         require_whole("keep", self.keep, least=1)
         for name in ("degree_every", "probe_every", "probe_views", "checkpoint_every", "map_views", "video"):

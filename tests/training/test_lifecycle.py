@@ -179,6 +179,15 @@ def test_an_error_names_each_setting_that_pruned_too_many(prune_world):
     assert ("raise density.prune_world=1e-06" in str(error.value)) is (prune_world is not None)
 
 
+def test_a_field_of_few_gaussians_may_grow_and_not_shrink():
+    field, optimizer, density = tagged()
+    density.settings = replace(density.settings, min_gaussians=100, prune_opacity=0.0)
+    assert len(density.restructure(field, optimizer, 10)) >= 12
+    density.settings = replace(density.settings, prune_opacity=0.99)
+    with pytest.raises(DensityError, match=r"fewer than min_gaussians=100"):
+        density.restructure(field, optimizer, 20)
+
+
 @pytest.mark.parametrize("named", ["parameter of means", "sum of score", "sum of ‖∇_u L‖"])
 def test_a_round_refuses_numbers_that_are_not_finite_also_on_a_device(named, monkeypatch):
     """Sorted downwards NaN comes first: such a score takes the place of another Gaussian's."""
