@@ -184,7 +184,7 @@ def _require_view(conductor: Conductor, view: View, **graphs: Graph | None) -> N
 
 def _require_started(conductor: Conductor) -> None:
     for s in conductor.strategies:
-        if s.cache.get("seed") is None and (overrides(s, "on_fit_start") or overrides(s, "on_views")):
+        if s.of_run.seed is None and (overrides(s, "on_fit_start") or overrides(s, "on_views")):
             raise ValueError(
                 f"{type(s).__name__} has not started. Call conductor.on_fit_start(len(views), seed, views=views) before the loop."
             )

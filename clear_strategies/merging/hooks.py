@@ -24,12 +24,11 @@ from clear_strategies.merging.logs import IterationLogs
 from clear_strategies.merging.objective import Objective
 from clear_strategies.strategies import answers
 from clear_strategies.strategies.base import (
-    LAMBDA_HR,
-    SPLATS,
     Scale,
     ScreenGradients,
     Strategy,
     by_class,
+    by_exp_and_sigmoid,
     misspelled,
     overrides,
 )
@@ -100,9 +99,7 @@ class Hooks:
             s.on_fit_start(n_views, seed)
             answers.require_started(s, seed)
             s.to(device)
-            s.cache[LAMBDA_HR] = self.objective.lambda_hr
-            if splats is not None:
-                s.cache[SPLATS] = splats
+            s.of_run.lambda_hr, s.of_run.splats = self.objective.lambda_hr, splats or by_exp_and_sigmoid
             if overrides(s, "on_views"):
                 with self.work_log.stage("views prepared"):
                     s.on_views(views)
@@ -223,7 +220,7 @@ class Hooks:
         self.views = ()
         for s in self.strategies:
             s.on_fit_end()
-            s.cache.pop(SPLATS, None)  # it keeps the field
+            s.of_run.splats = by_exp_and_sigmoid  # the run's own keeps the field
 
     def state_dict(self) -> dict[str, Tensor]:
         """Every strategy's `state`, as "<class>.<name>", and `run_state`, as "<class>:<name>" ("<class>2" for a second of one

@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 
 def require_started(s: Strategy, seed: int) -> None:
-    if s.cache.get("seed") != seed:
+    if s.of_run.seed != seed:
         raise AnswerError(f"{_named(s, 'on_fit_start')} must call super().on_fit_start(n_views, seed).")
 
 

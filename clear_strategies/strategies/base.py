@@ -29,13 +29,8 @@ from clear_strategies.kernels import reconcile
 from rasterizers.interface import Camera, Color, Splats
 from rasterizers.native import empty_for
 
-_DEVICE, _SEED = "device", "seed"  # in the cache
-LAMBDA_HR: Final = "lambda_hr"
-"""In the cache: the schedule of the run's objective, from `on_fit_start` on."""
 _ALIKE: Final = 0.85  # "regularise" to "regularize" 0.9, "densify" to "densifier" 0.75
-SPLATS: Final = "splats"
-"""In the cache: the activation of raw parameters, where the trainer has its own."""
-_OWN_NAMES: Final = {"state", "run_state", "cache", "logs", "device", "seed", "lambda_hr", "splats"}
+_OWN_NAMES: Final = {"state", "run_state", "cache", "logs", "of_run", "device", "seed", "lambda_hr", "splats"}
 
 Scale = Literal["lr", "hr"]
 
@@ -58,6 +53,31 @@ class ScreenGradients:
     ordinary: Float[Tensor, " N"]
 
 
+def _no_weight(t: int) -> float:
+    return 0.0
+
+
+def by_exp_and_sigmoid(params: Mapping[str, Tensor]) -> Splats:
+    """Raw parameters, activated as 3DGS does."""
+    scales, opacities = params["scales"].exp(), params["opacities"].sigmoid()
+    return Splats(params["means"], params["quats"], scales, opacities, params["sh0"], params["shN"])
+
+
+@dataclass(slots=True, eq=False)
+class RunFacts:
+    """What the trainer tells a strategy of the run; the properties and methods of `Strategy` give it.
+
+    Args:
+        seed: None before the run starts.
+        lambda_hr: the schedule of the run's objective. splats: activates raw parameters as the run draws them.
+    """
+
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    seed: int | None = None
+    lambda_hr: Callable[[int], float] = _no_weight
+    splats: Callable[[Mapping[str, Tensor]], Splats] = by_exp_and_sigmoid
+
+
 @dataclass(frozen=True)
 class Strategy:
     """A frozen dataclass of settings, plus its state.
@@ -68,6 +88,7 @@ class Strategy:
         run_state: other tensors that checkpoints save, of any shape: parameters of the strategy's own, by view or by group.
         cache: values that can be computed again (patch maps, keyed by view); never saved.
         logs: scalars of this iteration, see `log`.
+        of_run: device, seed, λ_HR and activations of the run.
 
     Randomness must be a function of (seed, t), so that resuming needs no generator state. Hooks run without autograd.
     """
@@ -76,6 +97,7 @@ class Strategy:
     run_state: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
     cache: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
     logs: dict[str, Logged] = field(default_factory=dict, init=False, repr=False, compare=False)
+    of_run: RunFacts = field(default_factory=RunFacts, init=False, repr=False, compare=False)
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
@@ -103,7 +125,7 @@ class Strategy:
         self.run_state.clear()
         self.cache.clear()
         self.logs.clear()
-        self.cache[_SEED] = seed
+        self.of_run.seed = seed
 
     def on_views(self, views: Sequence[View]) -> None:
         """Look at all training views once, after `on_fit_start`.
@@ -270,38 +292,30 @@ class Strategy:
 
     def to(self, device: torch.device | str) -> None:
         """Move `state` and `run_state` to the device of the field; answers are expected there."""
-        self.cache[_DEVICE] = torch.device(device)
+        self.of_run.device = torch.device(device)
         for tensors in (self.state, self.run_state):
             tensors.update({name: x.to(device) for name, x in tensors.items()})
 
     @property
     def device(self) -> torch.device:
         """The device of the field."""
-        device: torch.device = self.cache.get(_DEVICE, torch.device("cpu"))
-        return device
+        return self.of_run.device
 
     def lambda_hr(self, t: int) -> float:
         """λ_HR(t) of the run's objective; 0 before the run starts."""
-        schedule: Callable[[int], float] | None = self.cache.get(LAMBDA_HR)
-        return 0.0 if schedule is None else schedule(t)
+        return self.of_run.lambda_hr(t)
 
     def splats(self, params: Mapping[str, Tensor]) -> Splats:
         """Raw parameters of as many Gaussians as the field has, activated as the run draws them, without f_det. Differentiable.
 
         In this trainer the 3D filter of the field makes them larger and fainter; other trainers' own filters are left out.
         """
-        activate: Callable[[Mapping[str, Tensor]], Splats] = self.cache.get(SPLATS, _unfiltered)
-        return activate(params)
+        return self.of_run.splats(params)
 
     @property
     def seed(self) -> int:
         """The seed of the run; 0 before it starts."""
-        return int(self.cache.get(_SEED, 0))
-
-
-def _unfiltered(params: Mapping[str, Tensor]) -> Splats:
-    scales, opacities = params["scales"].exp(), params["opacities"].sigmoid()
-    return Splats(params["means"], params["quats"], scales, opacities, params["sh0"], params["shN"])
+        return self.of_run.seed or 0
 
 
 def stored(strategy: Strategy) -> list[Tensor]:

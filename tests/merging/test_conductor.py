@@ -389,10 +389,14 @@ class Swaps(Densifier):
         self.count = int(tensors.get("count", 0))
 
 
-def test_a_strategy_knows_the_weight_of_hr():
+def test_a_strategy_knows_its_run_whatever_it_does_to_its_cache():
     @dataclass(frozen=True)
     class Balanced(Strategy):
         """0.25 l + 0.5 h, whatever λ_HR."""
+
+        def on_resize(self, parents):
+            super().on_resize(parents)
+            self.cache.clear()  # it held a row for each Gaussian
 
         def reconcile(self, products, step):
             λ = self.lambda_hr(step.t)
@@ -405,8 +409,10 @@ def test_a_strategy_knows_the_weight_of_hr():
     (g_lr,) = lr.vjp(objective.lr(lr.image, view.lr.image).cotangents)
     (g_hr,) = hr.vjp(objective.hr(hr.image, view.hr.image).cotangents)
     for t in (2, 7):
-        conductor = Conductor(Balanced(), objective=objective)
-        conductor.on_fit_start(1, 0)
+        conductor = Conductor(balanced := Balanced(), objective=objective)
+        conductor.on_fit_start(1, 7, "meta")
+        conductor.on_resize(torch.arange(3))
+        assert (balanced.seed, balanced.device.type) == (7, "meta")
         merged = conductor.update(field.raw(), lr, hr, view, t).grads
         assert torch.allclose(merged["means"], 0.25 * g_lr["means"] + 0.5 * g_hr["means"], atol=1e-7)
 
