@@ -114,7 +114,7 @@ def summed(each: Sequence[Grads], weight: Float[Tensor, " N"]) -> list[Grads]:
     The last keeps its `screen` and `weight` times its gradient of f_det, the only gradient that f_det gets.
     """
     *others, base, hf = each
-    total = base.without_detail().plus(hf.without_detail(), weight)
+    total = base.without_detail().plus(hf.without_detail(), weight)  # Eq. 13
     total.screen = base.screen
     detail = {"detail": scale_rows(hf["detail"], weight)} if "detail" in hf else {}
     return [*others, total, Grads(detail, screen=hf.screen)]

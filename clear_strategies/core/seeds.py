@@ -36,4 +36,4 @@ def one_of(items: Sequence[T], generator: torch.Generator) -> T:
 def dropout_mask(n: int, p: float, seed: int, t: int, device: torch.device | str = "cpu") -> Float[Tensor, " N"]:
     """Bernoulli(1 - p) / (1 - p) for n Gaussians, drawn on `device` and reproducible there from (seed, t).  Eq. 15"""
     generator = hashed_generator_at(seed, t, device)
-    return (torch.rand(n, generator=generator, device=device) >= p) / (1 - p)
+    return (torch.rand(n, generator=generator, device=device) >= p) / (1 - p)  # Eq. 15

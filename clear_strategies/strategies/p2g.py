@@ -122,11 +122,11 @@ class P2G(Strategy):
         if disagreement is None:
             disagreement = (reduced - lr).abs()
         tau_r = _tau_r(self.reliability_scale, float(disagreement.mean()))
-        R = torch.exp(-patch_means(disagreement, self.patch) / tau_r)
+        R = torch.exp(-patch_means(disagreement, self.patch) / tau_r)  # Eq. 9
         # All kernels of D but "area" round to 8 bits. In an SR image with more bits, what rounding loses is not detail.
         shown = hr if self.down == "area" else quantize(hr)
         residual = (shown - upsample(reduced, factor)).abs()
-        A = (patch_means(residual, self.patch * factor) / (2 * residual.mean() + self.detail_eps)).clamp(0, 1)
+        A = (patch_means(residual, self.patch * factor) / (2 * residual.mean() + self.detail_eps)).clamp(0, 1)  # Eq. 9
         return R, A
 
     def looked_up(self, view: View) -> Float[Tensor, "2 ph pw"]:

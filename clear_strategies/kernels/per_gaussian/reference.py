@@ -64,12 +64,12 @@ def evidence(
     column, row = (centers / patch).to(torch.int32).unbind(-1)
     height, width = maps.shape[1:]
     at = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
-    return Evidence(*(maps.flatten(1).index_select(1, at) * visible))
+    return Evidence(*(maps.flatten(1).index_select(1, at) * visible))  # Eq. 10
 
 
 def route(e: Evidence, visible: Bool[Tensor, " N"], floor: float, normalize: bool) -> Float[Tensor, " N"]:
     """m_i, over its mean where `normalize`; undefined for invisible Gaussians.  Eq. 12"""
-    m = floor + (1 - floor) * e.weight
+    m = floor + (1 - floor) * e.weight  # Eq. 12
     if not normalize:
         return m
     mean = (m * visible).sum() / visible.sum().clamp_min(1)
@@ -101,7 +101,7 @@ def evidence_score(
     e: Evidence, hf: Float[Tensor, "N 2"], ordinary: Float[Tensor, " N"], joined: bool
 ) -> Float[Tensor, " N"]:
     """S_i, alone or joined with the ordinary statistic at equal mean.  Eq. 14"""
-    S = e.weight * screen_norm(hf)
+    S = e.weight * screen_norm(hf)  # Eq. 14
     return ordinary + S * (ordinary.mean() / S.mean().clamp_min(torch.finfo(S.dtype).tiny)) if joined else S
 
 
