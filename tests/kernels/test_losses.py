@@ -217,6 +217,14 @@ def test_gradients_are_written_to_out(name):
     assert torch.equal(out[0], losses.photometric(x, y, 0.2, kernels=name).gradient)
 
 
+@pytest.mark.parametrize("dssim", [0.0, 1.0])
+@pytest.mark.parametrize("name", [pytest.param("cpp", marks=needs("cpp"))])
+def test_without_a_gradient_the_kernel_computes_ssim_alone(name, dssim):
+    x, y = photo(20, 30), photo(20, 30, 6)
+    means = native.module().photometric(x, y, None, 1.0, dssim, 0, 1)
+    assert means == (0.0, pytest.approx(1 - float(losses.ssim(x, y).value), abs=1e-6))
+
+
 @pytest.mark.parametrize(
     ("x", "y", "error", "message"),
     [
