@@ -233,9 +233,9 @@ class Conductor(Hooks):
 
     @apart_from_the_loop
     def extra_loss(self, image: Float[Tensor, "h w 3"], extra: ExtraView, t: int) -> Losses:
-        """The LR loss of a render of `extra`, weighted by pixel: its value and its cotangent [1, h, w, 3].  Eq. 4
+        """The LR loss of a render of `extra`, and its cotangent [1, h, w, 3], each pixel's times its weight.  Eq. 4
 
-        Where the weight is 0, both images count as black.
+        Where the weight is 0, both images count as black; else the loss itself has no weights.
 
         Raises:
             DivergedError: the loss is not finite.

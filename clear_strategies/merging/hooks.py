@@ -174,7 +174,7 @@ class Hooks:
         for s in self.regularizers:
             g = answers.regularized(s, s.regularize(params, iteration(t)), params, finite=finite)
             if g is None:
-                self.work_log.skip("regularize", "no anchor yet")
+                self.work_log.skip("regularize", "it adds nothing yet")
             else:
                 total = g if not total else total + g
         return total

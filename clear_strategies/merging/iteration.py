@@ -9,7 +9,6 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core import deferred
 from clear_strategies.core.deferred import Number, Scalar
 from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import Grads
@@ -116,9 +115,7 @@ class Stepper(Protocol):
 
 
 def require_finite_parts(where: str, g_lr: Grads, hr: HrSide | None) -> None:
-    """Check the inputs of a `Stepper`: gradients, evidence and routing weights; those on a device are not read."""
-    if g_lr.screen is None or not deferred.is_immediate(g_lr.screen):
-        return
+    """Check what is merged: gradients, evidence and routing weights; those on a device are not read."""
     parts: dict[str, Mapping[str, Tensor]] = {}
     if hr is not None:  # evidence and weights first, since the gradients contain them
         weights = {} if hr.step.evidence is None else {"reliability": hr.step.evidence.reliability}
