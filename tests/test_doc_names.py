@@ -34,7 +34,9 @@ def test_the_public_api_lists_what_the_package_exports_and_tests_that_the_paper_
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_what_a_page_names_exists(page):
-    """Links, paths, `file:symbol`, and dotted names; a table of files has its folder in the heading."""
+    """Links, paths, `file:symbol`, dotted names, and [`symbol`](file), perhaps behind its module; a table of files has its folder
+    in the heading.
+    """
     text = page.read_text()
     for target, _, anchor in (link.partition("#") for link in re.findall(r"\]\(((?!https?:)[^)\s]+)\)", text)):
         path = (page.parent / target).resolve() if target else page
@@ -47,6 +49,8 @@ def test_what_a_page_names_exists(page):
     assert not [path for path in paths if not (ROOT / path).exists()]
     stations = re.findall(r"`([\w./-]+\.(?:py|cpp|hpp|yaml|md)):([\w.]+)`", text)
     assert not [f"{file}:{symbol}" for file, symbol in stations if not holds(ROOT / file, symbol)]
+    linked = re.findall(r"\[`(?:[a-z_]+\.)*([\w.]+)`\]\(([^)\s]+\.py)\)", text)
+    assert not [f"{file}:{symbol}" for symbol, file in linked if not holds((page.parent / file).resolve(), symbol)]
     dotted = re.findall(rf"`((?:{'|'.join(OURS)})(?:\.\w+)+)", text)
     assert not [one for one in dict.fromkeys(dotted) if not exists(one)]
 
