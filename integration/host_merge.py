@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Final
-from weakref import WeakMethod
+from weakref import ReferenceType, WeakMethod, ref
 
 import torch
 from torch import Tensor
@@ -56,7 +57,7 @@ class HostMerge:
         self.scaler = None if host.threshold is None else ScoreScaler(host.threshold)
         self.fading = Fading(conductor.detail, host.accumulation)
         self._replayed = ReplayedMerge(conductor, device)
-        self._pass: BackwardPass | None = None  # the last one that has reached a rendering
+        self._pass: ReferenceType[BackwardPass] | None = None  # the last to reach a rendering; torch keeps it alive
         self._in_vain = 0  # renderings, one after the other, that were not merged
         self._outweighed: int | None = 0  # of the first merges with HR; None: in one of them HR had a part
 
@@ -84,11 +85,13 @@ class HostMerge:
         """Called when a backward pass of the host has reached the nth rendering, but no parameter yet."""
         if self.pending is None:
             return None
-        if self._pass is None or self._pass.task != current_pass():
-            self._pass = now = BackwardPass(current_pass(), self._host.leaves())
-            when_pass_ends(lambda: self._on_backward_end(now))
-        self._pass.renderings.add(nth)
-        return self._pass.take if self.pending.may_take_factors(self._pass.params) else None
+        now = None if self._pass is None else self._pass()
+        if now is None or now.task != current_pass():
+            now = BackwardPass(current_pass(), self._host.leaves())
+            when_pass_ends(partial(self._on_backward_end, now))
+            self._pass = ref(now)
+        now.renderings.add(nth)
+        return now.take if self.pending.may_take_factors(now.params) else None
 
     @torch.no_grad()
     def _on_backward_end(self, done: BackwardPass) -> None:
@@ -96,8 +99,7 @@ class HostMerge:
 
         A pass that leaves every `.grad` as it was (`torch.autograd.grad`) is ignored.
         """
-        pending, self._pass = self.pending, None
-        expected, accumulated = trained(done.params), done.accumulated()
+        pending, expected, accumulated = self.pending, trained(done.params), done.accumulated()
         if pending is not None and (accumulated or not expected):
             pending.require_alone(done)
             using = [type(s).__name__ for s in map(self._conductor.owner, ("reconcile", "score")) if s is not None]

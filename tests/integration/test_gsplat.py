@@ -15,6 +15,7 @@ from clear_strategies.training.optim import LearningRates
 from integration import HostError
 from integration.autograd_shot import HostOutput
 from integration.gsplat import attach
+from integration.pending import BackwardPass
 from rasterizers import autograd
 from tests.helpers import toy
 from tests.helpers.gsplat_host import RASTERIZER, Host, attached, drawn, in_double, rasterization, started, trained
@@ -212,9 +213,12 @@ def test_parameters_that_are_computed_from_others_are_refused():
 
 @pytest.mark.parametrize("last_one_has_backward", [True, False])
 def test_renderings_are_freed_after_their_step_and_with_the_loop(last_one_has_backward):
-    def kept():
+    def kept(kind=HostOutput):
         gc.collect()
-        return sum(isinstance(thing, HostOutput) for thing in gc.get_objects())
+        return sum(isinstance(thing, kind) for thing in gc.get_objects())
+
+    def fail(_):
+        raise RuntimeError("out of memory")
 
     before = kept()
     host, clear, render = started()
@@ -222,6 +226,15 @@ def test_renderings_are_freed_after_their_step_and_with_the_loop(last_one_has_ba
     for i in (0, 1, 0):
         render(i).mean().backward()
     assert clear.attachment.counts["merges"] == 3
+    loss = render(0).mean()
+    failing = host.splats["means"].register_hook(fail)
+    with pytest.raises(RuntimeError, match="out of memory"):  # torch calls nothing at the end of such a pass
+        loss.backward()
+    del loss
+    assert kept(BackwardPass) == 0
+    failing.remove()
+    render(0).mean().backward()
+    assert clear.attachment.counts["merges"] == 4
     if not last_one_has_backward:
         render(0)
         del host, clear, render
