@@ -1,5 +1,8 @@
 """From conf/ to objects: names on the command line, the defaults' one owner, and what is refused."""
 
+import os
+from pathlib import Path
+
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -14,7 +17,7 @@ from clear_strategies.errors import SettingError
 from clear_strategies.hydra_errors import not_composed
 from clear_strategies.jobs.settings import settings_of
 from clear_strategies.merging.detail import DetailRates
-from clear_strategies.options import CONF
+from clear_strategies.options import CONF, _ConfSource
 from clear_strategies.training.settings import FitSettings
 from rasterizers.geometry import SH_C0
 from tests.helpers import command_line
@@ -236,3 +239,14 @@ def test_in_a_host_best_leaves_random_backgrounds_out_and_says_so_once_unless_th
     for names in ("best", "strategies.random_background.until=8000"), (["gco", "random_background"],):
         assert isinstance(conductor(*names).strategies[-1], RandomBackground)
     assert caplog.text.count("random_background is left out") == 1
+
+
+def test_a_file_of_options_that_is_edited_is_read_again_and_what_is_made_of_it_is_a_copy(tmp_path: Path) -> None:
+    source, file = _ConfSource("conf", f"clear://{tmp_path}"), tmp_path / "mine.yaml"
+    for second, value in enumerate((1, 2)):
+        file.write_text(f"# @package _global_\nfit:\n  seed: {value}\n")
+        os.utime(file, (second, second))
+        for _ in range(2):
+            found = source.load_config("mine")
+            assert (found.config.fit.seed, found.header["package"]) == (value, "_global_")
+            found.config.fit.seed, found.header["package"] = 5, None
