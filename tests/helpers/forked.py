@@ -25,9 +25,9 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 # What a run imports. None of them starts a thread or asks for a GPU, which no fork would have.
 _IMPORTED = (
-    "clear_strategies.hydra_app", "clear_strategies.jobs.job", "clear_strategies.report", "cv2", "imageio_ffmpeg", "jinja2",
-    "matplotlib.backends.backend_agg", "rasterizers.cpp", "scipy.spatial", "skimage.data", "skimage.metrics",
-    "skimage.transform", "warp",
+    "clear_strategies.hydra_app", "clear_strategies.jobs.job", "clear_strategies.report", "cv2", "filelock", "imageio_ffmpeg",
+    "jinja2", "matplotlib.backends.backend_agg", "rasterizers.cpp", "scipy.ndimage", "scipy.spatial", "skimage.data",
+    "skimage.metrics", "skimage.transform", "warp",
 )  # fmt: skip
 
 
@@ -146,10 +146,22 @@ def _become(request: dict[str, Any], stdout: int, stderr: int, status_file: int)
     sys.path[0] = request["cwd"]
 
 
+def _compute_ahead() -> None:
+    """What a process computes at its first configuration and its first picture of the demo, and keeps: the tables of Hydra's
+    parser, and the photographs and the light of the demo's room.
+    """
+    from clear_strategies.data.readers import demo
+    from clear_strategies.options import composed_by_hydra
+
+    composed_by_hydra(["+strategy=best"], "config")
+    demo.read(width=1, height=1).frames[0].load()
+
+
 def main() -> None:
     """What `python -m tests.helpers.forked FILENO` does."""
     for name in _IMPORTED:
         importlib.import_module(name)
+    _compute_ahead()
     gc.freeze()  # a fork would take a second to end, and copy all of these objects' memory, to find no garbage among them
     with socket.socket(fileno=int(sys.argv[1])) as requests:
         request = _serve(requests)
