@@ -1,5 +1,6 @@
 """Fixtures shared by all tests."""
 
+import gc
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from importlib.machinery import ModuleSpec, PathFinder
@@ -33,6 +34,7 @@ def pytest_collection_finish() -> None:
     looks for plain code, and every later process that imports it without the hook fails.
     """
     sys.dont_write_bytecode = True
+    gc.freeze()  # a collection would look through torch's modules and all tests, a million objects that stay
 
 
 def pytest_runtest_setup() -> None:
