@@ -55,7 +55,7 @@ def _ratio(photo: Photo, depth: DepthMap, other: Photo, other_depth: DepthMap) -
     shared, row, column, z = seen_pixels(other.camera, surface)
     shared[shared.clone()] = (other_depth.depth[row, column] / z - 1).abs() <= _TOLERANCE  # False where it is unknown
     pixels = project(other.camera, surface)[0][shared]
-    colors, other_colors = photo.image[rows[shared], columns[shared]], sample_colors(other.image, pixels)
+    colors, other_colors = photo.image[rows[shared], columns[shared]], sample_colors(other, pixels)
     low, high = _UNCLIPPED
     usable = (colors > low) & (colors < high) & (other_colors > low) & (other_colors < high)
     medians, counts = torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)

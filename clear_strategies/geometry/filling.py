@@ -105,7 +105,7 @@ def _pixels_to_fill(
     if depth_map is not None:
         wanted = wanted & ~depth_map.known.cpu()
     grid = grid[wanted[y, x]]
-    colors = sample_colors(photo.image, grid)
+    colors = sample_colors(photo, grid)
     if background is None:
         return grid, colors
     surface = ~is_background(colors, background)

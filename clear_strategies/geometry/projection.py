@@ -9,9 +9,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from clear_strategies.core.view import Photo
 from rasterizers.interface import Camera
 
 _BEHIND: Final = 0.03  # relative excess over the surface's depth up to which a point is visible
+_NO_WEIGHT: Final = 1e-6  # of a pixel in a bilinear mean
 
 
 def intrinsics(camera: Camera) -> Float[Tensor, "3 3"]:
@@ -74,10 +76,19 @@ def ray_angles(a: Float[Tensor, " 3"], b: Float[Tensor, "*K 3"], points: Float[T
     return torch.rad2deg(torch.atan2(sine, (x * y).sum(-1)))
 
 
-def sample_colors(image: Float[Tensor, "H W 3"], pixels: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
-    """Sample bilinearly at pixels (column, row); beyond the centres of the border pixels, the border's colour is returned."""
-    height, width = image.shape[:2]
-    grid = (2 * pixels / torch.tensor([width, height]) - 1).to(image)[None, None]
-    batch = image.permute(2, 0, 1)[None]
-    samples = torch.nn.functional.grid_sample(batch, grid, padding_mode="border", align_corners=False)
-    return samples[0, :, 0].T.cpu()
+def sample_colors(photo: Photo, pixels: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
+    """Sample bilinearly at pixels (column, row); beyond the centres of the border pixels, the border's colour is returned. Hidden
+    pixels are left out of the mean; it is black where all are hidden.
+    """
+    image = photo.image
+    grid = (2 * pixels / torch.tensor([photo.camera.width, photo.camera.height]) - 1).to(image)[None, None]
+
+    def sampled(layer: Float[Tensor, "H W C"]) -> Float[Tensor, "N C"]:
+        batch = layer.permute(2, 0, 1)[None]
+        samples = torch.nn.functional.grid_sample(batch, grid, padding_mode="border", align_corners=False)
+        return samples[0, :, 0].T.cpu()
+
+    if photo.shown is None:
+        return sampled(image)
+    shown = photo.shown[..., None].to(image)
+    return sampled(image * shown) / sampled(shown).clamp_min(_NO_WEIGHT)

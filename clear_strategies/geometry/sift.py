@@ -110,7 +110,7 @@ def triangulate(photos: Sequence[Photo], settings: TriangulationSettings | None 
     pairs = Pairs(*map(torch.cat, zip(*per_pair, strict=True)))
     chosen = one_per_track(pairs, view)
 
-    sampled = [sample_colors(photo.image, f.pixels) for photo, f in zip(photos, features, strict=True)]
+    sampled = [sample_colors(photo, f.pixels) for photo, f in zip(photos, features, strict=True)]
     colors = torch.cat(sampled)[pairs.features[chosen]].mean(dim=1) if len(chosen) else torch.zeros(0, 3)
     source = f"{len(chosen):,} points triangulated from the {len(photos)} photos"
     return PointCloud(pairs.means[chosen].float(), colors, source)

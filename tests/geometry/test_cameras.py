@@ -1,6 +1,7 @@
 """What cameras look at: their common box, which of them are compared, and which see a surface."""
 
 import math
+from dataclasses import replace
 
 import torch
 from hypothesis import given, settings
@@ -59,9 +60,12 @@ def test_few_cameras_are_all_compared_and_of_many_the_nearest_and_some_far_ones_
 
 # ---- colours between pixel centres, and which cameras see a surface
 def test_colours_lie_between_pixel_centres_and_a_point_is_seen_inside_a_camera_if_not_hidden():
-    image = torch.tensor([[[0.0, 0, 0], [1.0, 1, 1]]])
+    pair = Photo(replace(small_camera(0.0), width=2, height=1), torch.tensor([[[0.0, 0, 0], [1.0, 1, 1]]]))
     at = torch.tensor([[0.5, 0.5], [1.0, 0.5], [1.25, 0.5], [1.5, 0.5], [0.1, 0.2]])
-    assert torch.allclose(sample_colors(image, at)[:, 0], torch.tensor([0, 0.5, 0.75, 1, 0]))
+    assert torch.allclose(sample_colors(pair, at)[:, 0], torch.tensor([0, 0.5, 0.75, 1, 0]))
+    for colors in (pair.image, pair.image + 0.5):  # whatever colour a mask hides
+        hidden = replace(pair, image=colors, shown=torch.tensor([[False, True]]))
+        assert torch.allclose(sample_colors(hidden, at[1:4]), colors[0, 1])
     wall = torch.full((10, 10), 1.0)
     across = torch.arange(10) / 10 - 0.45  # the centres of a row of pixels at a depth of 1
     points = torch.stack((across, torch.zeros(10) + 0.05, torch.ones(10)), dim=1)

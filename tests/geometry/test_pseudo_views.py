@@ -55,7 +55,7 @@ def test_a_plane_is_seen_as_its_photos_show_it():
         pixels = rays.flip(1).double() + 0.5
         near, far = (back_project(camera, pixels, torch.full((len(pixels),), z).double()).double() for z in (1.0, 2.0))
         on_plane = near + (far - near) * ((DEPTH - near[:, 2]) / (far - near)[:, 2])[:, None]
-        expected = torch.stack([sample_colors(p.image, project(p.camera, on_plane)[0]) for p in photos.values()])
+        expected = torch.stack([sample_colors(p, project(p.camera, on_plane)[0]) for p in photos.values()])
         inside = torch.stack(
             [((xy := project(p.camera, on_plane)[0]) > 1).all(1) & (xy < torch.tensor([119, 89])).all(1) for p in photos.values()]
         )  # fmt: skip
@@ -81,7 +81,7 @@ def test_a_depth_that_no_photo_vouches_for_and_pixels_beside_the_background_give
     row, column = torch.nonzero(view.known).unbind(1)
     centers, depth = torch.stack((column, row), 1).double() + 0.5, torch.full((len(row),), 2.0).double()
     pixels, _ = project(photos["1.png"].camera, back_project(view.photo.camera, centers, depth))
-    error = (sample_colors(photos["1.png"].image, pixels) - view.photo.image[row, column]).abs().amax(1)
+    error = (sample_colors(photos["1.png"], pixels) - view.photo.image[row, column]).abs().amax(1)
     hidden = (pixels[:, 0] > 2) & (pixels[:, 0] < 118)
     assert hidden.any()
     assert error[hidden].median() < 0.02

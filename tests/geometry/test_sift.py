@@ -27,7 +27,7 @@ def test_a_plane_is_found_where_it_is(count: int) -> None:
     # The colour is the texture's at that place.
     pixels, _ = project(photos[0].camera, cloud.means)
     inside = (pixels[:, 0] < 120) & (pixels[:, 0] > 0)
-    assert torch.allclose(cloud.colors[inside], sample_colors(photos[0].image, pixels[inside]), atol=0.1)
+    assert torch.allclose(cloud.colors[inside], sample_colors(photos[0], pixels[inside]), atol=0.1)
 
 
 def test_a_point_seen_by_three_views_is_one_point_and_of_too_many_features_the_strongest_are_taken() -> None:
