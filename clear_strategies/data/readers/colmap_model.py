@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 _LONGEST_NAME: Final = 4096
 _RECORD_COUNT: Final = re.compile(r"^# Number of \w+: (\d+)", re.MULTILINE)  # in a text file's header
-_NUMERIC: Final = "0123456789.+-eE \t"  # characters of a line of numbers
+_NUMERIC: Final = re.compile(r"(?:[-+.0-9eE\s]+|nan|inf)*+", re.IGNORECASE)  # a line of numbers
 
 _COUNT, _CAMERA, _IMAGE = map(struct.Struct, ("<Q", "<iiQQ", "<i7di"))
 _POINT: Final = struct.Struct("<Q3d3BdQ")  # id, position, colour, error, length of the track
@@ -298,7 +298,7 @@ def _text_images(path: Path) -> Iterator[Image]:
     poses, after_pose = list[tuple[int, str]](), False
     stated, lines = _lines(path)
     for line, text in lines:
-        points = after_pose and len(text.split()) % 3 == 0 and not text.strip(_NUMERIC)
+        points = after_pose and len(text.split()) % 3 == 0 and _NUMERIC.fullmatch(text) is not None
         if after_pose := bool(text.strip()) and not points:
             poses.append((line, text))
     _warn_if_truncated(path, stated, len(poses))

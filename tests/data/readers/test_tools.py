@@ -171,8 +171,8 @@ def test_transforms_under_any_name_are_read_when_the_file_is_named(tmp_path: Pat
 # ---- nothing is dropped in silence
 @pytest.mark.parametrize("names", [NAMES, ("a photo 1.png", "b photo 2.png", "c photo 3.png")])
 @pytest.mark.parametrize(
-    "points", ["", "\n", "8.0 6.0 -1 7 7 12\n", "1 1 0 0 0 0 0 0 1 5 5 -1\n"]
-)  # the last looks like a pose
+    "points", ["", "\n", "8.0 6.0 -1 7 7 12\n", "1 1 0 0 0 0 0 0 1 5 5 -1\n", "1 1 0 0 0 0 0 0 1 nan -NaN -1\n"]
+)  # the last two look like poses
 def test_images_without_a_line_of_points_are_all_read(names: tuple[str, ...], points: str, tmp_path: Path) -> None:
     root = tiny.colmap_txt(tmp_path)
     for old, new in zip(NAMES, names, strict=True):
