@@ -20,7 +20,7 @@ from torch import Tensor
 from clear_strategies.data.file_names import normalized
 from clear_strategies.data.lenses import Lens
 from clear_strategies.data.masks import check_mask, read_mask
-from clear_strategies.data.photo_files import has_alpha, image_size, read_image
+from clear_strategies.data.photo_files import Header, read_header, read_image
 from clear_strategies.data.priors.interface import Prior
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera, Color
@@ -71,8 +71,9 @@ class Frame:
         """
         path = Path(path)
         mask = None if mask is None else Path(mask)
-        turn = _turned_as(path, lens) if upright is None else upright
-        width, height = image_size(path, turn=turn)
+        header = read_header(path)
+        turn = _turned_as(header, lens) if upright is None else upright
+        width, height = header.size(turn)
         fitted = lens.resized(width, height, path)
         pinhole = fitted.undistorted(path)
         camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, width, height)
@@ -85,7 +86,7 @@ class Frame:
             """The photo over white minus the photo over black."""
             return (load((1.0, 1.0, 1.0)) - load(BLACK)).mean(dim=2).clamp(0, 1)
 
-        through = transparency if has_alpha(path) else None
+        through = transparency if header.has_alpha else None
         return Frame(normalized(name), camera, partial(load, background), split, sfm_id, lens, shown, through)
 
 
@@ -179,12 +180,12 @@ def lens_notes(frames: Sequence[Frame]) -> dict[str, str]:
     return notes
 
 
-def _turned_as(path: Path, lens: Lens) -> bool | None:
+def _turned_as(header: Header, lens: Lens) -> bool | None:
     """Choose `turn` of `read_image` by the aspect ratio of the lens; None where the ratio does not decide it."""
-    if lens.width == lens.height:
+    width, height = header.stored
+    if lens.width == lens.height or header.size(turn=True) == header.stored:
         return None
-    (width, height), upright = (image_size(path, turn=turn) for turn in (False, True))
-    return None if (width, height) == upright else (width > height) != (lens.width > lens.height)
+    return (width > height) != (lens.width > lens.height)
 
 
 def _load(path: Path, lens: Lens, pinhole: Lens, turn: bool | None, background: Color | None) -> Float[Tensor, "H W 3"]:

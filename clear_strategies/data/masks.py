@@ -16,7 +16,7 @@ from torch import Tensor
 
 from clear_strategies.data.file_names import name_key, some
 from clear_strategies.data.lenses import Lens
-from clear_strategies.data.photo_files import SUFFIXES, image_size, is_lossy, read_image
+from clear_strategies.data.photo_files import SUFFIXES, read_header, read_image
 from clear_strategies.data.photo_folders import images_in
 from clear_strategies.errors import DataError
 
@@ -90,7 +90,7 @@ def _by_name(folder: Path) -> dict[str, Path]:
 def check_mask(path: Path, lens: Lens, turn: bool | None) -> None:
     """Raise a DataError unless a mask has the aspect ratio of the lens. Reads only the header; `turn`: see `read_image`."""
     with _errors_of_mask():
-        lens.resized(*image_size(path, turn=turn), path)
+        lens.resized(*read_header(path).size(turn), path)
 
 
 def read_mask(path: Path, lens: Lens, pinhole: Lens, turn: bool | None) -> Bool[Tensor, "H W"]:
@@ -101,7 +101,7 @@ def read_mask(path: Path, lens: Lens, pinhole: Lens, turn: bool | None) -> Bool[
     """
     with _errors_of_mask():
         values = read_image(path, turn=turn).amax(dim=2)
-        shown = (values > (values.max() / 2 if is_lossy(path) else 0)).float()
+        shown = (values > (values.max() / 2 if read_header(path).lossy else 0)).float()
     shown = F.interpolate(shown[None, None], (lens.height, lens.width), mode="nearest-exact")[0, 0]
     if lens.distorts:
         shown = lens.undistort(shown, pinhole)

@@ -67,6 +67,30 @@ class Optics(NamedTuple):
     lens: tuple[str, ...]
 
 
+class Header(NamedTuple):
+    """What is known of an image before it is decoded.
+
+    Args:
+        stored: width and height as in the file, of the image as `read_image` returns it.
+        orientation: EXIF's, 1 (upright) to 8.
+        has_alpha: the image may have transparent pixels.
+        lossy: the format does not keep each value.
+    """
+
+    path: Path
+    stored: tuple[int, int]
+    orientation: int
+    has_alpha: bool
+    lossy: bool
+
+    def size(self, turn: bool | None) -> tuple[int, int]:
+        """(width, height); `turn` and its error as of `read_image`."""
+        if turn is None and self.orientation != 1:
+            raise _rotation_error(self.path, self.orientation)
+        width, height = self.stored
+        return (height, width) if turn and self.orientation in _ON_THE_SIDE else (width, height)
+
+
 def read_image(
     path: Path, *, background: Color | None = None, expect: tuple[int, int] | None = None, turn: bool | None = None
 ) -> Float[Tensor, "H W 3"]:
@@ -78,9 +102,11 @@ def read_image(
         turn: what to do with an EXIF rotation. True: apply it, and refuse a 16-bit PNG, which cannot be rotated. False: return
             the stored pixels, and refuse a TIFF, which decoders rotate. None: refuse the image.
     """
-    with _opened(path, turn) as image:
+    with _opened(path) as image:
         sixteen_bits = _has_sixteen_bits(image)  # unknown after decoding
         orientation = _orientation_of(image)  # Pillow forgets that of a TIFF as it decodes it
+        if turn is None and orientation != 1:
+            raise _rotation_error(path, orientation)
         try:
             image.load()
         except Exception as error:  # PIL's decoders raise many types of error on damaged bytes
@@ -105,33 +131,26 @@ def read_image(
     return torch.from_numpy(np.ascontiguousarray(rgb))
 
 
-def image_size(path: Path, *, turn: bool | None = None) -> tuple[int, int]:
-    """Return (width, height). Reads only the header; `turn` and errors as of `read_image`."""
-    with _opened(path, turn) as image:
+def read_header(path: Path) -> Header:
+    """Read the header of an image; errors as of `read_image`, but of an EXIF rotation."""
+    with _opened(path) as image:
         width, height = image.size
         # Some versions of PIL return the upright size of a rotated TIFF.
         if isinstance(image, TiffImagePlugin.TiffImageFile):
             width, height = image.tag_v2[TiffImagePlugin.IMAGEWIDTH], image.tag_v2[TiffImagePlugin.IMAGELENGTH]
         factor = _reduction_factor(width * height)
-        width, height = -(-width // factor), -(-height // factor)
-        return (height, width) if turn and _orientation_of(image) in _ON_THE_SIDE else (width, height)
+        stored, lossy = (-(-width // factor), -(-height // factor)), image.format not in _LOSSLESS
+        return Header(path, stored, _orientation_of(image), bool(image.has_transparency_data), lossy)
 
 
-def has_alpha(path: Path) -> bool:
-    """Return True if the image may have transparent pixels. Reads only the header; errors as of `read_image`."""
-    with _opened(path, False) as image:
-        return bool(image.has_transparency_data)
-
-
-def is_lossy(path: Path) -> bool:
-    """Return True if the file's format is not lossless. Reads only the header; errors as of `read_image`."""
-    with _opened(path, False) as image:
-        return image.format not in _LOSSLESS
+def image_size(path: Path) -> tuple[int, int]:
+    """Return (width, height) of an image without an EXIF rotation. Reads only the header; errors as of `read_image`."""
+    return read_header(path).size(None)
 
 
 def optics(path: Path) -> Optics:
     """Return the camera data of the EXIF block; errors as of `read_image`."""
-    with _opened(path, False) as image:
+    with _opened(path) as image:
         tags = _tags(image, ExifTags.IFD.Exif)
     value = tags.get(ExifTags.Base.FocalLengthIn35mmFilm, 0)
     try:  # cameras also write 0, 0/0, text and tuples
@@ -155,8 +174,8 @@ def png_bytes(image: Float[Tensor, "H W 3"] | Float[Tensor, "H W"]) -> bytes:
 
 
 @contextmanager
-def _opened(path: Path, turn: bool | None) -> Iterator[Image.Image]:
-    """Open an image and check its size and EXIF rotation, without decoding its pixels."""
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """Open an image and check its size, without decoding its pixels."""
     require_regular(path)
     formats = (*_FORMATS, "HEIF") if _is_heif(path) else _FORMATS
     try:
@@ -179,8 +198,6 @@ def _opened(path: Path, turn: bool | None) -> Iterator[Image.Image]:
         if image.width * image.height > (most := _MAX_PIXELS if _has_sixteen_bits(image) else _LARGEST):
             problem = f"{image.width}x{image.height} is more than {most:,} pixels"
             raise DataError(path, "size", problem, f"reduce it: mogrify -resize 50% {shlex.quote(str(path))}")
-        if turn is None and (orientation := _orientation_of(image)) != 1:
-            raise _rotation_error(path, orientation)
         yield image
 
 

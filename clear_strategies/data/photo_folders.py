@@ -8,11 +8,13 @@ import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 from clear_strategies.data.file_names import LISTED, is_file, named, some
 from clear_strategies.data.photo_files import SUFFIXES, read_image
 from clear_strategies.errors import DataError
+
+T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
 
@@ -116,10 +118,13 @@ def images_in(folder: Path, pattern: str = "*") -> list[Path]:
     return [p for p in images if not any(part.startswith(".") for part in p.relative_to(folder).parts)]
 
 
-def usable(listing: Path, paths: Sequence[Path], *, skip_faulty: bool, scene: Path | None = None) -> list[Path]:
+def usable(
+    listing: Path, photos: Iterable[tuple[T, Path]], *, skip_faulty: bool, scene: Path | None = None
+) -> list[tuple[T, Path]]:
     """Select the photos that can be used, in order.
 
     Args:
+        photos: each with what the reader knows of it.
         listing: the file or folder that lists the photos, for messages.
         scene: the folder that data.reader.images is relative to; None: the reader has no such setting.
         skip_faulty: decode every photo, and leave out those that are missing or cannot be decoded, with a warning for each.
@@ -134,16 +139,17 @@ def usable(listing: Path, paths: Sequence[Path], *, skip_faulty: bool, scene: Pa
             return False
         return True
 
-    absent = [path for path in paths if not is_file(path)]
-    if absent and len(absent) == len(paths):
+    photos = list(photos)
+    absent = [path for _, path in photos if not is_file(path)]
+    if absent and len(absent) == len(photos):
         raise _none_found(listing, absent, scene)
     if absent and not skip_faulty:
-        problem = f"{len(absent)} of {len(paths)} are not there: {some([path.name for path in absent])}"
+        problem = f"{len(absent)} of {len(photos)} are not there: {some([path.name for path in absent])}"
         remedy = "put them back, or train without them: data.reader.skip_faulty=true"
         raise DataError(listing, "photos", problem, remedy)
-    kept = list(filter(decodes, paths) if skip_faulty else paths)
-    if paths and not kept:
-        raise DataError(listing, "photos", f"none of {len(paths)} can be used", "check the path")
+    kept = [photo for photo in photos if not skip_faulty or decodes(photo[1])]
+    if photos and not kept:
+        raise DataError(listing, "photos", f"none of {len(photos)} can be used", "check the path")
     return kept
 
 

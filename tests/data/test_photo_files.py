@@ -104,7 +104,7 @@ def test_a_turned_photo_is_read_as_it_is_stored_or_upright(ending: str, orientat
             continue
         found = photo_files.read_image(path, turn=turn, expect=(expected.shape[1], expected.shape[0]))
         assert np.array_equal(found.numpy() > 0.5, expected > 127)
-        assert photo_files.image_size(path, turn=turn) == found.shape[1::-1]
+        assert photo_files.read_header(path).size(turn) == found.shape[1::-1]
 
 
 def test_a_rotation_that_a_png_file_has_behind_its_pixels_is_known_before_they_are_decoded(tmp_path: Path) -> None:
@@ -114,7 +114,7 @@ def test_a_rotation_that_a_png_file_has_behind_its_pixels_is_known_before_they_a
     data = path.read_bytes()
     first, last = data.index(b"eXIf") - 4, data.index(b"IDAT") - 4
     path.write_bytes(data[:first] + data[last:-12] + data[first:last] + data[-12:])  # IEND has 12 bytes
-    assert photo_files.image_size(path, turn=True) == (12, 16)
+    assert photo_files.read_header(path).size(turn=True) == (12, 16)
     with pytest.raises(DataError, match="EXIF orientation: is 6"):
         photo_files.image_size(path)
 
@@ -251,7 +251,7 @@ def test_hdr_without_a_profile_and_adobe_rgb_that_only_exif_tells_are_told(tmp_p
     path = write(tmp_path / "a.heic", LEVELS)
     photo_files.read_image(path)
     assert not caplog.text
-    with photo_files._opened(path, False) as image:
+    with photo_files._opened(path) as image:
         image.info["nclx_profile"] = {"color_primaries": 9, "transfer_characteristics": 16}
         photo_files._to_srgb_of(image)
     assert "primaries 9 and the transfer 16 of ITU-T H.273 (HDR, or a wide gamut)" in caplog.text

@@ -8,7 +8,7 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.data.photo_files import has_alpha, read_image
+from clear_strategies.data.photo_files import read_header, read_image
 from clear_strategies.data.priors.interface import AS_EXPECTED, checked_sr, require_path
 from clear_strategies.data.view_names import ViewFiles
 
@@ -45,5 +45,5 @@ class Images:
     def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
         file = self._files.file(name, lr.shape[1] * factor, lr.shape[0] * factor)
         over_black = "its transparent pixels are black in the photos, too; else save it without alpha"
-        check = over_black if has_alpha(file) else AS_EXPECTED
+        check = over_black if read_header(file).has_alpha else AS_EXPECTED
         return checked_sr(file.name, read_image(file), lr, factor, check)

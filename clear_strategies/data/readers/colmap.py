@@ -78,13 +78,11 @@ def capture(
         DataError: an image cannot be used.
     """
     listing = model.listing
-    listed = [paths[image.name] for image in model.images]
-    kept = set(usable(listing, listed, skip_faulty=skip_faulty, scene=root))
+    listed = ((image, paths[image.name]) for image in model.images)
+    photos = usable(listing, listed, skip_faulty=skip_faulty, scene=root)
     masks = masks_of(folder.parent, paths.values())
     frames = []
-    for image, path in zip(model.images, listed, strict=True):
-        if path not in kept:
-            continue
+    for image, path in photos:
         inside = path.relative_to(folder) if path.is_relative_to(folder) else path  # which `sorted_by_name` refuses
         frames.append(Frame.of_photo(
             inside.as_posix(), path, model.lenses[image.camera], image.pose,

@@ -219,11 +219,8 @@ def frames_of(
     own = {entry.path: find(entry.transform.mask_path) for entry in every if entry.transform.mask_path}
     masks = masks_of(folder, [entry.path for entry in every], own)
     for file, entries in listed.items():
-        kept = set(usable(file, [entry.path for entry in entries], skip_faulty=skip_faulty, scene=scene))
-        for i, entry in enumerate(entries):
-            where, path = f"frames[{i}]", entry.path
-            if path not in kept:
-                continue
+        photos = (((f"frames[{i}]", entry), entry.path) for i, entry in enumerate(entries))
+        for (where, entry), path in usable(file, photos, skip_faulty=skip_faulty, scene=scene):
             pose = _pose_of(file, f"{where}.transform_matrix", entry.transform.transform_matrix)
             lens, mask = entry.transform.lens(file, where, path), masks.get(path)
             frames.append(

@@ -104,7 +104,8 @@ def read(
     base = Path(cache) if cache is not None else cache_folder() / "sfm"
     if base.resolve().is_relative_to(root.resolve()):
         raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
-    paths = usable(root, _without_masks_and_twins(images), skip_faulty=skip_faulty)
+    chosen = ((path.name, path) for path in _without_masks_and_twins(images))
+    paths = [path for _, path in usable(root, chosen, skip_faulty=skip_faulty)]
     require_text((name, *(path.name for path in paths)))
     if len(paths) < sfm.FEWEST:
         raise DataError(root, "images", f"there are {len(paths)}, poses need at least {sfm.FEWEST}", MORE_PHOTOS)
