@@ -217,6 +217,8 @@ def _reduced(image: Image.Image) -> Image.Image:
 
 def _has_sixteen_bits(image: Image.Image) -> bool:
     """Return True if the file has 16 bits per channel; known only until the image is decoded."""
+    if isinstance(image, TiffImagePlugin.TiffImageFile):
+        return 16 in image.tag_v2.get(TiffImagePlugin.BITSPERSAMPLE, ())
     return ";16" in str(getattr(image, "tile", ""))
 
 
@@ -278,6 +280,8 @@ def _to_float(path: Path, image: Image.Image, sixteen_bits: bool) -> Float[np.nd
     """Convert a decoded image to sRGB, with alpha if it has any: [H, W, 3 or 4] in [0, 1]."""
     if image.format in ("PNG", "TIFF", "WEBP") and getattr(image, "n_frames", 1) > 1:
         raise DataError(path, "pages", "are several in one file", "save each image as a file of its own")
+    if sixteen_bits and not _is_plain(image):
+        raise _unknown_layout(path)
     if image.mode in ("I;16", "I;16B", "I;16L", "I;16N"):
         return np.repeat(np.asarray(image).astype(np.float32)[..., None] / 65535, 3, axis=2)
     if image.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
@@ -333,12 +337,28 @@ def _warn_of_colors(colors: str) -> None:
     _log.warning("photos have the colours of %s, and are taken as sRGB. Export them in sRGB.", colors)
 
 
+def _is_plain(image: Image.Image) -> bool:
+    """False for a 16-bit TIFF of which Pillow and OpenCV return other values: inverted, multiplied by alpha, or by channel."""
+    if not isinstance(image, TiffImagePlugin.TiffImageFile):
+        return True
+    tags = image.tag_v2
+    inverted = tags.get(TiffImagePlugin.PHOTOMETRIC_INTERPRETATION) == 0
+    multiplied = 1 in tags.get(TiffImagePlugin.EXTRASAMPLES, ())
+    by_channel = tags.get(TiffImagePlugin.PLANAR_CONFIGURATION) == 2 and len(image.getbands()) > 1
+    return not (inverted or multiplied or by_channel)
+
+
+def _unknown_layout(path: Path) -> DataError:
+    problem = "are 16-bit in a layout that is not known"
+    return DataError(path, "pixels", problem, "convert the image to 8-bit RGB, or to a 16-bit PNG")
+
+
 def _read_sixteen_bits(path: Path) -> Float[np.ndarray, "H W C"]:
     """Read 16-bit colour by OpenCV, since PIL keeps only the upper 8 bits."""
     import cv2
 
     data = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
     if data is None or data.dtype != np.uint16 or data.ndim != 3 or data.shape[2] not in (3, 4):
-        raise DataError(path, "pixels", "are 16-bit in a layout that is not known", "convert the image to 8-bit RGB")
+        raise _unknown_layout(path)
     order = [2, 1, 0] if data.shape[2] == 3 else [2, 1, 0, 3]
     return data[..., order].astype(np.float32) / 65535

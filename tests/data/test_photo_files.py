@@ -54,6 +54,23 @@ def test_sixteen_bits_stay_sixteen_bits(channels: int, ending: str, turn: bool |
     torch.testing.assert_close(photo_files.read_image(path, turn=turn), torch.tensor(expected, dtype=torch.float32))
 
 
+@pytest.mark.parametrize(
+    ("channels", "plain", "other"),
+    [(1, (262, 3, 1, 1), (262, 3, 1, 0)), (3, (284, 3, 1, 1), (284, 3, 1, 2)), (4, (339, 3, 4), (338, 3, 1, 1))],
+    ids=["white is 0", "a plane for each channel", "colours multiplied by alpha"],
+)
+def test_a_sixteen_bit_tiff_that_would_be_read_wrongly_is_refused(channels, plain, other, tmp_path: Path) -> None:
+    path = tmp_path / "a.tiff"
+    cv2.imwrite(str(path), np.zeros((2, 3, channels), np.uint16), [cv2.IMWRITE_TIFF_COMPRESSION, 1])
+    entry = struct.pack("<HHIH"[: len(plain) + 1], *plain)  # tag, type, count, value
+    at = path.read_bytes().index(entry)
+    data = bytearray(path.read_bytes())
+    data[at : at + 10] = struct.pack("<HHIH", *other)
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=r"a\.tiff: pixels: are 16-bit in a layout that is not known"):
+        photo_files.read_image(path)
+
+
 def test_sixteen_bit_grey_with_alpha_is_composited(tmp_path: Path) -> None:
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
