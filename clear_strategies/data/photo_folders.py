@@ -12,7 +12,7 @@ from typing import Final, TypeVar
 
 from clear_strategies.data.file_names import LISTED, is_file, named, some
 from clear_strategies.data.photo_files import SUFFIXES, read_image
-from clear_strategies.errors import DataError
+from clear_strategies.errors import DataError, one_line
 
 T = TypeVar("T")
 
@@ -135,7 +135,7 @@ def usable(
         try:
             read_image(path, turn=True)
         except DataError as error:
-            _log.warning("skipped: %s", error)
+            _log.warning("skipped: %s: %s: %s", error.file, error.field, one_line(error.problem))
             return False
         return True
 

@@ -50,6 +50,7 @@ def test_a_defect_is_refused_in_one_line_with_the_setting_that_goes_on(tmp_path,
     assert [Path(frame.name).stem for frame in capture.frames] == ["a", "c"]
     assert all(bool(frame.load().isfinite().all()) for frame in capture.frames)
     assert len([record for record in caplog.records if "skipped: " in record.message and "/b" in record.message]) == 1
+    assert "data.reader.skip_faulty" not in caplog.text  # it is set
 
 
 def test_a_capture_without_any_photo_is_refused_even_where_faulty_ones_are_skipped(tmp_path):
