@@ -32,14 +32,18 @@ def require_warp(what: str, device: str, otherwise: str) -> None:
         otherwise: says in the error message what runs without CUDA.
 
     Raises:
-        BackendUnavailable: Warp is not installed, or there is no CUDA device.
+        BackendUnavailable: Warp is not installed or too old, or there is no CUDA device.
     """
+    install = "pip install -U 'clear-strategies[warp]'"
     try:
         import warp as wp
     except ImportError as error:
-        raise BackendUnavailable(
-            f"{what} needs NVIDIA Warp, which is not installed ({error}); pip install 'clear-strategies[warp]'."
-        ) from error
+        raise BackendUnavailable(f"{what} needs NVIDIA Warp, which is not installed ({error}); {install}.") from error
+    major, minor, *_ = wp.config.version.split(".")
+    # 1.17 does not compile `ellipses[listed[pair]]`. Until 1.16, a sort may free the memory in which a CUDA graph sorts, and a
+    # replay would read it (NVIDIA/warp#1373).
+    if (int(major), int(minor)) < (1, 18):
+        raise BackendUnavailable(f"{what} needs NVIDIA Warp 1.18 or later, got {wp.config.version}; {install}.")
     # Warp would print a greeting and a line per compilation to stdout, which belongs to the application.
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     if device != "cuda":

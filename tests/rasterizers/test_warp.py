@@ -84,8 +84,21 @@ def test_without_cuda_the_error_says_what_to_install():
 
 def test_without_warp_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "warp", None)  # makes its import fail
-    with pytest.raises(BackendUnavailable, match=r"not installed .*pip install 'clear-strategies\[warp\]'"):
+    with pytest.raises(BackendUnavailable, match=r"not installed .*pip install -U 'clear-strategies\[warp\]'"):
         rasterizers.load("warp")
+
+
+@installed
+def test_a_warp_that_is_too_old_is_refused(monkeypatch):
+    import warp as wp
+
+    for version in ("1.9.1", "1.17.0"):
+        monkeypatch.setattr(wp.config, "version", version)
+        with pytest.raises(BackendUnavailable, match=rf"1\.18 or later, got {version}; pip install -U"):
+            rasterizers.load("warp", device="cpu")
+    for version in ("1.18.0rc1", "2.0.0"):
+        monkeypatch.setattr(wp.config, "version", version)
+        assert rasterizers.load("warp", device="cpu").device == "cpu"
 
 
 @pytest.mark.parametrize(
