@@ -19,7 +19,7 @@ class Act:
         what: "pool", "begin", "end" and "replay" of a graph; "warp stream", "warp begin" and "warp end"; "wait" for another
             stream; "work", "allocate", "sort", "read", "send" and "pin"; "load" of a kernel's module; "random" numbers of the
             device's own generator; "empty": `torch.cuda.empty_cache`; "event": one is recorded; "graph": autograd notes work;
-            "destroy": a graph is no more.
+            "destroy": a graph is no more; "unpin": pinned memory is no more, which work on the stream has copied.
         on: the stream. graph: whose pool, beginning, end or replay it is. other: the stream that is waited for.
         freed: the graph reads memory that is no more. by_warp: memory is Warp's, not torch's.
     """
@@ -157,6 +157,14 @@ def pinning_memory(a: Act, s: State) -> bool:
     an event that precedes it (of a torch whose pinned memory has no pools of graphs).
     """
     return a.what == "pin" and s.capture is not None
+
+
+@rule
+def freeing_pinned_memory(a: Act, s: State) -> bool:
+    """Operation not permitted on an event last recorded in a capturing stream: torch records one where pinned memory is freed, on
+    each stream that has copied it, and asks for it whenever it pins memory later (CachingHostAllocatorImpl::free).
+    """
+    return a.what == "unpin" and s.captures(a.on)
 
 
 @check

@@ -92,10 +92,10 @@ class StrictCuda:
         self.ask("empty")
         self.state.cached = 0
 
-    def destroy(self) -> None:
-        """As `CUDAGraph::reset`, which warns."""
+    def lets_go(self, what: str, on: Stream | None = None) -> None:
+        """Ask as a destructor does, which raises nothing; a capture is invalid all the same."""
         with contextlib.suppress(RuntimeError):
-            self.ask("destroy")
+            self.ask(what, on)
 
     def set_sync_debug_mode(self, mode: str) -> None:
         """`torch.cuda.set_sync_debug_mode`."""
@@ -143,7 +143,7 @@ class Graph:
             raise RuntimeError("Operation failed due to a previous error during capture.")
         self.cuda.end_allocate(0, self.pooled)
         self.cuda.state.seeds, self.captured = False, True
-        weakref.finalize(self, self.cuda.destroy)
+        weakref.finalize(self, self.cuda.lets_go, "destroy")
 
     def pool(self) -> Pool:
         self.cuda.ask("pool", graph=self)
@@ -349,6 +349,16 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         cuda.ask("pin")
         return numbers
 
+    def reads(numbers: torch.Tensor) -> Callable[[], Any]:
+        cuda.ask("pin")
+        copied = numbers.clone()
+
+        def wait() -> Any:
+            return copied.tolist()
+
+        weakref.finalize(wait, cuda.lets_go, "unpin", cuda.current)
+        return wait
+
     def on_no_cpu(*_: Any) -> Any:
         raise BackendUnavailable("this memory is the CPU's")
 
@@ -379,7 +389,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         replayed_drawing: {"_threads": replayed_drawing._Threads()},
         reconcile: {"_for_device": lambda device: warp_merge},
         rasterizers.native: {"empty": on_no_cpu},
-        frame: {"DEFERRED_COUNTS": {"cpu": True}},
+        frame: {"DEFERRED_COUNTS": {"cpu": True}, "_read_deferred": reads},
         sending: {"sent": sends},
         warp_runtime: {"sent": sends, "_kept": warp_runtime._Kept()},
     }  # fmt: skip

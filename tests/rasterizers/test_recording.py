@@ -89,6 +89,16 @@ def test_a_recording_that_is_dropped_in_another_ends_that(strict_cuda):
         Recording(CPU, lambda: (older.clear(), torch.zeros(1)))
 
 
+def test_a_drawing_that_is_dropped_in_a_recording_ends_that(strict_cuda):
+    """The host copies its counts to pinned memory."""
+    import rasterizers
+
+    with on_side_stream(CPU):
+        drawn = [rasterizers.load("warp", device="cpu")(toy.splats(9), toy.camera(0.0))]
+    with pytest.raises(RuntimeError, match="a previous error"):
+        Recording(CPU, lambda: (drawn.clear(), torch.zeros(1)))
+
+
 def test_memory_of_recordings_that_were_dropped_is_given_back_before_it_runs_short(strict_cuda):
     for _ in range(2 * ROOM):
         Recording(CPU, lambda: torch.zeros(1))
@@ -278,6 +288,7 @@ EXAMPLES: dict[str, list[Callable[[StrictCuda, torch.Tensor], object]]] = {
         lambda cuda, x: torch.linalg.inv(x[:, None]),
     ],
     "pinning_memory": [lambda cuda, x: x.pin_memory()],
+    "freeing_pinned_memory": [lambda cuda, x: cuda.ask("unpin", cuda.current)],
     "sending_where_waits_are_refused": [
         lambda cuda, x: [torch.cuda.set_sync_debug_mode("error"), x.new_tensor(2.0)]
     ],
