@@ -258,3 +258,6 @@ def test_the_kernels_compile_for_cuda_on_a_machine_without(ptx_of):
         ptx_of(project.project_vjp(k).module)
         ptx_of(project.project_vjp(k, summed=k > 1).module)
         assert ptx_of(blend.blend_vjp(k, 32, True).module, 32).count("shfl.sync") == {1: 12, 2: 20, 3: 28}[k]
+    ptx_of(blend.blend_vjp(1, 32, True, absolute=True).module, 32)
+    for kernel in (project.fold(1, absolute=True), project.project_vjp(1, absolute=True)):
+        ptx_of(kernel.module)
