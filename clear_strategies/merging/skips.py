@@ -29,6 +29,7 @@ _log = logging.getLogger(__name__)
 PLATEAU_LOSS: Final = "loss_views"
 """The column of the history by which a plateau is found: the mean loss of training views, every Gaussian drawn."""
 
+_LOOKS: Final = 6  # at each view in a window, at least: in fewer, the loss rises and falls by chance
 _REDUCED: Final = 2  # the coarse SR image has half the size of the fine one
 _GATED: Final = 0.5  # an opacity is drawn up to twice as high where up to half of the Gaussians are dropped
 
@@ -43,8 +44,8 @@ class Skips:
         hr_every: until then, HR is rendered and compared in one of so many iterations, and in each whose scores densification
             reads; 1: in each.
         plateau_gain: once the loss of the training views, rendered with all Gaussians, has not fallen by at least this share
-            within `plateau_window` iterations, training continues at iteration `plateau_to`; 0: never.
-        plateau_window: iterations between two measurements.
+            within a window, training continues at iteration `plateau_to`; 0: never.
+        plateau_window: iterations between two measurements, at least six for each training view.
         plateau_from: iteration of the earliest measurement.
         plateau_to: iteration from which every run trains: the learning rates fall, and HR is at full size.
         undrawn: once densification has ended, Gaussians too faint to be drawn in any view are removed if they are at least
@@ -97,13 +98,13 @@ class SkipPolicy:
             return phrases
         if s.undrawn > 0:
             phrases.append("Gaussians too faint to be drawn, once densification has ended")
-        if s.plateau_gain > 0 and s.plateau_window == 0:
-            _log.debug("skips.plateau_gain has no effect: in this short run plateau_window is less than one iteration.")
+        if s.plateau_gain > 0 and not self._measurements(len(views)):
+            _log.debug(
+                "skips.plateau_gain has no effect: this run is too short for %d looks at each of %s between two measurements.",
+                _LOOKS, counted(len(views), "view"),
+            )  # fmt: skip
         elif s.plateau_gain > 0:
-            phrases.append(
-                f"all iterations up to {s.plateau_to}, once the loss of the training views falls by less than "
-                f"{s.plateau_gain:.1%} in {counted(s.plateau_window, 'iteration')}"
-            )
+            phrases.append(f"all iterations up to {s.plateau_to}, once {self.plateau(len(views))}")
         return phrases
 
     def view(self, view: View, t: int) -> View:
@@ -145,20 +146,30 @@ class SkipPolicy:
             return None
         return rows
 
-    def measured(self, t: int) -> bool:
-        """Return True if the loss of the training views is measured after iteration t, to find a plateau."""
-        s = self.skips
-        if s.plateau_gain == 0 or s.plateau_window == 0:
-            return False
-        return t % s.plateau_window == 0 and s.plateau_from <= t < s.plateau_to
+    def plateau(self, n_views: int) -> str:
+        """What a plateau is, in words, with `n_views` training views."""
+        window = counted(self._measurements(n_views).step, "iteration")
+        return f"the loss of the training views falls by less than {self.skips.plateau_gain:.1%} in {window}"
 
-    def settled(self, history: Sequence[dict[str, Number]], t: int) -> bool:
+    def _measurements(self, n_views: int) -> range:
+        """The iterations after which the training views are measured, a window apart; empty where there would be one only."""
+        s = self.skips
+        window = max(s.plateau_window, _LOOKS * n_views)
+        times = range(-(-s.plateau_from // window) * window, s.plateau_to, window)
+        return times if s.plateau_gain > 0 and len(times) > 1 else times[:0]
+
+    def measured(self, t: int, n_views: int) -> bool:
+        """Return True if the loss of the training views, so many, is measured after iteration t, to find a plateau."""
+        return t in self._measurements(n_views)
+
+    def settled(self, history: Sequence[dict[str, Number]], t: int, n_views: int) -> bool:
         """True if the training views have stopped improving by iteration t, the last of the history; `plateau_to` then follows.
         False if it is unknown: iterations were left out within the window, or at one end of it the structure has changed or
         another loss was measured.
         """
-        window = self.skips.plateau_window
-        if not (self.measured(t) and self.measured(t - window) and len(history) > window):
+        times = self._measurements(n_views)
+        window = times.step
+        if t not in times[1:] or len(history) <= window:
             return False
         rows = deferred.resolve(history)
         before, now = rows[-1 - window], rows[-1]

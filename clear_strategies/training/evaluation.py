@@ -14,7 +14,6 @@ from clear_strategies.training.state import TrainState
 from rasterizers.interface import Rasterizer
 
 _STAGE: Final = "probe test views"
-_VIEWS_OF_LOSS: Final = 4
 
 
 def evaluate(state: TrainState, scene: Scene, rasterizer: Rasterizer, done: int) -> None:
@@ -34,12 +33,12 @@ def evaluate(state: TrainState, scene: Scene, rasterizer: Rasterizer, done: int)
 
 
 def loss_of_views(state: TrainState, rasterizer: Rasterizer) -> Number:
-    """Mean loss of training views against what they are trained on, every Gaussian drawn; of the first few views.
+    """Mean loss of training views against what they are trained on, every Gaussian drawn.
 
     A training loss is no measure of progress: dropout changes it, and so does the order of the views.
     """
     objective, losses = state.conductor.objective, []
-    for view in state.views[:_VIEWS_OF_LOSS]:
+    for view in state.views:
         shown, compare, name = view.lr, objective.lr, "lr"
         if objective.lambda_hr(state.t) > 0:
             shown, compare, name = state.conductor.skips.view(view, state.t).hr, objective.hr, "base"

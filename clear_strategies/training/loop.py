@@ -58,7 +58,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
         if s.filter_due() and not restructured and not s.remove_undrawn():  # each recomputes the filter
             s.refilter()
     s.history.append(_with_logs(_row(s) | row | extra, conductor.logs.counted()))
-    if s.conductor.skips.measured(t) and not (restructured or s.reset_due(t)):
+    if s.conductor.skips.measured(t, len(s.views)) and not (restructured or s.reset_due(t)):
         with stage("loss of the training views"):
             s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)
     s.advance()

@@ -17,7 +17,7 @@ from clear_strategies.core import deferred
 from clear_strategies.core.finite import is_finite, rows_not_finite
 from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
-from clear_strategies.errors import AnswerError, DataError, DivergedError, counted
+from clear_strategies.errors import AnswerError, DataError, DivergedError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.training.checkpoint import Checkpoint
 from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for
@@ -147,12 +147,11 @@ class TrainState:
     def advance(self) -> None:
         """Go to the next iteration, or from a plateau of the training views straight to its end."""
         done, self.t = self.t, self.t + 1
-        if not self.conductor.skips.settled(self.history, done):
+        policy = self.conductor.skips
+        if not policy.settled(self.history, done, len(self.views)):
             return
-        s = self.conductor.skips.skips
-        window = counted(s.plateau_window, "iteration")
-        reason = f"the loss of the training views fell by less than {s.plateau_gain:.1%} in {window}"
-        self.t = min(s.plateau_to, self.settings.iterations) + 1
+        reason = policy.plateau(len(self.views))
+        self.t = min(policy.skips.plateau_to, self.settings.iterations) + 1
         left_out = self.t - done - 1
         self.optimizer.steps += left_out  # the learning rates follow the iteration
         self.conductor.work_log.skip("iterations", reason, left_out)

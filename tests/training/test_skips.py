@@ -25,7 +25,7 @@ def loss_rows(*losses: float, lambda_hr: float = 0.0) -> list[dict[str, float]]:
 def test_by_default_and_of_photos_that_sr_does_not_enlarge_nothing_is_left_out_and_milestones_stretch():
     view, skip_policy, work_log = toy.scene().train[0], SkipPolicy(), WorkLog()
     assert skip_policy.view(view, 1) is view
-    assert not skip_policy.settled(loss_rows(*[1.0] * 20_000), 20_000)
+    assert not skip_policy.settled(loss_rows(*[1.0] * 20_000), 20_000, 3)
     assert not work_log.entries
     view, work_log, skip_policy = toy.scene().train[0], WorkLog(), SkipPolicy(Skips(coarse_until=10))
     same = replace(view, hr=view.lr)
@@ -74,27 +74,40 @@ def test_a_skip_that_cannot_act_is_logged_and_not_in_the_plan(caplog):
     assert "by less than 1.0% in 500 iterations" in window
     assert not caplog.records
     odd = replace(view, hr=view.hr.reduced(4))  # by a factor of 1
-    assert SkipPolicy(replace(skips, plateau_window=0)).descriptions([odd]) == []
     assert SkipPolicy(skips).descriptions([odd]) == [window]
+    assert SkipPolicy(scaled(skips, 0.03)).descriptions([odd] * 10) == []
     logged = {record.getMessage().partition(" ")[0]: record.levelname for record in caplog.records}
     assert logged == {"skips.coarse_until": "WARNING", "skips.plateau_gain": "DEBUG"}  # the latter is every short run's
 
 
 @pytest.mark.parametrize(("now", "ends"), [(0.99, True), (0.97, False), (1.10, True)])
 def test_a_plateau_is_a_window_that_gains_less_than_asked(now, ends):
-    skip_policy = SkipPolicy(Skips(plateau_gain=0.02, plateau_window=4, plateau_from=4))
-    assert skip_policy.settled(loss_rows(*[1.0] * 4, *[now] * 4), 8) is ends
+    skip_policy = SkipPolicy(Skips(plateau_gain=0.02, plateau_window=6, plateau_from=6))
+    assert skip_policy.settled(loss_rows(*[1.0] * 6, *[now] * 6), 12, n_views=1) is ends
 
 
 def test_a_plateau_begins_neither_early_nor_between_windows_nor_late():
-    skips = Skips(plateau_gain=0.5, plateau_window=4, plateau_from=7, plateau_to=20)
-    rows = loss_rows(*[1.0] * 24)
-    assert [t for t in range(1, 25) if SkipPolicy(skips).settled(rows[:t], t)] == [12, 16]
-    assert not SkipPolicy(skips).settled([*rows[:6], rows[15]], 16)  # those between were left out
+    skips = Skips(plateau_gain=0.5, plateau_window=6, plateau_from=7, plateau_to=30)
+    rows = loss_rows(*[1.0] * 36)
+    assert [t for t in range(1, 37) if SkipPolicy(skips).settled(rows[:t], t, n_views=1)] == [18, 24]
+    assert not SkipPolicy(skips).settled([*rows[:8], rows[23]], 24, n_views=1)  # those between were left out
+
+
+@pytest.mark.parametrize(
+    ("iterations", "n_views", "window"), [(10_000, 3, 250), (1_500, 3, 38), (1_000, 10, 60), (300, 6, 36)]
+)
+def test_a_window_shows_each_view_several_times(iterations, n_views, window):
+    """In 8 of 300 iterations six views are seen 1.3 times each, and their loss rises and falls by chance."""
+    policy = SkipPolicy(scaled(Skips(plateau_gain=0.01, plateau_window=250), iterations / 10_000))
+    rows = loss_rows(*[1.0] * iterations)
+    measured = [t for t in range(1, iterations + 1) if policy.measured(t, n_views)]
+    assert measured == [t for t in range(0, iterations, window) if 0.5 * iterations <= t < 0.8 * iterations]
+    assert [t for t in range(1, iterations + 1) if policy.settled(rows[:t], t, n_views)] == measured[1:]
+    assert not any(policy.measured(t, n_views=iterations // 6) for t in range(1, iterations + 1))
 
 
 @pytest.mark.parametrize("peak", [0.0, 1.0])
-def test_the_loss_that_tells_a_plateau_is_of_every_gaussian(peak):
+def test_the_loss_that_tells_a_plateau_is_of_every_gaussian_and_view(peak):
     objective = Objective(lambda_hr=WarmupDecay(peak=peak, final=peak, start=0, full=0))
     thinned = Conductor(SVS(Ramp(0.9, "constant"), looks=0), objective=objective)
     losses = []
@@ -108,10 +121,14 @@ def test_the_loss_that_tells_a_plateau_is_of_every_gaussian(peak):
     (whole, with_dropout), (same, without) = losses
     assert whole == same
     assert with_dropout != without
+    views = toy.scene(16, train=6).train
+    *of_each, of_all = (loss_of_views(replace(state, views=some), toy.RASTERIZER) for some in (*zip(views), views))
+    assert of_all == pytest.approx(sum(of_each) / 6, rel=1e-6)
 
 
-def test_what_raises_the_measured_loss_is_no_plateau():
+def test_what_raises_the_measured_loss_is_no_plateau(monkeypatch):
     """HR begins after t = 8 and is whole after t = 10; at t = 12 the structure changes and opacities are lowered."""
+    monkeypatch.setattr("clear_strategies.merging.skips._LOOKS", 0)
     state = start(())
     state.density.settings = replace(state.density.settings, start=11)
     hr = WarmupDecay(start=8, full=9, decay_from=14, end=ITERATIONS)
@@ -125,13 +142,14 @@ def test_what_raises_the_measured_loss_is_no_plateau():
     policy = SkipPolicy(Skips(coarse_until=6, plateau_gain=0.5, plateau_window=4, plateau_from=4))
     rises = [1.0] * 7 + [2.0]
     lr, hr = loss_rows(*rises), loss_rows(*rises, lambda_hr=1.0)
-    assert policy.settled(lr, 8)
-    assert not policy.settled([*lr[:7], hr[7]], 8)  # HR sets in
-    assert not policy.settled(hr, 8)  # HR becomes whole
-    assert SkipPolicy(replace(policy.skips, coarse_until=0)).settled(hr, 8)
+    assert policy.settled(lr, 8, 1)
+    assert not policy.settled([*lr[:7], hr[7]], 8, 1)  # HR sets in
+    assert not policy.settled(hr, 8, 1)  # HR becomes whole
+    assert SkipPolicy(replace(policy.skips, coarse_until=0)).settled(hr, 8, 1)
 
 
-def test_a_plateau_is_left_out_and_the_run_has_its_end(caplog):
+def test_a_plateau_is_left_out_and_the_run_has_its_end(caplog, monkeypatch):
+    monkeypatch.setattr("clear_strategies.merging.skips._LOOKS", 0)
     state = start(("gco",))
     state.density.settings = replace(state.density.settings, stop=0)  # a change of structure is no plateau
     state.conductor.skips = SkipPolicy(Skips(plateau_gain=0.99, plateau_window=2, plateau_from=6, plateau_to=17))
@@ -139,7 +157,7 @@ def test_a_plateau_is_left_out_and_the_run_has_its_end(caplog):
         fit(state, toy.scene(), toy.RASTERIZER)
     assert [int(row["t"]) for row in state.history] == [*range(1, 9), 18, 19, 20]
     assert state.optimizer.steps == ITERATIONS  # so the learning rates are those of the end
-    assert "to 18, since the loss of the training views fell by less than" in caplog.text
+    assert "to 18, since the loss of the training views falls by less than" in caplog.text
     assert sum(state.conductor.work_log.entries["iterations"].skipped.values()) == 9
 
 
