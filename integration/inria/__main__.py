@@ -20,7 +20,7 @@ import torch
 from clear_strategies.errors import HostError
 from integration import launcher
 from integration.inria.cameras import photo_of
-from integration.inria.from_options import install
+from integration.inria.from_options import install, training_render
 from integration.replacing import replaced_attribute, replaced_everywhere
 from integration.settings import Settings
 from integration.views import no_stereo
@@ -37,9 +37,7 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
     """
     renderer: Any = importlib.import_module("gaussian_renderer")  # whose `render` install replaces
     scene: Any = importlib.import_module("scene")
-    init, render = scene.Scene.__init__, getattr(renderer, "render", None)
-    if render is None:
-        raise HostError("gaussian_renderer has no function render, which it has in 3DGS.")
+    init, render = scene.Scene.__init__, training_render(renderer)
     of = scene.GaussianModel
     scenes, models, attached = list[Any](), list[Any](), list[Any]()
 

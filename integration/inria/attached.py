@@ -89,7 +89,8 @@ class Attached:
         if missing := [attribute for attribute in required if getattr(gaussians, attribute, None) is None]:
             raise HostError(
                 f"{type(gaussians).__name__} has no {missing[0]}, which a GaussianModel has in 3DGS. Attach after "
-                "gaussians.training_setup(opt)."
+                "gaussians.training_setup(opt). A model whose Gaussians a network computes, as in Scaffold-GS, has none, and its "
+                "trainer does not work."
             )
         if "save_ply" in vars(gaussians):
             raise HostError("these gaussians are attached already; remove() the attachment that did it first.")
@@ -255,7 +256,11 @@ class Attached:
             optimizer.register_state_dict_post_hook(self._save_state),
             optimizer.register_load_state_dict_pre_hook(self._load_state),
         ]
-        self.attachment.hook([optimizer])
+        ours = set(map(id, self._host_params().values()))
+        self.attachment.hook([  # Taming-3DGS and FastGS have one more, of the higher SH bands
+            o for o in vars(self._model).values()
+            if isinstance(o, torch.optim.Optimizer) and any(id(p) in ours for g in o.param_groups for p in g["params"])
+        ])  # fmt: skip
 
     def _save_state(self, _: Any, stored: dict[str, Any]) -> None:
         stored[_STATE] = {"detail": self.detail.state_dict(), "attachment": self.attachment.state_dict()}

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import inspect
 import sys
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Final
+from types import ModuleType
+from typing import Any, Final, cast
 
 import torch
 
@@ -39,6 +41,7 @@ def install(gaussians: Any, scene: Any, opt: Any, settings: Settings | None = No
         DataError: see `Attached`; stereo confirms no depth.
     """
     show_in_host()
+    render = training_render(sys.modules.get("gaussian_renderer"))
     wanted = replace(settings or Settings(), **changes)
     iterations = getattr(opt, "iterations", None)
     if iterations is None:
@@ -52,12 +55,25 @@ def install(gaussians: Any, scene: Any, opt: Any, settings: Settings | None = No
         threshold=getattr(opt, "densify_grad_threshold", None), densify_until=getattr(opt, "densify_until_iter", None),
         own_background=bool(getattr(opt, "random_background", False)), accumulation=wanted.accumulation,
     )  # fmt: skip
-    renderer = sys.modules.get("gaussian_renderer")
-    if renderer is None or not hasattr(renderer, "render"):
-        attached.remove()
-        raise HostError("no module gaussian_renderer with a function render has been imported, which 3DGS has.")
-    attached.replace_everywhere(renderer.render)
+    attached.replace_everywhere(render)
     return attached
+
+
+def training_render(renderer: ModuleType | None) -> Callable[..., Any]:
+    """The function `render` of a host's module gaussian_renderer; in one without it, the only function whose name begins so, as
+    FastGS's `render_fastgs`.
+
+    Raises:
+        HostError: there is none, or there are several.
+    """
+    names = [name for name in dir(renderer) if name.startswith("render")]
+    chosen = ["render"] if "render" in names else names
+    if len(chosen) != 1:
+        raise HostError(
+            "gaussian_renderer must be imported, and have a function render, as in 3DGS, got "
+            f"{', '.join(names) or 'none'}. Use attach, and replace_everywhere of the function that the loop trains with."
+        )
+    return cast(Callable[..., Any], getattr(renderer, chosen[0]))
 
 
 def start_from_stereo(gaussians: Any, scene: Any, opt: Any) -> None:

@@ -131,8 +131,8 @@ def host_output(
     image, centres, radii = (result[name] for name in names[:3])
     if tuple(image.shape[1:]) != (camera.height, camera.width) or len(image) < 3:
         raise HostError(
-            f"render must return an RGB image of {camera.width}x{camera.height} pixels, got shape {tuple(image.shape)}. Train "
-            "at the resolution of the photos."
+            f"render must return an RGB image of {camera.width}x{camera.height} pixels, the size of its camera, got shape "
+            f"{tuple(image.shape)}. Train at the resolution of the photos, and pass no other size to render."
         )
     marks = () if drawings or not image.requires_grad else (image,)
     if marks and image._is_view():  # its hook would be lost where the host multiplies it in place by a mask

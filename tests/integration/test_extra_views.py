@@ -152,6 +152,32 @@ def test_an_inria_style_host_draws_any_camera(inria_host, inria_capture, drawn):
     assert torch.allclose(image.double(), reference(before, camera, 0), atol=1e-4)
 
 
+def test_an_inria_style_host_steps_on_it_with_each_of_its_optimizers(inria_host, inria_capture, monkeypatch):
+    """Taming-3DGS and FastGS have one more, of the higher SH bands."""
+
+    def set_up(model, opt):
+        setup(model, opt)
+        groups = model.optimizer.param_groups
+        (sh,) = (i for i, group in enumerate(groups) if group["name"] == "f_rest")
+        model.shoptimizer = torch.optim.Adam([groups.pop(sh)], lr=0.0, eps=1e-15)
+
+    def step(model, _):
+        if hasattr(model, "shoptimizer"):
+            model.shoptimizer.step()
+            model.shoptimizer.zero_grad()
+
+    setup, done = inria_host.GaussianModel.training_setup, []
+    for both in (setup, set_up):
+        monkeypatch.setattr(inria_host.GaussianModel, "training_setup", both)
+        done.append(
+            trained_inria(inria_host, inria_capture, [toy.ShowsDark()], also=step, iterations=12, densify_until_iter=0)
+        )
+    (one, clear, _), (two, *_) = done
+    assert clear.attachment.counts["extra views"] == 12
+    assert bool(one._features_rest.any())
+    assert all(torch.equal(getattr(one, name), getattr(two, name)) for name in _ATTRIBUTES.values())
+
+
 @pytest.mark.parametrize(
     "step", [lambda self, visibility: None, lambda self, visibility, N: None], ids=["gsplat", "3dgs"]
 )

@@ -49,14 +49,19 @@ def svs(**settings):
     return scaled(SVS(**{"anchor_strength": 0.01, "anchor_weights": weights} | settings), STEPS / 10_000)
 
 
-def trained(host, folder, strategies, objective=HR_FROM_START, **settings):
-    """Train with the strategies attached."""
+def trained(host, folder, strategies, objective=HR_FROM_START, also=lambda gaussians, iteration: None, **settings):
+    """Train with the strategies attached.
+
+    Args:
+        also: is done between the backward pass and the step.
+    """
     opt = options(host, folder, **settings)
     gaussians, scene = host.setup(opt)
     grads = {}
 
     def between(iteration):
         grads.update({k: p.grad.clone() for k, p in clear.params().items() if p.grad is not None})
+        also(gaussians, iteration)
 
     clear = attach(
         gaussians, scene.getTrainCameras(), Conductor(*strategies, objective=objective), sr=folder / "sr",
@@ -327,7 +332,7 @@ def test_unsupported_calls_are_refused(inria_host, inria_capture, inria_attached
     with pytest.raises(HostError, match="render must return a dict"):
         clear.wrap(lambda *_: (1, 2))(camera, gaussians, None, None)
     camera.image_width *= 2
-    with pytest.raises(HostError, match=r"an RGB image of 24x16 pixels, got shape \(3, 16, 48\)"):
+    with pytest.raises(HostError, match=r"24x16 pixels, the size of its camera, got shape \(3, 16, 48\)"):
         render(camera, gaussians, None, None)
     with pytest.raises(HostError, match="attached already"):
         attach(gaussians, scene.cameras, Conductor(GCO()), sr=inria_capture / "sr")
@@ -439,6 +444,21 @@ def test_each_of_two_models_that_a_script_trains_has_the_strategies(inria_host, 
     assert inria_launched("--iterations", "4", change=(TRAINING, 2 * TRAINING)) == 0
     assert caplog.text.count("4 merges") == 2
     assert not hasattr(inria_host.render, "__wrapped__")
+
+
+@pytest.mark.parametrize("named", [["render_fastgs"], ["render_a", "render_b"]])
+def test_a_renderer_of_another_name_is_found_if_it_is_the_only_one(
+    named, inria_host, inria_launched, caplog, monkeypatch
+):
+    """FastGS has no other; of several, none is the first."""
+    module = sys.modules["gaussian_renderer"]
+    for name in named:
+        monkeypatch.setattr(module, name, inria_host.render, raising=False)
+    monkeypatch.delattr(module, "render")
+    monkeypatch.delattr(inria_host, "render")
+    change = "import render\n", f"import {named[0]} as render\n"
+    assert inria_launched("--iterations", "4", change=change) == (0 if len(named) == 1 else 2)
+    assert ("4 merges" if len(named) == 1 else "got render_a, render_b. Use attach") in caplog.text
 
 
 @pytest.mark.parametrize(
