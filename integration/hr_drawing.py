@@ -181,7 +181,7 @@ class HrDrawing:
         """As `hr`, drawn by this package."""
         conductor, t, view = self._conductor, step.t, step.view
         photo = view.hr.over(conductor.background(t), view.background)
-        looked_up = None if self._replays is None else conductor.looked_up(view)
+        looked_up = conductor.looked_up(view)
 
         def work(inputs: _RenderInputs) -> tuple[HrSide, dict[str, Number]]:
             shown = view if inputs.image is photo.image else replace(view, hr=inputs.over(photo))

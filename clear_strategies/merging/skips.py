@@ -72,7 +72,7 @@ class SkipPolicy:
 
     def __init__(self, skips: Skips | None = None) -> None:
         self.skips = skips if skips is not None else Skips()
-        self._coarse: dict[str, View] = {}
+        self._coarse: dict[str, tuple[View, View]] = {}  # a view and its coarse one, by name
 
     def descriptions(self, views: Sequence[View], *, uses_hr: bool = True, in_host: bool = False) -> list[str]:
         """A phrase for each skip that is on, for the plan; one that has no effect is logged.
@@ -114,9 +114,11 @@ class SkipPolicy:
             return view
         if not _halves(view):
             return view
-        if view.name not in self._coarse:
-            self._coarse[view.name] = replace(view, hr=view.hr.reduced(_REDUCED), truth=None)
-        return self._coarse[view.name]
+        whole, coarse = self._coarse.get(view.name, (None, None))
+        if coarse is None or whole is not view:  # of another scene, or with another SR image
+            coarse = replace(view, hr=view.hr.reduced(_REDUCED), truth=None)
+            self._coarse[view.name] = view, coarse
+        return coarse
 
     def leaves_out_hr(self, t: int, work_log: WorkLog) -> bool:
         """Return True if HR is left out of iteration t: with `hr_every=2` of even ones, in which pseudo views come, too."""
@@ -127,7 +129,7 @@ class SkipPolicy:
 
     def lr_due(self, view: View, hr_due: bool, work_log: WorkLog) -> bool:
         """True if LR is rendered: not if HR at half its size is as large as the photo, since one render then serves both."""
-        if view.factor > 1 or not hr_due or view is not self._coarse.get(view.name):
+        if view.factor > 1 or not hr_due or view is not self._coarse.get(view.name, (None, None))[1]:
             return True
         work_log.skip("render LR", "HR at half its size is as large (skips.coarse_until)")
         return False

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
+import operator
 from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
@@ -130,18 +131,18 @@ class P2G(Strategy):
         return R, A
 
     def looked_up(self, view: View) -> Float[Tensor, "2 ph pw"]:
-        """R and A."""
-        key = (view.name, view.factor)
-        if key not in self.cache:
+        """R and A, computed anew where a view of this name has other images, such as another crop of its photo."""
+        key, shown = (view.name, view.factor), (view.lr.image, view.hr.image)
+        known: tuple[tuple[Tensor, Tensor], Tensor] | None = self.cache.get(key)
+        if known is None or not all(map(operator.is_, known[0], shown)):
             maps = self.patch_maps(view)
             R, A = maps.reliability, maps.demand
-            self.cache[key] = torch.stack((R, A))
+            known = self.cache[key] = shown, torch.stack((R, A))
             _log.debug(
                 "%s: reliability R %.2f..%.2f (mean %.3f), detail demand A mean %.3f over %dx%d patches.",
                 view.name, float(R.min()), float(R.max()), float(R.mean()), float(A.mean()), R.shape[1], R.shape[0],
             )  # fmt: skip
-        maps_of_view: Tensor = self.cache[key]
-        return maps_of_view
+        return known[1]
 
 
 # Rounding to 8 bits changes an image by a quarter of a grey level on average; a smaller scale would measure rounding.

@@ -1,13 +1,14 @@
 """P2G: Eq. 9, 10, 12 and 14."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clear_strategies import P2G, Evidence, ScreenGradients, Step
+from clear_strategies import P2G, Evidence, Photo, ScreenGradients, Step
 from clear_strategies.core import images
 from clear_strategies.kernels.per_gaussian import evidence
 from clear_strategies.training.field import GaussianField
@@ -100,6 +101,16 @@ def test_observation_is_made_once_a_view_and_invisible_gaussians_have_none(caplo
     assert torch.equal(first.reliability, second.reliability)
     assert not first.weight[~shot.visible].any()
     assert (first.reliability[shot.visible] > 0).all()
+    crop = replace(view, lr=cut(view.lr, 1), hr=cut(view.hr, view.factor))
+    assert torch.equal(p2g.looked_up(crop), P2G().looked_up(crop))
+    assert torch.equal(p2g.looked_up(view), P2G().looked_up(view))
+
+
+def cut(photo, unit):
+    """The lower right of a photo, without `unit` times 8 and 4 pixels."""
+    camera, x, y = photo.camera, 8 * unit, 4 * unit
+    moved = replace(camera, cx=camera.cx - x, cy=camera.cy - y, width=camera.width - x, height=camera.height - y)
+    return Photo(moved, photo.image[y:, x:].contiguous())
 
 
 def screens(ordinary, hf):

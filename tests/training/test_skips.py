@@ -59,6 +59,9 @@ def test_the_coarse_reference_is_the_mean_of_blocks_seen_by_the_scaled_camera():
     assert coarse.hr.camera.fx == view.hr.camera.fx / 2
     assert coarse.lr is view.lr
     assert skip_policy.view(view, 9) is coarse
+    another = replace(view, hr=replace(view.hr, image=1 - view.hr.image))  # of its name, e.g. in the next run
+    assert torch.equal(skip_policy.view(another, 9).hr.image, another.hr.reduced(2).image)
+    coarse = skip_policy.view(view, 9)
     assert skip_policy.view(view, 11) is view
     freed = weakref.ref(coarse.hr.image)
     del coarse
