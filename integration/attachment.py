@@ -98,6 +98,7 @@ class Attachment:
         self._logged: dict[str, Logged] = {}
         self._has_warned_of_accumulation = False
         conductor.on_fit_start(len(views), seed, means.device, views)
+        self._run = conductor.runs
         announce(conductor, views, host)
         self._finalizer = finalize(self, warn_without_hr, conductor, self.counts)
 
@@ -105,14 +106,22 @@ class Attachment:
         """Render a training view at both scales; returns what the host's render function returns at LR.
 
         Raises:
-            HostError: a backward pass is running; `render_at` renders other parameters, or its Gaussians in another order.
+            HostError: a backward pass is running; the conductor has begun another run; `render_at` renders other parameters, or
+                its Gaussians in another order.
             SettingError: several processes train.
         """
+        if self.removed:
+            return _lr(render_at, None, view).returned
         _require_one_process()
         if current_pass() >= 0:
             raise HostError(
                 f"{view.name} is rendered inside of a backward pass, as torch.utils.checkpoint does it: HR would be drawn twice, "
                 "and the loss be that of another picture. Checkpoint what comes before the rendering, or after it."
+            )
+        if self.conductor.runs != self._run:
+            raise HostError(
+                "the conductor of this loop was attached to another one since, for which its strategies have begun anew. Make a "
+                "conductor for each loop."
             )
         self._finish_step()  # not every optimizer may have stepped, and the structure may have changed
         conductor, t, leaves = self.conductor, self.t, self._host.leaves()
@@ -133,9 +142,7 @@ class Attachment:
         if self.passes == 0:  # once per step of the host, however many passes it accumulates
             extra_views = conductor.extra_views(t)
             self._steps.follow_by(leaves, (self._hr.extra_view(x, view, t, apart) for x in extra_views))
-        output = render_at("lr", z, view)
-        if isinstance(output, Drawable):
-            raise TypeError("an adapter renders LR by the host's own function, got a Drawable.")
+        output = _lr(render_at, z, view)
         if not output.shot.is_in_order:
             raise HostError(
                 f"{view.name} is rendered with its Gaussians in another order than that of the parameters, so that f_det and "
@@ -144,8 +151,7 @@ class Attachment:
             )
         self.counts["LR renders"] += 1
         pending = Pending(self.counts["LR renders"], t, view.name, output, hr)
-        if not self.removed:
-            self._merging.await_passes(pending, to_screen=hr is not None and self._hr.is_scored)
+        self._merging.await_passes(pending, to_screen=hr is not None and self._hr.is_scored)
         return output.returned
 
     @property
@@ -298,6 +304,13 @@ def _checked(render_at: RenderAt, params: Mapping[str, Tensor]) -> RenderAt:
         return output
 
     return render
+
+
+def _lr(render_at: RenderAt, gate: Tensor | None, view: View) -> HostOutput:
+    output = render_at("lr", gate, view)
+    if isinstance(output, Drawable):
+        raise TypeError("an adapter renders LR by the host's own function, got a Drawable.")
+    return output
 
 
 def _to_change(p: Tensor) -> Tensor:

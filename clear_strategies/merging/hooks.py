@@ -55,6 +55,7 @@ class Hooks:
         regularizers: the strategies that override `regularize`.
         showing: the strategies that override `extra_views`.
         views: the argument of `on_fit_start`.
+        runs: how often `on_fit_start` was called.
         logs: the scalars that the strategies log.
         work_log: which work was done, and which was skipped.
 
@@ -66,6 +67,7 @@ class Hooks:
         self.strategies = tuple(strategies)
         self.objective = objective
         self.views: tuple[View, ...] = ()
+        self.runs = 0
         self.logs = IterationLogs(strategies)
         self.work_log = WorkLog()
         self.comparing = [s for s in strategies if overrides(s, "compare")]
@@ -95,6 +97,7 @@ class Hooks:
             splats: see `Strategy.splats`; None: exp and sigmoid.
         """
         self.work_log.device, self.views = torch.device(device), tuple(views)
+        self.runs += 1
         for s in self.strategies:
             s.on_fit_start(n_views, seed)
             answers.require_started(s, seed)

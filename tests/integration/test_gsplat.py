@@ -116,6 +116,19 @@ def test_splats_are_attached_once_at_a_time():
     assert clear.attachment.counts["merges"] == again.attachment.counts["merges"] == 1
 
 
+def test_a_conductor_trains_one_loop_at_a_time():
+    """The strategies would mix what they know of two scenes, whose photos may have the same names."""
+    scene, first, second = toy.scene(20), Host(toy.scene(20)), Host(toy.scene(20))
+    shared = Conductor(P2G(patch=4), objective=HR_FROM_START)
+    clear, _ = attached(first, scene, shared), attached(second, scene, shared)
+    camera = scene.train[0].lr.camera
+    second.render(camera)[0].mean().backward()
+    with pytest.raises(HostError, match=r"attached to another one since.*Make a conductor for each loop"):
+        first.render(camera)
+    clear.remove()
+    assert first.render(camera)[0].isfinite().all()
+
+
 def first_gradient(degree=0, **settings):
     """Of a step with all strategies."""
     scene = toy.scene(30)
