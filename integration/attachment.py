@@ -135,9 +135,10 @@ class Attachment:
         # HR and extra views leave torch's random numbers as they were, so a dropout of the host drops the same at LR.
         apart = torch.random.fork_rng([means.device] if means.device.type == "cuda" else [])(render_at)
         hr, step = None, Step(t, view, params=params)
+        losses: Mapping[str, Number] = {}
         if self._hr.wanted(t):
             view = conductor.skips.view(view, t)
-            hr = self._hr.hr(replace(step, view=view), z, apart)
+            hr, losses = self._hr.hr(replace(step, view=view), z, apart)
         self._step = step if hr is None else hr.step
         if self.passes == 0:  # once per step of the host, however many passes it accumulates
             extra_views = conductor.extra_views(t)
@@ -150,7 +151,7 @@ class Attachment:
                 "parameters."
             )
         self.counts["LR renders"] += 1
-        pending = Pending(self.counts["LR renders"], t, view.name, output, hr)
+        pending = Pending(self.counts["LR renders"], t, view.name, output, hr, losses)
         self._merging.await_passes(pending, to_screen=hr is not None and self._hr.is_scored)
         return output.returned
 
@@ -267,8 +268,7 @@ class Attachment:
             return
         self.passes += 1
         λ = self.conductor.objective.lambda_hr(self.t)
-        losses = {} if pending.hr is None else pending.hr.losses
-        shares = conflict_columns(conflict)
+        losses, shares = pending.losses, conflict_columns(conflict)
         self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **shares, **self.conductor.logs.uncounted()}
         if self.counts["merges"] % _LOGGED_EVERY == 0:
             now = self.log

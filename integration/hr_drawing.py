@@ -144,8 +144,10 @@ class HrDrawing:
         scores = self.is_scored and conductor.may_densify(t)
         return conductor.wants_hr(t) and (scores or not conductor.skips.leaves_out_hr(t, conductor.work_log))
 
-    def hr(self, step: Step, gate: Float[Tensor, " N"] | None, render_at: RenderAt) -> HrSide:
-        """The gradients of HR, of the raw parameters if HR takes part in the merge."""
+    def hr(
+        self, step: Step, gate: Float[Tensor, " N"] | None, render_at: RenderAt
+    ) -> tuple[HrSide, Mapping[str, Number]]:
+        """The gradients of HR, of the raw parameters if HR takes part in the merge; and its losses by name, for the log."""
         self._counts["HR renders"] += 1
         conductor, view = self._conductor, step.view
         mask, drawn = self._masks.get(view.name), render_at("hr", gate, view)
@@ -165,7 +167,9 @@ class HrDrawing:
             shot = replace(shot, image=shot.image * fine.to(shot.image))
         apart = shot.drawing is not None or "detail" in shot.params
         hr = conductor.hr_gradients(shot, step, AutogradShot.gradients, apart=apart)
-        return side_of_parameters(hr, shot.inputs, shot.params) if conductor.objective.lambda_hr(step.t) > 0 else hr
+        if conductor.objective.lambda_hr(step.t) > 0:
+            hr = side_of_parameters(hr, shot.inputs, shot.params)
+        return hr, hr.losses
 
     def extra_view(self, extra: ExtraView, view: View, t: int, render_at: RenderAt) -> Grads:
         """The gradient of an extra view, which is drawn without gate and f_det."""
@@ -177,7 +181,9 @@ class HrDrawing:
 
     @in_full_precision
     @torch.no_grad()
-    def _own_hr(self, asked: Drawable, step: Step, mask: Float[Tensor, "H W 1"] | None) -> HrSide:
+    def _own_hr(
+        self, asked: Drawable, step: Step, mask: Float[Tensor, "H W 1"] | None
+    ) -> tuple[HrSide, Mapping[str, Number]]:
         """As `hr`, drawn by this package."""
         conductor, t, view = self._conductor, step.t, step.view
         photo = view.hr.over(conductor.background(t), view.background)
@@ -192,8 +198,8 @@ class HrDrawing:
         inputs = asked.compared_with(photo, looked_up=looked_up, mask=mask)
         hr, losses = self._done(asked, inputs, t, ("hr", view.factor), work)
         seen = hr.step if self._replays is None else hr.step.copied()
-        hr = replace(hr, step=replace(seen, t=t, view=view, params=step.params), losses=losses)
-        return side_of_parameters(hr, asked.drawn, asked.params)
+        hr = replace(hr, step=replace(seen, t=t, view=view, params=step.params), losses={})  # those of a recording change
+        return side_of_parameters(hr, asked.drawn, asked.params), losses
 
     @in_full_precision
     @torch.no_grad()

@@ -178,9 +178,9 @@ class Conductor(Hooks):
                 grads, conflict = merged.grads, merged.conflict
             else:
                 grads, conflict = None, stepper.step(params, rendered, g_lr, from_hr, t)
-        losses: Mapping[str, Any] = {} if from_hr is None else from_hr.losses
+        losses = {**l_lr.values, **({} if from_hr is None else from_hr.losses)}
         logs = self.logs.counted_since_kept()
-        return Update(step, grads, score, ordinary, conflict, {**l_lr.values, **losses}, logs, l_lr.cotangents)
+        return Update(step, grads, score, ordinary, conflict, losses, logs, l_lr.cotangents)
 
     @apart_from_the_loop
     def hr_gradients(

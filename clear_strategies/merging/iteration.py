@@ -40,7 +40,7 @@ class HrSide:
     size: tuple[int, int]
     step: Step
     m: float | Float[Tensor, " N"] = 1.0
-    losses: Mapping[str, Number] = field(default_factory=dict)
+    losses: Mapping[str, Scalar] = field(default_factory=dict)
     lr: Grads | None = None
 
     @property
