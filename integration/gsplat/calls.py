@@ -17,6 +17,7 @@ from clear_strategies.errors import HostError
 from clear_strategies.geometry.projection import intrinsics
 from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot
 from integration.hr_drawing import Drawable
+from integration.pending import widened
 from integration.views import SAME_POSE, require_intrinsics
 from rasterizers.as_gsplat import cameras_of
 from rasterizers.autograd import collected_drawings
@@ -107,7 +108,7 @@ def with_offset(call: Call, detail: Float[Tensor, "*B N 3"], *, is_ours: bool) -
     Args:
         is_ours: the function is this package's, which has an argument for the offset.
     """
-    colors, as_bands = call["colors"], call.get("sh_degree") is not None
+    colors, as_bands = widened(call["colors"]), call.get("sh_degree") is not None
     if is_ours and as_bands:
         return {**call, "rgb_offset": detail.to(call["means"].dtype)}
     if detail.dim() > 2:  # of several scenes, whose cameras may have colours of their own

@@ -12,6 +12,7 @@ from clear_strategies import P2G, SVS, Conductor, PseudoViews, RandomBackground,
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.schedules import Ramp
 from integration import HostError
+from integration.gsplat import calls
 from integration.gsplat.calls import Poses
 from integration.host_merge import HostMerge
 from rasterizers import autograd
@@ -246,6 +247,14 @@ def test_the_detail_feature_has_the_type_of_what_is_drawn():
     gsplat_host.drawn(host.rasterization, drawn, host.photos["view0"].camera)[0].mean().backward()
     assert clear.attachment.counts["merges"] == 1
     assert bool(host.splats["detail"].grad.any())
+
+
+def test_the_detail_feature_beside_colours_in_float16_has_gradients_that_float16_has_not():
+    detail, colors = torch.zeros(4, 3, requires_grad=True), torch.rand(4, 16, 3).half()
+    for degree, shown, expected in ((3, colors, 1e-9 / SH_C0), (None, colors[:, 0], 1e-9)):
+        found = calls.with_offset({"colors": shown, "sh_degree": degree}, detail, is_ours=False)["colors"]
+        (g,) = torch.autograd.grad(1e-9 * found.float().sum(), detail)
+        torch.testing.assert_close(g, torch.full_like(g, expected))
 
 
 def test_opacities_that_a_loop_keeps_are_multiplied_by_the_gate_of_each_step():
