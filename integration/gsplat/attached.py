@@ -109,7 +109,10 @@ class Attached:
         if missing := [name for name in self._names.values() if name not in params]:
             raise ValueError(f"params must hold {', '.join(self._names.values())}; {missing[0]} is missing.")
         if any(other._params is params and not other.attachment.removed for other in _MADE):
-            raise HostError("these params are attached already; remove() the attachment that did it first.")
+            raise HostError(
+                "these params are attached already; first remove() the attachment that did it, which attach returned. In a "
+                "notebook, run also the cells that make the params and their optimizers."
+            )
         means = params[self._names["means"]]
         if detail and "detail" not in params:
             params["detail"] = torch.nn.Parameter(means.new_zeros(len(means), 3))
@@ -152,7 +155,7 @@ class Attached:
         if (attached := getattr(rasterization, _ATTACHED, None)) is not None and not attached.attachment.removed:
             raise HostError(
                 "this rasterization is wrapped already; remove() the attachment that wrapped it first, or "
-                "wrap its __wrapped__."
+                "wrap rasterization.__wrapped__."
             )
         signature = inspect.signature(rasterization)
         var_keyword = [name for name, p in signature.parameters.items() if p.kind is p.VAR_KEYWORD]

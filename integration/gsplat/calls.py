@@ -50,8 +50,8 @@ class Poses:
         poses = viewmats.detach().reshape(-1, 4, 4).cpu().numpy()  # compared in numpy: a step has few torch operations
         if len(poses) != 1:
             raise HostError(
-                f"only one view per step is supported, got {len(poses)}. Set batch_size=1, or call joint_loss for each view "
-                "and average."
+                f"one view is rendered at a time, got {len(poses)}. For several in a step, call backward() after each and set "
+                "accumulation=; in simple_trainer.py set batch_size=1."
             )
         distances = np.abs(self._poses - poses).max((1, 2)).tolist()
         tolerance = SAME_POSE * max(1.0, float(np.abs(poses).max()))

@@ -105,7 +105,7 @@ def test_remove_restores_the_loop():
 def test_splats_are_attached_once_at_a_time():
     """A second attachment would step and number the same Gaussians; a cell of a notebook may be run twice."""
     host, clear, render = started(GCO())
-    with pytest.raises(HostError, match=r"attached already; remove\(\) the attachment"):
+    with pytest.raises(HostError, match=r"attached already; first remove\(\) the attachment"):
         attach(host.splats, host.optimizers, toy.scene(20).train, Conductor())
     render().mean().backward()
     host.optimizers["means"].step()
