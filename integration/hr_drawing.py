@@ -198,7 +198,8 @@ class HrDrawing:
         inputs = asked.compared_with(photo, looked_up=looked_up, mask=mask)
         hr, losses = self._done(asked, inputs, t, ("hr", view.factor), work)
         seen = hr.step if self._replays is None else hr.step.copied()
-        hr = replace(hr, step=replace(seen, t=t, view=view, params=step.params), losses={})  # those of a recording change
+        # The losses of a recording are overwritten by the next replay.
+        hr = replace(hr, step=replace(seen, t=t, view=view, params=step.params), losses={})
         return side_of_parameters(hr, asked.drawn, asked.params), losses
 
     @in_full_precision
