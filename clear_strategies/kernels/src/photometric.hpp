@@ -58,8 +58,8 @@ PhotometricMeans sum_tiles(const ImagePair& im, int inset, int threads, Task&& t
 }
 
 // Writes the gradient of l1 · mean |x - y| + dssim · (1 - SSIM) with respect to x; returns both means. With dssim = 0 no
-// SSIM is computed, and its mean is 0; without a gradient SSIM alone, and the mean of L1 is 0. SSIM is that of the windows about pixels at least `inset` from the
-// border.
+// SSIM is computed, and its mean is 0; without a gradient SSIM alone is, and the mean of L1 is 0. SSIM is that of the windows
+// about pixels at least `inset` from the border.
 inline PhotometricMeans photometric(const ImagePair& im, PhotometricWeights weights, int inset, int threads) {
   if (weights.dssim == 0 && im.gradient) return {l1_with_gradient(im, weights.l1, threads), 0};
   auto [l1, dssim] = sum_tiles(im, im.gradient ? 0 : inset, threads,
