@@ -24,7 +24,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import ExifTags, Image, ImageOps, TiffImagePlugin
+from PIL import ExifTags, Image, ImageOps, TiffImagePlugin, UnidentifiedImageError
 from torch import Tensor
 
 from clear_strategies.core.images import to_bytes
@@ -184,6 +184,8 @@ def _opened(path: Path) -> Iterator[Image.Image]:
             limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # 200 megapixels of a phone exceed it
             try:
                 image = Image.open(path, formats=formats)
+                if image.mode == "P" and image.palette is None:  # PIL asserts that later
+                    raise UnidentifiedImageError("its palette is missing")
             finally:
                 Image.MAX_IMAGE_PIXELS = limit
     except FileNotFoundError as error:

@@ -71,6 +71,17 @@ def test_a_sixteen_bit_tiff_that_would_be_read_wrongly_is_refused(channels, plai
         photo_files.read_image(path)
 
 
+def test_a_png_file_that_lacks_its_palette_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    Image.new("P", (4, 3)).save(path)
+    data = path.read_bytes()
+    at = data.index(b"PLTE") - 4
+    path.write_bytes(data[:at] + data[at + 12 + int.from_bytes(data[at : at + 4], "big") :])
+    for read in (photo_files.read_header, photo_files.read_image):
+        with pytest.raises(DataError, match=r"a\.png: file: is no readable image"):
+            read(path)
+
+
 def test_sixteen_bit_grey_with_alpha_is_composited(tmp_path: Path) -> None:
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
