@@ -98,10 +98,13 @@ def border_view(photo: Photo, *, field: float, max_pixels: int) -> PseudoView:
 
 
 def _source(photo: Photo, depth_map: DepthMap, background: Color) -> _Source:
-    """Make a source. Pixels at the border of the background are mixed with it, so their colours are not used."""
+    """Make a source. The colours beside the background, or beside what a mask hides, are mixed with it, and not used."""
     known, depth = depth_map.known, torch.nan_to_num(depth_map.depth)
     points = _behind(photo.camera, depth)[:, known.flatten()]
-    mixed = F.max_pool2d(is_background(photo.image, background)[None, None].float(), 3, 1, 1)[0, 0] > 0
+    apart = is_background(photo.image, background)
+    if photo.shown is not None:
+        apart |= ~photo.shown
+    mixed = F.max_pool2d(apart[None, None].float(), 3, 1, 1)[0, 0] > 0
     return _Source(photo, points, torch.where(known & ~mixed, depth, 0.0), float(depth[known].median()))
 
 

@@ -73,7 +73,7 @@ def test_without_two_photos_with_depth_there_are_none_and_large_ones_are_reduced
     assert view.known.float().mean() > 0.5
 
 
-def test_a_depth_that_no_photo_vouches_for_and_pixels_beside_the_background_give_no_colour():
+def test_a_depth_that_no_photo_vouches_for_and_pixels_beside_the_background_or_a_mask_give_no_colour():
     photos = plane(2)
     apart = {"0.png": depth_of(photos["0.png"], 4.0), "1.png": depth_of(photos["1.png"], 2.0)}
     view = views_of(photos, apart, reach=1e-6)[0]
@@ -91,6 +91,8 @@ def test_a_depth_that_no_photo_vouches_for_and_pixels_beside_the_background_give
     assert not known[:, 71:].any()  # photo 1 stands 10 px aside and shows the surface up to there
     assert known[:, 5:45].float().mean() > 0.9
     assert on_black[5:-5, 65:110].all()
+    masked = {name: replace(p, shown=~right[..., 0].expand(90, 120)) for name, p in white.items()}
+    assert torch.equal(views_of(masked, reach=1e-6)[0].known, known)
 
 
 @pytest.mark.parametrize("max_pixels", [10**6, 3_000])
