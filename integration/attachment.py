@@ -53,6 +53,7 @@ from integration.pending import Pending, why_nothing_was_merged
 from integration.structure import resized
 from integration.views import require_unique
 from rasterizers.interface import Color
+from rasterizers.modes import on_cpu_by_default
 from rasterizers.torch_internals import current_pass
 
 _log = logging.getLogger(__name__)
@@ -74,6 +75,7 @@ class Attachment:
         undo: callbacks of `remove`, by which an adapter undoes its changes to the host.
     """
 
+    @on_cpu_by_default
     def __init__(self, conductor: Conductor, host: Host, views: Sequence[View], *, seed: int = 0) -> None:
         _require_supported(conductor)
         require_unique(view.name for view in views)

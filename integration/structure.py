@@ -41,7 +41,7 @@ def resized(
     if parents is None:
         if state:
             # SVS raises an AnchorError here, which says more: the anchor's iteration, and the setting to change.
-            conductor.on_resize(torch.zeros(now, dtype=torch.long))
+            conductor.on_resize(torch.zeros(now, dtype=torch.long, device="cpu"))
             raise HostError(
                 f"the number of Gaussians changed from {before:,} to {now:,} and the host does not say which came from "
                 f"which, but {state} is stored per Gaussian. End densification first, or pass the host's state."

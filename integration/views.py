@@ -24,6 +24,7 @@ from clear_strategies.errors import DataError, HostError
 from clear_strategies.geometry import stereo
 from clear_strategies.geometry.projection import intrinsics
 from rasterizers.interface import Camera
+from rasterizers.modes import on_cpu_by_default
 
 _log = logging.getLogger(__name__)
 SAME_POSE: Final = 1e-3
@@ -94,6 +95,7 @@ class HostPhoto:
         image = self.image.float() / 255 if self.image.dtype == torch.uint8 else self.image.float()
         return Photo(self.camera, image[..., :3].clamp(0, 1))  # reduced photos may overshoot
 
+    @on_cpu_by_default
     def view(self, sr: SuperResolve, factor: int) -> View:
         """See `view`."""
         lr = self.posed

@@ -1,4 +1,6 @@
-"""Decorators that turn off modes of torch in which a loop may call this package: `torch.compile`, `torch.autocast`, autograd."""
+"""Decorators that turn off modes of torch in which a loop may call this package: `torch.compile`, `torch.autocast`, autograd, and
+the default device.
+"""
 
 from __future__ import annotations
 
@@ -32,6 +34,20 @@ def in_full_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
 def apart_from_the_loop(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """The function with torch's autocast and autograd off, so that it runs in the same modes in each loop and stores no graph."""
     return in_full_precision(torch.no_grad()(function))
+
+
+def on_cpu_by_default(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """The function with the CPU as torch's default device, which a loop may have changed: photos are worked on there.
+
+    Each operation inside takes some microseconds longer, so this is for work that is done once.
+    """
+
+    @functools.wraps(function)
+    def called(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        with torch.device("cpu"):
+            return function(*args, **kwargs)
+
+    return called
 
 
 def uncompiled(function: Callable[_P, _R]) -> Callable[_P, _R]:

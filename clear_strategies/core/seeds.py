@@ -30,7 +30,7 @@ def hashed_generator_at(seed: int, t: int, device: torch.device | str = "cpu") -
 
 def one_of(items: Sequence[T], generator: torch.Generator) -> T:
     """One of the items, all equally likely."""
-    return items[int(torch.randint(len(items), (), generator=generator))]
+    return items[int(torch.randint(len(items), (), generator=generator, device=generator.device))]
 
 
 def dropout_mask(n: int, p: float, seed: int, t: int, device: torch.device | str = "cpu") -> Float[Tensor, " N"]:

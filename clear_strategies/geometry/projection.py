@@ -18,7 +18,8 @@ _NO_WEIGHT: Final = 1e-6  # of a pixel in a bilinear mean
 
 def intrinsics(camera: Camera) -> Float[Tensor, "3 3"]:
     """K, float64 on the CPU."""
-    return torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float64)
+    K = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+    return torch.tensor(K, dtype=torch.float64, device=camera.world_to_camera.device)
 
 
 def projection_matrix(camera: Camera) -> Float[Tensor, "3 4"]:

@@ -20,6 +20,7 @@ from clear_strategies.geometry.photos import blackened
 from clear_strategies.geometry.projection import seen_pixels
 from clear_strategies.geometry.sift import features_of
 from rasterizers.interface import Camera
+from rasterizers.modes import on_cpu_by_default
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +42,7 @@ class Stereo:
     summary: str
 
 
+@on_cpu_by_default
 def stereo(
     images: Sequence[Tensor] | Tensor,
     world_to_camera: Tensor,

@@ -132,7 +132,7 @@ class PseudoViews(Strategy):
         generator = generator_at(self.seed, t)
 
         def drawn(n: int) -> int:
-            return int(torch.randint(n, (), generator=generator))
+            return int(torch.randint(n, (), generator=generator, device="cpu"))
 
         choices = borders if borders and not (aside and drawn(_BORDER_SHARE)) else aside
         return (choices[drawn(len(choices))](),)

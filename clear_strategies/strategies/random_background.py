@@ -68,7 +68,7 @@ class RandomBackground(Strategy):
         """RGB, uniform in [0, 1]: a function of (seed, t)."""
         if t > self.until or self.cache.get("reason"):
             return None
-        r, g, b = torch.rand(3, generator=generator_at(self.seed, t)).tolist()
+        r, g, b = torch.rand(3, generator=generator_at(self.seed, t), device="cpu").tolist()
         return r, g, b
 
 

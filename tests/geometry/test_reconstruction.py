@@ -55,6 +55,12 @@ def test_the_cloud_of_the_demo_is_the_trainers_to_the_bit() -> None:
     )
 
 
+def test_torchs_default_device_plays_no_part(plane: Stereo) -> None:
+    given = arguments(plane_photos(3, 64, 48))
+    with torch.device("meta"):  # a host's may be a GPU
+        assert same(stereo(**given), plane)
+
+
 def test_means_lie_on_the_plane_and_the_summary_says_how_much_is_known(plane: Stereo) -> None:
     assert ((plane.means[:, 2] / 4 - 1).abs() < 0.03).float().mean() > 0.9
     assert plane.colors.min() >= 0

@@ -9,6 +9,8 @@ import torch
 
 from clear_strategies import GCO, P2G, SVS, Conductor, Objective, Photo, View
 from clear_strategies.compose import conductor as composed_conductor
+from clear_strategies.data.priors.interface import Bicubic
+from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.schedules import scaled
 from clear_strategies.training.loop import iterate, view_at
 from clear_strategies.training.optim import LearningRates
@@ -16,6 +18,7 @@ from integration import HostError
 from integration.autograd_shot import HostOutput
 from integration.gsplat import attach
 from integration.pending import BackwardPass
+from integration.views import view
 from rasterizers import autograd
 from tests.helpers import toy
 from tests.helpers.gsplat_host import RASTERIZER, Host, attached, drawn, in_double, rasterization, started, trained
@@ -69,6 +72,21 @@ def test_fifty_steps_equal_those_of_our_own_trainer(name):
     assert clear.attachment.t == STEPS + 1  # the next
     assert clear.attachment.counts["merges"] == STEPS
     assert clear.attachment.counts["HR renders"] == STEPS - 2  # lambda_HR is 0 until t = 2
+
+
+def test_torchs_default_device_plays_no_part():
+    """As of a loop that begins with `torch.set_default_device("cuda")`."""
+    scene, trained = toy.scene(30), []
+    photos = [(v.name, v.lr.image, v.lr.camera.world_to_camera, intrinsics(v.lr.camera)) for v in scene.train]
+    for device in ("cpu", "meta"):
+        host, clear = Host(scene), composed_conductor("best", iterations=12)
+        with torch.device(device):
+            views = [view(*photo, sr=clear.prior(Bicubic())) for photo in photos]
+            attached(host, replace(scene, train=tuple(views)), clear)
+            host.train([views[i % 3].name for i in range(12)])
+        trained.append(host.splats)
+    cpu, meta = trained
+    assert [name for name, p in cpu.items() if not torch.equal(p, meta[name])] == []
 
 
 def test_renderings_of_no_photo_train_nothing_and_look_the_same_once_the_detail_feature_is_folded():
