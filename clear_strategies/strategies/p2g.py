@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import logging
 import math
-import operator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.utils.weak import TensorWeakRef
 
 from clear_strategies.core.checks import refuse, require_choice, require_number, require_whole
 from clear_strategies.core.evidence import Evidence, PatchMaps
@@ -132,12 +133,12 @@ class P2G(Strategy):
 
     def looked_up(self, view: View) -> Float[Tensor, "2 ph pw"]:
         """R and A, computed anew where a view of this name has other images, such as another crop of its photo."""
-        key, shown = (view.name, view.factor), (view.lr.image, view.hr.image)
-        known: tuple[tuple[Tensor, Tensor], Tensor] | None = self.cache.get(key)
-        if known is None or not all(map(operator.is_, known[0], shown)):
+        key, images = (view.name, view.factor), (view.lr.image, view.hr.image)
+        known: tuple[Sequence[TensorWeakRef], Tensor] | None = self.cache.get(key)
+        if known is None or any(of() is not image for of, image in zip(known[0], images, strict=True)):
             maps = self.patch_maps(view)
             R, A = maps.reliability, maps.demand
-            known = self.cache[key] = shown, torch.stack((R, A))
+            known = self.cache[key] = [*map(TensorWeakRef, images)], torch.stack((R, A))  # a loop may free its images
             _log.debug(
                 "%s: reliability R %.2f..%.2f (mean %.3f), detail demand A mean %.3f over %dx%d patches.",
                 view.name, float(R.min()), float(R.max()), float(R.mean()), float(A.mean()), R.shape[1], R.shape[0],

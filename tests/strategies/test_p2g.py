@@ -1,6 +1,8 @@
 """P2G: Eq. 9, 10, 12 and 14."""
 
+import copy
 import math
+import weakref
 from dataclasses import replace
 
 import pytest
@@ -101,9 +103,16 @@ def test_observation_is_made_once_a_view_and_invisible_gaussians_have_none(caplo
     assert torch.equal(first.reliability, second.reliability)
     assert not first.weight[~shot.visible].any()
     assert (first.reliability[shot.visible] > 0).all()
+    aside = copy.deepcopy(p2g)  # as for the maps of a run, which copy no photo
+    with caplog.at_level("DEBUG"):
+        aside.looked_up(view)
+    assert caplog.text.count(view.name) == 1
     crop = replace(view, lr=cut(view.lr, 1), hr=cut(view.hr, view.factor))
-    assert torch.equal(p2g.looked_up(crop), P2G().looked_up(crop))
-    assert torch.equal(p2g.looked_up(view), P2G().looked_up(view))
+    for shown in (crop, view, crop):
+        assert torch.equal(p2g.looked_up(shown), P2G().looked_up(shown))
+    freed = [weakref.ref(photo.image) for photo in (crop.lr, crop.hr)]
+    del crop, shown  # a loop that reads a photo for each step keeps none
+    assert [of() for of in freed] == [None, None]
 
 
 def cut(photo, unit):
