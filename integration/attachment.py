@@ -203,7 +203,8 @@ class Attachment:
         self.removed, self._merging.pending = True, None
         self.hook([])
         self._steps.follow_by({}, [])
-        self.conductor.on_fit_end()
+        if self.conductor.runs == self._run:  # else its strategies train another loop by now
+            self.conductor.on_fit_end()
         self._finalizer()
         self.undo.close()
 

@@ -145,6 +145,7 @@ def test_a_conductor_trains_one_loop_at_a_time():
         first.render(camera)
     clear.remove()
     assert first.render(camera)[0].isfinite().all()
+    assert shared.views  # the second loop goes on
 
 
 def first_gradient(degree=0, **settings):
