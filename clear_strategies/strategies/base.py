@@ -125,7 +125,7 @@ class Strategy:
         self.run_state.clear()
         self.cache.clear()
         self.logs.clear()
-        self.of_run.seed = seed
+        self.of_run.seed = int(seed)  # arithmetic with numpy's overflows
 
     def on_views(self, views: Sequence[View]) -> None:
         """Look at all training views once, after `on_fit_start`.

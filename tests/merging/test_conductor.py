@@ -1,8 +1,10 @@
 """The conductor: Eq. 8 and 13, exclusivity, and the strategies' contract."""
 
+import inspect
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -22,6 +24,7 @@ from clear_strategies import (
     StrategyConflict,
     Weights,
 )  # fmt: skip
+from clear_strategies.core.seeds import dropout_mask
 from clear_strategies.errors import AnswerError
 from clear_strategies.kernels.losses import reference
 from clear_strategies.schedules import WarmupDecay
@@ -415,6 +418,8 @@ def test_a_strategy_knows_its_run_whatever_it_does_to_its_cache():
         assert (balanced.seed, balanced.device.type) == (7, "meta")
         merged = conductor.update(field.raw(), lr, hr, view, t).grads
         assert torch.allclose(merged["means"], 0.25 * g_lr["means"] + 0.5 * g_hr["means"], atol=1e-7)
+    inspect.unwrap(Strategy.on_fit_start)(balanced, 1, np.int64(7))  # which only tests refuse, by its type
+    assert torch.equal(dropout_mask(9, 0.5, balanced.seed, 1), dropout_mask(9, 0.5, 7, 1))
 
 
 @pytest.mark.parametrize(
