@@ -5,7 +5,6 @@ that nothing crosses over to the host while iterating; and with meta as the *def
 a tensor that forgets where it belongs cannot be reckoned with.
 """
 
-import itertools
 import math
 from dataclasses import dataclass, replace
 
@@ -15,6 +14,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
+from torch.utils.weak import TensorWeakRef
 
 from clear_strategies import P2G, SVS, Conductor, Grads, SplatSuRe
 from clear_strategies.core import deferred
@@ -112,17 +112,18 @@ def no_data(monkeypatch):
 def cache_evidence(state: TrainState) -> None:
     """P2G's evidence is computed once a view, at either size of its SR image; here it is there already."""
     for p2g in (s for s in state.conductor.strategies if isinstance(s, P2G)):
-        for view, divisor in itertools.product(state.views, (1, 2)):
-            p2g.cache[view.name, view.factor // divisor] = view.lr.image.new_zeros(2, 2, 2)
+        for view in (v for whole in state.views for v in (whole, state.conductor.skips.view(whole, 1))):
+            images = [TensorWeakRef(photo.image) for photo in (view.lr, view.hr)]
+            p2g.cache[view.name, view.factor] = images, view.lr.image.new_zeros(2, 2, 2)
 
 
 def on_meta(monkeypatch, names: tuple[str, ...]) -> TrainState:
     """A run in its middle, of which all lies on meta but the cameras."""
     monkeypatch.setattr("tests.helpers.short_run.SCENE", SCENE.to("meta"))
     state = start(names)
+    state.conductor.skips = SkipPolicy(COARSE)
     cache_evidence(state)
     state.compiled_step = None
-    state.conductor.skips = SkipPolicy(COARSE)
     # Statistics are gathered; a round reads, and does not come.
     state.density.settings = replace(state.density.settings, start=90, stop=100, statistics_from=1)
     return state
