@@ -18,7 +18,7 @@ from typing import Final
 import torch
 
 from clear_strategies.core.checks import require_number, require_whole
-from clear_strategies.core.seeds import generator_at
+from clear_strategies.core.seeds import generator_at, one_of
 from clear_strategies.core.view import DepthMap, ExtraView, Photo, View
 from clear_strategies.geometry.photos import cut_out
 from clear_strategies.geometry.pseudo_views import PseudoView, border_view, continued, pseudo_views
@@ -130,12 +130,8 @@ class PseudoViews(Strategy):
         if not (aside or borders) or t % self.every:
             return ()
         generator = generator_at(self.seed, t)
-
-        def drawn(n: int) -> int:
-            return int(torch.randint(n, (), generator=generator, device="cpu"))
-
-        choices = borders if borders and not (aside and drawn(_BORDER_SHARE)) else aside
-        return (choices[drawn(len(choices))](),)
+        choices = aside if aside and (not borders or one_of(range(_BORDER_SHARE), generator) > 0) else borders
+        return (one_of(choices, generator)(),)
 
     def on_fit_end(self) -> None:
         self.cache["views"] = self.cache["borders"] = ()
