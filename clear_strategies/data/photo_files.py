@@ -105,17 +105,15 @@ def read_image(
     with _opened(path) as image:
         sixteen_bits = _has_sixteen_bits(image)  # unknown after decoding
         orientation = _orientation_of(image)  # Pillow forgets that of a TIFF as it decodes it
-        if turn is None and orientation != 1:
+        decoded_upright = image.format == "TIFF"  # by Pillow and by OpenCV
+        as_asked = decoded_upright or not sixteen_bits if turn else turn is False and not decoded_upright
+        if orientation != 1 and not as_asked:
             raise _rotation_error(path, orientation)
         try:
             image.load()
         except Exception as error:  # PIL's decoders raise many types of error on damaged bytes
             remedy = "replace the damaged file, or go on without it: data.reader.skip_faulty=true"
             raise DataError(path, "pixels", f"cannot be decoded ({error})", remedy) from error
-        decoded_upright = image.format == "TIFF"  # by Pillow and by OpenCV
-        as_asked = decoded_upright or not sixteen_bits if turn else not decoded_upright
-        if orientation != 1 and not as_asked:
-            raise _rotation_error(path, orientation)
         if orientation != 1 and turn and not decoded_upright:
             ImageOps.exif_transpose(image, in_place=True)
         pixels = _to_float(path, image, sixteen_bits)
