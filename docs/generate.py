@@ -3,7 +3,8 @@
 `configuration.md` is made from conf/ and the classes that its `_target_`s name. A field's type and default come from the
 signature of the class, its description from the `Args:` of the docstring, or from the comment beside it in the YAML file where
 the docstring says nothing. On the other pages, what stands between `<!-- api NAME -->` and `<!-- end -->` is made from the
-signatures and docstrings of a module, class or function; `<!-- api NAME alone -->` leaves out the members.
+signatures and docstrings of a module, class or function; `<!-- api NAME alone -->` leaves out the members, `<!-- api NAME with
+ONE OTHER -->` all but these. Parameters that are fields of the configuration are described there alone.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import inspect
+import itertools
 import re
 import subprocess
 import sys
@@ -26,7 +28,7 @@ from omegaconf import DictConfig, OmegaConf
 ROOT: Final = Path(__file__).resolve().parents[1]
 CONF: Final = ROOT / "conf"
 REFERENCE: Final = ROOT / "docs" / "reference"
-API: Final = re.compile(r"(<!-- api (\S+)( alone)? -->\n).*?(<!-- end -->)", re.DOTALL)
+API: Final = re.compile(r"(<!-- api (\S+)(?: (alone|with [\w ]+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 OURS: Final = ("clear_strategies", "rasterizers", "integration")
 
 
@@ -73,12 +75,13 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
 
 def pages() -> dict[Path, str]:
     """What each page that is made from the code holds now, by its path."""
-    api = Api()
-    made = {REFERENCE / "configuration.md": configuration(groups())}
+    listed = groups()
+    api = Api(listed)
+    made = {REFERENCE / "configuration.md": configuration(listed)}
     for path in sorted(REFERENCE.glob("*.md")):
         text = path.read_text(encoding="utf-8")
         if path not in made and API.search(text):
-            made[path] = _formatted(API.sub(lambda p: f"{p[1]}\n{api(p[2], members=not p[3])}\n{p[4]}", text))
+            made[path] = _formatted(API.sub(lambda p: f"{p[1]}\n{api(p[2], p[3])}\n{p[4]}", text))
     return made
 
 
@@ -91,30 +94,71 @@ def _formatted(text: str) -> str:
 class Api:
     """Markdown of the signatures and docstrings of this package, by griffe2md."""
 
-    def __init__(self) -> None:
+    def __init__(self, listed: list[Group]) -> None:
         import griffe
 
         loader = griffe.GriffeLoader(
-            search_paths=[ROOT], docstring_parser=griffe.Parser.google, docstring_options={"warnings": False}
+            search_paths=[ROOT],
+            docstring_parser=griffe.Parser.google,
+            docstring_options={"warnings": False, "returns_multiple_items": False},
         )
         for package in OURS:
             loader.load(package)
         loader.resolve_aliases(implicit=False, external=False)
         self._found = loader.modules_collection
+        sections = [section for group in reversed(listed) for section in reversed(group.sections) if section.target]
+        self._configured = {
+            self._item(str(section.target)).path: section for section in sections
+        }  # the first of a class
 
-    def __call__(self, name: str, *, members: bool) -> str:
+    def __call__(self, name: str, members: str | None) -> str:
+        """Without members (`alone`), with some of them (`with ONE OTHER`), or with all (None)."""
         from griffe2md import ConfigDict, render_object_docs
 
-        item = self._found[name]
-        item = item.final_target if item.is_alias else item
+        item = self._item(name)
+        self._shorten(item)
         options = ConfigDict(
             heading_level=3, show_root_heading=not item.is_module, show_root_full_path=False, members_order="source",
             show_root_members_full_path=False, show_object_full_path=False, show_signature_annotations=True, line_length=100,
             show_if_no_docstring=False, show_bases=False, inherited_members=False, summary=False,
-            members=None if members else False,
+            members=None if members is None else members.split()[1:],
         )  # fmt: skip
         text = render_object_docs(item, options)  # its links lead to places of a site that has every object
         return re.sub(r"<code>(.*?)</code>", r"`\1`", re.sub(r"\[([^\[\]]*)\]\(#[^)]*\)", r"\1", text)).strip() + "\n"
+
+    def _item(self, name: str) -> Any:
+        item = self._found[name]
+        return item.final_target if item.is_alias else item
+
+    def _shorten(self, item: Any) -> None:
+        """Leave out of the docstrings what the signature or the configuration page says: types, and fields."""
+        import griffe
+
+        section = self._configured.get(item.path)
+        fields = {setting.name for setting in section.settings} if section else set()
+        parts = item.docstring.parsed if item.docstring else []
+        for i, part in enumerate(list(parts)):
+            if part.kind is griffe.DocstringSectionKind.returns:
+                parts[i] = griffe.DocstringSectionText(f"**Returns:** {part.value[0].description}")
+            if part.kind is not griffe.DocstringSectionKind.parameters:
+                continue
+            entries = [one for entry in part.value for one in self._split(entry, item)]
+            part.value = kept = [one for one in entries if not fields.issuperset(one.name.split(", "))]
+            if section and len(kept) < len(entries):
+                text = f"Parameters are the fields of {_link(section)}" + (", and those below." if kept else ".")
+                parts[i : i + 1] = [griffe.DocstringSectionText(text), *([part] if kept else [])]
+        for member in item.members.values():
+            if not member.is_alias:
+                self._shorten(member)
+
+    def _split(self, entry: Any, item: Any) -> Iterator[Any]:
+        """One entry for each parameter: "a: …. b: …" describes two. The signature has their types."""
+        import griffe
+
+        others = "|".join(parameter.name for parameter in item.parameters)
+        for text in re.split(rf"(?<=[.;])\s+(?=(?:{others}): )", f"{entry.name}: {entry.description}"):
+            name, _, description = text.partition(": ")
+            yield griffe.DocstringParameter(name, description=description)
 
 
 def groups() -> list[Group]:
@@ -174,6 +218,7 @@ def configuration(listed: list[Group]) -> str:
         "`fit.iterations`.",
         "",
     ]
+    earlier: list[Section] = []
     for group in listed:
         lines += [f"## {'The base configuration' if group.name == '.' else f'`{group.name}=`'}", ""]
         if group.name != ".":
@@ -181,20 +226,44 @@ def configuration(listed: list[Group]) -> str:
             lines += [f"| `{name}` | {_cell(text)} |" for name, text in group.options.items()]
             lines.append("")
         for section in group.sections:
-            choice = "" if section.choice.startswith("_") or group.name == "." else f" ({section.choice})"
-            lines += [f"### `{section.key}`{choice}" if section.key else "### Top level", ""]
+            lines += [f"### {_title(section)}", ""]
             if section.target:
                 lines += [f"`{section.target}`", ""]
             if section.summary:
                 lines += [section.summary, ""]
-            if section.settings:
-                lines += ["| field | type | default | description |", "|---|---|---|---|"]
+            same = next((s for s in earlier if len(s.settings) > 1 and set(s.settings) <= set(section.settings)), None)
+            if same:
                 lines += [
-                    f"| `{s.name}` | {_code(s.type)} | {_code(s.default)} | {_cell(s.description)} |"
-                    for s in section.settings
+                    f"The fields of {_link(same, '')}{', and:' if same.settings != section.settings else '.'}",
+                    "",
                 ]
-                lines.append("")
+            rows = [s for s in section.settings if not same or s not in same.settings]
+            if rows:
+                lines += ["| field | type | default | description |", "|---|---|---|---|", *_rows(rows), ""]
+            earlier.append(section)
     return "\n".join(lines)
+
+
+def _title(section: Section) -> str:
+    if not section.key:
+        return "Top level"
+    return f"`{section.key}`" + (
+        f" ({section.choice})" if section.choice[:1] != "_" and section.choice != "config" else ""
+    )
+
+
+def _link(section: Section, page: str = "configuration.md") -> str:
+    anchor = re.sub(r"[^\w\- ]", "", _title(section).lower()).replace(" ", "-")
+    return f"[`{section.key or 'the base configuration'}`]({page}#{anchor})"
+
+
+def _rows(settings: Iterable[Setting]) -> Iterator[str]:
+    """A row for each field, or for neighbours that share type and description."""
+    for (kind, text), alike in itertools.groupby(settings, lambda s: (s.type, s.description)):
+        for fields in [list(alike)] if text else [[s] for s in alike]:
+            names, defaults = ([_code(getattr(s, part)) for s in fields] for part in ("name", "default"))
+            shown = defaults[:1] if len(set(defaults)) == 1 else defaults
+            yield f"| {', '.join(names)} | {_code(kind)} | {', '.join(shown)} | {_cell(text)} |"
 
 
 def _cell(text: str) -> str:
@@ -214,7 +283,7 @@ def _heading(text: str) -> str:
         if "@package" not in line:
             lines.append(line.lstrip("# "))
     whole = " ".join(lines)
-    return re.split(r"(?<=\.)\s(?=[A-Z])|: +(?=python)", whole, maxsplit=1)[0].rstrip(":")
+    return re.split(r"(?<=[.?])\s(?=[A-Z`]|python|experiment=)|: +(?=python)", whole, maxsplit=1)[0].rstrip(":")
 
 
 def _sections(path: Path, text: str) -> Iterator[Section]:
