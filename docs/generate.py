@@ -145,7 +145,7 @@ class Api:
             entries = [one for entry in part.value for one in self._split(entry, item)]
             part.value = kept = [one for one in entries if not fields.issuperset(one.name.split(", "))]
             if section and len(kept) < len(entries):
-                text = f"Parameters are the fields of {_link(section)}" + (", and those below." if kept else ".")
+                text = f"Parameters: see {_link(section)}{' and below' if kept else ''}."
                 parts[i : i + 1] = [griffe.DocstringSectionText(text), *([part] if kept else [])]
         for member in item.members.values():
             if not member.is_alias:

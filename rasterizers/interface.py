@@ -437,6 +437,6 @@ PRESETS: Final[Mapping[str, Mapping[str, float]]] = {
 }
 """Cut-offs by name, coarsest first. The error of the gradients is due to the cut-offs, not to the arithmetic.
 
-"fast", the default, has gradients that are off by about 3 %. "accurate" has a tenth of that error for a fifth more time.
+"fast", the default, has gradients that are off by about 3 %. "accurate" has a tenth of that error, for up to a third more time.
 At "exact", for numeric tests, only the rounding of float32 remains.
 """
