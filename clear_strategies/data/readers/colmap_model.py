@@ -10,6 +10,7 @@ import logging
 import math
 import re
 import struct
+from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +18,8 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from numpy.lib.stride_tricks import sliding_window_view
 from torch import Tensor
 
 from clear_strategies.data.capture import SfmPoints
@@ -34,7 +36,10 @@ _RECORD_COUNT: Final = re.compile(r"^# Number of \w+: (\d+)", re.MULTILINE)  # i
 _NUMERIC: Final = re.compile(r"(?:[-+.0-9eE\s]+|nan|inf)*+", re.IGNORECASE)  # a line of numbers
 
 _COUNT, _CAMERA, _IMAGE = map(struct.Struct, ("<Q", "<iiQQ", "<i7di"))
-_POINT: Final = struct.Struct("<Q3d3BdQ")  # id, position, colour, error, length of the track
+_POINT: Final = np.dtype(
+    [("id", "<u8"), ("position", "<f8", 3), ("color", "u1", 3), ("error", "<f8"), ("length", "<u8")]
+)
+_OBSERVATION: Final = np.dtype([("image", "<i4"), ("feature", "<i4")])  # `length` of them follow a point: its track
 
 _T = TypeVar("_T")
 _Number = TypeVar("_Number", int, float)
@@ -58,8 +63,10 @@ class Image(NamedTuple):
         return pose
 
 
-_Point = tuple[int, Sequence[float], Sequence[int], np.ndarray]
-"""Id, position, 8-bit colour, and the ids of the images that observe it; a plain tuple, because there may be millions."""
+_Points = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Ids [N], positions [N, 3], 8-bit colours [N, 3], lengths of the tracks [N], and the ids of their images, track after track; no
+objects of Python, because there may be millions of points.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,22 +175,17 @@ def read_images(path: Path) -> list[Image]:
 
 def read_points(path: Path) -> SfmPoints:
     """Read the points with their tracks; none if the file does not exist."""
-    records: list[_Point] = []
-    if path.exists():
-        records = list(_binary_points(path) if path.suffix == ".bin" else _text_points(path))
-    if not records:
+    if not path.exists():
         return SfmPoints.without_tracks(torch.zeros(0, 3), torch.zeros(0, 3), "")
-    ids, positions, colors, tracks = zip(*records, strict=True)
-    if len(set(ids)) != len(ids):
+    ids, means, colors, lengths, images = (_binary_points if path.suffix == ".bin" else _text_points)(path)
+    if len(np.unique(ids)) != len(ids):
         raise _damaged(path, "point id", "occurs twice")
-    means = np.array(positions)
     near = np.abs(means) < FARTHEST
     if not near.all():
         raise DataError(path, f"point {np.argwhere(~near)[0, 0]}", "is not finite", "remove the point")
-    levels = torch.from_numpy(np.array(colors, np.uint8)).float()
-    point = torch.arange(len(means)).repeat_interleave(torch.tensor([len(images) for images in tracks]))
-    image = torch.from_numpy(np.concatenate(tracks).astype(np.int64))
-    return SfmPoints(torch.from_numpy(means).float(), levels / 255, point, image, "")
+    positions, levels = (torch.from_numpy(values.astype(np.float32)) for values in (means, colors))
+    point, image = np.repeat(np.arange(len(ids)), lengths), images.astype(np.int64)
+    return SfmPoints(positions, levels / 255, torch.from_numpy(point), torch.from_numpy(image), "")
 
 
 def _by_id(path: Path, records: Iterable[tuple[int, _T]]) -> dict[int, _T]:
@@ -269,13 +271,31 @@ def _binary_images(path: Path) -> Iterator[Image]:
     file.finish()
 
 
-def _binary_points(path: Path) -> Iterator[_Point]:
+def _binary_points(path: Path) -> _Points:
     file = _Bytes(path)
-    for i in range(file.count("number of points")):
-        number, x, y, z, *color, _, length = file.take(_POINT, f"point {i}")
-        track = np.frombuffer(file.data, "<i4", 2 * length, file.skip(8 * length, f"track of point {i}"))[::2]
-        yield number, (x, y, z), color, track
+
+    def places() -> Iterator[int]:
+        for i in range(file.count("number of points")):
+            yield (start := file.skip(_POINT.itemsize, f"point {i}"))
+            (length,) = _COUNT.unpack_from(file.data, start + _POINT.itemsize - _COUNT.size)
+            file.skip(_OBSERVATION.itemsize * length, f"track of point {i}")
+
+    starts = np.fromiter(places(), np.int64)
     file.finish()
+    points = _structs(file.data, starts, _POINT)
+    lengths = points["length"].astype(np.int64)
+    tracks = starts + _POINT.itemsize - _OBSERVATION.itemsize * (lengths.cumsum() - lengths)
+    observations = np.repeat(tracks, lengths) + _OBSERVATION.itemsize * np.arange(lengths.sum())
+    images = _structs(file.data, observations, _OBSERVATION)["image"]
+    return points["id"], points["position"], points["color"], lengths, images
+
+
+def _structs(data: bytes, places: Int[np.ndarray, " N"], kind: np.dtype[Any]) -> np.ndarray:
+    """The structures that begin at these places."""
+    if len(places) == 0:
+        return np.zeros(0, kind)
+    found: np.ndarray = sliding_window_view(np.frombuffer(data, np.uint8), kind.itemsize)[places].view(kind)[:, 0]
+    return found
 
 
 def _text_cameras(path: Path, used: Set[int]) -> Iterator[tuple[int, Lens]]:
@@ -311,15 +331,21 @@ def _text_images(path: Path) -> Iterator[Image]:
         yield Image(number, tuple(numbers[:4]), tuple(numbers[4:]), camera, cells[9].strip())
 
 
-def _text_points(path: Path) -> Iterator[_Point]:
+def _text_points(path: Path) -> _Points:
+    ids, lengths, images, positions, colors = array("q"), array("q"), array("q"), array("d"), array("B")
     for line, cells in _rows(path):
         if len(cells) < 8 or len(cells) % 2:
             raise _damaged(path, f"line {line}", f"has {len(cells)} columns where 8 and pairs belong")
         color = _numbers(path, line, cells[4:7], _whole)
         if not all(0 <= c <= 255 for c in color):
             raise DataError(path, f"line {line}", f"has the colour {color}", "colours lie in 0..255")
-        track = np.array(_numbers(path, line, cells[8::2], _whole), np.int64)
-        yield _numbers(path, line, cells[:1], _whole)[0], _numbers(path, line, cells[1:4], float), color, track
+        colors.extend(color)
+        positions.extend(_numbers(path, line, cells[1:4], float))
+        ids.extend(_numbers(path, line, cells[:1], _whole))
+        images.extend(_numbers(path, line, cells[8::2], _whole))
+        lengths.append(len(cells) // 2 - 4)
+    by_point = np.reshape(positions, (-1, 3)), np.reshape(colors, (-1, 3))
+    return np.asarray(ids), *by_point, np.asarray(lengths), np.asarray(images)
 
 
 def _lines(path: Path) -> tuple[int, list[tuple[int, str]]]:

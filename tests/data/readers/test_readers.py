@@ -1,6 +1,8 @@
 """What each format with poses has of its own: NeRF-synthetic, LLFF, transforms.json, COLMAP models."""
 
 import shutil
+import struct
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,7 @@ from clear_strategies.data import photo_files
 from clear_strategies.data.lenses import Lens
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.ply import write_points
-from clear_strategies.data.readers import blender, colmap, nerfstudio
+from clear_strategies.data.readers import blender, colmap, colmap_model, nerfstudio
 from clear_strategies.errors import DataError
 from tests.helpers import captures as tiny
 
@@ -169,6 +171,28 @@ def test_photos_and_points_are_those_of_the_files(layout: str, tmp_path: Path) -
     assert pairs == [(0, 1), (0, 2), (1, 2), (1, 3)]
     assert points.source == "COLMAP sparse/0, 2 points, triangulated from all 3 images"
     assert capture.notes["poses"] == f"COLMAP sparse/0 ({layout}), 3 images"
+
+
+def test_many_points_take_little_more_memory_than_their_file(tmp_path: Path) -> None:
+    """Of 10 million points, plain Python objects would fill 9 GB."""
+    tracks = [[point % 7 + k for k in range(point % 4)] for point in range(1_000)]
+    records = [
+        struct.pack(
+            f"<Q3d3BdQ{2 * len(t)}i", p + 5, p, -p, 0.5, p % 256, 1, 2, 0.0, len(t), *(x for i in t for x in (i, 9))
+        )
+        for p, t in enumerate(tracks)
+    ]
+    file = tmp_path / "points3D.bin"
+    file.write_bytes(struct.pack("<Q", len(tracks)) + b"".join(records))
+    tracemalloc.start()
+    points = colmap_model.read_points(file)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 6 * file.stat().st_size
+    assert points.means[999].tolist() == [999, -999, 0.5]
+    assert points.colors[300].mul(255).round().tolist() == [44, 1, 2]
+    pairs = list(zip(points.track_point.tolist(), points.track_image.tolist(), strict=True))
+    assert pairs == [(point, image) for point, track in enumerate(tracks) for image in track]
 
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
