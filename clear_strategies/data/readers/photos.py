@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 import shlex
 from collections import Counter
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ from clear_strategies.core.checks import require_choice, require_number, require
 from clear_strategies.data.capture import MORE_PHOTOS, Capture
 from clear_strategies.data.file_names import named, require_text, some
 from clear_strategies.data.masks import masks_among
-from clear_strategies.data.photo_files import SUFFIXES, optics
+from clear_strategies.data.photo_files import SUFFIXES, optics, read_header
 from clear_strategies.data.photo_folders import (
     folders_of_images,
     images_in,
@@ -34,6 +35,7 @@ _log = logging.getLogger(__name__)
 
 _HEIC: Final = (".heic", ".heif")
 _FEW: Final = 30  # photos, up to which precise=auto is true
+_THUMBNAIL: Final = 64  # times as many pixels has the largest photo as one that is a preview
 _HEAD: Final = 1 << 16  # bytes of a file by which its format is recognized
 _LOOKED_INTO: Final = 50  # files of each pattern, at most
 _CONVERT: Final = "ns-process-data {0} --data {{root}}{1} --output-dir converted"
@@ -105,7 +107,7 @@ def read(
     if base.resolve().is_relative_to(root.resolve()):
         raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
     chosen = ((path.name, path) for path in _without_masks_and_twins(images))
-    paths = [path for _, path in usable(root, chosen, skip_faulty=skip_faulty)]
+    paths = _without_thumbnails([path for _, path in usable(root, chosen, skip_faulty=skip_faulty)])
     require_text((name, *(path.name for path in paths)))
     if len(paths) < sfm.FEWEST:
         raise DataError(root, "images", f"there are {len(paths)}, poses need at least {sfm.FEWEST}", MORE_PHOTOS)
@@ -192,6 +194,16 @@ def _without_masks_and_twins(paths: Sequence[Path]) -> list[Path]:
     if same := [stem for stem, count in Counter(path.stem for path in kept).items() if count > 1]:
         raise DataError(kept[0].parent, "file name", f"{same[0]!r} has several files", "keep one file of each photo")
     return kept
+
+
+def _without_thumbnails(paths: Sequence[Path]) -> list[Path]:
+    """The photos without those that are so small beside the largest that they are previews of others."""
+    pixels = {path: math.prod(read_header(path).stored) for path in paths}
+    small = [path.name for path in paths if _THUMBNAIL * pixels[path] < max(pixels.values())]
+    if small:
+        message = "%d of the images have less than 1/%d of the pixels of the largest, and are not used: %s."
+        _log.warning(message, len(small), _THUMBNAIL, some(small))
+    return [path for path in paths if path.name not in small]
 
 
 def _cache_key(paths: Sequence[Path], *settings: int) -> str:

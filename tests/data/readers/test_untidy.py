@@ -281,6 +281,11 @@ READ: dict[str, tuple[Callable[[Path], object], list[str], str]] = {
         ALL,
         "clip.mov",
     ),
+    "a preview beside the photos": (
+        lambda f: image_of(f / "a.png").resize((2, 1)).save(f / "a_thumb.jpg"),
+        ALL,
+        "1 of the images have less than 1/64 of the pixels of the largest, and are not used: a_thumb.jpg",
+    ),
     "links to another folder": (linked, ALL, ""),
     "a link to nowhere": (lambda f: (f / "d.png").symlink_to(f / "gone.png"), ALL, ""),
     "a browser's ending of JPEG": (lambda f: again(f, "b.jfif", format="JPEG"), ["a.png", "b.jfif", "c.png"], ""),
