@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
+import subprocess
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -92,11 +95,12 @@ def write_video(path: Path, frames: Iterable[Pixels]) -> None:
 
     Raises:
         SettingError: imageio-ffmpeg or its program is missing.
+        OSError: ffmpeg could not write the file, and has said why.
     """
     try:
         import imageio_ffmpeg
 
-        imageio_ffmpeg.get_ffmpeg_exe()
+        program = imageio_ffmpeg.get_ffmpeg_exe()
     except ImportError as error:
         raise SettingError("videos need imageio-ffmpeg: pip install imageio-ffmpeg.") from error
     except RuntimeError as error:
@@ -104,15 +108,16 @@ def write_video(path: Path, frames: Iterable[Pixels]) -> None:
         raise SettingError(problem) from error
     rest = iter(frames)
     first = next(rest)
+    height, width, _ = first.shape
+    given = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {FPS} -i -"
+    wanted = f"-an -c:v libx264 -pix_fmt yuv420p -vf {_HD} -crf {_QUALITY} -preset veryfast -movflags +faststart"
     with files.replacing(path.absolute()) as partial:  # ffmpeg interprets "a:" at the beginning as a protocol
-        writer = imageio_ffmpeg.write_frames(
-            str(partial), first.shape[1::-1], fps=FPS, codec="libx264", pix_fmt_out="yuv420p", quality=None,
-            output_params=["-vf", _HD, "-crf", _QUALITY, "-preset", "veryfast", "-movflags", "+faststart"],
-            macro_block_size=2, ffmpeg_log_level="error",
-        )  # fmt: skip
-        writer.send(None)
-        try:
+        command = [program, "-y", "-v", "error", *given.split(), *wanted.split(), str(partial)]
+        # imageio_ffmpeg.write_frames does not tell how ffmpeg ended, so a full disk would leave a part of a video without a word.
+        # A session of its own: Ctrl-C is for this process, which may finish the video.
+        ffmpeg = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)  # noqa: S603
+        with suppress(BrokenPipeError), ffmpeg:
             for frame in itertools.chain([first], rest):
-                writer.send(np.ascontiguousarray(frame))
-        finally:
-            writer.close()
+                ffmpeg.stdin.write(frame.tobytes())  # type: ignore[union-attr]
+        if ffmpeg.returncode:
+            raise OSError(errno.EIO, "ffmpeg could not write it", str(path))

@@ -3,7 +3,6 @@
 import errno
 import math
 import os
-import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +11,9 @@ import torch
 
 from clear_strategies import DataError
 from clear_strategies.training import checkpoint
+from tests.helpers.full_disk import full_disk
 from tests.helpers.short_run import start
 
-resource = pytest.importorskip("resource")
 TYPES = (
     torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.int32, torch.int16, torch.int8,
     torch.uint8, torch.bool,
@@ -49,14 +48,8 @@ def test_what_is_saved_comes_back(tmp_path: Path) -> None:
 
 def test_a_full_disk_is_told_as_such_and_leaves_nothing(tmp_path: Path) -> None:
     saved = start(()).checkpoint({})
-    limits, ignored = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
-    try:
-        with pytest.raises(OSError, match=os.strerror(errno.EFBIG)) as refused:
-            checkpoint.save(tmp_path, saved)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, ignored)
+    with full_disk(), pytest.raises(OSError, match=os.strerror(errno.EFBIG)) as refused:
+        checkpoint.save(tmp_path, saved)
     assert refused.value.errno == errno.EFBIG
     assert list(tmp_path.iterdir()) == []
 

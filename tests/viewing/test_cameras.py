@@ -1,5 +1,6 @@
 """Cameras as files, closed, even paths along them, and videos."""
 
+import errno
 import json
 import math
 import sys
@@ -14,6 +15,7 @@ from clear_strategies.errors import DataError, SettingError
 from clear_strategies.viewing import cameras, look
 from rasterizers.interface import Camera
 from tests.helpers import toy
+from tests.helpers.full_disk import full_disk
 
 # ---- cameras as files: what a run writes is what is read
 SCENE = toy.scene(train=3, test=1)
@@ -152,6 +154,15 @@ def test_a_video_that_breaks_leaves_nothing(tmp_path):
 
     with pytest.raises(RuntimeError):
         look.write_video(tmp_path / "a.mp4", broken())
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("side", [32, 256], ids=["at the end", "while frames are written"])
+def test_a_video_for_which_the_disk_is_too_full_is_told_and_leaves_nothing(side, tmp_path):
+    noise = np.random.default_rng(0).integers(0, 255, (side, side, 3)).astype(np.uint8)
+    with full_disk(), pytest.raises(OSError, match=r"ffmpeg could not write it: .*a\.mp4") as refused:
+        look.write_video(tmp_path / "a.mp4", [noise] * 60)
+    assert refused.value.errno == errno.EIO
     assert not list(tmp_path.iterdir())
 
 
