@@ -51,7 +51,7 @@ def main(arguments: list[str]) -> None:
 
 def overrides(arguments: Sequence[str]) -> list[str]:
     """Translate the command's arguments to Hydra overrides; a SettingError for a wrong argument."""
-    if not arguments or is_of_hydra(arguments[0]):
+    if not arguments or (is_of_hydra(arguments[0]) and not Path(arguments[0]).exists()):
         raise SettingError("train needs a folder of photos first: clear-strategies train PHOTOS [setting=value …].")
     path, rest = path_of(arguments[0]), arguments[1:]
     if "://" in arguments[0]:

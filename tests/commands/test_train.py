@@ -40,7 +40,7 @@ def test_a_folder_of_any_name_becomes_data_path(tmp_path, name):
     }  # fmt: skip
 
 
-PLAIN = dict.fromkeys(("photos", "a/b-c.d", "my photos"), True) | dict.fromkeys(
+PLAIN = dict.fromkeys(("photos", "a/b-c.d", "my photos", "-photos"), True) | dict.fromkeys(
     ("1e5", "null", " photos", "a,b"), False
 )
 

@@ -6,6 +6,7 @@ pycolmap is no substitute: it reads a points3D.bin that is cut in half without a
 from __future__ import annotations
 
 import io
+import json
 import logging
 import math
 import re
@@ -350,8 +351,9 @@ def _text_points(path: Path) -> _Points:
 
 def _lines(path: Path) -> tuple[int, list[tuple[int, str]]]:
     """Return the number of records that the header states, else -1, and the numbered lines without comments."""
-    try:
-        text = io.StringIO(read_bytes(path).decode("utf-8-sig"), newline=None).read()  # with every line break as \n
+    data = read_bytes(path)
+    try:  # the encodings of JSON: UTF-8, and UTF-16 as PowerShell writes it
+        text = io.StringIO(data.decode(json.detect_encoding(data)), newline=None).read()  # with every line break as \n
     except UnicodeDecodeError as error:
         raise _damaged(path, "file", "is no UTF-8 text") from error
     stated = _RECORD_COUNT.findall(text)

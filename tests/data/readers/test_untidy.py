@@ -163,6 +163,7 @@ POSED: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "UTF-16, as PowerShell writes it": ("nerfstudio", encoded("transforms.json", "utf-16"), ""),
     "a byte order mark in a Blender scene": ("blender", encoded("transforms_train.json", "utf-8-sig"), ""),
     "a byte order mark in COLMAP's text": ("colmap_txt", encoded("sparse/0/images.txt", "utf-8-sig"), ""),
+    "UTF-16 in COLMAP's text": ("colmap_txt", encoded("sparse/0/images.txt", "utf-16"), ""),
     "photos in a folder of another name": ("colmap", moved("images", "photos"), ""),
     "photos two folders below": ("colmap", moved("images", "DCIM/100CANON"), ""),
 }
