@@ -34,10 +34,11 @@ CAMERA_MODELS: Final = {
 _PERSPECTIVE: Final = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE: Final = ("k1", "k2", "k3", "k4")
 _UNDISTORT: Final = "colmap image_undistorter --image_path images --input_path sparse/0 --output_path undistorted"
-_CUT: Final = (
+CUT: Final = (
     "cut panoramas into flat photos: "
     "ns-process-data images --camera-type equirectangular --data images --output-dir flat"
 )
+"""The remedy for panoramas of 360 degrees."""
 _BORDER_SAMPLES: Final = 33
 
 
@@ -155,7 +156,7 @@ def terms_of(file: Path, where: str, model: str) -> tuple[str, ...]:
     if parameters := CAMERA_MODELS.get(model, "").split():
         extra = ["k3"] if model == "OPENCV" else []  # nerfstudio adds k3, and a k4 that is not OpenCV's
         return tuple(k for k in (_FISHEYE if "FISHEYE" in model else _PERSPECTIVE) if k in [*parameters, *extra])
-    remedy = _CUT if model == "EQUIRECTANGULAR" else f"undistort the photos first: {_UNDISTORT}"
+    remedy = CUT if model == "EQUIRECTANGULAR" else f"undistort the photos first: {_UNDISTORT}"
     raise DataError(file, where, f"has the camera model {model[:40]}, which is not supported", remedy)
 
 

@@ -15,6 +15,7 @@ from typing import Final, Literal
 from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.data.capture import MORE_PHOTOS, Capture
 from clear_strategies.data.file_names import named, require_text, some
+from clear_strategies.data.lenses import CUT
 from clear_strategies.data.masks import masks_among
 from clear_strategies.data.photo_files import SUFFIXES, optics, read_header
 from clear_strategies.data.photo_folders import (
@@ -108,6 +109,11 @@ def read(
         raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
     chosen = ((path.name, path) for path in _without_masks_and_twins(images))
     paths = _without_thumbnails([path for _, path in usable(root, chosen, skip_faulty=skip_faulty)])
+    if all(width == 2 * height for width, height in (read_header(path).stored for path in paths)):
+        message = (
+            "%s: all photos are twice as wide as high. Of 360-degree panoramas, poses and splat would be wrong: %s."
+        )
+        _log.warning(message, root, CUT)
     require_text((name, *(path.name for path in paths)))
     if len(paths) < sfm.FEWEST:
         raise DataError(root, "images", f"there are {len(paths)}, poses need at least {sfm.FEWEST}", MORE_PHOTOS)

@@ -338,6 +338,14 @@ def test_untidy_photos_that_can_be_read_are_read(of_photos, name, caplog):
     assert all(bool(frame.load().isfinite().all()) for frame in capture.frames)
 
 
+def test_photos_that_may_be_panoramas_are_told_with_the_command_that_cuts_them(of_photos, caplog):
+    folder, read = of_photos
+    captures.write_photos(folder, size=(24, 12))
+    with pytest.raises(DataError, match="another shape"):  # the poses are of other photos
+        read()
+    assert "poses and splat would be wrong: cut panoramas into flat photos: ns-process-data" in caplog.text
+
+
 def only(folder: Path, *names: str) -> None:
     """Only these files, in place of the photos."""
     for photo in folder.iterdir():
