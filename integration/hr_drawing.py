@@ -227,7 +227,7 @@ class HrDrawing:
             return work(inputs)
         called = *conductor.comparing, conductor.owner("observe"), conductor.owner("route")
         state = [x.data_ptr() for s in called if s is not None for x in stored(s)]
-        key = GraphKey((len(inputs.means), *state), shapes_of(inputs), (rasterizer, *constants))
+        key = GraphKey(n := len(inputs.means), tuple(state), shapes_of(inputs, n), (rasterizer, *constants))
         device = inputs.means.device
 
         def record() -> RecordedWork[Any]:

@@ -74,7 +74,7 @@ class ReplayedMerge:
         called = conductor.owner("reconcile"), *conductor.regularizers
         saved = [x for s in called if s is not None for x in stored(s)]
         addresses = [x.data_ptr() for x in (*params.values(), *step.params.values(), *saved)]
-        key = GraphKey((len(first), *addresses), shapes_of(inputs), (*of_lr, None, *of_hr, None, *out))
+        key = GraphKey(n := len(first), tuple(addresses), shapes_of(inputs, n), (*of_lr, None, *of_hr, None, *out))
         made, row = self._replays.do(key, t, inputs, live=lambda: work(inputs, out), record=record)
         if made is not out:
             write([*out.values()], [*made.values()])

@@ -50,7 +50,8 @@ class _Call:
 
     @property
     def key(self) -> GraphKey:
-        return GraphKey((len(self.inputs.means),), shapes_of(self.given), (_over_black(self.rasterizer), self.depth))
+        n, of_kind = len(self.inputs.means), (_over_black(self.rasterizer), self.depth)
+        return GraphKey(n, (), shapes_of(self.given, n), of_kind)
 
     @property
     def given(self) -> Given:

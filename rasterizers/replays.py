@@ -1,6 +1,6 @@
 """Work on CUDA that is recorded and replayed, one recording for each `GraphKey`; see `rasterizers.recording`.
 
-Work with a new key runs live first, which compiles kernels and fills caches. The second time it is recorded, and from then on it
+Work of a new kind runs live first, which compiles kernels and fills caches. The second time it is recorded, and from then on it
 is replayed, as long as the tensors that it reads stay at their addresses. When they move, it is recorded again. If a recording or
 a replay fails, all later work runs live.
 """
@@ -42,11 +42,12 @@ class GraphKey:
     """What Python decides by in the work: work with equal keys launches the same kernels.
 
     Args:
-        addresses: of the tensors that the work reads in place, and their number of rows. When they change, every recording is
-            dropped.
+        rows: the number of Gaussians.
+        addresses: of the tensors that the work reads in place. When they or `rows` change, every recording is dropped.
         shapes: see `shapes_of`. constants: whatever else Python looks at.
     """
 
+    rows: int
     addresses: tuple[int, ...]
     shapes: tuple[Any, ...]
     constants: tuple[Any, ...]
@@ -57,9 +58,15 @@ def can_record(device: torch.device) -> bool:
     return device.type in DEVICES
 
 
-def shapes_of(inputs: Given) -> tuple[Any, ...]:
-    """The shape of each input, and the size of each camera."""
-    return tuple(x if x is None else x.shape if isinstance(x, Tensor) else (x.width, x.height) for x in inputs)
+def shapes_of(inputs: Given, rows: int) -> tuple[Any, ...]:
+    """The shape of each input, with "rows" for that number, which says how many there are; and the size of each camera."""
+
+    def shape(x: Tensor | Camera | None) -> Any:
+        if isinstance(x, Tensor):
+            return tuple("rows" if length == rows else length for length in x.shape)
+        return x if x is None else (x.width, x.height)
+
+    return tuple(map(shape, inputs))
 
 
 class StaticInputs:
@@ -129,9 +136,9 @@ class Replays:
     def __init__(self, device: torch.device, name: str, count: Callable[[str], None] = lambda reason: None) -> None:
         self._device, self._name, self._count = device, name, count
         self._recorded: dict[GraphKey, Any] = {}  # None: to be recorded
-        self._warm = set[tuple[Any, ...]]()  # keys, apart from addresses, of work that has run live
-        self._addresses: tuple[int, ...] = ()
-        self._moves = 0  # changes of `_addresses` since the last replay
+        self._warm = set[tuple[Any, ...]]()  # keys, apart from rows and addresses, of work that has run live
+        self._structure: tuple[int, tuple[int, ...]] = (-1, ())  # the rows and addresses of a key
+        self._moves = 0  # changes of them since the last replay
         self._guard_failures = 0.0  # less what the replays since then have saved
         self._failed = False
 
@@ -141,9 +148,9 @@ class Replays:
         """Do the work live, while it is recorded, or by a replay."""
         if self._failed:
             return self._live(live, _FAILED)
-        if key.addresses != self._addresses:  # the structure has changed, and no recording holds
+        if (structure := (key.rows, key.addresses)) != self._structure:  # it has changed, and no recording holds
             self._recorded.clear()
-            self._addresses, self._moves = key.addresses, self._moves + 1
+            self._structure, self._moves = structure, self._moves + 1
             if self._moves == _MOST_MOVES:
                 _log.warning(
                     "%s: nothing is replayed, so that on a GPU an iteration takes two to three times as long. In each one, the "

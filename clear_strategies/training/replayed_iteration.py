@@ -144,7 +144,7 @@ def _key(s: TrainState, inputs: IterationInputs, given: Given) -> GraphKey:
     else:
         constants.append(inputs.view.robust)
     constants += [photo.transparency is None for photo in inputs.photos]
-    return GraphKey((len(s.field), *addresses), shapes_of(given), tuple(constants))
+    return GraphKey(n := len(s.field), tuple(addresses), shapes_of(given, n), tuple(constants))
 
 
 def _given(s: TrainState, rasterizer: Rasterizer, inputs: IterationInputs) -> Given:

@@ -28,7 +28,7 @@ from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from rasterizers import replays
 from rasterizers.recording import Recording, running
-from rasterizers.replays import GraphKey, Replays
+from rasterizers.replays import GraphKey, Replays, shapes_of
 from tests.helpers.backends import needs
 from tests.helpers.short_run import SCENE, tensors, with_depth
 from tests.training.test_resume import without_time
@@ -286,7 +286,8 @@ def test_recordings_of_an_earlier_structure_are_dropped():
         return made[-1]
 
     for address in range(2 * replays._MOST_RECORDINGS):
-        key = GraphKey((address,), (), ())
+        rows = 5 + address // 2
+        key = GraphKey(rows, (address,), shapes_of([torch.zeros(rows, 3)], rows), ())
         found = [kept.do(key, 1, [], live=lambda: "live", record=recorded) for _ in range(3)]
         assert found == ["replayed" if address else "live", "replayed", "replayed"]
         assert len(made) == address + 1
@@ -311,7 +312,7 @@ def test_work_is_recorded_anew_as_long_as_recordings_pay_off(lasts, pays):
                 holds_at=lambda now: now // lasts == t // lasts, replay=lambda _: True, outcome=lambda: "replayed"
             )
 
-        return kept.do(GraphKey((), (), ()), t, [], live=lambda: "live", record=record)
+        return kept.do(GraphKey(1, (), (), ()), t, [], live=lambda: "live", record=record)
 
     found = [do(t) for t in range(240)]
     assert found[1] == "replayed"
@@ -320,7 +321,7 @@ def test_work_is_recorded_anew_as_long_as_recordings_pay_off(lasts, pays):
 
 def test_memory_that_is_new_in_each_iteration_is_told_and_not_recorded(caplog):
     kept = Replays(DEVICE, "")
-    found = [kept.do(GraphKey((k,), (), ()), k, [], live=lambda: "live", record=fails) for k in range(30)]
+    found = [kept.do(GraphKey(1, (k,), (), ()), k, [], live=lambda: "live", record=fails) for k in range(30)]
     assert set(found) == {"live"}
     assert caplog.text.count("Write to Strategy.state in place") == 1
 
