@@ -15,6 +15,7 @@ from clear_strategies.core import deferred
 from clear_strategies.core.conflicts import Weights
 from clear_strategies.core.gradients import gradients_of
 from clear_strategies.density.adaptive import DensitySettings
+from clear_strategies.kernels.gaussian_step import StepSettings
 from clear_strategies.kernels.gaussian_step.cpp import CppGaussianStep
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
 from clear_strategies.strategies.base import Strategy
@@ -26,6 +27,7 @@ from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import BackendUnavailable
 from tests.helpers import toy
+from tests.helpers.backends import needs
 from tests.helpers.compiled_step_cases import (
     ANCHORING,
     HR_LOSSES,
@@ -427,3 +429,16 @@ def test_the_readable_path_is_taken_where_it_must_be_and_that_is_said_once(caplo
         assert compiled_step_for(Conductor(), adam) is None
     path = "The per-Gaussian step takes the readable path, which is several times slower: "
     assert caplog.messages == [path + "the compiled kernels are not installed."]
+
+
+@needs("warp")
+def test_torchs_default_dtype_plays_no_part_in_the_numbers_of_a_recorded_step():
+    from clear_strategies.kernels.gaussian_step.warp import loss_weights, written
+
+    settings = StepSettings(0.9, 0.999, 1.0, 1e-15, 0.5, False, 0)
+    torch.set_default_dtype(torch.float64)
+    try:
+        found = loss_weights(written(settings, {}, torch.device("cpu"), lambda_hf=0.25))
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert found.tolist() == [0.5, 0.25]

@@ -153,7 +153,8 @@ def written(
     Args:
         rates: each attribute's, see `Attribute`. lambda_hf: λ_HR λ_HF.
     """
-    out = torch.empty(1, sizeof(_STEP) // _BYTES, device=device) if out is None else out
+    if out is None:
+        out = torch.empty(1, sizeof(_STEP) // _BYTES, dtype=torch.float32, device=device)
     numbers = struct(
         passes.AdamStep, {}, rates=struct(passes.Rates, {}, **{name: -rate for name, rate in rates.items()}), beta1=s.beta1,
         beta2=s.beta2, gain1=1 - s.beta1, gain2=1 - s.beta2, per_bias2=1 / s.bias2, eps=s.eps, lambda_hr=s.lambda_hr,
