@@ -9,6 +9,7 @@ import shutil
 import stat
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -181,22 +182,23 @@ def hold(folder: Path) -> Iterator[None]:
 
 
 class Beside:
-    """Calls functions, one after the other, in a thread of its own: pictures are drawn and encoded while others are rendered.
+    """Calls functions, one after the other, in a thread of its own: pictures are drawn and encoded while others are rendered, a
+    checkpoint is written while training goes on.
 
     A context. `finish` raises the first error of a call; where it is not reached, what was not begun is left out.
     """
 
     def __init__(self) -> None:
-        self._thread, self._calls = ThreadPoolExecutor(1), list[Future[None]]()
+        self._thread, self._calls = ThreadPoolExecutor(1), deque[Future[object]]()
 
-    def __call__(self, function: Callable[..., None], *arguments: Any) -> None:
+    def __call__(self, function: Callable[..., object], *arguments: Any) -> None:
         """Call it soon. The arguments must not change any more."""
         self._calls.append(self._thread.submit(function, *arguments))
 
-    def finish(self) -> None:
-        """Wait until all calls have been made."""
-        for call in self._calls:
-            call.result()
+    def finish(self, *, waits: bool = True) -> None:
+        """Wait until all calls have been made; or only raise the error of one that has failed."""
+        while self._calls and (waits or self._calls[0].done()):
+            self._calls.popleft().result()
 
     def __enter__(self) -> Beside:
         return self

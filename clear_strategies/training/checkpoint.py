@@ -11,7 +11,7 @@ import hashlib
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -67,6 +67,11 @@ class Checkpoint:
     work_log: Mapping[str, Any] = field(default_factory=dict)
     device: str = "cpu"
 
+    def copied(self) -> Checkpoint:
+        """The same in the CPU's memory, which training does not change as it goes on."""
+        tensors = {name: x.detach().to("cpu", copy=True) for name, x in self.tensors.items()}
+        return replace(self, tensors=tensors, history=[*self.history])
+
 
 def save(folder: Path, checkpoint: Checkpoint, *, keep: int = 3) -> Path:
     """Write `folder/step_<t>.safetensors` atomically; returns its path.
@@ -74,7 +79,8 @@ def save(folder: Path, checkpoint: Checkpoint, *, keep: int = 3) -> Path:
     Raises:
         OSError: the disk is full or read-only; earlier checkpoints are untouched.
     """
-    c, target = checkpoint, folder / f"{_PREFIX}{checkpoint.t:07d}{SUFFIX}"
+    c = checkpoint
+    target = folder / f"{_PREFIX}{c.t:07d}{SUFFIX}"
     columns = list(dict.fromkeys(name for row in c.history for name in row))
     rows = [[row.get(name, math.nan) for name in columns] for row in c.history]
     tensors = {name: x.detach().cpu().contiguous() for name, x in c.tensors.items()}

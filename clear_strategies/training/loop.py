@@ -14,6 +14,7 @@ from typing import Any, Final
 
 import torch
 
+from clear_strategies import files
 from clear_strategies.core import deferred, images
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import require_finite
@@ -205,19 +206,25 @@ def fit(
     """
     settings = state.settings
 
-    def save() -> Path | None:
+    def save(*, waits: bool = True) -> Path | None:
         if checkpoints is None:
             return None
         with state.conductor.work_log.stage("checkpoints"):
-            return checkpoint.save(checkpoints, state.checkpoint(config or {}), keep=settings.keep)
+            beside.finish()  # the one before
+            current = state.checkpoint(config or {})
+            if waits:
+                return checkpoint.save(checkpoints, current, keep=settings.keep)
+            beside(partial(checkpoint.save, keep=settings.keep), checkpoints, current.copied())
+        return None
 
     if settings.replay or (settings.replay is None and state.device.type == "cuda"):
         state.replays = replays_for(state, rasterizer)
     clock = Clock(state.history_as_floats()[-1] if state.history else {})
     before = state.t - 1
-    with deferred_signals() as pending, kernel_threads(state, rasterizer):
+    with deferred_signals() as pending, kernel_threads(state, rasterizer), files.Beside() as beside:
         while not state.ended:
             done, steps = state.t, state.optimizer.steps
+            beside.finish(waits=False)
             try:
                 iterate(state, rasterizer)
             except Exception as error:
@@ -244,7 +251,7 @@ def fit(
             if pending:
                 raise Interrupted(foremost(pending), f"before iteration {state.t}", save())
             if settings.checkpoint_every and _passed(settings.checkpoint_every, before, done) and not ended:
-                save()
+                save(waits=False)  # its file takes as long as hundreds of iterations on a GPU
             before = done
         saved = save()
         if pending:

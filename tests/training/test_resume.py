@@ -4,6 +4,7 @@ import json
 import logging
 import math
 import signal
+import threading
 
 import pytest
 import torch
@@ -92,6 +93,27 @@ def test_a_signal_during_the_last_save_ends_a_run_that_is_saved_to_its_end(tmp_p
         fit(state, SCENE, toy.RASTERIZER, checkpoints=tmp_path)
     assert "step_0000004" in str(ended.value)
     assert checkpoint.load(checkpoint.saved(tmp_path)[-1]).t == 4
+
+
+def test_training_goes_on_while_a_checkpoint_is_written_of_the_state_as_it_was(tmp_path, monkeypatch):
+    save, went_on, states = checkpoint.save, threading.Event(), {}
+
+    def slow(folder, saved, **named):
+        assert went_on.wait(2)
+        return save(folder, saved, **named)
+
+    def progress(s):
+        states[s.t] = {name: x.clone() for name, x in s.field.raw().items()}
+        if s.t == 5:
+            went_on.set()
+
+    monkeypatch.setattr(checkpoint, "save", slow)
+    state = start(())
+    state.settings = FitSettings(iterations=5, scale_schedule=False, probe_every=0, checkpoint_every=3)
+    fit(state, SCENE, toy.RASTERIZER, checkpoints=tmp_path, progress=progress)
+    saved = checkpoint.load(tmp_path / "step_0000004.safetensors")
+    assert [row["t"] for row in saved.history] == [1, 2, 3]
+    assert all(torch.equal(saved.tensors[f"field/{name}"], x) for name, x in states[4].items())
 
 
 def test_checkpoints_come_where_skips_jump_over_their_iteration(tmp_path, monkeypatch):
