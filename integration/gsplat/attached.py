@@ -177,11 +177,12 @@ class Attached:
                 return rasterization(**call)
             if not torch.is_grad_enabled():
                 return rasterization(**self._with_detail(call, trained=False))
-            view = self._poses.find(call["viewmats"]) if self._named is None else self._named[0]
+            read = functools.cache(functools.partial(calls.cameras_read, call))
+            view = self._poses.find(read()["viewmats"]) if self._named is None else self._named[0]
             if view is None:  # a viewer, a camera without a photo
                 return rasterization(**self._with_detail(call, trained=False))
             if self._named is None:
-                calls.require_own_intrinsics(call, view)
+                calls.require_own_intrinsics({**call, **read()}, view)
             calls.require_pinhole(call, self.attachment.conductor.showing)
 
             @functools.cache  # the product is the same tensor at both scales, and none is kept for longer
@@ -191,7 +192,7 @@ class Attached:
 
             def render_at(target: Target, gate: Tensor | None, sized: View) -> HostOutput | Drawable:
                 shown = call if gate is None else {**call, "opacities": gated(gate)}
-                return self._render(rasterization, shown, sized, target, gate)
+                return self._render(rasterization, shown, sized, target, gate, read)
 
             self._follow_optimizers()
             with self._together(call):
@@ -250,7 +251,8 @@ class Attached:
         return as_bands or not (self._has_drawn_bands or self._named == (None,))
 
     def _render(
-        self, rasterization: Rasterization, arguments: Mapping[str, Any], view: View, target: Target, gate: Tensor | None
+        self, rasterization: Rasterization, arguments: Mapping[str, Any], view: View, target: Target, gate: Tensor | None,
+        read: Callable[[], Mapping[str, Tensor]],
     ) -> HostOutput | Drawable:  # fmt: skip
         call, params = {**arguments, **self._background(arguments)}, self.params()
         if call["means"].dim() > 2:
@@ -265,7 +267,8 @@ class Attached:
             )
         own = None if target == "lr" else self._own_rasterizer(call)
         if target == "hr":
-            call = calls.enlarged(self._with_detail(call, trained=True) if own is None else call, view.factor)
+            wanted = self._with_detail(call, trained=True) if own is None else {**call, **read()}
+            call = calls.enlarged(wanted, view.factor)
             call |= {"packed": False} if self._is_ours else {}  # nobody reads its `info`
         else:
             params.pop("detail", None)

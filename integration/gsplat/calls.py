@@ -34,6 +34,16 @@ _LENS: Final = (
 _POSE_RATIO: Final = 10  # by which the second nearest pose must be farther away, since frames of a video lie close
 
 
+def cameras_read(call: Call) -> dict[str, Tensor]:
+    """`viewmats` and `Ks` of a call in the CPU's memory. From a device both come in one transfer, for which the host waits."""
+    viewmats, Ks = (call[name].detach() for name in ("viewmats", "Ks"))
+    together = torch.cat(
+        (viewmats.reshape(-1), Ks.to(viewmats.device).reshape(-1))
+    ).cpu()  # in the wider of their types
+    poses, K = torch.split(together, [viewmats.numel(), Ks.numel()])
+    return {"viewmats": poses.view(viewmats.shape).to(viewmats.dtype), "Ks": K.view(Ks.shape).to(Ks.dtype)}
+
+
 class Poses:
     """Finds the view of a call by its pose, if the loop does not name the view."""
 
@@ -42,12 +52,12 @@ class Poses:
         self._poses = torch.stack([view.lr.camera.world_to_camera for view in views]).double().cpu().numpy()
 
     def find(self, viewmats: Float[Tensor, "*C 4 4"]) -> View | None:
-        """The view with this pose; None: no training view has it.
+        """The view with this pose, in the CPU's memory; None: no training view has it.
 
         Raises:
             HostError: there are several poses, or two views have this one.
         """
-        poses = viewmats.detach().reshape(-1, 4, 4).cpu().numpy()  # compared in numpy: a step has few torch operations
+        poses = viewmats.reshape(-1, 4, 4).numpy()  # compared in numpy: a step has few torch operations
         if len(poses) != 1:
             raise HostError(
                 f"one view is rendered at a time, got {len(poses)}. For several in a step, call backward() after each and set "
@@ -63,10 +73,12 @@ class Poses:
 
 
 def require_own_intrinsics(call: Call, view: View) -> None:
-    """Raise a HostError if a call of the photo's size has other intrinsics; other sizes are refused where they are drawn."""
+    """Raise a HostError if a call of the photo's size, with cameras in the CPU's memory, has other intrinsics; other sizes are
+    refused where they are drawn.
+    """
     lr = view.lr.camera
     if (call["width"], call["height"]) == (lr.width, lr.height):
-        (fx, _, cx), (_, fy, cy), _ = call["Ks"].detach().reshape(3, 3).cpu().numpy().tolist()
+        (fx, _, cx), (_, fy, cy), _ = call["Ks"].reshape(3, 3).tolist()
         remedy = (
             "Pass view() the K of the loop, and cut a crop out of the whole picture. A loop that optimizes K names the view: "
             "with clear.rendering(view): …"
@@ -132,7 +144,7 @@ def drawable(rasterizer: Rasterizer, call: Call, params: Mapping[str, Tensor], c
     """The `Drawable` of a call.
 
     Args:
-        camera: None: that of the call.
+        camera: None: that of the call, which is in the CPU's memory.
     """
     if camera is None:
         viewmats, Ks = call["viewmats"].reshape(1, 4, 4), call["Ks"].reshape(1, 3, 3)

@@ -85,6 +85,19 @@ def test_cameras_that_lie_close_together_are_told_apart(origin, step):
         assert poses.find(rounded) is view
 
 
+def test_a_step_reads_its_camera_in_one_transfer(monkeypatch):
+    """Of a device; what is drawn is then known on the CPU."""
+    _, _, render = started(P2G(patch=4), hr_by="torch")
+    read, cpu = [], torch.Tensor.cpu
+    monkeypatch.setattr(torch.Tensor, "cpu", lambda x: read.append(x.numel()) or cpu(x))
+    render().mean().backward()
+    assert [n for n in read if n <= 16 + 9] == [16 + 9]  # others are of pictures
+    call = {"viewmats": torch.rand(1, 4, 4), "Ks": torch.rand(1, 3, 3, dtype=torch.float64)}
+    for name, x in calls.cameras_read(call).items():
+        assert torch.equal(x, call[name])
+        assert x.dtype == call[name].dtype
+
+
 @pytest.mark.parametrize(("ratio", "found"), [(8, False), (12, True)])
 def test_the_nearest_camera_is_the_one_that_is_rendered_if_the_next_is_ten_times_as_far(ratio, found):
     """Poses that a loop optimizes or adds noise to lie beside those of the photos."""
