@@ -67,6 +67,7 @@ class StrictCuda:
     def __init__(self) -> None:
         self.current = Stream(self)
         self.state = State(self.current)
+        self.backward: int | None = None  # autograd's thread of the device
 
     def ask(self, what: str, on: Stream | None = None, **more: Any) -> None:
         """Refuse the act where a rule does."""
@@ -123,6 +124,7 @@ class Graph:
     def __init__(self, cuda: StrictCuda) -> None:
         self.cuda, self.stream = cuda, cuda.current
         self.captured = self.invalid = False
+        self.thread, self.mode = threading.get_ident(), "global"
         self.calls: list[tuple[Callable[..., Any], Any]] = []
         self.pooled = Pool()
         self.on_host: dict[int, torch.Tensor] = {}  # what a generator of the CPU has drawn meanwhile, which may be read
@@ -134,6 +136,7 @@ class Graph:
             self.pooled.used, state.living = True, state.living + 1
             weakref.finalize(self.pooled, state.drop)
         self.stream, state.capture, state.seeds = self.cuda.current, self, True
+        self.mode = capture_error_mode
         state.underway.append(self.pooled)
 
     def capture_end(self) -> None:
@@ -155,6 +158,11 @@ class Graph:
         with _disable_current_modes(), torch.no_grad():
             for (call, _), given in zip(self.calls, arguments, strict=True):
                 call(*given)
+
+    def may_be_read(self, x: torch.Tensor) -> bool:
+        """Whether a tensor is on the host; or the thread is another one, which in the mode thread_local may wait."""
+        is_others = threading.get_ident() not in (self.thread, self.cuda.backward)
+        return _address(x) in self.on_host or (is_others and self.mode == "thread_local")
 
     def reference(self, x: Any) -> Any:
         """A tensor of the pool itself; a weak reference to another, which others have to keep."""
@@ -244,7 +252,7 @@ def _asks(cuda: StrictCuda, name: str, act: str) -> Callable[..., Any]:
 
     @wraps(method)
     def asked(x: torch.Tensor, *args: Any, **kwargs: Any) -> Any:
-        if (graph := cuda.state.capture) is None or _address(x) not in graph.on_host:
+        if (graph := cuda.state.capture) is None or not graph.may_be_read(x):
             cuda.ask(act)
         return x if act == "pin" else method(x, *args, **kwargs)
 
@@ -269,11 +277,11 @@ class _Elsewhere:
 
     def __init__(self) -> None:
         self._thread = ThreadPoolExecutor(1)
-        self._ident = self._thread.submit(threading.get_ident).result()
+        self.ident = self._thread.submit(threading.get_ident).result()
 
     def does(self, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any, **kwargs: Any) -> Any:
-            if threading.get_ident() == self._ident:
+            if threading.get_ident() == self.ident:
                 return function(*args, **kwargs)
             modes = _get_current_dispatch_mode_stack()  # autograd takes these along, and no modes of functions
             return self._thread.submit(self._within, modes, partial(function, *args, **kwargs)).result()
@@ -304,7 +312,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     from rasterizers.warp_backend import frame
 
     cuda, autograd, loaded = StrictCuda(), _Elsewhere(), set[Any]()
-    construct, state = warp_runtime._Launch.__init__, cuda.state
+    construct, state, cuda.backward = warp_runtime._Launch.__init__, cuda.state, autograd.ident
     sort, prepare, allocate, init = wp.utils.radix_sort_pairs, warp_runtime._Launch.prepare, wp.empty, wp.init
 
     def initialises() -> None:

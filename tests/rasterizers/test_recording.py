@@ -202,6 +202,18 @@ def test_each_thread_records_on_a_stream_of_its_own(monkeypatch):
     assert first[0] is not second[0]
 
 
+def test_another_thread_may_read_while_a_recording_is_made(recorded_on):
+    """A checkpoint is written beside training."""
+    x = torch.ones(2, device=recorded_on)
+
+    def work():
+        with ThreadPoolExecutor(1) as other:
+            assert other.submit(lambda: torch.ones(3).numpy().sum()).result() == 3
+        return x + 1
+
+    assert Recording(recorded_on, work).result.tolist() == [2, 2]
+
+
 def test_a_backward_pass_runs_in_a_thread_of_its_own(recorded_on):
     x, seen = torch.ones(1, device=recorded_on, requires_grad=True), []
     x.register_hook(lambda _: seen.append(threading.get_ident()))
