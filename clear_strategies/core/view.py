@@ -136,14 +136,15 @@ class View:
 
     Args:
         lr: the authentic low-resolution photo.
-        hr: the super-resolved (SR) image of the prior; the truth only where photos train at both scales.
-        truth: the real photo at HR, for evaluation only; training never uses it.
+        hr: the super-resolved (SR) image of the prior.
+        truth: the real photo at HR beside it, for evaluation only; None where it is unknown.
         sr_source: the prior's label, e.g. "onnx span_x4.onnx".
         depth: of the photo's surfaces, from stereo, on the pixels of `depth_photo`; None where nothing needs it, e.g. in
             test views.
         disagreement: |D(I) - I_LR| of the network's SR image I, by which P2G measures reliability. Back-projection, which makes
             `hr` of I, removes this difference. None if `hr` is I itself.
         background: RGB in [0, 1] behind the scene; pixels of this colour belong to no surface.
+        hr_is_photo: `hr` is the photo itself in place of an SR image (`data.views.photos_are=both`).
     """
 
     name: str
@@ -154,6 +155,7 @@ class View:
     depth: DepthMap | None = None
     disagreement: Float[Tensor, "h w 3"] | None = None
     background: Color = (0.0, 0.0, 0.0)
+    hr_is_photo: bool = False
 
     @property
     def factor(self) -> int:
@@ -161,9 +163,9 @@ class View:
         return self.hr.camera.width // self.lr.camera.width
 
     @property
-    def hr_is_photo(self) -> bool:
-        """True if HR is the photo itself in place of an SR image (`data.views.photos_are=both`)."""
-        return self.truth is self.hr.image
+    def true_hr(self) -> Float[Tensor, "H W 3"] | None:
+        """The real photo at HR, whether `hr` is that or not; None where it is unknown."""
+        return self.hr.image if self.hr_is_photo else self.truth
 
     @property
     def depth_photo(self) -> Photo:
@@ -184,16 +186,13 @@ class View:
         lr, hr = (
             replace(photo, image=(photo.image * gain).clamp(0, 1), transparency=None) for photo in (self.lr, self.hr)
         )
-        truth = hr.image if self.hr_is_photo else None if self.truth is None else (self.truth * gain).clamp(0, 1)
+        truth = None if self.truth is None else (self.truth * gain).clamp(0, 1)
         disagreement = None if self.disagreement is None else self.disagreement * gain  # a difference of such images
         return replace(self, lr=lr, hr=hr, truth=truth, disagreement=disagreement)
 
     def to(self, device: torch.device | str) -> View:
-        hr = self.hr.to(device)
-        truth = hr.image if self.hr_is_photo else None if self.truth is None else self.truth.to(device)
-        depth = None if self.depth is None else self.depth.to(device)
-        disagreement = None if self.disagreement is None else self.disagreement.to(device)
-        return replace(self, lr=self.lr.to(device), hr=hr, truth=truth, depth=depth, disagreement=disagreement)
+        layers = {name: getattr(self, name) for name in ("lr", "hr", "truth", "depth", "disagreement")}
+        return replace(self, **{name: layer.to(device) for name, layer in layers.items() if layer is not None})
 
 
 @dataclass(frozen=True, slots=True, eq=False)

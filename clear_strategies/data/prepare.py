@@ -145,9 +145,9 @@ class _ViewMaker:
         """The view of a frame. If the prior has no SR image, bicubic replaces it, or a `required` view is a DataError."""
         lr, factor, prior = self.lr(frame, photo), self.settings.sr_scale, self.prior
         hr_camera, truth = (photo.camera.scaled(factor), None) if lr is photo else (photo.camera, photo.image)
-        hr = replace(photo, shown=None)
+        hr, are_both = replace(photo, shown=None), self.settings.photos_are == "both"
         source, disagreement = "the photos themselves", None
-        if self.settings.photos_are != "both":
+        if not are_both:
             try:
                 sr = super_resolved(prior, frame.name, lr.image, factor)
             except DataError as missing:
@@ -158,8 +158,10 @@ class _ViewMaker:
                 sr = super_resolved(prior, frame.name, lr.image, factor)
             hr = Photo(hr_camera, sr.image, transparency=self.enlarged(lr.transparency, frame.name))
             source, disagreement = prior.label, sr.disagreement
-        background = self.capture.background
-        view = View(frame.name, lr, hr, truth, source, disagreement=disagreement, background=background)
+        view = View(
+            frame.name, lr, hr, None if are_both else truth, source, disagreement=disagreement,
+            background=self.capture.background, hr_is_photo=are_both,
+        )  # fmt: skip
         shown = None if photo.shown is None else photo.reduced(photo.camera.width // lr.camera.width).shown
         return view if shown is None else view.hiding(shown)
 

@@ -143,9 +143,6 @@ def guarded(view: View, *, over_changing: bool) -> View:
         camera = unread(p.camera, "the camera of the view", ("width", "height"))
         return replace(p, camera=camera, image=image, transparency=layer(p.transparency, "transparency"))
 
-    lr, hr = photo(view.lr), photo(view.hr)
-    return View(
-        unread(view.name, "the name of the view"), lr, hr, hr.image if view.hr_is_photo else layer(view.truth, "truth"),
-        unread(view.sr_source, "the sr_source of the view"), layer(view.depth, "depth"),
-        layer(view.disagreement, "disagreement"), view.background,
-    )  # fmt: skip
+    named = {name: unread(getattr(view, name), f"the {name} of the view") for name in ("name", "sr_source")}
+    layers = {name: layer(getattr(view, name), name) for name in ("truth", "depth", "disagreement")}
+    return replace(view, lr=photo(view.lr), hr=photo(view.hr), **named, **layers)

@@ -184,7 +184,7 @@ def evaluate(
 
 def _part(views: Sequence[View], table: Table, of: int | None = None) -> Part:
     """The scores of some or all of the views, and their means."""
-    kinds = {"LR" if view.truth is None else "HR" for view in views}
+    kinds = {"LR" if view.true_hr is None else "HR" for view in views}
     scored = sorted({image for row in table.values() for image in row})
     means = {image: mean_scores([row[image] for row in table.values() if image in row]) for image in scored}
     return Part(f"{' and '.join(sorted(kinds))} photos" if kinds else "nothing", table, means, of)
@@ -194,7 +194,7 @@ def _scores_of(
     view: View, image: Float[Tensor, "H W 3"], down: DownKernel, own: Mapping[str, Metric] | None
 ) -> dict[str, ImageScores]:
     """Score the images of a view."""
-    truth, mask, scored = view.truth, view.hr.shown, {"ours": image}
+    truth, mask, scored = view.true_hr, view.hr.shown, {"ours": image}
     if truth is None:
         if mask is not None:  # else D would mix hidden pixels into shown ones
             scored["ours"] = torch.where(mask[..., None], image, view.hr.image)

@@ -196,7 +196,7 @@ def _write_sheet(folder: Path, scene: Scene, stems: Mapping[str, str], evaluatio
     for view in (*scene.train, *scene.test):  # the viewer shows them beside the rendering
         write_png(folder / "views" / f"{stems[view.name]}_lr.png", view.lr.image)
     for view in spaced(rendered, _SHEET_VIEWS):
-        for kind, shown in {"prior": view.hr.image, "truth": view.truth}.items():
+        for kind, shown in {"prior": view.hr.image, "truth": view.true_hr}.items():
             if shown is not None:
                 write_png(folder / "views" / f"{stems[view.name]}_{kind}.png", shown)
         columns: dict[str, Tensor] = {}
@@ -204,9 +204,8 @@ def _write_sheet(folder: Path, scene: Scene, stems: Mapping[str, str], evaluatio
             columns["LR, enlarged"] = images.upsample(view.lr.image, view.factor, "nearest")
             columns["SR prior"] = view.hr.image
         columns["ours"] = evaluation.renders[view.name].clamp(0, 1)
-        if view.truth is not None:
-            columns["ground truth"] = view.truth
-            columns["error of ours"] = (columns["ours"] - view.truth).abs().mean(-1)
+        if (truth := view.true_hr) is not None:
+            columns |= {"ground truth": truth, "error of ours": (columns["ours"] - truth).abs().mean(-1)}
         score = scored[view.name]["ours"]
         captions = {"ours": f"{score.psnr:.2f} dB, SSIM {score.ssim:.3f}"}
         pixels = {name: image.numpy() for name, image in columns.items()}

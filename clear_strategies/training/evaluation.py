@@ -24,9 +24,9 @@ def evaluate(state: TrainState, scene: Scene, rasterizer: Rasterizer, done: int)
         return
     with work_log.stage(_STAGE):
         values = [
-            psnr_of(state.field.render(rasterizer, view.hr.camera), view.truth, view.hr.shown)
+            psnr_of(state.field.render(rasterizer, view.hr.camera), truth, view.hr.shown)
             for view in scene.test[: state.settings.probe_views]
-            if view.truth is not None and view.lr.shows_something
+            if (truth := view.true_hr) is not None and view.lr.shows_something
         ]
         if values:
             state.history[-1]["psnr_test"] = sum(deferred.read(values)) / len(values)

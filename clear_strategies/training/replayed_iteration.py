@@ -167,6 +167,4 @@ def _reading(inputs: IterationInputs, given: list[Any]) -> IterationInputs:
     if isinstance(inputs, ExtraViewInputs):
         return replace(inputs, view=replace(inputs.view, photo=photos[0], weight=gate), background=None)
     lr, hr = photos[0], photos[1] if inputs.scales["hr"] else inputs.view.hr  # without HR, only its size is read
-    truth = hr.image if inputs.view.hr_is_photo else inputs.view.truth
-    view = replace(inputs.view, lr=lr, hr=hr, truth=truth)
-    return replace(inputs, view=view, gate=gate, background=None, looked_up=looked_up)
+    return replace(inputs, view=replace(inputs.view, lr=lr, hr=hr), gate=gate, background=None, looked_up=looked_up)

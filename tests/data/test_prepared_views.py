@@ -58,7 +58,7 @@ def test_back_projected_sr_images_shrink_to_the_photos_and_keep_how_far_they_wer
 
 def test_photos_that_are_the_hr_side_are_not_moved_and_equalize_has_no_effect_without_depth(caplog):
     scene = prepare(ROOM, ViewSettings(photos_are="both", train=2), BackProjected(wrong()), POINTS)
-    assert all(view.hr.image is view.truth for view in scene.train)
+    assert all(view.hr_is_photo and view.true_hr is view.hr.image for view in scene.train)
     assert "back-projection" not in scene.notes
     made = prepare(capture(), ViewSettings(sr_scale=2, equalize=True), Bicubic(), POINTS)
     assert "data.views.equalize has no effect" in caplog.text

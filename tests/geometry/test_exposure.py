@@ -51,7 +51,8 @@ def test_a_view_is_brightened_at_both_scales_and_its_photo_stays_its_truth():
     assert torch.equal(made.lr.image, (lr.image * gain).clamp(0, 1))
     assert made.hr.image[0, 0].tolist() == pytest.approx([0.9, 1.0, 0.3])
     assert made.truth[0, 0].tolist() == pytest.approx([0.75, 1.0, 0.25])
-    assert View("v", lr, hr, truth=hr.image).brightened(gain).hr_is_photo
+    photo = View("v", lr, hr, hr_is_photo=True).brightened(gain)
+    assert photo.true_hr is photo.hr.image
 
 
 def test_the_reliability_of_a_brightened_view_is_that_of_its_brightened_images():

@@ -141,7 +141,7 @@ def test_an_earlier_run_goes_with_all_of_its_files_and_no_other(tmp_path: Path, 
 
 def test_the_sheet_of_photos_at_hr_shows_no_sr(tmp_path, state, monkeypatch):
     def photos(view: View) -> View:
-        return replace(view, hr=replace(view.hr, image=view.truth))
+        return replace(view, hr=replace(view.hr, image=view.truth), truth=None, hr_is_photo=True)
 
     sheets: list[Any] = []
     monkeypatch.setattr(results, "write_curves", lambda *_: None)
