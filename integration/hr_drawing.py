@@ -140,9 +140,7 @@ class HrDrawing:
 
     def wanted(self, t: int) -> bool:
         """Return True if HR takes part at t. No iteration is skipped while the host's densifier reads a score."""
-        conductor = self._conductor
-        scores = self.is_scored and conductor.may_densify(t)
-        return conductor.wants_hr(t) and (scores or not conductor.skips.leaves_out_hr(t, conductor.work_log))
+        return self._conductor.wants_hr(t, scored=self.is_scored and self._conductor.may_densify(t))
 
     def hr(
         self, step: Step, gate: Float[Tensor, " N"] | None, render_at: RenderAt

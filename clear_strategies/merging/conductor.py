@@ -98,15 +98,33 @@ class Conductor(Hooks):
         λ = self.objective.lambda_hr
         return λ.peak > 0 or λ.final > 0 or not self.wants_lr or self.owner("score") is not None
 
-    def wants_hr(self, t: int) -> bool:
-        """Return True if the HR render is used at t: λ_HR > 0, Î_LR is its area mean, or a densification score needs it."""
-        if self.objective.lambda_hr(t) > 0 or not self.wants_lr:
+    def wants_hr(self, t: int, *, scored: bool = True) -> bool:
+        """Return True if the HR render is used at t: λ_HR > 0, Î_LR is its area mean, or a densification score needs it.
+
+        Args:
+            scored: False: no densification reads the scores of this iteration, so that `skips.hr_every` may leave HR out.
+        """
+        if self.objective.lambda_hr(t) == 0 and self.wants_lr:
+            collecting = self.statistics_from is not None and t > self.statistics_from
+            if self.owner("score") is None or not collecting or not self.may_densify(t):
+                self.work_log.skip("render LR + HR", "lambda_HR = 0")
+                return False
+        if scored or not self.wants_lr or not self.skips.leaves_out_hr(t):
             return True
-        collecting = self.statistics_from is not None and t > self.statistics_from
-        if self.owner("score") is not None and collecting and self.may_densify(t):
-            return True
-        self.work_log.skip("render LR + HR", "lambda_HR = 0")
+        reason = f"HR in one of {self.skips.skips.hr_every} iterations (skips.hr_every)"
+        self.work_log.skip("render LR + HR", reason)
         return False
+
+    def lr_due(self, view: View, hr_due: bool) -> bool:
+        """Return True if LR is rendered beside HR, or alone where HR is not due.
+
+        Args:
+            view: of the iteration, from `skips.view`.
+        """
+        if self.wants_lr and hr_due and self.skips.serves_lr(view):
+            self.work_log.skip("render LR", "HR at half its size is as large (skips.coarse_until)")
+            return False
+        return self.wants_lr
 
     @apart_from_the_loop
     def update(

@@ -20,7 +20,6 @@ from clear_strategies.core import deferred
 from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.view import View
-from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import counted
 from clear_strategies.schedules import milestone
 
@@ -67,109 +66,34 @@ class Skips:
         require_whole("hr_every", self.hr_every, least=1)
 
 
-class SkipPolicy:
-    """Applies the skips of one run. It stores only caches, which no checkpoint needs."""
+@dataclass(frozen=True, slots=True)
+class Plateau:
+    """A plateau of the loss of the training views, at which training continues at `skips.plateau_to`.
 
-    def __init__(self, skips: Skips | None = None) -> None:
-        self.skips = skips if skips is not None else Skips()
-        self._coarse: dict[str, tuple[View, View]] = {}  # a view and its coarse one, by name
+    Args:
+        n_views: training views.
+    """
 
-    def descriptions(self, views: Sequence[View], *, uses_hr: bool = True, in_host: bool = False) -> list[str]:
-        """A phrase for each skip that is on, for the plan; one that has no effect is logged.
+    skips: Skips
+    n_views: int
 
-        Args:
-            uses_hr: there is work on HR to leave out.
-            in_host: the iterations are a host's, so that none is left out.
-        """
-        s, phrases = self.skips, []
-        if uses_hr and s.coarse_until > 0 and not any(map(_halves, views)):
-            _log.warning(
-                "skips.coarse_until has no effect: SR images are halved only where %s is even.",
-                "factor" if in_host else "data.views.sr_scale",
-            )
-        elif uses_hr and s.coarse_until > 0:
-            phrases.append(f"HR at half its size until iteration {s.coarse_until}")
-        if uses_hr and s.hr_every > 1 and s.coarse_until > 0:
-            phrases.append(
-                f"HR in one of {s.hr_every} iterations until iteration {s.coarse_until}, and in each whose scores "
-                "densification reads"
-            )
-        if in_host:
-            return phrases
-        if s.undrawn > 0:
-            phrases.append("Gaussians too faint to be drawn, once densification has ended")
-        if s.plateau_gain > 0 and not self._measurements(len(views)):
-            _log.debug(
-                "skips.plateau_gain has no effect: this run is too short for %d looks at each of %s between two measurements.",
-                _LOOKS, counted(len(views), "view"),
-            )  # fmt: skip
-        elif s.plateau_gain > 0:
-            phrases.append(f"all iterations up to {s.plateau_to}, once {self.plateau(len(views))}")
-        return phrases
-
-    def view(self, view: View, t: int) -> View:
-        """The view of iteration t: with a coarse SR image at first, where the factor is even."""
-        if t > self.skips.coarse_until:
-            self._coarse.clear()  # no later iteration needs them
-            return view
-        if not _halves(view):
-            return view
-        whole, coarse = self._coarse.get(view.name, (None, None))
-        if coarse is None or whole is not view:  # of another scene, or with another SR image
-            coarse = replace(view, hr=view.hr.reduced(_REDUCED), truth=None)
-            self._coarse[view.name] = view, coarse
-        return coarse
-
-    def leaves_out_hr(self, t: int, work_log: WorkLog) -> bool:
-        """Return True if HR is left out of iteration t: with `hr_every=2` of even ones, in which pseudo views come, too."""
-        if t > self.skips.coarse_until or (t - 1) % self.skips.hr_every == 0:
-            return False
-        work_log.skip("render LR + HR", f"HR in one of {self.skips.hr_every} iterations (skips.hr_every)")
-        return True
-
-    def lr_due(self, view: View, hr_due: bool, work_log: WorkLog) -> bool:
-        """True if LR is rendered: not if HR at half its size is as large as the photo, since one render then serves both."""
-        if view.factor > 1 or not hr_due or view is not self._coarse.get(view.name, (None, None))[1]:
-            return True
-        work_log.skip("render LR", "HR at half its size is as large (skips.coarse_until)")
-        return False
-
-    def drawn(self, opacities: Float[Tensor, " N"], alpha_min: float) -> Int[Tensor, " M"] | None:
-        """The rows of the Gaussians that some view may draw; None where (nearly) all may.
-
-        Args:
-            opacities: as rendered. alpha_min: of the rasterizer, see `RasterSettings`.
-        """
-        if self.skips.undrawn == 0:
-            return None
-        rows = torch.nonzero(opacities >= _GATED * alpha_min)[:, 0]
-        faint = len(opacities) - len(rows)
-        if faint < max(1, self.skips.undrawn * len(opacities)) or not len(rows):
-            return None
-        return rows
-
-    def plateau(self, n_views: int) -> str:
-        """What a plateau is, in words, with `n_views` training views."""
-        window = counted(self._measurements(n_views).step, "iteration")
+    def __str__(self) -> str:
+        window = counted(self.measurements.step, "iteration")
         return f"the loss of the training views falls by less than {self.skips.plateau_gain:.1%} in {window}"
 
-    def _measurements(self, n_views: int) -> range:
+    @property
+    def measurements(self) -> range:
         """The iterations after which the training views are measured, a window apart; empty where there would be one only."""
         s = self.skips
-        window = max(s.plateau_window, _LOOKS * n_views)
+        window = max(s.plateau_window, _LOOKS * self.n_views)
         times = range(-(-s.plateau_from // window) * window, s.plateau_to, window)
         return times if s.plateau_gain > 0 and len(times) > 1 else times[:0]
 
-    def measured(self, t: int, n_views: int) -> bool:
-        """Return True if the loss of the training views, so many, is measured after iteration t, to find a plateau."""
-        return t in self._measurements(n_views)
-
-    def settled(self, history: Sequence[dict[str, Number]], t: int, n_views: int) -> bool:
-        """True if the training views have stopped improving by iteration t, the last of the history; `plateau_to` then follows.
-        False if it is unknown: iterations were left out within the window, or at one end of it the structure has changed or
-        another loss was measured.
+    def reached(self, history: Sequence[dict[str, Number]], t: int) -> bool:
+        """True if the training views have stopped improving by iteration t, the last of the history. False if it is unknown:
+        iterations were left out within the window, or at one end of it the structure has changed or another loss was measured.
         """
-        times = self._measurements(n_views)
+        times = self.measurements
         window = times.step
         if t not in times[1:] or len(history) <= window:
             return False
@@ -186,6 +110,82 @@ class SkipPolicy:
         if row["lambda_hr"] == 0:
             return "LR"
         return "HR at half its size" if row["t"] <= self.skips.coarse_until else "HR"
+
+
+class SkipPolicy:
+    """Applies the skips of HR and of Gaussians in one run. It stores only caches, which no checkpoint needs."""
+
+    def __init__(self, skips: Skips | None = None) -> None:
+        self.skips = skips if skips is not None else Skips()
+        self._coarse: dict[str, tuple[View, View]] = {}  # a view and its coarse one, by name
+
+    def descriptions(self, views: Sequence[View], *, uses_hr: bool = True, in_host: bool = False) -> list[str]:
+        """A phrase for each skip that is on, for the plan; one that has no effect is logged.
+
+        Args:
+            uses_hr: there is work on HR to leave out.
+            in_host: the iterations are a host's, so that none is left out.
+        """
+        s, phrases, plateau = self.skips, [], Plateau(self.skips, len(views))
+        if uses_hr and s.coarse_until > 0 and not any(map(_halves, views)):
+            _log.warning(
+                "skips.coarse_until has no effect: SR images are halved only where %s is even.",
+                "factor" if in_host else "data.views.sr_scale",
+            )
+        elif uses_hr and s.coarse_until > 0:
+            phrases.append(f"HR at half its size until iteration {s.coarse_until}")
+        if uses_hr and s.hr_every > 1 and s.coarse_until > 0:
+            phrases.append(
+                f"HR in one of {s.hr_every} iterations until iteration {s.coarse_until}, and in each whose scores "
+                "densification reads"
+            )
+        if in_host:
+            return phrases
+        if s.undrawn > 0:
+            phrases.append("Gaussians too faint to be drawn, once densification has ended")
+        if s.plateau_gain > 0 and not plateau.measurements:
+            _log.debug(
+                "skips.plateau_gain has no effect: this run is too short for %d looks at each of %s between two measurements.",
+                _LOOKS, counted(len(views), "view"),
+            )  # fmt: skip
+        elif s.plateau_gain > 0:
+            phrases.append(f"all iterations up to {s.plateau_to}, once {plateau}")
+        return phrases
+
+    def view(self, view: View, t: int) -> View:
+        """The view of iteration t: with a coarse SR image at first, where the factor is even."""
+        if t > self.skips.coarse_until:
+            self._coarse.clear()  # no later iteration needs them
+            return view
+        if not _halves(view):
+            return view
+        whole, coarse = self._coarse.get(view.name, (None, None))
+        if coarse is None or whole is not view:  # of another scene, or with another SR image
+            coarse = replace(view, hr=view.hr.reduced(_REDUCED), truth=None)
+            self._coarse[view.name] = view, coarse
+        return coarse
+
+    def leaves_out_hr(self, t: int) -> bool:
+        """Return True if HR is left out of iteration t: with `hr_every=2` of even ones, in which pseudo views come, too."""
+        return t <= self.skips.coarse_until and (t - 1) % self.skips.hr_every != 0
+
+    def serves_lr(self, view: View) -> bool:
+        """Return True if HR at half its size is as large as the photo, so that one render serves both."""
+        return view.factor == 1 and view is self._coarse.get(view.name, (None, None))[1]
+
+    def drawn(self, opacities: Float[Tensor, " N"], alpha_min: float) -> Int[Tensor, " M"] | None:
+        """The rows of the Gaussians that some view may draw; None where (nearly) all may.
+
+        Args:
+            opacities: as rendered. alpha_min: of the rasterizer, see `RasterSettings`.
+        """
+        if self.skips.undrawn == 0:
+            return None
+        rows = torch.nonzero(opacities >= _GATED * alpha_min)[:, 0]
+        faint = len(opacities) - len(rows)
+        if faint < max(1, self.skips.undrawn * len(opacities)) or not len(rows):
+            return None
+        return rows
 
 
 def _halves(view: View) -> bool:

@@ -45,9 +45,8 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
     conductor.logs.forget()
     θ.degree = min(s.settings.max_degree, (t - 1) // max(1, s.settings.degree_every))
     view = conductor.skips.view(view_at(s), t)
-    needs_hr = not conductor.wants_lr or s.density.collects(t)  # for Î_LR, or for a score
-    hr_due = conductor.wants_hr(t) and (needs_hr or not conductor.skips.leaves_out_hr(t, conductor.work_log))
-    scales = {"lr": conductor.wants_lr and conductor.skips.lr_due(view, hr_due, conductor.work_log), "hr": hr_due}
+    hr_due = conductor.wants_hr(t, scored=s.density.collects(t))
+    scales = {"lr": conductor.lr_due(view, hr_due), "hr": hr_due}
     z, background = conductor.gate(t, len(θ)), conductor.background(t)  # zᵗ             Eq. 15       SVS
     u, row = run_or_replay(s, rasterizer, ViewInputs(t, view, scales, z, background), learn)
     conductor.draw(t, θ.means.data, partial(enlarged, s, rasterizer, background))
@@ -59,7 +58,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
         if s.filter_due() and not restructured and not s.remove_undrawn():  # each recomputes the filter
             s.refilter()
     s.history.append(_with_logs(_row(s) | row | extra, conductor.logs.counted()))
-    if s.conductor.skips.measured(t, len(s.views)) and not (restructured or s.reset_due(t)):
+    if t in s.plateau.measurements and not (restructured or s.reset_due(t)):
         with stage("loss of the training views"):
             s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)
     s.advance()

@@ -19,6 +19,7 @@ from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import AnswerError, DataError, DivergedError
 from clear_strategies.merging.conductor import Conductor
+from clear_strategies.merging.skips import Plateau
 from clear_strategies.training.checkpoint import Checkpoint
 from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for
 from clear_strategies.training.densifier import Densifier, DensifierSettings, cameras_extent
@@ -144,18 +145,20 @@ class TrainState:
     def ended(self) -> bool:
         return self.t > self.settings.iterations
 
+    @property
+    def plateau(self) -> Plateau:
+        return Plateau(self.conductor.skips.skips, len(self.views))
+
     def advance(self) -> None:
         """Go to the next iteration, or from a plateau of the training views straight to its end."""
         done, self.t = self.t, self.t + 1
-        policy = self.conductor.skips
-        if not policy.settled(self.history, done, len(self.views)):
+        if not self.plateau.reached(self.history, done):
             return
-        reason = policy.plateau(len(self.views))
-        self.t = min(policy.skips.plateau_to, self.settings.iterations) + 1
+        self.t = min(self.plateau.skips.plateau_to, self.settings.iterations) + 1
         left_out = self.t - done - 1
         self.optimizer.steps += left_out  # the learning rates follow the iteration
-        self.conductor.work_log.skip("iterations", reason, left_out)
-        _log.info("no progress: skipping from iteration %d to %d, since %s.", done, self.t, reason)
+        self.conductor.work_log.skip("iterations", str(self.plateau), left_out)
+        _log.info("no progress: skipping from iteration %d to %d, since %s.", done, self.t, self.plateau)
 
     def refilter(self) -> None:
         cameras = [(v.hr if self.mip.cameras == "hr" else v.lr).camera for v in self.views]

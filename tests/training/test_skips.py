@@ -9,8 +9,7 @@ import torch
 
 from clear_strategies import SVS, Conductor, Objective
 from clear_strategies.core import images
-from clear_strategies.core.work_log import WorkLog
-from clear_strategies.merging.skips import PLATEAU_LOSS, SkipPolicy, Skips
+from clear_strategies.merging.skips import PLATEAU_LOSS, Plateau, SkipPolicy, Skips
 from clear_strategies.schedules import Ramp, WarmupDecay, scaled
 from clear_strategies.training.evaluation import loss_of_views
 from clear_strategies.training.loop import fit, iterate
@@ -23,24 +22,23 @@ def loss_rows(*losses: float, lambda_hr: float = 0.0) -> list[dict[str, float]]:
 
 
 def test_by_default_and_of_photos_that_sr_does_not_enlarge_nothing_is_left_out_and_milestones_stretch():
-    view, skip_policy, work_log = toy.scene().train[0], SkipPolicy(), WorkLog()
-    assert skip_policy.view(view, 1) is view
-    assert not skip_policy.settled(loss_rows(*[1.0] * 20_000), 20_000, 3)
-    assert not work_log.entries
-    view, work_log, skip_policy = toy.scene().train[0], WorkLog(), SkipPolicy(Skips(coarse_until=10))
-    same = replace(view, hr=view.lr)
-    assert skip_policy.view(same, 1) is same
-    assert skip_policy.lr_due(same, True, work_log)
-    assert not work_log.entries
+    view = toy.scene().train[0]
+    assert SkipPolicy().view(view, 1) is view
+    assert not Plateau(Skips(), 3).measurements
+    conductor, same = Conductor(skips=Skips(coarse_until=10)), replace(view, hr=view.lr)
+    assert conductor.skips.view(same, 1) is same
+    assert conductor.lr_due(same, True)
+    assert not conductor.work_log.entries
     short = scaled(Skips(coarse_until=3_000), 0.1)
     assert (short.coarse_until, short.plateau_from, short.plateau_window, short.plateau_to) == (300, 500, 50, 800)
 
 
 def test_hr_is_left_out_in_all_but_one_of_so_many_iterations_until_coarse_until():
-    work_log, policy = WorkLog(), SkipPolicy(Skips(coarse_until=8, hr_every=3))
-    assert [t for t in range(1, 13) if policy.leaves_out_hr(t, work_log)] == [2, 3, 5, 6, 8]
-    assert work_log.entries["render LR + HR"].skipped == {"HR in one of 3 iterations (skips.hr_every)": 5}
-    assert not any(SkipPolicy().leaves_out_hr(t, work_log) for t in range(1, 5))
+    always = Objective(lambda_hr=WarmupDecay(start=0, full=0))
+    conductor = Conductor(objective=always, skips=Skips(coarse_until=8, hr_every=3))
+    assert [t for t in range(1, 13) if not conductor.wants_hr(t, scored=False)] == [2, 3, 5, 6, 8]
+    assert conductor.work_log.entries["render LR + HR"].skipped == {"HR in one of 3 iterations (skips.hr_every)": 5}
+    assert all(conductor.wants_hr(t) and Conductor(objective=always).wants_hr(t, scored=False) for t in range(1, 5))
     state = start(("gco",))
     state.conductor.skips = SkipPolicy(Skips(coarse_until=ITERATIONS, hr_every=2))
     for _ in range(ITERATIONS):
@@ -85,15 +83,15 @@ def test_a_skip_that_cannot_act_is_logged_and_not_in_the_plan(caplog):
 
 @pytest.mark.parametrize(("now", "ends"), [(0.99, True), (0.97, False), (1.10, True)])
 def test_a_plateau_is_a_window_that_gains_less_than_asked(now, ends):
-    skip_policy = SkipPolicy(Skips(plateau_gain=0.02, plateau_window=6, plateau_from=6))
-    assert skip_policy.settled(loss_rows(*[1.0] * 6, *[now] * 6), 12, n_views=1) is ends
+    plateau = Plateau(Skips(plateau_gain=0.02, plateau_window=6, plateau_from=6), 1)
+    assert plateau.reached(loss_rows(*[1.0] * 6, *[now] * 6), 12) is ends
 
 
 def test_a_plateau_begins_neither_early_nor_between_windows_nor_late():
-    skips = Skips(plateau_gain=0.5, plateau_window=6, plateau_from=7, plateau_to=30)
+    plateau = Plateau(Skips(plateau_gain=0.5, plateau_window=6, plateau_from=7, plateau_to=30), 1)
     rows = loss_rows(*[1.0] * 36)
-    assert [t for t in range(1, 37) if SkipPolicy(skips).settled(rows[:t], t, n_views=1)] == [18, 24]
-    assert not SkipPolicy(skips).settled([*rows[:8], rows[23]], 24, n_views=1)  # those between were left out
+    assert [t for t in range(1, 37) if plateau.reached(rows[:t], t)] == [18, 24]
+    assert not plateau.reached([*rows[:8], rows[23]], 24)  # those between were left out
 
 
 @pytest.mark.parametrize(
@@ -101,12 +99,11 @@ def test_a_plateau_begins_neither_early_nor_between_windows_nor_late():
 )
 def test_a_window_shows_each_view_several_times(iterations, n_views, window):
     """In 8 of 300 iterations six views are seen 1.3 times each, and their loss rises and falls by chance."""
-    policy = SkipPolicy(scaled(Skips(plateau_gain=0.01, plateau_window=250), iterations / 10_000))
-    rows = loss_rows(*[1.0] * iterations)
-    measured = [t for t in range(1, iterations + 1) if policy.measured(t, n_views)]
+    plateau = Plateau(scaled(Skips(plateau_gain=0.01, plateau_window=250), iterations / 10_000), n_views)
+    rows, measured = loss_rows(*[1.0] * iterations), [*plateau.measurements]
     assert measured == [t for t in range(0, iterations, window) if 0.5 * iterations <= t < 0.8 * iterations]
-    assert [t for t in range(1, iterations + 1) if policy.settled(rows[:t], t, n_views)] == measured[1:]
-    assert not any(policy.measured(t, n_views=iterations // 6) for t in range(1, iterations + 1))
+    assert [t for t in range(1, iterations + 1) if plateau.reached(rows[:t], t)] == measured[1:]
+    assert not replace(plateau, n_views=iterations // 6).measurements
 
 
 @pytest.mark.parametrize("peak", [0.0, 1.0])
@@ -142,13 +139,13 @@ def test_what_raises_the_measured_loss_is_no_plateau(monkeypatch):
     fit(state, toy.scene(), toy.RASTERIZER)
     assert [int(row["t"]) for row in state.history if PLATEAU_LOSS in row] == [7, 8, 9, 10, 11, 13]
     assert len(state.history) == ITERATIONS
-    policy = SkipPolicy(Skips(coarse_until=6, plateau_gain=0.5, plateau_window=4, plateau_from=4))
+    plateau = Plateau(Skips(coarse_until=6, plateau_gain=0.5, plateau_window=4, plateau_from=4), 1)
     rises = [1.0] * 7 + [2.0]
     lr, hr = loss_rows(*rises), loss_rows(*rises, lambda_hr=1.0)
-    assert policy.settled(lr, 8, 1)
-    assert not policy.settled([*lr[:7], hr[7]], 8, 1)  # HR sets in
-    assert not policy.settled(hr, 8, 1)  # HR becomes whole
-    assert SkipPolicy(replace(policy.skips, coarse_until=0)).settled(hr, 8, 1)
+    assert plateau.reached(lr, 8)
+    assert not plateau.reached([*lr[:7], hr[7]], 8)  # HR sets in
+    assert not plateau.reached(hr, 8)  # HR becomes whole
+    assert Plateau(replace(plateau.skips, coarse_until=0), 1).reached(hr, 8)
 
 
 def test_a_plateau_is_left_out_and_the_run_has_its_end(caplog, monkeypatch):
