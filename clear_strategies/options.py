@@ -9,6 +9,7 @@ import hashlib
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
@@ -93,15 +94,16 @@ class _ConfSource(FileConfigSource):
 
     def load_config(self, config_path: str) -> ConfigResult:
         file = Path(self.path, self._normalize_file_name(config_path))
-        header, content = _parsed(self.path, config_path, file.stat().st_mtime_ns if file.is_file() else 0)
-        return ConfigResult(self.provider, self.full_path(), OmegaConf.create(with_defaults(content)), {**header})
+        read = _read(self.provider, self.path, config_path, file.stat().st_mtime_ns if file.is_file() else 0)
+        return replace(
+            read, config=OmegaConf.create(with_defaults(OmegaConf.to_container(read.config))), header={**read.header}
+        )
 
 
 @cache  # for one command Hydra reads each file twice, and once more for each job of a sweep
-def _parsed(folder: str, config_path: str, written: int) -> tuple[Mapping[str, str | None], Any]:
-    """The header and the content of a file that was written at this time, ns."""
-    result = FileConfigSource("conf", folder).load_config(config_path)
-    return result.header, OmegaConf.to_container(result.config)
+def _read(provider: str, folder: str, config_path: str, written: int) -> ConfigResult:
+    """What Hydra reads of a file that was written at this time, ns."""
+    return FileConfigSource(provider, folder).load_config(config_path)
 
 
 class _ReadConf(SearchPathPlugin):

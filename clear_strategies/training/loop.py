@@ -30,7 +30,7 @@ from clear_strategies.signals import Interrupted, deferred_signals, foremost
 from clear_strategies.training import checkpoint
 from clear_strategies.training.clock import Clock
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
-from clear_strategies.training.replayed_iteration import ExtraViewInputs, ViewInputs, replays_for, run_or_replay
+from clear_strategies.training.replayed_iteration import ExtraViewInputs, ViewInputs, replayable, replays_for
 from clear_strategies.training.state import TrainState
 from rasterizers import native
 from rasterizers.interface import Camera, Color, Rasterizer, over
@@ -48,7 +48,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
     hr_due = conductor.wants_hr(t, scored=s.density.collects(t))
     scales = {"lr": conductor.lr_due(view, hr_due), "hr": hr_due}
     z, background = conductor.gate(t, len(θ)), conductor.background(t)  # zᵗ             Eq. 15       SVS
-    u, row = run_or_replay(s, rasterizer, ViewInputs(t, view, scales, z, background), learn)
+    u, row = learn(s, rasterizer, ViewInputs(t, view, scales, z, background))
     conductor.draw(t, θ.means.data, partial(enlarged, s, rasterizer, background))
     extra = extra_steps(s, rasterizer, conductor.extra_views(t), background)
     conductor.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS
@@ -64,10 +64,11 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
     s.advance()
 
 
+@replayable
 def learn(s: TrainState, rasterizer: Rasterizer, inputs: ViewInputs) -> tuple[Update, dict[str, Number]]:
     """What an iteration does with its view: render, compare, step on the merged gradient, and accumulate statistics.
 
-    `replayed_iteration` may record it, so nothing here may read a number from the device.
+    Nothing here may read a number from the device, see `replayable`.
     """
     t, view, θ, conductor, stage = inputs.t, inputs.view, s.field, s.conductor, s.conductor.work_log.stage
     with stage(f"render {' + '.join(scale.upper() for scale, wanted in inputs.scales.items() if wanted)}"):
@@ -129,13 +130,14 @@ def extra_steps(
     row: dict[str, Number] = {}
     for extra in extra_views:
         steps = s.optimizer.steps
-        row |= run_or_replay(s, rasterizer, ExtraViewInputs(s.t, extra, background), learn_extra)[1]
+        row |= learn_extra(s, rasterizer, ExtraViewInputs(s.t, extra, background))[1]
         s.optimizer.steps = steps  # the learning rates follow the iteration
     return row
 
 
+@replayable
 def learn_extra(s: TrainState, rasterizer: Rasterizer, inputs: ExtraViewInputs) -> tuple[None, dict[str, Number]]:
-    """What an iteration does with an extra view. It may be recorded, like `learn`."""
+    """What an iteration does with an extra view."""
     θ, extra, where = s.field, inputs.view, f"t={inputs.t}, an extra view"
     with s.conductor.work_log.stage("extra views"):
         shot = θ.shot(over(rasterizer, inputs.background), extra.photo.camera)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, wraps
 from typing import Any, TypeVar, cast
 
 from torch import Tensor
@@ -75,6 +75,7 @@ class ExtraViewInputs:
 
 
 IterationInputs = ViewInputs | ExtraViewInputs
+I = TypeVar("I", ViewInputs, ExtraViewInputs)
 
 
 def replays_for(s: TrainState, rasterizer: Rasterizer) -> Replays | None:
@@ -88,12 +89,23 @@ def replays_for(s: TrainState, rasterizer: Rasterizer) -> Replays | None:
     return None
 
 
-def run_or_replay(
-    s: TrainState, rasterizer: Rasterizer, inputs: IterationInputs, learn: Callable[[TrainState, Rasterizer, Any], L]
-) -> L:
-    """The result of `learn`, run live, recorded, or replayed if `replays_for` has found that it can be."""
-    if s.replays is None:
-        return learn(s, rasterizer, inputs)
+def replayable(learn: Callable[[TrainState, Rasterizer, I], L]) -> Callable[[TrainState, Rasterizer, I], L]:
+    """The function, recorded and replayed in a training that has `replays`. Its work may read no number from the device."""
+
+    @wraps(learn)
+    def learned(s: TrainState, rasterizer: Rasterizer, inputs: I) -> L:
+        if s.replays is None:
+            return learn(s, rasterizer, inputs)
+        return _replayed(s, s.replays, rasterizer, inputs, learn)
+
+    return learned
+
+
+def _replayed(
+    s: TrainState, replays: Replays, rasterizer: Rasterizer, inputs: IterationInputs,
+    learn: Callable[[TrainState, Rasterizer, Any], L],
+) -> L:  # fmt: skip
+    """The result of `learn`, run live, recorded, or replayed."""
     steps, given, drawn_by = s.optimizer.steps, _given(s, rasterizer, inputs), cast(Recordable, rasterizer)
 
     def live() -> tuple[Update | None, dict[str, Number]]:
@@ -112,7 +124,7 @@ def run_or_replay(
             count=cast(CompiledStep, s.compiled_step).count,
         )  # fmt: skip
 
-    update, row = s.replays.do(_key(s, inputs, given), inputs.t, given, live=live, record=record)
+    update, row = replays.do(_key(s, inputs, given), inputs.t, given, live=live, record=record)
     if isinstance(inputs, ViewInputs) and update is not None:
         # A strategy may store tensors of the step, which the next replay overwrites.
         update = replace(update, step=replace(update.step.copied(), t=inputs.t, view=inputs.view))
