@@ -14,13 +14,15 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import accumulate, islice, takewhile
+from itertools import accumulate, takewhile
 from operator import itemgetter
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+K = TypeVar("K")
 
 
 class Deferred(NamedTuple):
@@ -67,23 +69,22 @@ def defer(recipe: Callable[..., float], *numbers: Number) -> Number:
 
 def read(numbers: Sequence[Number]) -> list[float]:
     """The numbers as floats; those on the device are fetched in one transfer."""
-    values = _transferred([x for number in numbers for x in _tensors(number)])
-
-    def value(x: Number) -> Any:
-        if isinstance(x, Deferred):
-            return x.recipe(*map(value, x.parts))
-        return values[id(x)] if isinstance(x, Tensor) else x
-
-    return [value(x) for x in numbers]
+    vector, row_of = gathered(dict(enumerate(numbers)))
+    values = vector.tolist()
+    return [cast(float, x.recipe(values) if isinstance(x, Deferred) else x) for x in row_of(vector).values()]
 
 
-def gathered(row: Mapping[str, Number]) -> tuple[Float[Tensor, " K"], Callable[[Tensor], dict[str, Number]]]:
-    """The numbers on the device that a row is made of, as one float64 vector, and the row of a copy of that vector."""
-    found = {id(x): x for number in row.values() for x in _tensors(number)}
-    firsts = dict(zip(found, accumulate((x.numel() for x in found.values()), initial=0), strict=False))
-    parts = [x.reshape(-1) for x in found.values()]
-    device = parts[0].device if parts else None
-    vector = torch.cat([*parts, torch.empty(0, dtype=torch.float64, device=device)])
+def gathered(row: Mapping[K, Number]) -> tuple[Float[Tensor, " N"], Callable[[Tensor], dict[K, Number]]]:
+    """The numbers on the device that a row is made of, as one float64 vector, and the row of a copy of that vector. Tensors of one
+    type are joined first, so that few kernels copy many numbers.
+    """
+    by_type: defaultdict[torch.dtype, list[Tensor]] = defaultdict(list)
+    for x in {id(x): x for number in row.values() for x in _tensors(number)}.values():
+        by_type[x.dtype].append(x)
+    found = [x for alike in by_type.values() for x in alike]
+    firsts = dict(zip(map(id, found), accumulate((x.numel() for x in found), initial=0), strict=False))
+    joined = [torch.cat([x.reshape(-1) for x in alike]).double() for alike in by_type.values()]
+    vector = torch.cat(joined) if joined else torch.empty(0, dtype=torch.float64)
 
     def reader(number: Number) -> Callable[[Sequence[float]], Any]:
         if isinstance(number, Deferred):
@@ -96,7 +97,7 @@ def gathered(row: Mapping[str, Number]) -> tuple[Float[Tensor, " K"], Callable[[
 
     readers = {name: reader(x) for name, x in row.items() if is_unread(x)}
 
-    def row_of(copy: Tensor) -> dict[str, Number]:
+    def row_of(copy: Tensor) -> dict[K, Number]:
         parts = (copy,)
         return {name: Deferred(readers[name], parts) if name in readers else x for name, x in row.items()}
 
@@ -135,17 +136,3 @@ def _tensors(x: Number) -> Iterator[Tensor]:
             yield from _tensors(part)
     elif isinstance(x, Tensor):
         yield x
-
-
-def _transferred(tensors: Sequence[Tensor]) -> dict[int, float | Sequence[float]]:
-    """Each tensor's number, or those of a vector, by its id. Tensors of one type are joined first, so that few kernels fetch many
-    numbers.
-    """
-    by_type: defaultdict[torch.dtype, list[Tensor]] = defaultdict(list)
-    for x in {id(x): x for x in tensors}.values():
-        by_type[x.dtype].append(x)
-    if not by_type:
-        return {}
-    joined = torch.cat([torch.cat([x.view(-1) for x in alike]).double() for alike in by_type.values()])
-    values = iter(joined.tolist())
-    return {id(x): [*islice(values, len(x))] if x.dim() else next(values) for alike in by_type.values() for x in alike}

@@ -23,7 +23,7 @@ from clear_strategies.training import checkpoint, loop
 from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
-from clear_strategies.training.replayed_iteration import replays_for
+from clear_strategies.training.replayed_iteration import replayable, replays_for
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from rasterizers import replays
@@ -544,7 +544,7 @@ def fails(*_: object) -> None:
 @pytest.mark.parametrize("fault", [lambda x: x.tolist(), fails], ids=["reads numbers", "an error of another kind"])
 def test_what_cannot_be_recorded_is_live_from_then_on_and_one_line_says_why(fault, monkeypatch, caplog):
     """tests/rasterizers/test_recording.py has everything that cannot be recorded."""
-    learn = loop.learn
+    learn = loop.learn.__wrapped__
 
     def faulty(s, rasterizer, given):
         learned = learn(s, rasterizer, given)
@@ -552,7 +552,7 @@ def test_what_cannot_be_recorded_is_live_from_then_on_and_one_line_says_why(faul
             fault(s.field.means.data)
         return learned
 
-    monkeypatch.setattr(loop, "learn", faulty)
+    monkeypatch.setattr(loop, "learn", replayable(faulty))
     assert live_in(both(lambda: start(density=False), 8)) == {FIRST: 2, FAILED: 6}
     require_one_line(caplog, 3)
 
