@@ -49,8 +49,8 @@ def test_what_libraries_say_is_not_shown_but_their_errors_are():
 def test_pythons_warnings_do_not_reach_the_user(tmp_path):
     code = """if True:
         import warnings
-        from clear_strategies import commands, run
-        commands.named = lambda arguments: lambda: warnings.warn("this library has a new name")
+        from clear_strategies import run
+        run.named = lambda arguments: lambda: warnings.warn("this library has a new name")
         run.main()
     """
     done = run(cwd=tmp_path, code=code)

@@ -187,12 +187,12 @@ def test_an_error_after_a_signal_whose_exception_a_library_has_lost_is_the_signa
     """As numpy's import does: an attribute is missing later."""
     code = (
         "import contextlib, signal\n"
-        "from clear_strategies import commands, run\n"
+        "from clear_strategies import run\n"
         "def named(_):\n"
         "    with contextlib.suppress(KeyboardInterrupt):\n"
         f"        signal.raise_signal({int(stop)})\n"
         "    raise AttributeError\n"
-        "commands.named = named\n"
+        "run.named = named\n"
         "run.main()\n"
     )
     ended = run(cwd=tmp_path, code=code)

@@ -75,7 +75,7 @@ def read(numbers: Sequence[Number]) -> list[float]:
 
 
 def gathered(row: Mapping[K, Number]) -> tuple[Float[Tensor, " N"], Callable[[Tensor], dict[K, Number]]]:
-    """The numbers on the device that a row is made of, as one float64 vector, and the row of a copy of that vector. Tensors of one
+    """The numbers on the device that a row is made of, as one float64 vector, and the row of a copy of that vector. Those of one
     type are joined first, so that few kernels copy many numbers.
     """
     by_type: defaultdict[torch.dtype, list[Tensor]] = defaultdict(list)

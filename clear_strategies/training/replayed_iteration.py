@@ -75,7 +75,7 @@ class ExtraViewInputs:
 
 
 IterationInputs = ViewInputs | ExtraViewInputs
-I = TypeVar("I", ViewInputs, ExtraViewInputs)
+Inputs = TypeVar("Inputs", ViewInputs, ExtraViewInputs)
 
 
 def replays_for(s: TrainState, rasterizer: Rasterizer) -> Replays | None:
@@ -89,11 +89,11 @@ def replays_for(s: TrainState, rasterizer: Rasterizer) -> Replays | None:
     return None
 
 
-def replayable(learn: Callable[[TrainState, Rasterizer, I], L]) -> Callable[[TrainState, Rasterizer, I], L]:
+def replayable(learn: Callable[[TrainState, Rasterizer, Inputs], L]) -> Callable[[TrainState, Rasterizer, Inputs], L]:
     """The function, recorded and replayed in a training that has `replays`. Its work may read no number from the device."""
 
     @wraps(learn)
-    def learned(s: TrainState, rasterizer: Rasterizer, inputs: I) -> L:
+    def learned(s: TrainState, rasterizer: Rasterizer, inputs: Inputs) -> L:
         if s.replays is None:
             return learn(s, rasterizer, inputs)
         return _replayed(s, s.replays, rasterizer, inputs, learn)

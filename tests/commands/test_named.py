@@ -10,7 +10,7 @@ from importlib import metadata
 import pytest
 
 import rasterizers
-from clear_strategies import commands
+from clear_strategies import hydra_app, run
 from clear_strategies.commands import doctor
 from clear_strategies.errors import SettingError
 from tests.helpers import command_line
@@ -21,23 +21,26 @@ SLOW = ("hydra", "numpy", "omegaconf", "torch")
 
 @pytest.mark.parametrize("arguments", [[], ["help"], ["--help"], ["-h"]], ids=" ".join)
 def test_help_lists_the_commands_and_then_where_research_begins(arguments, capsys):
-    commands.named(arguments)()
+    run.named(arguments)()
     said = capsys.readouterr().out
     rows = [line.split()[0] for line in said.splitlines() if line.startswith("  ")]
-    assert rows[: len(commands.NAMES)] == commands.NAMES
+    assert rows[: len(run.NAMES)] == run.NAMES
     for word in ("+strategy=clear", "-m ", "--cfg job", "--hydra-help"):
         assert word in said[said.index("research") :]
 
 
 @pytest.mark.parametrize("arguments", [["--version"], ["train", "--version"], ["+strategy=clear", "--version"]])
 def test_the_version_is_this_packages_and_not_hydras(arguments, capsys):
-    commands.named(arguments)()
+    run.named(arguments)()
     assert capsys.readouterr().out == f"clear-strategies {metadata.version('clear-strategies')}\n"
 
 
 @pytest.mark.parametrize("first", ["+strategy=clear", "fit.iterations=3", "~data.reader.width", "-m", "--cfg", "-v"])
-def test_overrides_and_flags_are_hydras(first):
-    assert commands.named([first, "more"]) is None
+def test_overrides_and_flags_are_hydras(first, monkeypatch):
+    called = list[str]()
+    monkeypatch.setattr(hydra_app, "main", lambda: called.append(first))
+    run.named([first, "more"])()
+    assert called == [first]
 
 
 @pytest.mark.parametrize(
@@ -57,12 +60,12 @@ def test_another_word_is_refused_with_what_was_meant(word, meant, tmp_path, monk
     (tmp_path / "views").mkdir()
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SettingError) as refused:
-        commands.named([word, "kit"])
+        run.named([word, "kit"])
     assert str(refused.value) == f"{word}: there is no such command. {meant}"
 
 
 QUICK = {
-    "": 0, "--help": 0, **{f"{name} --help": 0 for name in commands.NAMES}, "trian kit": 2, "photos/": 2,
+    "": 0, "--help": 0, **{f"{name} --help": 0 for name in run.NAMES}, "trian kit": 2, "photos/": 2,
     "train nowhere": 2, "render": 2, "export run --sh nothing": 2,
 }  # fmt: skip
 REPORTED = f"""
