@@ -31,7 +31,7 @@ from omegaconf.errors import OmegaConfBaseException
 from clear_strategies import console, files, signals
 from clear_strategies.compose import quoted, require_each_once
 from clear_strategies.errors import ClearError, SettingError, counted
-from clear_strategies.hydra_errors import not_composed, require_option
+from clear_strategies.hydra_errors import WRITTEN, not_composed, require_option
 from clear_strategies.jobs import exit_codes, sweep
 from clear_strategies.options import CONF
 
@@ -49,7 +49,6 @@ _FLAGS: Final = (
 _WITH_VALUE: Final = {
     "--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd",
 }  # fmt: skip
-_WRITTEN: Final = "A setting is written name=value, and clear-strategies --cfg job prints all of them."
 
 
 def main(overrides: Sequence[str] | None = None) -> None:
@@ -115,19 +114,17 @@ def _flags_last(arguments: Sequence[str]) -> list[str]:
     """The settings, then the flags: Hydra refuses settings on both sides of a flag.
 
     Raises:
-        SettingError: there is no such flag, or a word is neither flag nor setting. Hydra's messages name none of our commands.
+        SettingError: there is no such flag. Hydra's message names none of our commands.
     """
     settings, flags, words = list[str](), list[str](), iter(arguments)
     for word in words:
         flag = word.partition("=")[0]
         if flag.startswith("--") and flag != "--verbose" and not any(known.startswith(flag) for known in _FLAGS):
-            raise SettingError(f"{flag}: there is no such flag. {_WRITTEN}")
+            raise SettingError(f"{flag}: there is no such flag. {WRITTEN}")
         if word.startswith("-"):
             flags += [word, next(words, "")] if word in _WITH_VALUE else [word]
-        elif "=" in word or word.startswith("~"):
-            settings.append(word)
         else:
-            raise SettingError(f"{word}: is no setting. {_WRITTEN}")
+            settings.append(word)
     return [*settings, *filter(None, flags)]
 
 

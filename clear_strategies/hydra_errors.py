@@ -16,12 +16,13 @@ from clear_strategies.errors import SettingError, one_line
 from clear_strategies.options import CONF, composed_by_hydra, options, sweeps
 from clear_strategies.settings import TARGET, flat, has_parameter
 
+WRITTEN: Final = "A setting is written name=value, and clear-strategies --cfg job prints all of them."
 # What Hydra says, and what to say in place of it. Packages hydra-NAME-launcher bring launchers.
 _IN_OUR_WORDS: Final = {
     r"Could not (?:load|find) 'hydra/launcher/((joblib|submitit|ray)(?:_local|_slurm|_aws)?)'": (
         "hydra/launcher: {} is not installed: pip install hydra-{}-launcher."
     ),
-    r"^Error parsing override '(.*)' missing EQUAL": "{}: is no setting. A setting is written name=value.",
+    r"^Error parsing override '(.*)' missing EQUAL": f"{{}}: is no setting. {WRITTEN}",
     r"^Multiple values for (\S+)\. To override a value use 'override \S+: (\S+)'$": (
         "+{0}={1}: a choice of this group is there already. Replace it: {0}={1}."
     ),

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, Final, NamedTuple, ParamSpec, TypeVar, cast
+from typing import Any, Final, NamedTuple, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -30,9 +30,6 @@ from rasterizers.pose import pose_gradient
 from rasterizers.torch_internals import is_transformed
 
 __all__ = ["BackwardHook", "Drawing", "Drawn", "TakeColours", "collected_drawings", "draw", "outer"]
-
-_P = ParamSpec("_P")
-_R = TypeVar("_R")
 
 
 class Drawn(NamedTuple):
