@@ -119,7 +119,7 @@ class Conductor(Hooks):
         """Return True if LR is rendered beside HR, or alone where HR is not due.
 
         Args:
-            view: of the iteration, from `skips.view`.
+            view: of the iteration, from `SkipPolicy.view`.
         """
         if self.wants_lr and hr_due and self.skips.serves_lr(view):
             self.work_log.skip("render LR", "HR at half its size is as large (skips.coarse_until)")
