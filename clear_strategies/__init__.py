@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from clear_strategies.core.conflicts import Products, Weights
     from clear_strategies.core.evidence import Evidence
-    from clear_strategies.core.gradients import ATTRIBUTES, CONFLICT_GROUPS, Grads, Shot
+    from clear_strategies.core.gradients import ATTRIBUTES, CONFLICT_GROUPS, Grads, ScreenGradients, Shot
     from clear_strategies.core.step import Step
     from clear_strategies.core.view import DepthMap, ExtraView, Photo, View
     from clear_strategies.density.mcmc import MCMC
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from clear_strategies.merging.iteration import Update
     from clear_strategies.merging.objective import Objective
     from clear_strategies.notebook import Run, train
-    from clear_strategies.strategies.base import ScreenGradients, Strategy
+    from clear_strategies.strategies.base import Strategy
     from clear_strategies.strategies.fading_opacity import FadingOpacity
     from clear_strategies.strategies.gco import GCO
     from clear_strategies.strategies.p2g import P2G
@@ -44,7 +44,7 @@ __version__: str  # of the installed package
 _NAMES: Final = {  # by the module of this package that they are defined in
     "core.conflicts": ("Products", "Weights"),
     "core.evidence": ("Evidence",),
-    "core.gradients": ("ATTRIBUTES", "CONFLICT_GROUPS", "Grads", "Shot"),
+    "core.gradients": ("ATTRIBUTES", "CONFLICT_GROUPS", "Grads", "ScreenGradients", "Shot"),
     "core.step": ("Step",),
     "core.view": ("DepthMap", "ExtraView", "Photo", "View"),
     "density.mcmc": ("MCMC",),
@@ -53,7 +53,7 @@ _NAMES: Final = {  # by the module of this package that they are defined in
     "merging.iteration": ("Update",),
     "merging.objective": ("Objective",),
     "notebook": ("Run", "train"),
-    "strategies.base": ("ScreenGradients", "Strategy"),
+    "strategies.base": ("Strategy",),
     "strategies.fading_opacity": ("FadingOpacity",),
     "strategies.gco": ("GCO",),
     "strategies.p2g": ("P2G",),

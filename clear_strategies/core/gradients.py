@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, NamedTuple, Protocol, runtime_checkable
 
@@ -89,6 +90,21 @@ class Grads(dict[str, Tensor]):
         """The same without f_det, which is never corrected."""
         kept = {name: value for name, value in self.items() if name != "detail"}
         return Grads(kept, colour=self.colour, screen=self.screen)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScreenGradients:
+    """∇_u of the three losses, [N, 2], in NDC units (pixel gradient × W/2, H/2 of its own image).
+
+    Args:
+        base, hf: None while HR is not rendered; hf is also None when λ_HF = 0.
+        ordinary: ‖∇_u(L_LR + λ_HR(L_base + λ_HF L_HF))‖, the statistic of 3DGS.
+    """
+
+    lr: Float[Tensor, "N 2"]
+    base: Float[Tensor, "N 2"] | None
+    hf: Float[Tensor, "N 2"] | None
+    ordinary: Float[Tensor, " N"]
 
 
 def gradients_of(g: SplatGradients) -> list[Grads]:

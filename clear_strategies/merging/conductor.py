@@ -17,7 +17,7 @@ from clear_strategies.core import images
 from clear_strategies.core.conflicts import Weights
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import require_finite, require_finite_losses
-from clear_strategies.core.gradients import Grads, Shot, screen_norm, screen_of, summed, to_ndc
+from clear_strategies.core.gradients import Grads, ScreenGradients, Shot, screen_norm, screen_of, summed, to_ndc
 from clear_strategies.core.step import Losses, Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.kernels import per_gaussian, reconcile
@@ -35,7 +35,7 @@ from clear_strategies.merging.iteration import (
 )
 from clear_strategies.merging.objective import Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
-from clear_strategies.strategies.base import ScreenGradients, Strategy
+from clear_strategies.strategies.base import Strategy
 from rasterizers.guards import iteration
 from rasterizers.interface import Color
 from rasterizers.modes import apart_from_the_loop

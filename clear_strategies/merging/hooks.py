@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.core.conflicts import Products, Weights
-from clear_strategies.core.gradients import Grads, Shot
+from clear_strategies.core.gradients import Grads, ScreenGradients, Shot
 from clear_strategies.core.step import Losses, Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.core.work_log import WorkLog
@@ -25,7 +25,6 @@ from clear_strategies.merging.objective import Objective
 from clear_strategies.strategies import answers
 from clear_strategies.strategies.base import (
     Scale,
-    ScreenGradients,
     Strategy,
     by_class,
     by_exp_and_sigmoid,

@@ -21,7 +21,7 @@ from torch import Tensor
 from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.deferred import Deferred, Number
 from clear_strategies.core.evidence import Evidence, PatchMaps
-from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, Shot, gathered
+from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, ScreenGradients, Shot, gathered
 from clear_strategies.core.step import Losses, Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.errors import AnswerError
@@ -36,21 +36,6 @@ Scale = Literal["lr", "hr"]
 
 Logged = Number | Callable[[], Number]
 """A scalar, or a function that computes it."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ScreenGradients:
-    """∇_u of the three losses, [N, 2], in NDC units (pixel gradient × W/2, H/2 of its own image).
-
-    Args:
-        base, hf: None while HR is not rendered; hf is also None when λ_HF = 0.
-        ordinary: ‖∇_u(L_LR + λ_HR(L_base + λ_HF L_HF))‖, the statistic of 3DGS.
-    """
-
-    lr: Float[Tensor, "N 2"]
-    base: Float[Tensor, "N 2"] | None
-    hf: Float[Tensor, "N 2"] | None
-    ordinary: Float[Tensor, " N"]
 
 
 def _no_weight(t: int) -> float:

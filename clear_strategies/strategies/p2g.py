@@ -20,12 +20,12 @@ from torch.utils.weak import TensorWeakRef
 
 from clear_strategies.core.checks import refuse, require_choice, require_number, require_whole
 from clear_strategies.core.evidence import Evidence, PatchMaps
-from clear_strategies.core.gradients import Shot
+from clear_strategies.core.gradients import ScreenGradients, Shot
 from clear_strategies.core.images import DownKernel, downsample, patch_means, quantize, upsample
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
 from clear_strategies.kernels import per_gaussian
-from clear_strategies.strategies.base import ScreenGradients, Strategy
+from clear_strategies.strategies.base import Strategy
 
 _log = logging.getLogger(__name__)
 

@@ -83,7 +83,7 @@ def screens(
     size: tuple[int, int],
     weights: tuple[float, float] | Float[Tensor, " 2"],
 ) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N 2"] | None, Float[Tensor, " N"]]:
-    """∇_u of the two HR losses in NDC, and the ordinary statistic, see `strategies.base.ScreenGradients`.
+    """∇_u of the two HR losses in NDC, and the ordinary statistic, see `ScreenGradients`.
 
     Args:
         lr: in NDC. base, hf: 1/pixel of an image of `size`. weights: λ_HR and λ_HR λ_HF, as numbers or on the device.
