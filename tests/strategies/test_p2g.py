@@ -103,13 +103,32 @@ def test_observation_is_made_once_a_view_and_invisible_gaussians_have_none(caplo
     assert torch.equal(first.reliability, second.reliability)
     assert not first.weight[~shot.visible].any()
     assert (first.reliability[shot.visible] > 0).all()
-    aside = copy.deepcopy(p2g)  # as for the maps of a run, which copy no photo
+    aside = P2G()
+    aside.cache.update(copy.deepcopy(p2g.cache))  # as for the maps of a run, which copy no photo
     with caplog.at_level("DEBUG"):
         aside.looked_up(view)
     assert caplog.text.count(view.name) == 1
+
+
+def test_evidence_is_that_of_the_images_which_a_loop_may_read_anew_crop_or_change(caplog):
+    view, p2g = toy.scene().train[0], P2G()
+
+    def read(change=torch.clone, **others):
+        lr, hr = (replace(photo, image=change(photo.image)) for photo in (view.lr, view.hr))
+        return replace(view, lr=lr, hr=hr, **others)
+
+    with caplog.at_level("DEBUG"):
+        first, second, third = (p2g.looked_up(read()) for _ in range(3))
+    assert caplog.text.count(view.name) == 2  # the first images of a view have no digest
+    assert torch.equal(first, second)
+    assert third is second
     crop = replace(view, lr=cut(view.lr, 1), hr=cut(view.hr, view.factor))
-    for shown in (crop, view, crop):
+    turned, measured = read(lambda image: image.flip(0)), read(disagreement=torch.full_like(view.lr.image, 0.1))
+    for shown in (crop, view, crop, turned, view, measured, view, turned, turned):
         assert torch.equal(p2g.looked_up(shown), P2G().looked_up(shown))
+        turned.hr.image.mul_(0.9)
+    with torch.inference_mode():
+        assert torch.equal(p2g.looked_up(read()), first)
     freed = [weakref.ref(photo.image) for photo in (crop.lr, crop.hr)]
     del crop, shown  # a loop that reads a photo for each step keeps none
     assert [of() for of in freed] == [None, None]
