@@ -29,7 +29,7 @@ class SettingError(ClearError, ValueError):
 
 
 class StrategyConflict(ClearError, TypeError):
-    """Two strategies answer a question that only one may answer."""
+    """Two strategies answer a question that only one may answer, or one strategy takes part in two runs at once."""
 
 
 class AnswerError(ClearError, TypeError):

@@ -100,7 +100,7 @@ class Attachment:
         self._logged: dict[str, Logged] = {}
         self._has_warned_of_accumulation = False
         conductor.on_fit_start(len(views), seed, means.device, views)
-        self._run = conductor.runs
+        self._run = conductor.run
         announce(conductor, views, host)
         self._finalizer = finalize(self, warn_without_hr, conductor, self.counts)
 
@@ -108,8 +108,8 @@ class Attachment:
         """Render a training view at both scales; returns what the host's render function returns at LR.
 
         Raises:
-            HostError: a backward pass is running; the conductor has begun another run; `render_at` renders other parameters, or
-                its Gaussians in another order.
+            HostError: a backward pass is running; `render_at` renders other parameters, or its Gaussians in another order.
+            StrategyConflict: the conductor or one of its strategies has begun another run.
             SettingError: several processes train.
         """
         if self.removed:
@@ -120,11 +120,7 @@ class Attachment:
                 f"{view.name} is rendered inside of a backward pass, as torch.utils.checkpoint does it: HR would be drawn twice, "
                 "and the loss be that of another picture. Checkpoint what comes before the rendering, or after it."
             )
-        if self.conductor.runs != self._run:
-            raise HostError(
-                "the conductor of this loop was attached to another one since, for which its strategies have begun anew. Make a "
-                "conductor for each loop."
-            )
+        self.conductor.require_run(self._run)
         self._finish_step()  # not every optimizer may have stepped, and the structure may have changed
         conductor, t, leaves = self.conductor, self.t, self._host.leaves()
         render_at = _checked(render_at, leaves)
@@ -203,7 +199,7 @@ class Attachment:
         self.removed, self._merging.pending = True, None
         self.hook([])
         self._steps.follow_by({}, [])
-        if self.conductor.runs == self._run:  # else its strategies train another loop by now
+        if self.conductor.trains(self._run):  # else its strategies train another loop by now
             self.conductor.on_fit_end()
         self._finalizer()
         self.undo.close()

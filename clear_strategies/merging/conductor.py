@@ -150,8 +150,10 @@ class Conductor(Hooks):
 
         Raises:
             ValueError: a scale that the objective needs was not rendered.
+            StrategyConflict: one of the strategies has begun the run of another conductor.
             DivergedError: a loss or a gradient is not finite; `params` and the optimizer are unchanged.
         """
+        self.require_run(self.run)
         o, stage, where = self.objective, self.work_log.stage, _where(view, t)
         vjp: Callable[..., Sequence[Grads]] = _vjp if stepper is None else stepper.vjp
         reduced = not self.wants_lr or (lr is None and view.factor == 1)

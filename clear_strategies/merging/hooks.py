@@ -24,6 +24,7 @@ from clear_strategies.merging.logs import IterationLogs
 from clear_strategies.merging.objective import Objective
 from clear_strategies.strategies import answers
 from clear_strategies.strategies.base import (
+    RunFacts,
     Scale,
     Strategy,
     by_class,
@@ -54,7 +55,7 @@ class Hooks:
         regularizers: the strategies that override `regularize`.
         showing: the strategies that override `extra_views`.
         views: the argument of `on_fit_start`.
-        runs: how often `on_fit_start` was called.
+        run: what the strategies know of the run, which `on_fit_start` begins; None before it.
         logs: the scalars that the strategies log.
         work_log: which work was done, and which was skipped.
 
@@ -66,7 +67,7 @@ class Hooks:
         self.strategies = tuple(strategies)
         self.objective = objective
         self.views: tuple[View, ...] = ()
-        self.runs = 0
+        self.run: Sequence[RunFacts] | None = None
         self.logs = IterationLogs(strategies)
         self.work_log = WorkLog()
         self.comparing = [s for s in strategies if overrides(s, "compare")]
@@ -96,15 +97,30 @@ class Hooks:
             splats: see `Strategy.splats`; None: exp and sigmoid.
         """
         self.work_log.device, self.views = torch.device(device), tuple(views)
-        self.runs += 1
         for s in self.strategies:
+            of_last_run = s.of_run
             s.on_fit_start(n_views, seed)
-            answers.require_started(s, seed)
+            answers.require_started(s, of_last_run)
             s.to(device)
             s.of_run.lambda_hr, s.of_run.splats = self.objective.lambda_hr, splats or by_exp_and_sigmoid
             if overrides(s, "on_views"):
                 with self.work_log.stage("views prepared"):
                     s.on_views(views)
+        self.run = [s.of_run for s in self.strategies]
+
+    def trains(self, run: Sequence[RunFacts] | None) -> bool:
+        """Return True if this conductor and its strategies have begun `run`, and no other one since."""
+        return run is self.run and (
+            run is None or all(s.of_run is x for s, x in zip(self.strategies, run, strict=True))
+        )
+
+    def require_run(self, run: Sequence[RunFacts] | None) -> None:
+        """Raise a StrategyConflict if the conductor or one of its strategies takes part in another run by now."""
+        if not self.trains(run):
+            raise StrategyConflict(
+                "the strategies of this loop have begun anew for another one since, or are copies. Make a conductor for each "
+                "loop, with strategies of its own."
+            )
 
     @apart_from_the_loop
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | Float[Tensor, "2 N"] | None:

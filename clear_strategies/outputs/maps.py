@@ -173,7 +173,7 @@ def _gradients(
 ) -> tuple[Grads, Grads, Grads | None, Float[Tensor, "H W 3"]]:
     """(g_LR, g_HR before correction, g̃_HR or None if no strategy corrects at t, Î_HR on the CPU), with λ_HR = 1."""
     objective = replace(conductor.objective, lambda_hr=_ALWAYS_ON)
-    aside = Conductor(*copy.deepcopy(conductor.strategies), objective=objective)
+    aside = Conductor(*map(_in_its_run, conductor.strategies), objective=objective)
     field = painter.field
     lr, hr = (cast(FieldShot, shot) for shot in field.render_scales(painter.rasterizer, view))  # both are asked for
     (g_lr,) = lr.vjp(objective.lr(lr.image.detach(), view.lr.image, view.lr.shown).cotangents)
@@ -186,6 +186,13 @@ def _gradients(
         return g_lr, g_hr, None, hr.image.detach().cpu()
     answer = answers.corrected(owner, owner.correct(g_lr, g_hr, from_hr.step), g_hr, finite=False)
     return g_lr, g_hr, answer, hr.image.detach().cpu()
+
+
+def _in_its_run(strategy: Strategy) -> Strategy:
+    """A copy that also knows the run, which its hooks then do not change."""
+    copied = copy.copy(strategy)
+    vars(copied).update(copy.deepcopy(vars(strategy)))
+    return copied
 
 
 def _compare(lr: Grads, hr: Grads, corrected: Grads | None) -> tuple[dict[str, Tensor], Bool[Tensor, " N"]]:

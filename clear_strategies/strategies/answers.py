@@ -23,13 +23,13 @@ from clear_strategies.core.gradients import Grads
 from clear_strategies.core.step import Losses, Step
 from clear_strategies.core.view import ExtraView, Photo
 from clear_strategies.errors import AnswerError
-from clear_strategies.strategies.base import Scale, Strategy
+from clear_strategies.strategies.base import RunFacts, Scale, Strategy
 
 T = TypeVar("T")
 
 
-def require_started(s: Strategy, seed: int) -> None:
-    if s.of_run.seed != seed:
+def require_started(s: Strategy, of_last_run: RunFacts) -> None:
+    if s.of_run is of_last_run:
         raise AnswerError(f"{_named(s, 'on_fit_start')} must call super().on_fit_start(n_views, seed).")
 
 

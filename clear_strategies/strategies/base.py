@@ -73,9 +73,10 @@ class Strategy:
         run_state: other tensors that checkpoints save, of any shape: parameters of the strategy's own, by view or by group.
         cache: values that can be computed again (patch maps, keyed by view); never saved.
         logs: scalars of this iteration, see `log`.
-        of_run: device, seed, λ_HR and activations of the run.
+        of_run: device, seed, λ_HR and activations of the run, a new object in each run.
 
-    Randomness must be a function of (seed, t), so that resuming needs no generator state. Hooks run without autograd.
+    Randomness must be a function of (seed, t), so that resuming needs no generator state. Hooks run without autograd. Copies and
+    pickles have the settings alone, for a run of their own.
     """
 
     state: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
@@ -90,6 +91,10 @@ class Strategy:
             raise TypeError(
                 f"{cls.__name__}: a setting must not be called {min(taken)}, which every strategy has already."
             )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The settings. What a strategy knows of its run may hold photos, the field and functions."""
+        return {**vars(self), **vars(Strategy())}
 
     # ---- hooks, in the order in which this trainer calls them --------------------------------------------------------
 
@@ -110,7 +115,8 @@ class Strategy:
         self.run_state.clear()
         self.cache.clear()
         self.logs.clear()
-        self.of_run.seed = int(seed)  # arithmetic with numpy's overflows
+        of_run = RunFacts(self.device, int(seed))  # arithmetic with numpy's overflows
+        object.__setattr__(self, "of_run", of_run)
 
     def on_views(self, views: Sequence[View]) -> None:
         """Look at all training views once, after `on_fit_start`.

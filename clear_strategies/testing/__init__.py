@@ -198,12 +198,14 @@ def check_facts_can_be_asked(make: Make) -> None:
 
 
 def check_can_be_copied(make: Make) -> None:
-    """Sweeps send strategies to other processes."""
+    """Sweeps send strategies to other processes, also after a run."""
+    conductor = given.conductor(make)
+    list(given.trace(conductor, 1, given.STEPS))
     try:
-        sent = ForkingPickler.dumps(make())
+        sent = ForkingPickler.dumps(conductor.strategies[0])
     except Exception as error:
         raise ContractError(f"a strategy cannot be sent to another process: {error}") from error
-    require(ForkingPickler.loads(sent) == make(), "a strategy does not survive pickling")
+    require(ForkingPickler.loads(sent) == conductor.strategies[0], "a strategy does not survive pickling")
 
 
 CHECKS: Final[Sequence[Callable[[Make], None]]] = (

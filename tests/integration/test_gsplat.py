@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clear_strategies import GCO, P2G, SVS, Conductor, Objective, Photo, View
+from clear_strategies import GCO, P2G, SVS, Conductor, Objective, Photo, StrategyConflict, View
 from clear_strategies.compose import conductor as composed_conductor
 from clear_strategies.data.priors.interface import Bicubic
 from clear_strategies.geometry.projection import intrinsics
@@ -134,18 +134,19 @@ def test_splats_are_attached_once_at_a_time():
     assert clear.attachment.counts["merges"] == again.attachment.counts["merges"] == 1
 
 
-def test_a_conductor_trains_one_loop_at_a_time():
-    """The strategies would mix what they know of two scenes, whose photos may have the same names."""
+@pytest.mark.parametrize("another", [lambda c: c, lambda c: Conductor(*c.strategies, objective=c.objective)])
+def test_a_strategy_trains_one_loop_at_a_time(another):
+    """It would mix what it knows of two scenes, whose photos may have the same names."""
     scene, first, second = toy.scene(20), Host(toy.scene(20)), Host(toy.scene(20))
-    shared = Conductor(P2G(patch=4), objective=HR_FROM_START)
-    clear, _ = attached(first, scene, shared), attached(second, scene, shared)
+    conductor = Conductor(P2G(patch=4), objective=HR_FROM_START)
+    clear, _ = attached(first, scene, conductor), attached(second, scene, goes_on := another(conductor))
     camera = scene.train[0].lr.camera
     second.render(camera)[0].mean().backward()
-    with pytest.raises(HostError, match=r"attached to another one since.*Make a conductor for each loop"):
+    with pytest.raises(StrategyConflict, match=r"begun anew for another one since.*Make a conductor for each loop"):
         first.render(camera)
     clear.remove()
     assert first.render(camera)[0].isfinite().all()
-    assert shared.views  # the second loop goes on
+    assert goes_on.views
 
 
 def first_gradient(degree=0, **settings):

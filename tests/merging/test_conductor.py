@@ -1,5 +1,6 @@
 """The conductor: Eq. 8 and 13, exclusivity, and the strategies' contract."""
 
+import copy
 import inspect
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -29,7 +30,7 @@ from clear_strategies.errors import AnswerError
 from clear_strategies.kernels.losses import reference
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.base import misspelled
-from clear_strategies.testing import CHECKS, ContractError, check_strategy
+from clear_strategies.testing import CHECKS, ContractError, check_strategy, given
 from clear_strategies.training import loop
 from clear_strategies.training.densifier import Densifier
 from clear_strategies.training.field import GaussianField
@@ -295,6 +296,16 @@ def test_a_method_whose_name_is_nearly_that_of_a_hook_is_told(caplog):
     ours = [cls for cls in Strategy.__subclasses__() if cls.__module__.startswith("clear_strategies.")]
     assert {cls.__name__ for cls in ours} >= {"GCO", "P2G", "SVS", "PseudoViews", "MCMC"}
     assert not [cls for cls in ours if misspelled(cls)]
+
+
+def test_a_strategy_takes_part_in_one_run_at_a_time_and_a_copy_in_none():
+    first = given.conductor(lambda: SVS(anchor_start=1, anchor_strength=0.01))
+    next(trace := given.trace(first, 1, given.STEPS))
+    second = Conductor(*first.strategies)
+    second.on_fit_start(1, 0)
+    for stopped in (trace, given.trace(copy.deepcopy(second), 1, given.STEPS)):
+        with pytest.raises(StrategyConflict, match="begun anew for another one since, or are copies"):
+            list(stopped)
 
 
 @dataclass(frozen=True)
