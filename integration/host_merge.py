@@ -19,6 +19,7 @@ from clear_strategies.core.step import Step
 from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide
+from clear_strategies.merging.recorded_work import merging_strategies
 from integration.autograd_shot import AutogradShot, trained
 from integration.densification import ScoreScaler, score_for_host
 from integration.detail import Fading
@@ -167,7 +168,8 @@ class HostMerge:
         merged = self._replayed(params, g_lr, high, step, t, out)
         if self._host.loss_scale is None and not isinstance(merged.finite, Tensor) and not merged.finite:
             by_host = all(map(is_finite, [*high.values(), *(high.colour or ())]))
-            hint = " (that of HR is finite: look at the loop's own loss)" if by_host else ""
+            mine = "".join(f", and at the answers of {type(s).__name__}" for s in merging_strategies(self._conductor))
+            hint = f" (that of HR is finite: look at the loop's own loss{mine})" if by_host else ""
             remedy = "If the loop skips such steps, attach with loss_scale=lambda: 1.0."
             require_finite(f"t={t}: the merged gradient{hint}", merged.grads, remedy=remedy)
         done.replace(out, scale)

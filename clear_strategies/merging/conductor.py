@@ -224,11 +224,8 @@ class Conductor(Hooks):
             sr = self._over_background(view.hr, t, view.background)
             _require_size(view, "HR", hr.image, sr.image)
             step = self._told(replace(step, visible=hr.visible))
-            # The memory is reused: an allocator would map tens of megabytes anew each time, with a page fault for every 4 KB.
-            objective, reuse = self.objective, self._hr_cotangents
-            compare = self.comparison("hr", sr, step, lambda image: objective.hr(image, sr.image, sr.shown, reuse))
+            compare = self.comparison("hr", sr, step, lambda image: self._compared_at_hr(image, sr))
             losses = compare(hr.image.detach())  # Eq. 5
-            self._hr_cotangents = losses.cotangents
         require_finite_losses(_where(view, t), losses.values, {"the SR image": sr.image, "the HR render": hr.image})
         of_hr = losses.cotangents
         if len(of_hr) != 1 + (λ_hf > 0):
@@ -323,6 +320,14 @@ class Conductor(Hooks):
         """Once, after the last iteration."""
         self._hr_cotangents = None
         super().on_fit_end()
+
+    def _compared_at_hr(self, image: Float[Tensor, "H W 3"], sr: Photo) -> Losses:
+        """L_base and L_HF. Their cotangents take the memory of the last ones: an allocator would map tens of megabytes anew each
+        time, with a page fault for every 4 KB.
+        """
+        losses = self.objective.hr(image, sr.image, sr.shown, self._hr_cotangents)
+        self._hr_cotangents = losses.cotangents  # not those that a strategy returns, which may be stored
+        return losses
 
     def _told(self, step: Step) -> Step:
         """The iteration as strategies see it; in a recording, they cannot read from it what differs between replays."""

@@ -129,7 +129,7 @@ class Hooks:
         z = answers.gate(s, s.gate(t, n), n)
         if z is None and self.owner("gate") is not None:
             self.work_log.skip("gate", "no Gaussian is dropped at this rate")
-        return None if z is None else z.detach().float()  # kernels read no other type
+        return None if z is None else z.detach().float().contiguous()  # kernels read nothing else
 
     def background(self, t: int) -> Color | None:
         """The colour behind every rendering of iteration t; None: the scene's own."""
@@ -226,7 +226,7 @@ class Hooks:
             answers.require_run_state(s)
 
     def may_densify(self, t: int) -> bool:
-        return all(s.may_densify(t) for s in self.strategies)
+        return all(answers.may_densify(s, s.may_densify(t)) for s in self.strategies)
 
     @apart_from_the_loop
     def on_resize(self, parents: Int[Tensor, " M"]) -> None:

@@ -24,6 +24,7 @@ from clear_strategies.core.step import Losses, Step
 from clear_strategies.core.view import ExtraView, Photo
 from clear_strategies.errors import AnswerError
 from clear_strategies.strategies.base import RunFacts, Scale, Strategy
+from rasterizers.interface import Color
 
 T = TypeVar("T")
 
@@ -37,7 +38,7 @@ def require_state(s: Strategy, params: Mapping[str, Tensor]) -> None:
     if not s.state:
         return
     n = {len(p) for p in params.values()}
-    memory = {p.data_ptr() for p in params.values()} - {0}  # of tensors without any
+    memory = {_memory(p) for p in params.values()} - {0}  # of tensors without any
     for name, rows in s.state.items():
         if not isinstance(rows, Tensor) or (n and rows.dim() > 0 and len(rows) not in n):
             raise AnswerError(
@@ -45,11 +46,16 @@ def require_state(s: Strategy, params: Mapping[str, Tensor]) -> None:
                 f"without dimensions, got {_shown(rows)}. Other tensors belong in run_state, and what can be computed again in "
                 "cache."
             )
-        if rows.data_ptr() in memory:  # a resumed run would have a copy
+        if _memory(rows) in memory:  # a resumed run would have a copy
             raise AnswerError(
                 f"{type(s).__name__}.state[{name!r}] must be a tensor of its own, got the memory of a parameter, which changes "
                 "with it. Store parameter.clone()."
             )
+
+
+def _memory(x: Tensor) -> int:
+    """The address of the memory that a tensor, or a part of it, is in."""
+    return x.untyped_storage().data_ptr()
 
 
 def require_run_state(s: Strategy) -> None:
@@ -101,10 +107,10 @@ def gate(s: Strategy, z: T, n: int) -> T:
     return z
 
 
-def background(s: Strategy, color: T) -> T:
+def background(s: Strategy, color: Any) -> Color | None:
     if color is not None and not is_color(color):
         _refuse(s, "background", "three numbers in [0, 1] or None", color)
-    return color
+    return None if color is None else (color[0], color[1], color[2])
 
 
 def evidence(s: Strategy, e: T, n: int) -> T:
@@ -162,6 +168,12 @@ def extra_views(s: Strategy, answer: Any) -> list[ExtraView]:
             _refuse(s, "extra_views", f"an ExtraView whose weight is a tensor {[*shape]}, as its photo", extra.weight)
         _require_numbers(s, "extra_views", "the weight", extra.weight)
     return extras
+
+
+def may_densify(s: Strategy, answer: Any) -> bool:
+    if answer is None:  # a forgotten return would end densification
+        _refuse(s, "may_densify", "True or False", answer)
+    return bool(answer)
 
 
 def _require_finite(s: Strategy, hook: str, numbers: Mapping[str, Any]) -> None:

@@ -245,7 +245,8 @@ def test_half_precision_is_merged_in_float32(passes):
 
 
 @pytest.mark.parametrize(
-    ("side", "hint"), [("lr", r" \(that of HR is finite: look at the loop's own loss\)"), ("hr", "")]
+    ("side", "hint"),
+    [("lr", r" \(that of HR is finite: look at the loop's own loss, and at the answers of GCO, .* SVS\)"), ("hr", "")],
 )
 def test_what_is_not_finite_is_refused_but_under_a_gradient_scaler(side, hint):
     params, before, hr, step = setting(torch.float32, accumulated=False, factors=False, scale=1.0)

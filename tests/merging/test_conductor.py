@@ -256,15 +256,21 @@ def test_an_answer_that_a_hook_must_not_give_is_refused_by_the_name_of_both(answ
         check_strategy(answering(hook, given))
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bool])
-def test_a_gate_of_any_type_is_what_it_is_as_float32(dtype):
-    def trained(dtype):
-        state = short_run.start((), more=[answering("gate", lambda t, n: (torch.arange(n) % 3 > 0).to(dtype))()])
+@pytest.mark.parametrize("form", [Tensor.double, Tensor.half, Tensor.bool, lambda z: torch.stack((z, 1 - z), 1)[:, 0]])
+def test_a_gate_of_any_type_and_strides_is_what_it_is_as_float32(form):
+    def trained(form):
+        state = short_run.start((), more=[answering("gate", lambda t, n: form((torch.arange(n) % 3 > 0).float()))()])
         loop.iterate(state, toy.RASTERIZER)
         return short_run.tensors(state)
 
-    expected = trained(torch.float32)
-    assert not [name for name, x in trained(dtype).items() if not torch.equal(x, expected[name])]
+    expected = trained(Tensor.clone)
+    assert not [name for name, x in trained(form).items() if not torch.equal(x, expected[name])]
+
+
+def test_a_colour_may_be_a_list_and_a_forgotten_answer_does_not_end_densification():
+    assert Conductor(answering("background", [0.25, 0.5, 0])()).background(1) == (0.25, 0.5, 0)
+    with pytest.raises(AnswerError, match=r"may_densify\(\) must give True or False, got None"):
+        Conductor(answering("may_densify", None)()).may_densify(1)
 
 
 @dataclass(frozen=True)
@@ -464,15 +470,17 @@ def test_state_of_other_rows_and_settings_of_taken_names_are_refused():
     ):
         Conductor(Short()).after_step({"means": torch.zeros(30, 3)}, toy.step())
 
-    def anchors(self, params, step):
-        self.state.setdefault("anchor", params["means"])
+    for column in (slice(None), 2):
 
-    with pytest.raises(
-        AnswerError, match=r"state\['anchor'\] must be a tensor of its own, got the memory of a parameter"
-    ):
-        Conductor(type("Alias", (Short,), {"after_step": anchors})()).after_step(
-            {"means": torch.zeros(30, 3)}, toy.step()
-        )
+        def anchors(self, params, step, column=column):
+            self.state.setdefault("anchor", params["means"][:, column])
+
+        with pytest.raises(
+            AnswerError, match=r"state\['anchor'\] must be a tensor of its own, got the memory of a parameter"
+        ):
+            Conductor(type("Alias", (Short,), {"after_step": anchors})()).after_step(
+                {"means": torch.zeros(30, 3)}, toy.step()
+            )
     with pytest.raises(TypeError, match="a setting must not be called seed"):
         type("Mine", (Strategy,), {"__annotations__": {"seed": int}})
 
@@ -748,6 +756,21 @@ def test_comparisons_change_the_image_and_add_losses_each_around_the_next(drawn)
             assert found.losses[f"mean_{scale}"] == pytest.approx(seen * float(shot.image.mean()), rel=1e-5)
         torch.testing.assert_close(found.cotangents_lr, darker.cotangents_lr + seen / lr.image.numel())
         assert not torch.equal(found.grads["means"], darker.grads["means"])
+
+
+def test_cotangents_that_a_strategy_stores_are_its_own(drawn):
+    field, view, lr, hr = drawn
+    stored = []
+
+    def compare(scale, image, photo, step, losses):
+        found = losses(image)
+        stored.append(2 * found.cotangents.mT.contiguous().mT)
+        return found._replace(cotangents=stored[-1])
+
+    conductor = Conductor(answering("compare", compare)(), objective=Objective(lambda_hr=ALWAYS))
+    for t in (1, 2):
+        conductor.update(field.raw(), lr, hr, view, t)
+    assert torch.equal(stored[1], stored[3])
 
 
 def test_a_comparison_must_pass_on_the_losses_of_one_image(drawn):
