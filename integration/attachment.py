@@ -268,7 +268,8 @@ class Attachment:
         self.passes += 1
         λ = self.conductor.objective.lambda_hr(self.t)
         losses, shares = pending.losses, conflict_columns(conflict)
-        self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **shares, **self.conductor.logs.uncounted()}
+        row: dict[str, Logged] = {"t": float(self.t), "lambda_hr": λ, **losses, **shares}
+        self._logged = row | self.conductor.logs.uncounted(row)
         if self.counts["merges"] % _LOGGED_EVERY == 0:
             now = self.log
             losses_now = ", ".join(f"L_{name} {now[name]:.4f}" for name in losses) or "no HR"

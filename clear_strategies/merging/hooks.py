@@ -222,8 +222,7 @@ class Hooks:
         params = MappingProxyType(params)  # to replace an entry would have no effect
         for s in self.strategies:
             s.after_step(params, step)
-            answers.require_state(s, params)
-            answers.require_run_state(s)
+            answers.require_stored(s, params)
 
     def may_densify(self, t: int) -> bool:
         return all(answers.may_densify(s, s.may_densify(t)) for s in self.strategies)

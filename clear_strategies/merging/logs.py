@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from clear_strategies.core.deferred import Number
+from clear_strategies.errors import AnswerError
 from clear_strategies.strategies.base import Logged, Strategy, by_class
 
 
@@ -27,15 +28,26 @@ class IterationLogs:
             kept.update(s.logs)
             s.logs.clear()
 
-    def uncounted(self) -> dict[str, Logged]:
+    def uncounted(self, columns: Collection[str] = ()) -> dict[str, Logged]:
         """The scalars as they were logged, some as functions that compute them. A name that another strategy has logged too is
         prefixed by the class.
-        """
-        return _named(self._strategies, [kept | s.logs for kept, s in zip(self._kept, self._strategies, strict=True)])
 
-    def counted(self) -> dict[str, Number]:
-        """The scalars, computed."""
-        return _counted(self.uncounted())
+        Args:
+            columns: of the row that the scalars are added to.
+
+        Raises:
+            AnswerError: one of these columns was logged.
+        """
+        logged = _named(self._strategies, [kept | s.logs for kept, s in zip(self._kept, self._strategies, strict=True)])
+        if taken := logged.keys() & columns:
+            raise AnswerError(
+                f"a strategy logs {min(taken)!r}, a column that the row has already. Give it another name."
+            )
+        return logged
+
+    def counted(self, columns: Collection[str] = ()) -> dict[str, Number]:
+        """As `uncounted`, computed."""
+        return _counted(self.uncounted(columns))
 
     def counted_since_kept(self) -> dict[str, Number]:
         """The scalars that were logged since `keep`, computed."""

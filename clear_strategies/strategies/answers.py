@@ -34,37 +34,36 @@ def require_started(s: Strategy, of_last_run: RunFacts) -> None:
         raise AnswerError(f"{_named(s, 'on_fit_start')} must call super().on_fit_start(n_views, seed).")
 
 
-def require_state(s: Strategy, params: Mapping[str, Tensor]) -> None:
-    if not s.state:
+def require_stored(s: Strategy, params: Mapping[str, Tensor]) -> None:
+    """Check that `state` and `run_state` are what a checkpoint can give back."""
+    if not (s.state or s.run_state):
         return
     n = {len(p) for p in params.values()}
-    memory = {_memory(p) for p in params.values()} - {0}  # of tensors without any
-    for name, rows in s.state.items():
-        if not isinstance(rows, Tensor) or (n and rows.dim() > 0 and len(rows) not in n):
-            raise AnswerError(
-                f"{type(s).__name__}.state[{name!r}] must be a tensor with a row for each Gaussian, {min(n, default=0)}, or "
-                f"without dimensions, got {_shown(rows)}. Other tensors belong in run_state, and what can be computed again in "
-                "cache."
-            )
-        if _memory(rows) in memory:  # a resumed run would have a copy
-            raise AnswerError(
-                f"{type(s).__name__}.state[{name!r}] must be a tensor of its own, got the memory of a parameter, which changes "
-                "with it. Store parameter.clone()."
-            )
-
-
-def _memory(x: Tensor) -> int:
-    """The address of the memory that a tensor, or a part of it, is in."""
-    return x.untyped_storage().data_ptr()
-
-
-def require_run_state(s: Strategy) -> None:
-    for name, x in s.run_state.items():
-        if not isinstance(x, Tensor) or x.requires_grad:
-            raise AnswerError(
-                f"{type(s).__name__}.run_state[{name!r}] must be a tensor that requires no gradient, got {_shown(x)}. Hooks turn "
-                "autograd on for a copy, x.detach().requires_grad_()."
-            )
+    of_parameters = {p.untyped_storage().data_ptr() for p in params.values()}
+    taken = set[int]()
+    for where, tensors in (("state", s.state), ("run_state", s.run_state)):
+        for name, x in tensors.items():
+            entry = f"{type(s).__name__}.{where}[{name!r}]"
+            if not isinstance(name, str):
+                raise AnswerError(
+                    f"{entry} must have a text as its key, which is what checkpoints keep, got {name!r:.80}."
+                )
+            if where == "state" and (not isinstance(x, Tensor) or (n and x.dim() > 0 and len(x) not in n)):
+                raise AnswerError(
+                    f"{entry} must be a tensor with a row for each Gaussian, {min(n, default=0)}, or without dimensions, got "
+                    f"{_shown(x)}. Other tensors belong in run_state, and what can be computed again in cache."
+                )
+            if not isinstance(x, Tensor) or (where == "run_state" and x.requires_grad):
+                raise AnswerError(
+                    f"{entry} must be a tensor that requires no gradient, got {_shown(x)}. Hooks turn autograd on for a copy, "
+                    "x.detach().requires_grad_()."
+                )
+            if x.numel() and (x.data_ptr() in taken or x.untyped_storage().data_ptr() in of_parameters):
+                raise AnswerError(
+                    f"{entry} must be a tensor of its own, got the memory of a parameter or of another tensor that is stored, "
+                    "which changes with it. Store its clone()."
+                )
+            taken |= {x.data_ptr()}
 
 
 def compared(

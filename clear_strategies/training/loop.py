@@ -57,7 +57,8 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
         restructured = conductor.may_densify(t) and s.restructure()
         if s.filter_due() and not restructured and not s.remove_undrawn():  # each recomputes the filter
             s.refilter()
-    s.history.append(_with_logs(_row(s) | row | extra, conductor.logs.counted()))
+    row = _row(s) | row | extra
+    s.history.append(row | conductor.logs.counted(row))
     if t in s.plateau.measurements and not (restructured or s.reset_due(t)):
         with stage("loss of the training views"):
             s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)
@@ -152,15 +153,6 @@ def learn_extra(s: TrainState, rasterizer: Rasterizer, inputs: ExtraViewInputs) 
             s.optimizer.step(θ.raw(), grads)
             θ.constrain()
     return None, {EXTRA_LOSS: losses.values["lr"]}
-
-
-def _with_logs(row: dict[str, Number], logs: Mapping[str, Number]) -> dict[str, Number]:
-    """A row of the history with what strategies have logged."""
-    if taken := row.keys() & logs.keys():
-        raise AnswerError(
-            f"a strategy logs {min(taken)!r}, a column that the history has already. Give it another name."
-        )
-    return row | dict(logs)
 
 
 def _row(s: TrainState) -> dict[str, Number]:
