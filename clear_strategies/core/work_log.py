@@ -128,7 +128,7 @@ class WorkLog:
         entry.runs += 1
         entry.peak = peak_mib()
         if self.device.type == "cuda":
-            self._stamped.append((entry, start, _stamp()))
+            self._stamped.append((entry, start, _stamp(self.device)))
             if len(self._stamped) >= _BATCH:
                 self._read_stamps(wait=False)
         else:
@@ -163,14 +163,14 @@ class _Stage:
         self._log, self._name = log, name
 
     def __enter__(self) -> None:
-        self._start = _stamp() if self._log.device.type == "cuda" else time.perf_counter()
+        self._start = _stamp(self._log.device) if self._log.device.type == "cuda" else time.perf_counter()
 
     def __exit__(self, *_: object) -> None:
         self._log._ended(self._name, self._start)
 
 
-def _stamp() -> Any:
-    """A CUDA event, recorded on the current stream."""
+def _stamp(device: torch.device) -> Any:
+    """A CUDA event, recorded on the device's current stream. The device need not be the current one."""
     event: Any = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]
-    event.record()
+    event.record(torch.cuda.current_stream(device))
     return event

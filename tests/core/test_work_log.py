@@ -20,6 +20,7 @@ class Device:
     """A clock that a test moves, ms: what is recorded now is passed once the device has come so far."""
 
     queued, reached, waits = 0.0, 0.0, 0
+    of = torch.device("cuda:1")  # not the current one
 
     def event(self, *, enable_timing: bool) -> Event:
         assert enable_timing
@@ -31,7 +32,8 @@ class Event:
     device: Device
     at: float = math.nan
 
-    def record(self) -> None:
+    def record(self, stream: torch.device) -> None:
+        assert stream == self.device.of  # each device has a stream of its own
         self.at = self.device.queued
 
     def query(self) -> bool:
@@ -51,6 +53,7 @@ class Event:
 def device(monkeypatch) -> Device:
     fake = Device()
     monkeypatch.setattr(torch.cuda, "Event", fake.event)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device=torch.device("cuda:0"): device)
     return fake
 
 
@@ -60,7 +63,7 @@ def work(work_log: WorkLog, device: Device, name: str, ms: float) -> None:
 
 
 def test_on_cuda_nobody_waits_until_somebody_looks_and_a_failing_stage_is_stamped_too(device):
-    work_log = WorkLog("cuda")
+    work_log = WorkLog(Device.of)
     for _ in range(3):
         work(work_log, device, "render", 2.0)
         work(work_log, device, "step", 0.5)
@@ -70,7 +73,7 @@ def test_on_cuda_nobody_waits_until_somebody_looks_and_a_failing_stage_is_stampe
     assert (rows["render"]["runs"], rows["render"]["ms_each"], rows["render"]["seconds"]) == (3, 2.0, 0.006)
     assert rows["step"]["ms_each"] == 0.5
     assert list(rows) == ["render", "step"]
-    work_log = WorkLog("cuda")
+    work_log = WorkLog(Device.of)
     with pytest.raises(ZeroDivisionError), work_log.stage("render"):
         work(work_log, device, "inner", 1 / 0)
     assert work_log.entries["render"].runs == 1
@@ -78,7 +81,7 @@ def test_on_cuda_nobody_waits_until_somebody_looks_and_a_failing_stage_is_stampe
 
 def test_the_state_is_ready_for_json_and_counting_goes_on_from_it(device):
     work_log = WorkLog()
-    work_log.device = torch.device("cuda")  # once the trainer knows
+    work_log.device = Device.of  # once the trainer knows
     work(work_log, device, "render", 1000.0)
     work_log.skip("rows", "still", torch.tensor(7))
     state = json.loads(json.dumps(work_log.state_dict()))
@@ -87,7 +90,7 @@ def test_the_state_is_ready_for_json_and_counting_goes_on_from_it(device):
         "render": {"runs": 1, "seconds": 1.0, "skipped": {}},
         "rows": {"runs": 0, "seconds": 0.0, "peak": 0, "skipped": {"still": 7}},
     }
-    resumed = WorkLog("cuda")
+    resumed = WorkLog(Device.of)
     work(resumed, device, "lost", 1.0)
     resumed.load_state_dict(state)
     work(resumed, device, "render", 500.0)

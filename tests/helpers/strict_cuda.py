@@ -48,8 +48,8 @@ class Event:
     def __init__(self, cuda: StrictCuda, enable_timing: bool = False) -> None:
         self.cuda = cuda
 
-    def record(self) -> None:
-        self.cuda.ask("event")
+    def record(self, stream: Stream | None = None) -> None:
+        self.cuda.ask("event", on=stream)
 
     def query(self) -> bool:
         self.cuda.ask("read")
