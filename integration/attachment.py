@@ -69,7 +69,7 @@ class Attachment:
 
     Attributes:
         t: the current iteration, from 1.
-        passes: its backward passes so far.
+        passes: backward passes since the last step of the host, whose gradients it has kept.
         counts: how often each kind of work was done.
         removed: whether `remove` was called.
         undo: callbacks of `remove`, by which an adapter undoes its changes to the host.
@@ -121,7 +121,7 @@ class Attachment:
                 "and the loss be that of another picture. Checkpoint what comes before the rendering, or after it."
             )
         self.conductor.require_run(self._run)
-        self._finish_step()  # not every optimizer may have stepped, and the structure may have changed
+        self._finish_step(view)  # not every optimizer may have stepped, and the structure may have changed
         conductor, t, leaves = self.conductor, self.t, self._host.leaves()
         render_at = _checked(render_at, leaves)
         params = {name: p.detach() for name, p in leaves.items()}
@@ -138,7 +138,7 @@ class Attachment:
             view = conductor.skips.view(view, t)
             hr, losses = self._hr.hr(replace(step, view=view), z, apart)
         self._step = step if hr is None else hr.step
-        if self.passes == 0:  # once per step of the host, however many passes it accumulates
+        if self.passes == 0 or not self._steps.has_extra_views:  # of one iteration, however many a step of the host sums
             extra_views = conductor.extra_views(t)
             self._steps.follow_by(leaves, (self._hr.extra_view(x, view, t, apart) for x in extra_views))
         output = _lr(render_at, z, view)
@@ -207,7 +207,7 @@ class Attachment:
     def _step_begins(self, has_merged: bool) -> None:
         """Raise an error if no strategy takes part in the host's first step; warn of a later one."""
         if has_merged:
-            self._merging.fading.before_step()
+            self._merging.fading.before_step(max(self.passes, self._host.accumulation))
             return
         names = [*trained(self._host.leaves())]
         cause, remedy = why_nothing_was_merged(self._merging.pending, names)
@@ -231,17 +231,24 @@ class Attachment:
         if self._steps.is_complete and may_densify(self.t) == may_densify(max(1, self.t - 1)):
             self._finish_step()
 
-    def _finish_step(self) -> None:
-        """Call `on_resize` and `after_step`, after the host has stepped and perhaps densified. Passes whose gradients the loop
-        dropped before a step, e.g. after an error, do not count.
+    def _finish_step(self, rendered: View | None = None) -> None:
+        """Call `on_resize` and `after_step`, after the host has stepped and perhaps densified.
+
+        A step has all passes since the last one whose gradients the loop has kept. An iteration ends with its step, or after
+        `accumulation` passes: a gradient scaler skips steps, and FastGS sums the views of many iterations. It does not end
+        before another pass over the same view, as in a step of SAM.
+
+        Args:
+            rendered: the view that the host renders next; None: it has stepped.
         """
         params = self._host.leaves()
         self._follow_structure(len(params["means"]))
         if not self.passes:
             return
-        # A gradient scaler may skip the step.
-        has_stepped = self._steps.has_begun or self.passes >= self._host.accumulation
-        if has_stepped:
+        last = None if self._step is None or rendered is None else self._step.view.name
+        again = last is not None and self._steps.are_known and last == rendered.name
+        has_stepped = self._steps.has_begun
+        if has_stepped or (self.passes % self._host.accumulation == 0 and not again):
             if self._step is not None:
                 self.conductor.after_step({name: _to_change(p) for name, p in params.items()}, self._step)
             self.t += 1
@@ -258,14 +265,14 @@ class Attachment:
             self._n = n
             self.counts["structure changes"] += 1
 
-    def _merged(self, pending: Pending, conflict: Mapping[str, Number] | None, before: Sequence[Tensor]) -> None:
+    def _merged(self, pending: Pending, conflict: Mapping[str, Number] | None) -> None:
         """Called when gradients of a rendering were merged: the first of them with their conflict ratios, or more of them."""
-        if conflict is not None and self.passes == 0 and not self._steps.has_begun:
-            self._warn_of_accumulation(before)
         self._steps.on_merge()
         if conflict is None:
             return
         self.passes += 1
+        if self.passes > self._host.accumulation:
+            self._warn_of_accumulation()
         λ = self.conductor.objective.lambda_hr(self.t)
         losses, shares = pending.losses, conflict_columns(conflict)
         row: dict[str, Logged] = {"t": float(self.t), "lambda_hr": λ, **losses, **shares}
@@ -275,20 +282,16 @@ class Attachment:
             losses_now = ", ".join(f"L_{name} {now[name]:.4f}" for name in losses) or "no HR"
             _log.info("t=%d: %s, lambda_HR %.3f, %s Gaussians.", self.t, losses_now, λ, f"{self._n:,}")
 
-    def _warn_of_accumulation(self, before: Sequence[Tensor]) -> None:
-        """Warn once if a step sums more passes than `accumulation` names.
-
-        Args:
-            before: `.grad` before the first pass of a step.
-        """
-        if self._has_warned_of_accumulation or self.counts["merges"] == 1 or not any(bool(g.any()) for g in before):
+    def _warn_of_accumulation(self) -> None:
+        """Warn once if a step sums more passes than `accumulation` names."""
+        if self._has_warned_of_accumulation:
             return
         self._has_warned_of_accumulation = True
         _log.warning(
             "%d backward passes over training views add to the same gradients, without an optimizer step between them, but "
-            "accumulation=%d: HR weighs too much, and the schedules of the strategies end too early. Pass accumulation=n, the "
-            "number of views in a step, and divide each loss by n.",
-            self._host.accumulation + 1, self._host.accumulation,
+            "accumulation=%d. If the loop divides each loss by the number of views in a step, HR weighs too much: pass that "
+            "number as accumulation. If the loop sums the losses of several iterations, all is well.",
+            self.passes, self._host.accumulation,
         )  # fmt: skip
 
 

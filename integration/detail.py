@@ -40,36 +40,33 @@ def sh0_offset(detail: Float[Tensor, "N 3"], sh0: Float[Tensor, "N ..."]) -> Flo
 class Fading:
     """The decay of f_det in each step of the host in which HR takes part. L_HF does not change if a constant is added to the
     colours, so nothing else would keep the mean of f_det near 0.
-
-    Args:
-        passes: backward passes per step, each of which adds an equal part of the decay.
     """
 
-    def __init__(self, rates: DetailRates, passes: int) -> None:
-        self._rates, self._passes = rates, passes
+    def __init__(self, rates: DetailRates) -> None:
+        self._rates = rates
         self._passed: list[Tensor] = []  # f_det in the passes since the last step
-        self._gradients = 0
+        self._steps = 0  # which had a gradient of f_det in their first pass
 
     def add_pass(self, detail: Tensor, *, is_learned: bool) -> None:
-        """Count a backward pass in which HR takes part. Warns if f_det has not changed after several gradients.
+        """Count a backward pass in which HR takes part. Warns if f_det has not changed after several steps.
 
         Args:
             is_learned: whether the pass has a gradient of f_det; otherwise HR is rendered only for its scores.
         """
+        begins = is_learned and not self._passed
         self._passed.append(detail)
-        self._gradients += is_learned
-        warns = is_learned and self._gradients == _PATIENCE * self._passes and self._rates.rate > 0
-        if warns and not bool(detail.any()):
+        self._steps += begins
+        if begins and self._steps == _PATIENCE and self._rates.rate > 0 and not bool(detail.any()):
             _log.warning(
                 "f_det has no effect: none of its first %d gradients was stepped on. Step the optimizer of the parameter detail: "
                 "attach adds it to the optimizers that it is given, and one that is made anew must hold it, too.", _PATIENCE,
             )  # fmt: skip
 
     @torch.no_grad()
-    def before_step(self) -> None:
-        """Apply the decay of the passes since the last step, to the tensors of these passes."""
+    def before_step(self, passes: int) -> None:
+        """Apply the decay of the step's passes, each of which adds an equal part of it, to the tensors of these passes."""
         for detail in self._passed:
-            detail.mul_(1 - self._rates.decay / self._passes)
+            detail.mul_(1 - self._rates.decay / passes)
         self._passed.clear()
 
     def forget(self) -> None:

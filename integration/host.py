@@ -29,7 +29,8 @@ class Host:
         threshold: the densification threshold on the mean ‖∇_u‖ in NDC units; None: the score is not scaled.
         reads_score: the densifier reads the screen gradient.
         loss_scale: returns the factor of the loss (`scaler.get_scale` of an AMP gradient scaler).
-        accumulation: backward passes per optimizer step, each of 1/accumulation of the loss.
+        accumulation: backward passes per optimizer step, if the host divides each loss by this number, and the schedules count
+            steps; 1: it sums the losses of several views, or a step has only one, and they count views.
         masks: [h, w] by the name of a view, by which the host multiplies its LR image; the HR image is multiplied here.
         own_background: the host chooses the colour behind its renderings, and `Attachment.background` has no effect.
         iterations: of the loop, if they are known.

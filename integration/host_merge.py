@@ -40,8 +40,7 @@ class HostMerge:
 
     Args:
         device: of the Gaussians. counts: `Attachment.counts`, to which this class adds.
-        merged: called after each merge, with the conflict ratios by group before correction if it is the first of its rendering,
-            and what `.grad` of the parameters held before the pass.
+        merged: called after each merge, with the conflict ratios by group before correction if it is the first of its rendering.
 
     Attributes:
         pending: the last rendering; None: there is none, or none is to be merged any more.
@@ -51,12 +50,12 @@ class HostMerge:
 
     def __init__(
         self, conductor: Conductor, host: Host, device: torch.device, counts: Counter[str],
-        merged: Callable[[Pending, Mapping[str, Number] | None, Sequence[Tensor]], None],
+        merged: Callable[[Pending, Mapping[str, Number] | None], None],
     ) -> None:  # fmt: skip
         self._conductor, self._host, self._counts, self._merged = conductor, host, counts, merged
         self.pending: Pending | None = None
         self.scaler = None if host.threshold is None else ScoreScaler(host.threshold)
-        self.fading = Fading(conductor.detail, host.accumulation)
+        self.fading = Fading(conductor.detail)
         self._replayed = ReplayedMerge(conductor, device)
         self._pass: ReferenceType[BackwardPass] | None = None  # the last to reach a rendering; torch keeps it alive
         self._in_vain = 0  # renderings, one after the other, that were not merged
@@ -135,8 +134,7 @@ class HostMerge:
             detail = None
         if detail is not None and detail.grad is not None:  # the host's own gradient of it stays
             done.before["detail"] = detail.grad
-        t, before = pending.t, [done.before[name] for name in names if name in done.before]
-        λ = self._conductor.objective.lambda_hr(t)
+        t, λ = pending.t, self._conductor.objective.lambda_hr(pending.t)
         g_hr = pending.routed_of(names, done.params) if λ > 0 else Grads()
         self._warn_if_outweighed(done, g_hr, scale)
         of_all = [*names] if detail is None else [*names, "detail"]
@@ -147,7 +145,7 @@ class HostMerge:
         self._counts["merges"] += 1
         if first and hr is not None and pending.output is not None and done.task in pending.screen:
             self._write_score(pending.output.shot, pending.screen[done.task], hr, t, scale)
-        self._merged(pending, conflict if first else None, before)
+        self._merged(pending, conflict if first else None)
 
     def merge_gradients(
         self, done: BackwardPass, names: Iterable[str], g_hr: Grads, step: Step | None, t: int, scale: float

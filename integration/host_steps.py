@@ -71,6 +71,16 @@ class HostSteps:
         self._has_merged = True
 
     @property
+    def are_known(self) -> bool:
+        """True if the host has optimizers whose steps can be seen."""
+        return bool(self._hooked)
+
+    @property
+    def has_extra_views(self) -> bool:
+        """True if the host's next step is followed by steps on extra views."""
+        return bool(self._extra)
+
+    @property
     def has_begun(self) -> bool:
         """True if an optimizer has stepped since the last merge."""
         return bool(self._stepped)

@@ -206,12 +206,12 @@ class Pending:
         if self.nth in of.renderings:
             raise HostError(
                 "one backward pass reaches two renderings of training views, but each is merged by itself. With several views "
-                "for a step, call backward() after each rendering and set accumulation=, or use joint_loss. For a second pass "
+                "for a step, call backward() after each rendering (see accumulation=), or use joint_loss. For a second pass "
                 "over the same view, call the function that was wrapped, its __wrapped__."
             )
         raise HostError(
             f"a backward pass reaches an earlier rendering than that of {self.view}, but only the last can be merged. Call "
-            "backward() after each rendering; with several views for a step, set accumulation=."
+            "backward() after each rendering; with several views for a step, see accumulation=."
         )
 
     def require_first(self, names: Iterable[str], correcting: str) -> None:

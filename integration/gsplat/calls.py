@@ -60,7 +60,7 @@ class Poses:
         poses = viewmats.reshape(-1, 4, 4).numpy()  # compared in numpy: a step has few torch operations
         if len(poses) != 1:
             raise HostError(
-                f"one view is rendered at a time, got {len(poses)}. For several in a step, call backward() after each and set "
+                f"one view is rendered at a time, got {len(poses)}. For several in a step, call backward() after each; see "
                 "accumulation=; in simple_trainer.py set batch_size=1."
             )
         distances = np.abs(self._poses - poses).max((1, 2)).tolist()
