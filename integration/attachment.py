@@ -201,6 +201,8 @@ class Attachment:
         self._steps.follow_by({}, [])
         if self.conductor.trains(self._run):  # else its strategies train another loop by now
             self.conductor.on_fit_end()
+        for replays in filter(None, (self._hr.replays, self._merging.replayed.replays)):
+            replays.release()
         self._finalizer()
         self.undo.close()
 

@@ -46,6 +46,7 @@ class HostMerge:
         pending: the last rendering; None: there is none, or none is to be merged any more.
         scaler: of the densification score; None: the score is not scaled.
         fading: of f_det.
+        replayed: merges by recordings on CUDA.
     """
 
     def __init__(
@@ -56,7 +57,7 @@ class HostMerge:
         self.pending: Pending | None = None
         self.scaler = None if host.threshold is None else ScoreScaler(host.threshold)
         self.fading = Fading(conductor.detail)
-        self._replayed = ReplayedMerge(conductor, device)
+        self.replayed = ReplayedMerge(conductor, device)
         self._pass: ReferenceType[BackwardPass] | None = None  # the last to reach a rendering; torch keeps it alive
         self._in_vain = 0  # renderings, one after the other, that were not merged
         self._outweighed: int | None = 0  # of the first merges with HR; None: in one of them HR had a part
@@ -163,7 +164,7 @@ class HostMerge:
         g_lr, out = done.added(names, scale)
         params = {name: done.params[name].detach() for name in out}
         high = Grads({name: widened(g) for name, g in g_hr.items()}, colour=g_hr.colour)
-        merged = self._replayed(params, g_lr, high, step, t, out)
+        merged = self.replayed(params, g_lr, high, step, t, out)
         if self._host.loss_scale is None and not isinstance(merged.finite, Tensor) and not merged.finite:
             by_host = all(map(is_finite, [*high.values(), *(high.colour or ())]))
             mine = "".join(f", and at the answers of {type(s).__name__}" for s in merging_strategies(self._conductor))

@@ -128,14 +128,15 @@ class HrDrawing:
 
     Attributes:
         is_scored: whether a strategy has a densification score that the host's densifier reads.
+        replays: the recordings of this work; None: it is not recorded.
     """
 
     def __init__(self, conductor: Conductor, host: Host, device: torch.device, counts: Counter[str]) -> None:
         self._conductor, self._masks, self._counts = conductor, host.masks, counts
         self.is_scored = host.reads_score and conductor.owner("score") is not None
-        self._replays = replays_on(device, conductor.work_log, "the replay of HR")
-        if self._replays is not None and (reason := next(why_not_recorded(conductor), None)) is not None:
-            self._replays = None
+        self.replays = replays_on(device, conductor.work_log, "the replay of HR")
+        if self.replays is not None and (reason := next(why_not_recorded(conductor), None)) is not None:
+            self.replays = None
             _log.info("HR is not replayed: %s.", reason)
 
     def wanted(self, t: int) -> bool:
@@ -195,7 +196,7 @@ class HrDrawing:
 
         inputs = asked.compared_with(photo, looked_up=looked_up, mask=mask)
         hr, losses = self._done(asked, inputs, t, ("hr", view.factor), work)
-        seen = hr.step if self._replays is None else hr.step.copied()
+        seen = hr.step if self.replays is None else hr.step.copied()
         # The losses of a recording are overwritten by the next replay.
         hr = replace(hr, step=replace(seen, t=t, view=view, params=step.params), losses={})
         return side_of_parameters(hr, asked.drawn, asked.params), losses
@@ -221,7 +222,7 @@ class HrDrawing:
     def _done(self, asked: Drawable, inputs: _RenderInputs, t: int, constants: tuple[Any, ...], work: _Work) -> _Made:
         """Do the work, live or by a replay."""
         conductor, rasterizer = self._conductor, asked.rasterizer
-        if self._replays is None or not can_be_recorded(rasterizer):
+        if self.replays is None or not can_be_recorded(rasterizer):
             return work(inputs)
         called = *conductor.comparing, conductor.owner("observe"), conductor.owner("route")
         state = [x.data_ptr() for s in called if s is not None for x in stored(s)]
@@ -234,4 +235,4 @@ class HrDrawing:
                 numbers_of=partial(rasterizer.numbers_of, device=device), calls=conductor.comparing,
             )  # fmt: skip
 
-        return self._replays.do(key, t, inputs, live=lambda: work(inputs), record=record)
+        return self.replays.do(key, t, inputs, live=lambda: work(inputs), record=record)

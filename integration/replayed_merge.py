@@ -36,18 +36,21 @@ class ReplayedMerge:
 
     Args:
         device: of the Gaussians. On CUDA a merge in which HR takes part is recorded and replayed.
+
+    Attributes:
+        replays: the recordings of merges; None: they are not recorded.
     """
 
     def __init__(self, conductor: Conductor, device: torch.device) -> None:
         self._conductor, self._device = conductor, device
-        self._replays = replays_on(device, conductor.work_log, "the replay of the merge")
+        self.replays = replays_on(device, conductor.work_log, "the replay of the merge")
 
     def __call__(
         self, params: Mapping[str, Tensor], g_lr: Grads, g_hr: Grads, step: Step | None, t: int, out: Mapping[str, Tensor]
     ) -> Merged:  # fmt: skip
         """See `Conductor.merge`."""
         conductor, λ = self._conductor, self._conductor.objective.lambda_hr(t)
-        if self._replays is None or step is None or not g_hr.tensors or λ == 0:
+        if self.replays is None or step is None or not g_hr.tensors or λ == 0:
             return conductor.merge(params, g_lr, g_hr, step, t, out)
         of_lr, of_hr, e, first = _named(g_lr), _named(g_hr), step.evidence, next(iter(out.values()))
         evidence = () if e is None else (e.reliability, e.demand, e.sums)
@@ -75,7 +78,7 @@ class ReplayedMerge:
         saved = [x for s in called if s is not None for x in stored(s)]
         addresses = [x.data_ptr() for x in (*params.values(), *step.params.values(), *saved)]
         key = GraphKey(n := len(first), tuple(addresses), shapes_of(inputs, n), (*of_lr, None, *of_hr, None, *out))
-        made, row = self._replays.do(key, t, inputs, live=lambda: work(inputs, out), record=record)
+        made, row = self.replays.do(key, t, inputs, live=lambda: work(inputs, out), record=record)
         if made is not out:
             write([*out.values()], [*made.values()])
         return Merged(Grads(out), row, row.pop(_FINITE))

@@ -190,6 +190,10 @@ class Replays:
         self._recorded[key] = recorded
         return self._live(live, reason) if recorded is None else recorded.outcome()
 
+    def release(self) -> None:
+        """Drop all recordings, with their memory on the device."""
+        self._recorded.clear()
+
     def _live(self, live: Callable[[], T], reason: str) -> T:
         self._count(reason)
         return live()

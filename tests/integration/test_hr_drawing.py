@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import partial
+from weakref import WeakSet
 
 import pytest
 import torch
@@ -10,10 +11,10 @@ import clear_strategies as cs
 import rasterizers
 from clear_strategies import Conductor
 from clear_strategies.core.view import ExtraView
-from clear_strategies.merging.recorded_work import LIVE
+from clear_strategies.merging.recorded_work import LIVE, RecordedWork
 from clear_strategies.merging.skips import Skips
 from clear_strategies.schedules import Ramp, WarmupDecay
-from integration import hr_drawing
+from integration import hr_drawing, replayed_merge
 from rasterizers import replays
 from rasterizers.recording import running
 from tests.helpers import toy
@@ -286,6 +287,15 @@ def test_replays_over_densification_resets_evaluation_and_resuming(monkeypatch, 
     strategies = pytest.importorskip("gsplat.strategy")
     scene = toy.scene(40).to(recorded_on)
     names = [scene.train[i % 3].name for i in range(20)]
+    living = WeakSet()
+
+    class Seen(RecordedWork):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+            living.add(self)
+
+    for module in (hr_drawing, replayed_merge):
+        monkeypatch.setattr(module, "RecordedWork", Seen)
 
     def begun(host):
         host.degree = lambda step: 3
@@ -306,7 +316,9 @@ def test_replays_over_densification_resets_evaluation_and_resuming(monkeypatch, 
 
         host.train(names, between=evaluate)
         logs = [clear.attachment.conductor.work_log]
+        assert len(living) == (2 if replays.can_record(recorded_on) else 0)
         clear.remove()
+        assert not living
         resumed = Host(scene, rasterization=drawn_by("warp"), extent=4.0)
         resumed.splats = {name: torch.nn.Parameter(p.detach().clone()) for name, p in host.splats.items()}
         resumed.optimizers = {name: torch.optim.Adam([p], lr=1e-3) for name, p in resumed.splats.items()}
