@@ -167,7 +167,8 @@ class Attachment:
         if not self.removed:
             self._follow_structure(len(self._host.leaves()["means"]))  # the host may have densified since it rendered
         return {
-            "t": self.t, "passes": self.passes, "strategies": self.conductor.state_dict(),
+            "t": self.t, "passes": self.passes, "passes_with_hr": self._merging.fading.passes,
+            "strategies": self.conductor.state_dict(),
             "view": None if self._step is None else self._step.view.name, "step": _rows_of(self._step),
             "score": None if self._merging.scaler is None else self._merging.scaler.state_dict(),
         }  # fmt: skip
@@ -177,9 +178,11 @@ class Attachment:
         self.t, self.passes = int(state["t"]), int(state["passes"])
         self.conductor.load_state_dict(state["strategies"])
         self._host.restart_parents()
-        self._n = len(self._host.leaves()["means"])
+        leaves = self._host.leaves()
+        self._n = len(leaves["means"])
+        self._merging.fading.resume(leaves.get("detail"), int(state.get("passes_with_hr", 0)))
         if (view := self._views.get(state.get("view") or "")) is not None:  # its `after_step` is still to come
-            rows = {name: x.to(self._host.leaves()["means"].device) for name, x in state.get("step", {}).items()}
+            rows = {name: x.to(leaves["means"].device) for name, x in state.get("step", {}).items()}
             evidence = Evidence(rows["reliability"], rows["demand"]) if "demand" in rows else None
             self._step = Step(self.t, view, rows.get("visible"), evidence)
         if self._merging.scaler is not None and state.get("score") is not None:
@@ -256,8 +259,7 @@ class Attachment:
             self.t += 1
         gradients = (p.grad for name, p in params.items() if name != "detail")  # which the host may not zero
         if has_stepped or not any(g is not None and bool(g.any()) for g in gradients):
-            self.passes = 0
-            self._merging.fading.forget()
+            self.passes = self._merging.fading.passes = 0
 
     def _follow_structure(self, n: int) -> None:
         """Tell the strategies about a change of structure, if there was one; the host has n Gaussians now."""

@@ -40,11 +40,15 @@ def sh0_offset(detail: Float[Tensor, "N 3"], sh0: Float[Tensor, "N ..."]) -> Flo
 class Fading:
     """The decay of f_det in each step of the host in which HR takes part. L_HF does not change if a constant is added to the
     colours, so nothing else would keep the mean of f_det near 0.
+
+    Attributes:
+        passes: backward passes in which HR takes part, since the last step.
     """
 
     def __init__(self, rates: DetailRates) -> None:
         self._rates = rates
-        self._passed: list[Tensor] = []  # f_det in the passes since the last step
+        self._detail: Tensor | None = None
+        self.passes = 0
         self._steps = 0  # which had a gradient of f_det in their first pass
 
     def add_pass(self, detail: Tensor, *, is_learned: bool) -> None:
@@ -53,8 +57,10 @@ class Fading:
         Args:
             is_learned: whether the pass has a gradient of f_det; otherwise HR is rendered only for its scores.
         """
-        begins = is_learned and not self._passed
-        self._passed.append(detail)
+        if detail is not self._detail:  # a densifier has replaced it
+            self.resume(detail, 0)
+        begins = is_learned and self.passes == 0
+        self.passes += 1
         self._steps += begins
         if begins and self._steps == _PATIENCE and self._rates.rate > 0 and not bool(detail.any()):
             _log.warning(
@@ -62,13 +68,13 @@ class Fading:
                 "attach adds it to the optimizers that it is given, and one that is made anew must hold it, too.", _PATIENCE,
             )  # fmt: skip
 
+    def resume(self, detail: Tensor | None, passes: int) -> None:
+        """Continue from so many passes of a step."""
+        self._detail, self.passes = detail, passes
+
     @torch.no_grad()
     def before_step(self, passes: int) -> None:
-        """Apply the decay of the step's passes, each of which adds an equal part of it, to the tensors of these passes."""
-        for detail in self._passed:
-            detail.mul_(1 - self._rates.decay / passes)
-        self._passed.clear()
-
-    def forget(self) -> None:
-        """Drop the passes since the last step, after the host has dropped them or skipped its step."""
-        self._passed.clear()
+        """Apply the decay of a step of so many passes, of which each with HR adds an equal part."""
+        if self._detail is not None and self.passes:
+            self._detail.mul_((1 - self._rates.decay / passes) ** self.passes)
+        self.passes = 0

@@ -312,6 +312,29 @@ def test_a_step_of_sam_is_one_iteration_and_one_of_summed_views_is_several():
     torch.testing.assert_close(found, 3 * expected)
 
 
+def test_a_loop_resumes_between_the_passes_of_a_step_with_the_same_bits():
+    def trained(pauses):
+        loop = host, clear, render = started(toy.ShowsDark(), accumulation=2)
+        host.splats["detail"].data += 1.0
+        for i in range(4):
+            if i in pauses:
+                earlier, (host, clear, render) = loop, started(toy.ShowsDark(), accumulation=2)
+                for name, p in host.splats.items():
+                    before = earlier[0].splats[name]
+                    p.data, p.grad = before.data, before.grad
+                    if name in host.optimizers:
+                        host.optimizers[name].load_state_dict(earlier[0].optimizers[name].state_dict())
+                clear.attachment.load_state_dict(earlier[1].attachment.state_dict())
+                loop = host, clear, render
+            render(i % 3).mean().backward()
+            if i % 2:
+                host.step()
+        return host.splats
+
+    whole, resumed = trained(()), trained((1, 2, 3))
+    assert not [name for name, p in whole.items() if not torch.equal(p, resumed[name])]
+
+
 @pytest.mark.parametrize("passes", [1, 2])
 @pytest.mark.parametrize("decay", [0.0, 0.5])
 def test_f_det_fades_with_a_step_and_not_with_passes_that_the_loop_drops(decay, passes):
