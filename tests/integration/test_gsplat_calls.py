@@ -277,6 +277,7 @@ def test_opacities_that_a_loop_keeps_are_multiplied_by_the_gate_of_each_step():
     for _ in range(2):
         function = lambda m, q, s, o, *more, **call: host.rasterization(m, q, s, kept, *more, **call)  # noqa: E731
         gsplat_host.drawn(function, host.splats, host.photos["view0"].camera)[0].mean().backward()
+        host.step()
     hr, lr, next_hr, next_lr = seen
     assert torch.equal(hr, lr)
     assert torch.equal(next_hr, next_lr)
@@ -355,8 +356,8 @@ def test_a_detail_feature_whose_ten_gradients_no_optimizer_steps_on_gives_a_warn
     clear = gsplat_host.attached(host, scene, conductor, accumulation=accumulation)
     for i in range(12):
         host.render(scene.train[i % 3].lr.camera)[0].mean().backward()
-        if stepped:
-            host.optimizers["detail"].step()
+        if (i + 1) % accumulation == 0:
+            host.optimizers["detail" if stepped else "means"].step()
     assert clear.attachment.counts["HR renders"] == 12
     assert caplog.text.count("f_det has no effect") == warnings
 

@@ -211,7 +211,7 @@ def test_a_resumed_loop_tells_strategies_what_its_last_step_has_seen():
         _, clear, render = gsplat_host.started(SplatSuRe(), P2G())
         if state is not None:
             clear.attachment.load_state_dict(state)
-        render(1).mean().backward()  # `after_step` of the step before comes first
+        render(1 if state is None else 2).mean().backward()  # `after_step` of the step before comes first
         return clear.attachment
 
     first = told()
