@@ -53,7 +53,7 @@ class Event:
 def device(monkeypatch) -> Device:
     fake = Device()
     monkeypatch.setattr(torch.cuda, "Event", fake.event)
-    monkeypatch.setattr(torch.cuda, "current_stream", lambda device=torch.device("cuda:0"): device)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device=None: device)
     return fake
 
 

@@ -291,14 +291,12 @@ def test_a_step_of_sam_is_one_iteration_and_one_of_summed_views_is_several():
 
     def trained(steps, **settings):
         host, clear, render = started(toy.ShowsDark(), **settings)
-        for step, passes in enumerate(steps):
+        for passes in steps:
             for i in passes:
                 if i == "ascend":  # SAM steps with the gradient at a point near by, which it takes by another optimizer
-                    with torch.no_grad():
-                        for p in host.splats.values():
-                            p += 0 if p.grad is None else 1e-3 * p.grad
-                    for p in host.splats.values():
-                        p.grad = None
+                    for name, g in host.gradients().items():
+                        host.splats[name].data.add_(g, alpha=1e-3)
+                        host.splats[name].grad = None
                 else:
                     render(i).mean().backward()
             found = host.splats["detail"].grad.clone()
