@@ -133,12 +133,13 @@ class Attachment:
         # HR and extra views leave torch's random numbers as they were, so a dropout of the host drops the same at LR.
         apart = torch.random.fork_rng([means.device] if means.device.type == "cuda" else [])(render_at)
         hr, step = None, Step(t, view, params=params)
-        losses: Mapping[str, Number] = {}
         if self._hr.wanted(t):
             view = conductor.skips.view(view, t)
-            hr, losses = self._hr.hr(replace(step, view=view), z, apart)
-        self._step = step if hr is None else hr.step
-        if self.passes == 0 or not self._steps.has_extra_views:  # of one iteration, however many a step of the host sums
+            hr = self._hr.hr(replace(step, view=view), z, apart)
+        self._step = step if hr is None else hr.side.step
+        if (
+            self.passes == 0 or not self._steps.has_extra_views
+        ):  # of one iteration, however many a step of the host sums
             extra_views = conductor.extra_views(t)
             self._steps.follow_by(leaves, (self._hr.extra_view(x, view, t, apart) for x in extra_views))
         output = _lr(render_at, z, view)
@@ -149,7 +150,7 @@ class Attachment:
                 "parameters."
             )
         self.counts["LR renders"] += 1
-        pending = Pending(self.counts["LR renders"], t, view.name, output, hr, losses)
+        pending = Pending(self.counts["LR renders"], t, view.name, output, *(hr or (None, {})))
         self._merging.await_passes(pending, to_screen=hr is not None and self._hr.is_scored)
         return output.returned
 
@@ -250,8 +251,9 @@ class Attachment:
         self._follow_structure(len(params["means"]))
         if not self.passes:
             return
-        last = None if self._step is None or rendered is None else self._step.view.name
-        again = last is not None and self._steps.are_known and last == rendered.name
+        again = False
+        if rendered is not None and self._step is not None:
+            again = self._steps.are_known and rendered.name == self._step.view.name
         has_stepped = self._steps.has_begun
         if has_stepped or (self.passes % self._host.accumulation == 0 and not again):
             if self._step is not None:

@@ -194,14 +194,11 @@ def to_parameters(g: Grads, drawn: Mapping[str, Tensor] | None, params: Mapping[
         g: by the names of `drawn`; the colours' gradient as factors if this package drew them. It stays so if `are_joined`.
         drawn: None: the raw parameters.
     """
-    raw, colour = trained(params), None
+    raw = trained(params)
     if drawn is None:
         return Grads({name: g[name] for name in raw})  # which hooks may have changed
-    if g.colour is not None:
-        if are_joined(drawn["colors"], params):
-            colour = g.colour
-        else:
-            g = Grads({**g, "colors": outer(g.colour.rgb, g.colour.basis, drawn["colors"].shape[1])})
+    g = _drawn_colours(g, drawn, params)
+    colour = g.colour
     direct = {name: g[name] for name, p in raw.items() if drawn.get(name) is p and not is_hooked(p)}
     graph = {name: x for name, x in drawn.items() if name in g and name not in direct and x.requires_grad}
     if not graph or not raw:
@@ -212,6 +209,35 @@ def to_parameters(g: Grads, drawn: Mapping[str, Tensor] | None, params: Mapping[
     found = {name: value for name, value in zip(raw, through, strict=True) if value is not None}
     both = {name: direct[name] + found[name] for name in direct.keys() & found.keys()}
     return Grads({**direct, **found, **both}, colour=colour)
+
+
+def to_others(
+    g: Grads, drawn: Mapping[str, Tensor] | None, params: Mapping[str, Tensor]
+) -> list[tuple[Tensor, Tensor]]:
+    """The other leaves that the drawn tensors were computed from (a network, an embedding), each with its gradient.
+
+    Args:
+        g, drawn: see `to_parameters`. params: raw parameters, which are left out.
+    """
+    known = {id(p) for p in params.values()}
+    graph = {name: x for name, x in (drawn or {}).items() if x.grad_fn is not None}
+    found = {id(leaf): leaf for x in graph.values() for leaf in graph_of(x).leaves}
+    leaves = [leaf for key, leaf in found.items() if key not in known]
+    if not leaves:
+        return []
+    g = _drawn_colours(g, graph, params)
+    of = [name for name in graph if name in g]
+    through = torch.autograd.grad(
+        [graph[name] for name in of], leaves, [g[name] for name in of], retain_graph=True, allow_unused=True
+    )
+    return [(leaf, value) for leaf, value in zip(leaves, through, strict=True) if value is not None]
+
+
+def _drawn_colours(g: Grads, drawn: Mapping[str, Tensor], params: Mapping[str, Tensor]) -> Grads:
+    """The gradients with that of the drawn colours in full; its factors stay if `are_joined`."""
+    if g.colour is None or "colors" not in drawn or are_joined(drawn["colors"], params):
+        return g
+    return Grads({**g, "colors": outer(g.colour.rgb, g.colour.basis, drawn["colors"].shape[1])})
 
 
 def every_number(g: Grads, params: Mapping[str, Tensor]) -> Grads:

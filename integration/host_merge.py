@@ -142,6 +142,10 @@ class HostMerge:
         conflict = self.merge_gradients(done, of_all, g_hr, None if hr is None else hr.step, t, scale)
         if detail is not None:
             self._finish_detail(detail, params, t, by_hf=hr is not None and hr.detail is not None)
+        reached = [(leaf.grad, g) for leaf, g in pending.others if leaf.grad is not None]
+        for grad, g in reached:
+            grad.add_(g.to(grad), alpha=scale * λ)
+        pending.others = [(leaf, g) for leaf, g in pending.others if leaf.grad is None]
         pending.merged.update(names or ("detail",))
         self._counts["merges"] += 1
         if first and hr is not None and pending.output is not None and done.task in pending.screen:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple, cast
@@ -27,7 +27,15 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide
 from clear_strategies.merging.recorded_work import RecordedWork, replays_on, why_not_recorded
 from clear_strategies.strategies.base import stored
-from integration.autograd_shot import AutogradShot, HostOutput, Target, every_number, side_of_parameters, to_parameters
+from integration.autograd_shot import (
+    AutogradShot,
+    HostOutput,
+    Target,
+    every_number,
+    side_of_parameters,
+    to_others,
+    to_parameters,
+)
 from integration.host import Host
 from integration.views import enlarged_mask
 from rasterizers.autograd import BackwardHook, Drawing
@@ -114,6 +122,19 @@ class _RenderInputs(NamedTuple):
         return AutogradShot(image, r.means2d, r.visible, asked.params, drawings=(drawing,), mask=self.mask)
 
 
+class OfHr(NamedTuple):
+    """What HR brings.
+
+    Args:
+        side: its gradients. losses: by name, for the log.
+        others: other tensors that the loop trains, e.g. of a network that makes colours, each with its gradient of HR.
+    """
+
+    side: HrSide
+    losses: Mapping[str, Number]
+    others: Sequence[tuple[Tensor, Tensor]] = ()
+
+
 _Made = tuple[Any, dict[str, Number]]
 _Work = Callable[[_RenderInputs], _Made]
 """Work on these inputs, or on a recording's copies of them. It returns its result, and numbers by name."""
@@ -143,10 +164,8 @@ class HrDrawing:
         """Return True if HR takes part at t. No iteration is skipped while the host's densifier reads a score."""
         return self._conductor.wants_hr(t, scored=self.is_scored and self._conductor.may_densify(t))
 
-    def hr(
-        self, step: Step, gate: Float[Tensor, " N"] | None, render_at: RenderAt
-    ) -> tuple[HrSide, Mapping[str, Number]]:
-        """The gradients of HR, of the raw parameters if HR takes part in the merge; and its losses by name, for the log."""
+    def hr(self, step: Step, gate: Float[Tensor, " N"] | None, render_at: RenderAt) -> OfHr:
+        """The gradients of HR, of the raw parameters if HR takes part in the merge."""
         self._counts["HR renders"] += 1
         conductor, view = self._conductor, step.view
         mask, drawn = self._masks.get(view.name), render_at("hr", gate, view)
@@ -166,9 +185,10 @@ class HrDrawing:
             shot = replace(shot, image=shot.image * fine.to(shot.image))
         apart = shot.drawing is not None or "detail" in shot.params
         hr = conductor.hr_gradients(shot, step, AutogradShot.gradients, apart=apart)
-        if conductor.objective.lambda_hr(step.t) > 0:
-            hr = side_of_parameters(hr, shot.inputs, shot.params)
-        return hr, hr.losses
+        if conductor.objective.lambda_hr(step.t) == 0:
+            return OfHr(hr, hr.losses)
+        others = to_others(hr.g, shot.inputs, shot.params)
+        return OfHr(side_of_parameters(hr, shot.inputs, shot.params), hr.losses, others)
 
     def extra_view(self, extra: ExtraView, view: View, t: int, render_at: RenderAt) -> Grads:
         """The gradient of an extra view, which is drawn without gate and f_det."""
@@ -180,9 +200,7 @@ class HrDrawing:
 
     @in_full_precision
     @torch.no_grad()
-    def _own_hr(
-        self, asked: Drawable, step: Step, mask: Float[Tensor, "H W 1"] | None
-    ) -> tuple[HrSide, Mapping[str, Number]]:
+    def _own_hr(self, asked: Drawable, step: Step, mask: Float[Tensor, "H W 1"] | None) -> OfHr:
         """As `hr`, drawn by this package."""
         conductor, t, view = self._conductor, step.t, step.view
         photo = view.hr.over(conductor.background(t), view.background)
@@ -199,7 +217,8 @@ class HrDrawing:
         seen = hr.step if self.replays is None else hr.step.copied()
         # The losses of a recording are overwritten by the next replay.
         hr = replace(hr, step=replace(seen, t=t, view=view, params=step.params), losses={})
-        return side_of_parameters(hr, asked.drawn, asked.params), losses
+        others = to_others(hr.g, asked.drawn, asked.params)
+        return OfHr(side_of_parameters(hr, asked.drawn, asked.params), losses, others)
 
     @in_full_precision
     @torch.no_grad()

@@ -135,6 +135,7 @@ class Pending:
     Args:
         nth: its number. t: the iteration. output: None once all trained parameters are merged.
         hr: the gradients of HR; None: HR takes no part. losses: of HR by name, for the log.
+        others: other tensors that the loop trains, each with its gradient of HR, which is still to be added.
         screen: the screen gradient of LR by the number of its pass, if a densifier reads it.
         merged: the parameters whose gradients are merged.
     """
@@ -145,6 +146,7 @@ class Pending:
     output: HostOutput | None
     hr: HrSide | None
     losses: Mapping[str, Number]
+    others: Sequence[tuple[Tensor, Tensor]] = ()
     screen: dict[int, Tensor] = field(default_factory=dict)
     merged: set[str] = field(default_factory=set)
 

@@ -348,13 +348,16 @@ def reference(loop: Loop, conductor, p, view):
     objective, names = conductor.objective, [name for name in PARAMETERS if p[name].requires_grad]
     before = {name: x.grad for name, x in p.items()}
     picture = pictures(loop, functools.partial(unrecorded, backend="torch"), p, [])
-    image, of = picture(view.hr, rgb_offset=p["detail"])[0][0], [p[name] for name in (*names, "detail")]
+    image = picture(view.hr, rgb_offset=p["detail"])[0][0]
+    beside = "offset", "gain", "shift"
+    of = [p[name] for name in (*names, *beside, "detail")]
     weights = 1, objective.lambda_hf
     base, hf = (
         torch.autograd.grad(image, of, w * c, retain_graph=True, materialize_grads=True, allow_unused=True)
         for w, c in zip(weights, objective.hr(image.detach(), view.hr.image.to(image)).cotangents, strict=True)
     )
-    hr = Grads({name: b + h for name, b, h in zip(names, base, hf, strict=False)})
+    of_all = {name: b + h for name, b, h in zip((*names, *beside), base, hf, strict=False)}
+    hr = Grads({name: of_all[name] for name in names})
     for x in p.values():
         x.grad = None
     loss = loss_of(loop, p, picture(view.lr), view, [])
@@ -367,7 +370,8 @@ def reference(loop: Loop, conductor, p, view):
         merged = conductor.strategies[0].correct(lr, hr, Step(1, view))
     found = {name: scale * (g + merged[name]) for name, g in lr.items()}
     found["detail"] = total(p["detail"].grad, scale * hf[-1] if lr else None)
-    found |= {name: p[name].grad for name in ("offset", "gain", "shift")}
+    found |= {name: total(p[name].grad, scale * of_all[name]) if lr and p[name].grad is not None else p[name].grad
+              for name in beside}  # fmt: skip
     return {name: total(before[name], found.get(name)) for name in p}, bool(lr)
 
 
