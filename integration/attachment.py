@@ -137,9 +137,7 @@ class Attachment:
             view = conductor.skips.view(view, t)
             hr = self._hr.hr(replace(step, view=view), z, apart)
         self._step = step if hr is None else hr.side.step
-        if (
-            self.passes == 0 or not self._steps.has_extra_views
-        ):  # of one iteration, however many a step of the host sums
+        if self.passes == 0 or not self._steps.has_extra_views:  # once for all passes of a step
             extra_views = conductor.extra_views(t)
             self._steps.follow_by(leaves, (self._hr.extra_view(x, view, t, apart) for x in extra_views))
         output = _lr(render_at, z, view)
