@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rasterizers.interface import RasterSettings
-from rasterizers.reference.projection import CONIC, DEPTH, MEAN, OPACITY, RGB
+from rasterizers.reference.projection import DEPTH, MEAN, OPACITY, RGB, SHEAR
 from rasterizers.reference.tiles import TileGrid, TileLists
 
 
@@ -150,9 +150,9 @@ def _composite(
     through: Float[Tensor, "B P"],
 ) -> Slab:
     dx, dy = _offsets(rows, tiles, grid)
-    A, B, C = (x[..., None, None] for x in rows[..., CONIC].unbind(-1))
+    A, S, D = (x[..., None, None] for x in rows[..., SHEAR].unbind(-1))
 
-    exponent = torch.addcmul(-0.5 * A * dx * dx, -B * dx, dy).sub_(0.5 * C * dy * dy)
+    exponent = torch.addcmul(dx, S, dy).square_().mul_(-0.5 * A).sub_(0.5 * D * dy * dy)
     splat = exponent.flatten(2).exp_().mul_(rows[..., OPACITY])
     alpha = _cut_below(splat.clamp_max(settings.alpha_max), settings.alpha_min)
     after = torch.cumprod(1 - alpha, dim=1).mul_(through[:, None])
@@ -178,8 +178,9 @@ def _absolute(
 ) -> Float[Tensor, "B L 2"]:
     """Σ|∂L/∂u| over the pixels of the tiles."""
     dx, dy = _offsets(rows, tiles, grid)
-    A, B, C = (x[..., None, None] for x in rows[..., CONIC].unbind(-1))
-    return torch.stack([(q * d.flatten(2)).abs().sum(-1) for d in (A * dx + B * dy, B * dx + C * dy)], -1)
+    A, S, D = (x[..., None, None] for x in rows[..., SHEAR].unbind(-1))
+    along = A * (dx + S * dy)
+    return torch.stack([(q * d.flatten(2)).abs().sum(-1) for d in (along, S * along + D * dy)], -1)
 
 
 def _table_gradient(
@@ -191,20 +192,21 @@ def _table_gradient(
     monomials: Float[Tensor, "P 6"],
 ) -> Float[Tensor, "B L _"]:
     """The gradient of the table's rows from q = ∂L/∂(log splat) per pixel, by q's moments about the Gaussian's centre."""
-    # Moments about the tile's centre first, because one matrix product then serves all tiles.
+    # Moments about the tile's centre first, because one matrix product then serves all tiles; then along s = x + S y, and about
+    # the Gaussian's centre.
     m, mx, my, mxx, mxy, myy = (q @ monomials).unbind(-1)
     u, v = rows[..., MEAN].unbind(-1)
-    A, B, C = rows[..., CONIC].unbind(-1)
+    A, S, D = rows[..., SHEAR].unbind(-1)
     columns, rows_of_tiles = (tiles % grid.columns).to(u.dtype), (tiles // grid.columns).to(v.dtype)
     ox = ((columns + 0.5) * grid.tile)[:, None] - u
     oy = ((rows_of_tiles + 0.5) * grid.tile)[:, None] - v
-    qx, qy = mx + ox * m, my + oy * m
-    qxx = mxx + 2 * ox * mx + ox * ox * m
-    qxy = mxy + ox * my + oy * mx + ox * oy * m
-    qyy = myy + 2 * oy * my + oy * oy * m
+    os, ms, msy = ox + S * oy, mx + S * my, mxy + S * myy
+    mss = mxx + S * (mxy + msy)
+    qs, qy = ms + os * m, my + oy * m
+    qss, qsy, qyy = mss + os * (ms + qs), msy + os * my + oy * qs, myy + oy * (my + qy)
     d_opacity = m / rows[..., OPACITY][..., 0].clamp_min(torch.finfo(rows.dtype).tiny)
-    d_mean_conic_opacity = (A * qx + B * qy, B * qx + C * qy, -0.5 * qxx, -qxy, -0.5 * qyy, d_opacity)
-    return torch.cat((torch.stack(d_mean_conic_opacity, dim=-1), d_channels), dim=-1)
+    geometry = (A * qs, S * A * qs + D * qy, -0.5 * qss, -A * qsy, -0.5 * qyy, d_opacity)
+    return torch.cat((torch.stack(geometry, dim=-1), d_channels), dim=-1)
 
 
 def _monomials(tile: int, like: Tensor) -> Float[Tensor, "P 6"]:

@@ -18,23 +18,31 @@ from rasterizers.geometry import BLACK, REACH, depths, rotation_matrix, spherica
 from rasterizers.interface import Camera, RasterSettings, SplatGradients, Splats
 
 # Columns of the table that blending reads, one row per projected Gaussian; the last one is there if depth is drawn.
-MEAN, CONIC, OPACITY, RGB, DEPTH = slice(0, 2), slice(2, 5), slice(5, 6), slice(6, 9), slice(9, 10)
+MEAN, SHEAR, OPACITY, RGB, DEPTH = slice(0, 2), slice(2, 5), slice(5, 6), slice(6, 9), slice(9, 10)
 
 
 class Footprints(NamedTuple):
     """What M Gaussians cover of an image, in the order of their rows.
 
     Args:
-        means2d: centre, px. conics: (A, B, C) of ½(A dx² + 2B dx dy + C dy²), 1/px².
+        means2d: centre, px.
+        shears: (A, S, D) of the exponent ½(A (dx + S dy)² + D dy²), A and D in 1/px². The expanded `conics` would lose all digits
+            far along a thin Gaussian, where their terms cancel.
         deviations: standard deviations along x and y, px.
         compensation: the opacity's factor, where Mip's antialiasing is on.
     """
 
     means2d: Float[Tensor, "M 2"]
     depths: Float[Tensor, " M"]
-    conics: Float[Tensor, "M 3"]
+    shears: Float[Tensor, "M 3"]
     deviations: Float[Tensor, "M 2"]
     compensation: Float[Tensor, " M"]
+
+    @property
+    def conics(self) -> Float[Tensor, "M 3"]:
+        """(A, B, C) of the same exponent, ½(A dx² + 2B dx dy + C dy²); 1/px²."""
+        A, S, D = self.shears.unbind(-1)
+        return torch.stack((A, A * S, A * S * S + D), -1)
 
     @torch.no_grad()
     def radii(self, opacities: Float[Tensor, " M"], alpha_min: float) -> Float[Tensor, "M 2"]:
@@ -72,7 +80,7 @@ class Projection:
     @property
     def _columns(self) -> list[Tensor]:
         f = self.footprints
-        return [f.means2d, f.conics, self.opacities, self.rgb, *([f.depths] if self.draws_depth else [])]
+        return [f.means2d, f.shears, self.opacities, self.rgb, *([f.depths] if self.draws_depth else [])]
 
     def table(self) -> Float[Tensor, "M1 W"]:
         """The columns that blending reads, plus an empty row that pads the tile lists."""
@@ -92,7 +100,7 @@ class Projection:
         inputs = (*self.leaves, self.raw_rgb)
         by_cotangent = []
         for g in table_gradients[:, : self.rows.shape[0]]:
-            parts = zip((MEAN, CONIC, OPACITY, RGB, DEPTH), self._columns, strict=False)
+            parts = zip((MEAN, SHEAR, OPACITY, RGB, DEPTH), self._columns, strict=False)
             cotangents = [g[:, columns].reshape(x.shape) for columns, x in parts]
             gradients = torch.autograd.grad(
                 self._columns, inputs, cotangents, retain_graph=True, materialize_grads=True
@@ -135,9 +143,9 @@ def footprints(
     area = torch.linalg.vector_norm(torch.linalg.cross(tx, ty), dim=-1)  # √det(T Tᵀ), det = Σ minors²
     blur = k * (a + c) + k * k
     det = area * area + blur  # det Σ'
-    conics = torch.stack((c + k, -b, a + k), dim=-1) / (det * unit * unit)[:, None]
+    shears = torch.stack(((c + k) / (det * unit * unit), -b / (c + k), 1 / ((c + k) * unit * unit)), dim=-1)
     deviations = torch.stack((a + k, c + k), dim=-1).sqrt() * unit[:, None]
-    return Footprints(means2d, z, conics, deviations, _compensation(area, blur))
+    return Footprints(means2d, z, shears, deviations, _compensation(area, blur))
 
 
 def project(splats: Splats, camera: Camera, settings: RasterSettings, *, depth: bool) -> Projection:

@@ -125,15 +125,15 @@ def _ellipse_reaches(
     that face the centre; on a side it is at the clamped vertex of a parabola.
     """
     u, v = projection.footprints.means2d.detach()[row].unbind(-1)
-    A, B, C = projection.footprints.conics.detach()[row].unbind(-1)
+    A, S, D = projection.footprints.shears.detach()[row].unbind(-1)
     left, top = tile_x * grid.tile + 0.5 - u, tile_y * grid.tile + 0.5 - v
     # The tiles of the last column and row may extend beyond the image, where there are no pixels.
     right = torch.minimum(left + grid.tile - 1, grid.width - 0.5 - u)
     bottom = torch.minimum(top + grid.tile - 1, grid.height - 0.5 - v)
     near_x, near_y = _nearest_to_zero(left, right), _nearest_to_zero(top, bottom)
-    on_side_x = torch.clamp(-B * near_x / C, top, bottom)
-    on_side_y = torch.clamp(-B * near_y / A, left, right)
-    power = torch.minimum(_power(A, B, C, near_x, on_side_x), _power(A, B, C, on_side_y, near_y))
+    on_side_x = torch.clamp(-A * S * near_x / (A * S * S + D), top, bottom)
+    on_side_y = torch.clamp(-S * near_y, left, right)
+    power = torch.minimum(_power(A, S, D, near_x, on_side_x), _power(A, S, D, on_side_y, near_y))
     return power <= projection.power_max[row]
 
 
@@ -141,5 +141,5 @@ def _nearest_to_zero(low: Tensor, high: Tensor) -> Tensor:
     return torch.clamp(torch.zeros_like(low), low, high)
 
 
-def _power(A: Tensor, B: Tensor, C: Tensor, dx: Tensor, dy: Tensor) -> Tensor:
-    return 0.5 * (A * dx * dx + C * dy * dy) + B * dx * dy
+def _power(A: Tensor, S: Tensor, D: Tensor, dx: Tensor, dy: Tensor) -> Tensor:
+    return 0.5 * (A * (dx + S * dy).square() + D * dy * dy)

@@ -34,16 +34,28 @@ def reaches_image(ellipse: Ellipse, grid: Grid) -> wp.bool:
     low = corner - ellipse.whole - ellipse.rest
     high = wp.vec2(wp.float32(grid.size[0]), wp.float32(grid.size[1])) - corner - ellipse.whole - ellipse.rest
     near_x, near_y = wp.clamp(0.0, low[0], high[0]), wp.clamp(0.0, low[1], high[1])
-    on_x = wp.clamp(-ellipse.B * near_x / (2.0 * ellipse.C), low[1], high[1])
-    on_y = wp.clamp(-ellipse.B * near_y / (2.0 * ellipse.A), low[0], high[0])
-    at_x = exponent(ellipse.A, ellipse.B, ellipse.C, near_x, on_x)
-    at_y = exponent(ellipse.A, ellipse.B, ellipse.C, on_y, near_y)
+    on_x = wp.clamp(tallest(ellipse) * near_x, low[1], high[1])
+    on_y = wp.clamp(-ellipse.S * near_y, low[0], high[0])
+    at_x = exponent(ellipse.A, ellipse.D, near_x + ellipse.S * on_x, on_x)
+    at_y = exponent(ellipse.A, ellipse.D, on_y + ellipse.S * near_y, near_y)
     return wp.min(at_x, at_y) <= ellipse.reach
 
 
 @wp.func
-def exponent(A: wp.float32, B: wp.float32, C: wp.float32, dx: wp.float32, dy: wp.float32) -> wp.float32:
-    return dx * (A * dx + B * dy) + C * dy * dy
+def exponent(A: wp.float32, D: wp.float32, u: wp.float32, dy: wp.float32) -> wp.float32:
+    return A * u * u + D * dy * dy
+
+
+@wp.func
+def precision_y(ellipse: Ellipse) -> wp.float32:
+    """The exponent's coefficient of dy²."""
+    return ellipse.A * ellipse.S * ellipse.S + ellipse.D
+
+
+@wp.func
+def tallest(ellipse: Ellipse) -> wp.float32:
+    """The dy per dx of the smallest exponent at this dx."""
+    return -ellipse.A * ellipse.S / precision_y(ellipse)
 
 
 @wp.func
@@ -70,7 +82,7 @@ def columns_of(ellipse: Ellipse, row: wp.int32, grid: Grid) -> tuple[wp.int32, w
     if not (first <= ellipse.half[1] + SLACK and last >= -ellipse.half[1] - SLACK):
         return wp.int32(0), wp.int32(0)
     low, high = wp.max(first, -ellipse.half[1]), wp.min(last, ellipse.half[1])
-    rightmost = -ellipse.B / (2.0 * ellipse.C) * ellipse.half[0]
+    rightmost = tallest(ellipse) * ellipse.half[0]
     right = chord(ellipse, wp.clamp(rightmost, low, high), 1.0)
     left = chord(ellipse, wp.clamp(-rightmost, low, high), -1.0)
     edge = wp.float32(TILE)
@@ -85,7 +97,7 @@ def chord(ellipse: Ellipse, dy: wp.float32, side: wp.float32) -> wp.float32:
     """The x where the ellipse ends to the left (-1) or right (1), dy px below its centre."""
     t = dy / wp.max(ellipse.half[1], 1e-20)
     width = wp.sqrt(ellipse.reach / ellipse.A) * wp.sqrt(wp.max(1.0 - t * t, 0.0))
-    return ellipse.whole[0] + ellipse.rest[0] - ellipse.B / (2.0 * ellipse.A) * dy + side * width
+    return ellipse.whole[0] + ellipse.rest[0] - ellipse.S * dy + side * width
 
 
 @wp.func

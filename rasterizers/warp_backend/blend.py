@@ -29,7 +29,7 @@ from rasterizers.warp_backend.types import PIXELS, SUMS, Cuts, Ellipse, Grid, Mo
 wp.set_module_options({"enable_backward": False})
 
 Near: Final[Any] = wp.types.vector(length=9, dtype=wp.float32)
-"""A Gaussian as a tile's pixels see it: its centre from the tile's first pixel, px; A, B and C; opacity; colour."""
+"""A Gaussian as a tile's pixels see it: its centre from the tile's first pixel, px; A, S and D; opacity; colour."""
 
 
 @wp.func
@@ -51,19 +51,20 @@ def near(pair: wp.int32, tile: wp.int32, listed: wp.array[wp.int32], ellipses: w
     ellipse, first = ellipses[listed[pair]], pixel_of(tile, 0, grid)
     centre = ellipse.whole - wp.vec2(wp.float32(first[0]), wp.float32(first[1])) + (ellipse.rest - wp.vec2(0.5, 0.5))
     rgb = wp.max(ellipse.rgb, wp.vec3(0.0, 0.0, 0.0))
-    return Near(centre[0], centre[1], ellipse.A, ellipse.B, ellipse.C, ellipse.opacity, rgb[0], rgb[1], rgb[2])
+    return Near(centre[0], centre[1], ellipse.A, ellipse.S, ellipse.D, ellipse.opacity, rgb[0], rgb[1], rgb[2])
 
 
 @wp.func
 def offset_of(within: wp.int32, g: Near) -> wp.vec2:
-    """The vector from the Gaussian's centre to the pixel's."""
-    return wp.vec2(wp.float32(within % TILE) - g[0], wp.float32(within / TILE) - g[1])
+    """(u, dy) of `Ellipse` of a pixel."""
+    dy = wp.float32(within / TILE) - g[1]
+    return wp.vec2(wp.float32(within % TILE) - g[0] + g[3] * dy, dy)
 
 
 @wp.func
 def alpha_of(g: Near, d: wp.vec2) -> wp.float32:
     """α before its cap."""
-    return g[5] * wp.exp(-exponent(g[2], g[3], g[4], d[0], d[1]))
+    return g[5] * wp.exp(-exponent(g[2], g[4], d[0], d[1]))
 
 
 @wp.func
@@ -370,8 +371,9 @@ def blend_vjp(K: int, lanes: int, shuffles: bool, absolute: bool = False) -> Any
                                 for m in range(SUMS):
                                     part[W * k + m] += moments[m]
                                 if wp.static(absolute):
-                                    part[W] += wp.abs(q * (2.0 * g[2] * d[0] + g[3] * d[1]))
-                                    part[W + 1] += wp.abs(q * (g[3] * d[0] + 2.0 * g[4] * d[1]))
+                                    along = 2.0 * g[2] * d[0]
+                                    part[W] += wp.abs(q * along)
+                                    part[W + 1] += wp.abs(q * (g[3] * along + 2.0 * g[4] * d[1]))
                             for c in range(3):
                                 part[W * k + SUMS + c] += weight * v[j * K + k, c]
                             behind[j, k] = behind[j, k] + weight * light_k

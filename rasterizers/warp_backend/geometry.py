@@ -52,9 +52,9 @@ class Footprint:
     normal: wp.vec3  # X × Y / size²
     area: wp.float32  # length of `normal`, √det(T Tᵀ) / size²
     det: wp.float32  # det Σ' / size⁴
-    xx: wp.float32  # Σ'⁻¹
-    xy: wp.float32
-    yy: wp.float32
+    A: wp.float32  # dᵀ Σ'⁻¹ d = A (dx + S dy)² + D dy²: a sum of squares, without cancellation
+    S: wp.float32
+    D: wp.float32
     compensation: wp.float32  # Mip-Splatting: √(det T Tᵀ / det Σ'), opacity factor that makes up for the kernel's blur
 
 
@@ -118,10 +118,10 @@ def footprint_of(g: Geometry, grid: Grid, cuts: Cuts) -> Footprint:
     area2 = wp.dot(f.normal, f.normal)
     f.area = wp.sqrt(area2)
     f.det = area2 + f.kernel * (f.a + f.c) + f.kernel * f.kernel
-    inverse = shrink * shrink / f.det
-    f.xx = (f.c + f.kernel) * inverse
-    f.xy = -wp.dot(x, y) * inverse
-    f.yy = (f.a + f.kernel) * inverse
+    blurred = f.c + f.kernel
+    f.A = shrink * shrink * blurred / f.det
+    f.S = -wp.dot(x, y) / blurred
+    f.D = shrink * shrink / blurred
     f.compensation = 1.0
     if cuts.antialiased:
         f.compensation = f.area / wp.sqrt(f.det)
@@ -130,36 +130,38 @@ def footprint_of(g: Geometry, grid: Grid, cuts: Cuts) -> Footprint:
 
 @wp.func
 def screen_vjp(f: Footprint, first: wp.vec2) -> wp.vec2:
-    """∂L/∂u = Σ'⁻¹ (Σ q dx, Σ q dy), of the projected centre."""
-    return wp.vec2(f.xx * first[0] + f.xy * first[1], f.xy * first[0] + f.yy * first[1])
+    """The gradient of the projected centre, Σ'⁻¹ Σ q d, from Σ q u and Σ q d_y."""
+    along = f.A * first[0]
+    return wp.vec2(along, f.S * along + f.D * first[1])
 
 
 @wp.func
 def geometry_vjp(
     pose: Pose, grid: Grid, cuts: Cuts, g: Geometry, f: Footprint, scale: wp.vec3, sums: Moments
 ) -> tuple[wp.vec3, wp.vec4, wp.vec3]:
-    """The VJP of the projection, with M the second moments and ρ the compensation: ∂L/∂T = Σ'⁻¹ M Σ'⁻¹ T + q ∂ log ρ/∂T.
+    """The VJP of the projection, with ρ the compensation: ∂L/∂T = Σ'⁻¹ (Σ q d dᵀ) Σ'⁻¹ T + q ∂ log ρ/∂T.
 
     Returns the gradients of mean, quaternion and scale.
     """
     screen = screen_vjp(f, wp.vec2(sums[1], sums[2]))
     du, dv = screen[0], screen[1]
 
-    # ∂L/∂T, row by row, with P = Σ'⁻¹ T. The rows of P, (y × n + κ x)/det and (n × x + κ y)/det with the rows x and y of T, have
-    # sums without cancellation; products of Σ'⁻¹ and T would lose all digits for a needle.
+    # ∂L/∂T, row by row. In the coordinates (u, d_y) of `Ellipse`, Σ'⁻¹ is the diagonal (A, D), and the rows of T are X + S Y and
+    # Y. The first times A is (y × n + κ x)/det with the rows x and y of T: sums without cancellation, where those of X + S Y lose
+    # all digits for a needle.
     shrink = 1.0 / f.size
     x, y = f.X * shrink, f.Y * shrink
-    along_x, along_y = wp.cross(y, f.normal), wp.cross(f.normal, x)
-    px, py = (along_x + f.kernel * x) * (shrink / f.det), (along_y + f.kernel * y) * (shrink / f.det)
-    mx, my = sums[3] * px + sums[4] * py, sums[4] * px + sums[5] * py
-    dX, dY = f.xx * mx + f.xy * my, f.xy * mx + f.yy * my
+    along_x = wp.cross(y, f.normal)
+    pu, py = (along_x + f.kernel * x) * (shrink / f.det), f.D * f.Y
+    dX = f.A * (sums[3] * pu + sums[4] * py)
+    dY = f.S * dX + f.D * (sums[4] * pu + sums[5] * py)
     if cuts.antialiased:
         # log ρ = ½ log area² - ½ log(area² + κ tr + κ²). This form avoids the cancellation for large Gaussians:
         # ∂ log ρ/∂x = κ/det ((tr + κ)/area² (y × n) - x), and for y with n × x.
         weight = sums[0] * shrink * f.kernel / f.det
         turn = (f.a + f.c + f.kernel) / (f.area * f.area)
         dX += weight * (turn * along_x - x)
-        dY += weight * (turn * along_y - y)
+        dY += weight * (turn * wp.cross(f.normal, x) - y)
 
     # T = J axes: gradients of the axes, of 1/z, and of the tangents where they are not clamped.
     gx, gy = grid.focal[0] * g.inverse_z * dX, grid.focal[1] * g.inverse_z * dY

@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from rasterizers.geometry import BLACK, REACH
-from rasterizers.warp_backend.bins import count_tiles, depth_key, reaches_image
+from rasterizers.warp_backend.bins import count_tiles, depth_key, precision_y, reaches_image
 from rasterizers.warp_backend.colour import colour_of
 from rasterizers.warp_backend.geometry import (
     Footprint,
@@ -38,9 +38,9 @@ def ellipse_at(u: wp.float64, v: wp.float64, f: Footprint, opacity: wp.float32, 
     ellipse = Ellipse()
     ellipse.whole = wp.vec2(wp.float32(whole_u), wp.float32(whole_v))
     ellipse.rest = wp.vec2(wp.float32(u - whole_u), wp.float32(v - whole_v))
-    ellipse.A = 0.5 * f.xx
-    ellipse.B = f.xy
-    ellipse.C = 0.5 * f.yy
+    ellipse.A = 0.5 * f.A
+    ellipse.S = f.S
+    ellipse.D = 0.5 * f.D
     ellipse.opacity = opacity * f.compensation
     ellipse.reach = wp.log(wp.max(ellipse.opacity, 1e-30) / cuts.alpha_min) * 1.001 + 1e-3
     ellipse.half = half_box(f, wp.sqrt(2.0 * wp.max(ellipse.reach, 0.0)))
@@ -50,7 +50,7 @@ def ellipse_at(u: wp.float64, v: wp.float64, f: Footprint, opacity: wp.float32, 
 @wp.func
 def is_visible(ellipse: Ellipse, grid: Grid) -> wp.bool:
     """Whether the ellipse reaches the image. The conditions say which are kept, because NaN fails each."""
-    visible = ellipse.reach > 0.0 and ellipse.A < HUGE and ellipse.C < HUGE
+    visible = ellipse.reach > 0.0 and ellipse.A < HUGE and precision_y(ellipse) < HUGE
     visible = visible and wp.abs(ellipse.whole[0]) < HUGE and wp.abs(ellipse.whole[1]) < HUGE
     visible = visible and ellipse.half[0] >= 0.0 and ellipse.half[1] >= 0.0
     if not visible:

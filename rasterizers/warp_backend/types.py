@@ -16,7 +16,7 @@ SUMS: Final = 6
 """Sums of a pair for one cotangent before those of the colour: q = ∂L/∂(log alpha) and its moments."""
 
 Moments: Final[Any] = wp.types.vector(length=SUMS, dtype=wp.float32)
-"""Those sums over pixels: q times 1, d_x, d_y, d_x², d_x d_y and d_y² with the vector d from the centre to a pixel."""
+"""Those sums over pixels: q times 1, u, d_y, u², u d_y and d_y² with `Ellipse`'s u and d_y of the pixel."""
 
 
 def width_of(K: int, absolute: bool) -> int:
@@ -66,14 +66,17 @@ class Cuts:
 
 @wp.struct
 class Ellipse:
-    """A projected Gaussian: alpha = opacity · exp(-(A dx² + B dx dy + C dy²)) at (dx, dy) px from its centre."""
+    """A projected Gaussian: alpha = opacity · exp(-(A u² + D dy²)) with u = dx + S dy, at (dx, dy) px from its centre.
+
+    A conic's expanded form, A dx² + B dx dy + C dy², would lose all digits far along a thin Gaussian, where its terms cancel.
+    """
 
     whole: wp.vec2  # the pixel corner nearest to the centre, px: at 1,000 px a float32 resolves 6e-5 px
     rest: wp.vec2  # the centre minus `whole`
     A: wp.float32
-    B: wp.float32
-    C: wp.float32
+    S: wp.float32
+    D: wp.float32
     opacity: wp.float32  # after the Mip compensation
-    reach: wp.float32  # alpha >= alpha_min within A dx² + B dx dy + C dy² <= reach, with a margin
+    reach: wp.float32  # alpha >= alpha_min within A u² + D dy² <= reach, with a margin
     half: wp.vec2  # half the box around that region, px
     rgb: wp.vec3  # before its clamp at 0

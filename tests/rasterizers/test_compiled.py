@@ -29,6 +29,9 @@ from tests.helpers.backends import (
     require_same_bits,
 )
 
+WITH_REFERENCE = pytest.mark.parametrize(
+    "backend", [pytest.param(make, id=name, marks=needs(name)) for name, make in EVERY.items()]
+)
 WITH_DEPTH = pytest.mark.parametrize("depth", [False, True], ids=["image", "depth"])
 
 
@@ -51,7 +54,7 @@ def require_reference(backend, splats, view, v, *, depth=False, **settings):
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda c: c.__name__)
-@pytest.mark.parametrize("backend", [pytest.param(make, id=name, marks=needs(name)) for name, make in EVERY.items()])
+@WITH_REFERENCE
 def test_every_backend_passes_the_checks(backend, check):
     """The reference, too, and each instruction set."""
     check(backend)
@@ -92,7 +95,7 @@ def test_gradients_of_needles_agree_with_float64(backend, length):
     found, expected = backend()(splats, view).vjp(v), exact(splats, view).vjp(v.double())
     for name in ATTRIBUTES:
         a, b = gradient_of(found, name), gradient_of(expected, name)
-        assert float((a - b).norm()) <= 3e-4 * float(b.norm()), name
+        assert float((a - b).norm()) <= 5e-5 * float(b.norm()), name
 
 
 @backends(dtype=torch.float32)
@@ -136,12 +139,33 @@ def test_needles_keep_their_shape(backend, aspect, pixels):
     for i in range(0, 24, 5):
         splats, image, expected = needle(aspect, pixels, i * math.pi / 24)
         found = backend(**CLEAN)(splats, camera(64, 64))
-        assert float((found.image.double() - image).abs().max()) < 5e-5
+        assert float((found.image.double() - image).abs().max()) < 2e-6
         ours = found.vjp(cotangents(1, 64, 64))
         for name in ("means", "scales", "opacities"):
             a, b = gradient_of(ours, name).double(), gradient_of(expected, name)
             assert bool(a.isfinite().all())
-            assert float((a - b).norm()) <= 2e-3 * float(b.norm()) + 1e-6, (name, i)
+            assert float((a - b).norm()) <= 2e-4 * float(b.norm()) + 1e-8, (name, i)
+
+
+@pytest.mark.parametrize("turned", [0.5, 1.2, 2.5])
+@WITH_REFERENCE
+def test_far_along_a_needle_nothing_cancels(backend, turned):
+    """The image shows what lies 600 px from the centre of a needle 0.3 px wide. The terms of its conic are near 10^6 there."""
+    view, v = camera(64, 64), cotangents(1, 64, 64)
+    pixel = 4.0 / view.fx
+    away = torch.tensor([[600 * math.cos(turned) + 0.7, 600 * math.sin(turned) + 0.9, 0.0]]) * pixel
+    splats = replace(
+        needle(1e3, 400.0, turned)[0], means=torch.tensor([[0.0, 0.0, 4.0]]) + away,
+        scales=torch.tensor([[400.0, 1e-3, 1e-3]]) * pixel,
+    )  # fmt: skip
+    settings = {**CLEAN, "antialiased": False}
+    found, right = backend(**settings)(splats, view), exact(splats, view, **settings)
+    assert float(right.alpha.max()) > 0.1
+    assert float((found.image.double() - right.image).abs().max()) < 2e-5
+    ours, expected = found.vjp(v), right.vjp(v.double())
+    for attribute in ("means", "quats", "scales", "opacities", "screen"):
+        a, b = gradient_of(ours, attribute).double(), gradient_of(expected, attribute)
+        assert float((a - b).norm()) <= 1e-3 * float(b.norm()), attribute
 
 
 # ---- the same bits -----------------------------------------------------------------------------------------------

@@ -76,8 +76,8 @@ CLEAR_INLINE void store_block(T* image, int width, int height, int X, int Y, con
 template <class T>
 CLEAR_INLINE Lanes<T> exponent(const Ellipse<T>& e, const Lanes<T>& dx, const Lanes<T>& dy) {
   using L = Lanes<T>;
-  L along = L(e.A) * dx + L(e.B) * dy;
-  return L(e.peak) - dx * along - L(e.C) * dy * dy;
+  const L u = dx + L(e.S) * dy;
+  return L(e.peak) - L(e.A) * u * u - L(e.D) * dy * dy;
 }
 
 // Blends one segment into a block; segments after the first continue from `out` and `end`.
@@ -135,7 +135,7 @@ struct BlockSums {
   static constexpr int kRows = kLanes;  // Gaussians are collected until every lane has one
   T q[K][kRows][kLanes], weight[kRows][kLanes];
   T offset_x[kRows], offset_y[kRows];  // from the Gaussian's centre to the block's
-  T conic[Absolute ? 3 : 1][kRows];
+  T slope[kRows], conic[Absolute ? 2 : 1][kRows];  // S, and A and D without log2(e)/2
   int place[kRows];
 
   // Not inlined: two copies beside the loop over Gaussians would exceed the instruction cache.
@@ -157,26 +157,27 @@ struct BlockSums {
     constexpr int n = L::registers;
     const PixelCentres<T> pixel(0);
     const L dx = pixel.x + L(offset_x[row] - kBlock / 2), dy = pixel.y + L(offset_y[row] - kBlock / 2);
-    const L w = L::load(weight[row]);
+    const L S = slope[row], u = dx + S * dy, w = L::load(weight[row]);
     constexpr int total = K * Sums::kWidth;
     Register all[(total + kQuad - 1) / kQuad * kQuad];
     for (int i = total; i < int(std::size(all)); ++i) all[i] = Register{};
 #pragma GCC unroll 3
     for (int k = 0; k < K; ++k) {
-      const L v = L::load(q[k][row]), along = v * dy;
+      const L v = L::load(q[k][row]), vu = v * u, vy = v * dy;
+      const L moments[6] = {v, vu, vy, vu * u, vu * dy, vy * dy};
       Register* out = all + k * Sums::kWidth;
-      Register m = v.r[0], my = along.r[0], myy = along.r[0] * dy.r[0];
-      for (int i = 1; i < n; ++i) m += v.r[i], my += along.r[i], myy += along.r[i] * dy.r[i];
-      const Register x = dx.r[0], mx = m * x;  // every register holds whole rows of pixels
-      out[0] = m, out[1] = mx, out[2] = my, out[3] = mx * x, out[4] = my * x, out[5] = myy;
+      for (int j = 0; j < 6; ++j) {
+        out[j] = moments[j].r[0];
+        for (int i = 1; i < n; ++i) out[j] += moments[j].r[i];
+      }
       for (int c = 0; c < C; ++c) {
         const L parts = L::load(cotangent[k][c]);
         Register& sum = out[Sums::of_channel(c)] = w.r[0] * parts.r[0];
         for (int i = 1; i < n; ++i) sum += w.r[i] * parts.r[i];
       }
       if constexpr (Absolute) {
-        const L xx = conic[0][row], xy = conic[1][row], yy = conic[2][row];
-        const L each[2] = {absolute(v * (xx * dx + xy * dy)), absolute(v * (xy * dx + yy * dy))};
+        const L along_u = L(conic[0][row]) * u;
+        const L each[2] = {absolute(v * along_u), absolute(v * (S * along_u + L(conic[1][row]) * dy))};
         for (int c = 0; c < 2; ++c) {
           out[6 + kColour + c] = each[c].r[0];
           for (int i = 1; i < n; ++i) out[6 + kColour + c] += each[c].r[i];
@@ -197,32 +198,31 @@ struct BlockSums {
     for (int i = count; i < kRows; ++i) {
       L(T(0)).store(weight[i]);
       for (int k = 0; k < K; ++k) L(T(0)).store(q[k][i]);
-      offset_x[i] = offset_y[i] = T(0);
-      if constexpr (Absolute) conic[0][i] = conic[1][i] = conic[2][i] = T(0);
+      offset_x[i] = offset_y[i] = slope[i] = T(0);
+      if constexpr (Absolute) conic[0][i] = conic[1][i] = T(0);
     }
     L w[kRows];
     for (int i = 0; i < kRows; ++i) w[i] = L::load(weight[i]);
     transpose(w);
-    const L ox = L::load(offset_x), oy = L::load(offset_y);
+    const L S = L::load(slope), oy = L::load(offset_y), ou = L::load(offset_x) + S * oy;
     L all[Sums::kRows][kLanes];
 #pragma GCC unroll 3
     for (int k = 0; k < K; ++k) {
       L v[kRows], *out = all[0] + k * Sums::kWidth;
       for (int i = 0; i < kRows; ++i) v[i] = L::load(q[k][i]);
       transpose(v);
-      moments(v, ox, oy, out);
+      moments(v, S, ou, oy, out);
       L channels[C];
       for (L& channel : channels) channel = T(0);
       for (int p = 0; p < kLanes; ++p)
         for (int c = 0; c < C; ++c) channels[c] += w[p] * L(cotangent[k][c][p]);
       for (int c = 0; c < C; ++c) out[Sums::of_channel(c)] = channels[c];
       if constexpr (Absolute) {
-        const L xx = L::load(conic[0]), xy = L::load(conic[1]), yy = L::load(conic[2]);
         out[6 + kColour] = out[7 + kColour] = L(T(0));
         for (int p = 0; p < kLanes; ++p) {
-          const L dx = ox + L(T(p % kBlock) - T(1.5)), dy = oy + L(T(p / kBlock) - T(1.5));
-          out[6 + kColour] += absolute(v[p] * (xx * dx + xy * dy));
-          out[7 + kColour] += absolute(v[p] * (xy * dx + yy * dy));
+          const L y = T(p / kBlock) - T(1.5), along_u = L::load(conic[0]) * (ou + S * y + L(T(p % kBlock) - T(1.5)));
+          out[6 + kColour] += absolute(v[p] * along_u);
+          out[7 + kColour] += absolute(v[p] * (S * along_u + L::load(conic[1]) * (oy + y)));
         }
       }
     }
@@ -246,8 +246,9 @@ struct BlockSums {
     }
   }
 
-  // Σ v, Σ v·dx, … about the Gaussian's centre, from the moments about the block's centre, whose offsets are constants.
-  static CLEAR_INLINE void moments(const Lanes<T> (&v)[kLanes], const Lanes<T>& ox, const Lanes<T>& oy, Lanes<T>* out) {
+  // Σ v, Σ v·u, … about the Gaussian's centre, from the moments about the block's centre, whose offsets are constants.
+  static CLEAR_INLINE void moments(const Lanes<T> (&v)[kLanes], const Lanes<T>& S, const Lanes<T>& ou, const Lanes<T>& oy,
+                                   Lanes<T>* out) {
     using L = Lanes<T>;
     L m = T(0), mx = T(0), my = T(0), mxx = T(0), mxy = T(0), myy = T(0);
     for (int row = 0; row < kBlock; ++row) {
@@ -258,10 +259,11 @@ struct BlockSums {
       m += sum, mx += first, mxx += second;
       my += y * sum, mxy += y * first, myy += y * y * sum;
     }
-    const L qx = mx + ox * m, qy = my + oy * m;
-    out[0] = m, out[1] = qx, out[2] = qy;
-    out[3] = mxx + ox * (mx + qx);
-    out[4] = mxy + ox * my + oy * qx;
+    const L mu = mx + S * my, muy = mxy + S * myy, muu = mxx + S * (mxy + muy);
+    const L qu = mu + ou * m, qy = my + oy * m;
+    out[0] = m, out[1] = qu, out[2] = qy;
+    out[3] = muu + ou * (mu + qu);
+    out[4] = muy + ou * my + oy * qu;
     out[5] = myy + oy * (my + qy);
   }
 };
@@ -328,9 +330,10 @@ void blend_block_vjp(const Segment<T>& segment, int block, const Settings<T>& s,
     }
     collected.offset_x[count] = centre_x - e.u;
     collected.offset_y[count] = centre_y - e.v;
+    collected.slope[count] = e.S;
     collected.place[count] = place;
     if constexpr (Absolute)  // of the natural logarithm of alpha
-      collected.conic[0][count] = 2 / kLog2E<T> * e.A, collected.conic[1][count] = e.B / kLog2E<T>, collected.conic[2][count] = 2 / kLog2E<T> * e.C;
+      collected.conic[0][count] = 2 / kLog2E<T> * e.A, collected.conic[1][count] = 2 / kLog2E<T> * e.D;
     if (++count == collected.kRows) collected.flush(count, cotangent, sums), count = 0;
   }
   collected.flush(count, cotangent, sums);

@@ -32,12 +32,11 @@ struct Segment {
 template <class T>
 CLEAR_INLINE void block_masks(const Lanes<T> (&e)[kLanes], const Lanes<T>& u, const Lanes<T>& v, std::uint64_t* masks) {
   using L = Lanes<T>;
-  const L A = e[kA], B = e[kB], C = e[kC], reach = e[kReach], half_x = e[kHalfX], half_y = e[kHalfY];
+  const L A = e[kA], S = e[kS], D = e[kD], reach = e[kReach], half_x = e[kHalfX], half_y = e[kHalfY];
   const L one = T(1), zero = T(0), slack = T(1e-3), eight = T(kBlocksAcross);
   const L inverse = one / maximum(half_y, L(T(1e-20)));
-  const L shear = -B / (L(T(2)) * A);                  // dx of the chord's middle per dy
   const L width = root(reach / A);                     // half the chord through the centre
-  const L widest = -B / (L(T(2)) * C) * half_x;        // dy of the rightmost point; the leftmost lies opposite
+  const L widest = -A * S / (A * S * S + D) * half_x;  // dy of the rightmost point; the leftmost lies opposite
   const L reach_y = half_y + L(T(0.01));  // so that no rounding leaves a row out
   const L top = maximum(floor((v - reach_y - L(T(kBlock - 0.5))) * L(T(1) / kBlock)), zero);
   const L bottom = minimum(floor((v + reach_y - L(T(0.5))) * L(T(1) / kBlock)), L(T(kBlocksAcross - 1)));
@@ -50,8 +49,8 @@ CLEAR_INLINE void block_masks(const Lanes<T> (&e)[kLanes], const Lanes<T>& u, co
     L from = maximum(first, -half_y), to = minimum(last, half_y);
     L dy_right = clamp(widest, from, to), dy_left = clamp(-widest, from, to);
     L t_right = dy_right * inverse, t_left = dy_left * inverse;
-    L right = u + shear * dy_right + width * root(maximum(one - t_right * t_right, zero)) + slack;
-    L left = u + shear * dy_left - width * root(maximum(one - t_left * t_left, zero)) - slack;
+    L right = u - S * dy_right + width * root(maximum(one - t_right * t_right, zero)) + slack;
+    L left = u - S * dy_left - width * root(maximum(one - t_left * t_left, zero)) - slack;
     // Blocks c with a pixel centre 4c + 0.5 … 4c + 3.5 in [left, right]; `end` is one past the last.
     L begin = clamp(-floor((L(T(3.5)) - left) * L(T(0.25))), zero, eight);
     L end = clamp(floor((right - L(T(0.5))) * L(T(0.25))) + one, zero, eight);

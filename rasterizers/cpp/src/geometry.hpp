@@ -115,7 +115,7 @@ struct Footprint {
   L a, b, c;             // T Tᵀ / size²
   L normal[3], area;     // X x Y / size² and its length, √det(T Tᵀ) / size²
   L det;                 // det Σ' / size⁴
-  L xx, xy, yy;          // Σ'⁻¹
+  L A, S, D;             // dᵀ Σ'⁻¹ d = A (dx + S dy)² + D dy²: a sum of squares, without cancellation
   L compensation;        // Mip-Splatting: √(det T Tᵀ / det Σ'), opacity factor that makes up for the kernel's blur
 
   CLEAR_INLINE Footprint(const Geometry<T>& g, const Grid<T>& grid, const Settings<T>& s) {
@@ -135,8 +135,8 @@ struct Footprint {
     L area2 = dot<T>(normal, normal);
     area = root(area2);
     det = area2 + kernel * (a + c) + kernel * kernel;
-    L inverse = shrink * shrink / det;
-    xx = (c + kernel) * inverse, xy = -b * inverse, yy = (a + kernel) * inverse;
+    const L blurred = c + kernel, inverse = shrink * shrink / blurred;
+    A = shrink * shrink * blurred / det, S = -b / blurred, D = inverse;
     compensation = s.antialiased ? area / root(det) : L(T(1));
   }
 };
@@ -148,42 +148,42 @@ struct LaneGradients {
   L mean[3], quat[4], scale[3], opacity;
 };
 
-// ∂L/∂u = Σ'⁻¹ (qx, qy), of the projected centre, from the moments of q that the blocks add up.
+// The gradient of the projected centre, Σ'⁻¹ Σ q d, from the moments of q that the blocks add up.
 template <class T>
-CLEAR_INLINE void screen_vjp(const Footprint<T>& f, const Lanes<T>& qx, const Lanes<T>& qy, Lanes<T> (&out)[2]) {
-  out[0] = f.xx * qx + f.xy * qy;
-  out[1] = f.xy * qx + f.yy * qy;
+CLEAR_INLINE void screen_vjp(const Footprint<T>& f, const Lanes<T>& qu, const Lanes<T>& qy, Lanes<T> (&out)[2]) {
+  out[0] = f.A * qu;
+  out[1] = f.S * out[0] + f.D * qy;
 }
 
-// VJP of the projection, with M = [[qxx, qxy], [qxy, qyy]]: ∂L/∂T = Σ'⁻¹ M Σ'⁻¹ T + q ∂ log ρ/∂T, ρ the compensation.
+// VJP of the projection: ∂L/∂T = Σ'⁻¹ (Σ q d dᵀ) Σ'⁻¹ T + q ∂ log ρ/∂T, ρ the compensation.
 template <class T>
 CLEAR_INLINE void project_vjp(const Pose& pose, const Grid<T>& grid, const Settings<T>& s, const Geometry<T>& g,
                               const Footprint<T>& f, const Vec3<T>& scale, const Lanes<T>& opacity, const Lanes<T>& q,
-                              const Lanes<T>& qx, const Lanes<T>& qy, const Lanes<T>& qxx, const Lanes<T>& qxy,
+                              const Lanes<T>& qu, const Lanes<T>& qy, const Lanes<T>& quu, const Lanes<T>& quy,
                               const Lanes<T>& qyy, LaneGradients<T>& out) {
   using L = Lanes<T>;
   const Rotation<T> W(pose);
   out.opacity = q / opacity;
   L screen[2];
-  screen_vjp(f, qx, qy, screen);
+  screen_vjp(f, qu, qy, screen);
   const L du = screen[0], dv = screen[1];
 
-  // ∂L/∂T, with P = Σ'⁻¹ T. The rows of P, (y x n + κ x)/det and (n x x + κ y)/det with the rows x and y of T, have sums
-  // without cancellation; products of Σ'⁻¹ and T would lose all digits for a needle.
+  // ∂L/∂T. In the coordinates (u, dy) of Footprint, Σ'⁻¹ is the diagonal (A, D), and the rows of T are X + S Y and Y. The first
+  // times A is P = (y x n + κ x)/det with the rows x and y of T: sums without cancellation, where those of X + S Y lose all digits
+  // for a needle.
   L tx[3], ty[3], along_x[3], along_y[3], dX[3], dY[3];
   const L shrink = L(T(1)) / f.size, over_det = shrink / f.det;
   for (int k = 0; k < 3; ++k) tx[k] = f.X[k] * shrink, ty[k] = f.Y[k] * shrink;
   cross<T>(ty, f.normal, along_x);
-  cross<T>(f.normal, tx, along_y);
   for (int k = 0; k < 3; ++k) {
-    L px = (along_x[k] + f.kernel * tx[k]) * over_det, py = (along_y[k] + f.kernel * ty[k]) * over_det;
-    L mx = qxx * px + qxy * py, my = qxy * px + qyy * py;  // M P
-    dX[k] = f.xx * mx + f.xy * my;
-    dY[k] = f.xy * mx + f.yy * my;
+    const L pu = (along_x[k] + f.kernel * tx[k]) * over_det, py = f.D * f.Y[k];
+    dX[k] = f.A * (quu * pu + quy * py);
+    dY[k] = f.S * dX[k] + f.D * (quy * pu + qyy * py);
   }
   if (s.antialiased) {
     // log ρ = ½ log area² - ½ log(area² + κ tr + κ²). This form avoids the cancellation for large Gaussians:
     //   ∂ log ρ/∂x = κ/det ((tr + κ)/area² (y x n) - x),   and for y with n x x.
+    cross<T>(f.normal, tx, along_y);
     L weight = q * f.kernel * over_det, turn = (f.a + f.c + f.kernel) / (f.area * f.area);
     for (int k = 0; k < 3; ++k) {
       dX[k] += weight * (turn * along_x[k] - tx[k]);

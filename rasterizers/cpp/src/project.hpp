@@ -50,16 +50,16 @@ CLEAR_INLINE void bins_of(const Grid<T>& grid, const Lanes<T> (&e)[kLanes], std:
                               : BinRange{};
 }
 
-// Whether the minimum of A dx² + B dx dy + C dy² over the box of the image's pixel centres is within reach; exact. A convex
+// Whether the minimum of A (dx + S dy)² + D dy² over the box of the image's pixel centres is within reach; exact. A convex
 // quadratic has its minimum over a box at its centre if that is inside, else on one of the sides that face the centre.
 template <class T>
 CLEAR_INLINE Mask<T> reaches_image(const Grid<T>& s, const Lanes<T>& u, const Lanes<T>& v, const Lanes<T>& A,
-                                   const Lanes<T>& B, const Lanes<T>& C, const Lanes<T>& reach) {
+                                   const Lanes<T>& S, const Lanes<T>& D, const Lanes<T>& reach) {
   using L = Lanes<T>;
   L left = L(T(0.5)) - u, right = L(T(s.width) - T(0.5)) - u, top = L(T(0.5)) - v, bottom = L(T(s.height) - T(0.5)) - v;
   L near_x = clamp(L(T(0)), left, right), near_y = clamp(L(T(0)), top, bottom);
-  L on_x = clamp(-B * near_x / (L(T(2)) * C), top, bottom), on_y = clamp(-B * near_y / (L(T(2)) * A), left, right);
-  auto power = [&](const L& dx, const L& dy) { return A * dx * dx + B * dx * dy + C * dy * dy; };
+  L on_x = clamp(-A * S * near_x / (A * S * S + D), top, bottom), on_y = clamp(-S * near_y, left, right);
+  auto power = [&](const L& dx, const L& dy) { return A * (dx + S * dy) * (dx + S * dy) + D * dy * dy; };
   return minimum(power(near_x, on_x), power(on_y, near_y)) <= reach;
 }
 
@@ -70,22 +70,22 @@ CLEAR_INLINE Mask<T> ellipse_of(const Centre& centre, const Geometry<T>& g, cons
   using L = Lanes<T>;
   Footprint<T> f(g, grid, s);
   constexpr T log2e = kLog2E<T>;
-  using D = Lanes<double>;
-  const D exact_u = D(grid.fx) * centre.tan_x + D(grid.cx), exact_v = D(grid.fy) * centre.tan_y + D(grid.cy);
-  const D whole_u = nearest(exact_u), whole_v = nearest(exact_v);
+  using Exact = Lanes<double>;
+  const Exact exact_u = Exact(grid.fx) * centre.tan_x + Exact(grid.cx), exact_v = Exact(grid.fy) * centre.tan_y + Exact(grid.cy);
+  const Exact whole_u = nearest(exact_u), whole_v = nearest(exact_v);
   const L u = convert<T>(exact_u), v = convert<T>(exact_v);
-  L A = L(log2e / 2) * f.xx, B = L(log2e) * f.xy, C = L(log2e / 2) * f.yy;
+  const L A = L(log2e / 2) * f.A, S = f.S, D = L(log2e / 2) * f.D;
   L peak = log2(maximum(opacity * f.compensation, L(T(1e-30))));
   L reach = (peak - L(s.log2_alpha_min)) * L(T(1.001)) + L(T(1e-3) * log2e);
   L extent = root(maximum(reach, L(T(0))) * L(2 / log2e)) * f.size;
   L half_x = extent * root(f.a + f.kernel), half_y = extent * root(f.c + f.kernel);
   constexpr T huge = T(1e30);  // such an ellipse, of 1e-15 px, covers no pixel centre, and the square would overflow
-  Mask<T> shows = (g.z > L(s.near)) & (opacity >= L(s.alpha_min)) & (reach > L(T(0))) & (A < L(huge)) & (C < L(huge)) &
+  Mask<T> shows = (g.z > L(s.near)) & (opacity >= L(s.alpha_min)) & (reach > L(T(0))) & (A < L(huge)) & (A * S * S + D < L(huge)) &
                   (absolute(u) < L(huge)) & (absolute(v) < L(huge)) & (half_x >= L(T(0))) & (half_y >= L(T(0))) &
-                  reaches_image(grid, u, v, A, B, C, reach);
+                  reaches_image(grid, u, v, A, S, D, reach);
   e[kU] = convert<T>(exact_u - whole_u), e[kV] = convert<T>(exact_v - whole_v);
   e[kWholeU] = convert<T>(whole_u), e[kWholeV] = convert<T>(whole_v);
-  e[kA] = A, e[kB] = B, e[kC] = C, e[kPeak] = peak, e[kReach] = select(shows, reach, L(T(-1)));
+  e[kA] = A, e[kS] = S, e[kD] = D, e[kPeak] = peak, e[kReach] = select(shows, reach, L(T(-1)));
   e[kHalfX] = half_x, e[kHalfY] = half_y;
   return shows;
 }

@@ -67,13 +67,14 @@ struct Splats {
   int bands;                // 0, 3, 8 or 15
 };
 
-// A projected Gaussian: alpha = 2^(peak - A dx² - B dx dy - C dy²). Sixteen numbers: one cache line, one register.
+// A projected Gaussian: alpha = 2^(peak - A u² - D dy²) with u = dx + S dy. Sixteen numbers: one cache line, one register.
+// A conic's expanded form, A dx² + B dx dy + C dy², would lose all digits far along a thin Gaussian, where its terms cancel.
 template <class T>
 struct alignas(kLanes * sizeof(T)) Ellipse {
   T u, v;            // centre, px, minus (whole_u, whole_v)
-  T A, B, C;         // conic times log2(e)/2, log2(e), log2(e)/2
+  T A, S, D;         // of Footprint; A and D times log2(e)/2
   T peak;            // log2 of the opacity after the Mip compensation
-  T reach;           // alpha >= alpha_min within A dx² + B dx dy + C dy² <= reach (with a margin); <= 0: not drawn
+  T reach;           // alpha >= alpha_min within A u² + D dy² <= reach (with a margin); <= 0: not drawn
   T half_x, half_y;  // half the box around that region, px
   T r, g, b, z;      // colour, clamped at 0, and the centre's depth: the channels that are blended
   T whole_u, whole_v;  // the whole pixel nearest to the centre: at 1,000 px a float resolves 6e-5 px
@@ -82,7 +83,7 @@ struct alignas(kLanes * sizeof(T)) Ellipse {
 static_assert(sizeof(Ellipse<float>) == 64);
 
 // Indices of an Ellipse's fields among its sixteen numbers.
-enum Field { kU, kV, kA, kB, kC, kPeak, kReach, kHalfX, kHalfY, kRed, kGreen, kBlue, kDepth, kWholeU, kWholeV };
+enum Field { kU, kV, kA, kS, kD, kPeak, kReach, kHalfX, kHalfY, kRed, kGreen, kBlue, kDepth, kWholeU, kWholeV };
 
 inline constexpr int kColour = 3, kColourAndDepth = 4;  // channels that are blended
 
@@ -94,7 +95,7 @@ struct Cotangents {
 };
 
 // Sums over the pixels of a (Gaussian, bin) pair, for each of K cotangents: q = ∂L/∂(log alpha), q's moments about the centre
-// x, y, xx, xy, yy, and ∂L/∂(r, g, b); with absolute gradients also Σ|∂L/∂u|; with depth, last, ∂L/∂z. Packed, because they are
+// u, y, uu, uy, yy with the u of Ellipse, and ∂L/∂(r, g, b); with absolute gradients also Σ|∂L/∂u|; with depth, last, ∂L/∂z. Packed, because they are
 // written, read and transposed by sixteen.
 template <class T, int K, int C = kColour, bool Absolute = false>
 struct alignas(kLanes * sizeof(T)) PairSums {
