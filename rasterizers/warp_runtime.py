@@ -213,8 +213,8 @@ def array(tensor: Tensor | None, kind: Any) -> Any:
     last = [
         (length, step) for length, step in zip(shape[n - 1 : outer], strides[n - 1 : outer], strict=True) if length != 1
     ]
-    joined = 0 in shape or all(step == length * finer for (_, step), (length, finer) in pairwise(last))
-    if not joined or strides[outer:] != dense:
+    joined = strides[outer:] == dense and all(step == length * finer for (_, step), (length, finer) in pairwise(last))
+    if not joined and 0 not in shape:
         raise ValueError(
             f"a tensor of shape {tuple(shape)} with strides {strides} is no array of {n} dimensions; copy it."
         )

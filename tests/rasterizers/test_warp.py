@@ -44,6 +44,8 @@ def test_the_last_dimension_of_an_array_goes_through_several_of_a_tensor():
     assert bytes(array(sh, flat)) == bytes(array(sh.view(-1), flat))
     assert bytes(array(sh[:, :1], rows)) == bytes(array(sh[:, 0], rows))
     assert bytes(array(torch.zeros(()), flat))[16:] == bytes(array(torch.zeros(1), flat))[16:]
+    no_bands = torch.rand(5, 3, 16).mT[:, :0]  # without numbers any strides fit
+    assert array(no_bands, wp.array(dtype=wp.vec3, ndim=2)).shape[:2] == [5, 0]
     for tensor, kind in ((sh[:, :2], flat), (sh[:, :2], rows), (torch.rand(3, 5).T, rows)):
         with pytest.raises(ValueError, match="copy it"):
             array(tensor, kind)
