@@ -33,7 +33,7 @@ def test_an_image_that_is_off_is_found() -> None:
             rendering.image = rendering.image * 0.99
             return rendering
 
-    image, gradient = projection.measure({"darker": Darker(**CLEAN)}, every=997)
+    image, gradient, *_ = projection.measure({"darker": Darker(**CLEAN)}, every=997)
     assert not image.met
     assert gradient.met
 
