@@ -95,8 +95,8 @@ struct Cotangents {
 };
 
 // Sums over the pixels of a (Gaussian, bin) pair, for each of K cotangents: q = ∂L/∂(log alpha), q's moments about the centre
-// u, y, uu, uy, yy with the u of Ellipse, and ∂L/∂(r, g, b); with absolute gradients also Σ|∂L/∂u|; with depth, last, ∂L/∂z. Packed, because they are
-// written, read and transposed by sixteen.
+// u, y, uu, uy, yy with the u of Ellipse, and ∂L/∂(r, g, b); with absolute gradients also Σ|∂L/∂u|; with depth, last, ∂L/∂z.
+// Packed, because they are written, read and transposed by sixteen.
 template <class T, int K, int C = kColour, bool Absolute = false>
 struct alignas(kLanes * sizeof(T)) PairSums {
   static constexpr int kWidth = 6 + C + (Absolute ? 2 : 0), kRows = (K * kWidth + kLanes - 1) / kLanes;
