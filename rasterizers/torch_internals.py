@@ -74,8 +74,8 @@ def hooks_after_accumulation(leaf: Tensor) -> MutableMapping[int, Callable[[Tens
 
 
 def version(x: Tensor) -> int:
-    """How often a tensor was written in place, by itself or by a view of it."""
-    return x._version
+    """How often a tensor was written in place, by itself or by a view of it; 0 in inference mode, where torch does not count."""
+    return 0 if x.is_inference() else x._version
 
 
 def is_transformed() -> bool:

@@ -39,7 +39,7 @@ def require_stored(s: Strategy, params: Mapping[str, Tensor]) -> None:
     if not (s.state or s.run_state):
         return
     n = {len(p) for p in params.values()}
-    of_parameters = {p.untyped_storage().data_ptr() for p in params.values()}
+    of_parameters = [range(p.data_ptr(), p.data_ptr() + p.nbytes) for p in params.values() if p.data_ptr()]
     taken = set[int]()
     for where, tensors in (("state", s.state), ("run_state", s.run_state)):
         for name, x in tensors.items():
@@ -58,12 +58,13 @@ def require_stored(s: Strategy, params: Mapping[str, Tensor]) -> None:
                     f"{entry} must be a tensor that requires no gradient, got {_shown(x)}. Hooks turn autograd on for a copy, "
                     "x.detach().requires_grad_()."
                 )
-            if x.numel() and (x.data_ptr() in taken or x.untyped_storage().data_ptr() in of_parameters):
+            address = x.data_ptr()  # 0: the tensor has no memory
+            if address and (address in taken or any(address in memory for memory in of_parameters)):
                 raise AnswerError(
                     f"{entry} must be a tensor of its own, got the memory of a parameter or of another tensor that is stored, "
                     "which changes with it. Store its clone()."
                 )
-            taken |= {x.data_ptr()}
+            taken.add(address)
 
 
 def compared(

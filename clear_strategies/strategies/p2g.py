@@ -27,6 +27,7 @@ from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
 from clear_strategies.kernels import per_gaussian
 from clear_strategies.strategies.base import Strategy
+from rasterizers.torch_internals import version
 
 _log = logging.getLogger(__name__)
 
@@ -149,7 +150,7 @@ class P2G(Strategy):
                 view.name, float(R.min()), float(R.max()), float(R.mean()), float(A.mean()), R.shape[1], R.shape[0],
             )  # fmt: skip
             known = _LookedUp((), digest, torch.stack((R, A)))
-        self.cache[key] = known._replace(images=[(TensorWeakRef(x), _version(x)) for x in images])
+        self.cache[key] = known._replace(images=[(TensorWeakRef(x), version(x)) for x in images])
         return known.maps
 
 
@@ -168,13 +169,8 @@ class _LookedUp(NamedTuple):
     def is_of(self, images: Sequence[Tensor]) -> bool:
         """Return True if these are the images, and no operation has changed them."""
         return len(images) == len(self.images) and all(
-            of() is x and version == _version(x) for (of, version), x in zip(self.images, images, strict=True)
+            of() is x and seen == version(x) for (of, seen), x in zip(self.images, images, strict=True)
         )
-
-
-def _version(x: Tensor) -> int:
-    """How many operations have changed x in place; 0 for tensors of inference mode, where torch does not count them."""
-    return 0 if x.is_inference() else x._version
 
 
 def _digest(images: Sequence[Tensor]) -> bytes:

@@ -20,10 +20,12 @@ from clear_strategies import P2G, SVS, Conductor, Grads, SplatSuRe
 from clear_strategies.core import deferred
 from clear_strategies.density.mcmc import MCMC, Sampler
 from clear_strategies.merging.skips import SkipPolicy, Skips
+from clear_strategies.strategies.p2g import _LookedUp
 from clear_strategies.training import checkpoint
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Rendering, SplatGradients, Traits
+from rasterizers.torch_internals import version
 from tests.helpers import toy
 from tests.helpers.short_run import SCENE, SUBSETS, start, tensors
 
@@ -113,8 +115,8 @@ def cache_evidence(state: TrainState) -> None:
     """P2G's evidence is computed once a view, at either size of its SR image; here it is there already."""
     for p2g in (s for s in state.conductor.strategies if isinstance(s, P2G)):
         for view in (v for whole in state.views for v in (whole, state.conductor.skips.view(whole, 1))):
-            images = [TensorWeakRef(photo.image) for photo in (view.lr, view.hr)]
-            p2g.cache[view.name, view.factor] = images, view.lr.image.new_zeros(2, 2, 2)
+            images = [(TensorWeakRef(photo.image), version(photo.image)) for photo in (view.lr, view.hr)]
+            p2g.cache[view.name, view.factor] = _LookedUp(images, None, view.lr.image.new_zeros(2, 2, 2))
 
 
 def on_meta(monkeypatch, names: tuple[str, ...]) -> TrainState:

@@ -200,6 +200,7 @@ def test_gaussians_that_no_view_draws_are_removed_and_the_pictures_stay():
     kept, before, n = faint(state, 0.4), state.field.baked(), len(state.field)
     density = state.density.state_dict()
     views = [view.hr.camera for view in state.views]
+    state.refilter()  # as `remove_undrawn` does
     pictures = [state.field.render(toy.RASTERIZER, camera) for camera in views]
     moments = {name: x[kept] for name, x in state.optimizer.first.items()}
     assert state.remove_undrawn()
