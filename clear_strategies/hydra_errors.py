@@ -22,7 +22,9 @@ _IN_OUR_WORDS: Final = {
     r"Could not (?:load|find) 'hydra/launcher/((joblib|submitit|ray)(?:_local|_slurm|_aws)?)'": (
         "hydra/launcher: {} is not installed: pip install hydra-{}-launcher."
     ),
-    r"^Error parsing override '(.*)' missing EQUAL": f"{{}}: is no setting. {WRITTEN}",
+    r"^(?:Error parsing override '|LexerNoViableAltException: )([^=~][^=]*?)(?:' missing EQUAL| \^ )": (
+        f"{{}}: is no setting. {WRITTEN}"
+    ),
     r"^Multiple values for (\S+)\. To override a value use 'override \S+: (\S+)'$": (
         "+{0}={1}: a choice of this group is there already. Replace it: {0}={1}."
     ),

@@ -73,6 +73,7 @@ def test_names_and_overrides_are_those_of_the_command_line_and_milestones_stretc
             ("gco", "strategies.gco.tolerance"),
             r"^strategies\.gco\.tolerance: is no setting\. A setting is written name=value",
         ),
+        (("gco", r"C:\my photos"), r"^C:\\my photos: is no setting\. A setting is written name=value"),
         (("gco", "+readings=paper"), r"\+readings=paper: .*: readings=paper\."),
         (("gco", "objective=null"), "objective=null: there is no such option. There are "),
         (("gco", "readings=literal"), "readings=literal: there is no such option. There are measured, paper"),

@@ -16,13 +16,11 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import accumulate, takewhile
 from operator import itemgetter
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-
-K = TypeVar("K")
 
 
 class Deferred(NamedTuple):
@@ -69,35 +67,31 @@ def defer(recipe: Callable[..., float], *numbers: Number) -> Number:
 
 def read(numbers: Sequence[Number]) -> list[float]:
     """The numbers as floats; those on the device are fetched in one transfer."""
-    vector, row_of = gathered(dict(enumerate(numbers)))
-    values = vector.tolist()
-    return [cast(float, x.recipe(values) if isinstance(x, Deferred) else x) for x in row_of(vector).values()]
+    vector, places = _joined(numbers)
+    read_once = vector.tolist()
+    values = {key: read_once[place] for key, place in places.items()}
+
+    def value(x: Number) -> Any:
+        if isinstance(x, Deferred):
+            return x.recipe(*map(value, x.parts))
+        return values[id(x)] if isinstance(x, Tensor) else x
+
+    return [value(x) for x in numbers]
 
 
-def gathered(row: Mapping[K, Number]) -> tuple[Float[Tensor, " N"], Callable[[Tensor], dict[K, Number]]]:
-    """The numbers on the device that a row is made of, as one float64 vector, and the row of a copy of that vector. Those of one
-    type are joined first, so that few kernels copy many numbers.
-    """
-    by_type: defaultdict[torch.dtype, list[Tensor]] = defaultdict(list)
-    for x in {id(x): x for number in row.values() for x in _tensors(number)}.values():
-        by_type[x.dtype].append(x)
-    found = [x for alike in by_type.values() for x in alike]
-    firsts = dict(zip(map(id, found), accumulate((x.numel() for x in found), initial=0), strict=False))
-    joined = [torch.cat([x.reshape(-1) for x in alike]).double() for alike in by_type.values()]
-    vector = torch.cat(joined) if joined else torch.empty(0, dtype=torch.float64)
+def gathered(row: Mapping[str, Number]) -> tuple[Float[Tensor, " N"], Callable[[Tensor], dict[str, Number]]]:
+    """The numbers on the device that a row is made of, as one float64 vector, and the row of a copy of that vector."""
+    vector, places = _joined([*row.values()])
 
     def reader(number: Number) -> Callable[[Sequence[float]], Any]:
         if isinstance(number, Deferred):
             recipe, each = number.recipe, [*map(reader, number.parts)]
             return lambda values: recipe(*(one(values) for one in each))
-        if isinstance(number, Tensor):
-            k = firsts[id(number)]
-            return itemgetter(slice(k, k + len(number)) if number.dim() else k)
-        return lambda _: number
+        return itemgetter(places[id(number)]) if isinstance(number, Tensor) else lambda _: number
 
     readers = {name: reader(x) for name, x in row.items() if is_unread(x)}
 
-    def row_of(copy: Tensor) -> dict[K, Number]:
+    def row_of(copy: Tensor) -> dict[str, Number]:
         parts = (copy,)
         return {name: Deferred(readers[name], parts) if name in readers else x for name, x in row.items()}
 
@@ -136,3 +130,17 @@ def _tensors(x: Number) -> Iterator[Tensor]:
             yield from _tensors(part)
     elif isinstance(x, Tensor):
         yield x
+
+
+def _joined(numbers: Sequence[Number]) -> tuple[Float[Tensor, " N"], dict[int, int | slice]]:
+    """The tensors that the numbers are made of, as one float64 vector, and where each is, by its id. Those of one type are joined
+    first, so that few kernels copy many numbers.
+    """
+    by_type: defaultdict[torch.dtype, list[Tensor]] = defaultdict(list)
+    for x in {id(x): x for number in numbers for x in _tensors(number)}.values():
+        by_type[x.dtype].append(x)
+    found = [x for alike in by_type.values() for x in alike]
+    firsts = accumulate((x.numel() for x in found), initial=0)
+    places = {id(x): slice(k, k + len(x)) if x.dim() else k for x, k in zip(found, firsts, strict=False)}
+    joined = [torch.cat([x.reshape(-1) for x in alike]).double() for alike in by_type.values()]
+    return torch.cat(joined) if joined else torch.empty(0, dtype=torch.float64), places

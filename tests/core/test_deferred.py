@@ -66,6 +66,9 @@ def test_numbers_cross_once_and_exactly_and_a_recipe_runs_once(on_a_device, monk
         3.0, 0.125, 1.0, 5.0, 7.0,
     ]  # fmt: skip
     assert moved == [3, 1]  # two scalars and a vector, all of one type
+    lists, vector = [], torch.ones(9)
+    deferred.read([deferred.Deferred(lambda x: lists.append(x) or 0.0, (vector,)) for _ in range(3)])
+    assert all(x is lists[0] for x in lists)  # a replayed iteration has one vector of all of its numbers
     large = torch.tensor(2**24 + 1)
     assert deferred.read([deferred.scalar(large), torch.tensor(0.5)]) == [2**24 + 1, 0.5]
     calls = []
