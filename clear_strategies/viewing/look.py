@@ -114,10 +114,16 @@ def write_video(path: Path, frames: Iterable[Pixels]) -> None:
     with files.replacing(path.absolute()) as partial:  # ffmpeg interprets "a:" at the beginning as a protocol
         command = [program, "-y", "-v", "error", *given.split(), *wanted.split(), str(partial)]
         # imageio_ffmpeg.write_frames does not tell how ffmpeg ended, so a full disk would leave a part of a video without a word.
-        # A session of its own: Ctrl-C is for this process, which may finish the video.
-        ffmpeg = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)  # noqa: S603
-        with suppress(BrokenPipeError), ffmpeg:
-            for frame in itertools.chain([first], rest):
-                ffmpeg.stdin.write(frame.tobytes())  # type: ignore[union-attr]
+        # A session of its own, on Windows a group: Ctrl-C is for this process, which may finish the video.
+        group = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
+        ffmpeg = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True, creationflags=group)  # noqa: S603
+        try:
+            with suppress(BrokenPipeError):
+                for frame in itertools.chain([first], rest):
+                    ffmpeg.stdin.write(frame.tobytes())  # type: ignore[union-attr]
+            ffmpeg.communicate()
+        finally:  # after an error it would go on with a file that is removed
+            ffmpeg.kill()
+            ffmpeg.communicate()
         if ffmpeg.returncode:
             raise OSError(errno.EIO, "ffmpeg could not write it", str(path))

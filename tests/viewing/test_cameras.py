@@ -3,6 +3,7 @@
 import errno
 import json
 import math
+import subprocess
 import sys
 from pathlib import Path
 
@@ -147,14 +148,18 @@ def test_an_mp4_holds_the_frames_in_a_folder_that_looks_like_a_protocol(tmp_path
     assert [path.name for path in Path("10:30").iterdir()] == ["a.mp4"]
 
 
-def test_a_video_that_breaks_leaves_nothing(tmp_path):
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_a_video_that_breaks_leaves_no_file_and_no_process(error, tmp_path, monkeypatch):
     def broken():
         yield FRAMES[0]
-        raise RuntimeError
+        raise error
 
-    with pytest.raises(RuntimeError):
+    started, start = [], subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", lambda *a, **k: started.append(start(*a, **k)) or started[-1])
+    with pytest.raises(error):
         look.write_video(tmp_path / "a.mp4", broken())
     assert not list(tmp_path.iterdir())
+    assert started[-1].returncode  # killed, else it would end a file that is removed, and complain
 
 
 @pytest.mark.parametrize("side", [32, 256], ids=["at the end", "while frames are written"])
