@@ -131,7 +131,7 @@ def test_heavy_libraries_are_imported_only_where_the_table_names_them():
 
 def test_packages_import_what_lies_below_them():
     """No concrete rasterizer in clear_strategies, nothing of clear_strategies in rasterizers, and hosts at the top."""
-    names = "interface geometry guards modes native recording replays sending testing warp_runtime"
+    names = "interface geometry guards modes native recording replays sending testing torch_internals warp_runtime"
     shared = tuple(f"rasterizers.{name}" for name in names.split())
     for path in modules("clear_strategies"):
         found = {name for name in imports(path) if name.startswith(("rasterizers.", "integration"))}
