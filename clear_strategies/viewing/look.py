@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import itertools
-import subprocess
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
@@ -95,12 +94,12 @@ def write_video(path: Path, frames: Iterable[Pixels]) -> None:
 
     Raises:
         SettingError: imageio-ffmpeg or its program is missing.
-        OSError: ffmpeg could not write the file, and has said why.
+        OSError: ffmpeg could not write the file, e.g. on a full disk.
     """
     try:
         import imageio_ffmpeg
 
-        program = imageio_ffmpeg.get_ffmpeg_exe()
+        imageio_ffmpeg.get_ffmpeg_exe()
     except ImportError as error:
         raise SettingError("videos need imageio-ffmpeg: pip install imageio-ffmpeg.") from error
     except RuntimeError as error:
@@ -108,22 +107,29 @@ def write_video(path: Path, frames: Iterable[Pixels]) -> None:
         raise SettingError(problem) from error
     rest = iter(frames)
     first = next(rest)
-    height, width, _ = first.shape
-    given = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {FPS} -i -"
-    wanted = f"-an -c:v libx264 -pix_fmt yuv420p -vf {_HD} -crf {_QUALITY} -preset veryfast -movflags +faststart"
     with files.replacing(path.absolute()) as partial:  # ffmpeg interprets "a:" at the beginning as a protocol
-        command = [program, "-y", "-v", "error", *given.split(), *wanted.split(), str(partial)]
-        # imageio_ffmpeg.write_frames does not tell how ffmpeg ended, so a full disk would leave a part of a video without a word.
-        # A session of its own, on Windows a group: Ctrl-C is for this process, which may finish the video.
-        group = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
-        ffmpeg = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True, creationflags=group)  # noqa: S603
+        writer = imageio_ffmpeg.write_frames(
+            str(partial), first.shape[1::-1], fps=FPS, codec="libx264", pix_fmt_out="yuv420p", quality=None,
+            output_params=["-vf", _HD, "-crf", _QUALITY, "-preset", "veryfast", "-movflags", "+faststart"],
+            macro_block_size=2, ffmpeg_log_level="error",
+        )  # fmt: skip
+        writer.send(None)
         try:
-            with suppress(BrokenPipeError):
-                for frame in itertools.chain([first], rest):
-                    ffmpeg.stdin.write(frame.tobytes())  # type: ignore[union-attr]
-            ffmpeg.communicate()
-        finally:  # after an error it would go on with a file that is removed
-            ffmpeg.kill()
-            ffmpeg.communicate()
-        if ffmpeg.returncode:
-            raise OSError(errno.EIO, "ffmpeg could not write it", str(path))
+            for n, frame in enumerate(itertools.chain([first], rest), 1):  # noqa: B007 - their number
+                writer.send(np.ascontiguousarray(frame))
+        finally:
+            writer.close()
+        _require_frames(partial, n)
+
+
+def _require_frames(path: Path, n: int) -> None:
+    """Raise an OSError if the video does not have n frames: imageio-ffmpeg does not tell that ffmpeg failed at the end, as on a
+    full disk.
+    """
+    import imageio_ffmpeg
+
+    found = 0
+    with suppress(RuntimeError):  # the file cannot be read at all
+        found, _ = imageio_ffmpeg.count_frames_and_secs(path)
+    if found != n:
+        raise OSError(errno.EIO, f"ffmpeg could write {found} of {n} frames", str(path))
