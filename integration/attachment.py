@@ -98,6 +98,7 @@ class Attachment:
         )  # fmt: skip
         self._step: Step | None = None  # of the rendering, until `after_step`
         self._logged: dict[str, Logged] = {}
+        self._dropped = False  # the last pass found that the loop had dropped the gradients of those before
         self._has_warned_of_accumulation = False
         conductor.on_fit_start(len(views), seed, means.device, views)
         self._run = conductor.run
@@ -137,7 +138,7 @@ class Attachment:
             view = conductor.skips.view(view, t)
             hr = self._hr.hr(replace(step, view=view), z, apart)
         self._step = step if hr is None else hr.side.step
-        if self.passes == 0 or not self._steps.has_extra_views:  # once for all passes of a step
+        if self.passes == 0 or self._dropped or not self._steps.has_extra_views:  # once for all passes of a step
             extra_views = conductor.extra_views(t)
             self._steps.follow_by(leaves, (self._hr.extra_view(x, view, t, apart) for x in extra_views))
         output = _lr(render_at, z, view)
@@ -252,8 +253,9 @@ class Attachment:
         again = False
         if rendered is not None and self._step is not None:
             again = self._steps.are_known and rendered.name == self._step.view.name
-        has_stepped = self._steps.has_begun
-        if has_stepped or (self.passes % self._host.accumulation == 0 and not again):
+        last, has_stepped = self._merging.pending, self._steps.has_begun  # None: of a loop that resumes
+        has_passed = (last is None or bool(last.merged)) and self.passes % self._host.accumulation == 0
+        if has_stepped or (has_passed and not again):
             if self._step is not None:
                 self.conductor.after_step({name: _to_change(p) for name, p in params.items()}, self._step)
             self.t += 1
@@ -269,11 +271,19 @@ class Attachment:
             self._n = n
             self.counts["structure changes"] += 1
 
-    def _merged(self, pending: Pending, conflict: Mapping[str, Number] | None) -> None:
-        """Called when gradients of a rendering were merged: the first of them with their conflict ratios, or more of them."""
+    def _merged(self, pending: Pending, conflict: Mapping[str, Number] | None, before: Mapping[str, Tensor]) -> None:
+        """Called when gradients of a rendering were merged: the first of them with their conflict ratios, or more of them.
+
+        Args:
+            before: `.grad` before the pass, by name.
+        """
         self._steps.on_merge()
         if conflict is None:
             return
+        if self.passes:
+            self._dropped = not any(bool(g.any()) for name, g in before.items() if name != "detail")
+        if self._dropped:
+            self.passes = self._merging.fading.passes = 0
         self.passes += 1
         if self.passes > self._host.accumulation:
             self._warn_of_accumulation()

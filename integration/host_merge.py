@@ -40,7 +40,8 @@ class HostMerge:
 
     Args:
         device: of the Gaussians. counts: `Attachment.counts`, to which this class adds.
-        merged: called after each merge, with the conflict ratios by group before correction if it is the first of its rendering.
+        merged: called after each merge, with the conflict ratios by group before correction if it is the first of its rendering,
+            and what `.grad` held before the pass, by name.
 
     Attributes:
         pending: the last rendering; None: there is none, or none is to be merged any more.
@@ -51,7 +52,7 @@ class HostMerge:
 
     def __init__(
         self, conductor: Conductor, host: Host, device: torch.device, counts: Counter[str],
-        merged: Callable[[Pending, Mapping[str, Number] | None], None],
+        merged: Callable[[Pending, Mapping[str, Number] | None, Mapping[str, Tensor]], None],
     ) -> None:  # fmt: skip
         self._conductor, self._host, self._counts, self._merged = conductor, host, counts, merged
         self.pending: Pending | None = None
@@ -140,17 +141,17 @@ class HostMerge:
         self._warn_if_outweighed(done, g_hr, scale)
         of_all = [*names] if detail is None else [*names, "detail"]
         conflict = self.merge_gradients(done, of_all, g_hr, None if hr is None else hr.step, t, scale)
-        if detail is not None:
-            self._finish_detail(detail, params, t, by_hf=hr is not None and hr.detail is not None)
-        reached = [(leaf.grad, g) for leaf, g in pending.others if leaf.grad is not None]
-        for grad, g in reached:
-            grad.add_(g.to(grad), alpha=scale * λ)
+        for leaf, g in pending.others:
+            if leaf.grad is not None:
+                leaf.grad.add_(g, alpha=scale * λ)
         pending.others = [(leaf, g) for leaf, g in pending.others if leaf.grad is None]
         pending.merged.update(names or ("detail",))
         self._counts["merges"] += 1
         if first and hr is not None and pending.output is not None and done.task in pending.screen:
             self._write_score(pending.output.shot, pending.screen[done.task], hr, t, scale)
-        self._merged(pending, conflict if first else None)
+        self._merged(pending, conflict if first else None, done.before)
+        if detail is not None:
+            self._finish_detail(detail, params, t, by_hf=hr is not None and hr.detail is not None)
 
     def merge_gradients(
         self, done: BackwardPass, names: Iterable[str], g_hr: Grads, step: Step | None, t: int, scale: float

@@ -29,7 +29,7 @@ def separate(splats):
 
 
 @pytest.mark.parametrize("clips", [False, True])
-def test_an_overflow_is_a_step_that_the_scaler_skips_for_f_det_too(clips):
+def test_an_overflow_is_a_step_that_the_scaler_skips_for_f_det_too(clips, caplog):
     scene, scaler = toy.scene(20), torch.amp.GradScaler("cpu", init_scale=2.0**14)
     host = Host(scene, rasterization=functools.partial(autograd.rasterization, backend="torch"))
     conductor = Conductor(GCO(), objective=HR_FROM_START, detail=DetailRates(decay=0))
@@ -37,6 +37,8 @@ def test_an_overflow_is_a_step_that_the_scaler_skips_for_f_det_too(clips):
     for i in range(4):
         view, before = scene.train[i % 3], host.splats["detail"].detach().clone()
         loss = photometric(host.render(view.lr.camera, 3)[0][0], view.lr.image) * (float("inf") if i == 2 else 1.0)
+        for o in host.optimizers.values():
+            o.zero_grad()
         scaler.scale(loss).backward()
         for o in host.optimizers.values():
             scaler.unscale_(o)
@@ -44,9 +46,9 @@ def test_an_overflow_is_a_step_that_the_scaler_skips_for_f_det_too(clips):
             torch.nn.utils.clip_grad_norm_([p for p in host.splats.values() if p.grad is not None], 1.0)
         for o in host.optimizers.values():
             scaler.step(o)
-            o.zero_grad()
         scaler.update()
         assert torch.equal(host.splats["detail"], before) == (i == 2)
+    assert "without an optimizer step" not in caplog.text
     assert all(bool(p.isfinite().all()) for p in host.splats.values())
 
 
@@ -60,11 +62,13 @@ def test_extra_views_are_stepped_on_by_optimizers_that_are_made_anew_and_it_is_t
     assert clear.attachment.counts["extra views"] == 20
     unknown = torch.optim.Adam([p for p in host.splats.values() if p.requires_grad])
     assert "no effect" not in caplog.text
-    for i in range(11):
-        render(i % 3).mean().backward()
-        unknown.step()
+    for i in range(12):
+        image = render(i % 3)
         unknown.zero_grad()
+        image.mean().backward()
+        unknown.step()
     assert caplog.text.count("put new ones in the same dictionary") == 1
+    assert "without an optimizer step" not in caplog.text
 
 
 def test_a_step_with_a_closure_is_refused():
@@ -293,7 +297,9 @@ def test_a_step_of_sam_is_one_iteration_and_one_of_summed_views_is_several():
         host, clear, render = started(toy.ShowsDark(), **settings)
         for passes in steps:
             for i in passes:
-                if i == "ascend":  # SAM steps with the gradient at a point near by, which it takes by another optimizer
+                if i == "look":
+                    render(0)
+                elif i == "ascend":  # SAM steps with the gradient at a point near by, taken by another optimizer
                     for name, g in host.gradients().items():
                         host.splats[name].data.add_(g, alpha=1e-3)
                         host.splats[name].grad = None
@@ -304,7 +310,7 @@ def test_a_step_of_sam_is_one_iteration_and_one_of_summed_views_is_several():
         return clear.attachment.t, clear.attachment.counts["extra views"], found
 
     assert trained([(0, "ascend", 0), (1, "ascend", 1)])[:2] == (3, 2)
-    t, extra, found = trained([(0,), (1, 2, 0)])
+    t, extra, found = trained([(0,), (1, "look", "look", 2, 0)])
     assert (t, extra) == (5, 2)
     *_, expected = trained([(0,), (1, 2, 0)], accumulation=3)
     torch.testing.assert_close(found, 3 * expected)
