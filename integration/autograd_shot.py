@@ -19,7 +19,7 @@ from integration.structure import rows_drawn
 from rasterizers.autograd import Drawing, Rendered, outer
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, summed_vjp
-from rasterizers.torch_internals import is_hooked, leaf_of
+from rasterizers.torch_internals import accumulator, is_hooked, leaf_of
 
 _GOLDEN: Final = 0.6180339887498949  # its multiples modulo 1 differ most for neighbouring rows
 _SAME_CODE: Final = 0.1  # tolerance of the ratio of a row's gradients, which e.g. the mean of all rows changes a little
@@ -123,7 +123,7 @@ class AutogradShot:
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
         """∇θ of every cotangent, each with `.screen`; the graph is kept. Frozen parameters have gradient 0."""
-        parts = [(g, to_parameters(g, self.inputs, self.params)) for g in self.gradients(cotangents)]
+        parts = [(g, to_leaves(g, self.inputs, self.params)[0]) for g in self.gradients(cotangents)]
         return [Grads(every_number(raw + self._detail(g), self.params), screen=g.screen) for g, raw in parts]
 
     def gradients(
@@ -174,70 +174,59 @@ class AutogradShot:
         return torch.stack([torch.autograd.grad(image, drawn, c, retain_graph=True)[0] for c in cotangents])
 
 
-def side_of_parameters(hr: HrSide, drawn: Mapping[str, Tensor] | None, params: Mapping[str, Tensor]) -> HrSide:
-    """The HR side with the gradients of the raw parameters in place of those of the drawn tensors, each with its `.screen`.
+OfOthers = list[tuple[Tensor, Tensor]]
+"""Other leaves that the loop trains (of a network, an embedding), each with its gradient."""
+
+
+def side_of_leaves(
+    hr: HrSide, drawn: Mapping[str, Tensor] | None, params: Mapping[str, Tensor], scale: float
+) -> tuple[HrSide, OfOthers]:
+    """The HR side with the gradients of the raw parameters in place of those of the drawn tensors, each with its `.screen`; and
+    those of other leaves.
 
     Args:
-        params: without "detail", f_det has no gradient.
+        params: without "detail", f_det has no gradient. scale: see `to_leaves`.
     """
-    g, detail = to_parameters(hr.g, drawn, params), hr.detail
+    (g, others), detail = to_leaves(hr.g, drawn, params, scale), hr.detail
     g.screen = hr.g.screen
     if detail is not None and "detail" not in params:
         detail = Grads(screen=detail.screen)
-    return replace(hr, g=g, detail=detail)
+    return replace(hr, g=g, detail=detail), others
 
 
-def to_parameters(g: Grads, drawn: Mapping[str, Tensor] | None, params: Mapping[str, Tensor]) -> Grads:
-    """The gradients of the raw parameters, without f_det, from those of the drawn tensors, through the host's own graph.
+def to_leaves(
+    g: Grads, drawn: Mapping[str, Tensor] | None, params: Mapping[str, Tensor], scale: float = 1.0
+) -> tuple[Grads, OfOthers]:
+    """The gradients of the raw parameters, without f_det, from those of the drawn tensors, through the host's own graph; and
+    those of the other leaves that the drawn tensors were computed from.
 
     Args:
         g: by the names of `drawn`; the colours' gradient as factors if this package drew them. It stays so if `are_joined`.
         drawn: None: the raw parameters.
+        scale: of a gradient scaler, so that small gradients pass through half precision in the graph.
     """
-    raw = trained(params)
+    raw, colour = trained(params), None
     if drawn is None:
-        return Grads({name: g[name] for name in raw})  # which hooks may have changed
-    g = _drawn_colours(g, drawn, params)
-    colour = g.colour
+        return Grads({name: g[name] for name in raw}), []  # which hooks may have changed
+    if g.colour is not None:
+        if are_joined(drawn["colors"], params):
+            colour = g.colour
+        else:
+            g = Grads({**g, "colors": outer(g.colour.rgb, g.colour.basis, drawn["colors"].shape[1])})
     direct = {name: g[name] for name, p in raw.items() if drawn.get(name) is p and not is_hooked(p)}
     graph = {name: x for name, x in drawn.items() if name in g and name not in direct and x.requires_grad}
-    if not graph or not raw:
-        return Grads(direct, colour=colour)
-    through = torch.autograd.grad(
-        list(graph.values()), list(raw.values()), [g[name] for name in graph], retain_graph=True, allow_unused=True
-    )
-    found = {name: value for name, value in zip(raw, through, strict=True) if value is not None}
-    both = {name: direct[name] + found[name] for name in direct.keys() & found.keys()}
-    return Grads({**direct, **found, **both}, colour=colour)
-
-
-def to_others(
-    g: Grads, drawn: Mapping[str, Tensor] | None, params: Mapping[str, Tensor]
-) -> list[tuple[Tensor, Tensor]]:
-    """The other leaves that the drawn tensors were computed from (a network, an embedding), each with its gradient.
-
-    Args:
-        g, drawn: see `to_parameters`. params: raw parameters, which are left out.
-    """
     known = {id(p) for p in params.values()}
-    graph = {name: x for name, x in (drawn or {}).items() if x.grad_fn is not None}
-    found = {id(leaf): leaf for x in graph.values() for leaf in graph_of(x).leaves}
-    leaves = [leaf for key, leaf in found.items() if key not in known]
-    if not leaves:
-        return []
-    g = _drawn_colours(g, graph, params)
-    of = [name for name in graph if name in g]
-    through = torch.autograd.grad(
-        [graph[name] for name in of], leaves, [g[name] for name in of], retain_graph=True, allow_unused=True
-    )
-    return [(leaf, value) for leaf, value in zip(leaves, through, strict=True) if value is not None]
-
-
-def _drawn_colours(g: Grads, drawn: Mapping[str, Tensor], params: Mapping[str, Tensor]) -> Grads:
-    """The gradients with that of the drawn colours in full; its factors stay if `are_joined`."""
-    if g.colour is None or "colors" not in drawn or are_joined(drawn["colors"], params):
-        return g
-    return Grads({**g, "colors": outer(g.colour.rgb, g.colour.basis, drawn["colors"].shape[1])})
+    others = [leaf for leaf in graph_of(*graph.values()).leaves if id(leaf) not in known]
+    leaves = [*raw.values(), *others]
+    if not graph or not leaves:
+        return Grads(direct, colour=colour), []
+    at_drawn = [g[name] if scale == 1 else g[name] * scale for name in graph]
+    through = torch.autograd.grad([*graph.values()], leaves, at_drawn, retain_graph=True, allow_unused=True)
+    values = [x if x is None or scale == 1 else x / scale for x in through]
+    found = {name: x for name, x in zip(raw, values, strict=False) if x is not None}
+    both = {name: direct[name] + found[name] for name in direct.keys() & found.keys()}
+    of_others = [(leaf, x) for leaf, x in zip(others, values[len(raw) :], strict=True) if x is not None]
+    return Grads({**direct, **found, **both}, colour=colour), of_others
 
 
 def every_number(g: Grads, params: Mapping[str, Tensor]) -> Grads:
@@ -313,15 +302,15 @@ def require_named(shot: object, params: Mapping[str, Tensor]) -> None:
 
 
 class Graph(NamedTuple):
-    """The leaves that a tensor was computed from, and the cameras of drawings by this package's rasterizers."""
+    """The leaves that tensors were computed from, and the cameras of drawings by this package's rasterizers."""
 
     leaves: list[Tensor]
     cameras: list[Camera]
 
 
-def graph_of(x: Tensor) -> Graph:
-    """The leaves and cameras behind a tensor, in one walk."""
-    graph, seen, nodes = Graph([], []), set[Any](), [x.grad_fn]
+def graph_of(*tensors: Tensor) -> Graph:
+    """The leaves and cameras behind tensors, in one walk. A leaf is its own."""
+    graph, seen, nodes = Graph([], []), set[Any](), [accumulator(x) for x in tensors if x.requires_grad]
     while nodes:
         if (node := nodes.pop()) is None or node in seen:
             continue

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple, cast
@@ -30,11 +30,11 @@ from clear_strategies.strategies.base import stored
 from integration.autograd_shot import (
     AutogradShot,
     HostOutput,
+    OfOthers,
     Target,
     every_number,
-    side_of_parameters,
-    to_others,
-    to_parameters,
+    side_of_leaves,
+    to_leaves,
 )
 from integration.host import Host
 from integration.views import enlarged_mask
@@ -127,12 +127,11 @@ class OfHr(NamedTuple):
 
     Args:
         side: its gradients. losses: by name, for the log.
-        others: other tensors that the loop trains, e.g. of a network that makes colours, each with its gradient of HR.
     """
 
     side: HrSide
     losses: Mapping[str, Number]
-    others: Sequence[tuple[Tensor, Tensor]] = ()
+    others: OfOthers
 
 
 _Made = tuple[Any, dict[str, Number]]
@@ -154,6 +153,7 @@ class HrDrawing:
 
     def __init__(self, conductor: Conductor, host: Host, device: torch.device, counts: Counter[str]) -> None:
         self._conductor, self._masks, self._counts = conductor, host.masks, counts
+        self._loss_scale = host.loss_scale or (lambda: 1.0)
         self.is_scored = host.reads_score and conductor.owner("score") is not None
         self.replays = replays_on(device, conductor.work_log, "the replay of HR")
         if self.replays is not None and (reason := next(why_not_recorded(conductor), None)) is not None:
@@ -186,9 +186,9 @@ class HrDrawing:
         apart = shot.drawing is not None or "detail" in shot.params
         hr = conductor.hr_gradients(shot, step, AutogradShot.gradients, apart=apart)
         if conductor.objective.lambda_hr(step.t) == 0:
-            return OfHr(hr, hr.losses)
-        others = to_others(hr.g, shot.inputs, shot.params)
-        return OfHr(side_of_parameters(hr, shot.inputs, shot.params), hr.losses, others)
+            return OfHr(hr, hr.losses, [])
+        side, others = side_of_leaves(hr, shot.inputs, shot.params, self._loss_scale())
+        return OfHr(side, hr.losses, others)
 
     def extra_view(self, extra: ExtraView, view: View, t: int, render_at: RenderAt) -> Grads:
         """The gradient of an extra view, which is drawn without gate and f_det."""
@@ -217,8 +217,8 @@ class HrDrawing:
         seen = hr.step if self.replays is None else hr.step.copied()
         # The losses of a recording are overwritten by the next replay.
         hr = replace(hr, step=replace(seen, t=t, view=view, params=step.params), losses={})
-        others = to_others(hr.g, asked.drawn, asked.params)
-        return OfHr(side_of_parameters(hr, asked.drawn, asked.params), losses, others)
+        side, others = side_of_leaves(hr, asked.drawn, asked.params, self._loss_scale())
+        return OfHr(side, losses, others)
 
     @in_full_precision
     @torch.no_grad()
@@ -235,7 +235,7 @@ class HrDrawing:
 
         inputs = asked.compared_with(photo, weight=extra.weight)
         g, _ = self._done(asked, inputs, t, ("extra", extra.robust), work)
-        found = every_number(to_parameters(g, asked.drawn, asked.params), asked.params)
+        found = every_number(to_leaves(g, asked.drawn, asked.params)[0], asked.params)
         return Grads({name: x.clone() for name, x in found.items()})  # the next replay overwrites some of them
 
     def _done(self, asked: Drawable, inputs: _RenderInputs, t: int, constants: tuple[Any, ...], work: _Work) -> _Made:

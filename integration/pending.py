@@ -17,7 +17,7 @@ from clear_strategies.core.gradients import Colour, Grads
 from clear_strategies.errors import HostError
 from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.iteration import HrSide
-from integration.autograd_shot import HostOutput
+from integration.autograd_shot import HostOutput, OfOthers
 from integration.colours import are_accumulated, are_joined
 from rasterizers.autograd import TakeColours
 from rasterizers.native import empty_for
@@ -135,7 +135,7 @@ class Pending:
     Args:
         nth: its number. t: the iteration. output: None once all trained parameters are merged.
         hr: the gradients of HR; None: HR takes no part. losses: of HR by name, for the log.
-        others: other tensors that the loop trains, each with its gradient of HR, which is still to be added.
+        others: what is still to be added of HR's gradients of other leaves.
         screen: the screen gradient of LR by the number of its pass, if a densifier reads it.
         merged: the parameters whose gradients are merged.
     """
@@ -146,7 +146,7 @@ class Pending:
     output: HostOutput | None
     hr: HrSide | None
     losses: Mapping[str, Number]
-    others: Sequence[tuple[Tensor, Tensor]] = ()
+    others: OfOthers = field(default_factory=list)
     screen: dict[int, Tensor] = field(default_factory=dict)
     merged: set[str] = field(default_factory=set)
 

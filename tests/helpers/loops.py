@@ -1,6 +1,6 @@
 """Training loops put together of parts, and what a step of each should leave in `.grad`, by plain torch in float64.
 
-A part is a small function of `p`, the tensors by name: gsplat's six parameters, and three that a loop trains beside them.
+A part is a small function of `p`, the tensors by name: gsplat's six parameters, and some that a loop trains beside them.
 """
 
 import functools
@@ -34,6 +34,7 @@ COLOURS = {
     "of three": lambda p: torch.cat((p["sh0"], p["shN"][:, :3], p["shN"][:, 3:]), 1),
     "viewed": lambda p: torch.cat((p["sh0"], p["shN"]), 1).view(len(p["sh0"]), -1, 3),
     "cast": lambda p: torch.cat((p["sh0"].double(), p["shN"].double()), 1).to(p["means"].dtype),
+    "another leaf": lambda p: p["bands"] if len(p["bands"]) == len(p["sh0"]) else p["bands"][1:],
     "half detached": lambda p: torch.cat((p["sh0"], p["shN"].detach()), 1),
     "negative dimension": lambda p: torch.cat((p["sh0"], p["shN"]), -2),
 }
@@ -233,7 +234,8 @@ class Running:
         for name in ("scales", "shN"):  # round Gaussians have no gradient of their rotation
             self.splats[name].data += 0.3 * torch.randn(self.splats[name].shape, generator=chance)
         self.beside = {"offset": Parameter(torch.full((1, 1, 3), 0.1)), "gain": Parameter(torch.full((1,), 0.9)),
-                       "shift": Parameter(torch.full((1, 3), 0.01))}  # fmt: skip
+                       "shift": Parameter(torch.full((1, 3), 0.01)),
+                       "bands": Parameter(0.3 * torch.rand(20, 16, 3, generator=chance))}  # fmt: skip
         one = torch.optim.Adam(self.splats.values(), **ADAM)
         self.optimizers = {"joined": one, "joined in a dictionary": {"all": one}}.get(loop.optimizers, self.separate())
         self.conductor = Conductor(*[GCO()] * loop.corrects, objective=HR_FROM_START)
@@ -349,7 +351,7 @@ def reference(loop: Loop, conductor, p, view):
     before = {name: x.grad for name, x in p.items()}
     picture = pictures(loop, functools.partial(unrecorded, backend="torch"), p, [])
     image = picture(view.hr, rgb_offset=p["detail"])[0][0]
-    beside = "offset", "gain", "shift"
+    beside = "offset", "gain", "shift", "bands"
     of = [p[name] for name in (*names, *beside, "detail")]
     weights = 1, objective.lambda_hf
     base, hf = (

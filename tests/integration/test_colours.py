@@ -11,6 +11,7 @@ from tests.helpers.loops import COLOURS
 def params():
     """Of three Gaussians; the others are what `COLOURS` may add."""
     shapes = {"sh0": (3, 1, 3), "shN": (3, 15, 3), "means": (3, 3), "offset": (1, 1, 3), "gain": (1,)}
+    shapes |= {"bands": (3, 16, 3)}
     return {name: Parameter(torch.ones(shape)) for name, shape in shapes.items()}
 
 

@@ -15,6 +15,7 @@ from clear_strategies.merging.recorded_work import LIVE, RecordedWork
 from clear_strategies.merging.skips import Skips
 from clear_strategies.schedules import Ramp, WarmupDecay
 from integration import hr_drawing, replayed_merge
+from integration.autograd_shot import to_leaves
 from rasterizers import replays
 from rasterizers.recording import running
 from tests.helpers import toy
@@ -179,6 +180,14 @@ def test_an_offset_of_the_colours_gets_what_it_gets_of_the_hosts_function():
         return {name: p.grad for name, p in host.splats.items()} | {"offset": offset.grad}
 
     require_close(gradients("torch"), gradients("host"))
+
+
+def test_small_gradients_pass_through_half_precision_by_the_scale_of_the_loss():
+    offset, scale = torch.nn.Parameter(torch.ones(5, 3)), 2.0**16
+    half, g = offset.half().float(), torch.full((5, 3), 1e-9)
+    _, ((leaf, found),) = to_leaves(cs.Grads({"colors": g}), {"colors": half}, {}, scale)
+    assert leaf is offset
+    torch.testing.assert_close(found, g, rtol=1e-3, atol=0)
 
 
 @pytest.mark.parametrize(
