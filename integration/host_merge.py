@@ -89,7 +89,7 @@ class HostMerge:
             return None
         now = None if self._pass is None else self._pass()
         if now is None or now.task != current_pass():
-            now = BackwardPass(current_pass(), self._host.leaves())
+            now = BackwardPass(current_pass(), self._host.leaves(), [leaf for leaf, _ in self.pending.others])
             when_pass_ends(partial(self._on_backward_end, now))
             self._pass = ref(now)
         now.renderings.add(nth)
@@ -109,10 +109,20 @@ class HostMerge:
             names = [name for name in accumulated if name not in pending.merged]
             if names or not (expected or pending.merged):
                 self._merge(pending, done, names)
+        if pending is not None and pending.others and done.renderings == {pending.nth}:
+            self._add_to_others(pending, done)
         for hook in done.hooks:
             hook()
         if pending is not None and pending.merged.issuperset(expected):
             pending.output = pending.hr = None
+
+    def _add_to_others(self, pending: Pending, done: BackwardPass) -> None:
+        """Add HR's gradients of other leaves to those that the pass has given."""
+        weight = self._host.scale() * self._conductor.objective.lambda_hr(pending.t)
+        for leaf, g in pending.others:
+            if leaf.grad is not None and done.has_given(leaf):
+                leaf.grad.add_(g, alpha=weight)
+        pending.others = [(leaf, g) for leaf, g in pending.others if not done.has_given(leaf)]
 
     def _merge(self, pending: Pending, done: BackwardPass, names: Sequence[str]) -> None:
         """Merge the gradients of these parameters; with the first of the rendering, merge that of f_det and write the score.
@@ -141,10 +151,6 @@ class HostMerge:
         self._warn_if_outweighed(done, g_hr, scale)
         of_all = [*names] if detail is None else [*names, "detail"]
         conflict = self.merge_gradients(done, of_all, g_hr, None if hr is None else hr.step, t, scale)
-        for leaf, g in pending.others:
-            if leaf.grad is not None:
-                leaf.grad.add_(g, alpha=scale * λ)
-        pending.others = [(leaf, g) for leaf, g in pending.others if leaf.grad is None]
         pending.merged.update(names or ("detail",))
         self._counts["merges"] += 1
         if first and hr is not None and pending.output is not None and done.task in pending.screen:
@@ -167,6 +173,8 @@ class HostMerge:
             DivergedError: a merged gradient in the CPU's memory is not finite, and no gradient scaler would skip the step.
         """
         g_lr, out = done.added(names, scale)
+        if not out:  # all Gaussians are frozen
+            return {}
         params = {name: done.params[name].detach() for name in out}
         high = Grads({name: widened(g) for name, g in g_hr.items()}, colour=g_hr.colour)
         merged = self.replayed(params, g_lr, high, step, t, out)

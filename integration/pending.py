@@ -36,7 +36,7 @@ class BackwardPass:
 
     Args:
         task: torch's number of the pass.
-        params: the leaves when it reached the rendering.
+        params: the leaves when it reached the rendering. others: those of `Pending.others`.
         renderings: the numbers of all renderings that it has reached.
         colour: the gradient of sh0 and shN that it has brought as factors, which their `.grad` lacks.
 
@@ -47,16 +47,18 @@ class BackwardPass:
 
     task: int
     params: Mapping[str, Tensor]
+    others: Sequence[Tensor] = ()
     renderings: set[int] = field(default_factory=set)
     colour: Colour | None = None
     before: dict[str, Tensor] = field(init=False)
     hooks: list[Callable[[], Any]] = field(default_factory=list)
-    _found: dict[str, tuple[Tensor | None, int]] = field(init=False)
+    _found: dict[int, tuple[Tensor | None, int]] = field(init=False)
 
     def __post_init__(self) -> None:
         grads = {name: p.grad for name, p in self.params.items()}
         self.before = {name: g.detach().clone() for name, g in grads.items() if g is not None}
-        self._found = {name: (g, 0 if g is None else version(g)) for name, g in grads.items()}
+        leaves = [*self.params.values(), *self.others]
+        self._found = {id(p): (p.grad, 0 if p.grad is None else version(p.grad)) for p in leaves}
         _PASSES[self.task] = self
         for hooks in filter(None, map(hooks_after_accumulation, self.params.values())):
             hooks.update({key: hook if isinstance(hook, _AtTheEnd) else _AtTheEnd(hook) for key, hook in hooks.items()})
@@ -68,11 +70,16 @@ class BackwardPass:
     def accumulated(self) -> list[str]:
         """The parameters, except for f_det, that the pass has given a gradient."""
         of_colour = () if self.colour is None else ("sh0", "shN")
-        return [name for name in self.params if name in of_colour or (name != "detail" and self._has_changed(name))]
+        return [
+            name
+            for name in self.params
+            if name in of_colour or (name != "detail" and self.has_given(self.params[name]))
+        ]
 
-    def _has_changed(self, name: str) -> bool:
-        before, written = self._found[name]
-        now = self.params[name].grad
+    def has_given(self, leaf: Tensor) -> bool:
+        """Whether the pass has added to `.grad` of this leaf."""
+        before, written = self._found[id(leaf)]
+        now = leaf.grad
         return now is not before or (now is not None and version(now) != written)
 
     def added(self, names: Iterable[str], scale: float) -> tuple[Grads, dict[str, Tensor]]:

@@ -372,8 +372,7 @@ def reference(loop: Loop, conductor, p, view):
         merged = conductor.strategies[0].correct(lr, hr, Step(1, view))
     found = {name: scale * (g + merged[name]) for name, g in lr.items()}
     found["detail"] = total(p["detail"].grad, scale * hf[-1] if lr else None)
-    found |= {name: total(p[name].grad, scale * of_all[name]) if lr and p[name].grad is not None else p[name].grad
-              for name in beside}  # fmt: skip
+    found |= {name: total(p[name].grad, scale * of_all[name]) for name in beside if p[name].grad is not None}
     return {name: total(before[name], found.get(name)) for name in p}, bool(lr)
 
 

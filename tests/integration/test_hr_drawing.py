@@ -182,6 +182,34 @@ def test_an_offset_of_the_colours_gets_what_it_gets_of_the_hosts_function():
     require_close(gradients("torch"), gradients("host"))
 
 
+@pytest.mark.parametrize("frozen", [False, True], ids=["apart", "alone"])
+def test_an_offset_of_the_colours_learns_the_same_in_a_pass_of_its_own(frozen):
+    def gradient(*passes):
+        host, offset = Host(SCENE), torch.nn.Parameter(torch.full((1, 1, 3), 0.1))
+        attached(host, SCENE, Conductor(cs.GCO(), objective=HR_FROM_START))
+        function, gaussians = host.rasterization, list(host.splats.values())
+        host.rasterization = lambda m, q, s, o, colors, *more, **call: function(
+            m, q, s, o, colors + offset, *more, **call
+        )
+        for p in gaussians:
+            p.requires_grad_(not frozen)
+        image = drawn(host.rasterization, host.splats, SCENE.train[0].lr.camera)[0][0]
+        loss = (image - SCENE.train[0].lr.image).abs().mean()
+        for one in passes:
+            one(loss, gaussians, offset)
+        return offset.grad
+
+    whole = gradient(lambda loss, *_: loss.backward())
+    first = torch.autograd.grad if frozen else torch.autograd.backward
+    apart = gradient(
+        lambda loss, gaussians, offset: first(loss, inputs=[offset] if frozen else gaussians, retain_graph=True),
+        lambda loss, _, offset: loss.backward(inputs=[offset]),
+    )
+    torch.testing.assert_close(apart, whole)
+    of_lr = gradient(lambda loss, _, offset: setattr(offset, "grad", torch.autograd.grad(loss, offset)[0]))
+    assert float((whole - of_lr).norm()) > 0.1 * float(of_lr.norm())
+
+
 def test_small_gradients_pass_through_half_precision_by_the_scale_of_the_loss():
     offset, scale = torch.nn.Parameter(torch.ones(5, 3)), 2.0**16
     half, g = offset.half().float(), torch.full((5, 3), 1e-9)
