@@ -11,13 +11,16 @@ from typing import Any
 
 @contextmanager
 def replaced_attribute(owner: Any, name: str, value: Any) -> Iterator[None]:
-    """Give an attribute another value."""
+    """Give an attribute another value. At the end it has its own again, unless somebody has replaced it since: the end may come
+    late, when Python collects an attachment that was never removed.
+    """
     original = getattr(owner, name)
     setattr(owner, name, value)
     try:
         yield
     finally:
-        setattr(owner, name, original)
+        if getattr(owner, name, None) is value:
+            setattr(owner, name, original)
 
 
 @contextmanager

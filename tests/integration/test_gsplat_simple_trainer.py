@@ -11,6 +11,7 @@ import torch
 
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.errors import HostError, SettingError
+from integration.replacing import replaced_attribute
 from tests.helpers import gsplat_host, toy
 from tests.helpers.host_parts import FROM_START, write_sr
 
@@ -130,3 +131,13 @@ def test_a_second_runner_in_one_process_trains_too(launched, tmp_path, monkeypat
     assert len(pickle.dumps(copied)) < 50_000  # without the photos
     runner.clear.remove()
     assert not hasattr(gsplat.export_splats, "__wrapped__")  # else the splats of every Runner stay in memory
+
+
+def test_what_was_replaced_since_stays_when_an_earlier_replacement_ends():
+    host = SimpleNamespace(draws=min)
+    first, second = replaced_attribute(host, "draws", max), replaced_attribute(host, "draws", sum)
+    with first:
+        second.__enter__()
+    assert host.draws is sum
+    second.__exit__(None, None, None)
+    assert host.draws is max
