@@ -280,8 +280,7 @@ class Attachment:
         self._steps.on_merge()
         if conflict is None:
             return
-        if self.passes:
-            self._dropped = not any(bool(g.any()) for name, g in before.items() if name != "detail")
+        self._dropped = self.passes > 0 and not any(bool(g.any()) for name, g in before.items() if name != "detail")
         if self._dropped:
             self.passes = self._merging.fading.passes = 0
         self.passes += 1
