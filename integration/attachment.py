@@ -250,9 +250,8 @@ class Attachment:
         self._follow_structure(len(params["means"]))
         if not self.passes:
             return
-        again = False
-        if rendered is not None and self._step is not None:
-            again = self._steps.are_known and rendered.name == self._step.view.name
+        last_view = None if self._step is None else self._step.view.name
+        again = rendered is not None and rendered.name == last_view and self._steps.are_known
         last, has_stepped = self._merging.pending, self._steps.has_begun  # None: of a loop that resumes
         has_passed = (last is None or bool(last.merged)) and self.passes % self._host.accumulation == 0
         if has_stepped or (has_passed and not again):

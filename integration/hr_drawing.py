@@ -126,7 +126,7 @@ class OfHr(NamedTuple):
     """What HR brings.
 
     Args:
-        side: its gradients. losses: by name, for the log.
+        side: its gradients. losses: by name, for the log. others: the gradients of other leaves.
     """
 
     side: HrSide

@@ -70,11 +70,8 @@ class BackwardPass:
     def accumulated(self) -> list[str]:
         """The parameters, except for f_det, that the pass has given a gradient."""
         of_colour = () if self.colour is None else ("sh0", "shN")
-        return [
-            name
-            for name in self.params
-            if name in of_colour or (name != "detail" and self.has_given(self.params[name]))
-        ]
+        given = (name for name, p in self.params.items() if name in of_colour or self.has_given(p))
+        return [name for name in given if name != "detail"]
 
     def has_given(self, leaf: Tensor) -> bool:
         """Whether the pass has added to `.grad` of this leaf."""

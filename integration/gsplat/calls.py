@@ -37,9 +37,8 @@ _POSE_RATIO: Final = 10  # by which the second nearest pose must be farther away
 def cameras_read(call: Call) -> dict[str, Tensor]:
     """`viewmats` and `Ks` of a call in the CPU's memory. From a device both come in one transfer, for which the host waits."""
     viewmats, Ks = (call[name].detach() for name in ("viewmats", "Ks"))
-    together = torch.cat(
-        (viewmats.reshape(-1), Ks.to(viewmats.device).reshape(-1))
-    ).cpu()  # in the wider of their types
+    flat = viewmats.reshape(-1), Ks.to(viewmats.device).reshape(-1)
+    together = torch.cat(flat).cpu()  # in the wider of their types
     poses, K = torch.split(together, [viewmats.numel(), Ks.numel()])
     return {"viewmats": poses.view(viewmats.shape).to(viewmats.dtype), "Ks": K.view(Ks.shape).to(Ks.dtype)}
 

@@ -7,7 +7,7 @@ import logging
 import math
 import shlex
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, Literal
@@ -108,8 +108,9 @@ def read(
     if base.resolve().is_relative_to(root.resolve()):
         raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
     chosen = ((path.name, path) for path in _without_masks_and_twins(images))
-    paths = _without_thumbnails([path for _, path in usable(root, chosen, skip_faulty=skip_faulty)])
-    if all(width == 2 * height for width, height in (read_header(path).stored for path in paths)):
+    sizes = {path: read_header(path).stored for _, path in usable(root, chosen, skip_faulty=skip_faulty)}
+    paths = _without_thumbnails(sizes)
+    if all(sizes[path][0] == 2 * sizes[path][1] for path in paths):
         message = (
             "%s: all photos are twice as wide as high. Of 360-degree panoramas, poses and splat would be wrong: %s."
         )
@@ -202,14 +203,14 @@ def _without_masks_and_twins(paths: Sequence[Path]) -> list[Path]:
     return kept
 
 
-def _without_thumbnails(paths: Sequence[Path]) -> list[Path]:
+def _without_thumbnails(sizes: Mapping[Path, tuple[int, int]]) -> list[Path]:
     """The photos without those that are so small beside the largest that they are previews of others."""
-    pixels = {path: math.prod(read_header(path).stored) for path in paths}
-    small = [path.name for path in paths if _THUMBNAIL * pixels[path] < max(pixels.values())]
+    most = max(map(math.prod, sizes.values()), default=0)
+    small = [path for path, size in sizes.items() if _THUMBNAIL * math.prod(size) < most]
     if small:
         message = "%d of the images have less than 1/%d of the pixels of the largest, and are not used: %s."
-        _log.warning(message, len(small), _THUMBNAIL, some(small))
-    return [path for path in paths if path.name not in small]
+        _log.warning(message, len(small), _THUMBNAIL, some([path.name for path in small]))
+    return [path for path in sizes if path not in small]
 
 
 def _cache_key(paths: Sequence[Path], *settings: int) -> str:
