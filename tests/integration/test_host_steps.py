@@ -1,6 +1,7 @@
 """A host's optimizers and gradient scaler: f_det and the extra views follow them, and a step without the strategies is told."""
 
 import functools
+import gc
 from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
@@ -408,6 +409,7 @@ def test_a_loop_that_ends_before_hr_takes_part_is_told(caplog):
 
 @pytest.mark.parametrize("factor", [1, 4])
 def test_a_loop_without_hr_is_told_of_no_work_on_it(factor, caplog):
+    gc.collect()  # attachments of other tests speak when they end
     caplog.set_level("INFO")
     scene = toy.scene(20)
     views = [replace(view, hr=view.hr.reduced(view.factor // factor)) for view in scene.train]
