@@ -4,25 +4,35 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from numbers import Real
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from clear_strategies.core.checks import is_color
 from clear_strategies.core.conflicts import Products, Weights
+from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import Grads, ScreenGradients, Shot
 from clear_strategies.core.step import Losses, Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.core.work_log import WorkLog
-from clear_strategies.errors import StrategyConflict
+from clear_strategies.errors import AnswerError, StrategyConflict
 from clear_strategies.merging.logs import IterationLogs
 from clear_strategies.merging.objective import Objective
-from clear_strategies.strategies import answers
+from clear_strategies.strategies.answers import (
+    is_real,
+    refuse,
+    require_finite,
+    require_not_negative,
+    require_stored,
+    rows_like,
+)
 from clear_strategies.strategies.base import (
     RunFacts,
     Scale,
@@ -67,7 +77,7 @@ class Hooks:
         self.strategies = tuple(strategies)
         self.objective = objective
         self.views: tuple[View, ...] = ()
-        self.run: Sequence[RunFacts] | None = None
+        self.run: RunFacts | None = None
         self.logs = IterationLogs(strategies)
         self.work_log = WorkLog()
         self.comparing = [s for s in strategies if overrides(s, "compare")]
@@ -97,24 +107,19 @@ class Hooks:
             splats: see `Strategy.splats`; None: exp and sigmoid.
         """
         self.work_log.device, self.views = torch.device(device), tuple(views)
+        # Arithmetic with numpy's numbers overflows.
+        self.run = RunFacts(self.work_log.device, int(seed), self.objective.lambda_hr, splats or by_exp_and_sigmoid)
         for s in self.strategies:
-            of_last_run = s.of_run
-            s.on_fit_start(n_views, seed)
-            answers.require_started(s, of_last_run)
-            s.to(device)
-            s.of_run.lambda_hr, s.of_run.splats = self.objective.lambda_hr, splats or by_exp_and_sigmoid
+            s.begin(self.run, n_views)
             if overrides(s, "on_views"):
                 with self.work_log.stage("views prepared"):
                     s.on_views(views)
-        self.run = [s.of_run for s in self.strategies]
 
-    def trains(self, run: Sequence[RunFacts] | None) -> bool:
+    def trains(self, run: RunFacts | None) -> bool:
         """Return True if this conductor and its strategies have begun `run`, and no other one since."""
-        return run is self.run and (
-            run is None or all(s.of_run is x for s, x in zip(self.strategies, run, strict=True))
-        )
+        return run is self.run and (run is None or all(s.of_run is run for s in self.strategies))
 
-    def require_run(self, run: Sequence[RunFacts] | None) -> None:
+    def require_run(self, run: RunFacts | None) -> None:
         """Raise a StrategyConflict if the conductor or one of its strategies takes part in another run by now."""
         if not self.trains(run):
             raise StrategyConflict(
@@ -126,7 +131,12 @@ class Hooks:
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | Float[Tensor, "2 N"] | None:
         """zᵗ, before render; None: every Gaussian takes part."""
         s = self._answering["gate"]
-        z = answers.gate(s, s.gate(t, n), n)
+        z = s.gate(t, n)
+        shape = (n,) if s.shares_gate else (2, n)
+        if z is not None and not is_real(z, shape):
+            scales = "" if s.shares_gate else ", a row for LR and one for HR,"
+            refuse(s, "gate", f"a tensor {[*shape]}{scales} or None", z)
+        require_not_negative(s, "gate", "z", z)
         if z is None and self.owner("gate") is not None:
             self.work_log.skip("gate", "no Gaussian is dropped at this rate")
         return None if z is None else z.detach().float().contiguous()  # kernels read nothing else
@@ -134,7 +144,10 @@ class Hooks:
     def background(self, t: int) -> Color | None:
         """The colour behind every rendering of iteration t; None: the scene's own."""
         s = self._answering["background"]
-        return answers.background(s, s.background(t))
+        color: Any = s.background(t)
+        if color is not None and not is_color(color):
+            refuse(s, "background", "three numbers in [0, 1] or None", color)
+        return None if color is None else (color[0], color[1], color[2])
 
     def looked_up(self, view: View) -> Tensor | None:
         """`Strategy.looked_up` of the strategy that observes, for `Step.looked_up`."""
@@ -145,24 +158,40 @@ class Hooks:
     ) -> Callable[[Tensor], Losses]:
         """The comparison of an image with its photo: `losses`, the objective's, within those of the strategies."""
         for s in reversed(self.comparing):
-            losses = partial(answers.compared, s, scale, photo, step, losses)
+            losses = partial(_compared, s, scale, photo, step, losses)
         return losses
 
     def observed(self, step: Step, hr: Shot) -> Step:
         """The step with the evidence q, a, w of the HR render.  Eq. 9, 10"""
         s = self._answering["observe"]
-        return replace(step, evidence=answers.evidence(s, s.observe(step, hr), len(hr.visible)))
+        e, n = s.observe(step, hr), len(hr.visible)
+        if not (e is None or isinstance(e, Evidence)):
+            refuse(s, "observe", "an Evidence or None", e)
+        for name in () if e is None else ("reliability", "demand"):
+            if not is_real(getattr(e, name), (n,)):
+                refuse(s, "observe", f"an Evidence whose {name} is a tensor [{n}]", getattr(e, name))
+        return replace(step, evidence=e)
 
     def route(self, step: Step, n: int) -> float | Float[Tensor, " N"]:
         """m, how much of its high-frequency gradient each of the n Gaussians gets.  Eq. 12"""
         s = self._answering["route"]
-        return answers.route(s, s.route(step), n)
+        m = s.route(step)
+        if not (isinstance(m, Real) or is_real(m, (n,))):
+            refuse(s, "route", f"a number or a tensor [{n}]", m)
+        if not isinstance(m, Tensor):
+            require_finite(s, "route", {"m": m})
+        return m
 
     def score(self, step: Step, screen: ScreenGradients) -> Float[Tensor, " N"]:
         """The densification score; the ordinary one where no strategy has another.  Eq. 14"""
         s = self._answering["score"]
-        score = answers.score(s, s.score(step, screen), len(screen.ordinary))
-        return screen.ordinary if score is None else score
+        score, n = s.score(step, screen), len(screen.ordinary)
+        if score is None:
+            return screen.ordinary
+        if not is_real(score, (n,)):
+            refuse(s, "score", f"a tensor [{n}] or None", score)
+        require_finite(s, "score", {"S": score})  # a Gaussian whose score is NaN would never grow
+        return score
 
     def reconciled(
         self, products: Products, step: Step | None, both: Callable[[], tuple[Grads, Grads]], *, finite: bool = False
@@ -179,8 +208,17 @@ class Hooks:
         s = self._answering["reconcile"]
         if overrides(s, "correct"):
             g_lr, g_hr = both()
-            return answers.corrected(s, s.correct(g_lr, g_hr, step), g_hr, finite=finite)
-        return answers.weights(s, s.reconcile(products, step), *products.dot.shape, finite=finite)
+            # By attributes of g_HR; those that the answer leaves out are 0.
+            return rows_like(s, "correct", s.correct(g_lr, g_hr, step), g_hr, "of g_HR", finite=finite)
+        weights, (n, groups) = s.reconcile(products, step), products.dot.shape
+        if not isinstance(weights, Weights):
+            refuse(s, "reconcile", "Weights(keep, remove)", weights)
+        for name, w in weights._asdict().items():
+            if not (isinstance(w, Real) or is_real(w, (), (n,), (n, groups))):
+                refuse(s, "reconcile", f"Weights whose {name} is a number or a tensor [{n}] or [{n}, {groups}]", w)
+        if finite:
+            require_finite(s, "reconcile", weights._asdict())
+        return weights
 
     def regularized(self, params: Mapping[str, Tensor], t: int, *, finite: bool = False) -> Grads:
         """What the strategies add to the merged gradient; empty: nothing.  Eq. 16
@@ -190,11 +228,12 @@ class Hooks:
         """
         total = Grads()
         for s in self.regularizers:
-            g = answers.regularized(s, s.regularize(params, iteration(t)), params, finite=finite)
-            if g is None:
+            answer = s.regularize(params, iteration(t))
+            if answer is None:
                 self.work_log.skip("regularize", "it adds nothing yet")
-            else:
-                total = g if not total else total + g
+                continue
+            g = rows_like(s, "regularize", answer, params, "of the parameters", finite=finite)
+            total = g if not total else total + g
         return total
 
     @apart_from_the_loop
@@ -214,7 +253,7 @@ class Hooks:
         if self.objective.lambda_lr == 0 or not self.showing:
             return []
         with self.work_log.stage("pictures of extra views"):  # a pseudo view is made when it is first asked for
-            return [extra for s in self.showing for extra in answers.extra_views(s, s.extra_views(t))]
+            return [extra for s in self.showing for extra in _extra_views(s, t)]
 
     @apart_from_the_loop
     def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
@@ -222,10 +261,16 @@ class Hooks:
         params = MappingProxyType(params)  # to replace an entry would have no effect
         for s in self.strategies:
             s.after_step(params, step)
-            answers.require_stored(s, params)
+            require_stored(s, params)
 
     def may_densify(self, t: int) -> bool:
-        return all(answers.may_densify(s, s.may_densify(t)) for s in self.strategies)
+        for s in self.strategies:
+            answer: Any = s.may_densify(t)
+            if answer is None:  # a forgotten return would end densification
+                refuse(s, "may_densify", "True or False", answer)
+            if not answer:
+                return False
+        return True
 
     @apart_from_the_loop
     def on_resize(self, parents: Int[Tensor, " M"]) -> None:
@@ -237,7 +282,8 @@ class Hooks:
         self.views = ()
         for s in self.strategies:
             s.on_fit_end()
-            s.of_run.splats = by_exp_and_sigmoid  # the run's own keeps the field
+        if self.run is not None:
+            self.run.splats = by_exp_and_sigmoid  # the run's own keeps the field
 
     def state_dict(self) -> dict[str, Tensor]:
         """Every strategy's `state`, as "<class>.<name>", and `run_state`, as "<class>:<name>" ("<class>2" for a second of one
@@ -279,3 +325,44 @@ def _only(strategies: Sequence[Strategy], hook: str) -> Strategy:
             "strategy that combines them."
         )
     return owners[0] if owners else Strategy()
+
+
+def _compared(
+    s: Strategy,
+    scale: Scale,
+    photo: Photo,
+    step: Step,
+    losses: Callable[[Tensor], Losses],
+    image: Float[Tensor, "H W 3"],
+) -> Losses:
+    """The answer of `compare`."""
+    inner: list[Losses] = []
+
+    def noted(image: Float[Tensor, "H W 3"]) -> Losses:
+        if inner:  # the memory of the first cotangents is used again
+            raise AnswerError(f"{type(s).__name__}.compare() must call losses(image) once, but calls it again.")
+        inner.append(losses(image))
+        return inner[0]
+
+    found = s.compare(scale, image, photo, step, noted)
+    if not inner or not isinstance(found, Losses):
+        refuse(s, "compare", "the Losses that losses(image) returns, or these with changes", found)
+    shape = inner[0].cotangents.shape
+    if not is_real(found.cotangents, tuple(shape)):
+        rule = f"Losses whose cotangents are a tensor {[*shape]}; add a loss to one of them"
+        refuse(s, "compare", rule, found.cotangents)
+    return found
+
+
+def _extra_views(s: Strategy, t: int) -> list[ExtraView]:
+    """The answer of `extra_views`."""
+    answer: Any = s.extra_views(t)
+    extras = [*answer] if isinstance(answer, Iterable) else refuse(s, "extra_views", "a sequence of ExtraView", answer)
+    for extra in extras:
+        if not isinstance(extra, ExtraView):
+            refuse(s, "extra_views", "a sequence of ExtraView", extra)
+        shape = extra.photo.image.shape[:2]
+        if not is_real(extra.weight, shape):
+            refuse(s, "extra_views", f"an ExtraView whose weight is a tensor {[*shape]}, as its photo", extra.weight)
+        require_not_negative(s, "extra_views", "the weight", extra.weight)
+    return extras

@@ -41,7 +41,7 @@ from clear_strategies.kernels import reconcile
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.outputs import figures
 from clear_strategies.schedules import WarmupDecay
-from clear_strategies.strategies import answers
+from clear_strategies.strategies.answers import rows_like
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.field import FieldShot
 from clear_strategies.viewing.cameras import at_most
@@ -184,7 +184,7 @@ def _gradients(
     g_lr, g_hr = g_lr.without_detail(), from_hr.g
     if (owner := aside.owner("reconcile")) is None:
         return g_lr, g_hr, None, hr.image.detach().cpu()
-    answer = answers.corrected(owner, owner.correct(g_lr, g_hr, from_hr.step), g_hr, finite=False)
+    answer = rows_like(owner, "correct", owner.correct(g_lr, g_hr, from_hr.step), g_hr, "of g_HR")
     return g_lr, g_hr, answer, hr.image.detach().cpu()
 
 

@@ -50,7 +50,7 @@ def by_exp_and_sigmoid(params: Mapping[str, Tensor]) -> Splats:
 
 @dataclass(slots=True, eq=False)
 class RunFacts:
-    """What the trainer tells a strategy of the run; the properties and methods of `Strategy` give it.
+    """What the trainer tells the strategies of a run; the properties and methods of `Strategy` give it.
 
     Args:
         seed: None before the run starts.
@@ -73,7 +73,7 @@ class Strategy:
         run_state: other tensors that checkpoints save, of any shape: parameters of the strategy's own, by view or by group.
         cache: values that can be computed again (patch maps, keyed by view); never saved.
         logs: scalars of this iteration, see `log`.
-        of_run: device, seed, λ_HR and activations of the run, a new object in each run.
+        of_run: device, seed, λ_HR and activations of the run, an object that its strategies share.
 
     Randomness must be a function of (seed, t), so that resuming needs no generator state. Hooks run without autograd. Copies and
     pickles have the settings alone, for a run of their own.
@@ -110,13 +110,7 @@ class Strategy:
         return None
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
-        """Start a run, or resume one. Overriders call `super()`."""
-        self.state.clear()
-        self.run_state.clear()
-        self.cache.clear()
-        self.logs.clear()
-        of_run = RunFacts(self.device, int(seed))  # arithmetic with numpy's overflows
-        object.__setattr__(self, "of_run", of_run)
+        """Start a run, or resume one."""
 
     def on_views(self, views: Sequence[View]) -> None:
         """Look at all training views once, after `on_fit_start`.
@@ -236,6 +230,15 @@ class Strategy:
     def on_fit_end(self) -> None:
         """After the last iteration: release the memory that only training needs."""
 
+    def begin(self, run: RunFacts, n_views: int) -> None:
+        """Forget the last run, and start this one. A conductor calls it."""
+        for of_last_run in (self.state, self.run_state, self.cache, self.logs):
+            of_last_run.clear()
+        object.__setattr__(self, "of_run", run)
+        self.on_fit_start(n_views, self.seed)
+        for made in (self.state, self.run_state):
+            made.update({name: x.to(self.device) for name, x in made.items()})
+
     # ---- facts about the strategy, for the plan, the pictures and recordings -------------------------------------------
 
     def summary(self) -> str | None:
@@ -281,15 +284,9 @@ class Strategy:
             raise AnswerError(f"{type(self).__name__}.log({name!r}, …) takes one number, got {found}.")
         self.logs[name] = value
 
-    def to(self, device: torch.device | str) -> None:
-        """Move `state` and `run_state` to the device of the field; answers are expected there."""
-        self.of_run.device = torch.device(device)
-        for tensors in (self.state, self.run_state):
-            tensors.update({name: x.to(device) for name, x in tensors.items()})
-
     @property
     def device(self) -> torch.device:
-        """The device of the field."""
+        """The device of the field, where answers are expected."""
         return self.of_run.device
 
     def lambda_hr(self, t: int) -> float:
@@ -323,7 +320,7 @@ def misspelled(cls: type[Strategy]) -> dict[str, str]:
     """Public methods that `Strategy` does not have, by the hook which each resembles and which the class does not override."""
     found = dict[str, str]()
     inherited = (name for name in vars(Strategy) if getattr(cls, name) is getattr(Strategy, name))
-    hooks = [name for name in inherited if name not in _OWN_NAMES | {"log", "to"} and name[0] != "_"]
+    hooks = [name for name in inherited if name not in _OWN_NAMES | {"log", "begin"} and name[0] != "_"]
     for name, _ in inspect.getmembers(cls, inspect.isfunction):
         if name[0] != "_" and not hasattr(Strategy, name):
             found |= dict.fromkeys(get_close_matches(name, hooks, n=1, cutoff=_ALIKE), name)

@@ -245,7 +245,6 @@ ANSWERS = {
         "extra_views", lambda t: [ExtraView(photo := toy.scene().train[0].lr, weight=photo.image[..., 0] * torch.nan)],
         "must give finite numbers >= 0, but the weight has nan to nan",
     ),
-    "start": ("on_fit_start", None, "must call super\\(\\).on_fit_start"),
 }  # fmt: skip
 
 
@@ -437,7 +436,7 @@ def test_a_strategy_knows_its_run_whatever_it_does_to_its_cache():
         assert (balanced.seed, balanced.device.type) == (7, "meta")
         merged = conductor.update(field.raw(), lr, hr, view, t).grads
         assert torch.allclose(merged["means"], 0.25 * g_lr["means"] + 0.5 * g_hr["means"], atol=1e-7)
-    inspect.unwrap(Strategy.on_fit_start)(balanced, 1, np.int64(7))  # which only tests refuse, by its type
+    inspect.unwrap(Conductor.on_fit_start)(conductor, 1, np.int64(7))  # which only tests refuse, by its type
     assert torch.equal(dropout_mask(9, 0.5, balanced.seed, 1), dropout_mask(9, 0.5, 7, 1))
 
 

@@ -450,7 +450,6 @@ class ByMean(cs.Strategy):
     in_place: bool = True
 
     def on_fit_start(self, n_views, seed):
-        super().on_fit_start(n_views, seed)
         self.state["mean"] = torch.ones(())
 
     def reconcile(self, products, step):
