@@ -178,13 +178,8 @@ class Density(Densifier):
             )
         rows = torch.arange(n, device=chosen.device)
         stay, clones, splits = rows[keep & ~split], rows[keep & chosen & ~split], rows[keep & split]
-        children = splits.repeat(_CHILDREN)
-        parents = torch.cat((stay, clones, children))
-        fresh = torch.arange(len(parents), device=parents.device) >= len(stay)
-        field.take(parents)
-        optimizer.take(parents, fresh)
+        parents = self._succeed(field, optimizer, stay, torch.cat((clones, splits.repeat(_CHILDREN))))
         self._place_children(field, slice(len(stay) + len(clones), len(parents)), t)
-        self.score, self.ordinary, self.count = (self.score.new_zeros(len(parents)) for _ in range(3))
         _log.debug(
             "t=%d: %d cloned, %d split, %d pruned: %d -> %d Gaussians.",
             t, len(clones), len(splits), n - int(keep.sum()), n, len(parents),
@@ -219,6 +214,16 @@ class Density(Densifier):
             )  # fmt: skip
             self._warned_of_cap = True
         return topk_mask(score, min(wanted, room))
+
+    def _succeed(
+        self, field: GaussianField, optimizer: Adam, stay: Int[Tensor, " K"], copied: Int[Tensor, " C"]
+    ) -> Int[Tensor, " M"]:
+        """Gather the rows that stay, and after them copies without momentum; returns parents [M]. Statistics begin anew."""
+        parents = torch.cat((stay, copied))
+        field.take(parents)
+        optimizer.take(parents, torch.arange(len(parents), device=parents.device) >= len(stay))
+        self.score, self.ordinary, self.count = (self.score.new_zeros(len(parents)) for _ in range(3))
+        return parents
 
     def _place_children(self, field: GaussianField, children: slice, t: int) -> None:
         """Place split children at random inside their parent, and make them smaller."""

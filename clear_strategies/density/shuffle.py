@@ -82,10 +82,7 @@ class ShuffleSplit(Density):
         chosen = topk_mask(opacities, min(count_passing(opacities, s.split_above), room))
         rows = torch.arange(n, device=chosen.device)
         stay, parent = rows[~chosen], rows[chosen]
-        parents = torch.cat((stay, parent.repeat(_CHILDREN)))
-        fresh = torch.arange(len(parents), device=parents.device) >= len(stay)
-        field.take(parents)
-        optimizer.take(parents, fresh)
+        parents = self._succeed(field, optimizer, stay, parent.repeat(_CHILDREN))
         children = slice(len(stay), len(parents))
         side = torch.arange(_CHILDREN, device=parents.device).repeat_interleave(len(parent))
         axis = torch.nn.functional.one_hot(side // 2, 3).to(field.scales.data)
@@ -94,7 +91,6 @@ class ShuffleSplit(Density):
         field.scales.data[children] -= axis * math.log(_ALONG) + (1 - axis) * math.log(_ACROSS)
         o = field.opacities.data[children]
         field.opacities.data[children] = torch.logit(-torch.expm1(torch.nn.functional.logsigmoid(-o) / 2), eps=1e-6)
-        self.score, self.ordinary, self.count = (self.score.new_zeros(len(parents)) for _ in range(3))
         _log.debug("t=%d: %d shuffled into six each: %d -> %d Gaussians.", t, len(parent), n, len(parents))
         return parents
 

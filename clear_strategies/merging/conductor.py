@@ -35,7 +35,7 @@ from clear_strategies.merging.iteration import (
 )
 from clear_strategies.merging.objective import Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
-from clear_strategies.strategies.base import Strategy
+from clear_strategies.strategies.base import RunFacts, Strategy
 from rasterizers.guards import iteration
 from rasterizers.interface import Color
 from rasterizers.modes import apart_from_the_loop
@@ -78,6 +78,14 @@ class Conductor(Hooks):
         self.decorated = not self.decorators
         self.sr: Any = None
         self._hr_cotangents: Tensor | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The settings. A copy of a conductor that takes part in a run has to begin its own."""
+        anew = Conductor(
+            *self.strategies, objective=self.objective, statistics_from=self.statistics_from, decorators=self.decorators,
+            detail=self.detail, skips=self.skips.skips,
+        )  # fmt: skip
+        return {**vars(self), **vars(anew), "run": None if self.run is None else RunFacts()}
 
     def prior(self, prior: P) -> P:
         """The prior with every decorator around it, which makes the SR images of a run with this conductor."""

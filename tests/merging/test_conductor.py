@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import pickle
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -308,9 +309,12 @@ def test_a_strategy_takes_part_in_one_run_at_a_time_and_a_copy_in_none():
     next(trace := given.trace(first, 1, given.STEPS))
     second = Conductor(*first.strategies)
     second.on_fit_start(1, 0)
-    for stopped in (trace, given.trace(copy.deepcopy(second), 1, given.STEPS)):
+    copies = [copy.deepcopy(second), pickle.loads(pickle.dumps(second))]  # noqa: S301 - our own bytes
+    for stopped in (trace, *(given.trace(one, 1, given.STEPS) for one in copies)):
         with pytest.raises(StrategyConflict, match="begun anew for another one since, or are copies"):
             list(stopped)
+    copies[1].on_fit_start(1, 0)
+    assert list(given.trace(copies[1], 1, given.STEPS))
 
 
 @dataclass(frozen=True)
