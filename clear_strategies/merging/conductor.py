@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core import images
@@ -35,7 +35,7 @@ from clear_strategies.merging.iteration import (
 )
 from clear_strategies.merging.objective import Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
-from clear_strategies.strategies.base import RunFacts, Strategy
+from clear_strategies.strategies.base import RunFacts, Scale, Strategy
 from rasterizers.guards import iteration
 from rasterizers.interface import Color
 from rasterizers.modes import apart_from_the_loop
@@ -162,7 +162,7 @@ class Conductor(Hooks):
             DivergedError: a loss or a gradient is not finite; `params` and the optimizer are unchanged.
         """
         self.require_run(self.run)
-        o, stage, where = self.objective, self.work_log.stage, _where(view, t)
+        stage, where = self.work_log.stage, _where(view, t)
         vjp: Callable[..., Sequence[Grads]] = _vjp if stepper is None else stepper.vjp
         reduced = not self.wants_lr or (lr is None and view.factor == 1)
         rendered = hr if reduced else lr
@@ -172,14 +172,10 @@ class Conductor(Hooks):
                 "and wants_hr(t) ask for."
             )
         self.logs.keep()
-        known = Step(t, view, params=params, looked_up=looked_up)
-        step = self._told(known)
-        with stage("losses LR"):
-            low, photo = rendered.image.detach(), self._over_background(view.lr, t, view.background)
-            _require_size(view, "HR" if reduced else "LR", low, view.hr.image if reduced else photo.image)
-            compare = self.comparison("lr", photo, step, lambda image: o.lr(image, photo.image, photo.shown))
-            l_lr = compare(images.area_mean(low, view.factor) if reduced else low)  # Eq. 4
-        require_finite_losses(where, l_lr.values, {"the LR photo": photo.image, "the LR render": low})
+        step = Step(t, view, params=params, looked_up=looked_up)
+        _require_size(view, "hr" if reduced else "lr", rendered.image)
+        image = rendered.image.detach()
+        l_lr = self._losses("lr", images.area_mean(image, view.factor) if reduced else image, step)  # Eq. 4
         g_lr: Any = None
         from_hr: HrSide | None = None
         if not reduced:
@@ -190,12 +186,12 @@ class Conductor(Hooks):
         else:
             # Where Î_LR is the area mean of Î_HR, the cotangent of L_LR passes through the same HR render.
             through_mean = images.area_mean_transposed(l_lr.cotangents, view.factor) if reduced else None
-            from_hr = self.hr_gradients(hr, known, vjp, lr_cotangents=through_mean)
+            from_hr = self.hr_gradients(hr, step, vjp, lr_cotangents=through_mean)
             g_lr, step = from_hr.lr if reduced else g_lr, from_hr.step
         with stage("strategies" if stepper is None else "per-Gaussian pass"):
             score = ordinary = None
             if scored:
-                weights = (o if stepper is None else stepper).weights(t)
+                weights = (self.objective if stepper is None else stepper).weights(t)
                 screen_lr = to_ndc(screen_of(g_lr), _size(rendered.image))
                 score, ordinary = self.scores(screen_lr, from_hr, weights)  # S^dens   Eq. 14
             require_finite_parts(where, g_lr, from_hr)
@@ -227,18 +223,11 @@ class Conductor(Hooks):
             apart: False: one cotangent, of L_base + λ_HF L_HF, unless a strategy routes or scores by L_HF.
             lr_cotangents: of λ_LR L_LR, if its gradient passes through this render, too.
         """
-        stage, λ_hf, t, view = self.work_log.stage, self.objective.lambda_hf, step.t, step.view
-        with stage("losses HR"):
-            sr = self._over_background(view.hr, t, view.background)
-            _require_size(view, "HR", hr.image, sr.image)
-            step = self._told(replace(step, visible=hr.visible))
-            compare = self.comparison("hr", sr, step, lambda image: self._compared_at_hr(image, sr))
-            losses = compare(hr.image.detach())  # Eq. 5
-        require_finite_losses(_where(view, t), losses.values, {"the SR image": sr.image, "the HR render": hr.image})
-        of_hr = losses.cotangents
-        if len(of_hr) != 1 + (λ_hf > 0):
-            rule = f"must give {1 + (λ_hf > 0)} cotangents, of L_base{' and of L_HF' * (λ_hf > 0)}, got {len(of_hr)}"
-            raise ValueError(f"{type(self.objective).__name__}.hr() {rule}. Add another loss to one of them.")
+        stage, λ_hf = self.work_log.stage, self.objective.lambda_hf
+        _require_size(step.view, "hr", hr.image)
+        step = replace(step, visible=hr.visible)
+        losses = self._losses("hr", hr.image.detach(), step)  # Eq. 5
+        of_hr, step = losses.cotangents, self._told(step)
         if len(of_hr) == 2 and not (apart or self.owner("route") is not None or self.owner("score") is not None):
             of_hr = torch.add(of_hr[:1], of_hr[1:], alpha=λ_hf)
         has_hf, n = len(of_hr) == 2, len(hr.visible)
@@ -329,11 +318,29 @@ class Conductor(Hooks):
         self._hr_cotangents = None
         super().on_fit_end()
 
-    def _compared_at_hr(self, image: Float[Tensor, "H W 3"], sr: Photo) -> Losses:
+    def _losses(self, scale: Scale, image: Float[Tensor, "H W 3"], step: Step) -> Losses:
+        """The losses of a render against the photo of its scale, which lies over the background of the iteration."""
+        view, is_lr = step.view, scale == "lr"
+        with self.work_log.stage(f"losses {scale.upper()}"):
+            photo = self._over_background(view.lr if is_lr else view.hr, step.t, view.background)
+            losses = self.objective.lr if is_lr else self._hr_losses
+            compare = self.comparison(scale, photo, self._told(step), lambda x: losses(x, photo.image, photo.shown))
+            found = compare(image)
+        target = "the LR photo" if is_lr else "the SR image"
+        compared = {target: photo.image, f"the {scale.upper()} render": image}
+        require_finite_losses(_where(view, step.t), found.values, compared)
+        return found
+
+    def _hr_losses(
+        self, image: Float[Tensor, "H W 3"], sr: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None
+    ) -> Losses:  # fmt: skip
         """L_base and L_HF. Their cotangents take the memory of the last ones: an allocator would map tens of megabytes anew each
         time, with a page fault for every 4 KB.
         """
-        losses = self.objective.hr(image, sr.image, sr.shown, self._hr_cotangents)
+        losses, has_hf = self.objective.hr(image, sr, shown, self._hr_cotangents), self.objective.lambda_hf > 0
+        if (found := len(losses.cotangents)) != 1 + has_hf:
+            rule = f"must give {1 + has_hf} cotangents, of L_base{' and of L_HF' * has_hf}, got {found}"
+            raise ValueError(f"{type(self.objective).__name__}.hr() {rule}. Add another loss to one of them.")
         self._hr_cotangents = losses.cotangents  # not those that a strategy returns, which may be stored
         return losses
 
@@ -358,13 +365,14 @@ def _vjp(
     return summed(shot.vjp(cotangents), weight) if of_shot is None else of_shot(cotangents, weight)
 
 
-def _require_size(view: View, scale: str, render: Tensor, image: Tensor) -> None:
+def _require_size(view: View, scale: Scale, render: Tensor) -> None:
+    image = (view.lr if scale == "lr" else view.hr).image
     if render.shape != image.shape:
         (h, w, *_), (height, width, *_) = render.shape, image.shape
-        rule = f"must have the {width}x{height} pixels of its {scale} image"
+        rule = f"must have the {width}x{height} pixels of its {scale.upper()} image"
         found = f"{w}x{h}" if render.shape[2:] == image.shape[2:] else f"the shape {[*render.shape]}"
         raise ValueError(
-            f"view {view.name}: the {scale} rendering {rule}, got {found}. Draw it by view.{scale.lower()}.camera."
+            f"view {view.name}: the {scale.upper()} rendering {rule}, got {found}. Draw it by view.{scale}.camera."
         )
 
 

@@ -102,7 +102,7 @@ class CompiledStep:
         self.conductor, self.optimizer, self.skips = conductor, optimizer, skips
         self._passes = gaussian_pass(optimizer) if passes is None else passes
         self.records = getattr(self._passes, "records", False)
-        self._numbers: Tensor | None = None  # see `_recorded_numbers`
+        self._numbers: Tensor | None = None  # on the device: `count` writes them before each replay of a recording
         self.bands, self._restored = 0, -1  # see `_find_bands`; `Adam.restored`, then
 
     def vjp(
@@ -138,18 +138,13 @@ class CompiledStep:
         device, (_, λ_hf) = self.optimizer.first["means"].device, self.conductor.objective.weights(t)
         self._numbers = written(self._settings(t, bias2), rates, device, lambda_hf=λ_hf, out=self._numbers)
 
-    @property
-    def _recorded_numbers(self) -> Tensor | None:
-        """The numbers on the device that `count` writes before each replay of a recording; None outside of a recording."""
-        return None if running() is None else self._numbers
-
     def weights(self, t: int) -> LossWeights:
         """λ_HR(t) and λ_HR(t) λ_HF; on the device in a recording."""
-        if (numbers := self._recorded_numbers) is None:
+        if running() is None or self._numbers is None:
             return self.conductor.objective.weights(t)
         from clear_strategies.kernels.gaussian_step.warp import loss_weights
 
-        return loss_weights(numbers)
+        return loss_weights(self._numbers)
 
     def step_extra(self, params: Mapping[str, Tensor], shot: FieldShot, g_lr: Grads, t: int) -> None:
         """Step on this gradient alone: nothing is regularized."""
@@ -172,7 +167,7 @@ class CompiledStep:
         Args:
             corrected: ĝ_HR, if a strategy overrides `correct`. decays: f_det decays.
         """
-        numbers = self._recorded_numbers
+        numbers = None if running() is None else self._numbers
         rates, bias2 = self.optimizer.advance() if numbers is None else ({}, 1.0)
         keep = 1 - self.optimizer.rates.detail_decay if decays else 1.0
         attributes = {

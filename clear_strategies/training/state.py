@@ -242,15 +242,8 @@ class TrainState:
     def checkpoint(self, config: Mapping[str, Any]) -> Checkpoint:
         """The checkpoint of this state."""
         self.require_finite()
-        tensors: dict[str, Tensor] = {}
-        for prefix, table in (
-            ("field", {**self.field.raw(), "filter_3d": self.field.filter_3d}),
-            ("optimizer", self.optimizer.state_dict()),
-            ("density", self.density.state_dict()),
-            ("strategies", self.conductor.state_dict()),
-            (PHOTOS, self.photos),
-        ):
-            tensors |= {f"{prefix}/{name}": value for name, value in table.items()}
+        tables = {**self._tables(), "strategies": self.conductor.state_dict(), PHOTOS: self.photos}
+        tensors = {f"{prefix}/{name}": value for prefix, table in tables.items() for name, value in table.items()}
         facts = {"optimizer_steps": float(self.optimizer.steps), "degree": float(self.field.degree)}
         history, work_log = self.history_as_floats(), self.conductor.work_log.state_dict()
         return Checkpoint(self.t, tensors, config, facts, history, work_log, self.device.type)
@@ -277,21 +270,21 @@ class TrainState:
         self.t = saved.t
         self.history = History(dict(row) for row in saved.history)
 
+    def _tables(self) -> dict[str, Mapping[str, Tensor]]:
+        """The tensors that this trainer's own parts store, by the name of the part."""
+        field = {**self.field.raw(), "filter_3d": self.field.filter_3d}
+        return {"field": field, "optimizer": self.optimizer.state_dict(), "density": self.density.state_dict()}
+
     def _require_rows(self, tables: Mapping[str, Mapping[str, Tensor]], saved: Checkpoint) -> None:
         """Check that all restored tensors have a row for each Gaussian, and the width and type that this run has."""
         if not (1 <= saved.t <= self.settings.iterations + 1 and saved.facts["degree"] <= self.field.max_degree):
             raise ValueError(f"t={saved.t} and degree={saved.facts['degree']:g} do not occur in it")
-        field, n = tables["field"], len(tables["field"]["means"])
-        for name, here in self.field.raw().items():
-            for table, key in (("field", name), ("optimizer", f"first.{name}"), ("optimizer", f"second.{name}")):
-                x = tables[table][key]
-                if x.dtype != here.dtype or tuple(x.shape) != (n, *here.shape[1:]):
-                    raise ValueError(f"{key} is {x.dtype} {tuple(x.shape)}, not {here.dtype} {(n, *here.shape[1:])}")
-        found = {"filter_3d": field["filter_3d"], **tables.get("density", {})}
-        for name, here in {"filter_3d": self.field.filter_3d, **self.density.state_dict()}.items():
-            shape = (n, *here.shape[1:])
-            if len(here.shape) and len(here) == len(self.field) and tuple(found[name].shape) != shape:
-                raise ValueError(f"{name} is {tuple(found[name].shape)}, not {shape}, a row for each Gaussian")
+        n = len(tables["field"]["means"])
+        for part, own in self._tables().items():
+            for name, here in own.items():
+                x, shape = tables[part][name], (n, *here.shape[1:])
+                if here.dim() and len(here) == len(self.field) and (x.dtype, x.shape) != (here.dtype, shape):
+                    raise ValueError(f"{name} is {x.dtype} {tuple(x.shape)}, not {here.dtype} {shape}")
 
     def require_finite(self) -> None:
         """Raise a DivergedError for the first parameter or moment of Adam that is not finite; reads the device."""
