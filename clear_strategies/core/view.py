@@ -211,3 +211,6 @@ class ExtraView:
     weight: Float[Tensor, "h w"]
     background: Color = (0.0, 0.0, 0.0)
     robust: bool = False
+
+    def to(self, device: torch.device | str) -> ExtraView:
+        return replace(self, photo=self.photo.to(device), weight=self.weight.to(device))

@@ -175,9 +175,10 @@ class Hooks:
     def route(self, step: Step, n: int) -> float | Float[Tensor, " N"]:
         """m, how much of its high-frequency gradient each of the n Gaussians gets.  Eq. 12"""
         s = self._answering["route"]
-        m = s.route(step)
-        if not (isinstance(m, Real) or is_real(m, (n,))):
-            refuse(s, "route", f"a number or a tensor [{n}]", m)
+        answer: Any = s.route(step)
+        if not (isinstance(answer, Real) or is_real(answer, (n,))):
+            refuse(s, "route", f"a number or a tensor [{n}]", answer)
+        m: float | Tensor = answer
         if not isinstance(m, Tensor):
             require_finite(s, "route", {"m": m})
         return m

@@ -236,8 +236,7 @@ class Strategy:
             of_last_run.clear()
         object.__setattr__(self, "of_run", run)
         self.on_fit_start(n_views, self.seed)
-        for made in (self.state, self.run_state):
-            made.update({name: x.to(self.device) for name, x in made.items()})
+        self.to(run.device)
 
     # ---- facts about the strategy, for the plan, the pictures and recordings -------------------------------------------
 
@@ -284,9 +283,15 @@ class Strategy:
             raise AnswerError(f"{type(self).__name__}.log({name!r}, …) takes one number, got {found}.")
         self.logs[name] = value
 
+    def to(self, device: torch.device | str) -> None:
+        """Move `state` and `run_state` to the device of the field; answers are expected there."""
+        self.of_run.device = torch.device(device)
+        for tensors in (self.state, self.run_state):
+            tensors.update({name: x.to(device) for name, x in tensors.items()})
+
     @property
     def device(self) -> torch.device:
-        """The device of the field, where answers are expected."""
+        """The device of the field."""
         return self.of_run.device
 
     def lambda_hr(self, t: int) -> float:
@@ -320,7 +325,7 @@ def misspelled(cls: type[Strategy]) -> dict[str, str]:
     """Public methods that `Strategy` does not have, by the hook which each resembles and which the class does not override."""
     found = dict[str, str]()
     inherited = (name for name in vars(Strategy) if getattr(cls, name) is getattr(Strategy, name))
-    hooks = [name for name in inherited if name not in _OWN_NAMES | {"log", "begin"} and name[0] != "_"]
+    hooks = [name for name in inherited if name not in _OWN_NAMES | {"log", "to", "begin"} and name[0] != "_"]
     for name, _ in inspect.getmembers(cls, inspect.isfunction):
         if name[0] != "_" and not hasattr(Strategy, name):
             found |= dict.fromkeys(get_close_matches(name, hooks, n=1, cutoff=_ALIKE), name)
