@@ -132,22 +132,25 @@ class Hooks:
         """zᵗ, before render; None: every Gaussian takes part."""
         s = self._answering["gate"]
         z = s.gate(t, n)
-        shape = (n,) if s.shares_gate else (2, n)
-        if z is not None and not is_real(z, shape):
-            scales = "" if s.shares_gate else ", a row for LR and one for HR,"
+        if z is None:
+            if self.owner("gate") is not None:
+                self.work_log.skip("gate", "no Gaussian is dropped at this rate")
+            return None
+        shape, scales = ((n,), "") if s.shares_gate else ((2, n), ", a row for LR and one for HR,")
+        if not is_real(z, shape):
             refuse(s, "gate", f"a tensor {[*shape]}{scales} or None", z)
         require_not_negative(s, "gate", "z", z)
-        if z is None and self.owner("gate") is not None:
-            self.work_log.skip("gate", "no Gaussian is dropped at this rate")
-        return None if z is None else z.detach().float().contiguous()  # kernels read nothing else
+        return z.detach().float().contiguous()  # kernels read nothing else
 
     def background(self, t: int) -> Color | None:
         """The colour behind every rendering of iteration t; None: the scene's own."""
         s = self._answering["background"]
         color: Any = s.background(t)
-        if color is not None and not is_color(color):
+        if color is None:
+            return None
+        if not is_color(color):
             refuse(s, "background", "three numbers in [0, 1] or None", color)
-        return None if color is None else (color[0], color[1], color[2])
+        return color[0], color[1], color[2]
 
     def looked_up(self, view: View) -> Tensor | None:
         """`Strategy.looked_up` of the strategy that observes, for `Step.looked_up`."""
@@ -165,9 +168,11 @@ class Hooks:
         """The step with the evidence q, a, w of the HR render.  Eq. 9, 10"""
         s = self._answering["observe"]
         e, n = s.observe(step, hr), len(hr.visible)
-        if not (e is None or isinstance(e, Evidence)):
+        if e is None:
+            return replace(step, evidence=None)
+        if not isinstance(e, Evidence):
             refuse(s, "observe", "an Evidence or None", e)
-        for name in () if e is None else ("reliability", "demand"):
+        for name in ("reliability", "demand"):
             if not is_real(getattr(e, name), (n,)):
                 refuse(s, "observe", f"an Evidence whose {name} is a tensor [{n}]", getattr(e, name))
         return replace(step, evidence=e)

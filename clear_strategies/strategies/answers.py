@@ -60,9 +60,9 @@ def require_finite(s: Strategy, hook: str, numbers: Mapping[str, float | Tensor]
             raise AnswerError(f"{_named(s, hook)} must give finite numbers, but {name} {found}.")
 
 
-def require_not_negative(s: Strategy, hook: str, name: str, x: Any) -> None:
+def require_not_negative(s: Strategy, hook: str, name: str, x: Tensor) -> None:
     """Finite numbers >= 0."""
-    if x is None or x.numel() == 0 or not deferred.is_immediate(x):
+    if x.numel() == 0 or not deferred.is_immediate(x):
         return
     least, most = torch.stack(x.float().aminmax()).tolist()
     if not (least >= 0 and most < math.inf):
