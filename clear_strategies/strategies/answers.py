@@ -54,9 +54,10 @@ def require_stored(s: Strategy, params: Mapping[str, Tensor]) -> None:
 
 def require_finite(s: Strategy, hook: str, numbers: Mapping[str, float | Tensor]) -> None:
     for name, x in numbers.items():
-        rows = x if isinstance(x, Tensor) else torch.tensor(float(x))
-        if deferred.is_immediate(rows) and not is_finite(rows):
-            found = rows_not_finite(rows) if rows.dim() else f"is {float(x)}"
+        # No tensor is made of a number, which a recording could not copy to the device.
+        finite = math.isfinite(x) if not isinstance(x, Tensor) else not deferred.is_immediate(x) or is_finite(x)
+        if not finite:
+            found = rows_not_finite(x) if isinstance(x, Tensor) and x.dim() else f"is {float(x)}"
             raise AnswerError(f"{_named(s, hook)} must give finite numbers, but {name} {found}.")
 
 
