@@ -110,7 +110,10 @@ class Strategy:
         return None
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
-        """Start a run, or resume one."""
+        """Start a run, or resume one. A conductor calls `begin`; without one, this starts a run on the present device. Overriders
+        need not call `super()`.
+        """
+        self._forget(RunFacts(self.device, int(seed)))  # arithmetic with numpy's numbers overflows
 
     def on_views(self, views: Sequence[View]) -> None:
         """Look at all training views once, after `on_fit_start`.
@@ -231,12 +234,16 @@ class Strategy:
         """After the last iteration: release the memory that only training needs."""
 
     def begin(self, run: RunFacts, n_views: int) -> None:
-        """Forget the last run, and start this one. A conductor calls it."""
+        """Forget the last run, and start this one, whose facts other strategies share. A conductor calls it."""
+        self._forget(run)
+        self.on_fit_start(n_views, self.seed)
+        object.__setattr__(self, "of_run", run)  # an override that calls `super()` has replaced it
+        self.to(run.device)
+
+    def _forget(self, run: RunFacts) -> None:
         for of_last_run in (self.state, self.run_state, self.cache, self.logs):
             of_last_run.clear()
         object.__setattr__(self, "of_run", run)
-        self.on_fit_start(n_views, self.seed)
-        self.to(run.device)
 
     # ---- facts about the strategy, for the plan, the pictures and recordings -------------------------------------------
 

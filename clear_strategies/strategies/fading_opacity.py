@@ -48,6 +48,7 @@ class FadingOpacity(Strategy):
         require_number("rate", self.rate, below=1)
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
+        super().on_fit_start(n_views, seed)
         share = min(1.0, _FEW_VIEWS / max(1, n_views)) * min(1.0, self.until / _LONG_RUN)
         self.cache["rate"] = self.rate * share
         if share < 1:

@@ -42,6 +42,7 @@ class RandomBackground(Strategy):
     until: int = milestone(9_000)
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
+        super().on_fit_start(n_views, seed)
         self.cache["reason"] = self._reason_to_keep(n_views)
 
     def summary(self) -> str | None:

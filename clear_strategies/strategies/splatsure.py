@@ -57,6 +57,7 @@ class SplatSuRe(Strategy):
         require_whole("min_views", self.min_views, least=1)
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
+        super().on_fit_start(n_views, seed)
         if n_views < self.min_views:
             _log.warning(
                 "SplatSuRe has no effect: %s, fewer than min_views=%d, so that every weight is 1.",

@@ -71,6 +71,7 @@ class SVS(Strategy):
             require_number(f"anchor_weights.{name}", weight)
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
+        super().on_fit_start(n_views, seed)
         n_views = max(1, n_views)
         # The share of the rate for a run that sees each view `dropout.full` / n_views times.
         self.cache["share"] = min(1.0, self.dropout.full / (self.looks * n_views)) if self.looks else 1.0

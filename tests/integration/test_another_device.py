@@ -19,7 +19,6 @@ import torch
 from clear_strategies import PseudoViews, View
 from clear_strategies.compose import conductor
 from clear_strategies.geometry import depth_maps, exposure_gains
-from clear_strategies.strategies.base import RunFacts
 from integration.examples.demo import load_demo
 from integration.views import view
 from tests.helpers.elsewhere import NAME, Elsewhere
@@ -41,7 +40,8 @@ with Elsewhere():
 
     def pseudo_views(device):
         made = PseudoViews(count=3, reach=0.1)
-        made.begin(RunFacts(torch.device(device), seed=0), 3)
+        made.on_fit_start(3, 0)
+        made.to(device)
         made.on_views([View(str(i), photo.to(device), photo.to(device)) for i, photo in enumerate(photos)])
         return [made.extra_views(t)[0] for t in range(2, 20, 2)]
 

@@ -17,7 +17,7 @@ LOGITS = torch.tensor([-20.0, -11.6, -11.4, -5.0, 0.0, 3.0, 15.0])
 
 def faded(settings, t=1, views=3, opacities=LOGITS):
     strategy = replace(settings)
-    strategy.on_fit_start(views, 0)
+    strategy.on_fit_start(views, seed=0)
     params = {"opacities": opacities.clone(), "means": torch.ones(len(opacities), 3)}
     strategy.after_step(params, Step(t, SCENE.train[0], None, None))
     return params

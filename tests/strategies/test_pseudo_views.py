@@ -11,7 +11,6 @@ from clear_strategies.data.prepare import prepare
 from clear_strategies.data.priors import Bicubic
 from clear_strategies.data.readers import demo
 from clear_strategies.data.view_settings import ViewSettings
-from clear_strategies.strategies.base import RunFacts
 from tests.helpers.short_run import SCENE, with_depth
 
 FEW = PseudoViews(count=8, reach=0.1)
@@ -20,7 +19,7 @@ FEW = PseudoViews(count=8, reach=0.1)
 def prepared(views=None, settings=FEW, seed=5):
     views = with_depth(SCENE).train if views is None else views
     strategy = replace(settings)
-    strategy.begin(RunFacts(seed=seed), len(views))
+    strategy.on_fit_start(len(views), seed)
     strategy.on_views(views)
     return strategy
 

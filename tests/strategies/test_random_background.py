@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from clear_strategies import Photo, RandomBackground
-from clear_strategies.strategies.base import RunFacts
 from clear_strategies.training.loop import iterate, view_at
 from tests.helpers.short_run import SCENE, start
 from tests.helpers.toy import RASTERIZER
@@ -14,7 +13,7 @@ from tests.helpers.toy import RASTERIZER
 
 def prepared(views=SCENE.train, seed=5, until=1_350):
     strategy = RandomBackground(until=until)
-    strategy.begin(RunFacts(seed=seed), len(views))
+    strategy.on_fit_start(len(views), seed)
     strategy.on_views(views)
     return strategy
 
@@ -37,7 +36,7 @@ def test_many_views_and_short_runs_keep_the_background_and_say_so(views, until, 
     assert kept.background(1) is None
     assert why in kept.summary()
     without_views = RandomBackground(until=until)
-    without_views.begin(RunFacts(seed=5), len(views))
+    without_views.on_fit_start(len(views), 5)
     without_views.on_views(())  # this loop does not have them at the start
     assert without_views.summary() == kept.summary()
     assert "another colour in each of the first 1,350" in prepared().summary()
