@@ -20,7 +20,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
-import hydra
+from hydra import version
+from hydra._internal.utils import _run_hydra, get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
@@ -39,16 +40,6 @@ _log = logging.getLogger(__name__)
 
 FAILED: Final = "failed.txt"
 """In the folder of a sweep's job: why it failed; beside the folder, behind its name, where that holds a finished run."""
-_VERBOSE: Final = "fit.verbose=true"
-_FLAGS: Final = (
-    "--help", "--hydra-help", "--cfg", "--resolve", "--package", "--run", "--multirun", "--shell-completion",
-    "--config-path", "--config-name", "--config-dir", "--info",
-)  # fmt: skip
-
-
-_WITH_VALUE: Final = {
-    "--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd",
-}  # fmt: skip
 
 
 def main(overrides: Sequence[str] | None = None) -> None:
@@ -58,23 +49,28 @@ def main(overrides: Sequence[str] | None = None) -> None:
         overrides: in place of the program's arguments.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
-    arguments = sys.argv[1:] if overrides is None else overrides
-    arguments = _flags_last(arguments)
-    if completed := re.match(
-        r"(\S+ )train \S+ (.*)", os.environ.get("COMP_LINE", "")
-    ):  # settings behind `train PHOTOS`
+    # Completes settings behind `train PHOTOS`.
+    if completed := re.match(r"(\S+ )train \S+ (.*)", os.environ.get("COMP_LINE", "")):
         os.environ["COMP_LINE"] = line = f"{completed[1]}+strategy=best {completed[2]}"
         os.environ["COMP_POINT"] = str(len(line))
     gc.freeze()  # what has been imported stays: collections need not look through torch's objects, which takes 0.1 s
-    sys.argv[1:] = [_VERBOSE if a in ("-v", "--verbose") else readable(a) for a in arguments]  # Hydra reads them there
+    parser = get_args_parser()
+    parser.add_argument("-v", "--verbose", action="store_true", help="Show details, as fit.verbose=true does")
+    # Intermixed: Hydra's own call of the parser refuses settings on both sides of a flag.
+    options, unknown = parser.parse_known_intermixed_args(sys.argv[1:] if overrides is None else overrides)
+    if unknown:  # argparse's message names none of our commands
+        raise SettingError(f"{unknown[0].partition('=')[0]}: there is no such flag. {WRITTEN}")
+    options.overrides = [*map(readable, options.overrides), *["fit.verbose=true"] * options.verbose]
+    options.config_dir = options.config_dir and files.expanded(options.config_dir)
     exit_codes.require("train")
+    version.setbase("1.3")
     try:
-        hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(job)()
+        _run_hydra(options, parser, job, str(CONF), "config")
     except Exception as error:
         if sweep.stopped:
             raise KeyboardInterrupt(sweep.stopped[0]) from error  # a process of joblib's had not begun, and was ended
         if isinstance(error, HydraException | OmegaConfBaseException):
-            overrides = [word for word in sys.argv[1:] if not word.startswith(("-", "hydra."))]
+            overrides = [word for word in options.overrides if not word.startswith("hydra.")]
             raise not_composed(error, overrides, "config") from error
         if isinstance(error, BrokenProcessPool):
             raise sweep.worker_ended(error) from error
@@ -91,8 +87,6 @@ def readable(word: str) -> str:
         return word
     if key in ("hydra.run.dir", "hydra.sweep.dir") and not value:  # as of a variable that is not set
         raise SettingError(f"{key}: must be a folder, got nothing: {key}=.")
-    if word.startswith("-"):
-        return f"{key}={files.expanded(value)}"
     if key.lstrip("+").startswith("hydra."):
         value = files.expanded(value)
         word = f"{key}={value}"
@@ -108,24 +102,6 @@ def readable(word: str) -> str:
         )
     is_path = value.startswith("\\\\") or ({",", "\\"} & {*value} and os.path.exists(value))  # noqa: PTH110 - as `is_file`
     return f"{key}={quoted(value)}" if is_path else word
-
-
-def _flags_last(arguments: Sequence[str]) -> list[str]:
-    """The settings, then the flags: Hydra refuses settings on both sides of a flag.
-
-    Raises:
-        SettingError: there is no such flag. Hydra's message names none of our commands.
-    """
-    settings, flags, words = list[str](), list[str](), iter(arguments)
-    for word in words:
-        flag = word.partition("=")[0]
-        if flag.startswith("--") and flag != "--verbose" and not any(known.startswith(flag) for known in _FLAGS):
-            raise SettingError(f"{flag}: there is no such flag. {WRITTEN}")
-        if word.startswith("-"):
-            flags += [word, next(words, "")] if word in _WITH_VALUE else [word]
-        else:
-            settings.append(word)
-    return [*settings, *filter(None, flags)]
 
 
 def job(config: DictConfig) -> float | None:

@@ -59,7 +59,7 @@ def test_a_tilde_that_no_shell_expanded_is_the_users_folder(tmp_path, monkeypatc
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "photos").mkdir()
     assert f"data.path={tmp_path}/photos" in train.overrides(["~/photos"])
-    for key in ("hydra.run.dir", "+hydra.sweep.dir", "--config-dir"):
+    for key in ("hydra.run.dir", "+hydra.sweep.dir"):
         assert hydra_app.readable(f"{key}=~/out/${{now:%H}}") == f"{key}={tmp_path}/out/${{now:%H}}"
     assert commands.parser_of("view", "").parse_args(["~/run"]).run == tmp_path / "run"
     make_run(tmp_path / "done")
@@ -76,5 +76,5 @@ def test_data_path_of_any_letters_needs_no_quotes_of_hydras(tmp_path, name):
     (tmp_path / name).mkdir()
     word = hydra_app.readable(f"data.path={tmp_path / name}")
     assert composed(["data=colmap", word], "config").data.path == str(tmp_path / name)
-    for as_it_is in ("fit.seed=1,2", "+strategy=[gco,svs]", "~prior", "--cfg"):
+    for as_it_is in ("fit.seed=1,2", "+strategy=[gco,svs]", "~prior"):
         assert hydra_app.readable(as_it_is) == as_it_is
