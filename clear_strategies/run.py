@@ -44,13 +44,18 @@ _RESEARCH: Final = {
 
 def main() -> None:
     """The command line: a subcommand, or Hydra's."""
+    program(lambda: named(sys.argv[1:])())  # noqa: PLW0108 - `named` raises errors, too
+
+
+def program(command: Callable[[], object]) -> None:
+    """Run a command; what the user can solve is told in one line, with an exit code (`jobs.exit_codes`)."""
     atexit.register(gc.freeze)  # else Python looks through all of torch's objects before it ends, for 0.3 s
     atexit.register(signals.handle, signal.SIG_DFL)  # else one more Ctrl-C shows a traceback of Python's own end
     logging.captureWarnings(True)  # of libraries: they are for run.log
     console.harden_output()
     signals.handle(signals.stop)  # else the system ends us at once, and joblib's workers go on without us
     try:
-        named(sys.argv[1:])()
+        command()
         sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as error:
         if (ending := exit_codes.describe(error)) is None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Final, NoReturn
+from typing import Any, Final, NoReturn
 
 from clear_strategies.errors import ClearError
 
@@ -38,6 +38,8 @@ STOPS: Final = (*TWICE, *_HANGUPS)
 _ANNOUNCEMENTS: Final = tuple(getattr(signal, name) for name in ("SIGUSR1", "SIGUSR2") if hasattr(signal, name))
 
 
+Handler = Callable[[int, FrameType | None], object] | signal.Handlers
+
 _collected: Final = list[list[int]]()  # by each `deferred_signals`
 
 
@@ -66,18 +68,14 @@ def deferred_signals() -> Iterator[list[int]]:
 
     handled = [s for s in _ANNOUNCEMENTS if callable(signal.getsignal(s))]
     handled += [s for s in _HANGUPS if signal.getsignal(s) is not signal.SIG_IGN]
-    try:
-        before = {s: signal.signal(s, note) for s in (*TWICE, *handled)}
-    except ValueError:  # not the main thread, which alone may set handlers
-        yield pending
-        return
-    _collected.append(pending)
-    try:
-        yield pending
-    finally:
-        _collected.pop()
-        for s, handler in before.items():
-            signal.signal(s, handler)
+    with _handled((*TWICE, *handled), note) as before:
+        if before:
+            _collected.append(pending)
+        try:
+            yield pending
+        finally:
+            if before:
+                _collected.pop()
 
 
 @contextmanager
@@ -86,19 +84,30 @@ def held() -> Iterator[None]:
     came = list[int]()
     known = [s for s in STOPS if signal.getsignal(s) is not None]  # others have been set by C
     try:
-        before = {s: signal.signal(s, lambda signum, _: came.append(signum)) for s in known}
-    except ValueError:  # as in `deferred_signals`
-        before = {}
-    try:
-        yield
+        with _handled(known, lambda signum, _: came.append(signum)):
+            yield
     finally:
-        for s, handler in before.items():
-            signal.signal(s, handler)
         for signum in came:
             signal.raise_signal(signum)
 
 
-def handle(handler: Callable[[int, FrameType | None], object] | signal.Handlers) -> None:
+@contextmanager
+def _handled(signals: Iterable[int], handler: Handler) -> Iterator[Mapping[int, Any]]:
+    """Set the handler of signals, and the handlers of before again, which this yields; without effect in other threads than the
+    main one, which alone may set handlers.
+    """
+    try:
+        before = {s: signal.signal(s, handler) for s in signals}
+    except ValueError:
+        before = {}
+    try:
+        yield before
+    finally:
+        for s, earlier in before.items():
+            signal.signal(s, earlier)
+
+
+def handle(handler: Handler) -> None:
     """Set a handler of `STOPS`; SIGHUP stays ignored where it is."""
     for signum in STOPS:
         if signal.getsignal(signum) is not signal.SIG_IGN:

@@ -1,7 +1,4 @@
-"""The command line of the benchmarks. A benchmark, QUESTION, is the module of its name; its options are defined here.
-
-Exit codes: 0; 2 for arguments or input that cannot be used; 130 after Ctrl-C.
-"""
+"""The command line of the benchmarks. A benchmark, QUESTION, is the module of its name; its options are defined here."""
 
 from __future__ import annotations
 
@@ -18,8 +15,8 @@ from clear_strategies import console
 from clear_strategies.bench.results import Results
 from clear_strategies.bench.scenes import NAMES
 from clear_strategies.commands import path_of, positive
-from clear_strategies.errors import ClearError
-from rasterizers.interface import PRESETS, BackendUnavailable
+from clear_strategies.run import program
+from rasterizers.interface import PRESETS
 
 _log = logging.getLogger(__name__)
 
@@ -66,31 +63,20 @@ QUESTIONS: Final[Mapping[str, tuple[str, Options]]] = {
 }  # fmt: skip
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
-    console.harden_output()
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure, print the tables and write them."""
     options = vars(parser().parse_args(arguments))
     question, threads = options.pop("question"), options.pop("threads")
     results = Results(_log.info, options.pop("out"))
     console.show()
     if threads is not None:
         torch.set_num_threads(threads)
-    try:
-        if results.out is not None:  # fails before the measurements if the folder cannot be made
-            results.out.mkdir(parents=True, exist_ok=True)
-        module = "integration.bench" if question == "host" else f"clear_strategies.bench.{question}"
-        import_module(module).measure(results, **options)
-        sys.stdout.write(results.text())
-        results.write(question, {k: options[k] for k in ("device", "repeats") if k in options})
-        return 0
-    except (ClearError, BackendUnavailable) as error:
-        _log.error("%s", error)
-    except OSError as error:
-        _log.error("%s: %s", error.filename or "output", error.strerror or error)
-    except KeyboardInterrupt:
-        _log.error("stopped; no tables were written.")
-        return 130
-    return 2
+    if results.out is not None:  # fails before the measurements if the folder cannot be made
+        results.out.mkdir(parents=True, exist_ok=True)
+    module = "integration.bench" if question == "host" else f"clear_strategies.bench.{question}"
+    import_module(module).measure(results, **options)
+    sys.stdout.write(results.text())
+    results.write(question, {k: options[k] for k in ("device", "repeats") if k in options})
 
 
 def parser() -> argparse.ArgumentParser:
@@ -105,4 +91,4 @@ def parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program(main)

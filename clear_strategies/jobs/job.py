@@ -102,11 +102,9 @@ class _Job:
         threads, reason = device.threads(settings.fit.threads)
         torch.set_num_threads(threads)
         load = functools.partial(scenes.load, settings.data, settings.prior, settings.fit.seed, self.conductor.prior)
-        if settings.fit.resume == resume.AUTO:
-            finished = resume.finished(folder, self.compared, load)
-            if finished is not None:
-                score = finished.shown.mean.get("ours")
-                return None if score is None else score.psnr
+        resumes = settings.fit.resume == resume.AUTO
+        if resumes and (finished := resume.finished(folder, self.compared, load)) is not None:
+            return finished.psnr
         # In a sweep the console shows one line per job; the rest is in run.log.
         level = logging.DEBUG if in_sweep() else logging.INFO
         asked, source = settings.fit, settings.data.source
@@ -133,8 +131,7 @@ class _Job:
             _log.info("%s", metrics.describe_job(HydraConfig.get().job.num, folder, evaluation, seconds))
         if few:
             _log.warning("%s.", few)
-        mean = evaluation.shown.mean.get("ours")
-        return None if mean is None else mean.psnr
+        return evaluation.psnr
 
     def _start(self, scene: Scene, there: Scene, ready: device.ReadyRasterizer) -> TrainState:
         """The state that training starts from: the initial one, or the checkpoint that `fit.resume` names.

@@ -81,14 +81,9 @@ def finished(folder: Path, config: Mapping[str, Any], scene: Callable[[], Scene]
         _require_same_cameras(folder, there := scene())
         if (last := newest(folder)) is not None:
             _require_same_photos(folder, checkpoint.load(last), fingerprints(there))
-    mean = content.shown.mean.get("ours")
-    score = "no PSNR" if mean is None or math.isnan(mean.psnr) else f"PSNR {mean.psnr:.2f} dB"
-    _log.info(
-        "%s: this run finished on %s (%s); nothing is trained.",
-        folder,
-        content.provenance.get("date", "an unknown date"),
-        score,
-    )
+    psnr, date = content.psnr, content.provenance.get("date", "an unknown date")
+    score = "no PSNR" if psnr is None or math.isnan(psnr) else f"PSNR {psnr:.2f} dB"
+    _log.info("%s: this run finished on %s (%s); nothing is trained.", folder, date, score)
     return content
 
 

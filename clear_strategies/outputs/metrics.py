@@ -93,6 +93,12 @@ class Scored(msgspec.Struct):
         """The test views; the training views if there are none."""
         return self.test if self.test.mean else self.train
 
+    @property
+    def psnr(self) -> float | None:
+        """The mean PSNR of the shown views, dB; None if there is none."""
+        mean = self.shown.mean.get("ours")
+        return None if mean is None else mean.psnr
+
 
 class Evaluation(Scored):
     """Scores, and the renders of the test views, or of a few training views if there are none."""
@@ -233,8 +239,8 @@ def describe(folder: Path, evaluation: Evaluation, seconds: float, parts: Mappin
 
 def describe_job(number: int, folder: Path, evaluation: Evaluation, seconds: float) -> str:
     """The message at the end of a job of a sweep, one line."""
-    mean = evaluation.shown.mean.get("ours")
-    score = "" if mean is None else f", {'test' if evaluation.test.mean else 'train'} views {mean.psnr:.2f} dB"
+    kind, psnr = "test" if evaluation.test.mean else "train", evaluation.psnr
+    score = "" if psnr is None else f", {kind} views {psnr:.2f} dB"
     return f"job {number}: done in {duration(seconds)}{score}: {_relative(folder)}"
 
 

@@ -25,8 +25,7 @@ from clear_strategies import console, files
 from clear_strategies.commands import path_of
 from clear_strategies.data.file_names import name_key
 from clear_strategies.data.photo_files import read_image
-from clear_strategies.errors import ClearError, DataError, counted
-from clear_strategies.jobs import exit_codes
+from clear_strategies.errors import DataError, counted
 from clear_strategies.outputs.figures import SheetRow, write_contact_sheet, write_curves
 from clear_strategies.report import paper
 from clear_strategies.report.runs import FinishedRun, collect, history
@@ -39,27 +38,17 @@ _log = logging.getLogger(__name__)
 _LONGEST: Final = 60  # characters of a scene in the name of a file
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code, see `jobs.exit_codes`."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Write the report, and print its table."""
     parser = argparse.ArgumentParser(
         prog="python -m clear_strategies.report", description=(__doc__ or "").split("\n")[0]
     )
     parser.add_argument("folders", nargs="+", type=path_of, metavar="DIR", help="a run's folder, or a folder of runs")
     parser.add_argument("--out", type=path_of, metavar="FOLDER", help="where the report goes (default: the first DIR)")
-    console.harden_output()
-    logging.captureWarnings(True)  # as `run.main`: matplotlib warns of each letter that its font lacks
     options = parser.parse_args(arguments)
     console.show()
     out = options.out or options.folders[0]
-    try:
-        text = write(collect(options.folders), out)
-    except (ClearError, OSError) as error:
-        if (ending := exit_codes.describe(error)) is None:
-            raise
-        _log.error("%s", ending.message)
-        return ending.code
-    sys.stdout.write(text)
-    return 0
+    sys.stdout.write(write(collect(options.folders), out))
 
 
 def write(runs: Sequence[FinishedRun], out: Path) -> str:

@@ -1,7 +1,6 @@
 """`python -m clear_strategies.report`."""
 
-import sys
-
 from clear_strategies.report import main
+from clear_strategies.run import program
 
-sys.exit(main())
+program(main)
