@@ -32,8 +32,7 @@ from rasterizers.interface import BackendUnavailable
 
 TARGET: Final = "_target_"
 _PARTIAL: Final = "_partial_"  # true: `build` returns a functools.partial, which waits for further arguments
-_RECURSIVE: Final = "_recursive_"  # false: the nodes below stay plain values
-_KEYWORDS: Final = (TARGET, _PARTIAL, _RECURSIVE, "_convert_")
+_KEYWORDS: Final = (TARGET, _PARTIAL)
 LISTED: Final = "listed"
 """False in the metadata of a dataclass field: its default is not written into the node."""
 _MISSING: Final = "???"
@@ -62,14 +61,13 @@ def with_defaults(node: Any) -> Any:
         return [with_defaults(value) for value in node]
     if not isinstance(node, Mapping):
         return node
-    if node.get(_RECURSIVE, True):
-        node = {key: with_defaults(value) for key, value in node.items()}
+    node = {key: with_defaults(value) for key, value in node.items()}
     try:
         if node.get(TARGET) is None:
-            return dict(node)
+            return node
         return _merged(_defaults(_located(node[TARGET])), node)
     except (ImportError, AttributeError):
-        return dict(node)
+        return node
 
 
 def defaults_of(target: str, *field: str) -> Any:
@@ -141,7 +139,7 @@ def _called(node: Mapping[str, Any], key: str) -> Any:
     arguments = {}
     for name, value in given.items():
         inner = _joined(key, name)
-        built = build(value, inner) if node.get(_RECURSIVE, True) else value
+        built = build(value, inner)
         arguments[name] = _of_type(built, hints[name], inner) if name in hints else built
     partial = functools.partial(function, **arguments)
     if node.get(_PARTIAL):

@@ -56,9 +56,6 @@ def test_defaults_come_from_the_signature_and_the_node_wins():
     assert with_defaults([target(call, depth=7)]) == [target(call, depth=7, strict=False)]
     node = with_defaults(target(Outer, inner=target(call, root="r")))
     assert node["inner"] == target(call, root="r", depth=2, strict=False)
-    node = target(call, root="r", _recursive_=False, inner=target(Inner))
-    assert with_defaults(node)["inner"] == target(Inner)
-    assert build(node) == ("r", 2, False, {"inner": target(Inner)})
 
 
 @pytest.mark.parametrize("kept", [{TARGET: None}, {TARGET: "nowhere.Mine", "x": 1}, {"a": {"b": 1}}, "text"])

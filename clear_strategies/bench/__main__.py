@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
@@ -17,8 +16,6 @@ from clear_strategies.bench.scenes import NAMES
 from clear_strategies.commands import path_of, positive
 from clear_strategies.run import program
 from rasterizers.interface import PRESETS
-
-_log = logging.getLogger(__name__)
 
 Options = Mapping[str, Mapping[str, Any]]
 """The arguments of argparse's `add_argument`, by the flag."""
@@ -67,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, print the tables and write them."""
     options = vars(parser().parse_args(arguments))
     question, threads = options.pop("question"), options.pop("threads")
-    results = Results(_log.info, options.pop("out"))
+    results = Results(options.pop("out"))
     console.show()
     if threads is not None:
         torch.set_num_threads(threads)
@@ -80,7 +77,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Make the parser of all benchmarks and their options."""
     result = argparse.ArgumentParser(prog="python -m clear_strategies.bench", description=__doc__)
     commands = result.add_subparsers(dest="question", required=True, metavar="QUESTION")
     for question, (what, options) in QUESTIONS.items():

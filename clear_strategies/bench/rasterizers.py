@@ -6,6 +6,7 @@ includes that of the cut-offs.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final
@@ -25,6 +26,8 @@ from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import DataError
 from clear_strategies.outputs.figures import new_figure
 from rasterizers.interface import PRESETS, Rasterizer, Rendering
+
+_log = logging.getLogger(__name__)
 
 COTANGENTS: Final = 3
 FORWARD, TOGETHER, SEPARATE, LATENCY = "forward", "lr_hr_together", "lr_hr_separate", "latency"
@@ -102,7 +105,7 @@ def measure(
     workloads = [scenes.load(name).to(device) for name in scene]
     times, errors, turns = list[dict[str, Any]](), list[dict[str, Any]](), list[pd.DataFrame]()
     for workload in workloads:
-        results.log(f"{workload.name}: {len(workload.splats):,} Gaussians")
+        _log.info("%s: %s Gaussians", workload.name, f"{len(workload.splats):,}")
         affordable_here = [b for b in backends if affordable(b, workload, b, results.note)]
         # gsplat's cut-offs are fixed.
         pairs = [(b, p) for b in affordable_here for p in preset if b != "gsplat" or p == "fast"]

@@ -8,6 +8,7 @@ loop.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -24,6 +25,9 @@ from clear_strategies import files
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.outputs.figures import save
 from clear_strategies.outputs.provenance import provenance
+from rasterizers import native
+
+_log = logging.getLogger(__name__)
 
 Contender = Callable[[], Mapping[str, float]]
 """Runs its stages once and returns the milliseconds of each."""
@@ -38,12 +42,10 @@ class Results:
     """The results of one benchmark.
 
     Args:
-        log: prints a line while measuring.
         out: the folder to write to; None: nothing is written.
         notes: remarks for readers of the tables, e.g. reasons why a contender was not measured.
     """
 
-    log: Callable[[str], None]
     out: Path | None = None
     tables: dict[str, pd.DataFrame] = field(default_factory=dict)
     figures: dict[str, Figure] = field(default_factory=dict)
@@ -51,7 +53,7 @@ class Results:
 
     def note(self, line: str) -> None:
         """Log a line and keep it."""
-        self.log(line)
+        _log.info("%s", line)
         self.notes.append(line)
 
     def text(self) -> str:
@@ -70,7 +72,7 @@ class Results:
             save(figure, self.out / f"{name}.png")
         system = collect_env.get_env_info()  # type: ignore[no-untyped-call]
         names = ("os", "gcc_version", "nvidia_gpu_models", "nvidia_driver_version", "cuda_runtime_version")
-        machine = provenance(torch=torch.__version__, torch_threads=torch.get_num_threads())
+        machine = provenance(threads=native.threads(), torch=torch.__version__, torch_threads=torch.get_num_threads())
         machine |= {name: getattr(system, name) for name in names}
         del machine["command"]  # it may name a folder, or a user
         facts = {"options": options, "machine": machine, "notes": self.notes}
@@ -87,7 +89,6 @@ def queued(work_log: WorkLog, stage: str) -> Iterator[None]:
 
 
 def milliseconds(work_log: WorkLog) -> dict[str, float]:
-    """The time of each stage."""
     return {name: 1e3 * entry.seconds for name, entry in work_log.entries.items()}
 
 

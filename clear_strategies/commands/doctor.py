@@ -13,7 +13,7 @@ from clear_strategies import console
 from clear_strategies.commands import parser_of
 from clear_strategies.errors import SettingError, counted, one_line
 from clear_strategies.jobs.exit_codes import NEEDED
-from clear_strategies.outputs.provenance import origin
+from clear_strategies.outputs.provenance import provenance
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str]) -> None:
 
 def _findings(broken: list[str], *, slow: bool) -> dict[str, Iterator[tuple[str, str]]]:
     """The rows of the report by title; they are computed while printed, since importing torch takes most of the time."""
-    facts = origin()
+    facts = provenance()
     versions = {"python": f"{facts['python']} ({sys.executable})", **facts["versions"], "checkout": facts["git"]}
     return {
         "versions": iter(versions.items()), "missing extras": _missing(), "other programs": _programs(),

@@ -13,7 +13,6 @@ _log = logging.getLogger(__name__)
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Write the PLY file."""
     parser = parser_of("export", "Write a saved run in the standard layout of 3DGS; f_det and the 3D filter included.")
     parser.add_argument("--out", type=path_of, metavar="FILE", help="where it goes (default: RUN/NAME.ply)")
     kept = "degree of view-dependent colour that is kept (3)"

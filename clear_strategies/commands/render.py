@@ -26,7 +26,6 @@ _SAMPLED: Final = 5  # approximate number of cameras that the range of depths is
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Render the video or the pictures."""
     options = _parser().parse_args(arguments)
     console.show(verbose=options.verbose)
     import torch

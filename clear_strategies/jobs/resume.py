@@ -77,7 +77,8 @@ def finished(folder: Path, config: Mapping[str, Any], scene: Callable[[], Scene]
     _require_same(folder, content.config, config)
     places = {key: config[key] for key in filter(_PLACE.fullmatch, config) if config[key]}
     moved = any(content.config.get(key) != place for key, place in places.items())
-    if moved or any(_has_newer(Path(place), path) for key, place in places.items() if key.endswith(_FILE)):
+    read = [Path(place) for key, place in places.items() if key.endswith(_FILE)]
+    if moved or any(file.lstat().st_mtime > path.stat().st_mtime for place in read for file in place.rglob("*")):
         _require_same_cameras(folder, there := scene())
         if (last := newest(folder)) is not None:
             _require_same_photos(folder, checkpoint.load(last), fingerprints(there))
@@ -85,11 +86,6 @@ def finished(folder: Path, config: Mapping[str, Any], scene: Callable[[], Scene]
     score = "no PSNR" if psnr is None or math.isnan(psnr) else f"PSNR {psnr:.2f} dB"
     _log.info("%s: this run finished on %s (%s); nothing is trained.", folder, date, score)
     return content
-
-
-def _has_newer(folder: Path, than: Path) -> bool:
-    """Return True if a file in the folder is newer than another file."""
-    return any(file.lstat().st_mtime > than.stat().st_mtime for file in folder.rglob("*"))
 
 
 def resume(state: TrainState, scene: Scene, source: str | None, folder: Path, config: Mapping[str, Any]) -> None:

@@ -68,7 +68,6 @@ class AutoPrior:
     """The capture's own prior, as the demo has one; else waifu2x, if it is installed and reaches the factor; else bicubic."""
 
     def of(self, capture: Capture, factor: int) -> Prior:
-        """The prior for this capture."""
         if capture.own_prior is not None:
             return capture.own_prior(_photos(capture))
         usable = factor in factors(_NETWORK) and not missing_packages(_NETWORK)

@@ -39,7 +39,6 @@ stopped: Final = list[int]()
 
 
 def in_sweep() -> bool:
-    """Return True if this job is one of a sweep."""
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 

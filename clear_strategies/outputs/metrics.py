@@ -124,7 +124,6 @@ class Metrics(Scored):
 
 
 def read(path: Path, remedy: str) -> Metrics:
-    """Read metrics.json."""
     content = read_object(path)
     numbers = {key: _with_nan(content[key]) for key in ("test", "train", "conflict") if key in content}
     metrics = typed(path, content | numbers, Metrics, remedy=remedy)
@@ -199,7 +198,6 @@ def _part(views: Sequence[View], table: Table, of: int | None = None) -> Part:
 def _scores_of(
     view: View, image: Float[Tensor, "H W 3"], down: DownKernel, own: Mapping[str, Metric] | None
 ) -> dict[str, ImageScores]:
-    """Score the images of a view."""
     truth, mask, scored = view.true_hr, view.hr.shown, {"ours": image}
     if truth is None:
         if mask is not None:  # else D would mix hidden pixels into shown ones

@@ -17,14 +17,7 @@ _PACKAGES: Final = (
 
 
 def provenance(**facts: Any) -> dict[str, Any]:
-    """The facts that are stored with every result; `facts` are those of the run (seed, backend, plan)."""
-    from rasterizers import native
-
-    return {**origin(), "threads": native.threads(), **facts}
-
-
-def origin() -> dict[str, Any]:
-    """Date, versions, machine, source and command."""
+    """Date, versions, machine, source and command, which are stored with every result; `facts` are those of the run."""
     return {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "versions": {name: version for name in _PACKAGES if (version := _version(name)) is not None},
@@ -32,6 +25,7 @@ def origin() -> dict[str, Any]:
         "platform": f"{platform.system()} {platform.machine()}, {_processor()}",
         "git": _git(),
         "command": sys.argv,
+        **facts,
     }
 
 

@@ -116,7 +116,7 @@ def write_results(
     metrics.write(
         folder / files.FINISHED, evaluation, scene=scene.name, **asdict(chosen), seed=settings.seed, iterations=state.t - 1,
         gaussians=len(field), seconds=seconds, conflict=_mean_conflict(history), synthetic_prior=scene.synthetic_prior,
-        config=config, provenance=provenance(seed=settings.seed, backend=backend, plan=scene.notes),
+        config=config, provenance=provenance(threads=threads(), seed=settings.seed, backend=backend, plan=scene.notes),
     )  # fmt: skip
     return evaluation
 

@@ -69,7 +69,6 @@ class FinishedRun:
 
     @classmethod
     def read(cls, folder: Path) -> FinishedRun:
-        """Read a run's folder."""
         path = folder / FINISHED
         content = metrics.read(path, "train the run again")
         overrides, part = content.overrides or [], content.shown

@@ -66,7 +66,6 @@ class _Entry(msgspec.Struct):
 
 
 def write_cameras(folder: Path, scene: Scene) -> None:
-    """Write `cameras.json`."""
     entries = []
     for number, view in enumerate((*scene.train, *scene.test)):
         camera = view.hr.camera

@@ -89,7 +89,6 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
 
     @property
     def address(self) -> str:
-        """The URL for the browser."""
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
     def get_camera_state(self, client: Any) -> Any:

@@ -33,7 +33,7 @@ def reference() -> rasterizers.Rasterizer:
 
 
 def measured(question, **options) -> Results:
-    results = Results(lambda line: None)
+    results = Results()
     question.measure(results, **options)
     return results
 
@@ -62,7 +62,7 @@ def test_each_row_names_the_module_whose_kernels_ran():
 
 
 def test_the_reference_takes_no_part_in_large_scenes_and_unavailable_backends_are_noted(monkeypatch):
-    results = Results(lambda line: None)
+    results = Results()
     with pytest.raises(DataError, match="measures none of these scenes"):
         drawing.measure(results, scene=["s100k-lr"], backend=["torch"], preset=["fast"], repeats=1, device="cpu")
     assert any("at most 10,000 Gaussians" in note for note in results.notes)
