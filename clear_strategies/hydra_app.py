@@ -66,8 +66,6 @@ def main(overrides: Sequence[str] | None = None) -> None:
     try:
         _run_hydra(options, parser, job, str(CONF), "config")
     except Exception as error:
-        if sweep.stopped:
-            raise KeyboardInterrupt(sweep.stopped[0]) from error  # a process of joblib's had not begun, and was ended
         if isinstance(error, HydraException | OmegaConfBaseException):
             overrides = [word for word in options.overrides if not word.startswith("hydra.")]
             raise not_composed(error, overrides, "config") from error
@@ -110,7 +108,7 @@ def job(config: DictConfig) -> float | None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     try:
         with sweep.first_signal_ends_job():
-            return None if sweep.stopped else _job(config, folder)
+            return None if signals.told else _job(config, folder)
     finally:
         with suppress(OSError):
             folder.rmdir()  # where nothing was written
@@ -160,7 +158,7 @@ def _end(error: BaseException, ending: exit_codes.Ending, folder: Path, *, resum
     if code > exit_codes.SIGNALS and code - exit_codes.SIGNALS not in signals.STOPS:
         signal.raise_signal(code - exit_codes.SIGNALS)  # all is saved: now the launcher's handler may resubmit the job
     if code > exit_codes.SIGNALS and sweep.in_worker():
-        sweep.stopped.append(code - exit_codes.SIGNALS)
+        signals.told.append(code - exit_codes.SIGNALS)
         return
     sys.exit(code)
 
@@ -178,8 +176,8 @@ class SweepCallback(Callback):
         sweep.name_by_all_that_is_swept(config)
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        if sweep.stopped:
-            sys.exit(exit_codes.SIGNALS + sweep.stopped[0])
+        if signals.told:
+            sys.exit(exit_codes.SIGNALS + signals.told[0])
         folder = Path(config.hydra.sweep.dir)
         _report(folder)
         failed = defaultdict[str, list[int]](list)

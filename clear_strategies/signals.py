@@ -115,7 +115,9 @@ def handle(handler: Handler) -> None:
 
 
 told: Final = list[int]()
-"""The signals that `stop` was called for. A library that is being imported may lose the exception, and fail later."""
+"""The signals that end this process, or the sweep of several that it belongs to. A library that is being imported may lose the
+exception of `stop`, and fail later.
+"""
 
 
 def stop(signum: int, _frame: FrameType | None) -> NoReturn:

@@ -34,9 +34,6 @@ from clear_strategies.settings import absent, missing
 # Launchers whose jobs share the file system of the process that was started; nodes of a cluster may have another.
 _LOCAL: Final = ("basic", "cores", "joblib", "submitit_local")
 
-stopped: Final = list[int]()
-"""The signals that stopped a sweep of several processes, in the process that was started and in each of the others."""
-
 
 def in_sweep() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
@@ -156,18 +153,12 @@ def first_signal_ends_job() -> Iterator[None]:
     try:
         yield
     finally:
-        signals.handle(_note)
-
-
-def _note(signum: int, _frame: FrameType | None) -> None:
-    """The handler of joblib's processes between two jobs."""
-    stopped.append(signum)
+        signals.handle(lambda signum, _: signals.told.append(signum))  # between two jobs
 
 
 def _end_job(signum: int, frame: FrameType | None) -> None:
     """The handler of joblib's processes during a job, outside steps that defer signals."""
-    if not stopped and not signals.asked():
-        _note(signum, frame)
+    if not signals.told and not signals.asked():
         signals.stop(signum, frame)
 
 
@@ -185,7 +176,7 @@ def stop_workers(signum: int, frame: FrameType | None) -> None:
     """The handler of a sweep: joblib's processes save their runs, and start no other job; a second signal acts at once."""
     if not (workers := multiprocessing.active_children()):
         signals.stop(signum, frame)
-    stopped.append(signum)
+    signals.told.append(signum)
     for twice in signals.TWICE:
         signal.signal(twice, signals.stop)
     # joblib composes each job just before it starts, from a list in one of these frames: an empty list starts no other job.

@@ -275,7 +275,7 @@ def test_a_stopped_sweep_composes_none_of_its_remaining_jobs(monkeypatch):
     monkeypatch.setattr(launcher, "Parallel", parallel)
     monkeypatch.setattr(sweep.multiprocessing, "active_children", lambda: [SimpleNamespace(pid=2**22 + 1)])
     monkeypatch.setattr(sweep.signal, "signal", lambda *_: None)
-    monkeypatch.setattr(sweep, "stopped", [])
+    monkeypatch.setattr(signals, "told", [])
     config = OmegaConf.create({"hydra": {"hydra_logging": None, "verbose": False, "sweep": {"dir": "."}}})
     asked = SimpleNamespace(
         config=config, task_function=len, hydra_context=SimpleNamespace(config_loader=None), joblib={}
