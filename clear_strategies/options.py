@@ -186,6 +186,9 @@ def _reading(*, _node_: Any, _root_: Any) -> Any:
     return defaults_of(_root_.strategies[strategy][TARGET], *field) if read is None else read
 
 
+# ---- Hydra's errors, in words that name our commands and settings
+
+
 def require_option(override: Override) -> None:
     """Raise a SettingError for an override that chooses nothing of a group of conf/, which is a bare error of Python's in Hydra,
     or several experiments of which one sweeps.
