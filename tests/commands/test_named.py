@@ -97,6 +97,11 @@ def test_the_shell_completes_settings_also_behind_train(line, tmp_path):
     assert ended.stdout.split() == ["fit.iterations="], ended.stderr
 
 
+def test_flags_stand_anywhere_between_settings(tmp_path):
+    said = command_line.run("+strategy=gco", "--cfg", "job", "-v", "fit.seed=3", cwd=tmp_path).stdout
+    assert {"  seed: 3", "  verbose: true"} <= {*said.splitlines()}
+
+
 # ---- `clear-strategies doctor` says what is here, what is missing, and which backend draws something wrong
 def test_doctor_names_versions_memory_backends_and_missing_extras(capsys, monkeypatch) -> None:
     monkeypatch.setattr(doctor, "find_spec", lambda name: None if name == "pycolmap" else object())
