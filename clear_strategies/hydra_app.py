@@ -57,6 +57,8 @@ def main(overrides: Sequence[str] | None = None) -> None:
     parser.add_argument("-v", "--verbose", action="store_true", help="Show details, as fit.verbose=true does")
     # Intermixed: Hydra's own call of the parser refuses settings on both sides of a flag.
     options, unknown = parser.parse_known_intermixed_args(sys.argv[1:] if overrides is None else overrides)
+    if options.experimental_rerun is not None:  # of `hydra.main`; fit.resume does this
+        unknown.append("--experimental-rerun")
     if unknown:  # argparse's message names none of our commands
         raise SettingError(f"{unknown[0].partition('=')[0]}: there is no such flag. {WRITTEN}")
     options.overrides = [*map(readable, options.overrides), *["fit.verbose=true"] * options.verbose]
