@@ -22,11 +22,12 @@ from omegaconf.errors import OmegaConfBaseException
 
 from clear_strategies import files
 from clear_strategies.errors import SettingError, one_line
+from clear_strategies.hydra_errors import not_composed, require_option
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.objective import Objective
 from clear_strategies.merging.skips import Skips
-from clear_strategies.options import READINGS, composed_by_hydra, not_composed, require_option, strategies_of
+from clear_strategies.options import READINGS, composed_by_hydra, strategies_of
 from clear_strategies.schedules import REFERENCE_ITERATIONS, scaled
 from clear_strategies.settings import TARGET, absent, build, missing
 from clear_strategies.strategies.base import Strategy

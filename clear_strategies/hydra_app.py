@@ -32,8 +32,9 @@ from omegaconf.errors import OmegaConfBaseException
 from clear_strategies import console, files, signals
 from clear_strategies.compose import quoted, require_each_once
 from clear_strategies.errors import ClearError, SettingError, counted
+from clear_strategies.hydra_errors import WRITTEN, not_composed, require_option
 from clear_strategies.jobs import exit_codes, sweep
-from clear_strategies.options import CONF, WRITTEN, not_composed, require_option
+from clear_strategies.options import CONF
 
 _log = logging.getLogger(__name__)
 

@@ -1,12 +1,10 @@
-"""The options of conf/ and of other packages, as Hydra reads and composes them, and its errors in words that name our commands
-and settings.
+"""The options of conf/ and of other packages, as Hydra reads and composes them.
 
 Each node with a `_target_` is filled with the defaults of what it names. To import this file registers conf/ and its resolvers.
 """
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import re
 import sys
@@ -22,16 +20,13 @@ import hydra
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.types import ChoiceSweep, Override
 from hydra.core.plugins import Plugins
-from hydra.errors import HydraException
 from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
-from clear_strategies.errors import SettingError, one_line
-from clear_strategies.settings import CHANGES_NO_RESULT, TARGET, defaults_of, flat, has_parameter, with_defaults
+from clear_strategies.errors import SettingError
+from clear_strategies.settings import CHANGES_NO_RESULT, TARGET, defaults_of, with_defaults
 
 _PACKAGE: Final = Path(__file__).resolve().parent
 # In a wheel conf/ lies inside the package, in a checkout beside it.
@@ -49,21 +44,6 @@ where data and SR images lie, which may move: for pictures of another SR model g
 # Bytes of a folder's name: most file systems take 255, and Windows 260 of a whole path.
 _LONGEST_NAME: Final = 80 if sys.platform == "win32" else 200
 _NOT_IN_NAMES: Final = re.compile(r'[<>:"\\|?*\x00-\x1f]|[. ]\Z')  # of Windows
-
-WRITTEN: Final = "A setting is written name=value, and clear-strategies --cfg job prints all of them."
-# What Hydra says, and what to say in place of it. Packages hydra-NAME-launcher bring launchers.
-_IN_OUR_WORDS: Final = {
-    r"Could not (?:load|find) 'hydra/launcher/((joblib|submitit|ray)(?:_local|_slurm|_aws)?)'": (
-        "hydra/launcher: {} is not installed: pip install hydra-{}-launcher."
-    ),
-    r"^(?:Error parsing override '|LexerNoViableAltException: )([^=~][^=]*?)(?:' missing EQUAL| \^ )": (
-        f"{{}}: is no setting. {WRITTEN}"
-    ),
-    r"^Multiple values for (\S+)\. To override a value use 'override \S+: (\S+)'$": (
-        "+{0}={1}: a choice of this group is there already. Replace it: {0}={1}."
-    ),
-}
-_SWEEPS: Final = re.compile(r"\+?(experiment=|strategy=[^\[]*,)")  # overrides by which strategies come later
 
 
 def composed_by_hydra(overrides: Sequence[str], config: str) -> DictConfig:
@@ -184,115 +164,6 @@ def _reading(*, _node_: Any, _root_: Any) -> Any:
     _, strategy, *field = _node_._get_full_key(None).split(".")
     read = OmegaConf.select(_root_, ".".join((READINGS, strategy, *field)))
     return defaults_of(_root_.strategies[strategy][TARGET], *field) if read is None else read
-
-
-# ---- Hydra's errors, in words that name our commands and settings
-
-
-def require_option(override: Override) -> None:
-    """Raise a SettingError for an override that chooses nothing of a group of conf/, which is a bare error of Python's in Hydra,
-    or several experiments of which one sweeps.
-    """
-    chosen, group = override.value(), override.key_or_group
-    each = chosen.list if isinstance(chosen, ChoiceSweep) else [chosen]
-    nothing = [name for name in each if not name and not (override.is_add() and name == [])]  # +method=srgs,[]: a row
-    if nothing and not override.is_delete() and (CONF / group).is_dir():
-        told = "null" if None in each else (override.input_line or "").partition("=")[2]
-        raise SettingError(no_option(group, told, [*options(group)]))
-    if group == "experiment" and len(each) > 1 and any(isinstance(name, str) and sweeps(name) for name in each):
-        alone = ", ".join(f"experiment={name}" for name in each)
-        raise SettingError(
-            f"{override.input_line}: an experiment that sweeps settings of its own runs alone. Start each by itself: {alone}."
-        )
-
-
-def no_option(group: str, name: object, listed: Sequence[str], config: str = "config") -> str:
-    """The message for an option that a group of conf/ does not have: the nearest one, or the group that has this name."""
-    base: Any = OmegaConf.load(CONF / f"{config}.yaml")
-    chosen = {key for entry in base.defaults if entry != "_self_" for key in entry}
-    groups = sorted(folder.name for folder in CONF.iterdir() if (folder / f"{name}.yaml").is_file())
-    if config == "conductor":  # a host has no method, and no scene
-        groups = [other for other in groups if other in chosen]
-    near = [f"{'' if other in chosen else '+'}{other}={name}" for other in groups]
-    near += difflib.get_close_matches(str(name), listed, 1)
-    suggestion = f" Did you mean {' or '.join(near)}?" if near else ""
-    return f"{group}={name}: there is no such option.{suggestion} There are {', '.join(listed)}."
-
-
-def not_composed(error: Exception, overrides: Sequence[str], config: str) -> SettingError:
-    """The error for overrides that Hydra cannot compose, in one line; where there is no such setting or option, it names the most
-    similar one.
-
-    Args:
-        config: as of `compose.composed`.
-    """
-    text = one_line(error)
-    for theirs, ours in _IN_OUR_WORDS.items():
-        if said := re.search(theirs, text):
-            return SettingError(ours.format(*said.groups()))
-    if said := re.search(r"Could not (?:find|load) '([^']+)/([^'/]*)'", text):
-        # Of a list of options Hydra names the file alone, and not the options that there are.
-        listed = re.search("Available options in '[^']*':(.*?)Config search path", text)
-        known = [*options(said[1])] if listed is None else [o for o in listed[1].split() if not o.startswith("_")]
-        return SettingError(no_option(said[1], said[2], known, config))
-    if said := re.match(r"Could not (?:override|delete from config\.) '([^']+)'", text):
-        return SettingError(f"{said[1]}: {_no_setting(said[1], overrides, config)}")
-    return SettingError(text)
-
-
-def _no_setting(key: str, overrides: Sequence[str], config: str) -> str:
-    """What to say of a setting that is not there."""
-    value = next((o.partition("=")[2] for o in overrides if _key(o) == key), "")
-    if (CONF / key).is_dir():
-        return f"no choice of this group is there to be replaced, so it is added: +{key}={value or '…'}."
-    others, group = [o for o in overrides if _key(o) != key], key.partition(".")[0]
-    having = [o for o in options(group) if key in flat(_composed([*others, f"{group}={o}"], config))]
-    if having:
-        train = ", or let the command find it: clear-strategies train FOLDER" if key == "data.path" else ""
-        return f"there is no such setting without one of {', '.join(f'{group}={o}' for o in having)}. Add it{train}."
-    return f"there is no such setting. {_remedy(key, value, overrides, _composed(others, config), config)}"
-
-
-def _composed(overrides: Sequence[str], config: str) -> dict[str, Any]:
-    """The settings of overrides, none if another one is wrong as well."""
-    try:
-        return OmegaConf.to_container(composed_by_hydra(overrides, config))  # type: ignore[return-value]
-    except (HydraException, OmegaConfBaseException):
-        return {}
-
-
-def _remedy(key: str, value: str, overrides: Sequence[str], known: Mapping[str, Any], config: str) -> str:
-    """What to write in place of an unknown setting; `known` are the settings of the other overrides."""
-    parent, _, name = key.rpartition(".")
-    beside = {".".join(k.split(".")[: key.count(".") + 1]) for k in flat(known) if k.startswith(f"{parent}.")}
-    if value.partition(",")[0] in options(name):  # as data.scene=fern
-        remedy = f"Did you mean +{name}={value}?"
-    elif has_parameter(str(flat(known).get(f"{parent}.{TARGET}")), name):
-        # of the user's own class, named by an override or a file
-        remedy = f"Its class has it; a plus adds it: +{key}=…."
-    elif key.startswith("strategies.") and not known:
-        # the options are in a folder that only Hydra's command line knows
-        remedy = f"If its class has it, a plus adds it: +{key}=…."
-    elif key.startswith("strategies.") and any(_SWEEPS.match(o) for o in overrides):
-        remedy = (
-            "Hydra composes a sweep first without what is swept, here the strategies. Sweep this setting, too "
-            f"({key}=a,b), or name the strategies that remain (+strategy=[gco,svs])."
-        )
-    elif name == TARGET:  # of a strategy or a decorator that is new
-        remedy = f"A plus adds it: +{key}=…."
-    elif f"~{key}" in overrides and beside:
-        remedy = f"There are {', '.join(sorted(beside))}."
-    elif near := difflib.get_close_matches(key, [name for name in flat(known) if not name.endswith(TARGET)], 1, 0.8):
-        remedy = f"Did you mean {near[0]}?"
-    elif known and config == "conductor":
-        remedy = f"A conductor has settings of {', '.join(known)}."
-    else:
-        remedy = "clear-strategies --cfg job prints all of them."
-    return remedy
-
-
-def _key(override: str) -> str:
-    return override.lstrip("+~").partition("=")[0]
 
 
 OmegaConf.register_new_resolver("job_folder", _job_folder, replace=True)

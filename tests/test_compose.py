@@ -16,7 +16,8 @@ from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs.settings import settings_of
 from clear_strategies.merging.detail import DetailRates
-from clear_strategies.options import CONF, _ConfSource, not_composed
+from clear_strategies.hydra_errors import not_composed
+from clear_strategies.options import CONF, _ConfSource
 from clear_strategies.training.settings import FitSettings
 from rasterizers.geometry import SH_C0
 from tests.helpers import command_line

@@ -28,7 +28,8 @@ from omegaconf.errors import OmegaConfBaseException
 from clear_strategies import signals
 from clear_strategies.errors import ClearError, DataError, SettingError
 from clear_strategies.files import FINISHED, expanded
-from clear_strategies.options import UNNAMED, require_option
+from clear_strategies.hydra_errors import require_option
+from clear_strategies.options import UNNAMED
 from clear_strategies.settings import absent, missing
 
 # Launchers whose jobs share the file system of the process that was started; nodes of a cluster may have another.
