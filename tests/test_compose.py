@@ -14,9 +14,9 @@ from clear_strategies.compose import conductor, tree
 from clear_strategies.data.priors import BackProjected, Bicubic
 from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.errors import SettingError
+from clear_strategies.hydra_errors import not_composed
 from clear_strategies.jobs.settings import settings_of
 from clear_strategies.merging.detail import DetailRates
-from clear_strategies.hydra_errors import not_composed
 from clear_strategies.options import CONF, _ConfSource
 from clear_strategies.training.settings import FitSettings
 from rasterizers.geometry import SH_C0
