@@ -1,10 +1,10 @@
-"""Messages in a host's log about the strategies, when they are attached, and at the end of a loop without HR."""
+"""Messages in a host's log: about the strategies when they are attached, at the end of a loop without HR, and once."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
-from typing import Final
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
 
 from clear_strategies.core.view import View
 from clear_strategies.merging.conductor import Conductor
@@ -13,6 +13,22 @@ from integration.host import Host
 
 _log = logging.getLogger(__name__)
 _STRETCH: Final = "Make the conductor for the length of the loop: conductor(…, iterations=…)."
+
+
+class Once:
+    """Logs each message once, whatever its values.
+
+    Args:
+        log: a method of a logger.
+    """
+
+    def __init__(self, log: Callable[..., None]) -> None:
+        self._log, self._told = log, set[str]()
+
+    def __call__(self, message: str, *values: Any) -> None:
+        if message not in self._told:
+            self._told.add(message)
+            self._log(message, *values)
 
 
 def announce(conductor: Conductor, views: Sequence[View], host: Host) -> None:

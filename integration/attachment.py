@@ -27,7 +27,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, Final, cast
 from weakref import finalize
 
 import torch
@@ -43,8 +43,8 @@ from clear_strategies.data.scene import require_shown
 from clear_strategies.errors import HostError, SettingError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.strategies.base import Logged
-from integration.announcement import announce, warn_without_hr
-from integration.autograd_shot import HostOutput, Target, require_named, trained
+from integration.announcement import Once, announce, warn_without_hr
+from integration.autograd_shot import HostOutput, Target, are_in_order, require_named, trained
 from integration.host import Host
 from integration.host_merge import HostMerge
 from integration.host_steps import HostSteps
@@ -86,8 +86,8 @@ class Attachment:
         self.counts: Counter[str] = Counter()
         self.removed = False
         self.undo = ExitStack()
+        self._warn_once = Once(_log.warning)
         self._host = host
-        self._views = {view.name: view for view in views}
         means = host.leaves()["means"]
         self._n = len(means)
         self._hr = HrDrawing(conductor, host, means.device, self.counts)
@@ -99,7 +99,6 @@ class Attachment:
         self._step: Step | None = None  # of the rendering, until `after_step`
         self._logged: dict[str, Logged] = {}
         self._dropped = False  # the last pass found that the loop had dropped the gradients of those before
-        self._has_warned_of_accumulation = False
         conductor.on_fit_start(len(views), seed, means.device, views)
         self._run = conductor.run
         announce(conductor, views, host)
@@ -114,7 +113,7 @@ class Attachment:
             SettingError: several processes train.
         """
         if self.removed:
-            return _lr(render_at, None, view).returned
+            return cast(HostOutput, render_at("lr", None, view)).returned
         _require_one_process()
         if current_pass() >= 0:
             raise HostError(
@@ -133,23 +132,23 @@ class Attachment:
             z = z.to(means)
         # HR and extra views leave torch's random numbers as they were, so a dropout of the host drops the same at LR.
         apart = torch.random.fork_rng([means.device] if means.device.type == "cuda" else [])(render_at)
-        hr, step = None, Step(t, view, params=params)
+        hr, others, step = None, [], Step(t, view, params=params)
         if self._hr.wanted(t):
             view = conductor.skips.view(view, t)
-            hr = self._hr.hr(replace(step, view=view), z, apart)
-        self._step = step if hr is None else hr.side.step
-        if self.passes == 0 or self._dropped or not self._steps.has_extra_views:  # once for all passes of a step
+            hr, others = self._hr.hr(replace(step, view=view), z, apart)
+        self._step = step if hr is None else hr.step
+        if self.passes == 0 or self._dropped or not self._steps.extra:  # once for all passes of a step
             extra_views = conductor.extra_views(t)
             self._steps.follow_by(leaves, (self._hr.extra_view(x, view, t, apart) for x in extra_views))
-        output = _lr(render_at, z, view)
-        if not output.shot.is_in_order:
+        output = cast(HostOutput, render_at("lr", z, view))
+        if not are_in_order(output.shot.inputs, output.shot.params):
             raise HostError(
                 f"{view.name} is rendered with its Gaussians in another order than that of the parameters, so that f_det and "
                 "dropout would go to others. Render them as they are, since the rasterizer sorts by depth itself, or sort the "
                 "parameters."
             )
         self.counts["LR renders"] += 1
-        pending = Pending(self.counts["LR renders"], t, view.name, output, *(hr or (None, {})))
+        pending = Pending(self.counts["LR renders"], t, view.name, output, hr, others)
         self._merging.await_passes(pending, to_screen=hr is not None and self._hr.is_scored)
         return output.returned
 
@@ -181,10 +180,11 @@ class Attachment:
         leaves = self._host.leaves()
         self._n = len(leaves["means"])
         self._merging.fading.resume(leaves.get("detail"), int(state.get("passes_with_hr", 0)))
-        if (view := self._views.get(state.get("view") or "")) is not None:  # its `after_step` is still to come
-            rows = {name: x.to(leaves["means"].device) for name, x in state.get("step", {}).items()}
-            evidence = Evidence(rows["reliability"], rows["demand"]) if "demand" in rows else None
-            self._step = Step(self.t, view, rows.get("visible"), evidence)
+        for view in self.conductor.views:
+            if view.name == state.get("view"):  # its `after_step` is still to come
+                rows = {name: x.to(leaves["means"].device) for name, x in state.get("step", {}).items()}
+                evidence = Evidence(rows["reliability"], rows["demand"]) if "demand" in rows else None
+                self._step = Step(self.t, view, rows.get("visible"), evidence)
         if self._merging.scaler is not None and state.get("score") is not None:
             self._merging.scaler.load_state_dict(state["score"])
 
@@ -221,19 +221,18 @@ class Attachment:
                 f"the host makes its first optimizer step, but {cause}, so that no strategy would take part. {remedy}"
             )
         self.counts["steps of the host alone"] += 1
-        if self.counts["steps of the host alone"] == 1:
-            _log.warning(
-                "the host makes a step in which no strategy takes part: %s, and %s changed without CLEAR or not at all. %s",
-                cause, ", ".join(names) or "nothing", remedy,
-            )  # fmt: skip
+        self._warn_once(
+            "the host makes a step in which no strategy takes part: %s, and %s changed without CLEAR or not at all. %s",
+            cause, ", ".join(names) or "nothing", remedy,
+        )  # fmt: skip
 
     def _after_optimizer(self) -> None:
         """Finish the step once all optimizers have stepped: strategies may change parameters in place, and the loop may compute
         with them before it renders again. The iteration in which densification ends is finished at the next rendering, since
         the host may still densify in it, and an anchor is taken after that.
         """
-        may_densify = self.conductor.may_densify
-        if self._steps.is_complete and may_densify(self.t) == may_densify(max(1, self.t - 1)):
+        may_densify, has_ended = self.conductor.may_densify, len(self._steps.stepped) == len(self._steps.hooked)
+        if has_ended and may_densify(self.t) == may_densify(max(1, self.t - 1)):
             self._finish_step()
 
     def _finish_step(self, rendered: View | None = None) -> None:
@@ -251,8 +250,8 @@ class Attachment:
         if not self.passes:
             return
         last_view = None if self._step is None else self._step.view.name
-        again = rendered is not None and rendered.name == last_view and self._steps.are_known
-        last, has_stepped = self._merging.pending, self._steps.has_begun  # None: of a loop that resumes
+        again = rendered is not None and rendered.name == last_view and bool(self._steps.hooked)
+        last, has_stepped = self._merging.pending, bool(self._steps.stepped)  # None: of a loop that resumes
         has_passed = (last is None or bool(last.merged)) and self.passes % self._host.accumulation == 0
         if has_stepped or (has_passed and not again):
             if self._step is not None:
@@ -284,9 +283,14 @@ class Attachment:
             self.passes = self._merging.fading.passes = 0
         self.passes += 1
         if self.passes > self._host.accumulation:
-            self._warn_of_accumulation()
+            self._warn_once(
+                "%d backward passes over training views add to the same gradients, without an optimizer step between them, but "
+                "accumulation=%d. If the loop divides each loss by the number of views in a step, HR weighs too much: pass that "
+                "number as accumulation. If the loop sums the losses of several iterations, all is well.",
+                self.passes, self._host.accumulation,
+            )  # fmt: skip
         λ = self.conductor.objective.lambda_hr(self.t)
-        losses, shares = pending.losses, conflict_columns(conflict)
+        losses, shares = {} if pending.hr is None else pending.hr.losses, conflict_columns(conflict)
         row: dict[str, Logged] = {"t": float(self.t), "lambda_hr": λ, **losses, **shares}
         self._logged = row | self.conductor.logs.uncounted(row)
         if self.counts["merges"] % _LOGGED_EVERY == 0:
@@ -294,38 +298,19 @@ class Attachment:
             losses_now = ", ".join(f"L_{name} {now[name]:.4f}" for name in losses) or "no HR"
             _log.info("t=%d: %s, lambda_HR %.3f, %s Gaussians.", self.t, losses_now, λ, f"{self._n:,}")
 
-    def _warn_of_accumulation(self) -> None:
-        """Warn once if a step sums more passes than `accumulation` names."""
-        if self._has_warned_of_accumulation:
-            return
-        self._has_warned_of_accumulation = True
-        _log.warning(
-            "%d backward passes over training views add to the same gradients, without an optimizer step between them, but "
-            "accumulation=%d. If the loop divides each loss by the number of views in a step, HR weighs too much: pass that "
-            "number as accumulation. If the loop sums the losses of several iterations, all is well.",
-            self.passes, self._host.accumulation,
-        )  # fmt: skip
-
 
 def _checked(render_at: RenderAt, params: Mapping[str, Tensor]) -> RenderAt:
-    """The function of an adapter, which raises an error if what it returns is none of the two types, or of other tensors."""
+    """The function of an adapter, which raises an error if what it returns has another type, or is of other tensors."""
 
     def render(target: Target, gate: Tensor | None, view: View) -> HostOutput | Drawable:
         output = render_at(target, gate, view)
-        if not isinstance(output, HostOutput | Drawable):
-            raise TypeError(f"render_at must return a HostOutput for {target!r}, got {type(output).__name__}.")
         if isinstance(output, HostOutput):
             require_named(output.shot, params)
+        elif target == "lr" or not isinstance(output, Drawable):
+            raise TypeError(f"render_at must return a HostOutput for {target!r}, got {type(output).__name__}.")
         return output
 
     return render
-
-
-def _lr(render_at: RenderAt, gate: Tensor | None, view: View) -> HostOutput:
-    output = render_at("lr", gate, view)
-    if isinstance(output, Drawable):
-        raise TypeError("an adapter renders LR by the host's own function, got a Drawable.")
-    return output
 
 
 def _to_change(p: Tensor) -> Tensor:

@@ -112,11 +112,6 @@ class AutogradShot:
         return self.drawn if self.drawing is None else self.drawing.inputs
 
     @property
-    def is_in_order(self) -> bool:
-        """Whether the rasterizer's rows are in the order of the parameters, see `are_in_order`."""
-        return self.inputs is None or are_in_order(self.inputs, self.params)
-
-    @property
     def gradient_slot(self) -> ScreenGradientSlot:
         """`slot`, or `means2d` as one."""
         return self.slot or ScreenGradientSlot(self.means2d, (self.image.shape[1], self.image.shape[0]))
@@ -235,13 +230,15 @@ def every_number(g: Grads, params: Mapping[str, Tensor]) -> Grads:
     return Grads({name: torch.zeros_like(p) for name, p in params.items() if name not in known} | known)
 
 
-def are_in_order(drawn: Mapping[str, Tensor], params: Mapping[str, Tensor]) -> bool:
-    """Return True if row i of the drawn tensors is computed from row i of the parameters.
+def are_in_order(drawn: Mapping[str, Tensor] | None, params: Mapping[str, Tensor]) -> bool:
+    """Return True if row i of the drawn tensors is computed from row i of the parameters; None: the parameters are drawn.
 
     A tensor with the parameter's memory is. Any other is tested by two cotangents, whose rows i are 1 and c_i: in the same order,
     the gradients of the parameter's row i are g and c_i g, otherwise g and c_j g. If no tensor has a gradient, positions are
     compared.
     """
+    if drawn is None:
+        return True
     asked = list[tuple[Tensor, Tensor]]()
     for name in ("opacities", "scales", "means", "quats", "colors"):
         x, p = drawn.get(name), params.get("sh0" if name == "colors" else name)

@@ -33,6 +33,11 @@ class HostSteps:
         begins: called when a step of the host begins, with whether gradients have been merged since the last step.
         after: called after an optimizer has stepped, also on extra views.
         counts: `Attachment.counts`, to which this class adds.
+
+    Attributes:
+        hooked: the optimizers whose steps can be seen.
+        stepped: the ids of those that have stepped since the last merge.
+        extra: the gradients of extra views, on which each of them makes a step after its own.
     """
 
     def __init__(
@@ -40,11 +45,11 @@ class HostSteps:
     ) -> None:  # fmt: skip
         self._is_waiting, self._begins, self._after, self._counts = is_waiting, begins, after, counts
         self._hooks: list[Any] = []
-        self._hooked: list[torch.optim.Optimizer] = []
-        self._stepped: set[int] = set()  # the optimizers that have made this step
+        self.hooked: list[torch.optim.Optimizer] = []
+        self.stepped: set[int] = set()
         self._has_merged = False  # since the last step
-        self._extra: list[Grads] = []
-        self._rendered: Mapping[str, Tensor] = {}  # the leaves of `_extra`
+        self.extra: list[Grads] = []
+        self._rendered: Mapping[str, Tensor] = {}  # the leaves of `extra`
         self._steps_on_extra = False  # an optimizer is stepping on an extra view
         self._has_stepped = False  # on the extra views of this iteration
         self._unused = 0  # consecutive iterations whose extra views no optimizer has stepped on
@@ -54,12 +59,12 @@ class HostSteps:
         if isinstance(optimizers, Mapping):
             raise TypeError("optimizers must be a sequence, got a dict: hook([*optimizers.values()]).")
         distinct = list({id(o): o for o in optimizers if isinstance(o, torch.optim.Optimizer)}.values())
-        if list(map(id, distinct)) == list(map(id, self._hooked)):
+        if list(map(id, distinct)) == list(map(id, self.hooked)):
             return
         for hook in self._hooks:
             hook.remove()
-        self._hooked = distinct
-        self._stepped.clear()
+        self.hooked = distinct
+        self.stepped.clear()
         self._hooks = [
             *(o.register_step_pre_hook(lambda o, given, named: self._before_one(o, *given, *named.values())) for o in distinct),
             *(o.register_step_post_hook(lambda o, *_: self._after_one(o)) for o in distinct),
@@ -67,28 +72,8 @@ class HostSteps:
 
     def on_merge(self) -> None:
         """Called when gradients were merged: the next step of any optimizer begins a step of the host."""
-        self._stepped.clear()
+        self.stepped.clear()
         self._has_merged = True
-
-    @property
-    def are_known(self) -> bool:
-        """True if the host has optimizers whose steps can be seen."""
-        return bool(self._hooked)
-
-    @property
-    def has_extra_views(self) -> bool:
-        """True if the host's next step is followed by steps on extra views."""
-        return bool(self._extra)
-
-    @property
-    def has_begun(self) -> bool:
-        """True if an optimizer has stepped since the last merge."""
-        return bool(self._stepped)
-
-    @property
-    def is_complete(self) -> bool:
-        """True if all optimizers have stepped since the last merge."""
-        return len(self._stepped) == len(self._hooked)
 
     def follow_by(self, params: Mapping[str, Tensor], gradients: Iterable[Grads]) -> None:
         """Set the gradients of this iteration's extra views. Warns if no optimizer has stepped on those of several iterations.
@@ -97,15 +82,15 @@ class HostSteps:
             params: the host's leaves, by name.
             gradients: with respect to `params`; computed one by one, after the memory of the last iteration's is free.
         """
-        if self._extra:
+        if self.extra:
             self._unused = 0 if self._has_stepped else self._unused + 1
             if self._unused == _PATIENCE:
                 _log.warning(
                     "extra views have no effect: they were rendered in %d iterations, and no optimizer that was passed stepped "
                     "on them. Pass those that the loop steps, and put new ones in the same dictionary.", _PATIENCE,
                 )  # fmt: skip
-        self._extra, self._has_stepped = [], False
-        self._extra += gradients
+        self.extra, self._has_stepped = [], False
+        self.extra += gradients
         self._rendered = {name: p for name, p in params.items() if name != "detail"}
 
     def _before_one(self, optimizer: torch.optim.Optimizer, *given: Any) -> None:
@@ -125,10 +110,10 @@ class HostSteps:
                 "the host steps inside of its backward pass, where the gradients of the views are not merged yet. Step after "
                 "loss.backward() has returned, not in a hook of a gradient."
             )
-        if id(optimizer) in self._stepped:
-            self._stepped.clear()
-        begins = not self._stepped
-        self._stepped.add(id(optimizer))
+        if id(optimizer) in self.stepped:
+            self.stepped.clear()
+        begins = not self.stepped
+        self.stepped.add(id(optimizer))
         if begins:
             has_merged, self._has_merged = self._has_merged, False
             self._begins(has_merged)
@@ -136,7 +121,7 @@ class HostSteps:
     def _after_one(self, optimizer: torch.optim.Optimizer) -> None:
         if self._steps_on_extra:
             return
-        if self._extra:
+        if self.extra:
             self._step_on_extra(optimizer)
         self._after()
 
@@ -156,7 +141,7 @@ class HostSteps:
         if scale is not None:  # gradients of extra views are not scaled
             optimizer.grad_scale = None  # type: ignore[attr-defined]
         try:
-            for grads in self._extra:
+            for grads in self.extra:
                 for p in stepped:
                     p.grad = None
                 for name, p in params.items():
@@ -170,7 +155,7 @@ class HostSteps:
                 p.grad = grad
         self._has_stepped = True
         if "means" in params:
-            self._counts["extra views"] += len(self._extra)
+            self._counts["extra views"] += len(self.extra)
 
 
 @cache

@@ -27,6 +27,7 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrSide
 from clear_strategies.merging.recorded_work import RecordedWork, replays_on, why_not_recorded
 from clear_strategies.strategies.base import stored
+from integration.announcement import Once
 from integration.autograd_shot import (
     AutogradShot,
     HostOutput,
@@ -52,7 +53,7 @@ class Drawable:
     """A rendering that a host asks for, as the arguments of a rasterizer of this package.
 
     Args:
-        drawn: means, quats, scales, opacities and colors [N, K, 3], in the host's graph.
+        inputs: means, quats, scales, opacities and colors [N, K, 3], in the host's graph.
         bands: the number of active bands of the colours. offset: f_det, at HR.
         background: behind the picture.
         params: raw parameters by gsplat's names.
@@ -60,7 +61,7 @@ class Drawable:
 
     rasterizer: Rasterizer
     camera: Camera
-    drawn: Mapping[str, Tensor]
+    inputs: Mapping[str, Tensor]
     bands: int
     offset: Float[Tensor, "N 3"] | None
     background: Float[Tensor, "1 3"]
@@ -68,7 +69,7 @@ class Drawable:
 
     def compared_with(self, photo: Photo, **more: Any) -> _RenderInputs:
         """What is drawn, without its graph, and the photo that it is compared with."""
-        drawn = Inputs(**self.drawn, rgb_offset=self.offset).drawn(self.bands)
+        drawn = Inputs(**self.inputs, rgb_offset=self.offset).drawn(self.bands)
         return _RenderInputs(*drawn, self.background, self.camera, photo.image, photo.shown, **more)
 
 
@@ -117,21 +118,9 @@ class _RenderInputs(NamedTuple):
             rasterizer = over(rasterizer, (red, green, blue))
         drawn = Inputs(self.means, self.quats, self.scales, self.opacities, self.colors, self.rgb_offset)
         r = rasterizer(drawn.splats(), self.camera)
-        drawing = Drawing(r, asked.drawn, r.image, BackwardHook())
+        drawing = Drawing(r, asked.inputs, r.image, BackwardHook())
         image = r.image if self.mask is None else r.image * self.mask
         return AutogradShot(image, r.means2d, r.visible, asked.params, drawings=(drawing,), mask=self.mask)
-
-
-class OfHr(NamedTuple):
-    """What HR brings.
-
-    Args:
-        side: its gradients. losses: by name, for the log. others: the gradients of other leaves.
-    """
-
-    side: HrSide
-    losses: Mapping[str, Number]
-    others: OfOthers
 
 
 _Made = tuple[Any, dict[str, Number]]
@@ -153,7 +142,7 @@ class HrDrawing:
 
     def __init__(self, conductor: Conductor, host: Host, device: torch.device, counts: Counter[str]) -> None:
         self._conductor, self._masks, self._counts = conductor, host.masks, counts
-        self._loss_scale = host.loss_scale or (lambda: 1.0)
+        self._loss_scale, self._log_once = host.loss_scale or (lambda: 1.0), Once(_log.info)
         self.is_scored = host.reads_score and conductor.owner("score") is not None
         self.replays = replays_on(device, conductor.work_log, "the replay of HR")
         if self.replays is not None and (reason := next(why_not_recorded(conductor), None)) is not None:
@@ -164,44 +153,43 @@ class HrDrawing:
         """Return True if HR takes part at t. No iteration is skipped while the host's densifier reads a score."""
         return self._conductor.wants_hr(t, scored=self.is_scored and self._conductor.may_densify(t))
 
-    def hr(self, step: Step, gate: Float[Tensor, " N"] | None, render_at: RenderAt) -> OfHr:
-        """The gradients of HR, of the raw parameters if HR takes part in the merge."""
+    def hr(self, step: Step, gate: Float[Tensor, " N"] | None, render_at: RenderAt) -> tuple[HrSide, OfOthers]:
+        """The HR side, by the raw parameters if HR takes part in the merge; and its gradients of other leaves."""
         self._counts["HR renders"] += 1
         conductor, view = self._conductor, step.view
-        mask, drawn = self._masks.get(view.name), render_at("hr", gate, view)
-        fine = None if mask is None else enlarged_mask(mask.to(step.params["means"]), view.factor)[..., None]
+        mask, asked = self._masks.get(view.name), render_at("hr", gate, view)
+        if mask is not None:
+            mask = enlarged_mask(mask.to(step.params["means"]), view.factor)[..., None]
+        drawn = asked if isinstance(asked, Drawable) else asked.shot
         if isinstance(drawn, Drawable):
-            return self._own_hr(drawn, step, fine)
-        shot = drawn.shot
-        if (n := len(shot.drawings)) > 1:
-            self._counts["HR renders in parts"] += 1
-            if self._counts["HR renders in parts"] == 1:
-                _log.info(
+            hr = self._own_hr(drawn, step, mask)
+        else:
+            shot = drawn if mask is None else replace(drawn, image=drawn.image * mask.to(drawn.image))
+            if (n := len(shot.drawings)) > 1:
+                self._counts["HR renders in parts"] += 1
+                self._log_once(
                     "The host calls its rasterizer %d times for one rendering, so each of the two HR gradients needs a backward "
                     "pass of its own: with 46,000 Gaussians a step takes 1.4 times as long. Call it under torch.no_grad() for "
                     "what is only looked at, and outside of the wrapped function for what only the LR loss needs.", n,
                 )  # fmt: skip
-        if fine is not None:
-            shot = replace(shot, image=shot.image * fine.to(shot.image))
-        apart = shot.drawing is not None or "detail" in shot.params
-        hr = conductor.hr_gradients(shot, step, AutogradShot.gradients, apart=apart)
+            apart = shot.drawing is not None or "detail" in shot.params
+            hr = conductor.hr_gradients(shot, step, AutogradShot.gradients, apart=apart)
         if conductor.objective.lambda_hr(step.t) == 0:
-            return OfHr(hr, hr.losses, [])
-        side, others = side_of_leaves(hr, shot.inputs, shot.params, self._loss_scale())
-        return OfHr(side, hr.losses, others)
+            return hr, []
+        return side_of_leaves(hr, drawn.inputs, drawn.params, self._loss_scale())
 
     def extra_view(self, extra: ExtraView, view: View, t: int, render_at: RenderAt) -> Grads:
         """The gradient of an extra view, which is drawn without gate and f_det."""
-        drawn = render_at(extra.photo.camera, None, view)
-        if isinstance(drawn, Drawable):
-            return self._own_extra_view(drawn, extra, t)
-        (g,) = drawn.shot.vjp(self._conductor.extra_loss(drawn.shot.image, extra, t).cotangents)
+        asked = render_at(extra.photo.camera, None, view)
+        if isinstance(asked, Drawable):
+            return self._own_extra_view(asked, extra, t)
+        (g,) = asked.shot.vjp(self._conductor.extra_loss(asked.shot.image, extra, t).cotangents)
         return g
 
     @in_full_precision
     @torch.no_grad()
-    def _own_hr(self, asked: Drawable, step: Step, mask: Float[Tensor, "H W 1"] | None) -> OfHr:
-        """As `hr`, drawn by this package."""
+    def _own_hr(self, asked: Drawable, step: Step, mask: Float[Tensor, "H W 1"] | None) -> HrSide:
+        """As `hr`, drawn by this package; by the drawn tensors."""
         conductor, t, view = self._conductor, step.t, step.view
         photo = view.hr.over(conductor.background(t), view.background)
         looked_up = conductor.looked_up(view)
@@ -215,10 +203,8 @@ class HrDrawing:
         inputs = asked.compared_with(photo, looked_up=looked_up, mask=mask)
         hr, losses = self._done(asked, inputs, t, ("hr", view.factor), work)
         seen = hr.step if self.replays is None else hr.step.copied()
-        # The losses of a recording are overwritten by the next replay.
-        hr = replace(hr, step=replace(seen, t=t, view=view, params=step.params), losses={})
-        side, others = side_of_leaves(hr, asked.drawn, asked.params, self._loss_scale())
-        return OfHr(side, losses, others)
+        # `losses` is a copy: those of a recording are overwritten by the next replay.
+        return replace(hr, step=replace(seen, t=t, view=view, params=step.params), losses=losses)
 
     @in_full_precision
     @torch.no_grad()
@@ -235,7 +221,7 @@ class HrDrawing:
 
         inputs = asked.compared_with(photo, weight=extra.weight)
         g, _ = self._done(asked, inputs, t, ("extra", extra.robust), work)
-        found = every_number(to_leaves(g, asked.drawn, asked.params)[0], asked.params)
+        found = every_number(to_leaves(g, asked.inputs, asked.params)[0], asked.params)
         return Grads({name: x.clone() for name, x in found.items()})  # the next replay overwrites some of them
 
     def _done(self, asked: Drawable, inputs: _RenderInputs, t: int, constants: tuple[Any, ...], work: _Work) -> _Made:

@@ -12,7 +12,6 @@ from weakref import WeakMethod, WeakValueDictionary
 import torch
 from torch import Tensor
 
-from clear_strategies.core.deferred import Number
 from clear_strategies.core.gradients import Colour, Grads
 from clear_strategies.errors import HostError
 from clear_strategies.kernels.reconcile import dense
@@ -138,8 +137,7 @@ class Pending:
 
     Args:
         nth: its number. t: the iteration. output: None once all trained parameters are merged.
-        hr: the gradients of HR; None: HR takes no part. losses: of HR by name, for the log.
-        others: what is still to be added of HR's gradients of other leaves.
+        hr: the gradients of HR; None: HR takes no part. others: what is still to be added of its gradients of other leaves.
         screen: the screen gradient of LR by the number of its pass, if a densifier reads it.
         merged: the parameters whose gradients are merged.
     """
@@ -149,7 +147,6 @@ class Pending:
     view: str
     output: HostOutput | None
     hr: HrSide | None
-    losses: Mapping[str, Number]
     others: OfOthers = field(default_factory=list)
     screen: dict[int, Tensor] = field(default_factory=dict)
     merged: set[str] = field(default_factory=set)

@@ -17,6 +17,7 @@ from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.core.view import View
 from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
+from integration.announcement import Once
 from integration.attachment import Attachment
 from integration.autograd_shot import HostOutput, Target
 from integration.densification import require_end, warn_if_score_is_unused
@@ -130,7 +131,7 @@ class Attached:
         self._named: tuple[View | None] | None = None  # see `rendering`; None: a view is found by its pose
         self._has_drawn_bands = False  # after a call with spherical harmonics, one without them draws no colours
         self._trains_detail = detail
-        self._hr_by, self._logged_by = hr_by, ""  # what draws HR, and the last log line about it
+        self._hr_by, self._log_once = hr_by, Once(_log.info)
         self._is_ours = False  # whether the wrapped function is this package's, see `wrap`
         stop, threshold = (getattr(strategy, name, None) for name in ("refine_stop_iter", "grow_grad2d"))
         require_end(conductor, stop, "refine_stop_iter", first=0)
@@ -175,11 +176,10 @@ class Attached:
                 call |= call.pop(name, {})
             if self.attachment.removed or not self._draws_colors(call):
                 return rasterization(**call)
-            if not torch.is_grad_enabled():
-                return rasterization(**self._with_detail(call, trained=False))
-            read = functools.cache(functools.partial(calls.cameras_read, call))
-            view = self._poses.find(read()["viewmats"]) if self._named is None else self._named[0]
-            if view is None:  # a viewer, a camera without a photo
+            read, view = functools.cache(functools.partial(calls.cameras_read, call)), None
+            if torch.is_grad_enabled():
+                view = self._poses.find(read()["viewmats"]) if self._named is None else self._named[0]
+            if view is None:  # evaluation, a viewer, a camera without a photo
                 return rasterization(**self._with_detail(call, trained=False))
             if self._named is None:
                 calls.require_own_intrinsics({**call, **read()}, view)
@@ -300,9 +300,7 @@ class Attached:
             if self._hr_by != "auto":
                 raise
             by = f"the host's own function: {error}"
-        if by != self._logged_by:
-            _log.info("HR and extra views are drawn by %s", by)
-            self._logged_by = by
+        self._log_once(f"HR and extra views are drawn by {by}")
         return rasterizer
 
     def _background(self, call: Mapping[str, Any]) -> dict[str, Tensor]:

@@ -15,6 +15,7 @@ from torch import Tensor
 from clear_strategies.core.view import View
 from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
+from integration.announcement import Once
 from integration.attachment import Attachment
 from integration.autograd_shot import HostOutput, Target
 from integration.densification import require_end, warn_if_score_is_unused
@@ -102,7 +103,7 @@ class Attached:
         warn_if_score_is_unused(conductor, gaussians, threshold)
         self._rows = CarriedRows(gaussians, self._host_params)
         self.detail, self._trains_detail = DetailFeature(lambda: gaussians._xyz, self._rows, conductor.detail), detail
-        self._warned: set[str] = set()
+        self._warn_once = Once(_log.warning)
         host = Host(
             self.params, self.detail.poll_parents, threshold=threshold, accumulation=accumulation, masks=self.views.masks,
             own_background=own_background, remedy="Nothing has their colour and rotation. End densification first.",
@@ -211,11 +212,6 @@ class Attached:
                 "viewspace_points have 4 columns: absolute gradients stay those of the LR image, and the densification "
                 "score of %s goes to the first two columns only.", type(scoring).__name__,
             )  # fmt: skip
-
-    def _warn_once(self, message: str, *values: Any) -> None:
-        if message not in self._warned:
-            _log.warning(message, *values)
-            self._warned.add(message)
 
     def _bg_color(self, own: Tensor | None) -> dict[str, Tensor]:
         """The colour that the strategies choose for this iteration, in place of the host's own, which must be black."""

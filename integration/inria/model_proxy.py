@@ -7,7 +7,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from typing import Any, Final, Literal
 
 import torch
@@ -22,14 +22,12 @@ from rasterizers.interface import Camera
 
 Role = Literal["gate", "detail"]
 """The changes of an override: opacities are multiplied by the gate, colours are offset by f_det."""
-_ROLES: Final[tuple[tuple[str, Role], ...]] = (
-    ("get_opacity", "gate"),
-    ("get_opacity_with_3D_filter", "gate"),
-    ("get_scaling_n_opacity_with_3D_filter", "gate"),
-    ("_features_dc", "detail"),
-)
-"""Names of a model's getters, methods and attributes, those that it has. Of role "gate" are opacities (or a tuple that ends with
-them), of role "detail" is the constant band of the colours.
+_ROLES: Final[Mapping[str, Role]] = {
+    "get_opacity": "gate", "get_opacity_with_3D_filter": "gate", "get_scaling_n_opacity_with_3D_filter": "gate",
+    "_features_dc": "detail",
+}  # fmt: skip
+"""A model's getters, methods and attributes, those that it has. Of role "gate" are opacities (or a tuple that ends with them), of
+role "detail" is the constant band of the colours.
 """
 
 
@@ -49,48 +47,38 @@ class Overrides:
     used: set[Role] = field(default_factory=set)
     active: set[Role] = field(default_factory=set)
 
+    def of(self, role: Role, get: Callable[[], Any]) -> Any:
+        """What `get` returns, changed once."""
+        if role in self.active:
+            return get()
+        self.active.add(role)
+        try:
+            return _apply(get(), self, role)
+        finally:
+            self.active.discard(role)
+
 
 def proxy(model: Any, overrides: Overrides) -> Any:
     """An object of the model's class that shares its attributes and applies the overrides."""
-    result: Any = object.__new__(_proxy_class(type(model)))  # type: ignore[arg-type]
+    result: Any = object.__new__(_proxy_class(type(model)))
     object.__setattr__(result, "__dict__", vars(model))
     object.__setattr__(result, "_clear_overrides", overrides)
     return result
 
 
 @cache
-def _proxy_class(cls: type) -> type:
-    members: dict[str, Any] = {"__slots__": ("_clear_overrides",), "__module__": cls.__module__}
-    for name, role in _ROLES:
-        members |= {name: _member(inspect.getattr_static(cls, name, None), name, role)}
-    return type(cls.__name__, (cls,), members)
-
-
-def _member(original: Any, name: str, role: Role) -> Any:
-    """A property or method in place of `original`; its value is overridden once."""
-
-    def overridden(self: Any, get: Callable[[], Any]) -> Any:
-        overrides: Overrides = self._clear_overrides
-        if role in overrides.active:
+def _proxy_class(cls: type) -> Any:
+    def read(self: Any, name: str) -> Any:
+        get = partial(cls.__getattribute__, self, name)
+        if (role := _ROLES.get(name)) is None:
             return get()
-        overrides.active.add(role)
-        try:
-            return _apply(get(), overrides, role)
-        finally:
-            overrides.active.discard(role)
+        overrides: Overrides = cls.__getattribute__(self, "_clear_overrides")
+        if inspect.isroutine(inspect.getattr_static(cls, name, None)):
+            return lambda *args, **kwargs: overrides.of(role, lambda: get()(*args, **kwargs))
+        return overrides.of(role, get)
 
-    if callable(original):
-        return lambda self, *args, **kwargs: overridden(self, lambda: original(self, *args, **kwargs))
-    if isinstance(original, property):
-        return property(lambda self: overridden(self, lambda: original.__get__(self)))
-    return property(lambda self: overridden(self, lambda: _attribute(self, name)))
-
-
-def _attribute(model: Any, name: str) -> Any:
-    try:
-        return vars(model)[name]
-    except KeyError:
-        raise AttributeError(f"{type(model).__name__} has no {name}") from None
+    members = {"__slots__": ("_clear_overrides",), "__module__": cls.__module__, "__getattribute__": read}
+    return type(cls.__name__, (cls,), members)
 
 
 def _apply(value: Any, overrides: Overrides, role: Role) -> Any:

@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from integration.announcement import Once
 from integration.replacing import replaced_methods
 from integration.structure import bits, composed, first_equal, is_same
 
@@ -58,7 +59,7 @@ class CarriedRows:
     """
 
     def __init__(self, model: Any, params: Callable[[], Mapping[str, Tensor]]) -> None:
-        self._model, self._params, self._warned = model, params, False
+        self._model, self._params, self._warn_once = model, params, Once(_log.warning)
         self._undo = ExitStack()
         self._undo.enter_context(replaced_methods(model, {
             "_prune_optimizer": functools.partial(_hooked, self._keep),
@@ -84,9 +85,8 @@ class CarriedRows:
         now = self._before
         if carried and len(parents) == len(now["means"]) and _are_copies(now, before, parents):
             return None if is_same(parents, len(before["means"])) else Change(parents, fresh)
-        if carried and not self._warned:
-            self._warned = True
-            _log.warning(
+        if carried:
+            self._warn_once(
                 "%s changes its rows elsewhere than in _prune_optimizer and cat_tensors_to_optimizer. Their parents are found by "
                 "the values of colours and rotations instead.", type(self._model).__name__,
             )  # fmt: skip

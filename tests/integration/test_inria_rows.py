@@ -210,7 +210,7 @@ def test_opacities_are_gated_once_and_the_detail_feature_is_added_to_the_constan
     assert torch.allclose(difference[:, 0], torch.full((N, 3), 1 / SH_C0))
     assert bool((difference[:, 1:] == 0).all())
     del model._features_dc
-    with pytest.raises(AttributeError, match="Model has no _features_dc"):
+    with pytest.raises(AttributeError, match="'Model' object has no attribute '_features_dc'"):
         _ = proxy(model, Overrides())._features_dc
 
 
