@@ -181,8 +181,9 @@ class Attached:
                 view = self._poses.find(read()["viewmats"]) if self._named is None else self._named[0]
             if view is None:  # evaluation, a viewer, a camera without a photo
                 return rasterization(**self._with_detail(call, trained=False))
+            calls.require_photo(call, view, len(self._params[self._names["means"]]))
             if self._named is None:
-                calls.require_own_intrinsics({**call, **read()}, view)
+                calls.require_own_intrinsics(read()["Ks"], view)
             calls.require_pinhole(call, self.attachment.conductor.showing)
 
             @functools.cache  # the product is the same tensor at both scales, and none is kept for longer
@@ -255,16 +256,6 @@ class Attached:
         read: Callable[[], Mapping[str, Tensor]],
     ) -> HostOutput | Drawable:  # fmt: skip
         call, params = {**arguments, **self._background(arguments)}, self.params()
-        if call["means"].dim() > 2:
-            raise HostError(
-                f"{view.name} is rendered with batches of scenes, means {[*call['means'].shape]}. Leave out what is in front of "
-                f"{[*params['means'].shape]}, of all tensors of the call."
-            )
-        if len(call["means"]) != len(params["means"]):
-            raise HostError(
-                f"{view.name} is rendered with {len(call['means']):,} of {len(params['means']):,} Gaussians, and it is unknown "
-                "which. Render all of them, or for a pass that shows a part: with clear.rendering(None): …"
-            )
         own = None if target == "lr" else self._own_rasterizer(call)
         if target == "hr":
             wanted = self._with_detail(call, trained=True) if own is None else {**call, **read()}
@@ -272,18 +263,11 @@ class Attached:
             call |= {"packed": False} if self._is_ours else {}  # nobody reads its `info`
         else:
             params.pop("detail", None)
-        if isinstance(target, Camera):
-            call = calls.seen_by(call, target) if own is None else call
-        else:
-            expected = view.hr.camera if target == "hr" else view.lr.camera
-            if (call["width"], call["height"]) != (expected.width, expected.height):
-                raise HostError(
-                    f"{view.name} is rendered at {arguments['width']}x{arguments['height']}, but its photo has "
-                    f"{view.lr.camera.width}x{view.lr.camera.height} pixels. Train at one resolution (nerfstudio: "
-                    "num_downscales=0), cut a crop out of the picture of the whole photo, and evaluate without gradients."
-                )
+        camera = target if isinstance(target, Camera) else None
         if own is not None:
-            return calls.drawable(own, call, params, target if isinstance(target, Camera) else None)
+            return calls.drawable(own, call, params, camera)
+        if camera is not None:
+            call = calls.seen_by(call, camera)
         call, aliases = (call, ()) if self._is_ours else calls.aliased(call)
         return calls.host_output(rasterization, call, params, gate, aliases if target == "lr" else ())
 

@@ -71,18 +71,35 @@ class Poses:
         return self._views[near[0][1]] if near else None
 
 
-def require_own_intrinsics(call: Call, view: View) -> None:
-    """Raise a HostError if a call of the photo's size, with cameras in the CPU's memory, has other intrinsics; other sizes are
-    refused where they are drawn.
-    """
-    lr = view.lr.camera
-    if (call["width"], call["height"]) == (lr.width, lr.height):
-        (fx, _, cx), (_, fy, cy), _ = call["Ks"].reshape(3, 3).tolist()
-        remedy = (
-            "Pass view() the K of the loop, and cut a crop out of the whole picture. A loop that optimizes K names the view: "
-            "with clear.rendering(view): …"
+def require_photo(call: Call, view: View, n: int) -> None:
+    """Raise a HostError unless a call draws all n Gaussians of one scene, at the size of the view's photo."""
+    drawn, lr = call["means"], view.lr.camera
+    if drawn.dim() > 2:
+        raise HostError(
+            f"{view.name} is rendered with batches of scenes, means {[*drawn.shape]}. Leave out what is in front of {[n, 3]}, of "
+            "all tensors of the call."
         )
-        require_intrinsics(view.name, (fx, fy, cx, cy), lr, remedy)
+    if len(drawn) != n:
+        raise HostError(
+            f"{view.name} is rendered with {len(drawn):,} of {n:,} Gaussians, and it is unknown which. Render all of them, or "
+            "for a pass that shows a part: with clear.rendering(None): …"
+        )
+    if (call["width"], call["height"]) != (lr.width, lr.height):
+        raise HostError(
+            f"{view.name} is rendered at {call['width']}x{call['height']}, but its photo has {lr.width}x{lr.height} pixels. "
+            "Train at one resolution (nerfstudio: num_downscales=0), cut a crop out of the picture of the whole photo, and "
+            "evaluate without gradients."
+        )
+
+
+def require_own_intrinsics(Ks: Float[Tensor, "*C 3 3"], view: View) -> None:
+    """Raise a HostError if K of a call, in the CPU's memory, is not that of the view's photo."""
+    (fx, _, cx), (_, fy, cy), _ = Ks.reshape(3, 3).tolist()
+    remedy = (
+        "Pass view() the K of the loop, and cut a crop out of the whole picture. A loop that optimizes K names the view: with "
+        "clear.rendering(view): …"
+    )
+    require_intrinsics(view.name, (fx, fy, cx, cy), view.lr.camera, remedy)
 
 
 def enlarged(call: Call, factor: int) -> dict[str, Any]:
