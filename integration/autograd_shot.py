@@ -118,8 +118,14 @@ class AutogradShot:
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
         """∇θ of every cotangent, each with `.screen`; the graph is kept. Frozen parameters have gradient 0."""
-        parts = [(g, to_leaves(g, self.inputs, self.params)[0]) for g in self.gradients(cotangents)]
-        return [Grads(every_number(raw + self._detail(g), self.params), screen=g.screen) for g, raw in parts]
+        results = []
+        for g in self.gradients(cotangents):
+            raw, _ = to_leaves(g, self.inputs, self.params)
+            detail = g.get("detail") if g.colour is None else g.colour.rgb
+            if "detail" in self.params and detail is not None:
+                raw["detail"] = detail
+            results.append(Grads(every_number(raw, self.params), screen=g.screen))
+        return results
 
     def gradients(
         self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"] | None = None
@@ -130,10 +136,7 @@ class AutogradShot:
         if self.drawing is not None:
             return gradients_of(summed_vjp(self.drawing.rendering, self._at_drawing(cotangents), weight))
         each = self._gradients_of_host(cotangents)
-        if weight is None:
-            return each
-        last = Grads(each[-1].without_detail() | self._detail(each[-1]), screen=each[-1].screen)
-        return summed([*each[:-1], last], weight)
+        return each if weight is None else summed(each, weight)
 
     def _gradients_of_host(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
         slot = self.gradient_slot
@@ -147,17 +150,11 @@ class AutogradShot:
             )  # fmt: skip
             screen = gradients[-1] if projected else torch.zeros_like(slot.tensor)
             values = dict(zip(tensors, gradients, strict=False))
+            if "detail" in self.params and "colors" in values:  # of which f_det is an offset
+                rgb = values["colors"]
+                values["detail"] = rgb if rgb.dim() == 2 else rgb[:, 0] / SH_C0
             results.append(Grads(values, screen=slot.per_gaussian(screen, len(self.visible))))
         return results
-
-    def _detail(self, g: Grads) -> Grads:
-        """The gradient of f_det, which is that of the colour."""
-        if "detail" not in self.params:
-            return Grads()
-        if "colors" in g:
-            return Grads({"detail": g["colors"] if g["colors"].dim() == 2 else g["colors"][:, 0] / SH_C0})
-        found = g.get("detail") if g.colour is None else g.colour.rgb
-        return Grads() if found is None else Grads({"detail": found})
 
     def _at_drawing(self, cotangents: Float[Tensor, "K H W 3"]) -> Float[Tensor, "K H W 3"]:
         """The cotangents of the rasterizer's image, from which the host may have computed `image`."""
