@@ -42,6 +42,7 @@ from clear_strategies.core.view import View
 from clear_strategies.data.scene import require_shown
 from clear_strategies.errors import HostError, SettingError
 from clear_strategies.merging.conductor import Conductor
+from clear_strategies.merging.logs import computed
 from clear_strategies.strategies.base import Logged
 from integration.announcement import Once, announce, warn_without_hr
 from integration.autograd_shot import HostOutput, Target, are_in_order, require_named, trained
@@ -195,7 +196,7 @@ class Attachment:
     @property
     def log(self) -> dict[str, float]:
         """Scalars of the last iteration that was merged. On a device, reading them waits for the device."""
-        return deferred.resolve([{name: x() if callable(x) else x for name, x in self._logged.items()}])[0]
+        return deferred.resolve([computed(self._logged)])[0]
 
     def remove(self) -> None:
         """Restore the host: its renderings pass through, and the gradients of a pending one are not merged."""
@@ -292,7 +293,7 @@ class Attachment:
         λ = self.conductor.objective.lambda_hr(self.t)
         losses, shares = {} if pending.hr is None else pending.hr.losses, conflict_columns(conflict)
         row: dict[str, Logged] = {"t": float(self.t), "lambda_hr": λ, **losses, **shares}
-        self._logged = row | self.conductor.logs.uncounted(row)
+        self._logged = row | self.conductor.logs.scalars(row)
         if self.counts["merges"] % _LOGGED_EVERY == 0:
             now = self.log
             losses_now = ", ".join(f"L_{name} {now[name]:.4f}" for name in losses) or "no HR"

@@ -33,6 +33,7 @@ from clear_strategies.merging.iteration import (
     guarded,
     require_finite_parts,
 )
+from clear_strategies.merging.logs import computed
 from clear_strategies.merging.objective import Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
 from clear_strategies.strategies.base import RunFacts, Scale, Strategy
@@ -203,7 +204,7 @@ class Conductor(Hooks):
             else:
                 grads, conflict = None, stepper.step(params, rendered, g_lr, from_hr, t)
         losses = {**l_lr.values, **({} if from_hr is None else from_hr.losses)}
-        logs = self.logs.counted_since_kept()
+        logs = computed(self.logs.scalars(since_kept=True))
         return Update(step, grads, score, ordinary, conflict, losses, logs, l_lr.cotangents)
 
     @apart_from_the_loop

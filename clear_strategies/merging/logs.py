@@ -28,38 +28,27 @@ class IterationLogs:
             kept.update(s.logs)
             s.logs.clear()
 
-    def uncounted(self, columns: Collection[str] = ()) -> dict[str, Logged]:
-        """The scalars as they were logged, some as functions that compute them. A name that another strategy has logged too is
-        prefixed by the class.
+    def scalars(self, columns: Collection[str] = (), *, since_kept: bool = False) -> dict[str, Logged]:
+        """The scalars as they were logged, see `computed`. A name that another strategy has logged too is prefixed by the class.
 
         Args:
             columns: of the row that the scalars are added to.
+            since_kept: those alone that were logged since `keep`.
 
         Raises:
             AnswerError: one of these columns was logged.
         """
-        logged = _named(self._strategies, [kept | s.logs for kept, s in zip(self._kept, self._strategies, strict=True)])
+        logged: dict[str, Logged] = {}
+        for owner, kept, s in zip(by_class(self._strategies), self._kept, self._strategies, strict=True):
+            own = s.logs if since_kept else kept | s.logs
+            logged |= {f"{owner}.{name}" if name in logged else name: x for name, x in own.items()}
         if taken := logged.keys() & columns:
             raise AnswerError(
                 f"a strategy logs {min(taken)!r}, a column that the row has already. Give it another name."
             )
         return logged
 
-    def counted(self, columns: Collection[str] = ()) -> dict[str, Number]:
-        """As `uncounted`, computed."""
-        return _counted(self.uncounted(columns))
 
-    def counted_since_kept(self) -> dict[str, Number]:
-        """The scalars that were logged since `keep`, computed."""
-        return _counted(_named(self._strategies, [s.logs for s in self._strategies]))
-
-
-def _named(strategies: Sequence[Strategy], logged: Sequence[Mapping[str, Logged]]) -> dict[str, Logged]:
-    named: dict[str, Logged] = {}
-    for owner, own in zip(by_class(strategies), logged, strict=True):
-        named |= {f"{owner}.{name}" if name in named else name: x for name, x in own.items()}
-    return named
-
-
-def _counted(logged: Mapping[str, Logged]) -> dict[str, Number]:
+def computed(logged: Mapping[str, Logged]) -> dict[str, Number]:
+    """The scalars, some of which were logged as functions that compute them."""
     return {name: x() if callable(x) else x for name, x in logged.items()}

@@ -25,6 +25,7 @@ from clear_strategies.data.priors import Bicubic, network_of
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import AnswerError, DivergedError
 from clear_strategies.merging.iteration import Update, require_finite_parts
+from clear_strategies.merging.logs import computed
 from clear_strategies.merging.skips import PLATEAU_LOSS
 from clear_strategies.signals import Interrupted, deferred_signals, foremost
 from clear_strategies.training import checkpoint
@@ -58,7 +59,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> None:
         if s.filter_due() and not restructured and not s.remove_undrawn():  # each recomputes the filter
             s.refilter()
     row = _row(s) | row | extra
-    s.history.append(row | conductor.logs.counted(row))
+    s.history.append(row | computed(conductor.logs.scalars(row)))
     if t in s.plateau.measurements and not (restructured or s.reset_due(t)):
         with stage("loss of the training views"):
             s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)

@@ -13,6 +13,7 @@ from clear_strategies.core.gradients import CONFLICT_GROUPS, Colour
 from clear_strategies.errors import DivergedError
 from clear_strategies.kernels import reconcile
 from clear_strategies.kernels.reconcile import dense, reference
+from clear_strategies.merging.logs import computed
 from clear_strategies.schedules import WarmupDecay
 from integration.host import Host
 from integration.host_merge import HostMerge
@@ -107,7 +108,7 @@ def test_every_pass_agrees_with_the_conductor_in_float64(passes, accumulated, fa
         merge = merge_in_place if dtype == torch.float32 else by_the_conductor
         conflicts.append(deferred.resolve([dict(merge(made, params, hr, step, T, before=before, scale=scale))])[0])
         results.append({name: p.grad.double() for name, p in params.items()})
-        assert deferred.read([made.logs.counted()["corrected"]])[0] > 0.1
+        assert deferred.read([computed(made.logs.scalars())["corrected"]])[0] > 0.1
     for name, exact in results[1].items():
         error = (results[0][name] - exact).flatten(1 if exact.dim() > 1 else 0).abs().max()
         assert error <= 4e-6 * exact.abs().max(), name
@@ -137,7 +138,7 @@ def test_the_lr_gradient_of_the_colours_may_come_by_its_factors(passes, accumula
         made, routed = conductor(), Grads() if hr == "none" else routed
         merge = by_the_conductor if exact else partial(merge_in_place, lr_colour=lr)
         merge(made, params, routed, step, T, before=before, scale=scale)
-        assert hr == "none" or deferred.read([made.logs.counted()["corrected"]])[0] > 0.1
+        assert hr == "none" or deferred.read([computed(made.logs.scalars())["corrected"]])[0] > 0.1
         results.append({name: p.grad.double() for name, p in params.items()})
     for name, exact in results[1].items():
         assert (results[0][name] - exact).abs().max() <= 4e-6 * exact.abs().max(), name

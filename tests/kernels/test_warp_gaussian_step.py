@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from clear_strategies import GCO, P2G, SVS
+from clear_strategies.merging.logs import computed
 from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.optim import Adam, LearningRates
 from tests.helpers import toy
@@ -34,7 +35,7 @@ def two_steps(warp_step):
     c, step = started(warp_step)
     conflicts = [as_floats(step.step(c.fields[1].raw(), *c.factors(1), T + i)) for i in range(2)]
     state = [*c.fields[1].raw().values(), *step.optimizer.first.values(), *step.optimizer.second.values()]
-    numbers = as_floats(step.conductor.logs.counted())
+    numbers = as_floats(computed(step.conductor.logs.scalars()))
     return state, conflicts, numbers, step.conductor.work_log.entries["optimizer rows"].skipped
 
 

@@ -29,6 +29,7 @@ from clear_strategies import (
 from clear_strategies.core.seeds import dropout_mask
 from clear_strategies.errors import AnswerError
 from clear_strategies.kernels.losses import reference
+from clear_strategies.merging.logs import computed
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.base import misspelled
 from clear_strategies.testing import CHECKS, ContractError, check_strategy, given
@@ -328,9 +329,9 @@ class LogsShare(Strategy):
 def test_what_two_strategies_of_one_class_log_is_both_there():
     conductor = Conductor(LogsShare(0.25), LogsShare(0.5))
     conductor.regularized({}, 1)
-    assert conductor.logs.counted() == {"share": 0.25, "LogsShare2.share": 0.5}
+    assert computed(conductor.logs.scalars()) == {"share": 0.25, "LogsShare2.share": 0.5}
     with pytest.raises(AnswerError, match="a strategy logs 'share', a column that the row has already"):
-        conductor.logs.uncounted({"t", "share"})  # else it would take the place of a loss, say
+        conductor.logs.scalars({"t", "share"})  # else it would take the place of a loss, say
 
 
 def test_a_parameter_that_is_replaced_in_place_of_changed_is_refused():

@@ -17,6 +17,7 @@ from clear_strategies.core.gradients import gradients_of
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.kernels.gaussian_step import StepSettings
 from clear_strategies.kernels.gaussian_step.cpp import CppGaussianStep
+from clear_strategies.merging.logs import computed
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for
@@ -95,7 +96,7 @@ def test_the_merged_gradient_is_the_readable_one(passes, setting, kind, caplog):
         expected, conflict, found, found_conflict = both_ways(passes, c, readable, compiled)
         assert_same_gradient(c, expected, found)
         assert repr(as_floats(found_conflict)) == repr(as_floats(conflict))
-        same(as_floats(readable.logs.counted()), as_floats(compiled.logs.counted()))
+        same(as_floats(computed(readable.logs.scalars())), as_floats(computed(compiled.logs.scalars())))
         assert not caplog.messages
 
 
@@ -111,7 +112,7 @@ def test_beyond_2e_7_of_the_margin_both_paths_decide_the_same(passes, beyond):
     readable, compiled = conductors(GCO)
     both_ways(passes, c, readable, compiled, "base")
     for conductor in (readable, compiled):
-        logs = as_floats(conductor.logs.counted())
+        logs = as_floats(computed(conductor.logs.scalars()))
         assert [logs[f"corrected_{group}"] for group in ("sh0", "shN")] == [float(beyond < 0)] * 2
 
 
@@ -272,7 +273,7 @@ def test_the_same_bits_for_any_number_of_threads(passes):
             for i in range(3):
                 step.step(c.fields[1].raw(), *c.factors(1), T + i)
             state = [*c.fields[1].raw().values(), *adam.first.values(), *adam.second.values()]
-            states.append((state, repr(as_floats(conductor.logs.counted()))))
+            states.append((state, repr(as_floats(computed(conductor.logs.scalars())))))
     finally:
         torch.set_num_threads(threads)
     for state, readings in states[1:]:
