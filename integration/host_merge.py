@@ -63,11 +63,6 @@ class HostMerge:
         self._in_vain = 0  # renderings, one after the other, that were not merged
         self._outweighed: int | None = 0  # of the first merges with HR; None: in one of them HR had a part
 
-    @property
-    def is_waiting(self) -> bool:
-        """Whether gradients of the last rendering are still to be merged."""
-        return self.pending is not None and self.pending.output is not None
-
     def await_passes(self, pending: Pending, *, to_screen: bool) -> None:
         """Merge this rendering in place of the last one; warn if no backward pass has merged the last ones: nobody may tell
         otherwise that a loop steps other tensors.

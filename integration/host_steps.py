@@ -18,7 +18,6 @@ from torch import Tensor
 
 from clear_strategies.core.gradients import Grads
 from clear_strategies.errors import HostError
-from rasterizers.torch_internals import current_pass
 
 _log = logging.getLogger(__name__)
 
@@ -29,7 +28,6 @@ class HostSteps:
     """Hooks on the host's optimizers. In a step of the host, each optimizer steps once, and then once for each extra view.
 
     Args:
-        is_waiting: whether a rendering waits for its backward pass.
         begins: called when a step of the host begins, with whether gradients have been merged since the last step.
         after: called after an optimizer has stepped, also on extra views.
         counts: `Attachment.counts`, to which this class adds.
@@ -40,10 +38,8 @@ class HostSteps:
         extra: the gradients of extra views, on which each of them makes a step after its own.
     """
 
-    def __init__(
-        self, *, is_waiting: Callable[[], bool], begins: Callable[[bool], None], after: Callable[[], None], counts: Counter[str]
-    ) -> None:  # fmt: skip
-        self._is_waiting, self._begins, self._after, self._counts = is_waiting, begins, after, counts
+    def __init__(self, begins: Callable[[bool], None], after: Callable[[], None], counts: Counter[str]) -> None:
+        self._begins, self._after, self._counts = begins, after, counts
         self._hooks: list[Any] = []
         self.hooked: list[torch.optim.Optimizer] = []
         self.stepped: set[int] = set()
@@ -104,11 +100,6 @@ class HostSteps:
             raise HostError(
                 "the host gives its optimizer a closure, which renders inside of step(), but the gradients are merged before. "
                 "Render and call loss.backward(), then step() without a closure."
-            )
-        if current_pass() >= 0 and self._is_waiting():
-            raise HostError(
-                "the host steps inside of its backward pass, where the gradients of the views are not merged yet. Step after "
-                "loss.backward() has returned, not in a hook of a gradient."
             )
         if id(optimizer) in self.stepped:
             self.stepped.clear()
