@@ -23,11 +23,11 @@ from integration.autograd_shot import HostOutput, Target
 from integration.densification import require_end, warn_if_score_is_unused
 from integration.detail import sh0_offset
 from integration.gsplat import calls
-from integration.gsplat.calls import Rasterization
+from integration.gsplat.calls import Call, Rasterization
 from integration.gsplat.optimizers import optimizers_of, step_detail
 from integration.gsplat.rows import RowNumbers
 from integration.host import Host
-from integration.hr_drawing import Drawable
+from integration.hr_drawing import Drawable, RenderAt
 from integration.replacing import replaced_attribute, replaced_everywhere
 from integration.structure import rows_drawn
 from rasterizers.ahead import drawing_ahead
@@ -132,7 +132,6 @@ class Attached:
         self._has_drawn_bands = False  # after a call with spherical harmonics, one without them draws no colours
         self._trains_detail = detail
         self._hr_by, self._log_once = hr_by, Once(_log.info)
-        self._is_ours = False  # whether the wrapped function is this package's, see `wrap`
         stop, threshold = (getattr(strategy, name, None) for name in ("refine_stop_iter", "grow_grad2d"))
         require_end(conductor, stop, "refine_stop_iter", first=0)
         warn_if_score_is_unused(conductor, strategy, threshold)
@@ -166,7 +165,7 @@ class Attached:
                 "function that takes them by name."
             )
 
-        self._is_ours = "rgb_offset" in signature.parameters
+        is_ours = "rgb_offset" in signature.parameters
 
         @functools.wraps(rasterization)
         @uncompiled
@@ -180,23 +179,14 @@ class Attached:
             if torch.is_grad_enabled():
                 view = self._poses.find(read()["viewmats"]) if self._named is None else self._named[0]
             if view is None:  # evaluation, a viewer, a camera without a photo
-                return rasterization(**self._with_detail(call, trained=False))
+                return rasterization(**self._with_detail(call, is_ours=is_ours, trained=False))
             calls.require_photo(call, view, len(self._params[self._names["means"]]))
             if self._named is None:
                 calls.require_own_intrinsics(read()["Ks"], view)
             calls.require_pinhole(call, self.attachment.conductor.showing)
-
-            @functools.cache  # the product is the same tensor at both scales, and none is kept for longer
-            def gated(gate: Tensor) -> Tensor:
-                opacities: Tensor = call["opacities"]
-                return opacities * gate.to(opacities)
-
-            def render_at(target: Target, gate: Tensor | None, sized: View) -> HostOutput | Drawable:
-                shown = call if gate is None else {**call, "opacities": gated(gate)}
-                return self._render(rasterization, shown, sized, target, gate, read)
-
             self._follow_optimizers()
-            with self._together(call):
+            render_at = self._renderer(rasterization, call, read, is_ours=is_ours)
+            with self._together(call) if is_ours else nullcontext():
                 return self.attachment.render_view(view, render_at)  # type: ignore[no-any-return]
 
         setattr(wrapped, _ATTACHED, self)
@@ -236,14 +226,14 @@ class Attached:
             found = step_detail(self._optimizers, found, self._params["detail"], self.attachment.conductor.detail)
         self.attachment.hook(found)
 
-    def _together(self, call: Mapping[str, Any]) -> AbstractContextManager[None]:
+    def _together(self, call: Call) -> AbstractContextManager[None]:
         """A context in which HR and LR share work, if this package's function draws both."""
-        if not self._is_ours or self._own_rasterizer(call) is not None:
+        if self._own_rasterizer(call) is not None:
             return nullcontext()
         pose, K = (call[name].detach().reshape(n, n) for name, n in (("viewmats", 4), ("Ks", 3)))
         return drawing_ahead(pose, K, call["width"], call["height"])
 
-    def _draws_colors(self, call: Mapping[str, Any]) -> bool:
+    def _draws_colors(self, call: Call) -> bool:
         """Return True if a call draws the colours of the scene, and not only depth, normals or other features."""
         as_bands = call.get("sh_degree") is not None
         self._has_drawn_bands |= as_bands
@@ -251,27 +241,45 @@ class Attached:
             return False
         return as_bands or not (self._has_drawn_bands or self._named == (None,))
 
-    def _render(
-        self, rasterization: Rasterization, arguments: Mapping[str, Any], view: View, target: Target, gate: Tensor | None,
-        read: Callable[[], Mapping[str, Tensor]],
-    ) -> HostOutput | Drawable:  # fmt: skip
-        call, params = {**arguments, **self._background(arguments)}, self.params()
-        own = None if target == "lr" else self._own_rasterizer(call)
-        if target == "hr":
-            wanted = self._with_detail(call, trained=True) if own is None else {**call, **read()}
-            call = calls.enlarged(wanted, view.factor)
-            call |= {"packed": False} if self._is_ours else {}  # nobody reads its `info`
-        else:
-            params.pop("detail", None)
-        camera = target if isinstance(target, Camera) else None
-        if own is not None:
-            return calls.drawable(own, call, params, camera)
-        if camera is not None:
-            call = calls.seen_by(call, camera)
-        call, aliases = (call, ()) if self._is_ours else calls.aliased(call)
-        return calls.host_output(rasterization, call, params, gate, aliases if target == "lr" else ())
+    def _renderer(
+        self, rasterization: Rasterization, arguments: Call, cameras: Callable[[], Mapping[str, Tensor]], *, is_ours: bool
+    ) -> RenderAt:  # fmt: skip
+        """What draws a call of the function at each scale, and from other cameras.
 
-    def _own_rasterizer(self, call: Mapping[str, Any]) -> Rasterizer | None:
+        Args:
+            cameras: returns those of the call, see `calls.cameras_read`.
+        """
+
+        @functools.cache  # the product is the same tensor at both scales, and none is kept for longer
+        def gated(gate: Tensor) -> Tensor:
+            opacities: Tensor = arguments["opacities"]
+            return opacities * gate.to(opacities)
+
+        def render_at(target: Target, gate: Tensor | None, view: View) -> HostOutput | Drawable:
+            call, params = {**arguments, **self._background(arguments)}, self.params()
+            if gate is not None:
+                call["opacities"] = gated(gate)
+            own = None if target == "lr" else self._own_rasterizer(call)
+            if target == "hr":
+                if own is None:
+                    call = self._with_detail(call, is_ours=is_ours, trained=True)
+                else:
+                    call |= cameras()
+                call = calls.enlarged(call, view.factor)
+                call |= {"packed": False} if is_ours else {}  # nobody reads its `info`
+            else:
+                params.pop("detail", None)
+            camera = target if isinstance(target, Camera) else None
+            if own is not None:
+                return calls.drawable(own, call, params, camera)
+            if camera is not None:
+                call = calls.seen_by(call, camera)
+            call, aliases = (call, ()) if is_ours else calls.aliased(call)
+            return calls.host_output(rasterization, call, params, gate, aliases if target == "lr" else ())
+
+        return render_at
+
+    def _own_rasterizer(self, call: Call) -> Rasterizer | None:
         """The rasterizer of this package that draws HR and extra views; None: the host's function does. Logs the choice once."""
         if self._hr_by == "host" or (self._hr_by == "auto" and call["means"].device.type != "cuda"):
             return None
@@ -287,18 +295,18 @@ class Attached:
         self._log_once(f"HR and extra views are drawn by {by}")
         return rasterizer
 
-    def _background(self, call: Mapping[str, Any]) -> dict[str, Tensor]:
+    def _background(self, call: Call) -> dict[str, Tensor]:
         """The `backgrounds` that the strategies choose for a call; empty if it names its own."""
         color = self.attachment.background
         if color is None or call.get("backgrounds") is not None:
             return {}
         return {"backgrounds": color_on(color, call["means"].device, call["means"].dtype)}
 
-    def _with_detail(self, arguments: Mapping[str, Any], *, trained: bool) -> dict[str, Any]:
+    def _with_detail(self, arguments: Call, *, is_ours: bool, trained: bool) -> dict[str, Any]:
         """The same call with colours f_base + f_det.
 
         Args:
-            trained: whether f_det gets a gradient.
+            is_ours: see `calls.with_offset`. trained: whether f_det gets a gradient.
         """
         detail = self._params.get("detail")
         if detail is None:
@@ -307,7 +315,7 @@ class Attached:
             detail, rows = detail.detach(), rows_drawn(arguments["means"].detach(), self.params()["means"].detach())
             if rows is not None:
                 detail = detail[rows.clamp_min(0)] * (rows >= 0)[..., None]
-        return calls.with_offset(arguments, detail, is_ours=self._is_ours)
+        return calls.with_offset(arguments, detail, is_ours=is_ours)
 
 
 attach = Attached

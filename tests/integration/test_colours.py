@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn import Parameter
 
-from integration.colours import are_accumulated, are_joined
+from integration.colours import are_joined
 from tests.helpers.loops import COLOURS
 
 
@@ -45,22 +45,3 @@ def test_no_hook_looks_at_them_and_the_leaves_are_those_that_train(changes):
     assert are_joined(colors, p)
     changes(p, colors)
     assert not are_joined(colors, p)
-
-
-@pytest.mark.parametrize(
-    ("backward", "accumulated"),
-    [
-        (lambda loss, p: loss.backward(), True),
-        (lambda loss, p: loss.backward(inputs=[p["sh0"], p["shN"]]), True),
-        (lambda loss, p: loss.backward(inputs=[p["sh0"]]), False),
-        (lambda loss, p: torch.autograd.grad(loss, [p["sh0"], p["shN"]]), False),
-        (lambda loss, p: torch.autograd.grad(loss, p["means"]), False),
-    ],
-)
-def test_the_pass_under_way_adds_to_both_of_their_gradients(backward, accumulated):
-    p, seen = params(), []
-    colors = COLOURS["joined"](p)
-    loss = (colors * p["means"].sum()).sum()
-    loss.register_hook(lambda _: seen.append(are_accumulated(p)))
-    backward(loss, p)
-    assert seen == [accumulated]

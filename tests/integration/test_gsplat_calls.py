@@ -377,6 +377,17 @@ def test_what_a_loop_itself_adds_to_the_gradient_of_f_det_stays(before_the_drawi
     assert torch.allclose(merged[1] - merged[0], torch.ones(20, 3))
 
 
+def test_functions_that_are_wrapped_one_after_the_other_get_their_own_arguments():
+    def theirs(means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree, render_mode="RGB"):
+        given = means, quats, scales, opacities, colors, viewmats, Ks, width, height
+        return gsplat_host.rasterization(*given, sh_degree=sh_degree, render_mode=render_mode)
+
+    _, clear, render = started(host=Host(toy.scene(20), rasterization=theirs))
+    clear.wrap(autograd.rasterization)  # which takes an offset of the colours
+    render().mean().backward()
+    assert clear.attachment.counts["merges"] == 1
+
+
 @pytest.mark.parametrize("own_background", [False, True])
 def test_all_renders_are_over_the_background_of_a_strategy_unless_the_loop_has_its_own(own_background, caplog) -> None:
     caplog.set_level("INFO")
