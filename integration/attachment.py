@@ -45,7 +45,7 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.logs import computed
 from clear_strategies.strategies.base import Logged
 from integration.announcement import Once, announce, warn_without_hr
-from integration.autograd_shot import HostOutput, Target, are_in_order, require_named, trained
+from integration.autograd_shot import HostOutput, OfOthers, Target, are_in_order, require_named, trained
 from integration.host import Host
 from integration.host_merge import HostMerge
 from integration.host_steps import HostSteps
@@ -130,7 +130,8 @@ class Attachment:
             z = z.to(means)
         # HR and extra views leave torch's random numbers as they were, so a dropout of the host drops the same at LR.
         apart = torch.random.fork_rng([means.device] if means.device.type == "cuda" else [])(render_at)
-        hr, others, step = None, [], Step(t, view, params=params)
+        hr, step = None, Step(t, view, params=params)
+        others: OfOthers = []
         if self._hr.wanted(t):
             view = conductor.skips.view(view, t)
             hr, others = self._hr.hr(replace(step, view=view), z, apart)

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core.deferred import Number
+from clear_strategies.core.deferred import Number, Scalar
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, Photo, View
@@ -160,7 +160,7 @@ class HrDrawing:
         mask, asked = self._masks.get(view.name), render_at("hr", gate, view)
         if mask is not None:
             mask = enlarged_mask(mask.to(step.params["means"]), view.factor)[..., None]
-        drawn = asked if isinstance(asked, Drawable) else asked.shot
+        drawn: Drawable | AutogradShot = asked if isinstance(asked, Drawable) else asked.shot
         if isinstance(drawn, Drawable):
             hr = self._own_hr(drawn, step, mask)
         else:
@@ -204,7 +204,8 @@ class HrDrawing:
         hr, losses = self._done(asked, inputs, t, ("hr", view.factor), work)
         seen = hr.step if self.replays is None else hr.step.copied()
         # `losses` is a copy: those of a recording are overwritten by the next replay.
-        return replace(hr, step=replace(seen, t=t, view=view, params=step.params), losses=losses)
+        scalars = cast(Mapping[str, Scalar], losses)
+        return replace(hr, step=replace(seen, t=t, view=view, params=step.params), losses=scalars)
 
     @in_full_precision
     @torch.no_grad()
