@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core.deferred import Number, Scalar
+from clear_strategies.core.deferred import Number
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, Photo, View
@@ -204,8 +204,7 @@ class HrDrawing:
         hr, losses = self._done(asked, inputs, t, ("hr", view.factor), work)
         seen = hr.step if self.replays is None else hr.step.copied()
         # `losses` is a copy: those of a recording are overwritten by the next replay.
-        scalars = cast(Mapping[str, Scalar], losses)
-        return replace(hr, step=replace(seen, t=t, view=view, params=step.params), losses=scalars)
+        return replace(hr, step=replace(seen, t=t, view=view, params=step.params), losses=losses)
 
     @in_full_precision
     @torch.no_grad()
