@@ -136,7 +136,7 @@ class Attachment:
             view = conductor.skips.view(view, t)
             hr, others = self._hr.hr(replace(step, view=view), z, apart)
         self._step = step if hr is None else hr.step
-        if self.passes == 0 or self._dropped or not self._steps.extra:  # once for all passes of a step
+        if self.passes == 0 or self._dropped or not self._steps.has_extra_views:  # once for all passes of a step
             extra_views = conductor.extra_views(t)
             self._steps.follow_by(leaves, (self._hr.extra_view(x, view, t, apart) for x in extra_views))
         output = cast(HostOutput, render_at("lr", z, view))
@@ -179,11 +179,11 @@ class Attachment:
         leaves = self._host.leaves()
         self._n = len(leaves["means"])
         self._merging.fading.resume(leaves.get("detail"), int(state.get("passes_with_hr", 0)))
-        for view in self.conductor.views:
-            if view.name == state.get("view"):  # its `after_step` is still to come
-                rows = {name: x.to(leaves["means"].device) for name, x in state.get("step", {}).items()}
-                evidence = Evidence(rows["reliability"], rows["demand"]) if "demand" in rows else None
-                self._step = Step(self.t, view, rows.get("visible"), evidence)
+        view = next((view for view in self.conductor.views if view.name == state.get("view")), None)
+        if view is not None:  # its `after_step` is still to come
+            rows = {name: x.to(leaves["means"].device) for name, x in state.get("step", {}).items()}
+            evidence = Evidence(rows["reliability"], rows["demand"]) if "demand" in rows else None
+            self._step = Step(self.t, view, rows.get("visible"), evidence)
         if self._merging.scaler is not None and state.get("score") is not None:
             self._merging.scaler.load_state_dict(state["score"])
 
@@ -236,8 +236,8 @@ class Attachment:
         with them before it renders again. The iteration in which densification ends is finished at the next rendering, since
         the host may still densify in it, and an anchor is taken after that.
         """
-        may_densify, has_ended = self.conductor.may_densify, len(self._steps.stepped) == len(self._steps.hooked)
-        if has_ended and may_densify(self.t) == may_densify(max(1, self.t - 1)):
+        may_densify = self.conductor.may_densify
+        if self._steps.is_complete and may_densify(self.t) == may_densify(max(1, self.t - 1)):
             self._finish_step()
 
     def _finish_step(self, rendered: View | None = None) -> None:
@@ -255,8 +255,8 @@ class Attachment:
         if not self.passes:
             return
         last_view = None if self._step is None else self._step.view.name
-        again = rendered is not None and rendered.name == last_view and bool(self._steps.hooked)
-        last, has_stepped = self._merging.pending, bool(self._steps.stepped)  # None: of a loop that resumes
+        again = rendered is not None and rendered.name == last_view and self._steps.are_known
+        last, has_stepped = self._merging.pending, self._steps.has_begun  # None: of a loop that resumes
         has_passed = (last is None or bool(last.merged)) and self.passes % self._host.accumulation == 0
         if has_stepped or (has_passed and not again):
             if self._step is not None:

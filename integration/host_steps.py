@@ -41,11 +41,11 @@ class HostSteps:
     def __init__(self, begins: Callable[[bool], None], after: Callable[[], None], counts: Counter[str]) -> None:
         self._begins, self._after, self._counts = begins, after, counts
         self._hooks: list[Any] = []
-        self.hooked: list[torch.optim.Optimizer] = []
-        self.stepped: set[int] = set()
+        self._hooked: list[torch.optim.Optimizer] = []
+        self._stepped: set[int] = set()
         self._has_merged = False  # since the last step
-        self.extra: list[Grads] = []
-        self._rendered: Mapping[str, Tensor] = {}  # the leaves of `extra`
+        self._extra: list[Grads] = []
+        self._rendered: Mapping[str, Tensor] = {}  # the leaves of `_extra`
         self._steps_on_extra = False  # an optimizer is stepping on an extra view
         self._has_stepped = False  # on the extra views of this iteration
         self._unused = 0  # consecutive iterations whose extra views no optimizer has stepped on
@@ -55,12 +55,12 @@ class HostSteps:
         if isinstance(optimizers, Mapping):
             raise TypeError("optimizers must be a sequence, got a dict: hook([*optimizers.values()]).")
         distinct = list({id(o): o for o in optimizers if isinstance(o, torch.optim.Optimizer)}.values())
-        if list(map(id, distinct)) == list(map(id, self.hooked)):
+        if list(map(id, distinct)) == list(map(id, self._hooked)):
             return
         for hook in self._hooks:
             hook.remove()
-        self.hooked = distinct
-        self.stepped.clear()
+        self._hooked = distinct
+        self._stepped.clear()
         self._hooks = [
             *(o.register_step_pre_hook(lambda o, given, named: self._before_one(o, *given, *named.values())) for o in distinct),
             *(o.register_step_post_hook(lambda o, *_: self._after_one(o)) for o in distinct),
@@ -68,8 +68,28 @@ class HostSteps:
 
     def on_merge(self) -> None:
         """Called when gradients were merged: the next step of any optimizer begins a step of the host."""
-        self.stepped.clear()
+        self._stepped.clear()
         self._has_merged = True
+
+    @property
+    def are_known(self) -> bool:
+        """True if the host has optimizers whose steps can be seen."""
+        return bool(self._hooked)
+
+    @property
+    def has_extra_views(self) -> bool:
+        """True if the host's next step is followed by steps on extra views."""
+        return bool(self._extra)
+
+    @property
+    def has_begun(self) -> bool:
+        """True if an optimizer has stepped since the last merge."""
+        return bool(self._stepped)
+
+    @property
+    def is_complete(self) -> bool:
+        """True if all optimizers have stepped since the last merge."""
+        return len(self._stepped) == len(self._hooked)
 
     def follow_by(self, params: Mapping[str, Tensor], gradients: Iterable[Grads]) -> None:
         """Set the gradients of this iteration's extra views. Warns if no optimizer has stepped on those of several iterations.
@@ -78,15 +98,15 @@ class HostSteps:
             params: the host's leaves, by name.
             gradients: with respect to `params`; computed one by one, after the memory of the last iteration's is free.
         """
-        if self.extra:
+        if self._extra:
             self._unused = 0 if self._has_stepped else self._unused + 1
             if self._unused == _PATIENCE:
                 _log.warning(
                     "extra views have no effect: they were rendered in %d iterations, and no optimizer that was passed stepped "
                     "on them. Pass those that the loop steps, and put new ones in the same dictionary.", _PATIENCE,
                 )  # fmt: skip
-        self.extra, self._has_stepped = [], False
-        self.extra += gradients
+        self._extra, self._has_stepped = [], False
+        self._extra += gradients
         self._rendered = {name: p for name, p in params.items() if name != "detail"}
 
     def _before_one(self, optimizer: torch.optim.Optimizer, *given: Any) -> None:
@@ -101,10 +121,10 @@ class HostSteps:
                 "the host gives its optimizer a closure, which renders inside of step(), but the gradients are merged before. "
                 "Render and call loss.backward(), then step() without a closure."
             )
-        if id(optimizer) in self.stepped:
-            self.stepped.clear()
-        begins = not self.stepped
-        self.stepped.add(id(optimizer))
+        if id(optimizer) in self._stepped:
+            self._stepped.clear()
+        begins = not self._stepped
+        self._stepped.add(id(optimizer))
         if begins:
             has_merged, self._has_merged = self._has_merged, False
             self._begins(has_merged)
@@ -112,7 +132,7 @@ class HostSteps:
     def _after_one(self, optimizer: torch.optim.Optimizer) -> None:
         if self._steps_on_extra:
             return
-        if self.extra:
+        if self._extra:
             self._step_on_extra(optimizer)
         self._after()
 
@@ -132,7 +152,7 @@ class HostSteps:
         if scale is not None:  # gradients of extra views are not scaled
             optimizer.grad_scale = None  # type: ignore[attr-defined]
         try:
-            for grads in self.extra:
+            for grads in self._extra:
                 for p in stepped:
                     p.grad = None
                 for name, p in params.items():
@@ -146,7 +166,7 @@ class HostSteps:
                 p.grad = grad
         self._has_stepped = True
         if "means" in params:
-            self._counts["extra views"] += len(self.extra)
+            self._counts["extra views"] += len(self._extra)
 
 
 @cache

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.core.conflicts import Weights
-from clear_strategies.core.deferred import Number, Scalar
+from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import require_finite, require_finite_losses
 from clear_strategies.core.gradients import Grads, ScreenGradients, Shot, screen_norm, screen_of, summed, to_ndc
 from clear_strategies.core.step import Losses, Step
@@ -203,9 +203,7 @@ class Conductor(Hooks):
                 grads, conflict = merged.grads, merged.conflict
             else:
                 grads, conflict = None, stepper.step(params, rendered, g_lr, from_hr, t)
-        losses = dict(l_lr.values)
-        if from_hr is not None:
-            losses |= cast(Mapping[str, Scalar], from_hr.losses)  # no replay's
+        losses = {**l_lr.values, **({} if from_hr is None else from_hr.losses)}
         logs = computed(self.logs.scalars(since_kept=True))
         return Update(step, grads, score, ordinary, conflict, losses, logs, l_lr.cotangents)
 

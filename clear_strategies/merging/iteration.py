@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core.deferred import Number, Scalar
+from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.step import Step
@@ -84,7 +84,7 @@ class Update:
     score: Float[Tensor, " N"] | None
     ordinary: Float[Tensor, " N"] | None
     conflict: Mapping[str, Number] = field(default_factory=dict)
-    losses: Mapping[str, Scalar] = field(default_factory=dict)
+    losses: Mapping[str, Number] = field(default_factory=dict)
     logs: Mapping[str, Number] = field(default_factory=dict)
     cotangents_lr: Float[Tensor, "1 H W 3"] | None = None
 
