@@ -245,7 +245,7 @@ class Attachment:
 
         A step has all passes since the last one whose gradients the loop has kept. An iteration ends with its step, or after
         `accumulation` passes: a gradient scaler skips steps, and FastGS sums the views of many iterations. It does not end
-        before another pass over the same view, as in a step of SAM.
+        before another pass over the same view if the loop has dropped the gradients of the last, as in a step of SAM.
 
         Args:
             rendered: the view that the host renders next; None: it has stepped.
@@ -254,16 +254,17 @@ class Attachment:
         self._follow_structure(len(params["means"]))
         if not self.passes:
             return
-        last_view = None if self._step is None else self._step.view.name
-        again = rendered is not None and rendered.name == last_view and self._steps.are_known
         last, has_stepped = self._merging.pending, self._steps.has_begun  # None: of a loop that resumes
+        gradients = (p.grad for name, p in params.items() if name != "detail")  # which the host may not zero
+        are_dropped = has_stepped or not any(g is not None and bool(g.any()) for g in gradients)
+        last_view = None if self._step is None else self._step.view.name
+        again = are_dropped and rendered is not None and rendered.name == last_view and self._steps.are_known
         has_passed = (last is None or bool(last.merged)) and self.passes % self._host.accumulation == 0
         if has_stepped or (has_passed and not again):
             if self._step is not None:
                 self.conductor.after_step({name: _to_change(p) for name, p in params.items()}, self._step)
             self.t += 1
-        gradients = (p.grad for name, p in params.items() if name != "detail")  # which the host may not zero
-        if has_stepped or not any(g is not None and bool(g.any()) for g in gradients):
+        if are_dropped:
             self.passes = self._merging.fading.passes = 0
 
     def _follow_structure(self, n: int) -> None:

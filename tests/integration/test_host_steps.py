@@ -311,9 +311,9 @@ def test_a_step_of_sam_is_one_iteration_and_one_of_summed_views_is_several():
         return clear.attachment.t, clear.attachment.counts["extra views"], found
 
     assert trained([(0, "ascend", 0), (1, "ascend", 1)])[:2] == (3, 2)
-    t, extra, found = trained([(0,), (1, "look", "look", 2, 0)])
+    t, extra, found = trained([(0,), (1, "look", "look", 1, 0)])  # drawn with replacement
     assert (t, extra) == (5, 2)
-    *_, expected = trained([(0,), (1, 2, 0)], accumulation=3)
+    *_, expected = trained([(0,), (1, 1, 0)], accumulation=3)
     torch.testing.assert_close(found, 3 * expected)
 
 
