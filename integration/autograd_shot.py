@@ -88,6 +88,7 @@ class AutogradShot:
         params: raw parameters by gsplat's names. A parameter that the image does not depend on has gradient 0.
         slot: where the host keeps the screen gradient; None: the image is a function of `means2d` itself.
         drawn: the rasterizer's means, quats, scales, opacities and colors, none of them with a hook; None: the raw parameters.
+            `joint_loss` finds those of this package's rasterizers itself.
         drawings: of this image by this package's rasterizers; a single one takes all cotangents in one pass.
         mask: the image is a drawing outside of any graph, times this mask.
     """
@@ -296,14 +297,14 @@ def require_named(shot: object, params: Mapping[str, Tensor]) -> None:
 
 
 class Graph(NamedTuple):
-    """The leaves that tensors were computed from, and the cameras of drawings by this package's rasterizers."""
+    """The leaves that tensors were computed from, and what this package's rasterizers drew for them."""
 
     leaves: list[Tensor]
-    cameras: list[Camera]
+    drawn: list[Rendered]
 
 
 def graph_of(*tensors: Tensor) -> Graph:
-    """The leaves and cameras behind tensors, in one walk. A leaf is its own."""
+    """The leaves and drawings behind tensors, in one walk. A leaf is its own."""
     graph, seen, nodes = Graph([], []), set[Any](), [accumulator(x) for x in tensors if x.requires_grad]
     while nodes:
         if (node := nodes.pop()) is None or node in seen:
@@ -312,7 +313,7 @@ def graph_of(*tensors: Tensor) -> Graph:
         if (leaf := leaf_of(node)) is not None:
             graph.leaves.append(leaf)
         elif isinstance(drawn := getattr(node, "rendered", None), Rendered):
-            graph.cameras.append(drawn.camera)
+            graph.drawn.append(drawn)
         nodes += [before for before, _ in node.next_functions]
     return graph
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -21,11 +22,20 @@ from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Update
 from clear_strategies.strategies.base import overrides
-from integration.autograd_shot import AutogradShot, Graph, graph_of, require_leaves, require_named
+from integration.autograd_shot import (
+    AutogradShot,
+    Graph,
+    OfOthers,
+    every_number,
+    graph_of,
+    require_leaves,
+    require_named,
+    to_leaves,
+)
 from integration.densification import ScoreScaler, score_for_host
 from integration.views import SAME_POSE, require_intrinsics
 from rasterizers.interface import Camera
-from rasterizers.torch_internals import hooks_on_gradient
+from rasterizers.torch_internals import hooks_on_gradient, is_hooked
 
 
 def joint_loss(
@@ -39,7 +49,9 @@ def joint_loss(
 ) -> tuple[Float[Tensor, ""], Update]:
     """λ_LR L_LR + λ_HR (L_base + λ_HF L_HF), whose gradient is the conductor's merged gradient, and the `Update`.
 
-    Other leaves of the LR rendering (exposure, poses, an offset of the colours) get the gradient of λ_LR L_LR.
+    Other leaves that the host trains get the gradient of λ_LR L_LR, and, if the rasterizer's inputs were computed from them (a
+    network, an embedding), that of HR after routing, which is known where this package's rasterizers draw, or by
+    `AutogradShot.drawn`.
 
     Args:
         params: the leaves of the Gaussians that the host optimizes, by gsplat's names (and "detail", if the host has it).
@@ -65,9 +77,12 @@ def joint_loss(
     _require_view(conductor, view, lr=of_lr, hr=of_hr)
     _require_started(conductor)
     with _without_hooks([*of_lr.leaves, *(() if of_hr is None else of_hr.leaves)]):
-        update = conductor.update(values, lr, hr, view, t)
+        to_others = _HrShot(hr, of_hr) if isinstance(hr, AutogradShot) and of_hr is not None else None
+        update = conductor.update(values, lr, to_others or hr, view, t)
         others = [*_others(params, lr, of_lr.leaves, update)]
     objective, λ = conductor.objective, conductor.objective.lambda_hr(t)
+    if to_others is not None and λ > 0:
+        others += [(leaf, λ * g) for leaf, g in to_others.of_others]
     losses = update.losses
     value = objective.lambda_lr * losses["lr"] + λ * (
         losses.get("base", 0.0) + objective.lambda_hf * losses.get("hf", 0.0)
@@ -144,7 +159,7 @@ def _require_rows(params: Mapping[str, Tensor]) -> None:
         if p.shape[:1] != (n,):
             raise ValueError(
                 f"params[{name!r}] must have a row for each of the {n:,} Gaussians, got {[*p.shape]}. Leave it out: what else "
-                "the rendering depends on gets the gradient of LR."
+                "the rendering depends on gets its gradient, too."
             )
 
 
@@ -170,7 +185,7 @@ def _require_view(conductor: Conductor, view: View, **graphs: Graph | None) -> N
         return [v for v, is_same in zip(views, same.flatten(1).all(1).tolist(), strict=True) if is_same]
 
     for name, graph in graphs.items():
-        for camera in () if graph is None else graph.cameras:
+        for camera in () if graph is None else (drawn.camera for drawn in graph.drawn):
             if not with_pose(camera, [view]) and (drawn := with_pose(camera, conductor.views)):
                 raise ValueError(
                     f"{name} must be drawn by the camera of its view {view.name}, got that of {drawn[0].name}. Pass its view."
@@ -188,6 +203,39 @@ def _require_started(conductor: Conductor) -> None:
             raise ValueError(
                 f"{type(s).__name__} has not started. Call conductor.on_fit_start(len(views), seed, views=views) before the loop."
             )
+
+
+class _HrShot:
+    """A host's rendering at HR, with one pass through the host's graph for both cotangents.
+
+    Args:
+        graph: of its image, in which this package's only drawing has the rasterizer's inputs, if the shot does not name them.
+
+    Attributes:
+        of_others: the gradients of other leaves in the last pass.
+    """
+
+    def __init__(self, shot: AutogradShot, graph: Graph) -> None:
+        if shot.inputs is None and len(graph.drawn) == 1:
+            inputs = {name: x for name, x in graph.drawn[0].inputs._asdict().items() if x is not None}
+            if not any(map(is_hooked, inputs.values())):
+                shot = replace(shot, drawn=inputs)
+        self.image, self.means2d, self.visible, self._shot = shot.image, shot.means2d, shot.visible, shot
+        self.of_others: OfOthers = []
+
+    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
+        """See `Shot`."""
+        return [self._to_leaves(g) for g in self._shot.gradients(cotangents)]
+
+    def summed_vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"]) -> list[Grads]:
+        """See `core.gradients.summed`."""
+        *each, of_hf = self._shot.gradients(cotangents, weight)
+        detail = {name: g for name, g in of_hf.items() if name in self._shot.params}
+        return [*map(self._to_leaves, each), Grads(detail, screen=of_hf.screen)]
+
+    def _to_leaves(self, g: Grads) -> Grads:
+        raw, self.of_others = to_leaves(g, self._shot.inputs, self._shot.params)
+        return Grads(every_number(raw, self._shot.params), screen=g.screen)
 
 
 def _others(

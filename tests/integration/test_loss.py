@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from clear_strategies import GCO, P2G, SVS, Conductor, Strategy
+from clear_strategies.core.step import Step
 from clear_strategies.training.field import GaussianField
 from integration import AutogradShot, HostError, ScoreScaler, extra_loss, joint_loss
 from rasterizers import Splats, autograd
@@ -100,23 +101,33 @@ class Halved(Strategy):
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5])
-def test_what_else_the_rendering_depends_on_gets_the_gradient_of_lr(share):
+@pytest.mark.parametrize("strategies", [(GCO(),), (GCO(), P2G(patch=4))], ids=len)
+@pytest.mark.parametrize("hooked", [False, True])
+def test_what_else_the_loop_trains_gets_its_gradient(share, strategies, hooked):
+    """The exposure, which is applied after drawing, that of LR; an offset of what is drawn also that of HR after routing."""
     scene, comparing = toy.scene(20), [Halved()] * (share < 1)
-    host, view, conductor = Host(scene), scene.train[0], Conductor(GCO(), *comparing, objective=HR_FROM_START)
+    host, view, conductor = Host(scene), scene.train[0], Conductor(*strategies, *comparing, objective=HR_FROM_START)
+    conductor.on_fit_start(3, 0, views=scene.train)
     exposure, offset = torch.eye(3).requires_grad_(), torch.zeros(1, 1, 3, requires_grad=True)
 
     def render(camera, detail=None):
         p = host.params | {"sh0": host.params["sh0"] + offset}
+        if hooked:
+            p["sh0"].register_hook(lambda g: 3 * g)
         splats = Splats(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"], detail)
         shot = autograd.draw(toy.RASTERIZER, splats, camera)
         return AutogradShot(shot.image @ exposure, shot.means2d, shot.visible, host.params)
 
     lr, hr = render(view.lr.camera), render(view.hr.camera, host.params["detail"])
-    (3 * joint_loss(conductor, host.params, lr, hr, view, 5)[0]).backward()
-    (cotangent,) = share * conductor.objective.lr(share * lr.image.detach(), view.lr.image, None).cotangents
-    for leaf, expected in zip(
-        (exposure, offset), torch.autograd.grad(lr.image, (exposure, offset), cotangent), strict=True
-    ):
+    joint, update = joint_loss(conductor, host.params, lr, hr, view, 5)
+    (3 * joint).backward()
+    objective, m = conductor.objective, conductor.hr_gradients(hr, Step(5, view)).m
+    (cotangent,) = share * objective.lr(share * lr.image.detach(), view.lr.image, None).cotangents
+    of_exposure, of_offset = torch.autograd.grad(lr.image, (exposure, offset), cotangent)
+    base, hf = hr.vjp(share * objective.hr(share * hr.image.detach(), view.hr.image, None).cotangents)
+    routed = base["sh0"] + objective.lambda_hf * torch.as_tensor(m).view(-1, 1, 1) * hf["sh0"]
+    of_offset = of_offset + objective.lambda_hr(5) * routed.sum(0, keepdim=True)
+    for leaf, expected in ((exposure, of_exposure), (offset, of_offset)):
         assert expected.abs().max() > 1e-4
         torch.testing.assert_close(leaf.grad, 3 * expected)
 
