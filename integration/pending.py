@@ -20,7 +20,7 @@ from integration.autograd_shot import HostOutput, OfOthers
 from integration.colours import are_accumulated, are_joined
 from rasterizers.autograd import TakeColours
 from rasterizers.native import empty_for
-from rasterizers.torch_internals import current_pass, hooks_after_accumulation, version
+from rasterizers.torch_internals import current_pass, hooks_after_accumulation, hooks_on_gradient, version
 
 Reached = Callable[[int], TakeColours | None]
 """Called when a backward pass has reached the nth rendering and no parameter yet; returns the same as
@@ -100,6 +100,11 @@ class BackwardPass:
         """Set `.grad`, in its memory, to what it was before the pass plus the merged gradient times `scale`."""
         for name, gradient in merged.items():
             p, scaled = self.params[name], gradient if scale == 1 else gradient.mul_(scale)
+            if name == "detail":  # no backward pass reaches it, and calls its hooks
+                for hook in [*hooks_on_gradient(p).values()]:
+                    changed = hook(scaled)
+                    scaled = scaled if changed is None else changed
+                self.hooks += [partial(hook, p) for hook in hooks_after_accumulation(p).values()]
             g = scaled.add_(self.before[name]) if name in self.before else scaled
             if p.grad is None:
                 p.grad = g.to(p.dtype)

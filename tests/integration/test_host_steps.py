@@ -220,6 +220,24 @@ def test_hooks_that_run_after_accumulation_change_the_merged_gradient():
     assert float(host.splats["means"].grad.abs().max()) == pytest.approx(1e-3)
 
 
+@pytest.mark.parametrize("late", [False, True])
+def test_hooks_that_freeze_some_gaussians_freeze_their_f_det(late):
+    host, _, render = started()
+    for p in host.splats.values():
+        shown = torch.ones(20, *[1] * (p.dim() - 1))
+        shown[:5] = 0
+        if p.requires_grad and late:
+            p.register_post_accumulate_grad_hook(lambda p, shown=shown: p.grad.mul_(shown))
+        elif p.requires_grad:
+            p.register_hook(lambda g, shown=shown: g * shown)
+    before = {name: p.detach().clone() for name, p in host.splats.items()}
+    for i in range(2):
+        render(i).mean().backward()
+        host.step()
+    assert all(torch.equal(p[:5], before[name][:5]) for name, p in host.splats.items())
+    assert bool((host.splats["detail"][5:] != 0).any())
+
+
 def test_a_loop_that_trains_a_copy_of_what_was_attached_is_told_once(caplog):
     host, clear, render = started()
     render().mean().backward()
@@ -311,10 +329,10 @@ def test_a_step_of_sam_is_one_iteration_and_one_of_summed_views_is_several():
         return clear.attachment.t, clear.attachment.counts["extra views"], found
 
     assert trained([(0, "ascend", 0), (1, "ascend", 1)])[:2] == (3, 2)
-    t, extra, found = trained([(0,), (1, "look", "look", 1, 0)])  # drawn with replacement
-    assert (t, extra) == (5, 2)
-    *_, expected = trained([(0,), (1, 1, 0)], accumulation=3)
-    torch.testing.assert_close(found, 3 * expected)
+    t, extra, found = trained([(0,), (1, "look", "look", 2, 2, 0)])  # drawn with replacement
+    assert (t, extra) == (6, 2)
+    *_, expected = trained([(0,), (1, 2, 2, 0)], accumulation=4)
+    torch.testing.assert_close(found, 4 * expected)
 
 
 def test_a_loop_resumes_between_the_passes_of_a_step_with_the_same_bits():
