@@ -119,7 +119,7 @@ def test_what_else_the_loop_trains_gets_its_gradient(share, strategies, hooked):
         return AutogradShot(shot.image @ exposure, shot.means2d, shot.visible, host.params)
 
     lr, hr = render(view.lr.camera), render(view.hr.camera, host.params["detail"])
-    joint, update = joint_loss(conductor, host.params, lr, hr, view, 5)
+    joint, _ = joint_loss(conductor, host.params, lr, hr, view, 5)
     (3 * joint).backward()
     objective, m = conductor.objective, conductor.hr_gradients(hr, Step(5, view)).m
     (cotangent,) = share * objective.lr(share * lr.image.detach(), view.lr.image, None).cotangents
