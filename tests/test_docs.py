@@ -194,7 +194,7 @@ def test_the_guides_reader_reads_a_folder_and_is_chosen_for_it(tmp_path, monkeyp
     capture = importlib.import_module("your_package").read(tmp_path)
     assert [frame.name for frame in capture.frames] == ["0.png", "1.png", "2.png"]
     assert capture.frames[2].camera.center.tolist() == [2, 0, -2]
-    assert capture.frames[2].load()[0, 0].tolist() == pytest.approx([160 / 255, 0, 0])
+    assert capture.frames[2].load().image[0, 0].tolist() == pytest.approx([160 / 255, 0, 0])
 
 
 @pytest.mark.slow

@@ -41,7 +41,7 @@ def downsample(image: Float[Tensor, "H W 3"], factor: int, kernel: DownKernel = 
     """
     height, width = image.shape[:2]
     if height % factor or width % factor:
-        raise ValueError(f"{width}x{height} is not a multiple of {factor}; crop it with images.crop_to_multiple first.")
+        raise ValueError(f"{width}x{height} is not a multiple of {factor}; crop it first.")
     return resize(image, (width // factor, height // factor), kernel)
 
 
@@ -103,12 +103,6 @@ def back_projected(
     for _ in range(rounds):
         sr = (sr + where * _enlarged(lr - downsample(sr, factor, down), factor, "bicubic")).clamp(0, 1)
     return sr
-
-
-def crop_to_multiple(image: Float[Tensor, "H W C"], factor: int) -> Float[Tensor, "h w C"]:
-    """Drop rows at the bottom and columns at the right until both sizes are multiples of `factor`."""
-    height, width = (size - size % factor for size in image.shape[:2])
-    return image[:height, :width]
 
 
 def patch_means(values: Float[Tensor, "H W C"], patch: int) -> Float[Tensor, "ph pw"]:

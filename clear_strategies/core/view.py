@@ -11,11 +11,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core import images
+from clear_strategies.core.images import DownKernel
 from rasterizers.interface import Camera, Color
 from rasterizers.sending import color_on
 
 SMALLEST: Final = 12
 """Pixels on each side of what can be scored: GMSD halves the image, and SSIM needs room for its window."""
+_WHOLE: Final = 0.99  # least share of a resized pixel that the mask shows, for the pixel to be shown
 _KNOWN_SHARE: Final = 0.3  # of a block's pixels, for its depth to be known
 
 
@@ -67,21 +69,44 @@ class Photo:
         """The smallest whole factor that reduces it to at most `max_pixels`."""
         return max(1, math.ceil(math.sqrt(self.camera.width * self.camera.height / max_pixels)))
 
+    def cropped(self, multiple: int) -> Photo:
+        """Without rows at the bottom and columns at the right, so that `multiple` divides both sizes."""
+        height, width = (size - size % multiple for size in self.image.shape[:2])
+        image, shown, through = (
+            None if x is None else x[:height, :width] for x in (self.image, self.shown, self.transparency)
+        )
+        return Photo(replace(self.camera, width=width, height=height), image, shown, through)
+
+    def resized(self, camera: Camera, kernel: DownKernel, layers: DownKernel | None = None) -> Photo:
+        """The photo at the size of `camera`, which sees the same, by the operator D. A pixel is shown if its whole area is.
+
+        Args:
+            layers: D of the mask and the transparency; None: `kernel`.
+        """
+        size = (camera.width, camera.height)
+
+        def layer(values: Float[Tensor, "H W"]) -> Float[Tensor, "h w"]:
+            of_three = values[..., None].expand(-1, -1, 3).contiguous()
+            return images.resize(of_three, size, layers or kernel).mean(dim=2)
+
+        shown = None if self.shown is None else layer(self.shown.float()) > _WHOLE
+        through = None if self.transparency is None else layer(self.transparency)
+        return Photo(camera, images.resize(self.image, size, kernel), shown, through)
+
     def reduced(self, factor: int) -> Photo:
         """The mean of each block of `factor` × `factor` pixels, hidden if one of them is. Pixels that fill no block, at the right
         and bottom, are cut off.
         """
         if factor == 1:
             return self
+        whole = self.cropped(factor)
 
-        def mean(x: Tensor) -> Tensor:
-            return images.area_mean(images.crop_to_multiple(x, factor), factor)
+        def mean(layer: Tensor) -> Tensor:
+            return images.area_mean(layer[..., None], factor)[..., 0]
 
-        image = mean(self.image)
-        camera = replace(self.camera, width=image.shape[1] * factor, height=image.shape[0] * factor)
-        shown = None if self.shown is None else mean(self.shown[..., None].float())[..., 0] == 1
-        through = None if self.transparency is None else mean(self.transparency[..., None])[..., 0]
-        return Photo(camera.scaled(1 / factor), image, shown, through)
+        shown = None if whole.shown is None else mean(whole.shown.float()) == 1
+        through = None if whole.transparency is None else mean(whole.transparency)
+        return Photo(whole.camera.scaled(1 / factor), images.area_mean(whole.image, factor), shown, through)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,9 +138,8 @@ class DepthMap:
         if factor == 1:
             return self
         depth, confidence = (
-            images.crop_to_multiple(x[..., None], factor)[..., 0].unfold(0, factor, factor).unfold(1, factor, factor)
-            .flatten(2) for x in (self.depth, self.confidence)
-        )  # fmt: skip
+            x.unfold(0, factor, factor).unfold(1, factor, factor).flatten(2) for x in (self.depth, self.confidence)
+        )
         known = (confidence > 0).float().mean(dim=-1)
         enough = known >= _KNOWN_SHARE
         mean = confidence.mean(dim=-1) / known.clamp_min(torch.finfo(known.dtype).tiny)

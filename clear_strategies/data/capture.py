@@ -8,19 +8,19 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from clear_strategies.core.view import Photo
 from clear_strategies.data.file_names import normalized
 from clear_strategies.data.lenses import Lens
 from clear_strategies.data.masks import check_mask, read_mask
-from clear_strategies.data.photo_files import Header, read_header, read_image
+from clear_strategies.data.photo_files import Header, read_header, read_layers
 from clear_strategies.data.priors.interface import Prior
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera, Color
@@ -35,16 +35,14 @@ STEP_ASIDE: Final = "take a step to the side from photo to photo, in place of tu
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One posed photo. `load`, `shown` and `transparency` decode its files; readers never call them."""
+    """One posed photo. `load` decodes its files, with mask and alpha; readers never call it."""
 
     name: str  # unique in its capture, e.g. the file's name
-    camera: Camera  # a pinhole, on the pixel grid of what `load` returns
-    load: Callable[[], Float[Tensor, "H W 3"]]
+    camera: Camera  # a pinhole, that of what `load` returns
+    load: Callable[[], Photo]
     split: str | None = None  # "train" or "test" where the data set itself defines the split (Blender)
     sfm_id: int | None = None  # in `SfmPoints.track_image`
     lens: Lens | None = None  # before undistortion; None: the data set gives `camera` itself
-    shown: Callable[[], Bool[Tensor, "H W"]] | None = None  # its mask, False at hidden pixels
-    transparency: Callable[[], Float[Tensor, "H W"]] | None = None  # 1 - alpha; None: its file has no alpha
 
     @staticmethod
     def of_photo(
@@ -77,17 +75,18 @@ class Frame:
         fitted = lens.resized(width, height, path)
         pinhole = fitted.undistorted(path)
         camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, width, height)
-        load = partial(_load, path, fitted, pinhole, turn)
         if mask is not None:
             check_mask(mask, fitted, turn)
-        shown = None if mask is None else partial(read_mask, mask, fitted, pinhole, turn)
 
-        def transparency() -> Float[Tensor, "H W"]:
-            """The photo over white minus the photo over black."""
-            return (load((1.0, 1.0, 1.0)) - load(BLACK)).mean(dim=2).clamp(0, 1)
+        def load() -> Photo:
+            image, through = read_layers(path, background=background, expect=(width, height), turn=turn)
+            if fitted.distorts:
+                image = fitted.undistort(image, pinhole)
+                through = None if through is None else fitted.undistort(through, pinhole)
+            shown = None if mask is None else read_mask(mask, fitted, pinhole, turn)
+            return Photo(camera, image, shown, through)
 
-        through = transparency if header.has_alpha else None
-        return Frame(normalized(name), camera, partial(load, background), split, sfm_id, lens, shown, through)
+        return Frame(normalized(name), camera, load, split, sfm_id, lens)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,7 +112,8 @@ class Capture:
     Args:
         background: the colour behind the scene (white for Blender's RGBA).
         notes: label -> fact for the printed plan (the source of the poses, what was undistorted …).
-        own_prior: makes the prior for `prior=auto` from the frames' `load` functions by name; None for real photos.
+        own_prior: makes the prior for `prior=auto` from functions that load the photos at HR, by the frames' names; None for
+            real photos.
         unplaced: photos without a pose: the reason by the photo's name.
     """
 
@@ -186,8 +186,3 @@ def _turned_as(header: Header, lens: Lens) -> bool | None:
     if lens.width == lens.height or header.size(turn=True) == header.stored:
         return None
     return (width > height) != (lens.width > lens.height)
-
-
-def _load(path: Path, lens: Lens, pinhole: Lens, turn: bool | None, background: Color | None) -> Float[Tensor, "H W 3"]:
-    image = read_image(path, background=background, expect=(lens.width, lens.height), turn=turn)
-    return lens.undistort(image, pinhole) if lens.distorts else image

@@ -15,7 +15,7 @@ import math
 import shlex
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -55,18 +55,6 @@ _LENS_TAGS: Final = (
 )  # fmt: skip
 
 
-class Optics(NamedTuple):
-    """The camera data of a photo's EXIF block.
-
-    Args:
-        focal_35mm: the focal length on 35 mm film of the same diagonal, mm; None: unknown.
-        lens: maker, model, lens, focal length and digital zoom, as written in the block.
-    """
-
-    focal_35mm: float | None
-    lens: tuple[str, ...]
-
-
 class Header(NamedTuple):
     """What is known of an image before it is decoded.
 
@@ -75,6 +63,8 @@ class Header(NamedTuple):
         orientation: EXIF's, 1 (upright) to 8.
         has_alpha: the image may have transparent pixels.
         lossy: the format does not keep each value.
+        focal_35mm: EXIF's focal length on 35 mm film of the same diagonal, mm; None: unknown.
+        lens: EXIF's maker, model, lens, focal length and digital zoom, as written there.
     """
 
     path: Path
@@ -82,6 +72,8 @@ class Header(NamedTuple):
     orientation: int
     has_alpha: bool
     lossy: bool
+    focal_35mm: float | None
+    lens: tuple[str, ...]
 
     def size(self, turn: bool | None) -> tuple[int, int]:
         """(width, height); `turn` and its error as of `read_image`."""
@@ -94,7 +86,14 @@ class Header(NamedTuple):
 def read_image(
     path: Path, *, background: Color | None = None, expect: tuple[int, int] | None = None, turn: bool | None = None
 ) -> Float[Tensor, "H W 3"]:
-    """Read an image as RGB in [0, 1], float32.
+    """Read an image as RGB in [0, 1], float32; arguments and errors of `read_layers`."""
+    return read_layers(path, background=background, expect=expect, turn=turn)[0]
+
+
+def read_layers(
+    path: Path, *, background: Color | None = None, expect: tuple[int, int] | None = None, turn: bool | None = None
+) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"] | None]:
+    """Read an image as RGB in [0, 1], and its transparency, 1 - alpha; None: it has no alpha. Both are float32.
 
     Args:
         background: RGB in [0, 1] behind (straight) alpha: rgb · alpha + background · (1 - alpha). None: black, logged.
@@ -104,7 +103,7 @@ def read_image(
     """
     with _opened(path) as image:
         sixteen_bits = _has_sixteen_bits(image)  # unknown after decoding
-        orientation = _orientation_of(image)  # Pillow forgets that of a TIFF as it decodes it
+        orientation = _orientation_of(_tags(image))  # Pillow forgets that of a TIFF as it decodes it
         decoded_upright = image.format == "TIFF"  # by Pillow and by OpenCV
         as_asked = decoded_upright or not sixteen_bits if turn else turn is False and not decoded_upright
         if orientation != 1 and not as_asked:
@@ -126,7 +125,8 @@ def read_image(
         if background is None:
             _log.debug("%s has transparent pixels: composited over black.", path.name)
         rgb = rgb * alpha + np.asarray(background or (0, 0, 0), np.float32) * (1 - alpha)
-    return torch.from_numpy(np.ascontiguousarray(rgb))
+    transparency = torch.from_numpy(1 - alpha[..., 0]) if alpha.size else None
+    return torch.from_numpy(np.ascontiguousarray(rgb)), transparency
 
 
 def read_header(path: Path) -> Header:
@@ -138,7 +138,9 @@ def read_header(path: Path) -> Header:
             width, height = image.tag_v2[TiffImagePlugin.IMAGEWIDTH], image.tag_v2[TiffImagePlugin.IMAGELENGTH]
         factor = _reduction_factor(width * height)
         stored, lossy = (-(-width // factor), -(-height // factor)), image.format not in _LOSSLESS
-        return Header(path, stored, _orientation_of(image), bool(image.has_transparency_data), lossy)
+        tags, has_alpha = _tags(image, ExifTags.IFD.Exif), bool(image.has_transparency_data)
+    lens = tuple(str(tags.get(tag, "")) for tag in _LENS_TAGS)
+    return Header(path, stored, _orientation_of(tags), has_alpha, lossy, _focal_length(tags), lens)
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -146,17 +148,14 @@ def image_size(path: Path) -> tuple[int, int]:
     return read_header(path).size(None)
 
 
-def optics(path: Path) -> Optics:
-    """Return the camera data of the EXIF block; errors as of `read_image`."""
-    with _opened(path) as image:
-        tags = _tags(image, ExifTags.IFD.Exif)
+def _focal_length(tags: Mapping[int, Any]) -> float | None:
+    """`Header.focal_35mm`."""
     value = tags.get(ExifTags.Base.FocalLengthIn35mmFilm, 0)
     try:  # cameras also write 0, 0/0, text and tuples
         number = float(value[0] if isinstance(value, tuple) else value)
     except (TypeError, ValueError, ZeroDivisionError, IndexError):
         number = math.nan
-    focal = number if math.isfinite(number) and number > 0 else None
-    return Optics(focal, tuple(str(tags.get(tag, "")) for tag in _LENS_TAGS))
+    return number if math.isfinite(number) and number > 0 else None
 
 
 def write_png(path: Path, image: Float[Tensor, "H W 3"] | Float[Tensor, "H W"]) -> None:
@@ -240,21 +239,24 @@ def _is_heif(path: Path) -> bool:
     return True
 
 
-def _orientation_of(image: Image.Image) -> int:
-    """The EXIF orientation of an opened image, 1 to 8; 1, upright, if it is missing or cannot be read."""
-    orientation = _tags(image).get(ExifTags.Base.Orientation, 1)
+def _orientation_of(tags: Mapping[int, Any]) -> int:
+    """The EXIF orientation, 1 to 8; 1, upright, if it is missing or cannot be read."""
+    orientation = tags.get(ExifTags.Base.Orientation, 1)
     return orientation if orientation in range(1, 9) else 1
 
 
 def _tags(image: Image.Image, *blocks: int) -> dict[int, Any]:
-    """The tags of an image's EXIF block, and of the given blocks in it; empty if it cannot be read."""
+    """The tags of an image's EXIF block, and of the given blocks in it, up to the first that cannot be read."""
+    tags = dict[int, Any]()
     try:
         # The method of PNG files decodes them, to find a block that lies behind the pixels.
         exif = Image.Image.getexif(_without_pixels(image) if image.format == "PNG" else image)
-        return {**exif, **{tag: value for block in blocks for tag, value in exif.get_ifd(block).items()}}
+        tags.update(exif)
+        for block in blocks:
+            tags.update(exif.get_ifd(block))
     except Exception as error:  # PIL raises many types of error on damaged blocks
         _log.debug("%s: its EXIF block cannot be read (%s) and is not used.", image.filename, error)  # type: ignore[attr-defined]
-        return {}
+    return tags
 
 
 def _without_pixels(image: Image.Image) -> Image.Image:

@@ -5,6 +5,7 @@ Every choice made here changes published numbers, so each has a line in the scen
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +18,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core import images
 from clear_strategies.core.progress import Progress
 from clear_strategies.core.view import SMALLEST, Photo, View
 from clear_strategies.core.work_log import WorkLog
@@ -34,12 +34,11 @@ from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, 
 from clear_strategies.errors import DataError
 from clear_strategies.geometry.cameras import centers_of
 from clear_strategies.geometry.exposure import exposure_gains
-from rasterizers.interface import Camera
+from rasterizers.interface import Camera, Color
 
 _log = logging.getLogger(__name__)
 
 _READERS: Final = 4  # photos read at once, at most, since each is held at its full size meanwhile
-_WHOLE: Final = 0.99  # least share of a pixel that the mask shows, for the pixel to be shown
 _SAME_EXPOSURE: Final = 0.01  # photos whose gains are closer to 1 stay as they are
 # Radius of the cameras' positions around their mean …
 _ONE_PLACE: Final = 1e-6  # … over their distance from the origin, up to which rounding in files explains it
@@ -58,7 +57,7 @@ def prepare(
         DataError: the capture cannot be prepared with these settings.
     """
     train_frames, test_frames = split(capture, views)
-    frames = [*train_frames, *(replace(frame, transparency=None) for frame in test_frames)]  # only training needs it
+    frames = [*train_frames, *test_frames]
     maker = _ViewMaker(capture, views, prior, check_headers(frames, views))
     require_source(cloud, capture.points)
     _check_positions(capture, [frame.camera for frame in train_frames], cloud)
@@ -66,7 +65,7 @@ def prepare(
     made, work_log = list[View](), WorkLog() if work_log is None else work_log
     with work_log.stage("photos and SR images"):
         for frame, photo in zip(frames, photos_of(frames, views), strict=True):
-            made.append(maker.view(frame, photo, required=len(made) < len(train_frames)))
+            made.append(maker.view(frame, photo, trains=len(made) < len(train_frames)))
             progress(len(made))
     train, test = tuple(made[: len(train_frames)]), tuple(made[len(train_frames) :])
     require_shown(train)
@@ -109,27 +108,30 @@ def check_headers(frames: Sequence[Frame], views: ViewSettings) -> dict[str, Pat
     return {frame.name: files.file(frame.name, *lr_size(frame.camera, views)) for frame in frames}
 
 
-def save_lr(scene: Scene, folder: Path) -> None:
+def save_lr(capture: Capture, views: ViewSettings, folder: Path) -> None:
     """Write the training and test LR images as PNG for an external SR model; prior=images reads its results."""
-    written = write_pngs(folder, ((view.name, view.lr.image) for view in (*scene.train, *scene.test)))
+    frames = list(itertools.chain(*split(capture, views)))
+    files = check_headers(frames, views)
+    photos = zip(frames, photos_of(frames, views), strict=True)
+    lr = ((frame.name, _lr(frame.name, photo, views, files, capture.background).image) for frame, photo in photos)
     message = "%d LR images written to %s. Super-resolve them, then train with prior=images prior.path=<results>."
-    _log.info(message, written, folder)
+    _log.info(message, write_pngs(folder, lr), folder)
 
 
 def photos_of(frames: Sequence[Frame], views: ViewSettings) -> Iterator[Photo]:
     """Load the photos of these frames in order, a few at a time, at HR size, or with photos_are=lr at LR size."""
     with ThreadPoolExecutor(min(torch.get_num_threads(), _READERS)) as pool:
-        yield from pool.map(partial(_reduced, views=views), frames)
+        yield from pool.map(lambda frame: _sized(frame.load(), views), frames)
     forget_maps()
 
 
-def at_hr(capture: Capture, views: ViewSettings) -> Capture:
-    """The capture with photos that load at the size of `photos_of`, for priors that use the truth."""
+def truth_of(capture: Capture, views: ViewSettings) -> dict[str, Callable[[], Float[Tensor, "H W 3"]]]:
+    """Functions that load the photos at the size of `photos_of`, by name, for priors that use the truth."""
 
-    def pixels(frame: Frame) -> Float[Tensor, "H W 3"]:
-        return _reduced(replace(frame, shown=None, transparency=None), views).image
+    def truth(frame: Frame) -> Float[Tensor, "H W 3"]:
+        return _sized(frame.load(), views).image
 
-    return replace(capture, frames=tuple(replace(f, load=partial(pixels, f)) for f in capture.frames))
+    return {frame.name: partial(truth, frame) for frame in capture.frames}
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,9 +143,13 @@ class _ViewMaker:
     prior: Prior
     lr_files: Mapping[str, Path]
 
-    def view(self, frame: Frame, photo: Photo, *, required: bool) -> View:
-        """The view of a frame. If the prior has no SR image, bicubic replaces it, or a `required` view is a DataError."""
-        lr, factor, prior = self.lr(frame, photo), self.settings.sr_scale, self.prior
+    def view(self, frame: Frame, photo: Photo, *, trains: bool) -> View:
+        """The view of a frame, for training or for testing. Of a test view, bicubic replaces an SR image that the prior does not
+        have, and transparency is left out.
+        """
+        photo = photo if trains else replace(photo, transparency=None)
+        lr = _lr(frame.name, photo, self.settings, self.lr_files, self.capture.background)
+        factor, prior = self.settings.sr_scale, self.prior
         hr_camera, truth = (photo.camera.scaled(factor), None) if lr is photo else (photo.camera, photo.image)
         hr, are_both = replace(photo, shown=None), self.settings.photos_are == "both"
         source, disagreement = "the photos themselves", None
@@ -151,7 +157,7 @@ class _ViewMaker:
             try:
                 sr = super_resolved(prior, frame.name, lr.image, factor)
             except DataError as missing:
-                if required:
+                if trains:
                     raise
                 _log.info("%s: no SR image for this test view (%s); bicubic replaces it.", frame.name, missing.problem)
                 prior = Bicubic()
@@ -165,32 +171,30 @@ class _ViewMaker:
         shown = None if photo.shown is None else photo.reduced(photo.camera.width // lr.camera.width).shown
         return view if shown is None else view.hiding(shown)
 
-    def lr(self, frame: Frame, photo: Photo) -> Photo:
-        factor, camera = self.settings.sr_scale, photo.camera
-        if self.settings.photos_are == "lr":
-            return photo
-        camera = camera.scaled(1 / factor)
-        if frame.name not in self.lr_files:
-            down = partial(images.downsample, factor=factor, kernel=self.settings.downsample)
-            return Photo(camera, down(photo.image), transparency=_resized_layer(down, photo.transparency))
-        file = self.lr_files[frame.name]
-        image = read_image(file, background=self.capture.background, expect=(camera.width, camera.height))
-        check = f"{file} shows this view, undistorted as data.save_lr writes it"
-        warn_if_far_from_lr(f"{frame.name}: the photo", photo.image, image, factor, check)
-        return Photo(camera, image)
-
     def enlarged(self, transparency: Float[Tensor, "h w"] | None, name: str) -> Float[Tensor, "H W"] | None:
         """Enlarge transparency to HR, by the prior's network; by bicubic without a network, or if every pixel is opaque."""
-        transparent = transparency is not None and bool(transparency.any())
-        enlarge = (kept_network_of(self.prior) if transparent else None) or Bicubic()
-        return _resized_layer(lambda image: enlarge(name, image, self.settings.sr_scale), transparency)
+        if transparency is None:
+            return None
+        enlarge = (kept_network_of(self.prior) if bool(transparency.any()) else None) or Bicubic()
+        grey = transparency[..., None].expand(-1, -1, 3).contiguous()
+        return enlarge(name, grey, self.settings.sr_scale).mean(dim=2)
 
 
-def _resized_layer(
-    resize: Callable[[Float[Tensor, "H W 3"]], Float[Tensor, "h w 3"]], layer: Float[Tensor, "H W"] | None
-) -> Float[Tensor, "h w"] | None:
-    """Resize one channel as an image of three equal channels; None for None."""
-    return None if layer is None else resize(layer[..., None].expand(-1, -1, 3).contiguous()).mean(dim=2)
+def _lr(name: str, photo: Photo, views: ViewSettings, files: Mapping[str, Path], background: Color) -> Photo:
+    """The LR photo: the photo itself, its ready-made file, or the photo reduced.
+
+    Args:
+        files: see `check_headers`.
+    """
+    if views.photos_are == "lr":
+        return photo
+    camera = photo.camera.scaled(1 / views.sr_scale)
+    if name not in files:
+        return photo.resized(camera, views.downsample)
+    image = read_image(files[name], background=background, expect=(camera.width, camera.height))
+    check = f"{files[name]} shows this view, undistorted as data.save_lr writes it"
+    warn_if_far_from_lr(f"{name}: the photo", photo.image, image, views.sr_scale, check)
+    return Photo(camera, image)
 
 
 def _equalized(train: Sequence[View]) -> tuple[tuple[View, ...], dict[str, str]]:
@@ -208,33 +212,14 @@ def _equalized(train: Sequence[View]) -> tuple[tuple[View, ...], dict[str, str]]
     return equal, {"equalized": f"{span} (data.views.equalize)"}
 
 
-def _reduced(frame: Frame, views: ViewSettings) -> Photo:
-    """Load a photo with its transparency and its mask, at the size of `photos_of`. A pixel is shown if its whole area is."""
-    image, camera = frame.load(), frame.camera
-    if image.shape[:2] != (camera.height, camera.width):
-        problem = f"is {image.shape[1]}x{image.shape[0]}, but its camera is for {size_of(camera)}"
-        raise DataError(frame.name, "size", problem, "give the photo that its camera was estimated from")
-
-    def sized(layer: Tensor) -> Tensor:
-        layer = images.resize(layer, (image.shape[1], image.shape[0]), "area")  # `within_limit` reduces only the photo
-        return _sized(layer, camera, views).image
-
-    through = None if frame.transparency is None else _resized_layer(sized, frame.transparency())
-    shown = None if frame.shown is None else _resized_layer(sized, frame.shown().float())
-    photo = replace(_sized(image, camera, views), transparency=through)
-    return photo if shown is None else replace(photo, shown=shown > _WHOLE)
-
-
-def _sized(image: Tensor, camera: Camera, views: ViewSettings) -> Photo:
+def _sized(photo: Photo, views: ViewSettings) -> Photo:
     """Reduce the photo by `shrink`, to a size that is whole at both scales, see `ViewSettings.sizes`."""
     multiple = 1 if views.photos_are == "lr" else views.sr_scale
     if views.sizes == "round":
-        width, height = (multiple * size for size in lr_size(camera, views))
-        camera = resized(camera, width, height)
-        return Photo(camera, images.resize(image, (width, height), views.downsample))
-    image = images.crop_to_multiple(image, views.shrink * multiple)
-    camera = replace(camera, width=image.shape[1], height=image.shape[0])
-    return Photo(camera.scaled(1 / views.shrink), images.downsample(image, views.shrink, views.downsample))
+        width, height = (multiple * size for size in lr_size(photo.camera, views))
+        return photo.resized(resized(photo.camera, width, height), views.downsample)
+    whole = photo.cropped(views.shrink * multiple)
+    return whole.resized(whole.camera.scaled(1 / views.shrink), views.downsample)
 
 
 def _check_positions(capture: Capture, cameras: Sequence[Camera], cloud: CloudSettings) -> None:

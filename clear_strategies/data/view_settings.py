@@ -10,7 +10,6 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from clear_strategies.core import images
 from clear_strategies.core.checks import refuse, require_choice, require_number, require_whole
 from clear_strategies.core.images import DownKernel
 from clear_strategies.data.capture import Capture, Frame
@@ -208,4 +207,4 @@ def _reduced(frame: Frame, ratio: float, multiple: int, kernel: DownKernel) -> F
     """The frame with a photo `ratio` times smaller, rounded to a size that `multiple` divides."""
     width, height = (max(1, round(s / ratio / multiple)) * multiple for s in (frame.camera.width, frame.camera.height))
     camera = resized(frame.camera, width, height)
-    return replace(frame, camera=camera, load=lambda: images.resize(frame.load(), (width, height), kernel))
+    return replace(frame, camera=camera, load=lambda: frame.load().resized(camera, kernel, layers="area"))

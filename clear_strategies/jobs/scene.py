@@ -6,13 +6,14 @@ import functools
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Final, cast
 
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.capture import MORE_PHOTOS, Capture
 from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.file_names import require_text
-from clear_strategies.data.prepare import at_hr, prepare
+from clear_strategies.data.prepare import prepare, save_lr, truth_of
 from clear_strategies.data.priors import Bicubic, Ncnn, Prior, cached, network_of
 from clear_strategies.data.priors.ncnn import factors, missing_packages
 from clear_strategies.data.scene import Scene
@@ -67,10 +68,10 @@ class DataSettings:
 class AutoPrior:
     """The capture's own prior, as the demo has one; else waifu2x, if it is installed and reaches the factor; else bicubic."""
 
-    def of(self, capture: Capture, factor: int) -> Prior:
+    def of(self, capture: Capture, views: ViewSettings) -> Prior:
         if capture.own_prior is not None:
-            return capture.own_prior(_photos(capture))
-        usable = factor in factors(_NETWORK) and not missing_packages(_NETWORK)
+            return capture.own_prior(truth_of(capture, views))
+        usable = views.sr_scale in factors(_NETWORK) and not missing_packages(_NETWORK)
         return Ncnn(_NETWORK) if usable else Bicubic()
 
 
@@ -84,10 +85,6 @@ def require_factor(prior: PriorSettings, factor: int) -> None:
         network.require_factor(factor)
 
 
-def _photos(capture: Capture) -> dict[str, Callable[[], Any]]:
-    return {frame.name: frame.load for frame in capture.frames}
-
-
 def load(
     data: DataSettings, prior: PriorSettings, seed: int, decorate: Callable[[Prior], Prior] = lambda prior: prior
 ) -> Scene:
@@ -99,17 +96,15 @@ def load(
     work_log = WorkLog()
     with work_log.stage("capture and poses"):
         capture, views = read(data, prior)
-    if data.save_lr is not None:
-        chosen: Prior = Bicubic()  # the images that the prior itself reads may not exist yet
-    elif isinstance(prior, AutoPrior):
-        chosen = prior.of(at_hr(capture, views), views.sr_scale)
+    if isinstance(prior, AutoPrior):
+        chosen = prior.of(capture, views)
     elif isinstance(prior, functools.partial):
-        chosen = prior(truth=_photos(at_hr(capture, views)))
+        chosen = prior(truth=truth_of(capture, views))
     else:
         chosen = cast("Prior", prior)
     scene = prepare(capture, views, decorate(cached(chosen)), data.cloud, seed=seed, work_log=work_log)
     # Logged once the photos are known to be usable.
-    if isinstance(prior, AutoPrior) and data.save_lr is None and views.photos_are != "both":
+    if isinstance(prior, AutoPrior) and views.photos_are != "both":
         if isinstance(chosen, Bicubic):
             _log.warning("prior: auto chose %s. %s.", chosen.label, _remedy(views.sr_scale))
         else:
@@ -117,15 +112,24 @@ def load(
     return scene
 
 
-def read(data: DataSettings, prior: PriorSettings) -> tuple[Capture, ViewSettings]:
-    """Read the capture, and fit it and the settings of its views into the limit of the HR images' size."""
+def write_lr(data: DataSettings, folder: Path) -> None:
+    """Read the data set and write its LR images, see `data.save_lr`; they have the sizes that prior=images trains on."""
+    save_lr(*read(data, None), folder)
+
+
+def read(data: DataSettings, prior: PriorSettings | None) -> tuple[Capture, ViewSettings]:
+    """Read the capture, and fit it and the settings of its views into the limit of the HR images' size.
+
+    Args:
+        prior: None: images of another program.
+    """
     capture = data.reader()
     require_text((capture.name, *(frame.name for frame in capture.frames), *capture.unplaced))
     placed, photos = len(capture.frames), len(capture.frames) + len(capture.unplaced)
     if placed < _ENOUGH * photos:
         few = f"{placed} of {photos} photos ({placed / photos:.0%}) have a pose, and the others are not used: {MORE_PHOTOS}"
         capture = replace(capture, notes={**capture.notes, FEW_PLACED: few})
-    auto = isinstance(prior, AutoPrior) and data.save_lr is None
+    auto = isinstance(prior, AutoPrior)
     network = network_of(prior)
 
     def reaches(factor: int) -> bool:

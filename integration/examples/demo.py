@@ -65,12 +65,16 @@ def load_demo(width: int = 256, height: int = 192, device: torch.device | str = 
     trained = [frame for frame in frames if frame.split == "train"]
     return Demo(
         [frame.name for frame in trained],
-        torch.stack([images.downsample(frame.load(), _FACTOR) for frame in trained]).to(device),
+        torch.stack([images.downsample(frame.load().image, _FACTOR) for frame in trained]).to(device),
         torch.stack([frame.camera.world_to_camera.float() for frame in trained]).to(device),
         torch.stack([intrinsics(frame.camera.scaled(1 / _FACTOR)).float() for frame in trained]).to(device),
         DemoPrior(truth={frame.name: frame.load for frame in trained}),
         [
-            (f.camera.world_to_camera.float().to(device), intrinsics(f.camera).float().to(device), f.load().to(device))
+            (
+                f.camera.world_to_camera.float().to(device),
+                intrinsics(f.camera).float().to(device),
+                f.load().image.to(device),
+            )
             for f in frames
             if f.split == "test"
         ],

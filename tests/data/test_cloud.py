@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from clear_strategies import DataError, Photo
-from clear_strategies.core import images
 from clear_strategies.data.cloud import CloudSettings, from_tracks, initial_points, random_cloud
 from clear_strategies.data.ply import write_points
 from clear_strategies.data.readers import colmap
@@ -124,11 +123,8 @@ def test_fern_is_triangulated_from_three_lr_images(shared_data: Path) -> None:
     """Half the triangulated points lie within 2 % of their depth of one that COLMAP found in all views."""
     capture = colmap.read(shared_data / "fern")
     train, _ = split(capture, ViewSettings(train=3, test_every=8))
-    photos = []
-    for frame in train:
-        image = images.downsample(images.crop_to_multiple(frame.load(), 8), 8)
-        full = replace(frame.camera, width=image.shape[1] * 8, height=image.shape[0] * 8)
-        photos.append(Photo(full.scaled(1 / 8), image))
+    whole = [frame.load().cropped(8) for frame in train]
+    photos = [photo.resized(photo.camera.scaled(1 / 8), "bicubic") for photo in whole]
     chosen = CloudSettings(init="triangulated", densify=False)
     cloud = initial_points(chosen, photos, sfm=capture.points).cloud
     assert len(cloud) > 200

@@ -42,9 +42,7 @@ VALUES = {
 def test_what_is_not_0_is_shown(tmp_path: Path, kind: str) -> None:
     ending, values = VALUES[kind]
     save(tiny.colmap_bin(tmp_path) / f"masks/a.{ending}", values)
-    shown = colmap.read(tmp_path).frames[0].shown
-    assert shown is not None
-    assert torch.equal(shown(), torch.from_numpy(LEFT))
+    assert torch.equal(colmap.read(tmp_path).frames[0].load().shown, torch.from_numpy(LEFT))
 
 
 def test_photo_and_mask_of_a_frame_may_be_named_by_texts(tmp_path: Path) -> None:
@@ -52,8 +50,7 @@ def test_photo_and_mask_of_a_frame_may_be_named_by_texts(tmp_path: Path) -> None
         save(tmp_path / name, 255 * LEFT)
     lens = Lens(tiny.WIDTH, tiny.HEIGHT, 9.0, 9.0, tiny.WIDTH / 2, tiny.HEIGHT / 2)
     frame = Frame.of_photo("a", f"{tmp_path}/photo.png", lens, torch.eye(4), mask=f"{tmp_path}/mask.png")
-    assert frame.shown is not None
-    assert torch.equal(frame.load()[..., 0] > 0, frame.shown())
+    assert torch.equal(frame.load().image[..., 0] > 0, frame.load().shown)
 
 
 NAMED = ("a.png", "a.PNG", "a.jpg", "A.png", "a.png.png", "dynamic_mask_a.png", "a_mask.png", "mask-a.jpeg")
@@ -64,15 +61,14 @@ NAMED = ("a.png", "a.PNG", "a.jpg", "A.png", "a.png.png", "dynamic_mask_a.png", 
 def test_a_mask_is_found_by_the_names_that_tools_give_it(tmp_path: Path, reader: str, name: str, caplog) -> None:
     save(tiny.GOOD[reader](tmp_path) / "masks" / name, 255 * LEFT)
     first = tiny.READERS[reader](tmp_path).frames[0]
-    assert first.shown is not None
-    assert torch.equal(first.shown(), torch.from_numpy(LEFT))
+    assert torch.equal(first.load().shown, torch.from_numpy(LEFT))
     assert "belong to no photo" not in caplog.text
 
 
 @pytest.mark.parametrize("folder", ["masks", "mask", "images/masks", "masks/images"])
 def test_masks_may_lie_beside_the_photos_or_in_their_folder(tmp_path: Path, folder: str) -> None:
     save(tiny.colmap_bin(tmp_path) / folder / "b.png", 1 * LEFT)
-    assert [frame.shown is not None for frame in colmap.read(tmp_path).frames] == [False, True, False]
+    assert [frame.load().shown is not None for frame in colmap.read(tmp_path).frames] == [False, True, False]
 
 
 @pytest.mark.parametrize("name", ["b.png.mask.png", "b_mask.jpg", "mask_b.PNG"])
@@ -80,7 +76,7 @@ def test_masks_may_lie_beside_the_photos_or_in_their_folder(tmp_path: Path, fold
 def test_marked_masks_may_lie_among_the_photos(tmp_path: Path, reader: str, name: str) -> None:
     save(tiny.GOOD[reader](tmp_path) / "images" / name, 255 * LEFT)
     capture = tiny.READERS[reader](tmp_path)
-    assert [frame.shown is not None for frame in capture.frames] == [False, True, False]
+    assert [frame.load().shown is not None for frame in capture.frames] == [False, True, False]
     assert "without pose" not in capture.notes
 
 
@@ -100,10 +96,10 @@ def test_masks_follow_the_size_and_the_folder_of_their_photos(tmp_path: Path) ->
         save(tmp_path / f"masks/{name}.png", 1 * LEFT)
     save(tmp_path / "masks_2/b.png", 1 - 1 * LEFT[::2, ::2])
     a, b, _ = colmap.read(tmp_path, images="images_2").frames
-    assert torch.equal(a.shown(), torch.from_numpy(LEFT[::2, ::2]))
-    assert torch.equal(b.shown(), torch.from_numpy(~LEFT[::2, ::2]))
+    assert torch.equal(a.load().shown, torch.from_numpy(LEFT[::2, ::2]))
+    assert torch.equal(b.load().shown, torch.from_numpy(~LEFT[::2, ::2]))
     whole = colmap.read(tmp_path).frames
-    assert all(torch.equal(frame.shown(), torch.from_numpy(LEFT)) for frame in whole[:2])
+    assert all(torch.equal(frame.load().shown, torch.from_numpy(LEFT)) for frame in whole[:2])
     tiny.write_photos(tmp_path / "elsewhere")
     save(tmp_path / "elsewhere/masks/a.png", 1 * LEFT)
     assert list(masks_of(tmp_path / "scene", [tmp_path / "elsewhere/a.png"])) == [tmp_path / "elsewhere/a.png"]
@@ -122,7 +118,7 @@ def test_nerfstudios_reduced_photos_keep_their_masks_splits_and_lenses(tmp_path:
     save(tmp_path / "masks/a.png", 255 * LEFT)
     first, second, _ = nerfstudio.read(tmp_path, images="images_2").frames
     assert (first.camera.width, first.camera.fx, first.split, second.split) == (8, tiny.FOCAL / 2, "train", "test")
-    assert torch.equal(first.shown(), torch.from_numpy(LEFT[::2, ::2]))
+    assert torch.equal(first.load().shown, torch.from_numpy(LEFT[::2, ::2]))
     with pytest.raises(DataError, match="images_4: images: is no folder: choose one of images, images_2"):
         nerfstudio.read(tmp_path, images="images_4")
 
@@ -134,9 +130,9 @@ def test_a_mask_that_cannot_be_read_is_refused_with_what_helps_a_mask(tmp_path: 
     for content, message in ((b"no image", "is no readable image"), (whole[:-30], "cannot be decoded")):
         mask.write_bytes(content)
         with pytest.raises(DataError, match=rf"a\.png: mask: .*{message}.*: put a mask of the photo's shape there"):
-            [frame.shown() for frame in colmap.read(tmp_path, skip_faulty=True).frames if frame.shown is not None]
+            [frame.load() for frame in colmap.read(tmp_path, skip_faulty=True).frames]
     mask.unlink()
-    assert not any(frame.shown for frame in colmap.read(tmp_path).frames)
+    assert not any(frame.load().shown is not None for frame in colmap.read(tmp_path).frames)
 
 
 def prepared(root: Path, read: Callable[[Path], Capture]) -> None:

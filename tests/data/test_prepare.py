@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from clear_strategies.core.view import Photo
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.photo_files import write_png
@@ -153,7 +154,7 @@ def rig() -> Capture:
     """Photos of two cameras, each of its own grey."""
     frames = capture(len(RIG)).frames
     return Capture("rig", tuple(
-        replace(frame, name=name, load=lambda i=i: torch.full((16, 16, 3), i / 5))
+        replace(frame, name=name, load=lambda frame=frame, i=i: Photo(frame.camera, torch.full((16, 16, 3), i / 5)))
         for i, (frame, name) in enumerate(zip(frames, RIG, strict=True))
     ))  # fmt: skip
 
@@ -173,11 +174,11 @@ def test_a_view_is_chosen_by_its_file_name_where_that_is_its_own_and_not_that_of
 
 
 def test_saved_lr_images_are_those_of_their_views_and_no_two_are_saved_as_one(tmp_path):
-    saved = prepare(rig(), papers(train=4, test_every=0), Bicubic(), POINTS)
-    save_lr(saved, tmp_path / "lr")
+    views = papers(train=4, test_every=0)
+    save_lr(rig(), views, tmp_path / "lr")
     assert sorted(str(p.relative_to(tmp_path / "lr")) for p in (tmp_path / "lr").rglob("*.png")) == sorted(RIG)
     read = prepare(rig(), papers(train=4, test_every=0, lr_folder=str(tmp_path / "lr")), Bicubic(), POINTS)
-    for view, expected in zip(read.train, saved.train, strict=True):
+    for view, expected in zip(read.train, prepare(rig(), views, Bicubic(), POINTS).train, strict=True):
         torch.testing.assert_close(view.lr.image, expected.lr.image, atol=1 / 255, rtol=0)
     for name in ("0001.png", "0002.png"):
         write_png(tmp_path / name, torch.zeros(4, 4, 3))
@@ -189,18 +190,18 @@ def test_saved_lr_images_are_those_of_their_views_and_no_two_are_saved_as_one(tm
     with pytest.raises(
         DataError, match=r"cam1/0001\.png: file: is there, and holds another image: give another folder"
     ):
-        save_lr(saved, tmp_path / "lr")
+        save_lr(rig(), views, tmp_path / "lr")
 
 
 def test_lr_images_of_photos_that_differ_in_their_endings_are_found_again(tmp_path):
     frames = in_a_row((16, 16), (16, 16)).frames
     shades = (torch.zeros(16, 16, 3), torch.ones(16, 16, 3))
     both = [
-        replace(frame, name=name, load=lambda shade=shade: shade)
+        replace(frame, name=name, load=lambda frame=frame, shade=shade: Photo(frame.camera, shade))
         for frame, name, shade in zip(frames, ("a.jpg", "a.png"), shades, strict=True)
     ]
     twins = Capture("twins", tuple(both))
-    save_lr(prepare(twins, papers(train=2, test_every=0), Bicubic(), POINTS), tmp_path)
+    save_lr(twins, papers(train=2, test_every=0), tmp_path)
     read = prepare(twins, papers(train=2, test_every=0, lr_folder=str(tmp_path)), Bicubic(), POINTS)
     assert [float(view.lr.image.mean()) for view in read.train] == [0, 1]
 

@@ -8,11 +8,12 @@ import pytest
 import torch
 from PIL import Image
 
-from clear_strategies import P2G, DepthMap
+from clear_strategies import P2G, DepthMap, Photo
 from clear_strategies.core import images
+from clear_strategies.data import photo_files
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.cloud import CloudSettings
-from clear_strategies.data.prepare import prepare
+from clear_strategies.data.prepare import prepare, truth_of
 from clear_strategies.data.priors import BackProjected, Bicubic, Cached, DemoPrior
 from clear_strategies.data.readers import blender, demo
 from clear_strategies.data.view_settings import ViewSettings
@@ -28,7 +29,7 @@ ROOM = demo.read(width=64, height=48, views=5, train=2)
 
 def wrong(**settings) -> DemoPrior:
     """SR images of the room with errors."""
-    return DemoPrior({f.name: f.load for f in ROOM.frames}, **settings)
+    return DemoPrior(truth_of(ROOM, papers()), **settings)
 
 
 @pytest.mark.parametrize(("prior", "least", "most"), [(Bicubic(), 0.0, 0.4), (wrong(), 1.0, 255.0)])  # 0.4: rounding
@@ -102,8 +103,8 @@ def test_equalized_photos_lose_their_casts_at_both_scales_and_test_photos_keep_t
     known = demo.read(width=160, height=120)
     names = [f.name for f in known.frames if f.split == "train"]
     casts = dict(zip(names, torch.tensor([[0.9, 1.0, 1.0], [1.0, 1.0, 0.92], [1.0, 1.05, 1.0]]), strict=True))
-    shown = {f.name: (f.load() * casts.get(f.name, 0.8)).clamp(0, 1) for f in known.frames}
-    frames = tuple(replace(f, load=lambda name=f.name: shown[name]) for f in known.frames)
+    shown = {f.name: (f.load().image * casts.get(f.name, 0.8)).clamp(0, 1) for f in known.frames}
+    frames = tuple(replace(f, load=lambda f=f: Photo(f.camera, shown[f.name])) for f in known.frames)
     wanted = ViewSettings(photos_are="hr", sr_scale=2, equalize=True)
     made = prepare(Capture("cast", frames), wanted, Bicubic(), CloudSettings(init="stereo"))
     common = torch.stack(list(casts.values())).log().mean(0).exp()
@@ -152,9 +153,17 @@ def test_the_colour_of_transparent_pixels_makes_no_fringe_where_photos_are_reduc
 def test_a_network_enlarges_the_transparency_of_a_photo_once(tmp_path):
     network = Counting()
     half = torch.full((16, 16), 0.5)
-    frames = [replace(frame, transparency=lambda: half) for frame in capture(1).frames]
+    (frame,) = capture(1).frames
+    glass = Capture("glass", (replace(frame, load=lambda: replace(frame.load(), transparency=half)),))
     for _ in range(2):
         prior = BackProjected(Cached(network, tmp_path))
-        made = prepare(Capture("glass", tuple(frames)), papers(train=1, test_every=0), prior, POINTS).train[0]
+        made = prepare(glass, papers(train=1, test_every=0), prior, POINTS).train[0]
         assert float((made.hr.transparency - 0.5).abs().max()) <= 1.01 / 255
     assert network.calls == ["0000.png"] * 2  # the photo and its transparency
+
+
+def test_a_photo_with_alpha_is_decoded_once(tmp_path, monkeypatch):
+    decoded, to_float = [], photo_files._to_float
+    monkeypatch.setattr(photo_files, "_to_float", lambda *given: decoded.append(given) or to_float(*given))
+    prepare(blender.read(tiny.blender(tmp_path)), ViewSettings(photos_are="both", sr_scale=2), Bicubic(), POINTS)
+    assert len(decoded) == len(tiny.NAMES)

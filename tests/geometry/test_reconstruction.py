@@ -48,7 +48,7 @@ def without(monkeypatch: pytest.MonkeyPatch, *modules: str) -> None:
 
 def test_the_cloud_of_the_demo_is_the_trainers_to_the_bit() -> None:
     frames = demo.read(width=64, height=48, views=6, train=3).frames[:3]
-    photos = [Photo(frame.camera, frame.load()) for frame in frames]
+    photos = [frame.load() for frame in frames]
     trained = initial_points(CloudSettings(init="stereo", densify=True), photos)
     assert same(
         reconstruct(photos, settings=None), Stereo(trained.depths, trained.cloud.means, trained.cloud.colors, "")

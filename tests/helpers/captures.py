@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from clear_strategies.core.view import Photo
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.photo_files import write_png
@@ -69,7 +70,8 @@ def in_a_row(*sizes: tuple[int, int], image: torch.Tensor | None = None) -> Capt
         shown = (
             torch.linspace(0, 1, width)[None, :, None].expand(height, width, 3).contiguous() if image is None else image
         )
-        frames.append(Frame(f"{i:04d}.png", camera, lambda shown=shown: shown))
+        photo = Photo(camera, shown)
+        frames.append(Frame(f"{i:04d}.png", camera, lambda photo=photo: photo))
     return Capture("made up", tuple(frames))
 
 
@@ -189,7 +191,7 @@ def demo_on_disk(
     """
     frames = []
     for i, frame in enumerate(views_of := demo.read(width=size[0], height=size[1], views=views, train=2).frames):
-        write_png(root / f"images/{i}.png", frame.load())
+        write_png(root / f"images/{i}.png", frame.load().image)
         matrix = np.linalg.inv(views_of[pose(i)].camera.world_to_camera.double().numpy()) @ np.diag([1.0, -1, -1, 1])
         matrix[:3, 3] *= scale
         frames.append({"file_path": f"images/{i}.png", "transform_matrix": matrix.tolist()})

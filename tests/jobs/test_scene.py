@@ -12,15 +12,16 @@ import torch
 from clear_strategies.commands import train
 from clear_strategies.compose import tree
 from clear_strategies.core.points import spread
+from clear_strategies.data import photo_files
 from clear_strategies.data.cloud import CloudSettings
-from clear_strategies.data.priors import Bicubic, Corrupted, DemoPrior, Ncnn, ncnn
+from clear_strategies.data.priors import Bicubic, Corrupted, DemoPrior, Images, Ncnn, ncnn
 from clear_strategies.data.readers import demo
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.view_settings import ViewSettings, split
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.jobs import job
 from clear_strategies.jobs.saved import open_splat
-from clear_strategies.jobs.scene import AutoPrior, DataSettings, load, require_factor
+from clear_strategies.jobs.scene import AutoPrior, DataSettings, load, read, require_factor
 from clear_strategies.jobs.settings import JobSettings, settings_of
 from tests.helpers import captures, fake_ncnn, forked
 from tests.helpers.command_line import ALONE
@@ -37,7 +38,7 @@ def test_a_photo_that_no_view_uses_may_be_too_small(caplog):
         scene = load(DataSettings(reader=lambda: replace(capture, frames=frames), views=views), AutoPrior(), 0)
     assert tiny.name not in {view.name for view in (*scene.train, *scene.test)}
     assert "prior: auto chose demo" in caplog.text
-    assert AutoPrior().of(replace(capture, name="mine"), 4).label.startswith("demo (synthetic")
+    assert AutoPrior().of(replace(capture, name="mine"), views).label.startswith("demo (synthetic")
 
 
 @pytest.mark.parametrize("whose", ["capture", "frame", "unplaced"])
@@ -228,3 +229,21 @@ def test_a_scene_in_other_units_gives_equal_results(scale: float, trained, caplo
         assert spread(splat.painter.field.means.data) == pytest.approx(3 * scale, rel=0.5)
         image = splat.painter.color(splat.poses()[0])
         assert float(image.std()) > 0.05
+
+
+def test_lr_images_are_saved_at_the_size_that_images_of_another_program_need_without_stereo(
+    tmp_path, monkeypatch, caplog
+):
+    monkeypatch.setattr("clear_strategies.data.prepare.initial_points", None)
+    words = [
+        "data=demo",
+        "data.views.photos_are=lr",
+        f"data.save_lr={tmp_path / 'lr'}",
+        "data.views.max_hr_megapixels=0.2",
+    ]
+    assert job.run(composed(*words), tmp_path / "run", words) is None
+    used = read(DataSettings(reader=demo.read, views=ViewSettings(max_hr_megapixels=0.2)), Images(str(tmp_path)))[0]
+    assert {file.stem for file in (tmp_path / "lr").iterdir()} == {frame.name for frame in used.frames}
+    camera = used.frames[0].camera
+    assert photo_files.image_size(tmp_path / f"lr/{used.frames[0].name}.png") == (camera.width, camera.height)
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]

@@ -69,7 +69,8 @@ def test_hidden_pixels_have_no_part_in_the_psnr_and_no_cotangent_and_shown_ones_
 def test_an_lr_pixel_is_hidden_where_a_photo_pixel_below_it_is():
     image, shown = torch.rand(16, 24, 3), torch.ones(16, 24, dtype=torch.bool)
     shown[5, 9] = False
-    frame = Frame("a.png", planes.camera(0, 24, 16), lambda: image, shown=lambda: shown)
+    photo = Photo(planes.camera(0, 24, 16), image, shown)
+    frame = Frame("a.png", photo.camera, lambda: photo)
     random = CloudSettings(init="random", random_points=50)
     made = prepare(Capture("a", (frame,)), ViewSettings(photos_are="hr", sr_scale=4), Bicubic(), random)
     view, expected = made.train[0], torch.ones(4, 6, dtype=torch.bool)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.core.checks import require_whole
+from clear_strategies.core.view import Photo
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.priors.corrupted import DemoPrior
 from clear_strategies.data.readers.demo_surfaces import (
@@ -74,7 +75,7 @@ def read(*, width: int = 256, height: int = 192, views: int = 12, train: int = 3
     frames = []
     for i in range(views):
         camera = _camera(2 * i / (views - 1) - 1, width, height)
-        load = lru_cache(maxsize=1)(partial(render, camera))
+        load = lru_cache(maxsize=1)(partial(_photo, camera))
         frames.append(Frame(f"demo_{i:02d}", camera, load, split="train" if i in chosen else "test"))
     notes = {"poses": "exact", "scene": "procedural room, photographs from scikit-image"}
     return Capture("demo", tuple(frames), notes=notes, own_prior=DemoPrior)
@@ -92,6 +93,10 @@ def render(camera: Camera) -> Float[Tensor, "H W 3"]:
         colors = _cast(rays).reshape(-1, _RAYS, camera.width, _RAYS, 3)
         bands.append(colors.mean(axis=(1, 3)))
     return images.quantize(torch.from_numpy(np.concatenate(bands)).clamp(0, 1))
+
+
+def _photo(camera: Camera) -> Photo:
+    return Photo(camera, render(camera))
 
 
 def _camera(position: float, width: int, height: int) -> Camera:

@@ -17,7 +17,7 @@ from clear_strategies.data.capture import MORE_PHOTOS, Capture
 from clear_strategies.data.file_names import named, require_text, some
 from clear_strategies.data.lenses import CUT
 from clear_strategies.data.masks import masks_among
-from clear_strategies.data.photo_files import SUFFIXES, optics, read_header
+from clear_strategies.data.photo_files import SUFFIXES, Header, read_header
 from clear_strategies.data.photo_folders import (
     folders_of_images,
     images_in,
@@ -108,9 +108,10 @@ def read(
     if base.resolve().is_relative_to(root.resolve()):
         raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
     chosen = ((path.name, path) for path in _without_masks_and_twins(images))
-    sizes = {path: read_header(path).stored for _, path in usable(root, chosen, skip_faulty=skip_faulty)}
-    paths = _without_thumbnails(sizes)
-    if all(sizes[path][0] == 2 * sizes[path][1] for path in paths):
+    headers = {path: read_header(path) for _, path in usable(root, chosen, skip_faulty=skip_faulty)}
+    photos = _without_thumbnails(headers)
+    paths = list(photos)
+    if all(width == 2 * height for width, height in (header.stored for header in photos.values())):
         message = (
             "%s: all photos are twice as wide as high. Of 360-degree panoramas, poses and splat would be wrong: %s."
         )
@@ -119,7 +120,6 @@ def read(
     if len(paths) < sfm.FEWEST:
         raise DataError(root, "images", f"there are {len(paths)}, poses need at least {sfm.FEWEST}", MORE_PHOTOS)
     precise = len(paths) <= _FEW if precise == "auto" else precise
-    photos = {path: optics(path) for path in paths}  # unreadable photos are refused before the long work
     folder = base / _cache_key(paths, max_side, max_features, precise, seed)
     if (folder / sfm.MODEL).is_file():
         _log.debug("%s: poses from the cache %s.", root, folder)
@@ -203,14 +203,15 @@ def _without_masks_and_twins(paths: Sequence[Path]) -> list[Path]:
     return kept
 
 
-def _without_thumbnails(sizes: Mapping[Path, tuple[int, int]]) -> list[Path]:
+def _without_thumbnails(headers: Mapping[Path, Header]) -> dict[Path, Header]:
     """The photos without those that are so small beside the largest that they are previews of others."""
-    most = max(map(math.prod, sizes.values()), default=0)
-    small = [path for path, size in sizes.items() if _THUMBNAIL * math.prod(size) < most]
+    pixels = {path: math.prod(header.stored) for path, header in headers.items()}
+    most = max(pixels.values(), default=0)
+    small = [path for path, count in pixels.items() if _THUMBNAIL * count < most]
     if small:
         message = "%d of the images have less than 1/%d of the pixels of the largest, and are not used: %s."
         _log.warning(message, len(small), _THUMBNAIL, some([path.name for path in small]))
-    return [path for path in sizes if path not in small]
+    return {path: header for path, header in headers.items() if path not in small}
 
 
 def _cache_key(paths: Sequence[Path], *settings: int) -> str:

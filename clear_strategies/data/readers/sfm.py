@@ -32,7 +32,7 @@ from clear_strategies.core.images import to_bytes
 from clear_strategies.core.progress import Progress
 from clear_strategies.data.capture import MORE_PHOTOS, NO_PARALLAX, STEP_ASIDE
 from clear_strategies.data.file_names import some
-from clear_strategies.data.photo_files import Optics, read_image
+from clear_strategies.data.photo_files import Header, read_image
 from clear_strategies.errors import DataError, counted
 
 _log = logging.getLogger(__name__)
@@ -75,11 +75,11 @@ class SfmSettings:
     seed: int
 
 
-def reconstruct(root: Path, photos: Mapping[Path, Optics], folder: Path, settings: SfmSettings) -> None:
+def reconstruct(root: Path, photos: Mapping[Path, Header], folder: Path, settings: SfmSettings) -> None:
     """Estimate the poses of these photos, and write the largest model to `folder`, with images named by `copy_name`.
 
     Args:
-        photos: their paths, with the camera data of their EXIF blocks.
+        photos: their paths and headers.
 
     Raises:
         DataError: pycolmap is not installed, memory is limited to too little, or too few photos can be placed.
@@ -141,7 +141,7 @@ def require_placed(root: Path, placed: int, count: int, least: float = 0.0) -> N
     raise DataError(root, "poses", f"{few} of the {count} photos could be related to each other", remedy)
 
 
-def _models(pycolmap: Any, photos: Mapping[Path, Optics], work: Path, settings: SfmSettings) -> list[Any]:
+def _models(pycolmap: Any, photos: Mapping[Path, Header], work: Path, settings: SfmSettings) -> list[Any]:
     """Run COLMAP's incremental pipeline: extract features, match all pairs, and map; returns the models. If photos are left over,
     those mapped without EXIF's focal lengths are returned where they place more photos.
     """
@@ -329,19 +329,19 @@ def _keep_coarsest(pycolmap: Any, database: Path, most: int) -> None:
             opened.write_descriptors(number, pycolmap.FeatureDescriptors(kind, descriptors))
 
 
-def _write_copies(photos: Mapping[Path, Optics], folder: Path, max_side: int) -> _Groups:
+def _write_copies(photos: Mapping[Path, Header], folder: Path, max_side: int) -> _Groups:
     """Write copies for COLMAP, no larger than `max_side`."""
     folder.mkdir()
     groups: _Groups = {}
-    for i, (path, (focal_35mm, lens)) in enumerate(photos.items()):
+    for i, (path, header) in enumerate(photos.items()):
         image = read_image(path, turn=True)
         height, width = image.shape[:2]
         scale = min(1.0, max_side / max(width, height))
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
         copy = Picture.fromarray(to_bytes(image)).resize(size, Picture.Resampling.LANCZOS)
         copy.save(folder / copy_name(i), quality=95, subsampling=0)
-        focal = focal_35mm and round(focal_35mm / _DIAGONAL_35MM * math.hypot(*size), 2)
-        groups.setdefault((*size, focal, lens), []).append(copy_name(i))
+        focal = header.focal_35mm and round(header.focal_35mm / _DIAGONAL_35MM * math.hypot(*size), 2)
+        groups.setdefault((*size, focal, header.lens), []).append(copy_name(i))
     return groups
 
 

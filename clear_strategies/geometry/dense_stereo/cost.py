@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import torch
@@ -48,15 +48,12 @@ class Grey:
 
 def grey(photo: Photo, enlarge: int, max_pixels: int) -> Grey:
     """The grey image of a photo, enlarged by `enlarge` if it is small, or reduced to at most `max_pixels`."""
-    image, camera = photo.image, photo.camera
-    reduce = 1
+    camera, reduce = photo.camera, 1
     while (camera.width // reduce) * (camera.height // reduce) > max_pixels:
         reduce += 1
-    if reduce > 1:
-        image = images.crop_to_multiple(image, reduce)
-        camera = replace(camera, width=image.shape[1], height=image.shape[0])
-        image, camera = images.downsample(image, reduce, "area"), camera.scaled(1 / reduce)
-    elif enlarge > 1 and camera.width * camera.height * enlarge**2 <= min(_ENLARGED, max_pixels):
+    whole = photo.cropped(reduce)
+    image, camera = images.downsample(whole.image, reduce, "area"), whole.camera.scaled(1 / reduce)
+    if reduce == 1 and enlarge > 1 and camera.width * camera.height * enlarge**2 <= min(_ENLARGED, max_pixels):
         image, camera = images.upsample(image, enlarge), camera.scaled(enlarge)
     r, g, b = image.float().unbind(dim=-1)
     return Grey(camera, (r + g + b) / 3)

@@ -77,7 +77,7 @@ def prior(**settings: float) -> DemoPrior:
 
 def lr_of(i: int) -> tuple[str, Tensor, Tensor]:
     frame = frames()[i]
-    return frame.name, images.downsample(frame.load(), FACTOR), frame.load()
+    return frame.name, images.downsample(frame.load().image, FACTOR), frame.load().image
 
 
 @cache

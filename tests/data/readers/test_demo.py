@@ -33,7 +33,7 @@ def depth_of(camera: Camera) -> Tensor:
 def test_photos_fill_the_picture_and_cameras_look_at_the_room_upright_from_different_places() -> None:
     assert [i for i, frame in enumerate(capture().frames) if frame.split == "train"] == [2, 6, 10]
     for frame in capture().frames[::5]:
-        photo = frame.load()
+        photo = frame.load().image
         assert photo.shape == (HEIGHT, WIDTH, 3)
         assert photo.dtype == torch.float32
         assert torch.equal(photo, images.quantize(photo))
@@ -81,8 +81,8 @@ def test_neighbouring_views_agree_where_depth_says_they_see_the_same_place() -> 
         return torch.nn.functional.grid_sample(values[None], grid, align_corners=False)[0]
 
     seen = (at(depth_of(b.camera).float()[None])[0] - there[..., 2]).abs() < 0.02
-    same = (at(b.load().permute(2, 0, 1)).permute(1, 2, 0) - a.load()).abs().mean(-1)[seen]
-    other = (b.load() - a.load()).abs().mean(-1)[seen]
+    same = (at(b.load().image.permute(2, 0, 1)).permute(1, 2, 0) - a.load().image).abs().mean(-1)[seen]
+    other = (b.load().image - a.load().image).abs().mean(-1)[seen]
     assert seen.float().mean() > 0.7
     assert same.mean() < 0.05
     assert same.mean() < 0.6 * other.mean()

@@ -17,7 +17,6 @@ from PIL import ExifTags, Image, ImageFilter
 
 from clear_strategies import files
 from clear_strategies.core.images import to_bytes
-from clear_strategies.data.photo_files import Optics
 from clear_strategies.data.readers import colmap, demo, photos, sfm
 from clear_strategies.data.readers.sfm import SfmSettings
 from clear_strategies.errors import DataError
@@ -73,7 +72,7 @@ def test_poses_are_those_of_the_ground_truth(shared_data, tmp_path, monkeypatch,
 @pytest.fixture(scope="module")
 def room() -> list[Image.Image]:
     """Four photos of the demo's room, by a lens of 31 mm on 35 mm film, that overlap."""
-    return [Image.fromarray(to_bytes(frame.load())) for frame in demo.read(width=200, height=150).frames[:4]]
+    return [Image.fromarray(to_bytes(frame.load().image)) for frame in demo.read(width=200, height=150).frames[:4]]
 
 
 def save_photos(folder: Path, pictures: Sequence[Image.Image], *focals: int) -> Path:
@@ -266,7 +265,7 @@ class FakeModel:
 def estimate(tmp_path, monkeypatch):
     """Estimates the poses of ten photos, with a function in place of COLMAP's pipeline."""
     monkeypatch.setattr(sfm, "_unplaced", lambda *_: {})
-    photos = {tmp_path / f"{i}.jpg": Optics(None, ()) for i in range(10)}
+    photos = dict.fromkeys(tmp_path / f"{i}.jpg" for i in range(10))
 
     def run(mapping):
         monkeypatch.setattr(sfm, "_models", mapping)

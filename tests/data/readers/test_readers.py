@@ -63,9 +63,9 @@ def test_the_lens_and_the_masks_that_a_file_names_are_used(tmp_path: Path) -> No
     capture = blender.read(tmp_path)
     train, test = capture.frames
     assert (train.camera.fx, train.camera.fy, train.camera.cx, train.camera.cy) == (22, 23, 7.5, 6.5)
-    assert not train.shown().any()
+    assert not train.load().shown.any()
     assert "1 of 2 photos undistorted" in capture.notes["lens"]
-    assert not torch.equal(test.load(), train.load())
+    assert not torch.equal(test.load().image, train.load().image)
 
 
 def test_the_protocols_frames_of_lego_are_found_by_number(shared_data: Path) -> None:
@@ -80,7 +80,7 @@ def test_the_protocols_frames_of_lego_are_found_by_number(shared_data: Path) -> 
         forward = camera.world_to_camera[2, :3]
         assert (-camera.center / camera.center.norm()) @ forward == pytest.approx(1, abs=1e-5)  # looking at its middle
     assert train[2].camera.fx == pytest.approx(1111.111, abs=1e-3)
-    assert (train[2].load()[0, 0] == 1).all()
+    assert (train[2].load().image[0, 0] == 1).all()
 
 
 def test_renamed_photos_of_llff_are_matched_by_order(tmp_path: Path) -> None:
@@ -163,7 +163,7 @@ def test_photos_and_points_are_those_of_the_files(layout: str, tmp_path: Path) -
     assert [frame.name for frame in capture.frames] == list(tiny.NAMES)
     assert [frame.sfm_id for frame in capture.frames] == [1, 2, 3]
     for frame in capture.frames:
-        assert torch.equal(frame.load(), photo_files.read_image(tmp_path / "images" / frame.name))
+        assert torch.equal(frame.load().image, photo_files.read_image(tmp_path / "images" / frame.name))
     points = capture.points
     assert points.means.tolist() == [list(p) for p in tiny.POINTS]
     torch.testing.assert_close(points.colors, torch.tensor([[1.0, 0.0, 0.2], [0.0, 0.4, 1.0]]))
@@ -292,8 +292,8 @@ def test_distorted_models_become_pinholes_and_are_noted(reader, model, parameter
     capture = reader.read(changed(tmp_path, lambda value: value.update(camera_model=model, k1=0.1)))
     assert capture.notes["lens"].startswith("3 of 3 photos undistorted by OpenCV")
     raw = photo_files.read_image(tmp_path / "images/a.png")
-    assert capture.frames[0].load().shape == raw.shape
-    assert not torch.equal(capture.frames[0].load(), raw)
+    assert capture.frames[0].load().image.shape == raw.shape
+    assert not torch.equal(capture.frames[0].load().image, raw)
     assert capture.frames[0].camera.fx != 20
 
 
@@ -310,5 +310,5 @@ def test_real_points_project_into_the_photos_that_observe_them(scene: str, share
         assert len(observed) > 0
         assert inside.float().mean() > 0.99
     assert cv2.imread(str(shared_data / scene / "images" / capture.frames[0].name)).shape == tuple(
-        capture.frames[0].load().shape
+        capture.frames[0].load().image.shape
     )

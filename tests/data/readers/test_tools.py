@@ -69,7 +69,7 @@ def test_masks_points_and_split_lists_are_found_by_the_same_rule(tmp_path: Path)
     capture = nerfstudio.read(root)
     assert len(capture.points.means) == 1
     assert [frame.split for frame in capture.frames] == ["train", "train", None]
-    assert not capture.frames[0].shown().any()
+    assert not capture.frames[0].load().shown.any()
 
 
 def test_two_files_that_a_name_could_mean_are_not_chosen_from(tmp_path: Path) -> None:

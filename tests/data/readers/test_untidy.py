@@ -48,7 +48,7 @@ def test_a_defect_is_refused_in_one_line_with_the_setting_that_goes_on(tmp_path,
     assert all(part in str(refusal.value) for part in message), str(refusal.value)
     capture = read(root, skip_faulty=True)
     assert [Path(frame.name).stem for frame in capture.frames] == ["a", "c"]
-    assert all(bool(frame.load().isfinite().all()) for frame in capture.frames)
+    assert all(bool(frame.load().image.isfinite().all()) for frame in capture.frames)
     assert len([record for record in caplog.records if "skipped: " in record.message and "/b" in record.message]) == 1
     assert "data.reader.skip_faulty" not in caplog.text  # it is set
 
@@ -67,7 +67,7 @@ def test_a_photo_on_its_side_is_turned_where_the_camera_is_not_that_of_the_store
     expected = captures.turn(folder / "b.png", 6, rotate=rotate)
     frame = read(root).frames[1]
     assert (frame.camera.width, frame.camera.height) == (WIDTH, HEIGHT)
-    assert torch.equal((frame.load() * 255).round().to(torch.uint8), torch.from_numpy(expected))
+    assert torch.equal((frame.load().image * 255).round().to(torch.uint8), torch.from_numpy(expected))
 
 
 @pytest.mark.parametrize("kind", GOOD)
@@ -335,7 +335,7 @@ def test_untidy_photos_that_can_be_read_are_read(of_photos, name, caplog):
     assert name != "masks among the photos" or all(frame.shown is not None for frame in capture.frames)
     assert told in caplog.text if told else "not used" not in caplog.text
     assert [frame.name for frame in capture.frames] == expected
-    assert all(bool(frame.load().isfinite().all()) for frame in capture.frames)
+    assert all(bool(frame.load().image.isfinite().all()) for frame in capture.frames)
 
 
 def test_photos_that_may_be_panoramas_are_told_with_the_command_that_cuts_them(of_photos, caplog):
@@ -391,7 +391,7 @@ def test_the_others_are_refused_in_one_line_with_the_file_and_the_remedy(of_phot
     if setting is not None:
         capture = read(**setting)
         assert len(capture.frames) == 3
-        assert all(bool(frame.load().isfinite().all()) for frame in capture.frames)
+        assert all(bool(frame.load().image.isfinite().all()) for frame in capture.frames)
 
 
 @pytest.mark.parametrize(
@@ -439,7 +439,7 @@ def test_photos_turned_by_exif_are_upright(of_photos):
     for orientation in (3, 6, 8):
         captures.write_photos(folder)
         upright = captures.turn(folder / "b.png", orientation)
-        assert torch.equal((read().frames[1].load() * 255).round().to(torch.uint8), torch.from_numpy(upright))
+        assert torch.equal((read().frames[1].load().image * 255).round().to(torch.uint8), torch.from_numpy(upright))
 
 
 def test_poses_of_the_cache_are_refused_and_taken_as_those_just_estimated(of_photos):
