@@ -13,16 +13,16 @@ EVERY: Final = 10.0  # seconds between two lines
 
 
 class Progress:
-    """Logs how much is done and how long the rest takes: first after `FIRST` seconds, then at most every `EVERY` seconds.
+    """Logs how much is done and how long the rest takes: first after `first` seconds, then at most every `EVERY` seconds.
 
     Args:
         what: the work. unit: what is counted, in the plural.
     """
 
-    def __init__(self, what: str, unit: str, total: int) -> None:
+    def __init__(self, what: str, unit: str, total: int, first: float = FIRST) -> None:
         self.what, self.unit, self.total = what, unit, total
         self._began = time.monotonic()
-        self._due, self._done = self._began + FIRST, 0
+        self._due, self._done = self._began + first, 0
 
     def __call__(self, done: int) -> None:
         """Log that `done` of `total` are done, if a line is due and `done` has grown since the last one."""

@@ -143,11 +143,6 @@ def read_header(path: Path) -> Header:
     return Header(path, stored, _orientation_of(tags), has_alpha, lossy, _focal_length(tags), lens)
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) of an image without an EXIF rotation. Reads only the header; errors as of `read_image`."""
-    return read_header(path).size(None)
-
-
 def _focal_length(tags: Mapping[int, Any]) -> float | None:
     """`Header.focal_35mm`."""
     value = tags.get(ExifTags.Base.FocalLengthIn35mmFilm, 0)

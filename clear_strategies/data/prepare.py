@@ -9,7 +9,7 @@ import itertools
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -34,7 +34,7 @@ from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, 
 from clear_strategies.errors import DataError
 from clear_strategies.geometry.cameras import centers_of
 from clear_strategies.geometry.exposure import exposure_gains
-from rasterizers.interface import Camera, Color
+from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
@@ -58,14 +58,14 @@ def prepare(
     """
     train_frames, test_frames = split(capture, views)
     frames = [*train_frames, *test_frames]
-    maker = _ViewMaker(capture, views, prior, check_headers(frames, views))
+    lr_files = check_headers(frames, views)
     require_source(cloud, capture.points)
     _check_positions(capture, [frame.camera for frame in train_frames], cloud)
     progress = Progress("photos and their SR images", "photos", len(frames))
     made, work_log = list[View](), WorkLog() if work_log is None else work_log
     with work_log.stage("photos and SR images"):
-        for frame, photo in zip(frames, photos_of(frames, views), strict=True):
-            made.append(maker.view(frame, photo, trains=len(made) < len(train_frames)))
+        for name, photo, lr in _loaded(capture, views, frames, lr_files):
+            made.append(_view(capture, views, prior, name, photo, lr, trains=len(made) < len(train_frames)))
             progress(len(made))
     train, test = tuple(made[: len(train_frames)]), tuple(made[len(train_frames) :])
     require_shown(train)
@@ -111,22 +111,14 @@ def check_headers(frames: Sequence[Frame], views: ViewSettings) -> dict[str, Pat
 def save_lr(capture: Capture, views: ViewSettings, folder: Path) -> None:
     """Write the training and test LR images as PNG for an external SR model; prior=images reads its results."""
     frames = list(itertools.chain(*split(capture, views)))
-    files = check_headers(frames, views)
-    photos = zip(frames, photos_of(frames, views), strict=True)
-    lr = ((frame.name, _lr(frame.name, photo, views, files, capture.background).image) for frame, photo in photos)
+    loaded = _loaded(capture, views, frames, check_headers(frames, views))
+    written = write_pngs(folder, ((name, lr.image) for name, _, lr in loaded))
     message = "%d LR images written to %s. Super-resolve them, then train with prior=images prior.path=<results>."
-    _log.info(message, write_pngs(folder, lr), folder)
-
-
-def photos_of(frames: Sequence[Frame], views: ViewSettings) -> Iterator[Photo]:
-    """Load the photos of these frames in order, a few at a time, at HR size, or with photos_are=lr at LR size."""
-    with ThreadPoolExecutor(min(torch.get_num_threads(), _READERS)) as pool:
-        yield from pool.map(lambda frame: _sized(frame.load(), views), frames)
-    forget_maps()
+    _log.info(message, written, folder)
 
 
 def truth_of(capture: Capture, views: ViewSettings) -> dict[str, Callable[[], Float[Tensor, "H W 3"]]]:
-    """Functions that load the photos at the size of `photos_of`, by name, for priors that use the truth."""
+    """Functions that load the photos at HR, by name, for priors that use the truth."""
 
     def truth(frame: Frame) -> Float[Tensor, "H W 3"]:
         return _sized(frame.load(), views).image
@@ -134,67 +126,69 @@ def truth_of(capture: Capture, views: ViewSettings) -> dict[str, Callable[[], Fl
     return {frame.name: partial(truth, frame) for frame in capture.frames}
 
 
-@dataclass(frozen=True, slots=True)
-class _ViewMaker:
-    """Makes the views of a capture from photos that `photos_of` loads."""
-
-    capture: Capture
-    settings: ViewSettings
-    prior: Prior
-    lr_files: Mapping[str, Path]
-
-    def view(self, frame: Frame, photo: Photo, *, trains: bool) -> View:
-        """The view of a frame, for training or for testing. Of a test view, bicubic replaces an SR image that the prior does not
-        have, and transparency is left out.
-        """
-        photo = photo if trains else replace(photo, transparency=None)
-        lr = _lr(frame.name, photo, self.settings, self.lr_files, self.capture.background)
-        factor, prior = self.settings.sr_scale, self.prior
-        hr_camera, truth = (photo.camera.scaled(factor), None) if lr is photo else (photo.camera, photo.image)
-        hr, are_both = replace(photo, shown=None), self.settings.photos_are == "both"
-        source, disagreement = "the photos themselves", None
-        if not are_both:
-            try:
-                sr = super_resolved(prior, frame.name, lr.image, factor)
-            except DataError as missing:
-                if trains:
-                    raise
-                _log.info("%s: no SR image for this test view (%s); bicubic replaces it.", frame.name, missing.problem)
-                prior = Bicubic()
-                sr = super_resolved(prior, frame.name, lr.image, factor)
-            hr = Photo(hr_camera, sr.image, transparency=self.enlarged(lr.transparency, frame.name))
-            source, disagreement = prior.label, sr.disagreement
-        view = View(
-            frame.name, lr, hr, None if are_both else truth, source, disagreement=disagreement,
-            background=self.capture.background, hr_is_photo=are_both,
-        )  # fmt: skip
-        shown = None if photo.shown is None else photo.reduced(photo.camera.width // lr.camera.width).shown
-        return view if shown is None else view.hiding(shown)
-
-    def enlarged(self, transparency: Float[Tensor, "h w"] | None, name: str) -> Float[Tensor, "H W"] | None:
-        """Enlarge transparency to HR, by the prior's network; by bicubic without a network, or if every pixel is opaque."""
-        if transparency is None:
-            return None
-        enlarge = (kept_network_of(self.prior) if bool(transparency.any()) else None) or Bicubic()
-        grey = transparency[..., None].expand(-1, -1, 3).contiguous()
-        return enlarge(name, grey, self.settings.sr_scale).mean(dim=2)
-
-
-def _lr(name: str, photo: Photo, views: ViewSettings, files: Mapping[str, Path], background: Color) -> Photo:
-    """The LR photo: the photo itself, its ready-made file, or the photo reduced.
+def _loaded(
+    capture: Capture, views: ViewSettings, frames: Sequence[Frame], lr_files: Mapping[str, Path]
+) -> Iterator[tuple[str, Photo, Photo]]:
+    """Load the photos of these frames in order, a few at a time: (name, the photo as `_sized` makes it, the LR photo).
 
     Args:
-        files: see `check_headers`.
+        lr_files: see `check_headers`.
     """
-    if views.photos_are == "lr":
-        return photo
-    camera = photo.camera.scaled(1 / views.sr_scale)
-    if name not in files:
-        return photo.resized(camera, views.downsample)
-    image = read_image(files[name], background=background, expect=(camera.width, camera.height))
-    check = f"{files[name]} shows this view, undistorted as data.save_lr writes it"
-    warn_if_far_from_lr(f"{name}: the photo", photo.image, image, views.sr_scale, check)
-    return Photo(camera, image)
+
+    def load(frame: Frame) -> tuple[str, Photo, Photo]:
+        photo = _sized(frame.load(), views)
+        if views.photos_are == "lr":
+            return frame.name, photo, photo
+        camera = photo.camera.scaled(1 / views.sr_scale)
+        if frame.name not in lr_files:
+            return frame.name, photo, replace(photo, shown=None).resized(camera, views.downsample)
+        file = lr_files[frame.name]
+        image = read_image(file, background=capture.background, expect=(camera.width, camera.height))
+        check = f"{file} shows this view, undistorted as data.save_lr writes it"
+        warn_if_far_from_lr(f"{frame.name}: the photo", photo.image, image, views.sr_scale, check)
+        return frame.name, photo, Photo(camera, image)
+
+    with ThreadPoolExecutor(min(torch.get_num_threads(), _READERS)) as pool:
+        yield from pool.map(load, frames)
+    forget_maps()
+
+
+def _view(
+    capture: Capture, views: ViewSettings, prior: Prior, name: str, photo: Photo, lr: Photo, *, trains: bool
+) -> View:
+    """The view of a photo, for training or for testing. If the prior has no SR image of a test view, bicubic replaces it."""
+    factor, are_both = views.sr_scale, views.photos_are == "both"
+    hr, truth = replace(photo, shown=None), None if lr is photo or are_both else photo.image
+    source, disagreement = "the photos themselves", None
+    if not are_both:
+        through = _enlarged(prior, lr.transparency, name, factor) if trains else None
+        try:
+            sr = super_resolved(prior, name, lr.image, factor)
+        except DataError as missing:
+            if trains:
+                raise
+            _log.info("%s: no SR image for this test view (%s); bicubic replaces it.", name, missing.problem)
+            prior = Bicubic()
+            sr = super_resolved(prior, name, lr.image, factor)
+        hr = Photo(lr.camera.scaled(factor), sr.image, transparency=through)
+        source, disagreement = prior.label, sr.disagreement
+    if not trains:  # only training needs it
+        lr, hr = replace(lr, transparency=None), replace(hr, transparency=None)
+    view = View(
+        name, lr, hr, truth, source, disagreement=disagreement, background=capture.background, hr_is_photo=are_both
+    )
+    shown = photo.reduced(photo.camera.width // lr.camera.width).shown
+    return view if shown is None else view.hiding(shown)
+
+
+def _enlarged(
+    prior: Prior, transparency: Float[Tensor, "h w"] | None, name: str, factor: int
+) -> Float[Tensor, "H W"] | None:
+    """Enlarge transparency to HR, by the prior's network; by bicubic without a network, or if every pixel is opaque."""
+    if transparency is None:
+        return None
+    enlarge = (kept_network_of(prior) if bool(transparency.any()) else None) or Bicubic()
+    return enlarge(name, transparency[..., None].expand(-1, -1, 3).contiguous(), factor).mean(dim=2)
 
 
 def _equalized(train: Sequence[View]) -> tuple[tuple[View, ...], dict[str, str]]:

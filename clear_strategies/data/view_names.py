@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.data.file_names import name_key, named, normalized
-from clear_strategies.data.photo_files import SUFFIXES, image_size, png_bytes
+from clear_strategies.data.photo_files import SUFFIXES, png_bytes, read_header
 from clear_strategies.data.photo_folders import list_images
 from clear_strategies.errors import DataError
 from clear_strategies.files import read_bytes, write_bytes
@@ -97,7 +97,7 @@ class ViewFiles:
             problem = f"would be that of two views, {other} and {name}"
             remedy = f"put the {self.what}s into subfolders like those of the photos"
             raise DataError(files[0], self.what, problem, remedy)
-        if (size := image_size(files[0])) != (width, height):
+        if (size := read_header(files[0]).size(None)) != (width, height):
             problem = f"is {size[0]}x{size[1]} where {width}x{height} is expected"
             raise DataError(files[0], "size", problem, self.resize)
         return files[0]

@@ -105,14 +105,14 @@ def test_a_photo_of_too_many_pixels_is_read_as_their_means_and_its_size_is_that(
     caplog.set_level("INFO")
     for _ in range(2):
         found = photo_files.read_image(tmp_path / "a.png")
-        assert photo_files.image_size(tmp_path / "a.png") == found.shape[1::-1] == (12, 7)
+        assert photo_files.read_header(tmp_path / "a.png").size(None) == found.shape[1::-1] == (12, 7)
     expected = torch.from_numpy(whole[:12, :22].reshape(6, 2, 11, 2, 3).mean(axis=(1, 3)))
     torch.testing.assert_close(found[:6, :11], expected, atol=1 / 255, rtol=0)
     assert caplog.messages == ["photos of 0 megapixels are read at 1/2 of their width and height."]
     assert Image.MAX_IMAGE_PIXELS == 50
     cv2.imwrite(str(tmp_path / "b.png"), pixels.astype(np.uint16))
     with pytest.raises(DataError, match=r"23x13 is more than 100 pixels: reduce it: mogrify -resize 50% .*b.png"):
-        photo_files.image_size(tmp_path / "b.png")
+        photo_files.read_header(tmp_path / "b.png").size(None)
     photo_files._reduction_factor.cache_clear()
 
 
@@ -144,7 +144,7 @@ def test_a_rotation_that_a_png_file_has_behind_its_pixels_is_known_before_they_a
     path.write_bytes(data[:first] + data[last:-12] + data[first:last] + data[-12:])  # IEND has 12 bytes
     assert photo_files.read_header(path).size(turn=True) == (12, 16)
     with pytest.raises(DataError, match="EXIF orientation: is 6"):
-        photo_files.image_size(path)
+        photo_files.read_header(path).size(None)
 
 
 def test_images_are_listed_by_name_and_ending_and_the_first_of_the_usual_folders_is_taken(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import torch
 
 import rasterizers
 from clear_strategies.commands import export, render, view
-from clear_strategies.data.photo_files import image_size, read_image
+from clear_strategies.data.photo_files import read_header, read_image
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs.saved import open_splat
@@ -134,12 +134,12 @@ def test_test_views_are_what_was_evaluated(saved_run, tmp_path):
 def test_width_sets_the_size_and_a_file_of_cameras_gives_a_picture_of_each_and_of_its_depth(saved_run, tmp_path):
     folder, _ = saved_run
     render.main([str(folder), "--path", "train", "--width", "48"])
-    assert image_size(folder / "rendered" / "view0.png") == (48, 32)
+    assert read_header(folder / "rendered" / "view0.png").size(None) == (48, 32)
     (entry, *_) = json.loads((folder / "cameras.json").read_text())
     (tmp_path / "path.json").write_text(json.dumps([{**entry, "img_name": name} for name in "ab"]))
     render.main([str(folder), "--path", str(tmp_path / "path.json"), "--depth", "--out", str(tmp_path / "out")])
     assert files(tmp_path / "out") == ["a.png", "b.png", "depth/a.png", "depth/b.png"]
-    assert image_size(tmp_path / "out" / "depth" / "b.png") == (96, 64)
+    assert read_header(tmp_path / "out" / "depth" / "b.png").size(None) == (96, 64)
 
 
 # ---- files for viewers hold the splat as it was measured; another program reads them

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from typing import Final
 
 import torch
 from jaxtyping import Float
@@ -13,6 +14,8 @@ from torch import Tensor
 from clear_strategies.core.checks import require_whole
 from clear_strategies.core.progress import Progress
 from clear_strategies.errors import SettingError
+
+_LONG: Final = 30.0  # seconds; less is told by the number of photos that are done
 
 
 def tiled(
@@ -35,7 +38,7 @@ def tiled(
     rows, columns = (_shares(size, tile, overlap) for size in (height, width))
     out = lr.new_zeros(height * factor, width * factor, 3)
     weight = lr.new_zeros(height * factor, width * factor, 1)
-    progress = Progress("super-resolution of a photo", "tiles", len(rows) * len(columns))
+    progress = Progress("super-resolution of a photo", "tiles", len(rows) * len(columns), _LONG)
     for done, (row, column) in enumerate((r, c) for r in rows for c in columns):
         (rows_in, rows_out, fade_y), (columns_in, columns_out, fade_x) = (
             _along(share, size, factor, overlap) for share, size in ((row, height), (column, width))

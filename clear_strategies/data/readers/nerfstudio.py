@@ -21,7 +21,7 @@ from clear_strategies.data.capture import BLACK, Capture, Frame, SfmPoints, lens
 from clear_strategies.data.file_names import finder, named, names_below, some
 from clear_strategies.data.lenses import FARTHEST, Lens, lens_of
 from clear_strategies.data.masks import masks_of
-from clear_strategies.data.photo_files import image_size
+from clear_strategies.data.photo_files import read_header
 from clear_strategies.data.photo_folders import image_folder, usable
 from clear_strategies.data.ply import read_points
 from clear_strategies.data.strict_json import Number, read_object, typed
@@ -125,7 +125,7 @@ def _sized(transform: Transform, find: Callable[[str], Path]) -> Transform:
     """Set a missing image size to that of the photo that the frame names."""
     if transform.w is not None and transform.h is not None:
         return transform
-    width, height = image_size(find(transform.file_path))
+    width, height = read_header(find(transform.file_path)).size(None)
     return msgspec.structs.replace(transform, w=float(width), h=float(height))
 
 
@@ -157,7 +157,7 @@ class Transform(msgspec.Struct):
     def lens(self, path: Path, where: str, image: Path) -> Lens:
         """The lens, for the size that the frame gives, else for that of its image; `path`, `where`: of the frame, for errors."""
         # With an EXIF rotation, only a given size tells that the lens is of the stored pixels.
-        actual = (0, 0) if self.w is not None and self.h is not None else image_size(image)
+        actual = (0, 0) if self.w is not None and self.h is not None else read_header(image).size(None)
         width = actual[0] if self.w is None else self.w
         height = actual[1] if self.h is None else self.h
 

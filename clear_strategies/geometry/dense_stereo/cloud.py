@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 import torch
@@ -21,6 +22,8 @@ from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
+_LISTED: Final = 12  # photos of which each coverage is told
+
 
 def stereo_cloud(
     features: PointCloud,
@@ -31,6 +34,7 @@ def stereo_cloud(
     background: Color | None = None,
     fill: bool = True,
     stride: int = STRIDE,
+    most: int | None = None,
     outlier_neighbours: int = OUTLIER_NEIGHBOURS,
     outlier_ratio: float = OUTLIER_RATIO,
 ) -> PointCloud | None:
@@ -42,6 +46,8 @@ def stereo_cloud(
         features: points of the surfaces, e.g. triangulated ones; there may be none.
         background: the colour of pixels without a surface.
         fill: add a grid of `stride` px at completed depth where a photo's depth is unknown.
+        most: of so many points no more are used. If the grids would exceed that, they are made coarser, down to a quarter of it,
+            since many photos fill the same places again. None: all are used.
         outlier_neighbours, outlier_ratio: see `without_outliers`.
     """
     if not any(depth_map.coverage > 0 for depth_map in maps):
@@ -53,9 +59,12 @@ def stereo_cloud(
         known[inside] |= depth_map.known.cpu()[row, column]
     means = torch.cat((means, features.means[~known]))
     colors = torch.cat((colors, features.colors[~known]))
-    shares = ", ".join(f"{depth_map.coverage:.0%}" for depth_map in maps)
-    uncovered = sum(depth_map.coverage == 0 for depth_map in maps)
-    source = f"{len(means):,} points of dense stereo between the {len(photos)} photos (depth known at {shares})"
+    shares = [depth_map.coverage for depth_map in maps]
+    told = ", ".join(f"{share:.0%}" for share in shares)
+    if len(shares) > _LISTED:
+        told = f"{min(shares):.0%} to {max(shares):.0%}, on average {sum(shares) / len(shares):.0%}"
+    uncovered = sum(share == 0 for share in shares)
+    source = f"{len(means):,} points of dense stereo between the {len(photos)} photos (depth known at {told})"
     if (fill or outlier_neighbours) and (packages := missing("scipy")):
         _log.warning("no outlier is removed and nothing is filled without %s: %s", packages, REMEDY)
         return PointCloud(means, colors, f"{source}, neither cleaned nor filled without {packages}")
@@ -64,7 +73,8 @@ def stereo_cloud(
     cloud = without_outliers(PointCloud(means, colors, source), outlier_neighbours, outlier_ratio)
     if not fill:
         return cloud
-    added, shades = grid_points(cloud.means, photos, stride, background, maps)
+    room = None if most is None else max(most - len(cloud), most // 4)
+    added, shades = grid_points(cloud.means, photos, stride, background, maps, room)
     source = f"{source}, filled by {len(added):,} at completed depth"
     return PointCloud(torch.cat((cloud.means, added)), torch.cat((cloud.colors, shades)), source)
 

@@ -71,17 +71,19 @@ def cost_volume(
     volume = photo.image.new_empty(height, width, len(inverse_depths))
     image = photo.image.contiguous()
     mean, deviation = (moment[0] for moment in _moments(image[None], window))
-    swept = [_Swept(photo, other) for other in others]
+    swept = []
+    for other in others:
+        rotated, shift = photo.towards(other)
+        swept.append((rotated.permute(2, 0, 1).contiguous(), shift, other.image.contiguous()))
     if native.runs(image):
         native.module().cost_volume(
-            image, mean, deviation, [(s.rotated, s.shift, s.image) for s in swept], inverse_depths, window,
-            _VARIANCE_FLOOR, volume, threads(),
+            image, mean, deviation, swept, inverse_depths, window, _VARIANCE_FLOOR, volume, threads()
         )  # fmt: skip
         return volume
 
-    def cost(other: _Swept, planes: slice) -> Float[Tensor, "P H W"]:
+    def cost(other: tuple[Tensor, Tensor, Tensor], planes: slice) -> Float[Tensor, "P H W"]:
         """From the correlation with the windows of the other photo warped by each plane; unseen ones correlate with 0."""
-        drawn, seen = other.through(inverse_depths[planes])
+        drawn, seen = _warped(*other, inverse_depths[planes])
         mean_drawn, deviation_drawn = _moments(drawn, window)
         covariance = box_mean(image * drawn, window) - mean * mean_drawn
         correlation = torch.where(seen, covariance, 0.0) / (deviation_drawn * deviation)
@@ -108,28 +110,25 @@ def mean_of_lowest(values: Iterator[Tensor], count: int) -> Tensor:
     return mean
 
 
-class _Swept:
-    """Another photo, drawn onto the pixels of the photo through planes."""
+def _warped(
+    rotated: Float[Tensor, "3 H W"],
+    shift: Float[Tensor, " 3"],
+    image: Float[Tensor, "h w"],
+    planes: Float[Tensor, " P"],
+) -> tuple[Float[Tensor, "P H W"], Bool[Tensor, "P H W"]]:
+    """(another photo's image, warped by each plane, True where the pixel lies inside it).
 
-    def __init__(self, photo: Grey, other: Grey) -> None:
-        rotated, self.shift = photo.towards(other)
-        self.rotated = rotated.permute(2, 0, 1).contiguous()
-        self.image = other.image.contiguous()
-
-    def through(self, inverse_depths: Float[Tensor, " P"]) -> tuple[Float[Tensor, "P H W"], Bool[Tensor, "P H W"]]:
-        """(the other photo warped by each plane, True where the pixel lies inside it).
-
-        A pixel's point at inverse depth d projects to K' (R K⁻¹ x + d t), up to its third coordinate.
-        """
-        x, y, z = (self.rotated[k] + self.shift[k] * inverse_depths[:, None, None] for k in range(3))
-        height, width = self.image.shape
-        # grid_sample's coordinates: -1 and 1 are the outer borders of the image.
-        u, v = x.div_(z * (width / 2)).sub_(1), y.div_(z * (height / 2)).sub_(1)
-        seen = (z > 0) & (torch.maximum(u.abs(), v.abs()) < 1)
-        grid = torch.view_as_real(torch.complex(u, v))  # a stack in a tenth of the time
-        images = self.image.expand(len(inverse_depths), 1, height, width)
-        drawn = torch.nn.functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
-        return drawn[:, 0], seen
+    A pixel's point at inverse depth d projects to K' (R K⁻¹ x + d t), up to its third coordinate, see `Grey.towards`.
+    """
+    x, y, z = (rotated[k] + shift[k] * planes[:, None, None] for k in range(3))
+    height, width = image.shape
+    # grid_sample's coordinates: -1 and 1 are the outer borders of the image.
+    u, v = x.div_(z * (width / 2)).sub_(1), y.div_(z * (height / 2)).sub_(1)
+    seen = (z > 0) & (torch.maximum(u.abs(), v.abs()) < 1)
+    grid = torch.view_as_real(torch.complex(u, v))  # a stack in a tenth of the time
+    images = image.expand(len(planes), 1, height, width)
+    drawn = torch.nn.functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
+    return drawn[:, 0], seen
 
 
 def _moments(images: Float[Tensor, "P H W"], window: int) -> tuple[Float[Tensor, "P H W"], Float[Tensor, "P H W"]]:
