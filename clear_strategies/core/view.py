@@ -47,9 +47,11 @@ class Photo:
                 raise ValueError(f"{name} must be {shape[:2]}, one value for each pixel, got {tuple(layer.shape)}.")
 
     @property
-    def shows_something(self) -> bool:
-        """True if its mask leaves a pixel."""
-        return self.shown is None or bool(self.shown.any())
+    def visible(self) -> Bool[Tensor, "H W"]:
+        """`shown`, or True everywhere without a mask."""
+        if self.shown is not None:
+            return self.shown
+        return torch.ones(self.image.shape[:2], dtype=torch.bool, device=self.image.device)
 
     def to(self, device: torch.device | str) -> Photo:
         """The same photo with its image on `device`. The camera stays on the CPU, where kernels read its numbers."""

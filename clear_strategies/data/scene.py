@@ -64,8 +64,7 @@ def require_shown(views: Sequence[View]) -> None:
     Raises:
         DataError: nearly all photos are hidden completely.
     """
-    shown = {view.name: _shown_share(view.lr) for view in views}
-    empty = [name for name, share in shown.items() if share < _NOTHING]
+    empty = [view.name for view in views if _shown_share(view.lr) < _NOTHING]
     why = "their masks hide every pixel, or their alpha is 0"
     if len(empty) > _NEARLY_ALL * len(views):
         problem = f"show nothing of {len(empty)} of {len(views)} photos: {some(empty)}"
@@ -83,7 +82,7 @@ def require_shown(views: Sequence[View]) -> None:
 
 def _shown_share(photo: Photo) -> float:
     """The share of its pixels that a photo shows."""
-    shown = torch.ones(photo.image.shape[:2], dtype=torch.bool) if photo.shown is None else photo.shown.cpu()
+    shown = photo.visible
     if photo.transparency is not None:
-        shown = shown & (photo.transparency.cpu() < 1 - _FAINT)
+        shown = shown & (photo.transparency < 1 - _FAINT)
     return float(shown.float().mean())

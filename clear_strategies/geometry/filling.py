@@ -110,7 +110,7 @@ def _pixels_to_fill(
     """The grid's shown pixels of unknown depth that are not of the background's colour, and their colours."""
     grid = pixel_grid(photo, stride)
     x, y = grid.long().unbind(dim=1)
-    wanted = torch.ones(photo.image.shape[:2], dtype=torch.bool) if photo.shown is None else photo.shown.cpu()
+    wanted = photo.visible.cpu()
     if depth_map is not None:
         wanted = wanted & ~depth_map.known.cpu()
     grid = grid[wanted[y, x]]

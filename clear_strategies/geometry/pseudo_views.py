@@ -8,7 +8,7 @@ wider field: its photo is known, the border around it is not. `clear_strategies.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Final, NamedTuple
 
@@ -25,14 +25,6 @@ from rasterizers.interface import Camera, Color
 
 _SOURCES: Final = 4  # the nearest photos that a pseudo view is warped from
 _NEIGHBOURS: Final = 3  # least number of known pixels in a pixel's 3 × 3 window; with fewer, it is an outlier
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PseudoView:
-    """A synthesized photo: its camera and its colours, 0 where they are unknown."""
-
-    photo: Photo
-    known: Bool[Tensor, "h w"]
 
 
 class _Source(NamedTuple):
@@ -58,8 +50,10 @@ def pseudo_views(
     max_pixels: int,
     background: Color,
     seed: int,
-) -> list[Callable[[], PseudoView]]:
+) -> list[Callable[[], Photo]]:
     """Return functions that make `count` pseudo views of the training cameras in turn; none if fewer than two photos have depth.
+
+    Pixels whose colour is unknown are black and not `shown`.
 
     Args:
         photos, depths: by the photos' names, on one device, where the pseudo views are made.
@@ -76,7 +70,7 @@ def pseudo_views(
     if len(sources) < 2:
         return []
     generator = torch.Generator().manual_seed(seed)
-    views = list[Callable[[], PseudoView]]()
+    views = list[Callable[[], Photo]]()
     for i in range(count):
         source = sources[i % len(sources)]
         camera = moved_aside(source.photo.camera, source.median, reach, generator)
@@ -84,31 +78,28 @@ def pseudo_views(
     return views
 
 
-def border_view(photo: Photo, *, field: float, max_pixels: int) -> PseudoView:
-    """Place the photo, reduced to at most `max_pixels`, in the middle of an image `field` times as wide and as high."""
+def border_view(photo: Photo, *, field: float, max_pixels: int) -> Photo:
+    """Place the photo, reduced to at most `max_pixels`, in the middle of an image `field` times as wide and as high, of which
+    the rest is not `shown`.
+    """
     photo = photo.reduced(photo.factor_to(max_pixels))
     c = photo.camera
     x, y = (round(n * (field - 1) / 2) for n in (c.width, c.height))
     wide = replace(c, cx=c.cx + x, cy=c.cy + y, width=c.width + 2 * x, height=c.height + 2 * y)
-    known = torch.zeros(wide.height, wide.width, dtype=torch.bool, device=photo.image.device)
-    known[y : y + c.height, x : x + c.width] = True if photo.shown is None else photo.shown
-    image = F.pad(photo.image, (0, 0, x, x, y, y))
     through = None if photo.transparency is None else F.pad(photo.transparency, (x, x, y, y))
-    return PseudoView(Photo(wide, image, transparency=through), known)
+    return Photo(wide, F.pad(photo.image, (0, 0, x, x, y, y)), F.pad(photo.visible, (x, x, y, y)), through)
 
 
 def _source(photo: Photo, depth_map: DepthMap, background: Color) -> _Source:
     """Make a source. The colours beside the background, or beside what a mask hides, are mixed with it, and not used."""
     known, depth = depth_map.known, torch.nan_to_num(depth_map.depth)
     points = _behind(photo.camera, depth)[:, known.flatten()]
-    apart = is_background(photo.image, background)
-    if photo.shown is not None:
-        apart |= ~photo.shown
+    apart = is_background(photo.image, background) | ~photo.visible
     mixed = F.max_pool2d(apart[None, None].float(), 3, 1, 1)[0, 0] > 0
     return _Source(photo, points, torch.where(known & ~mixed, depth, 0.0), float(depth[known].median()))
 
 
-def _warped(camera: Camera, sources: Sequence[_Source], tolerance: float) -> PseudoView:
+def _warped(camera: Camera, sources: Sequence[_Source], tolerance: float) -> Photo:
     away = torch.stack([torch.linalg.vector_norm(s.photo.camera.center - camera.center) for s in sources])
     nearest = [sources[i] for i in away.argsort()[:_SOURCES].tolist()]
     depth = _front(camera, nearest)
@@ -124,7 +115,7 @@ def _warped(camera: Camera, sources: Sequence[_Source], tolerance: float) -> Pse
     known &= (weight > 0).reshape(known.shape)
     around = 9 * F.avg_pool2d(known[None, None].float(), 3, 1, 1)[0, 0]
     known &= around >= _NEIGHBOURS - 0.5
-    return PseudoView(Photo(camera, torch.where(known, image, 0.0).permute(1, 2, 0).contiguous()), known)
+    return Photo(camera, torch.where(known, image, 0.0).permute(1, 2, 0).contiguous(), known)
 
 
 def _front(camera: Camera, sources: Sequence[_Source]) -> Float[Tensor, "h w"]:

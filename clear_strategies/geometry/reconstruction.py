@@ -140,7 +140,7 @@ def _unhidden(points: Float[Tensor, "N 3"], photos: Sequence[Photo]) -> Bool[Ten
     shown, hidden = torch.zeros(len(points), dtype=torch.bool), torch.zeros(len(points), dtype=torch.bool)
     for photo in photos:
         inside, row, column, _ = seen_pixels(photo.camera, points)
-        visible = torch.ones_like(row, dtype=torch.bool) if photo.shown is None else photo.shown.cpu()[row, column]
+        visible = photo.visible.cpu()[row, column]
         shown[inside] |= visible
         hidden[inside] |= ~visible
     return shown | ~hidden

@@ -157,8 +157,8 @@ def evaluate(
     """
     renders: dict[str, Tensor] = {}
     test, train = Table(), Table()
-    of_test = [view for view in scene.test if view.lr.shows_something]
-    of_train = spaced([view for view in scene.train if view.lr.shows_something], MOST_TRAIN)
+    of_test = [view for view in scene.test if view.lr.visible.any()]
+    of_train = spaced([view for view in scene.train if view.lr.visible.any()], MOST_TRAIN)
     kept = {view.name for view in of_test or spaced(of_train, TRAIN_RENDERS)}
     with ThreadPoolExecutor(n := threads()) as scorers:
         done = Progress("scores", "views", len(of_test) + len(of_train))

@@ -21,7 +21,7 @@ from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.seeds import generator_at, one_of
 from clear_strategies.core.view import DepthMap, ExtraView, Photo, View
 from clear_strategies.geometry.photos import cut_out
-from clear_strategies.geometry.pseudo_views import PseudoView, border_view, continued, pseudo_views
+from clear_strategies.geometry.pseudo_views import border_view, continued, pseudo_views
 from clear_strategies.strategies.base import Strategy
 from rasterizers.interface import Color
 
@@ -99,7 +99,7 @@ class PseudoViews(Strategy):
             borders=tuple(cache(partial(self._target, make, background)) for make in borders),
         )
 
-    def _moved_aside(self, views: Sequence[View], photos: dict[str, Photo]) -> list[Callable[[], PseudoView]]:
+    def _moved_aside(self, views: Sequence[View], photos: dict[str, Photo]) -> list[Callable[[], Photo]]:
         if len(photos) < 2:
             return []
         return pseudo_views(
@@ -117,11 +117,12 @@ class PseudoViews(Strategy):
         """The pixels of the largest photo, reduced to `max_pixels`."""
         return max(p.camera.width * p.camera.height // p.factor_to(self.max_pixels) ** 2 for p in photos.values())
 
-    def _target(self, make: Callable[[], PseudoView], background: Color) -> ExtraView:
-        view = make()
-        weight = torch.where(view.known, 1.0, self.continued if bool(view.known.any()) else 0.0) * self.weight
-        image = continued(view.photo.image, view.known) if self.continued > 0 else view.photo.image
-        return ExtraView(replace(view.photo, image=image), weight, background)
+    def _target(self, make: Callable[[], Photo], background: Color) -> ExtraView:
+        photo = make()
+        known = photo.visible
+        weight = torch.where(known, 1.0, self.continued if bool(known.any()) else 0.0) * self.weight
+        image = continued(photo.image, known) if self.continued > 0 else photo.image
+        return ExtraView(replace(photo, image=image, shown=None), weight, background)
 
     def extra_views(self, t: int) -> Sequence[ExtraView]:
         """One view every `every` iterations, a function of (seed, t)."""

@@ -26,7 +26,7 @@ def evaluate(state: TrainState, scene: Scene, rasterizer: Rasterizer, done: int)
         values = [
             psnr_of(state.field.render(rasterizer, view.hr.camera), truth, view.hr.shown)
             for view in scene.test[: state.settings.probe_views]
-            if (truth := view.true_hr) is not None and view.lr.shows_something
+            if (truth := view.true_hr) is not None and view.lr.visible.any()
         ]
         if values:
             state.history[-1]["psnr_test"] = sum(deferred.read(values)) / len(values)

@@ -68,15 +68,10 @@ def load_demo(width: int = 256, height: int = 192, device: torch.device | str = 
         torch.stack([images.downsample(frame.load().image, _FACTOR) for frame in trained]).to(device),
         torch.stack([frame.camera.world_to_camera.float() for frame in trained]).to(device),
         torch.stack([intrinsics(frame.camera.scaled(1 / _FACTOR)).float() for frame in trained]).to(device),
-        DemoPrior(truth={frame.name: frame.load for frame in trained}),
+        DemoPrior(truth={frame.name: lambda frame=frame: frame.load().image for frame in trained}),  # type: ignore[misc]
         [
-            (
-                f.camera.world_to_camera.float().to(device),
-                intrinsics(f.camera).float().to(device),
-                f.load().image.to(device),
-            )
-            for f in frames
-            if f.split == "test"
+            (c.world_to_camera.float().to(device), intrinsics(c).float().to(device), image.to(device))
+            for c, image in ((f.camera, f.load().image) for f in frames if f.split == "test")
         ],
     )
 

@@ -8,7 +8,7 @@ import torch
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.cameras import moved_aside
 from clear_strategies.geometry.projection import back_project, project, sample_colors
-from clear_strategies.geometry.pseudo_views import PseudoView, border_view, continued, pseudo_views
+from clear_strategies.geometry.pseudo_views import border_view, continued, pseudo_views
 from tests.helpers import planes
 from tests.helpers.image_files import noise
 from tests.helpers.planes import depth_of
@@ -20,7 +20,7 @@ def plane(count: int = 3) -> dict[str, Photo]:
     return {f"{i}.png": photo for i, photo in enumerate(planes.plane_photos(count))}
 
 
-def views_of(photos: dict[str, Photo], depths: dict[str, DepthMap] | None = None, **settings) -> list[PseudoView]:
+def views_of(photos: dict[str, Photo], depths: dict[str, DepthMap] | None = None, **settings) -> list[Photo]:
     if depths is None:
         depths = {name: depth_of(photo, DEPTH) for name, photo in photos.items()}
     chosen = {"count": 6, "reach": 0.2, "tolerance": 0.02, "max_pixels": 10**6, "background": (0.0,) * 3, "seed": 0}
@@ -49,9 +49,9 @@ def test_a_plane_is_seen_as_its_photos_show_it():
     views = views_of(photos)
     assert len(views) == 6
     for view in views:
-        assert view.known.float().mean() > 0.5
-        camera = view.photo.camera
-        rays = torch.nonzero(view.known)
+        assert view.shown.float().mean() > 0.5
+        camera = view.camera
+        rays = torch.nonzero(view.shown)
         pixels = rays.flip(1).double() + 0.5
         near, far = (back_project(camera, pixels, torch.full((len(pixels),), z).double()).double() for z in (1.0, 2.0))
         on_plane = near + (far - near) * ((DEPTH - near[:, 2]) / (far - near)[:, 2])[:, None]
@@ -59,7 +59,7 @@ def test_a_plane_is_seen_as_its_photos_show_it():
         inside = torch.stack(
             [((xy := project(p.camera, on_plane)[0]) > 1).all(1) & (xy < torch.tensor([119, 89])).all(1) for p in photos.values()]
         )  # fmt: skip
-        error = torch.where(inside, (expected - view.photo.image[view.known]).abs().amax(-1), torch.inf).amin(0)
+        error = torch.where(inside, (expected - view.image[view.shown]).abs().amax(-1), torch.inf).amin(0)
         assert error[inside.any(0)].median() < 0.02
 
 
@@ -68,9 +68,9 @@ def test_without_two_photos_with_depth_there_are_none_and_large_ones_are_reduced
     one = {"0.png": depth_of(photos["0.png"], DEPTH), "1.png": depth_of(photos["1.png"], torch.nan)}
     assert views_of(photos, one) == views_of(photos, {}) == []
     view = views_of(plane(), max_pixels=3_000)[0]
-    camera = view.photo.camera
+    camera = view.camera
     assert (camera.width, camera.height, camera.fx) == (60, 45, 50.0)
-    assert view.known.float().mean() > 0.5
+    assert view.shown.float().mean() > 0.5
 
 
 def test_a_depth_that_no_photo_vouches_for_and_pixels_beside_the_background_or_a_mask_give_no_colour():
@@ -78,21 +78,21 @@ def test_a_depth_that_no_photo_vouches_for_and_pixels_beside_the_background_or_a
     apart = {"0.png": depth_of(photos["0.png"], 4.0), "1.png": depth_of(photos["1.png"], 2.0)}
     view = views_of(photos, apart, reach=1e-6)[0]
     # Seen from camera 0, the nearer surface of photo 1 hides that of photo 0, which does not confirm it.
-    row, column = torch.nonzero(view.known).unbind(1)
+    row, column = torch.nonzero(view.shown).unbind(1)
     centers, depth = torch.stack((column, row), 1).double() + 0.5, torch.full((len(row),), 2.0).double()
-    pixels, _ = project(photos["1.png"].camera, back_project(view.photo.camera, centers, depth))
-    error = (sample_colors(photos["1.png"], pixels) - view.photo.image[row, column]).abs().amax(1)
+    pixels, _ = project(photos["1.png"].camera, back_project(view.camera, centers, depth))
+    error = (sample_colors(photos["1.png"], pixels) - view.image[row, column]).abs().amax(1)
     hidden = (pixels[:, 0] > 2) & (pixels[:, 0] < 118)
     assert hidden.any()
     assert error[hidden].median() < 0.02
     right = torch.arange(120)[None, :, None] >= 60
     white = {name: Photo(p.camera, torch.where(right, 1.0, p.image)) for name, p in plane(2).items()}
-    known, on_black = (views_of(white, reach=1e-6, background=color)[0].known for color in ((1.0,) * 3, (0.0,) * 3))
+    known, on_black = (views_of(white, reach=1e-6, background=color)[0].shown for color in ((1.0,) * 3, (0.0,) * 3))
     assert not known[:, 71:].any()  # photo 1 stands 10 px aside and shows the surface up to there
     assert known[:, 5:45].float().mean() > 0.9
     assert on_black[5:-5, 65:110].all()
     masked = {name: replace(p, shown=~right[..., 0].expand(90, 120)) for name, p in white.items()}
-    assert torch.equal(views_of(masked, reach=1e-6)[0].known, known)
+    assert torch.equal(views_of(masked, reach=1e-6)[0].shown, known)
 
 
 @pytest.mark.parametrize("max_pixels", [10**6, 3_000])
@@ -100,17 +100,17 @@ def test_a_border_view_shows_its_photo_in_the_middle_of_a_wider_field(max_pixels
     photo = planes.plane_photos(1)[0]
     photo = replace(photo, transparency=torch.rand(photo.image.shape[:2], generator=torch.Generator().manual_seed(0)))
     wide = border_view(photo, field=1.3, max_pixels=max_pixels)
-    c, (column, row) = wide.photo.camera, (int(wide.known.any(0).sum()), int(wide.known.any(1).sum()))
+    c, (column, row) = wide.camera, (int(wide.shown.any(0).sum()), int(wide.shown.any(1).sum()))
     assert (c.width, c.height) == (pytest.approx(1.3 * column, abs=2), pytest.approx(1.3 * row, abs=2))
-    assert bool(wide.known.sum() == column * row)
+    assert bool(wide.shown.sum() == column * row)
     if max_pixels == 10**6:
-        assert torch.equal(wide.photo.image[wide.known], photo.image.reshape(-1, 3))
-        assert torch.equal(wide.photo.transparency[wide.known], photo.transparency.flatten())
-    assert not wide.photo.image[~wide.known].any()
-    assert not wide.photo.transparency[~wide.known].any()
+        assert torch.equal(wide.image[wide.shown], photo.image.reshape(-1, 3))
+        assert torch.equal(wide.transparency[wide.shown], photo.transparency.flatten())
+    assert not wide.image[~wide.shown].any()
+    assert not wide.transparency[~wide.shown].any()
     point = torch.tensor([[0.3, -0.2, DEPTH]], dtype=torch.float64)
     (in_wide,), (in_photo,) = (project(camera, point)[0] for camera in (c, photo.camera))
-    y, x = (int(axis.nonzero()[0]) for axis in (wide.known.any(1), wide.known.any(0)))
+    y, x = (int(axis.nonzero()[0]) for axis in (wide.shown.any(1), wide.shown.any(0)))
     scale = column / photo.camera.width
     assert in_wide.tolist() == pytest.approx((in_photo * scale + torch.tensor([x, y])).tolist(), abs=1e-4)
 

@@ -91,4 +91,4 @@ def test_hidden_pixels_have_no_depth_give_no_points_and_the_border_continues_ove
         assert depth.known[:, 85:].any()
     photo = replace(planes.photo(), shown=torch.arange(40).expand(40, 40) > 10)
     wide = border_view(photo, field=1.5, max_pixels=10_000)
-    assert torch.equal(wide.known[10:50, 10:50], photo.shown)
+    assert torch.equal(wide.shown[10:50, 10:50], photo.shown)

@@ -66,8 +66,7 @@ def depth_maps(
         good &= (estimate.correlation >= settings.min_correlation) & (agreeing > 0)
         if background is not None:
             good &= ~is_background(photo.image, background)
-        if photo.shown is not None:
-            good &= photo.shown
+        good &= photo.visible
         confidence = estimate.correlation.clamp(0, 1) * (agreeing.float() / 2).clamp(max=1)
         depth = torch.where(good, 1 / inverse_depth, torch.nan)
         good &= ~speckles(depth, settings.speckle, _LIKE)

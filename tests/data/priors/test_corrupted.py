@@ -72,7 +72,7 @@ def frames():
 
 
 def prior(**settings: float) -> DemoPrior:
-    return DemoPrior({f.name: f.load for f in frames()}, patch=32, **settings)  # type: ignore[arg-type]
+    return DemoPrior({f.name: lambda f=f: f.load().image for f in frames()}, patch=32, **settings)  # type: ignore[arg-type]
 
 
 def lr_of(i: int) -> tuple[str, Tensor, Tensor]:

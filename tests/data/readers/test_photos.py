@@ -17,6 +17,7 @@ from PIL import ExifTags, Image, ImageFilter
 
 from clear_strategies import files
 from clear_strategies.core.images import to_bytes
+from clear_strategies.data.photo_files import Header
 from clear_strategies.data.readers import colmap, demo, photos, sfm
 from clear_strategies.data.readers.sfm import SfmSettings
 from clear_strategies.errors import DataError
@@ -265,7 +266,8 @@ class FakeModel:
 def estimate(tmp_path, monkeypatch):
     """Estimates the poses of ten photos, with a function in place of COLMAP's pipeline."""
     monkeypatch.setattr(sfm, "_unplaced", lambda *_: {})
-    photos = dict.fromkeys(tmp_path / f"{i}.jpg" for i in range(10))
+    paths = [tmp_path / f"{i}.jpg" for i in range(10)]
+    photos = {path: Header(path, (4, 3), 1, has_alpha=False, lossy=True, focal_35mm=None, lens=()) for path in paths}
 
     def run(mapping):
         monkeypatch.setattr(sfm, "_models", mapping)

@@ -135,9 +135,9 @@ def test_the_masks_it_names_hide_their_black_pixels_and_are_undistorted_with_the
     write_png(tmp_path / "m.png", mask)
     for lens in ({}, {"camera_model": "OPENCV", "k1": 0.05}):
         named = changed(tmp_path, lambda v, lens=lens: v["frames"][0].update(mask_path="m.png", **lens))
-        shown = [frame.shown for frame in nerfstudio.read(named).frames]
+        shown = [frame.load().shown for frame in nerfstudio.read(named).frames]
         assert sum(s is not None for s in shown) == 1
-        found = next(s for s in shown if s is not None)()
+        found = next(s for s in shown if s is not None)
         assert found.shape == (12, 16)
         assert not found[:, :3].any()
         assert found[:, 6:].all()
@@ -227,8 +227,8 @@ def test_photos_may_all_lie_in_subfolders_with_masks_in_subfolders_of_the_same_n
     capture = colmap.read(tmp_path)
     assert [frame.name for frame in capture.frames] == ["cam_a/1.png", "cam_b/1.png", "cam_c/1.png"]
     assert capture.notes["without pose"] == "1 photo, not used: cam_d/1.png"
-    a, b, c = (frame.shown for frame in capture.frames)
-    assert (bool(a().any()), bool(b().all()), c) == (False, True, None)
+    a, b, c = (frame.load().shown for frame in capture.frames)
+    assert (bool(a.any()), bool(b.all()), c) == (False, True, None)
 
 
 def test_a_missing_file_of_points_and_a_quaternion_of_another_length_are_noted(tmp_path: Path) -> None:

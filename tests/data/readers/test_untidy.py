@@ -200,7 +200,7 @@ def test_names_are_the_same_whether_their_letters_are_composed_or_not(kind: str,
         shutil.copy(decomposed, tmp_path / "sr")
     frames = READERS[kind](root).frames
     assert sorted(Path(frame.name).stem for frame in frames) == ["éa", "éb", "éc"]
-    assert all(frame.shown is not None for frame in frames)
+    assert all(frame.load().shown is not None for frame in frames)
     files = ViewFiles(tmp_path / "sr", "SR image", "", "")
     assert all(files.file(frame.name, WIDTH, HEIGHT).is_file() for frame in frames)
     names = [frame.name for frame in frames]
@@ -332,7 +332,7 @@ def test_untidy_photos_that_can_be_read_are_read(of_photos, name, caplog):
     make(folder)
     with caplog.at_level("INFO"):
         capture = read()
-    assert name != "masks among the photos" or all(frame.shown is not None for frame in capture.frames)
+    assert name != "masks among the photos" or all(frame.load().shown is not None for frame in capture.frames)
     assert told in caplog.text if told else "not used" not in caplog.text
     assert [frame.name for frame in capture.frames] == expected
     assert all(bool(frame.load().image.isfinite().all()) for frame in capture.frames)
