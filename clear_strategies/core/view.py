@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -55,9 +56,12 @@ class Photo:
 
     def to(self, device: torch.device | str) -> Photo:
         """The same photo with its image on `device`. The camera stays on the CPU, where kernels read its numbers."""
-        layers = (self.shown, self.transparency)
-        shown, transparency = (None if layer is None else layer.to(device) for layer in layers)
-        return replace(self, image=self.image.to(device), shown=shown, transparency=transparency)
+        return self._with(self.camera, lambda layer: layer.to(device))
+
+    def _with(self, camera: Camera, change: Callable[[Tensor], Tensor]) -> Photo:
+        """The photo with the same change of image, mask and transparency, as far as it has them."""
+        layers = (None if x is None else change(x) for x in (self.shown, self.transparency))
+        return Photo(camera, change(self.image), *layers)
 
     def over(self, color: Color | None, background: Color) -> Photo:
         """The photo composited over `color` instead of `background`, and then opaque; itself if `color` is None."""
@@ -74,10 +78,7 @@ class Photo:
     def cropped(self, multiple: int) -> Photo:
         """Without rows at the bottom and columns at the right, so that `multiple` divides both sizes."""
         height, width = (size - size % multiple for size in self.image.shape[:2])
-        image, shown, through = (
-            None if x is None else x[:height, :width] for x in (self.image, self.shown, self.transparency)
-        )
-        return Photo(replace(self.camera, width=width, height=height), image, shown, through)
+        return self._with(replace(self.camera, width=width, height=height), lambda layer: layer[:height, :width])
 
     def resized(self, camera: Camera, kernel: DownKernel, layers: DownKernel | None = None) -> Photo:
         """The photo at the size of `camera`, which sees the same, by the operator D. A pixel is shown if its whole area is.

@@ -18,6 +18,7 @@ from omegaconf import DictConfig
 from clear_strategies import files, signals
 from clear_strategies.compose import tree
 from clear_strategies.core.images import to_bytes
+from clear_strategies.data.prepare import save_lr
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DataError
 from clear_strategies.jobs import device, exit_codes, resume
@@ -110,7 +111,7 @@ class _Job:
         choices = plan.describe_choices(self.chosen, self.conductor, source, asked.iterations, asked.seed)
         _log.log(level, "%s", choices)
         if settings.data.save_lr is not None:
-            scenes.write_lr(settings.data, Path(settings.data.save_lr))
+            save_lr(*scenes.read(settings.data, None), Path(settings.data.save_lr))
             return None
         scene = load()
         if few := scene.notes.get(scenes.FEW_PLACED):

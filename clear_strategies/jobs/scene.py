@@ -6,14 +6,13 @@ import functools
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, Final, cast
 
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.capture import MORE_PHOTOS, Capture
 from clear_strategies.data.cloud import CloudSettings
 from clear_strategies.data.file_names import require_text
-from clear_strategies.data.prepare import prepare, save_lr, truth_of
+from clear_strategies.data.prepare import prepare, truth_of
 from clear_strategies.data.priors import Bicubic, Ncnn, Prior, cached, network_of
 from clear_strategies.data.priors.ncnn import factors, missing_packages
 from clear_strategies.data.scene import Scene
@@ -112,16 +111,11 @@ def load(
     return scene
 
 
-def write_lr(data: DataSettings, folder: Path) -> None:
-    """Read the data set and write its LR images, see `data.save_lr`; they have the sizes that prior=images trains on."""
-    save_lr(*read(data, None), folder)
-
-
 def read(data: DataSettings, prior: PriorSettings | None) -> tuple[Capture, ViewSettings]:
     """Read the capture, and fit it and the settings of its views into the limit of the HR images' size.
 
     Args:
-        prior: None: images of another program.
+        prior: None: images of another program, which super-resolves what `save_lr` writes.
     """
     capture = data.reader()
     require_text((capture.name, *(frame.name for frame in capture.frames), *capture.unplaced))

@@ -7,7 +7,7 @@ with anti-aliasing from exact poses. The capture has a synthetic prior of its ow
 from __future__ import annotations
 
 import math
-from functools import cache, lru_cache, partial
+from functools import cache, lru_cache
 from threading import Lock
 from typing import Final
 
@@ -75,7 +75,7 @@ def read(*, width: int = 256, height: int = 192, views: int = 12, train: int = 3
     frames = []
     for i in range(views):
         camera = _camera(2 * i / (views - 1) - 1, width, height)
-        load = lru_cache(maxsize=1)(partial(_photo, camera))
+        load = lru_cache(maxsize=1)(lambda camera=camera: Photo(camera, render(camera)))
         frames.append(Frame(f"demo_{i:02d}", camera, load, split="train" if i in chosen else "test"))
     notes = {"poses": "exact", "scene": "procedural room, photographs from scikit-image"}
     return Capture("demo", tuple(frames), notes=notes, own_prior=DemoPrior)
@@ -93,10 +93,6 @@ def render(camera: Camera) -> Float[Tensor, "H W 3"]:
         colors = _cast(rays).reshape(-1, _RAYS, camera.width, _RAYS, 3)
         bands.append(colors.mean(axis=(1, 3)))
     return images.quantize(torch.from_numpy(np.concatenate(bands)).clamp(0, 1))
-
-
-def _photo(camera: Camera) -> Photo:
-    return Photo(camera, render(camera))
 
 
 def _camera(position: float, width: int, height: int) -> Camera:
