@@ -74,7 +74,7 @@ def grid_points(
             known depth. None: no depth is known.
         most: `stride` is multiplied by a whole number, so that there are no more points than about this. None: any number.
     """
-    each_map = [None] * len(photos) if maps is None else maps
+    each_map: Sequence[DepthMap | None] = [None] * len(photos) if maps is None else maps
     step = stride
     if most is not None:
         every = zip(photos, each_map, strict=True)

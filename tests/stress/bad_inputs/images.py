@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from clear_strategies.data.photo_files import image_size, read_image
+from clear_strategies.data.photo_files import read_header, read_image
 from tests.stress.bad_inputs import BadInput, a_device, at, bomb
 
 
@@ -52,7 +52,7 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
         at("a.png", read_image, Path.mkdir),
         r"a.png: file: cannot be read \(Is a directory\): check the file",
     ),
-    "a pipe": (at("a.png", image_size, os.mkfifo), "a.png: file: is a pipe, a device or a socket"),
+    "a pipe": (at("a.png", read_header, os.mkfifo), "a.png: file: is a pipe, a device or a socket"),
     "a device": (at("a.png", read_image, a_device), "a.png: file: is a pipe, a device or a socket"),
     "empty": (_read(b""), _UNREADABLE),
     "text": (_read(b"not a picture\n" * 9), _UNREADABLE),
