@@ -60,8 +60,8 @@ class Photo:
 
     def _with(self, camera: Camera, change: Callable[[Tensor], Tensor]) -> Photo:
         """The photo with the same change of image, mask and transparency, as far as it has them."""
-        layers = (None if x is None else change(x) for x in (self.shown, self.transparency))
-        return Photo(camera, change(self.image), *layers)
+        shown, transparency = (None if x is None else change(x) for x in (self.shown, self.transparency))
+        return Photo(camera, change(self.image), shown, transparency)
 
     def over(self, color: Color | None, background: Color) -> Photo:
         """The photo composited over `color` instead of `background`, and then opaque; itself if `color` is None."""
