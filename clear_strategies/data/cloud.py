@@ -67,8 +67,7 @@ class CloudSettings:
             points are made at their size; where a prior made them, their depth completes that of the LR photos, except before a
             plain background. "lr": the LR photos. "auto": as "hr", but SR images of at most five photos only: with more
             photos, the LR photos give the same depth in a fraction of the time.
-        max_points: a larger cloud is reduced to this many points, chosen at random. With stereo, the grids that would exceed it
-            are made coarser first, down to a quarter of it.
+        max_points: a larger cloud is reduced to this many points, chosen at random.
         triangulation: for init=stereo, triangulated and auto.
         stereo: for init=stereo and auto.
     """
@@ -226,7 +225,7 @@ def _from_depth(
     cloud = stereo_cloud(
         features, photos, maps, stereo, background=background, fill=settings.densify is not False,
         stride=round(finer * settings.stride),  # completed points stay as few as at LR
-        most=settings.max_points, outlier_neighbours=settings.outlier_neighbours, outlier_ratio=settings.outlier_ratio,
+        outlier_neighbours=settings.outlier_neighbours, outlier_ratio=settings.outlier_ratio,
     )  # fmt: skip
     if cloud is None and settings.init == "stereo":
         none = f"stereo confirms no depth in any of the {len(lr)} training LR images"

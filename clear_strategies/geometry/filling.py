@@ -11,7 +11,6 @@ where ρ (Geman and McClure 1985) ignores outliers and the last term keeps plane
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
@@ -64,7 +63,6 @@ def grid_points(
     stride: int,
     background: Color | None = None,
     maps: Sequence[DepthMap] | None = None,
-    most: int | None = None,
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
     """(positions, colours) of a point every `stride` shown pixels of each photo, at depth completed from `means` and `maps`.
 
@@ -72,18 +70,11 @@ def grid_points(
         background: pixels of this colour show no surface and get no point.
         maps: of each photo. Pixels of known depth get no point, nor do those whose point would float in front of another photo's
             known depth. None: no depth is known.
-        most: `stride` is multiplied by a whole number, so that there are no more points than about this. None: any number.
     """
-    each_map: Sequence[DepthMap | None] = [None] * len(photos) if maps is None else maps
-    step = stride
-    if most is not None:
-        every = zip(photos, each_map, strict=True)
-        count = sum(len(_pixels_to_fill(photo, depth_map, stride, background)[0]) for photo, depth_map in every)
-        step *= max(1, math.ceil(math.sqrt(count / most)))
 
     def points_in(i: int) -> tuple[Tensor, Tensor]:
-        photo, depth_map = photos[i], each_map[i]
-        grid, shade = _pixels_to_fill(photo, depth_map, step, background)
+        photo, depth_map = photos[i], None if maps is None else maps[i]
+        grid, shade = _pixels_to_fill(photo, depth_map, stride, background)
         inverse_depth = _completed(means, photo, grid, 2 * stride, depth_map) if len(grid) else None
         if inverse_depth is None:
             return torch.zeros(0, 3), torch.zeros(0, 3)

@@ -34,7 +34,6 @@ def stereo_cloud(
     background: Color | None = None,
     fill: bool = True,
     stride: int = STRIDE,
-    most: int | None = None,
     outlier_neighbours: int = OUTLIER_NEIGHBOURS,
     outlier_ratio: float = OUTLIER_RATIO,
 ) -> PointCloud | None:
@@ -46,8 +45,6 @@ def stereo_cloud(
         features: points of the surfaces, e.g. triangulated ones; there may be none.
         background: the colour of pixels without a surface.
         fill: add a grid of `stride` px at completed depth where a photo's depth is unknown.
-        most: of so many points no more are used. If the grids would exceed that, they are made coarser, down to a quarter of it,
-            since many photos fill the same places again. None: all are used.
         outlier_neighbours, outlier_ratio: see `without_outliers`.
     """
     if not any(depth_map.coverage > 0 for depth_map in maps):
@@ -73,8 +70,7 @@ def stereo_cloud(
     cloud = without_outliers(PointCloud(means, colors, source), outlier_neighbours, outlier_ratio)
     if not fill:
         return cloud
-    room = None if most is None else max(most - len(cloud), most // 4)
-    added, shades = grid_points(cloud.means, photos, stride, background, maps, room)
+    added, shades = grid_points(cloud.means, photos, stride, background, maps)
     source = f"{source}, filled by {len(added):,} at completed depth"
     return PointCloud(torch.cat((cloud.means, added)), torch.cat((cloud.colors, shades)), source)
 
