@@ -131,7 +131,7 @@ def _called(node: Mapping[str, Any], key: str) -> Any:
         if not isinstance(error, ImportError | AttributeError):
             raise
         of_this_package = str(target).startswith(("clear_strategies.", "rasterizers."))
-        remedy = "pip install 'clear-strategies[train]'" if of_this_package else "Correct its dotted name"
+        remedy = "pip install 'clear-strategies[train]'" if of_this_package else "Correct its name, or PYTHONPATH"
         raise SettingError(f"{key}: {target} cannot be imported ({one_line(error)}). {remedy}.") from error
     parameters, hints = _parameters(function), _hints(function)
     given = {name: value for name, value in node.items() if name not in _KEYWORDS}

@@ -38,7 +38,6 @@ def main(arguments: Sequence[str]) -> None:
     from clear_strategies.viewing.cameras import at_most
     from clear_strategies.viewing.look import colored, depth_range, write_video
 
-    began = time.perf_counter()
     splat = open_splat(options.run, options.rasterizer)
     _log.info("%s", splat.source)
     painter = splat.painter
@@ -54,12 +53,15 @@ def main(arguments: Sequence[str]) -> None:
         kinds["depth"] = lambda camera: colored(painter.depth(camera), near, far)
     out = options.out or splat.folder / "rendered"
     for kind, draw in kinds.items():
+        began = time.perf_counter()
         if options.path == _LOOP:
-            write_video(out / f"{_LOOP}{kind and f'_{kind}'}.mp4", map(draw, cameras.values()))
-            continue
-        for name, camera in cameras.items():
-            write_png(out / kind / f"{name}.png", torch.from_numpy(draw(camera)) / 255)
-    _log.info("%s: %s in %.1f s", out, counted(len(cameras) * len(kinds), "picture"), time.perf_counter() - began)
+            made = out / f"{_LOOP}{kind and f'_{kind}'}.mp4"
+            write_video(made, map(draw, cameras.values()))
+        else:
+            made = out / kind
+            for name, camera in cameras.items():
+                write_png(made / f"{name}.png", torch.from_numpy(draw(camera)) / 255)
+        _log.info("%s: %s in %.1f s", made, counted(len(cameras), "picture"), time.perf_counter() - began)
 
 
 def cameras_of(splat: SavedSplat, path: str, frames: int) -> dict[str, Camera]:

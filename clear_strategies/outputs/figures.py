@@ -43,7 +43,7 @@ _CHARTS: Final = (
     ("PSNR of test views at HR, dB", "psnr_test", "t", False),
     ("PSNR of test views at HR, dB", "psnr_test", "seconds", False),
     ("share of Gaussians in conflict, before correction (running mean)", "conflict", "t", True),
-    ("share of the Gaussians that is corrected (running mean)", "corrected", "t", True),
+    ("share of Gaussians that are corrected (running mean)", "corrected", "t", True),
     ("number of Gaussians", "n_gaussians", "t", False),
 )
 _AXIS: Final = {"t": "iteration", "seconds": "training time, s"}
@@ -104,6 +104,8 @@ def write_curves(path: Path, histories: Mapping[str, pd.DataFrame], title: str) 
                 marker = "o" if column == "psnr_test" else None
                 style = {"linewidth": 1.4, "marker": marker, "markersize": 3.5, **_STYLES[i % len(_STYLES)]}
                 (known[run],) = axis.plot(points[over], y, **style)
+        if column == "loss_lr":
+            axis.set_yscale("log")  # after a reset of the opacities the loss is a hundred times as large
         _finish(axis)
     if known:
         names = [textwrap.fill(run, width=60) for run in known]

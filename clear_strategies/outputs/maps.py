@@ -57,7 +57,7 @@ MAPS: Final = {
     "corrected": "corrected\nthe share of the HR gradient that was taken away",
 }
 """Captions of the maps, by their names."""
-_COLUMNS: Final = 4  # of maps.jpg
+_COLUMNS: Final = 3  # of maps.jpg
 _NOTE: Final = (
     "reliability, demand, weight: means over pixels; corrected, conflict: means over the Gaussians that the view moves "
     "at both scales"
@@ -70,7 +70,7 @@ _LONGER_SIDE: Final = 96  # px, of the depth of a photo
 _SOLID: Final = 0.3  # opacity of the Gaussians that count as surface
 _MOST_POINTS: Final = 60_000  # on the map
 _COLORS: Final = {
-    "no photo": figures.RED, "one photo": figures.YELLOW, "two photos": figures.CYAN, "3 or more": figures.BLUE,
+    "no photo": figures.RED, "one photo": figures.YELLOW, "two photos": figures.CYAN, "three or more": figures.BLUE,
 }  # fmt: skip
 _CROP: Final = 0.03  # share of the points that lie beyond each side of the map
 _LONGEST_NOTE: Final = 400  # characters below the map

@@ -46,8 +46,8 @@ from rasterizers.native import threads
 _log = logging.getLogger(__name__)
 
 NOTE: Final = (
-    "bicubic and prior enlarge the LR photo of the view itself, which a run never sees of a test view: they show what "
-    "this photo holds, not what can be learned from the other photos"
+    "bicubic and prior enlarge the photo of the view itself, which a run never sees of a test view, so they do not show "
+    "what can be learned from the other photos"
 )
 
 _LEGEND: Final = (

@@ -125,7 +125,7 @@ def _compare_renders(path: Path, scene: str, runs: Mapping[str, FinishedRun]) ->
     if len({tile.shape for tile in (*tiles.values(), *truth.values())}) > 1:
         _log.warning("%s: the runs rendered at different sizes, so there is no comparison image.", scene)
         return False
-    captions = {method: f"mean of its views: {run.numbers['psnr']:.2f} dB" for method, run in runs.items()}
+    captions = {method: f"mean of the views: {run.numbers['psnr']:.2f} dB" for method, run in runs.items()}
     row = SheetRow("", {**tiles, **truth}, captions, tiles, next(iter(truth), None))
     write_contact_sheet(path, [row], f"{scene} · {Path(view).stem}")
     return True

@@ -72,7 +72,7 @@ def _quantities(table: pd.DataFrame) -> dict[str, tuple[str, str]]:
 
 def notes(table: pd.DataFrame, runs: Sequence[FinishedRun]) -> list[str]:
     """Notes for readers of the table."""
-    lines = [f"bicubic, prior: PSNR of the enlarged LR photos and of the SR images; {NOTE}."]
+    lines = [f"PSNR is also given of the enlarged LR photos (bicubic) and of the SR images (prior); {NOTE}."]
     if _differ(table):
         error = "; its ±: standard error of the differences seed by seed" * int(table["psnr_delta_error"].notna().any())
         lines.append(f"Δ: PSNR over the scene's first method, dB{error}.")
