@@ -212,7 +212,7 @@ def host(out: Path) -> None:
     panels: dict[str, Any] = {}
     torch.set_num_threads(1)
     with torch.no_grad():
-        for title, strategies in (("gsplat's loop", None), ("the same loop with `best`", "best")):
+        for title, strategies in (("gsplat's loop", None), ("the same loop with best", "best")):
             torch.manual_seed(0)
             with torch.enable_grad(), native.kernel_threads(native.threads()):
                 demo, render = train(500, strategies)

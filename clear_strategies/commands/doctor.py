@@ -47,7 +47,7 @@ def main(arguments: Sequence[str]) -> None:
     for title, rows in _findings(broken, slow=options.all).items():
         sys.stdout.write(f"{title}\n")
         for label, text in rows:
-            sys.stdout.write(f"  {label:<22}  {text}\n")
+            sys.stdout.write(f"  {label:<30}  {text}\n")
             sys.stdout.flush()
     if broken:
         raise SettingError(
