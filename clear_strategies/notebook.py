@@ -5,7 +5,6 @@ The command line composes the same configuration and calls the same job (`clear-
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -33,8 +32,6 @@ from clear_strategies.jobs.device import BY_NAME
 from clear_strategies.jobs.saved import SavedSplat, open_splat
 from clear_strategies.settings import TARGET
 from rasterizers.interface import Camera
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -122,6 +119,5 @@ def train(photos: str | Path | None = None, *settings: str, folder: str | Path |
             job.run(config, into, overrides, claim)
     finally:
         torch.set_num_threads(threads)
-    _log.info("%s", into)
     theirs = config.rasterizer[TARGET]
     return Run(into, None if theirs == BY_NAME else theirs)

@@ -109,7 +109,7 @@ def test_doctor_names_versions_memory_backends_and_missing_extras(capsys, monkey
     said = capsys.readouterr().out
     for word in ("python", "torch", "processor", "memory", "rasterizers", "SR images"):
         assert word in said
-    assert "torch                   works: differs from the reference by 0.0e+00" in said
+    assert f"{'torch':32}works: differs from the reference by 0.0e+00" in said
     assert "poses for photos without any (data=photos): pip install 'clear-strategies[colmap]' (lacks pycolmap)" in said
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert set(doctor.EXTRAS) == set(extras) - {"photos", "docs", "dev"}
@@ -121,7 +121,7 @@ def test_gsplat_which_has_cut_offs_of_its_own_alone_is_tested_by_them(capsys, mo
     monkeypatch.setattr(rasterizers, "names", lambda: ["gsplat"])
     monkeypatch.setattr(rasterizers, "load", lambda name, **s: load(name, **s, **(here if name == "gsplat" else {})))
     doctor.main([])
-    assert "gsplat                  works: differs from the reference by" in capsys.readouterr().out
+    assert f"{'gsplat':32}works: differs from the reference by" in capsys.readouterr().out
 
 
 def test_a_backend_that_draws_something_else_is_an_error(capsys, monkeypatch):
