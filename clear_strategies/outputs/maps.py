@@ -147,9 +147,8 @@ def _write_picture(path: Path, view: View, found: ViewMaps) -> None:
         near, far = depth_range(depth)
         title = f"depth by stereo, {near:.3g} (bright) to {far:.3g} (dark) world units\nknown at {stereo.coverage:.0%}"
         tiles |= {title: (far - depth) / (far - near), "confidence of the depth": confidence}
-    believed = "where the SR image is believed, and where the photo overrules it (0 is dark, 1 is bright)"
     pixels = {name: image.detach().clamp(0, 1).cpu().numpy() for name, image in tiles.items()}
-    figures.write_tiles(path, pixels, f"{view.name}: {believed}", _COLUMNS)
+    figures.write_tiles(path, pixels, f"{view.name}: how far the SR image is believed, from 0 (dark) to 1", _COLUMNS)
 
 
 def _evidence(conductor: Conductor, view: View) -> tuple[Strategy, PatchMaps] | None:
