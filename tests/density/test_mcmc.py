@@ -1,19 +1,20 @@
 """Density control by sampling: what moves, what is added, what the noise leaves alone."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 
 from clear_strategies import MCMC
-from clear_strategies.density.mcmc import Sampler, relocation
+from clear_strategies.density.mcmc import Sampler, drawn, relocation
 from clear_strategies.errors import DensityError, DivergedError
+from clear_strategies.schedules import LogLinear
 from clear_strategies.training import checkpoint
 from clear_strategies.training.densifier import Densifier
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.optim import Adam, LearningRates
-from rasterizers import Camera, load
 from tests.helpers import toy
 from tests.helpers.short_run import start, tensors
 
@@ -71,29 +72,30 @@ def test_where_sampling_is_of_no_use_density_control_stays_and_that_is_said(capl
     assert "an object before a plain background" in caplog.text
 
 
-def test_relocation_leaves_what_is_seen():
-    """An opacity of 0.75 as two Gaussians: each has 1 - √0.25 = 0.5, and shrinks by 0.75 / (2 · 0.5 - 0.5² / √2)."""
-    opacities, scales = relocation(torch.tensor([0.75, 0.3]), torch.ones(2, 3), torch.tensor([2, 1]))
-    assert opacities.tolist() == pytest.approx([0.5, 0.3])
-    assert scales[:, 0].tolist() == pytest.approx([0.75 / (1 - 0.25 / 2**0.5), 1.0])
-    many, _ = relocation(torch.tensor([0.999999]), torch.ones(1, 3), torch.tensor([51]))
-    assert 1 - (1 - float(many)) ** 51 == pytest.approx(0.999999)
+def test_relocation_is_equation_9_of_3dgs_mcmc_of_up_to_51_copies():
+    """Its double sum, one Gaussian after another: what it keeps is the integral of alpha along a line through the middle."""
+    g = torch.Generator().manual_seed(0)
+    opacities, scales = torch.rand(40, generator=g) * 0.99, torch.rand(40, 3, generator=g)
+    copies = torch.randint(1, 60, (40,), generator=g)
+    copies[:2] = torch.tensor([1, 52])
+    found, shrunk = relocation(opacities, scales, copies)
+    for i, o in enumerate(opacities.double().tolist()):
+        n = min(int(copies[i]), 51)
+        shared = 1 - (1 - o) ** (1 / n)
+        total = sum(
+            math.comb(k - 1, j) * (-1) ** j * shared ** (j + 1) / math.sqrt(j + 1)
+            for k in range(1, n + 1)
+            for j in range(k)
+        )
+        assert float(found[i]) == pytest.approx(shared, rel=1e-6)
+        assert shrunk[i].tolist() == pytest.approx((scales[i].double() * o / total).tolist(), rel=1e-6)
 
 
-@pytest.mark.parametrize("opacity", [0.2, 0.6, 0.95])
-def test_copies_look_as_the_one_that_they_replace(opacity):
-    """The integral of alpha along a line through the middle is that of the one Gaussian: what the formula holds."""
-    theta = GaussianField.from_cloud(toy.cloud(1))
-    theta.means.data[:] = torch.tensor([0.0, 0, 4])
-    theta.scales.data[:] = -1.0
-    theta.opacities.data[:] = torch.logit(torch.tensor(opacity))
-    camera, rasterizer = Camera(torch.eye(4), 60.0, 60.0, 40.0, 40.0, 80, 80), load("torch", kernel=0.0)
-    before = float(rasterizer(theta.baked(), camera).alpha[40].sum())
-    copies = torch.zeros(4, dtype=torch.long)
-    o, scales = relocation(theta.opacities.data.sigmoid(), theta.scales.data.exp(), torch.tensor([4]))
-    theta.take(copies)
-    theta.opacities.data[:], theta.scales.data[:] = torch.logit(o), scales.log()
-    assert float(rasterizer(theta.baked(), camera).alpha[40].sum()) == pytest.approx(before, rel=0.05)
+def test_sources_are_drawn_as_often_as_their_weights_say():
+    weights = torch.tensor([0.0, 0.1, 0.0, 0.6, 0.3, 0.0])
+    share = torch.bincount(drawn(weights, 100_000, torch.Generator().manual_seed(0)), minlength=6) / 100_000
+    assert torch.allclose(share, weights, atol=5e-3)
+    assert not share[weights == 0].any()
 
 
 def test_dead_gaussians_move_to_live_ones_and_start_without_momentum():
@@ -137,6 +139,10 @@ def test_noise_moves_the_faint_along_their_covariance_as_far_as_the_scene_is_lar
     assert float(moved[:20].min()) > 0
     assert float(moved[20:].max()) < 1e-9
     assert not displacement(theta, optimizer, densifier, EVERY.stop).any()
+    cooling, moved = LogLinear(1.0, 0.01, end=10), []
+    for rate in (cooling, LogLinear(1.0, 1.0)):
+        moved.append(displacement(*start_of_run(noise=100.0, start=9, opacity=-6.0, cooling=rate), t=4))
+    assert torch.allclose(moved[0], cooling(4) * moved[1], rtol=1e-3, atol=1e-5)
     offsets = []
     for size in (1.0, 8.0):
         theta, optimizer, densifier = start_of_run(noise=100.0, start=9, opacity=-6.0)
