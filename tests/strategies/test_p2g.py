@@ -40,8 +40,10 @@ def test_a_relative_scale_counts_in_the_views_own_disagreement_and_eight_bit_uni
     hr[:, :64] += 0.05
     relative, absolute = (P2G(r, down="area").patch_evidence(lr, hr, 4)[0] for r in ("relative:2", 0.05))
     assert torch.allclose(relative, absolute, rtol=1e-5)
-    with pytest.raises(ValueError, match=r"I_HR must lie in \[0, 1\]"):
-        P2G().patch_evidence(torch.rand(16, 16, 3), 255 * torch.rand(64, 64, 3), 4)
+    for low, high in ((0.0, 255.0), (-0.002, 1.0), (0.0, 1.002)):
+        with pytest.raises(ValueError, match=r"I_HR must lie in \[0, 1\]"):
+            P2G().patch_evidence(lr, torch.linspace(low, high, 64 * 128 * 3).view(64, 128, 3), 4)
+    P2G().patch_evidence(lr, torch.linspace(-5e-4, 1 + 5e-4, 64 * 128 * 3).view(64, 128, 3), 4)  # rounding
 
 
 def test_one_textured_patch_of_a_flat_image_demands_everything():
@@ -91,6 +93,8 @@ def test_normalized_routing_moves_detail_and_removes_none_and_is_finite_where_no
     none = torch.zeros(3, dtype=torch.bool)
     assert bool(P2G().route(toy.step(evidence=Evidence(torch.zeros(3), torch.zeros(3)), visible=none)).isfinite().all())
     assert bool(P2G(floor=0).route(toy.step(evidence=Evidence(torch.ones(3), torch.zeros(3)))).isfinite().all())
+    with pytest.raises(ValueError, match="there is none for this view"):
+        P2G().route(toy.step(visible=none))
 
 
 def test_observation_is_made_once_a_view_and_invisible_gaussians_have_none(caplog):
@@ -162,9 +166,3 @@ def test_a_flat_image_asks_for_no_detail_on_and_off_the_8_bit_grid(grey, down):
     hr = torch.full((64, 64, 3), grey)
     _, A = P2G(down=down).patch_evidence(torch.full((16, 16, 3), grey), hr, 4)
     assert float(A.max()) < 1e-3
-
-
-def test_without_a_high_frequency_loss_there_is_nothing_to_route():
-    weights = {"lambda_lr": 1.0, "lambda_hr": 1.0}
-    assert P2G().without_effect(**weights, lambda_hf=0.2) is None
-    assert "lambda_HF is 0" in P2G().without_effect(**weights, lambda_hf=0.0)

@@ -94,7 +94,7 @@ def test_views_without_depth_get_it_from_stereo_and_without_it_only_the_borders_
     assert "8 beside the training cameras" in (made.summary() or "")
 
 
-def test_without_views_after_the_run_and_without_an_lr_loss_there_are_none(caplog):
+def test_without_views_and_after_the_run_there_are_none(caplog):
     made = prepared(())
     assert "PseudoViews has no effect: this training loop does not give its views" in caplog.text
     assert not made.extra_views(2)
@@ -102,8 +102,6 @@ def test_without_views_after_the_run_and_without_an_lr_loss_there_are_none(caplo
     made.on_fit_end()
     assert made.summary() is None
     assert not made.extra_views(2)
-    assert "lambda_lr is 0" in (FEW.without_effect(lambda_lr=0.0, lambda_hr=1.0, lambda_hf=0.2) or "")
-    assert FEW.without_effect(lambda_lr=1.0, lambda_hr=0.0, lambda_hf=0.2) is None
 
 
 def test_an_object_cut_out_of_its_surroundings_needs_none(caplog):

@@ -86,10 +86,8 @@ def test_the_weights_follow_their_gaussians():
     assert torch.equal(s.weight("c"), before[[1, 0, 0]])
 
 
-def test_two_views_are_warned_of_and_without_hr_there_is_nothing_to_withhold(caplog):
+def test_two_views_are_warned_of(caplog):
     started(3)
     assert not caplog.text
     started(2)
     assert "SplatSuRe has no effect: 2 training views, fewer than min_views=3" in caplog.text
-    reasons = [SplatSuRe().without_effect(lambda_lr=lr, lambda_hr=1 - lr, lambda_hf=0.2) for lr in (1, 0)]
-    assert reasons == ["lambda_HR is 0 throughout", None]

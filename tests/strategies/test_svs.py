@@ -78,10 +78,14 @@ def params(n=20, seed=0):
 
 
 @pytest.mark.parametrize(("n_views", "rate"), [(2, 0.2), (4, 0.2), (8, 0.1), (80, 0.01)])
-def test_the_rate_falls_with_the_looks_at_each_view(n_views, rate):
+def test_the_rate_falls_with_the_looks_at_each_view(n_views, rate, caplog):
+    caplog.set_level("DEBUG")
     for looks, expected in ((1_000, 1 - rate), (0, 0.8)):  # 0: as published
         svs = started(n_views, dropout=Ramp(0.2, full=4_000), looks=looks)
         assert kept_share(svs, 4_000) == pytest.approx(expected, abs=4e-3)
+    assert [f"dropout rises to {rate:.3f} instead of 0.200" in message for message in caplog.messages] == [True] * (
+        rate < 0.2
+    )
 
 
 def test_a_rate_that_the_looks_lower_to_nothing_is_told(caplog):
@@ -89,6 +93,7 @@ def test_a_rate_that_the_looks_lower_to_nothing_is_told(caplog):
     assert "SVS drops nothing" in caplog.text
     caplog.clear()
     assert kept_share(started(dropout=Ramp(0.2, full=0), looks=0), 1) == pytest.approx(0.8, abs=4e-3)
+    assert started(dropout=Ramp(0.0, full=0)).gate(1, 5) is None
     assert not caplog.text
 
 
@@ -117,6 +122,9 @@ def test_anchored_positions_do_not_depend_on_the_unit_of_the_world_and_the_mean_
         if unit == 1.0:
             expected = vjp
     assert torch.allclose(vjp, expected, rtol=1e-4)
+    svs = started(anchor_start=1, anchor_strength=0.01, anchor_weights=PAPER_WEIGHTS)
+    svs.after_step({"means": torch.ones(20, 3)}, toy.step(1))  # a cloud without extent
+    assert svs.regularize({"means": torch.full((20, 3), 1.0)}, 2)["means"].isfinite().all()
     pulls = []
     for reduction in ("sum", "mean"):
         svs = started(anchor_start=1, anchor_strength=0.01, anchor_weights=PAPER_WEIGHTS, reduction=reduction)
@@ -136,6 +144,11 @@ def test_densification_ends_when_the_anchor_is_taken_once_whatever_a_skip_jumped
     svs.after_step(at_seven, toy.step(7))
     svs.after_step({name: p + 1 for name, p in at_seven.items()}, toy.step(8))
     assert torch.equal(svs.state["means"], at_seven["means"])
+    svs.on_resize(torch.arange(20).flip(0))
+    assert torch.equal(svs.state["means"], at_seven["means"].flip(0))
+    without = started(anchor_start=5, anchor_strength=0.0)
+    without.after_step(at_seven, toy.step(7))
+    assert not without.state
 
 
 def test_a_changed_number_of_gaussians_under_an_anchor_is_an_error():
