@@ -10,9 +10,8 @@ import math
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, lru_cache
 from itertools import pairwise
-from struct import Struct
 from typing import Any, Final
 
 import torch
@@ -67,18 +66,33 @@ def runs_warp(device: str) -> bool:
     return True
 
 
-def launch(
-    kernel: Any, dim: Sequence[int], arguments: Sequence[Any], device: torch.device, *, block: int = 256, together: bool = False
-) -> None:  # fmt: skip
-    """Launch a kernel with a thread for each index of `dim`, in a scope of `on_stream`.
+BLOCKS: Final = {"cuda"}
+"""The kinds of devices on which Warp's blocks have several threads; tests add the CPU."""
 
-    Does the same as `wp.launch` in a fifth of the host's time, which on CUDA exceeds the kernels': arguments that do not change
-    are converted once. With an empty `dim` it only compiles and loads the kernel, which a recording cannot.
+
+def lanes_on(device: torch.device, block: int) -> int:
+    """The number of threads in a block on this device: `block`, or 1."""
+    return block if device.type in BLOCKS else 1
+
+
+def launch(
+    kernel: Any, dim: Sequence[int], arguments: Sequence[Any], *, block: int = 256, together: bool = False
+) -> None:  # fmt: skip
+    """Launch a kernel with a thread for each index of `dim`, on the device of its tensors.
+
+    Does the same as `wp.launch` in a fifth of the host's time, which on CUDA exceeds the kernels': the layouts of arrays are
+    kept. With an empty `dim` it only compiles and loads the kernel, which a recording cannot.
 
     Args:
         arguments: numbers, structures of `struct`, and tensors or None for the kernel's arrays, see `array`.
-        block: threads per block. together: a block for each index of `dim`, as of `wp.launch_tiled`.
+        block: threads per block, see `lanes_on`. together: a block for each index of `dim`, as of `wp.launch_tiled`.
     """
+    device = next(x.device for x in arguments if isinstance(x, Tensor))
+    if device.type == "cuda" and _kept.stream is None:
+        with on_stream(device):
+            launch(kernel, dim, arguments, block=block, together=together)
+        return
+    block = lanes_on(device, block)
     size = (*dim, block) if together else tuple(dim)
     key = kernel, device, block
     kept = _kept.launches.get(key)
@@ -92,7 +106,7 @@ def launch(
 
 
 class _Launch:
-    """A launch that converts its size and arguments only when they change."""
+    """Launches of a kernel, on a device and with a number of threads per block."""
 
     def __init__(self, kernel: Any, device: torch.device, block: int) -> None:
         import warp as wp
@@ -101,52 +115,25 @@ class _Launch:
         self.command = wp.Launch(kernel, wp.device_from_torch(device), block_dim=block)
         self.on_cuda = device.type == "cuda"
         self.size: tuple[int, ...] = ()
-        self.bounds: dict[tuple[int, ...], Any] = {}  # Warp's description of a size, for the sizes so far
-        self.kinds = [argument.type for argument in kernel.adj.args]
-        # For each argument that is an array: by type, shape and strides, its description, of which only the address changes.
-        self.arrays: list[dict[Any, Any] | None] = [{} if wp.types.is_array(kind) else None for kind in self.kinds]
+        # The type of each argument that is an array.
+        self.arrays = [a.type if wp.types.is_array(a.type) else None for a in kernel.adj.args]
 
     def prepare(self, size: tuple[int, ...], arguments: Sequence[Any]) -> Any:
         command = self.command
         params = command.params  # the bounds, and the arguments
         if size != self.size:
-            self._resize(size)
-        for index, (argument, known) in enumerate(zip(arguments, self.arrays, strict=True), 1):
-            if known is None and not isinstance(argument, ctypes.Structure):
+            self.size, command.bounds = size, type(command.bounds)(size)  # `set_dim` takes as long as the launch
+            params[0] = command.bounds
+            if self.on_cuda:
+                command.params_addr[0] = ctypes.addressof(command.bounds)
+        for index, (argument, kind) in enumerate(zip(arguments, self.arrays, strict=True), 1):
+            if kind is None and not isinstance(argument, ctypes.Structure):
                 params[index].value = argument
                 continue
-            if known is None:
-                params[index] = argument
-            elif argument is None:
-                params[index] = _empty_array()
-            else:
-                layout = argument.dtype, argument.shape, argument.stride()
-                described = params[index] = known.get(layout) or self._described(index, layout, argument)
-                described.data = argument.data_ptr()
+            params[index] = argument if kind is None else array(argument, kind)
             if self.on_cuda:
                 command.params_addr[index] = ctypes.addressof(params[index])
         return command
-
-    def _described(self, index: int, layout: Any, tensor: Tensor) -> Any:
-        known = self.arrays[index - 1]
-        if known is None or len(known) >= _MOST_SHAPES:
-            known = self.arrays[index - 1] = {}
-        known[layout] = array(tensor, self.kinds[index - 1])
-        return known[layout]
-
-    def _resize(self, size: tuple[int, ...]) -> None:
-        """As `set_dim`, which takes as long as the launch: at two scales the sizes alternate."""
-        command, self.size = self.command, size
-        bounds = self.bounds.get(size)
-        if bounds is None:
-            if len(self.bounds) >= _MOST_SHAPES:
-                self.bounds.clear()
-            command.set_dim(size)
-            self.bounds[size] = command.bounds
-            return
-        command.bounds = command.params[0] = bounds
-        if self.on_cuda:
-            command.params_addr[0] = ctypes.addressof(bounds)
 
 
 class _Kept(threading.local):
@@ -163,15 +150,18 @@ class _Kept(threading.local):
 
 _kept = _Kept()
 _sorting: Final = threading.Lock()
-_MOST_SHAPES: Final = 256  # the number of Gaussians, and so the shapes, change in a long training
+_MOST_SHAPES: Final = 256  # the number of Gaussians, and so the lengths, change in a long training
 
 
-def sort_pairs(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
-    """Sort the first `count` keys and values by key, stably, in a scope of `on_stream`; both have twice that length, for scratch.
+def sort_pairs(keys: Tensor, values: Tensor, count: int, bits: int) -> tuple[Tensor, Tensor]:
+    """The first `count` keys and values in a stable order by key, sorted in a scope of `on_stream`; both tensors have twice that
+    length, for scratch.
 
     Does the same as `wp.utils.radix_sort_pairs`, but `wp.from_torch` would take longer than the sort: Warp's arrays are cached by
     length, and only their addresses change.
     """
+    if not count:
+        return keys[:0], values[:0]
     import warp as wp
 
     key = len(keys), keys.device
@@ -189,6 +179,7 @@ def sort_pairs(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
         wp.utils.radix_sort_pairs(*arrays, count, end_bit=bits)
     if (recording := running()) is not None:
         recording.launched((keys, values))
+    return keys[:count], values[:count]
 
 
 def array(tensor: Tensor | None, kind: Any) -> Any:
@@ -203,12 +194,18 @@ def array(tensor: Tensor | None, kind: Any) -> Any:
     """
     if tensor is None:
         return _empty_array()
-    n, shape, strides = kind.ndim, tensor.shape, tensor.stride()
-    if not (is_struct := hasattr(kind.dtype, "ctype")):
-        _require_numbers(tensor, kind.dtype)
-    inner = (
-        (ctypes.sizeof(kind.dtype.ctype) // tensor.element_size(),) if is_struct else getattr(kind.dtype, "_shape_", ())
-    )
+    layout = _layout(kind.dtype, kind.ndim, tensor.dtype, tensor.shape, tensor.stride())
+    described = type(layout).from_buffer_copy(layout)
+    described.data = tensor.data_ptr()
+    return described
+
+
+@lru_cache(maxsize=4096)  # a training's are those of the iteration before until the number of Gaussians changes
+def _layout(of: Any, n: int, dtype: torch.dtype, shape: Sequence[int], strides: Sequence[int]) -> Any:
+    """A tensor as an array of n dimensions `of` a type of Warp, without its address."""
+    if not (is_struct := hasattr(of, "ctype")):
+        _require_numbers(dtype, of)
+    inner = (ctypes.sizeof(of.ctype) // dtype.itemsize,) if is_struct else getattr(of, "_shape_", ())
     outer, dense = len(shape) - len(inner), tuple(math.prod(inner[k + 1 :]) for k in range(len(inner)))
     last = [
         (length, step) for length, step in zip(shape[n - 1 : outer], strides[n - 1 : outer], strict=True) if length != 1
@@ -220,49 +217,26 @@ def array(tensor: Tensor | None, kind: Any) -> Any:
         )
     lengths = *shape[: n - 1], math.prod(length for length, _ in last)
     steps = *strides[: n - 1], last[-1][1] if last else math.prod(inner)
-    in_bytes = [step * tensor.element_size() for step in steps]
-    return type(_empty_array())(tensor.data_ptr(), 0, n, lengths, in_bytes)
+    return type(_empty_array())(0, 0, n, lengths, [step * dtype.itemsize for step in steps])
 
 
-def _require_numbers(tensor: Tensor, kind: Any) -> None:
+def _require_numbers(dtype: torch.dtype, kind: Any) -> None:
     import warp as wp
 
-    read, given = getattr(kind, "_wp_scalar_type_", kind), wp.dtype_from_torch(tensor.dtype)  # of a vector, of a number
+    read, given = getattr(kind, "_wp_scalar_type_", kind), wp.dtype_from_torch(dtype)  # of a vector, of a number
     if given is not read:
         raise TypeError(f"a kernel reads numbers of type {read.__name__}, got {given.__name__}: cast the tensor.")
 
 
 def struct(kind: Any, rows: Mapping[str, Tensor | None], **values: Any) -> Any:
-    """A Warp structure as a kernel argument: `rows` as arrays, numbers. What is not given is empty, or 0.
-
-    With rows, structures are kept by all but the addresses: most of a training's iteration are those of the iteration before.
-    """
-    given = {name: x for name, x in rows.items() if x is not None}
-    if not given:
-        return kind.ctype(**values)
-    layouts = [part for x in given.values() for part in (x.dtype, x.shape, x.stride())]
-    key = kind, *given, *values, *values.values(), *layouts
-    known = _structures.get(key)
-    if known is None:
-        if len(_structures) >= _MOST_STRUCTURES:
-            _structures.clear()
-        arrays = {name: array(x, kind.vars[name].type) for name, x in given.items()}
-        known = _structures[key] = bytes(kind.ctype(**arrays, **values))
-    memory = bytearray(known)
-    offsets = _offsets(kind)
-    for name, tensor in given.items():
-        _ADDRESS.pack_into(memory, offsets[name], tensor.data_ptr())
-    return kind.ctype.from_buffer(memory)
+    """A Warp structure as a kernel argument: `rows` as arrays, numbers. What is not given is empty, or 0."""
+    arrays = {name: array(x, kind.vars[name].type) for name, x in rows.items() if x is not None}
+    return kind.ctype(**arrays, **values)
 
 
 def on_device(structure: Any, device: torch.device) -> Tensor:
     """A structure without arrays as an array of one, in a tensor of its bytes."""
     return sent(torch.frombuffer(bytearray(structure), dtype=torch.uint8)[None], device)
-
-
-_MOST_STRUCTURES: Final = 1024
-_structures: dict[tuple[Any, ...], bytes] = {}
-_ADDRESS: Final = Struct("=Q")  # the first field of an array
 
 
 @cache
@@ -273,15 +247,9 @@ def _empty_array() -> Any:
     return type(wp.from_torch(torch.empty(1, device="cpu"), return_ctype=True))()
 
 
-@cache
-def _offsets(kind: Any) -> Mapping[str, int]:
-    """The offset of each field of a Warp structure."""
-    return {name: getattr(kind.ctype, name).offset for name, _ in kind.ctype._fields_}
-
-
 @contextmanager
 def on_stream(device: torch.device) -> Iterator[None]:
-    """A scope in which this thread launches on torch's current stream."""
+    """A scope in which this thread launches on torch's current stream, which is looked up once."""
     outer, current = _kept.stream, None if device.type == "cpu" else torch.cuda.current_stream(device)
     _kept.stream = None if current is None else warp_stream(current)
     try:

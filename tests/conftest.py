@@ -61,16 +61,18 @@ def saved_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
 
 
 @pytest.fixture
-def blocks_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[str, int], int], None]:
-    """Lets the kernels of a table of lanes run with this many threads per block, as on CUDA, where lanes sum together."""
+def whole_blocks(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """Called, lets kernels run with as many threads per block as on CUDA, where lanes sum together."""
     import warp as wp
+
+    from rasterizers import warp_runtime
 
     if not hasattr(wp.config, "enable_cpu_blocks"):
         pytest.skip("this Warp has no blocks of several threads on a CPU")
 
-    def use(lanes: dict[str, int], threads: int) -> None:
+    def use() -> None:
         monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
-        monkeypatch.setitem(lanes, "cpu", threads)
+        monkeypatch.setattr(warp_runtime, "BLOCKS", {"cpu"})
 
     return use
 

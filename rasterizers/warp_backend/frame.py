@@ -12,9 +12,10 @@ and if the lists were too short, the image is drawn again before it is returned.
 from __future__ import annotations
 
 import ctypes
+import math
 import struct
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, Final, NamedTuple, cast
 
 import torch
@@ -32,15 +33,15 @@ from rasterizers.warp_backend.blend import blend, blend_pieces, blend_vjp
 from rasterizers.warp_backend.colour import basis
 from rasterizers.warp_backend.project import fold, project, project_vjp, radii
 from rasterizers.warp_backend.settings import PAIR_BYTES, SEGMENT, SUMS_BYTES, TILE, WarpSettings, mebibytes, padded
-from rasterizers.warp_runtime import launch, on_device, on_stream, sort_pairs
+from rasterizers.warp_runtime import lanes_on, launch, on_device, on_stream, sort_pairs
 
 _ELLIPSE: Final = ctypes.sizeof(cast(Any, types.Ellipse).ctype) // 4
 """Numbers of a `types.Ellipse`."""
 DEFERRED_COUNTS: Final = {"cuda": True, "cpu": False}
 """Whether the host reads the number of pairs only when an image is accessed."""
-LANES: Final = {"cuda": 32, "cpu": 1}
-"""Threads per segment of the blending VJP: a warp on CUDA; on a CPU, Warp's blocks have one thread."""
-TILE_LANES: Final = {"cuda": TILE**2, "cpu": 1}
+LANES: Final = 32
+"""Threads per segment of the blending VJP, see `lanes_on`: a warp on CUDA."""
+TILE_LANES: Final = TILE**2
 """Threads per tile of blending: a thread per pixel on CUDA."""
 
 
@@ -52,7 +53,7 @@ class _View:
     ) -> None:  # fmt: skip
         n, like = len(splats), splats.means
         self.camera, self.has_depth = camera, has_depth
-        self.columns, self.rows_of_tiles = _tiles_of(camera)
+        self.n_tiles = math.prod(_tiles_of(camera))
         self.opacities = splats.opacities.contiguous()
         self.offsets = None if splats.rgb_offset is None else splats.rgb_offset.contiguous()
         self.grid = numbers_of(camera, like.device).grid
@@ -102,7 +103,6 @@ class WarpFrame:
         self.totals = self.like.new_zeros(k + 3, dtype=torch.int64)
         each = zip(jobs, depth, self._counts, firsts, self._visible, self.totals[:k, None], strict=True)
         self.views = [_View(*job, *others) for job, *others in each]
-        self._basis: Tensor | None = None
         self._read: Callable[[], list[int]]  # the numbers of `totals`; set by `draw`
         self.resolved = False
 
@@ -110,7 +110,7 @@ class WarpFrame:
         """An image on each grid. Errors in the input may be raised only when an image is first accessed."""
         with on_stream(self.like.device):
             keys, places = self.project()
-            self._order = _sorted(keys, places, self.n, 31)[1]
+            self._order = sort_pairs(keys, places, self.n, 31)[1]
             ends = torch.cumsum(self._counts.index_select(1, self._order), 1)  # in 64 bits
             for view, ends_of_view in zip(self.views, ends, strict=True):
                 view.ends = ends_of_view
@@ -164,33 +164,26 @@ class WarpFrame:
             self.settings.remember(view.camera, count)
         return not not_finite and all(count <= view.pairs for view, count in zip(self.views, pairs, strict=True))
 
-    def launch(self, kernel: Any, threads: int, *arguments: Any) -> None:
-        """Launch a kernel with one thread per Gaussian, place or pair."""
-        launch(kernel, [threads], arguments, self.like.device)
-
-    def launch_blocks(self, kernel: Any, blocks: int, lanes: int, *arguments: Any) -> None:
-        """Launch a kernel whose blocks of `lanes` threads work together."""
-        launch(kernel, [blocks], arguments, self.like.device, block=lanes, together=True)
-
     def empty(self, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
         return self.like.new_empty(shape, dtype=dtype)
 
+    @cached_property
     def basis(self) -> Float[Tensor, "N B1"]:
         """Y of this pose's directions, computed once for all grids."""
-        if self._basis is None:
-            self._basis = self.empty(self.n, self.bands + 1)
-            self.launch(basis, self.n, self.pose, self.means, self._visible, self._basis)
-        return self._basis
+        Y = self.empty(self.n, self.bands + 1)
+        launch(basis, [self.n], (self.pose, self.means, self._visible, Y))
+        return Y
 
     def project(self) -> tuple[Tensor, Tensor]:
         """Project onto each grid. Returns depth keys and their Gaussians, with space for sorting."""
         keys, places = (self.empty(2 * self.n, dtype=torch.int32) for _ in range(2))
         for nth, view in enumerate(self.views):
-            self.launch(
-                project, self.n, self.pose, view.grid, self.cuts, self.means, self.quats, self.scales, view.opacities, self.sh0,
-                self.shN, view.offsets, nth == 0, keys, places, self.colours, self.slopes, self.depths,
-                view.ellipses, view.means2d, view.visible, view.counts, self.totals[len(self.views) :],
+            arguments = (
+                self.pose, view.grid, self.cuts, self.means, self.quats, self.scales, view.opacities, self.sh0, self.shN,
+                view.offsets, nth == 0, keys, places, self.colours, self.slopes, self.depths, view.ellipses, view.means2d,
+                view.visible, view.counts, self.totals[len(self.views) :],
             )  # fmt: skip
+            launch(project, [self.n], arguments)
         return keys, places
 
     def _require_memory(self, view: _View, count: int) -> None:
@@ -210,13 +203,11 @@ class WarpFrame:
         tiles, places, splats, gaussians = (
             self.empty(n, dtype=torch.int32) for n in (2 * length, 2 * length, length, length)
         )
-        n_tiles = view.columns * view.rows_of_tiles
-        starts, ends = self.like.new_zeros(2, n_tiles + 1, dtype=torch.int32)
-        self.launch(
-            list_pairs, capacity, self._order, view.ends, view.ellipses, view.grid, view.firsts, tiles, places, splats
-        )
-        tiles, places = _sorted(tiles, places, capacity, n_tiles.bit_length())
-        self.launch(find_tiles, capacity, tiles, places, splats, view.total, capacity, gaussians, starts, ends)
+        starts, ends = self.like.new_zeros(2, view.n_tiles + 1, dtype=torch.int32)
+        listed = self._order, view.ends, view.ellipses, view.grid, view.firsts, tiles, places, splats
+        launch(list_pairs, [capacity], listed)
+        tiles, places = sort_pairs(tiles, places, capacity, view.n_tiles.bit_length())
+        launch(find_tiles, [capacity], (tiles, places, splats, view.total, capacity, gaussians, starts, ends))
         view.capacity, view.lists = capacity, _Lists(splats, tiles, gaussians, places, starts, ends)
 
 
@@ -253,11 +244,8 @@ class WarpRendering:
         """See `WithTraits`."""
         frame, view = self._frame, self._view
         out = frame.empty(frame.n, 2, dtype=torch.int32)
-        with on_stream(frame.like.device):
-            frame.launch(
-                radii, frame.n, frame.pose, view.grid, frame.cuts, frame.means, frame.quats, frame.scales, view.opacities,
-                view.visible, out,
-            )  # fmt: skip
+        of_view = frame.means, frame.quats, frame.scales, view.opacities, view.visible
+        launch(radii, [frame.n], (frame.pose, view.grid, frame.cuts, *of_view, out))
         return out
 
     def _resolve(self) -> None:
@@ -272,19 +260,20 @@ class WarpRendering:
     def _blend(self) -> None:
         frame, view, lists = self._frame, self._view, self._view.lists
         self._drawn_from = lists
-        n_tiles, segments = view.columns * view.rows_of_tiles, -(-view.capacity // SEGMENT)
+        n_tiles, segments = view.n_tiles, -(-view.capacity // SEGMENT)
         pieces = self._marks = frame.empty(segments + n_tiles, types.PIXELS, 4)
         sums = frame.empty(segments + n_tiles, types.PIXELS, 2) if view.has_depth else None
-        lanes = TILE_LANES[frame.settings.device]
-        frame.launch_blocks(
-            blend_pieces(view.has_depth, lanes), segments, lanes, view.grid, frame.cuts, view.ellipses, frame.depths, lists.tiles,
-            lists.gaussians, view.total, view.capacity, pieces, sums,
+        alone = (
+            view.grid, frame.cuts, view.ellipses, frame.depths, lists.tiles, lists.gaussians, view.total, view.capacity, pieces,
+            sums,
         )  # fmt: skip
+        kernel = blend_pieces(view.has_depth, lanes_on(frame.like.device, TILE_LANES))
+        launch(kernel, [segments], alone, block=TILE_LANES, together=True)
         drawn = (
             view.grid, frame.cuts, frame.background, view.ellipses, frame.depths, lists.gaussians, lists.starts, lists.ends,
             pieces, sums, self._image, self._transmittance, self._ended, self._depth,
         )  # fmt: skip
-        launch(blend(view.has_depth), [n_tiles, types.PIXELS], drawn, frame.like.device, block=types.PIXELS)
+        launch(blend(view.has_depth), [n_tiles, types.PIXELS], drawn, block=types.PIXELS)
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"], *, absgrad: bool = False) -> SplatGradients:
         """One pass for up to three cotangents, with absolute gradients for one; see `Rendering.vjp`."""
@@ -300,7 +289,7 @@ class WarpRendering:
                 for first in range(0, k, together):
                     at = slice(first, first + together)
                     self._fill(v[at], *(x[at] for x in out), None if absolute is None else absolute[at])
-            return SplatGradients(*out, frame.basis(), absolute)
+            return SplatGradients(*out, frame.basis, absolute)
 
     def summed_vjp(self, cotangents: Float[Tensor, "K H W 3"], weight: Float[Tensor, " N"]) -> SplatGradients:
         """One pass for two or three cotangents; see `WithTraits`."""
@@ -311,7 +300,7 @@ class WarpRendering:
         out = _empty_gradients(self._frame, k - 1, k)
         with on_stream(self._frame.like.device):
             self._fill(cotangents.to(self._image).contiguous(), *out, None, weight=weight.to(self._image).contiguous())
-            return SplatGradients(*out, self._frame.basis())
+            return SplatGradients(*out, self._frame.basis)
 
     def _together(self) -> int:
         """How many cotangents one pass has the memory for."""
@@ -323,35 +312,26 @@ class WarpRendering:
         absolute = out[-1] is not None
         frame, view, lists, k = self._frame, self._view, self._drawn_from, v.shape[0]
         pair_sums = frame.empty(padded(view.pairs), types.width_of(k, absolute))
-        lanes = LANES[frame.settings.device]
-        kernel = blend_vjp(k, lanes, frame.settings.device == "cuda", absolute)
-        frame.launch_blocks(
-            kernel, -(-view.pairs // SEGMENT), lanes, view.grid, frame.cuts, frame.background, view.ellipses, lists.tiles,
-            lists.gaussians, lists.places, lists.ends, self._transmittance, self._ended, self._marks, v, view.total, pair_sums,
+        kernel = blend_vjp(k, lanes_on(v.device, LANES), v.device.type == "cuda", absolute)
+        blended = (
+            view.grid, frame.cuts, frame.background, view.ellipses, lists.tiles, lists.gaussians, lists.places, lists.ends,
+            self._transmittance, self._ended, self._marks, v, view.total, pair_sums,
         )  # fmt: skip
+        launch(kernel, [-(-view.pairs // SEGMENT)], blended, block=LANES, together=True)
         for stride in (1, SEGMENT):  # without pairs a recording, which folds by both, finds the kernel loaded
             pairs = view.pairs if stride in frame.folds else 0
-            frame.launch(
-                fold(k, absolute), pairs, view.counts, view.firsts, lists.splats, view.total, stride, pair_sums
-            )
-        frame.launch(
-            project_vjp(k, absolute, weight is not None), frame.n, frame.pose, view.grid, frame.cuts, frame.means, frame.quats,
-            frame.scales, view.opacities, frame.slopes, view.ellipses, view.counts, view.firsts, pair_sums, *out,
-            weight,
+            launch(fold(k, absolute), [pairs], (view.counts, view.firsts, lists.splats, view.total, stride, pair_sums))
+        projected = (
+            frame.pose, view.grid, frame.cuts, frame.means, frame.quats, frame.scales, view.opacities, frame.slopes,
+            view.ellipses, view.counts, view.firsts, pair_sums, *out, weight,
         )  # fmt: skip
+        launch(project_vjp(k, absolute, weight is not None), [frame.n], projected)
 
 
 def _empty_gradients(frame: WarpFrame, j: int, k: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Means, quats, scales, opacities, screen and rgb."""
     n, empty = frame.n, frame.empty
     return empty(j, n, 3), empty(j, n, 4), empty(j, n, 3), empty(j, n), empty(k, n, 2), empty(k, n, 3)
-
-
-def _sorted(keys: Tensor, values: Tensor, count: int, bits: int) -> tuple[Tensor, Tensor]:
-    """The first `count` keys and values in a stable order by key; both tensors have twice that length, for scratch."""
-    if count:
-        sort_pairs(keys, values, count, bits)
-    return keys[:count], values[:count]
 
 
 def _read_deferred(numbers: Tensor) -> Any:

@@ -40,10 +40,10 @@ def two_steps(warp_step):
 
 
 @pytest.mark.slow
-def test_blocks_of_many_threads_give_the_same_bits(warp_step, blocks_of):
+def test_blocks_of_many_threads_give_the_same_bits(warp_step, whole_blocks):
     """The last block is not full."""
     state, conflicts, readings, skipped = two_steps(warp_step)
-    blocks_of(warp_step.LANES, 128)
+    whole_blocks()
     again = two_steps(warp_step)
     assert all(torch.equal(a, b) for a, b in zip(state, again[0], strict=True))
     assert again[1] == conflicts
@@ -56,7 +56,7 @@ def test_blocks_of_many_threads_give_the_same_bits(warp_step, blocks_of):
 def test_the_kernels_compile_for_cuda_on_a_machine_without(warp_step, ptx_of):
     from clear_strategies.kernels.reconcile import warp as reconcile
 
-    assert "fma.rn.f32" not in ptx_of(reconcile.compare.module, reconcile._LANES["cuda"])
-    assembly = ptx_of(warp_step.passes.step.module, warp_step.LANES["cuda"])  # the module of all kernels
+    assert "fma.rn.f32" not in ptx_of(reconcile.compare.module, reconcile.LANES)
+    assembly = ptx_of(warp_step.passes.step.module, warp_step.LANES)  # the module of all kernels
     assert ".local" not in assembly  # no spills: a thread's numbers are in registers
     assert "fma.rn.f32" not in assembly  # products and sums round as in torch

@@ -177,7 +177,7 @@ def test_launches_of_two_threads_are_each_on_the_stream_of_its_own(monkeypatch):
         with warp_runtime.on_stream(torch.device("cuda")):
             for _ in range(2):
                 both_are_here.wait()
-                launch(doubled, [1], (), torch.device("cuda"))
+                launch(doubled, [1], (torch.zeros(1),))
         assert warp_runtime._kept.stream is None
 
     monkeypatch.setattr(warp_runtime, "_Launch", lambda *_: Command())
@@ -318,7 +318,7 @@ EXAMPLES: dict[str, list[Callable[[StrictCuda, torch.Tensor], object]]] = {
     "timing_in_a_capture": [lambda cuda, x: torch.cuda.Event(enable_timing=True).record()],
     "destroying_a_graph": [lambda cuda, x: cuda.ask("destroy")],
     "a_graph_of_autograd_on_another_stream": [lambda cuda, x: x.clone().requires_grad_().add(1)],
-    "loading_a_module": [lambda cuda, x: launch(doubled, [1], (x,), CPU)],
+    "loading_a_module": [lambda cuda, x: launch(doubled, [1], (x,))],
     "waiting_for_a_capturing_stream": [lambda cuda, x: cuda.state.legacy.wait_stream(cuda.current)],
     "a_capturing_stream_waiting": [lambda cuda, x: cuda.current.wait_stream(cuda.state.legacy)],
     "work_on_another_stream": [on_the_default_stream(lambda cuda, x: x.add_(1))],

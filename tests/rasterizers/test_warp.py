@@ -115,15 +115,12 @@ def test_warp_is_the_fastest_with_cuda_and_slower_than_cpp_without(monkeypatch, 
 
 @installed
 @pytest.mark.parametrize("k", [1, 3])
-def test_the_blending_vjp_is_the_same_with_32_threads_per_tile(blocks_of, k):
-    from rasterizers.warp_backend import frame
-
+def test_the_blending_vjp_is_the_same_with_32_threads_per_tile(whole_blocks, k):
     splats, view = dense_scene(600)
     v = cotangents(k, view.height, view.width)
     rasterizer = rasterizers.load("warp", device="cpu", **CLEAN)
     alone = rasterizer(splats, view).vjp(v)
-    blocks_of(frame.LANES, 32)
-    blocks_of(frame.TILE_LANES, 64)
+    whole_blocks()
     together, again = (rasterizer(splats, view).vjp(v) for _ in range(2))
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN", "screen"):
         found, expected = gradient_of(together, name), gradient_of(alone, name)

@@ -25,11 +25,11 @@ def passes(request):
 class Elsewhere:
     """A pass on another device; what it writes comes back to the tests' tensors."""
 
-    def __init__(self, passes, device, activation, lr, base, hf, lambda_hf) -> None:
+    def __init__(self, passes, device, *gradients) -> None:
         self.device = device
         self.there: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}  # the same tensor stays the same tensor
-        tables = ({name: self.bring(x) for name, x in t.items()} if t else None for t in (activation, lr, base, hf))
-        self.passes = passes(*tables, lambda_hf)
+        tables = ({name: self.bring(x) for name, x in t.items()} if t else None for t in gradients)
+        self.passes = passes(*tables)
 
     def bring(self, x):
         if not isinstance(x, torch.Tensor):

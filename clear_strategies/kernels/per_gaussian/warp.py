@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 import torch
 import warp as wp
@@ -10,12 +10,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core.evidence import Evidence
-from rasterizers.warp_runtime import launch, on_stream
+from rasterizers.warp_runtime import lanes_on, launch
 
 wp.set_module_options({"enable_backward": False})
 
-LANES: Final = {"cuda": 256, "cpu": 1}
-"""Threads per block; on a CPU, Warp's blocks have one."""
+LANES: Final = 256
+"""Threads per block, see `warp_runtime.lanes_on`."""
 _UNIT: Final = wp.constant(wp.float32(2.0**20))  # see `core.gradients.screen_norm`
 _TINY: Final = wp.constant(wp.float32(torch.finfo(torch.float32).tiny))
 
@@ -56,7 +56,7 @@ def activate(
     n = len(logits)
     scales, filtered = log_scales.new_empty(2, n, 3).unbind()
     rest = logits.new_empty(4, n).unbind()
-    _launch(_activate, n, log_scales, logits, filters, gate, scales, filtered, *rest)
+    launch(_activate, [n], (log_scales, logits, filters, gate, scales, filtered, *rest), block=LANES)
     return scales, filtered, *rest
 
 
@@ -90,7 +90,7 @@ def evidence(
 ) -> Evidence:
     q, a = maps.new_empty(2, len(centers)).unbind()
     parts = _parts(q, 3)
-    _launch(_look_up, len(parts), maps, centers.detach(), visible, patch, q, a, parts, together=True)
+    launch(_look_up, [len(parts)], (maps, centers.detach(), visible, patch, q, a, parts), block=LANES, together=True)
     return Evidence(q, a, parts.sum(0))
 
 
@@ -116,7 +116,7 @@ def route(e: Evidence, visible: Bool[Tensor, " N"], floor: float, normalize: boo
     m, sums = torch.empty_like(e.reliability), e.sums
     if sums is None:  # the evidence is not that of `evidence` above
         sums = torch.stack([x.sum(dtype=torch.float64) for x in (visible, e.reliability, e.weight)])
-    _launch(_route, len(m), e.reliability, e.demand, sums[None], floor, normalize, m)
+    launch(_route, [len(m)], (e.reliability, e.demand, sums[None], floor, normalize, m), block=LANES)
     return m
 
 
@@ -159,7 +159,7 @@ def screens(
     found, ordinary = base.new_empty(1 if hf is None else 2, len(base), 2), base.new_empty(len(base))
     numbers, changing = ((0.0, 0.0), weights) if isinstance(weights, Tensor) else (weights, None)
     halves = [pixels / 2 for pixels in size]
-    _launch(_screens, len(base), lr, base, hf, *halves, *numbers, changing, found, ordinary)
+    launch(_screens, [len(base)], (lr, base, hf, *halves, *numbers, changing, found, ordinary), block=LANES)
     return found[0], None if hf is None else found[1], ordinary
 
 
@@ -195,9 +195,10 @@ def evidence_score(
 ) -> Float[Tensor, " N"]:
     n = len(ordinary)
     score, parts = ordinary.new_empty(n), _parts(ordinary, 2)
-    _launch(_evidence_score, len(parts), e.reliability, e.demand, hf, ordinary, score, parts, together=True)
+    scored = e.reliability, e.demand, hf, ordinary, score, parts
+    launch(_evidence_score, [len(parts)], scored, block=LANES, together=True)
     if joined:
-        _launch(_joined, n, ordinary, parts.sum(0)[None], score)
+        launch(_joined, [n], (ordinary, parts.sum(0)[None], score), block=LANES)
     return score
 
 
@@ -226,7 +227,7 @@ def _accumulate(
 def accumulate(
     visible: Bool[Tensor, " N"], score: Tensor, ordinary: Tensor, totals: tuple[Tensor, Tensor, Tensor], largest: bool
 ) -> None:
-    _launch(_accumulate, len(visible), visible, score, ordinary, largest, *totals)
+    launch(_accumulate, [len(visible)], (visible, score, ordinary, largest, *totals), block=LANES)
 
 
 @wp.kernel
@@ -258,16 +259,9 @@ def wander(
     means: Tensor, quats: Tensor, log_scales: Tensor, gate: Tensor, rows: Tensor, eta: Tensor, strength: float
 ) -> None:
     typical = log_scales.amax(-1).median().view(1)
-    _launch(_wander, len(rows), quats, log_scales, gate, rows, eta, typical, strength, means)
+    launch(_wander, [len(rows)], (quats, log_scales, gate, rows, eta, typical, strength, means), block=LANES)
 
 
 def _parts(like: Tensor, width: int) -> Float[Tensor, "blocks width"]:
     """Memory for the sums of each block over the Gaussians of `like`."""
-    return like.new_empty(-(-len(like) // LANES[like.device.type]), width, dtype=torch.float64)
-
-
-def _launch(kernel: Any, n: int, *arguments: Any, together: bool = False) -> None:
-    """Launch n threads or, if `together`, n blocks of `LANES`."""
-    device = next(x.device for x in arguments if isinstance(x, Tensor))
-    with on_stream(device):
-        launch(kernel, [n], arguments, device, block=LANES[device.type], together=together)
+    return like.new_empty(-(-len(like) // lanes_on(like.device, LANES)), width, dtype=torch.float64)

@@ -18,11 +18,11 @@ from clear_strategies.core import conflicts, deferred
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads
 from clear_strategies.kernels.reconcile.tables import FIRST_BANDS, WeightTable, contiguous, row_width, weight_tables
-from rasterizers.warp_runtime import launch, on_stream, struct
+from rasterizers.warp_runtime import lanes_on, launch, struct
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-_LANES: Final = {"cuda": 128, "cpu": 1}  # threads per block; on a CPU, Warp's blocks have one
+LANES: Final = 128  # threads per block, see `lanes_on`
 _ORDER: Final = ("means", "quats", "scales", "opacities", "sh0", "shN", "detail")
 
 
@@ -43,7 +43,6 @@ class Weight:
     number: wp.float64  # of all, where there are no rows
     rows: wp.array[wp.float64]
     stride: wp.int32  # from one group to the next
-    has_rows: wp.bool
 
 
 @wp.struct
@@ -56,10 +55,7 @@ class Weights:
 
 def weights_of(tables: Sequence[WeightTable]) -> Any:
     """The weights as kernels take them."""
-    keep, remove = (
-        struct(Weight, {"rows": rows}, number=number, stride=stride, has_rows=rows is not None)
-        for number, rows, stride in tables
-    )
+    keep, remove = (struct(Weight, {"rows": rows}, number=number, stride=stride) for number, rows, stride in tables)
     return struct(Weights, {}, keep=keep, remove=remove)
 
 
@@ -77,7 +73,7 @@ def products_of(names: Sequence[str], table: Tensor, counts: Tensor) -> conflict
 
 @wp.func
 def weight(w: Weight, group: wp.int32, i: wp.int32) -> wp.float64:
-    if w.has_rows:
+    if w.rows.shape[0] > 0:
         return w.rows[group * w.stride + i]
     return w.number
 
@@ -120,13 +116,12 @@ def store(p: Products, table: wp.array2d[wp.float64], i: wp.int32) -> None:
 
 @wp.struct
 class Rows:
-    """One attribute's gradients; bit k of `has` says whether the k-th array is there."""
+    """One attribute's gradients; an array that is not there is empty."""
 
     lr: wp.array[wp.float32]
     hr: wp.array[wp.float32]
     plus: wp.array[wp.float32]
     out: wp.array[wp.float32]
-    has: wp.int32
     width: wp.int32
     first_band: wp.int32  # of the spherical harmonics; -1: others
 
@@ -143,7 +138,6 @@ class Factors:
 class Options:
     """Options that all attributes share."""
 
-    n: wp.int32
     lr: Factors
     hr: Factors
     lambda_hr: wp.float32
@@ -160,20 +154,11 @@ def product(f: Factors, a: Rows, i: wp.int32, d: wp.int32) -> wp.float32:
 
 
 @wp.func
-def low(a: Rows, i: wp.int32, d: wp.int32, o: Options) -> wp.float32:
-    """g_LR."""
-    g = product(o.lr, a, i, d)
-    if (a.has & 1) != 0:
-        g += a.lr[i * a.width + d]
-    return g
-
-
-@wp.func
-def high(a: Rows, i: wp.int32, d: wp.int32, o: Options) -> wp.float32:
-    """g^HR."""
-    g = product(o.hr, a, i, d)
-    if (a.has & 2) != 0:
-        g += a.hr[i * a.width + d]
+def gradient(rows: wp.array[wp.float32], f: Factors, a: Rows, i: wp.int32, d: wp.int32) -> wp.float32:
+    """The d-th number of an attribute's row of a gradient, of its rows and factors."""
+    g = product(f, a, i, d)
+    if rows.shape[0] > 0:
+        g += rows[i * a.width + d]
     return g
 
 
@@ -181,7 +166,7 @@ def high(a: Rows, i: wp.int32, d: wp.int32, o: Options) -> wp.float32:
 def compared(a: Rows, i: wp.int32, o: Options) -> wp.vec3d:
     total = wp.vec3d()
     for d in range(a.width):
-        g_lr, g_hr = wp.float64(low(a, i, d, o)), wp.float64(high(a, i, d, o))
+        g_lr, g_hr = wp.float64(gradient(a.lr, o.lr, a, i, d)), wp.float64(gradient(a.hr, o.hr, a, i, d))
         total += wp.vec3d(g_lr * g_hr, g_lr * g_lr, g_hr * g_hr)
     return total
 
@@ -195,7 +180,7 @@ def compare(
     block, lane = wp.tid()
     i = block * wp.block_dim() + lane
     tally = Counts()
-    if i < o.n:
+    if i < table.shape[1]:
         p = Products()
         p[MEANS] = compared(means, i, o)
         p[SH0] = compared(sh0, i, o)
@@ -214,11 +199,11 @@ def write(
     finite: wp.array[wp.int32],
 ) -> None:  # fmt: skip
     at = i * a.width + d
-    g_lr = low(a, i, d, o)
-    total = reconciled(high(a, i, d, o), g_lr, keep, remove)  # Eq. 7
+    g_lr = gradient(a.lr, o.lr, a, i, d)
+    total = reconciled(gradient(a.hr, o.hr, a, i, d), g_lr, keep, remove)  # Eq. 7
     if o.keeps_lr:
         total = g_lr + total * lambda_hr  # Eq. 8
-    if (a.has & 4) != 0:
+    if a.plus.shape[0] > 0:
         total += a.plus[at]
     if not wp.isfinite(total):
         finite[0] = 0
@@ -260,13 +245,11 @@ def products(lr: Grads, hr: Grads, names: Sequence[str]) -> conflicts.Products:
     """See `kernels.reconcile.products`."""
     lr, hr = contiguous(lr), contiguous(hr)
     like = next(iter(lr.tensors.values()))
-    n, device, lanes = len(like), like.device, _LANES[like.device.type]
-    blocks = -(-n // lanes)
+    n = len(like)
+    blocks = -(-n // lanes_on(like.device, LANES))
     rows = [_rows(name, row_width(name, lr, hr) if name in names else 0, lr, hr, Grads(), None) for name in _ORDER[:-1]]
     table, counts = product_table(like, n, blocks)
-    with on_stream(device):
-        compared = *rows, _options(n, lr, hr), table, counts
-        launch(compare, [blocks], compared, device, block=lanes, together=True)
+    launch(compare, [blocks], (*rows, _options(lr, hr), table, counts), block=LANES, together=True)
     return products_of(names, table, counts)
 
 
@@ -276,22 +259,21 @@ def apply(
 ) -> Number:  # fmt: skip
     """See `kernels.reconcile.apply`."""
     lr, hr, plus, like = contiguous(lr), contiguous(hr), contiguous(plus), next(iter(out.values()))
-    n, device = len(like), like.device
+    n = len(like)
     rows = [
         _rows(name, out[name].shape[1:].numel() if name in out else 0, lr, hr, plus, out.get(name)) for name in _ORDER
     ]
-    tables, finite = weight_tables(weights, n, device), like.new_ones(1, dtype=torch.int32)
+    tables, finite = weight_tables(weights, n, like.device), like.new_ones(1, dtype=torch.int32)
     changing = lambda_hr if isinstance(lambda_hr, Tensor) else None
-    options = _options(n, lr, hr, 0.0 if isinstance(lambda_hr, Tensor) else lambda_hr, keeps_lr)
-    with on_stream(device):
-        combined = *rows, options, weights_of(tables), changing, finite
-        launch(combine, [n, sum(row.width for row in rows)], combined, device, block=_LANES[device.type])
+    options = _options(lr, hr, 0.0 if isinstance(lambda_hr, Tensor) else lambda_hr, keeps_lr)
+    combined = *rows, options, weights_of(tables), changing, finite
+    launch(combine, [n, sum(row.width for row in rows)], combined, block=LANES)
     return deferred.scalar(finite[0])
 
 
-def _options(n: int, lr: Grads, hr: Grads, lambda_hr: float = 1.0, keeps_lr: bool = True) -> Any:
+def _options(lr: Grads, hr: Grads, lambda_hr: float = 1.0, keeps_lr: bool = True) -> Any:
     low, high = (struct(Factors, {} if c is None else c._asdict()) for c in (lr.colour, hr.colour))
-    return struct(Options, {}, n=n, lr=low, hr=high, lambda_hr=lambda_hr, keeps_lr=keeps_lr)
+    return struct(Options, {}, lr=low, hr=high, lambda_hr=lambda_hr, keeps_lr=keeps_lr)
 
 
 def _rows(name: str, width: int, lr: Grads, hr: Grads, plus: Grads, out: Tensor | None) -> Any:
@@ -299,5 +281,4 @@ def _rows(name: str, width: int, lr: Grads, hr: Grads, plus: Grads, out: Tensor 
     if width == 0:
         return struct(Rows, {})
     tensors = {"lr": lr.get(name), "hr": hr.get(name), "plus": plus.get(name), "out": out}
-    has = sum(1 << k for k, x in enumerate([*tensors.values()][:-1]) if x is not None)
-    return struct(Rows, tensors, has=has, width=width, first_band=FIRST_BANDS.get(name, -1))
+    return struct(Rows, tensors, width=width, first_band=FIRST_BANDS.get(name, -1))

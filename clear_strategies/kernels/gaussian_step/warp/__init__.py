@@ -20,10 +20,10 @@ from clear_strategies.kernels.gaussian_step import Attribute, StepSettings
 from clear_strategies.kernels.gaussian_step.warp import passes
 from clear_strategies.kernels.reconcile.tables import weight_tables
 from clear_strategies.kernels.reconcile.warp import product_table, products_of, weights_of
-from rasterizers.warp_runtime import launch, on_stream, struct
+from rasterizers.warp_runtime import lanes_on, launch, on_stream, struct
 
-LANES: Final = {"cuda": 128, "cpu": 1}
-"""Threads per block; on a CPU, Warp's blocks have one."""
+LANES: Final = 128
+"""Threads per block, see `lanes_on`."""
 
 _STEP: Final = cast(Any, passes.AdamStep).ctype
 _BYTES: Final = 4  # of each of its numbers
@@ -57,23 +57,19 @@ class WarpGaussianStep:
         self._has_hr, high = hr is not None, hr or {}
         inputs = {"scales": 3, "filtered": 3, "filter": 1, "sigmoid": 1, "factor": 1, "basis": self._bases}
         widths = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "rgb": 3}
-        learns_detail = "detail" in high
-        widths_of_hr = widths | {"detail": 3} if learns_detail else widths
+        widths_of_hr = widths | {"detail": 3} if "detail" in high else widths
         self._gradients = (
             self._rows(passes.Activation, activation, inputs),
             self._rows(passes.Gradient, lr, widths),
             self._rows(passes.Gradient, high, widths_of_hr if high else {}),
-            struct(passes.View, {}, n=self._n, has_hr=self._has_hr, has_detail=learns_detail),
         )
 
     def products(self) -> Products:
         if self._n and not self._has_hr:
             raise ValueError("there is no HR gradient to reconcile.")
-        lanes, device = self._lanes, self._like.device
-        blocks = -(-self._n // lanes)
+        blocks = -(-self._n // lanes_on(self._like.device, LANES))
         table, counts = product_table(self._like, self._n, blocks)
-        with on_stream(device):
-            launch(passes.compare, [blocks], (*self._gradients, table, counts), device, block=lanes, together=True)
+        launch(passes.compare, [blocks], (*self._gradients, table, counts), block=LANES, together=True)
         return products_of(CONFLICT_GROUPS, table, counts)
 
     def step(
@@ -88,8 +84,8 @@ class WarpGaussianStep:
             )
         colours = self._like.new_empty(self._n, 3)
         moving = self._like.new_empty(self._n, dtype=torch.bool)
-        device, lanes, adam_step = self._like.device, self._lanes, settings.changing
-        blocks = -(-self._n // lanes)
+        device, adam_step = self._like.device, settings.changing
+        blocks = -(-self._n // lanes_on(device, LANES))
         stills = self._like.new_empty(blocks, dtype=torch.int32)
         if adam_step is None:
             adam_step = written(settings, {name: a.rate for name, a in attributes.items()}, device)
@@ -102,13 +98,9 @@ class WarpGaussianStep:
         )  # fmt: skip
         of_bands = self._like, colours, moving, adam_step, bands
         with on_stream(device):
-            launch(passes.step, [blocks], step, device, block=lanes, together=True)
-            launch(passes.step_bands, [self._n, settings.width], of_bands, device, block=lanes)
+            launch(passes.step, [blocks], step, block=LANES, together=True)
+            launch(passes.step_bands, [self._n, settings.width], of_bands, block=LANES)
         return stills.sum() if settings.skips else 0
-
-    @property
-    def _lanes(self) -> int:
-        return LANES[self._like.device.type]
 
     def _attribute(self, a: Attribute, width: int) -> Any:
         """The structure for the kernels, checked, and cached by the tensors' addresses, which stay between changes of the field's
@@ -124,8 +116,7 @@ class WarpGaussianStep:
             if len(_attributes) >= _MOST_ATTRIBUTES:
                 _attributes.clear()
             _attributes[key] = struct(
-                passes.Attribute, tensors, width=width, has_hr=a.hr is not None, has_plus=a.plus is not None,
-                bounded=a.keep != 1 or a.limit != math.inf, keep=a.keep, limit=a.limit,
+                passes.Attribute, tensors, width=width, bounded=a.keep != 1 or a.limit != math.inf, keep=a.keep, limit=a.limit
             )  # fmt: skip
         return _attributes[key]
 
@@ -160,8 +151,7 @@ def written(
         beta2=s.beta2, gain1=1 - s.beta1, gain2=1 - s.beta2, per_bias2=1 / s.bias2, eps=s.eps, lambda_hr=s.lambda_hr,
         lambda_hf=lambda_hf,
     )  # fmt: skip
-    with on_stream(device):
-        launch(passes.write, [1], (numbers, out), device, block=LANES[device.type])
+    launch(passes.write, [1], (numbers, out), block=LANES)
     return out
 
 

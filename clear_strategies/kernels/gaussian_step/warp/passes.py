@@ -37,7 +37,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 class Gradient:
     """One cotangent's rasterizers.interface.SplatGradients; rgb is the factor beside Y of the colour gradient.
 
-    `detail`, of HR, is m λ_HF ∇L_HF of f_det.
+    `detail`, of HR, is m λ_HF ∇L_HF of f_det. An array that is not there is empty.
     """
 
     means: wp.array[wp.vec3]
@@ -58,15 +58,6 @@ class Activation:
     sigmoid: wp.array[wp.float32]
     factor: wp.array[wp.float32]
     basis: wp.array2d[wp.float32]
-
-
-@wp.struct
-class View:
-    """The number of Gaussians, and which gradients there are."""
-
-    n: wp.int32
-    has_hr: wp.bool
-    has_detail: wp.bool
 
 
 @wp.struct
@@ -100,21 +91,19 @@ def activation_vjp(g: Gradient, a: Activation, i: wp.int32) -> RawGradient:
 
 
 @wp.func
-def load(
-    activation: Activation, lr: Gradient, hr: Gradient, view: View, i: wp.int32
-) -> tuple[RawGradient, RawGradient]:
+def load(activation: Activation, lr: Gradient, hr: Gradient, i: wp.int32) -> tuple[RawGradient, RawGradient]:
     """∇L_LR and g^HR of a Gaussian; 0 for one that is missing."""
     g_lr, g_hr = activation_vjp(lr, activation, i), RawGradient()
-    if view.has_hr:
+    if hr.means.shape[0] > 0:
         g_hr = activation_vjp(hr, activation, i)
     return g_lr, g_hr
 
 
 @wp.func
-def detail_of(hr: Gradient, view: View, i: wp.int32) -> wp.vec3:
+def detail_of(hr: Gradient, i: wp.int32) -> wp.vec3:
     """The gradient of f_det, m λ_HF ∇L_HF; 0 if there is none."""
     g = wp.vec3()
-    if view.has_detail:
+    if hr.detail.shape[0] > 0:
         g = hr.detail[i]
     return g
 
@@ -167,7 +156,7 @@ class AdamStep:
 
 @wp.struct
 class Attribute:
-    """A parameter with its moments, row-major, terms that are added to its gradient, and its limits."""
+    """A parameter with its moments, row-major, terms that are added to its gradient, if any, and its limits."""
 
     p: wp.array[wp.float32]
     m: wp.array[wp.float32]
@@ -175,8 +164,6 @@ class Attribute:
     hr: wp.array[wp.float32]  # ĝ_HR where a strategy has computed it
     plus: wp.array[wp.float32]
     width: wp.int32
-    has_hr: wp.bool
-    has_plus: wp.bool
     bounded: wp.bool  # a row that takes no step may still decay or be clamped
     keep: wp.float32  # factor of the decay per step (f_det), 1: none
     limit: wp.float32
@@ -198,9 +185,9 @@ def step_number(
         return
     p = a.p[at]
     g = gradient
-    if a.has_hr:
+    if a.hr.shape[0] > 0:
         g += a.hr[at] * adam.lambda_hr
-    if a.has_plus:
+    if a.plus.shape[0] > 0:
         g += a.plus[at]
     after = p * a.keep
     if moves:
@@ -222,9 +209,9 @@ def is_still(a: Attribute, i: wp.int32, width: wp.int32) -> wp.bool:
     for at in range(a.width * i, a.width * i + width):
         if a.m[at] != 0.0 or a.v[at] != 0.0:
             return False
-        if a.has_hr and a.hr[at] != 0.0:
+        if a.hr.shape[0] > 0 and a.hr[at] != 0.0:
             return False
-        if a.has_plus and a.plus[at] != 0.0:
+        if a.plus.shape[0] > 0 and a.plus[at] != 0.0:
             return False
     return True
 
@@ -273,13 +260,12 @@ def merged(low: Any, high: Any, w: Weights, group: wp.int32, i: wp.int32, lambda
 
 @wp.kernel
 def compare(
-    activation: Activation, lr: Gradient, hr: Gradient, view: View,
-    table: wp.array2d[wp.float64], counts: wp.array[Counts],
+    activation: Activation, lr: Gradient, hr: Gradient, table: wp.array2d[wp.float64], counts: wp.array[Counts]
 ) -> None:  # fmt: skip
     block, lane = wp.tid()
     i, tally = block * wp.block_dim() + lane, Counts()
-    if i < view.n:
-        g_lr, g_hr = load(activation, lr, hr, view, i)
+    if i < table.shape[1]:
+        g_lr, g_hr = load(activation, lr, hr, i)
         p = group_products(g_lr, g_hr, activation, i)
         store(p, table, i)
         tally = counted(p)
@@ -291,7 +277,6 @@ def step(
     activation: Activation,
     lr: Gradient,
     hr: Gradient,
-    view: View,
     w: Weights,
     options: StepOptions,
     adams: wp.array[AdamStep],
@@ -308,11 +293,11 @@ def step(
 ) -> None:
     """One thread per Gaussian: steps everything but shN, for which it writes the merged colour to `colours`."""
     block, lane = wp.tid()
-    adam = adams[0]
+    adam, n = adams[0], moving.shape[0]
     at = block * wp.block_dim() + lane
-    i = wp.min(at, view.n - 1)  # lanes beyond the last Gaussian neither count nor write
-    g_lr, g_hr = load(activation, lr, hr, view, i)
-    g_detail = detail_of(hr, view, i)
+    i = wp.min(at, n - 1)  # lanes beyond the last Gaussian neither count nor write
+    g_lr, g_hr = load(activation, lr, hr, i)
+    g_detail = detail_of(hr, i)
     still = options.skips and size(g_lr) + size(g_hr) + wp.norm_l1(g_detail) <= 0.0
     still = still and is_still(means, i, 3) and is_still(quats, i, 4) and is_still(scales, i, 3)
     still = still and is_still(opacities, i, 1) and is_still(sh0, i, 3) and is_still(detail, i, 3)
@@ -330,10 +315,10 @@ def step(
     d_rgb = merged(g_lr.rgb, g_hr.rgb, w, SHN, i, λ)
 
     count = wp.int32(0)
-    if still and at < view.n:
+    if still and at < n:
         count = 1
     wp.tile_store(stills, wp.tile_sum(wp.tile(count)), offset=(block,))
-    if at >= view.n:
+    if at >= n:
         return
 
     moving[i] = moves

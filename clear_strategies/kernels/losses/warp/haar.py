@@ -14,10 +14,12 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def pixel(x: wp.array2d[wp.vec3], y: wp.array2d[wp.vec3], first: wp.bool, row: wp.int32, column: wp.int32) -> wp.vec3:
-    """A pixel of x - y at the first level, and of the low part x at the others; beyond the edge the last one is repeated."""
+def pixel(x: wp.array2d[wp.vec3], y: wp.array2d[wp.vec3], row: wp.int32, column: wp.int32) -> wp.vec3:
+    """A pixel of x - y at the first level, and of the low part x at the others, without a y; beyond the edge the last one is
+    repeated.
+    """
     i, j = wp.min(row, x.shape[0] - 1), wp.min(column, x.shape[1] - 1)
-    if first:
+    if y.shape[0] > 0:
         return x[i, j] - y[i, j]
     return x[i, j]
 
@@ -28,11 +30,11 @@ def signs(v: wp.vec3) -> wp.vec3:
 
 
 @wp.kernel
-def low_part(x: wp.array2d[wp.vec3], y: wp.array2d[wp.vec3], first: wp.bool, low: wp.array2d[wp.vec3]) -> None:
+def low_part(x: wp.array2d[wp.vec3], y: wp.array2d[wp.vec3], low: wp.array2d[wp.vec3]) -> None:
     """One thread per block."""
     i, j = wp.tid()
-    a, b = pixel(x, y, first, 2 * i, 2 * j), pixel(x, y, first, 2 * i, 2 * j + 1)
-    c, d = pixel(x, y, first, 2 * i + 1, 2 * j), pixel(x, y, first, 2 * i + 1, 2 * j + 1)
+    a, b = pixel(x, y, 2 * i, 2 * j), pixel(x, y, 2 * i, 2 * j + 1)
+    c, d = pixel(x, y, 2 * i + 1, 2 * j), pixel(x, y, 2 * i + 1, 2 * j + 1)
     low[i, j] = 0.5 * (a + b + c + d)
 
 
@@ -40,9 +42,7 @@ def low_part(x: wp.array2d[wp.vec3], y: wp.array2d[wp.vec3], first: wp.bool, low
 def details(
     x: wp.array2d[wp.vec3],
     y: wp.array2d[wp.vec3],
-    first: wp.bool,
     above: wp.array2d[wp.vec3],
-    last: wp.bool,
     weight: wp.float64,
     out: wp.array2d[wp.vec3],
     parts: wp.array[wp.float64],
@@ -54,13 +54,13 @@ def details(
     step = 0.5 * wp.float32(weight)
     share = wp.float64(0.0)
     for j in range(lane, (x.shape[1] + 1) / 2, wp.block_dim()):
-        a, b = pixel(x, y, first, 2 * i, 2 * j), pixel(x, y, first, 2 * i, 2 * j + 1)
-        c, d = pixel(x, y, first, 2 * i + 1, 2 * j), pixel(x, y, first, 2 * i + 1, 2 * j + 1)
+        a, b = pixel(x, y, 2 * i, 2 * j), pixel(x, y, 2 * i, 2 * j + 1)
+        c, d = pixel(x, y, 2 * i + 1, 2 * j), pixel(x, y, 2 * i + 1, 2 * j + 1)
         horizontal, vertical, diagonal = a - b + c - d, a + b - c - d, a - b - c + d  # doubled
         share += wp.float64(wp.norm_l1(horizontal) + wp.norm_l1(vertical) + wp.norm_l1(diagonal))
         h, v, hv = step * signs(horizontal), step * signs(vertical), step * signs(diagonal)
         low = wp.vec3(0.0, 0.0, 0.0)
-        if not last:
+        if above.shape[0] > 0:
             low = 0.5 * above[i, j]
         a, b, c, d = low + h + v + hv, low - h + v - hv, low + h - v - hv, low - h - v + hv
         has_right, has_lower = 2 * j + 1 < x.shape[1], 2 * i + 1 < x.shape[0]
