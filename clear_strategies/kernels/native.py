@@ -1,15 +1,33 @@
-"""The compiled module of this package, built from `src/`, and whether there is one."""
+"""Which implementation of this package's functions runs on a device, and the module compiled from `src/`."""
 
 from __future__ import annotations
 
+from importlib import import_module
 from types import ModuleType
+from typing import Final, Literal
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from rasterizers.interface import BackendUnavailable
-from rasterizers.native import empty, load_kernels
+from rasterizers.native import empty_for, load_kernels
+from rasterizers.warp_runtime import runs_warp
+
+ON_WARP: Final = {"cuda"}
+"""The kinds of devices for which Warp's kernels are used; tests add the CPU."""
+
+
+def fastest(device: torch.device) -> Literal["cpp", "warp", "torch"]:
+    """What computes float32 on this device: C++ on a CPU, Warp on CUDA, torch where these do not run."""
+    if device.type == "cpu" and available():
+        return "cpp"
+    return "warp" if device.type in ON_WARP and runs_warp(device.type) else "torch"
+
+
+def implementation(package: str, device: torch.device) -> ModuleType:
+    """The module of a package that computes float32 on this device: `cpp`, `warp`, or `reference` in torch."""
+    name = fastest(device)
+    return import_module(f"{package}.{'reference' if name == 'torch' else name}")
 
 
 def available() -> bool:
@@ -26,12 +44,9 @@ def module() -> ModuleType:
     return load_kernels("clear_strategies.kernels")
 
 
-def times(a: Float[Tensor, "N G"], b: Tensor) -> Float[Tensor, "N G"]:
-    """A · b, with a's type and layout; in recycled memory if there are compiled kernels."""
-    if a.device.type != "cpu" or not available():
-        return a * b
-    out = empty(a.shape, a.dtype) if a.is_contiguous() else empty(a.shape[::-1], a.dtype).T
-    return torch.mul(a, b, out=out)
+def times(a: Tensor, b: Tensor) -> Tensor:
+    """A · b, with a's type and layout, [N, G] by rows or columns; in recycled memory if there are compiled kernels."""
+    return torch.mul(a, b, out=empty_for(a) if a.is_contiguous() else empty_for(a.T).T)
 
 
 def runs(x: Tensor) -> bool:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.view import ExtraView, Photo, View
-from clear_strategies.kernels import losses
+from clear_strategies.kernels import native
 from clear_strategies.merging.iteration import Update
 from clear_strategies.merging.recorded_work import RecordedWork, merging_strategies, replays_on, why_not_recorded
 from clear_strategies.training.compiled_step import CompiledStep
@@ -137,7 +137,7 @@ def _why_not(s: TrainState, rasterizer: Rasterizer) -> Iterator[str]:
     if s.compiled_step is None or not s.compiled_step.records:
         yield "the per-Gaussian step is not that of Warp"
     chosen = s.conductor.objective.kernels
-    if (losses.running_on(s.device.type)[0] if chosen == "auto" else chosen) != "warp":
+    if (native.fastest(s.device) if chosen == "auto" else chosen) != "warp":
         yield "the losses are not those of Warp (objective.kernels)"
     yield from why_not_recorded(s.conductor)
 

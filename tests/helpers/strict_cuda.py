@@ -306,8 +306,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
 
     import rasterizers.native
     from clear_strategies.core import deferred
-    from clear_strategies.kernels import native, per_gaussian, reconcile
-    from clear_strategies.kernels.reconcile import warp as warp_merge
+    from clear_strategies.kernels import native
     from rasterizers import recording, replayed_drawing, replays, sending, warp_runtime
     from rasterizers.warp_backend import frame
 
@@ -391,11 +390,9 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         warp_runtime._Launch: {"__init__": constructed, "prepare": prepared},
         recording: {"_side_stream": cache(lambda device: Stream(cuda, records=True))},
         deferred: {"is_immediate": lambda x: False},
-        native: {"available": lambda: False},
-        per_gaussian: {"DEVICES": {"cpu"}},
+        native: {"available": lambda: False, "ON_WARP": {"cpu"}},
         replays: {"DEVICES": {"cpu"}},
-        replayed_drawing: {"_threads": replayed_drawing._Threads()},
-        reconcile: {"_for_device": lambda device: warp_merge},
+        replayed_drawing: {"_thread": replayed_drawing._Thread()},
         rasterizers.native: {"empty": on_no_cpu},
         frame: {"DEFERRED_COUNTS": {"cpu": True}, "_read_deferred": reads},
         sending: {"sent": sends},

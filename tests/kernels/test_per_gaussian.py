@@ -22,17 +22,15 @@ N = 700
 OF_ACTIVATION = ("scales", "filtered", "sigmoid", "coefficient", "factor", "opacities")
 
 
-@pytest.fixture(params=[pytest.param(x, marks=needs("cpp" if x == "cpp" else "warp")) for x in ("cpp", 1, 32)])
+@pytest.fixture(params=[pytest.param(x, marks=needs("cpp" if x == "cpp" else "warp")) for x in ("cpp", 1, "many")])
 def lanes(request, monkeypatch):
     """C++, or Warp's kernels with so many threads per block."""
     if request.param == "cpp":
         return request.param
-    from clear_strategies.kernels.per_gaussian import warp
-
     monkeypatch.setattr(native, "available", lambda: False)
-    monkeypatch.setattr(per_gaussian, "DEVICES", {"cpu"})
-    if request.param > 1:
-        request.getfixturevalue("blocks_of")(warp.LANES, request.param)
+    monkeypatch.setattr(native, "ON_WARP", {"cpu"})
+    if request.param == "many":
+        request.getfixturevalue("whole_blocks")()
     return request.param
 
 
@@ -165,7 +163,7 @@ def test_the_noise_of_mcmc(lanes):
 def test_the_kernels_compile_for_cuda_on_a_machine_without(ptx_of):
     from clear_strategies.kernels.per_gaussian import warp
 
-    ptx_of(warp._activate.module, warp.LANES["cuda"])  # the module of all kernels
+    ptx_of(warp._activate.module, warp.LANES)  # the module of all kernels
 
 
 @needs("warp")
@@ -176,7 +174,7 @@ def test_other_tensors_take_torch(monkeypatch):
     monkeypatch.setattr(native, "available", lambda: False)  # not C++
     x = [torch.zeros(1, 3), torch.zeros(1), torch.zeros(1)]
     assert activate(*x, None) != "Warp's"
-    monkeypatch.setattr(per_gaussian, "DEVICES", {"cpu"})
+    monkeypatch.setattr(native, "ON_WARP", {"cpu"})
     assert activate(*x, None) == "Warp's"
     assert activate(*x, torch.zeros(1, dtype=torch.float64)) != "Warp's"
 

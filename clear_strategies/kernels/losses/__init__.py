@@ -19,26 +19,16 @@ from torch import Tensor
 from clear_strategies.errors import SettingError
 from clear_strategies.kernels import native
 from clear_strategies.kernels.losses import cpp, reference
-from clear_strategies.kernels.losses.images import DEVICES, supported
+from clear_strategies.kernels.losses.images import supported
 from clear_strategies.kernels.losses.reference import LossAndGradient
-from rasterizers.warp_runtime import require_warp, runs_warp
+from rasterizers.warp_runtime import require_warp
 
-__all__ = ["Choice", "LossAndGradient", "haar_l1", "photometric", "require", "running_on", "ssim"]
+__all__ = ["Choice", "LossAndGradient", "haar_l1", "photometric", "require", "ssim"]
 
 _log = logging.getLogger(__name__)
 
 Choice = Literal["auto", "torch", "cpp", "warp"]
 _CHOICES: Final = get_args(Choice)
-
-
-def running_on(device: str = "cpu") -> list[Choice]:
-    """The implementations that run here for images on "cpu" or "cuda", fastest first.
-
-    Warp's kernels on a CPU are for checks, and are not listed.
-    """
-    compiled: Choice = "warp" if device == "cuda" else "cpp"
-    available = runs_warp("cuda") if device == "cuda" else native.available()
-    return [compiled, "torch"] if available else ["torch"]
 
 
 def require(kernels: Choice) -> None:
@@ -80,9 +70,7 @@ def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], inset: int = 0) -
     Raises:
         ValueError: there is no such pixel.
     """
-    if native.available() and supported(DEVICES["cpp"], x, y):
-        return cpp.ssim(x, y, inset)
-    return reference.ssim(x, y, inset)
+    return (cpp if _fastest(x, y) == "cpp" else reference).ssim(x, y, inset)
 
 
 def haar_l1(
@@ -110,8 +98,7 @@ def _chosen(kernels: Choice, x: Tensor, y: Tensor) -> ModuleType:
 
 
 def _fastest(x: Tensor, y: Tensor) -> Choice:
-    fastest = running_on(x.device.type)[0]
-    return fastest if fastest != "torch" and supported(DEVICES[fastest], x, y) else "torch"
+    return native.fastest(x.device) if supported(x, y) else "torch"
 
 
 @cache

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import wraps
 from types import ModuleType
-from typing import Final, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
@@ -18,13 +18,9 @@ from torch import Tensor
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.kernels import native
 from clear_strategies.kernels.per_gaussian import cpp, reference
-from rasterizers.warp_runtime import runs_warp
 
 P = ParamSpec("P")
 T = TypeVar("T")
-
-DEVICES: Final = {"cuda"}
-"""The devices for which Warp's kernels are used; tests add the CPU."""
 
 
 def _fastest(function: Callable[P, T]) -> Callable[P, T]:
@@ -46,16 +42,12 @@ def _tensors(argument: object) -> Sequence[Tensor]:
 
 
 def _kernels(tensors: Sequence[Tensor]) -> ModuleType | None:
-    """C++ for contiguous tensors on a CPU, Warp on CUDA, both for float32; None: torch."""
-    if any(x.is_floating_point() and x.dtype != torch.float32 for x in tensors):
+    """The implementation for float32 on one device, contiguous where that is C++; None: torch."""
+    device = tensors[0].device
+    if any(x.device != device or (x.is_floating_point() and x.dtype != torch.float32) for x in tensors):
         return None
-    if native.available() and all(x.device.type == "cpu" and x.is_contiguous() for x in tensors):
-        return cpp
-    if all(x.device.type in DEVICES for x in tensors) and runs_warp(tensors[0].device.type):
-        from clear_strategies.kernels.per_gaussian import warp
-
-        return warp
-    return None
+    kernels = native.implementation(__name__, device)
+    return None if kernels is cpp and not all(x.is_contiguous() for x in tensors) else kernels
 
 
 accumulate = _fastest(reference.accumulate)

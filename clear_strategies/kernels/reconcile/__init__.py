@@ -20,10 +20,9 @@ from clear_strategies.core.conflicts import Products, Weights
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads
 from clear_strategies.kernels import native
-from clear_strategies.kernels.reconcile import cpp, reference
+from clear_strategies.kernels.reconcile import reference
 from clear_strategies.kernels.reconcile.tables import WIDEST, common_groups, has
 from rasterizers.native import empty_for
-from rasterizers.warp_runtime import runs_warp
 
 __all__ = ["apply", "common_groups", "dense", "has", "products"]
 
@@ -77,14 +76,4 @@ def _chosen(*tensors: Tensor) -> ModuleType:
     first = tensors[0]
     if any(x.dtype != torch.float32 or x.device != first.device or x.shape[1:].numel() > WIDEST for x in tensors):
         return reference
-    return _for_device(first.device.type)
-
-
-def _for_device(device: str) -> ModuleType:
-    if device == "cpu" and native.available():
-        return cpp
-    if device == "cuda" and runs_warp(device):
-        from clear_strategies.kernels.reconcile import warp
-
-        return warp
-    return reference
+    return native.implementation(__name__, first.device)
