@@ -16,7 +16,7 @@ from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.iteration import HrSide
 from integration.colours import are_joined
 from integration.structure import rows_drawn
-from rasterizers.autograd import Drawing, Rendered, outer
+from rasterizers.differentiable import Drawing, Rendered, outer
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, summed_vjp
 from rasterizers.torch_internals import accumulator, is_hooked, leaf_of

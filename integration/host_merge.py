@@ -26,7 +26,7 @@ from integration.detail import Fading
 from integration.host import Host
 from integration.pending import BackwardPass, Pending, why_nothing_was_merged, widened
 from integration.replayed_merge import ReplayedMerge
-from rasterizers.autograd import TakeColours
+from rasterizers.differentiable import TakeColours
 from rasterizers.torch_internals import current_pass, when_pass_ends
 
 _log = logging.getLogger(__name__)

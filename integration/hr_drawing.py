@@ -39,7 +39,7 @@ from integration.autograd_shot import (
 )
 from integration.host import Host
 from integration.views import enlarged_mask
-from rasterizers.autograd import BackwardHook, Drawing
+from rasterizers.differentiable import BackwardHook, Drawing
 from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer, can_be_recorded, over
 from rasterizers.modes import in_full_precision

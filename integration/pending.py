@@ -18,13 +18,13 @@ from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.iteration import HrSide
 from integration.autograd_shot import HostOutput, OfOthers
 from integration.colours import are_accumulated, are_joined
-from rasterizers.autograd import TakeColours
+from rasterizers.differentiable import TakeColours
 from rasterizers.native import empty_for
 from rasterizers.torch_internals import current_pass, hooks_after_accumulation, hooks_on_gradient, version
 
 Reached = Callable[[int], TakeColours | None]
 """Called when a backward pass has reached the nth rendering and no parameter yet; returns the same as
-`rasterizers.autograd.BackwardHook.reached`.
+`rasterizers.differentiable.BackwardHook.reached`.
 """
 
 

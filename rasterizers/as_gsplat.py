@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 import rasterizers
-from rasterizers.autograd import stacked
+from rasterizers.differentiable import stacked
 from rasterizers.geometry import depths
 from rasterizers.gsplat_info import info_of_all, info_of_visible
 from rasterizers.gsplat_picture import CameraView

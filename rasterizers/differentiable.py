@@ -1,8 +1,7 @@
-"""Rasterizers as differentiable torch functions.
+"""Renderings in the autograd graph of what they show: `autograd.draw` and `as_gsplat.rasterization` are made of `render`, which
+draws outside of it, and `in_graph`.
 
-`draw` returns a rendering that is part of the autograd graph; `as_gsplat.rasterization` does so with gsplat's signature. A
-backward pass handles one cotangent; `Rendering.vjp` handles several, and `collected_drawings` returns it to callers of code that
-draws.
+A backward pass handles one cotangent, `Rendering.vjp` several; `collected_drawings` returns it to callers of code that draws.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any, Final, NamedTuple, cast
 
 import torch
@@ -24,12 +22,10 @@ from rasterizers.ahead import draw_or_take, is_drawing_ahead
 from rasterizers.checks import require_trait
 from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, over
-from rasterizers.modes import in_full_precision, uncompiled
+from rasterizers.modes import in_full_precision
 from rasterizers.native import empty_for
 from rasterizers.pose import pose_gradient
 from rasterizers.torch_internals import is_transformed
-
-__all__ = ["BackwardHook", "Drawing", "Drawn", "TakeColours", "collected_drawings", "draw", "outer"]
 
 
 class Drawn(NamedTuple):
@@ -96,43 +92,6 @@ def collected_drawings() -> Iterator[list[Drawing]]:
         yield drawings
     finally:
         _collecting.reset(before)
-
-
-@uncompiled
-@in_full_precision
-def draw(
-    rasterizer: Rasterizer,
-    splats: Splats,
-    camera: Camera,
-    means2d: Tensor | None = None,
-    *,
-    depth: bool = False,
-    colors: Float[Tensor, "N K 3"] | None = None,
-) -> Drawn:
-    """Draw the splats. Gradients flow from the image, its alpha and its depth to the splats' tensors and the pose.
-
-    Without the trait `depth_gradient`, depth has none, and a loss of alpha draws the splats a second time, over another
-    background, and takes a second backward pass.
-
-    Args:
-        means2d: a tensor that receives the projected centres and whose `.grad` will be the screen gradient; None makes one.
-        depth: also draw the expected depth.
-        colors: the tensor of which `splats.sh0` and `splats.shN` are slices, if the caller has one.
-
-    Raises:
-        ValueError: the rasterizer lacks the trait `depth` that `depth=True` needs.
-        NotImplementedError: in `backward`, if the loss depends on the depth and the rasterizer lacks `depth_gradient`.
-        RuntimeError: in `backward`, if the loss depends on these gradients, e.g. by a gradient penalty.
-    """
-    if colors is None:
-        colors = torch.cat((splats.sh0, splats.shN), 1)
-    inputs = Inputs(splats.means, splats.quats, splats.scales, splats.opacities, colors, splats.rgb_offset)
-    rendered = render(rasterizer, inputs, 1 + splats.shN.shape[1], camera, depth=depth)
-    if means2d is None:
-        means2d = rendered.rendering.means2d.clone().requires_grad_()
-    else:
-        means2d.data.copy_(rendered.rendering.means2d)
-    return in_graph(rendered, means2d, pose=camera.world_to_camera)
 
 
 class Rendered(NamedTuple):
@@ -293,12 +252,3 @@ class _Stack(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
         return gradient.unbind()
-
-
-def __getattr__(name: str) -> Any:
-    """The earlier places of `rasterization` and `drawing_ahead`."""
-    if name == "rasterization":
-        return import_module("rasterizers.as_gsplat").rasterization
-    if name == "drawing_ahead":
-        return import_module("rasterizers.ahead").drawing_ahead
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

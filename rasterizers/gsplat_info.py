@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from rasterizers.autograd import Rendered, stacked
+from rasterizers.differentiable import Rendered, stacked
 from rasterizers.interface import RasterSettings, WithTraits
 from rasterizers.modes import in_full_precision
 from rasterizers.reference.projection import footprints

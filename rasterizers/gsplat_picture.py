@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from rasterizers.autograd import Rendered, in_graph, render
+from rasterizers.differentiable import Rendered, in_graph, render
 from rasterizers.geometry import constant_band, depths, low_and_span
 from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer, over
@@ -47,7 +47,7 @@ class CameraView:
 
     Args:
         inputs, sh_degree, background, render_mode: as of `as_gsplat.rasterization`, for one scene and camera.
-        replays: see `autograd.render`.
+        replays: see `differentiable.render`.
     """
 
     rasterizer: Rasterizer

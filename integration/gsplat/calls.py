@@ -20,7 +20,7 @@ from integration.hr_drawing import Drawable
 from integration.pending import widened
 from integration.views import SAME_POSE, require_intrinsics
 from rasterizers.as_gsplat import cameras_of
-from rasterizers.autograd import collected_drawings
+from rasterizers.differentiable import collected_drawings
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, Rasterizer
 

@@ -28,7 +28,7 @@ from integration.inria.rows import CarriedRows
 from integration.replacing import replaced_attribute, replaced_everywhere, replaced_methods
 from integration.settings import Settings
 from integration.views import SuperResolve
-from rasterizers.autograd import collected_drawings
+from rasterizers.differentiable import collected_drawings
 from rasterizers.interface import Camera
 from rasterizers.modes import uncompiled
 from rasterizers.sending import color_on

@@ -17,7 +17,7 @@ from torch import Tensor
 from clear_strategies.errors import HostError
 from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot
 from integration.detail import sh0_offset
-from rasterizers.autograd import Drawing
+from rasterizers.differentiable import Drawing
 from rasterizers.interface import Camera
 
 Role = Literal["gate", "detail"]

@@ -18,7 +18,7 @@ from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.training.field import GaussianField
 from integration.gsplat import attach
 from integration.gsplat.rows import ROWS
-from rasterizers import autograd
+from rasterizers import autograd, differentiable
 from tests.helpers import toy
 from tests.helpers.host_parts import HR_FROM_START, photometric
 
@@ -119,11 +119,11 @@ ADAM = {"lr": 1e-3, "eps": 1e-15}
 
 def unrecorded(*args, **call):
     """This package's rasterization as CLEAR sees gsplat's own: by no drawing that it knows."""
-    collecting = autograd._collecting.set(())
+    collecting = differentiable._collecting.set(())
     try:
         return autograd.rasterization(*args, **call)
     finally:
-        autograd._collecting.reset(collecting)
+        differentiable._collecting.reset(collecting)
 
 
 def gsplats(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **call):
