@@ -59,22 +59,18 @@ class Guarded(Unread):
     plain number, which a replay would repeat.
 
     Args:
-        of: the number as a function of t.
+        at: the number as a function of t.
     """
 
-    def __init__(self, value: Any, what: str, of: Callable[[int], Any] = lambda t: t) -> None:
+    def __init__(self, value: Any, what: str, at: Callable[[int], Any] = lambda t: t) -> None:
         super().__init__(value, what)
-        self._of = of
-
-    def at(self, t: int) -> Any:
-        """The number at another iteration."""
-        return self._of(t)
+        self.at = at
 
     def _made(self, by: Callable[..., Any], *other: Any) -> Guarded:
-        return Guarded(by(self._value, *other), self._what, lambda t: by(self._of(t), *other))
+        return Guarded(by(self._value, *other), self._what, lambda t: by(self.at(t), *other))
 
     def _answered(self, by: Callable[..., bool], *other: Any) -> bool:
-        answer, of = by(self._value, *other), self._of
+        answer, of = by(self._value, *other), self.at
         if (recording := running()) is not None:
             recording.guards.append(lambda t: by(of(t), *other) == answer)
         return answer

@@ -34,9 +34,30 @@ def draw(rasterizer: Rasterizer, inputs: Inputs, camera: Camera, *, depth: bool)
     device, call = inputs.means.device, _Call(rasterizer, inputs, camera, depth)
     if not (can_record(device) and can_be_recorded(rasterizer)) or running() is not None:
         return call.live()
-    if device not in _threads.drawings:
-        _threads.drawings[device] = _Drawings(device)
-    return _threads.drawings[device].draw(call)
+    key, last = call.key, _thread.last
+    if key in last and (drawn := last[key]()) is not None and drawn.awaits_backward:
+        return call.live()
+    if device not in _thread.replays:
+        _thread.replays[device] = Replays(device, "the replay of drawings")
+    _thread.count += 1
+    record = partial(_RecordedDrawing, call)
+    rendering = _thread.replays[device].do(key, _thread.count, call.given, live=call.live, record=record)
+    if isinstance(rendering, _Replayed):
+        rendering.call = call
+        _thread.last = {k: one for k, one in last.items() if one() is not None} | {key: weakref.ref(rendering)}
+    return rendering
+
+
+class _Thread(threading.local):
+    """A thread's recordings of drawings, the last replay of each kind while its rendering is alive, and the number of calls."""
+
+    def __init__(self) -> None:
+        self.replays: dict[torch.device, Replays] = {}
+        self.last: dict[GraphKey, weakref.ref[_Replayed]] = {}
+        self.count = 0
+
+
+_thread: Final = _Thread()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,8 +71,8 @@ class _Call:
 
     @property
     def key(self) -> GraphKey:
-        n, of_kind = len(self.inputs.means), (_over_black(self.rasterizer), self.depth)
-        return GraphKey(n, (), shapes_of(self.given, n), of_kind)
+        n, device = len(self.inputs.means), self.inputs.means.device
+        return GraphKey(n, (), shapes_of(self.given, n), (device, _over_black(self.rasterizer), self.depth))
 
     @property
     def given(self) -> Given:
@@ -135,36 +156,6 @@ class _Replayed:
     @property
     def _is_last(self) -> bool:
         return self._number == self._of.replays
-
-
-class _Drawings:
-    """The drawings of a thread on one device."""
-
-    def __init__(self, device: torch.device) -> None:
-        self._replays = Replays(device, "the replay of drawings")
-        self._last: dict[GraphKey, weakref.ref[_Replayed]] = {}
-        self._count = 0
-
-    def draw(self, call: _Call) -> Rendering:
-        key = call.key
-        last = self._last[key]() if key in self._last else None
-        if last is not None and last.awaits_backward:
-            return call.live()
-        self._count += 1
-        record = partial(_RecordedDrawing, call)
-        drawn = self._replays.do(key, self._count, call.given, live=call.live, record=record)
-        if isinstance(drawn, _Replayed):
-            drawn.call = call
-            self._last = {k: one for k, one in self._last.items() if one() is not None} | {key: weakref.ref(drawn)}
-        return drawn
-
-
-class _Threads(threading.local):
-    def __init__(self) -> None:
-        self.drawings: dict[torch.device, _Drawings] = {}
-
-
-_threads: Final = _Threads()
 
 
 @lru_cache(maxsize=64)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from itertools import chain
 from typing import Final
 
@@ -105,7 +106,6 @@ class _Frame:
         )
         self.means2d = [self.empty(n, 2) for _ in jobs]
         self.visible = [torch.empty(n, dtype=torch.bool, device="cpu") for _ in jobs]
-        self._basis: Tensor | None = None
         grids = [[c.fx, c.fy, c.cx, c.cy, float(c.width), float(c.height)] for c in self.cameras]
         if not self.native.project(
             *self.shared, grids, self.opacities, self.offsets, self.means2d, self.visible, self.threads
@@ -117,13 +117,12 @@ class _Frame:
         """An uninitialised tensor in recycled memory, because fresh pages cost more than filling them."""
         return from_dlpack(self.native.empty(shape))
 
+    @cached_property
     def basis(self) -> Float[Tensor, "N B1"]:
         """Y of this pose's directions, computed once for all grids."""
-        if self._basis is None:
-            means, shN = self.shared[0], self.shared[4]
-            self._basis = self.empty(len(means), shN.shape[1] + 1)
-            self.native.basis(self._basis, self.threads)
-        return self._basis
+        Y = self.empty(len(self.shared[0]), self.shared[4].shape[1] + 1)
+        self.native.basis(Y, self.threads)
+        return Y
 
 
 class CppRendering:
@@ -179,4 +178,4 @@ class CppRendering:
             self._grid, cotangents.detach().to(self.image).contiguous(), v_alpha, v_depth, means, quats, scales, opacities,
             screen, rgb, absolute, weight, frame.threads,
         )  # fmt: skip
-        return SplatGradients(means, quats, scales, opacities, screen, rgb, frame.basis(), absolute)
+        return SplatGradients(means, quats, scales, opacities, screen, rgb, frame.basis, absolute)

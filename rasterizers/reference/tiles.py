@@ -72,14 +72,10 @@ class TileLists:
 
     def slabs(self, tiles: Int[Tensor, " B"]) -> list[Int[Tensor, "B _"]]:
         """The lists of some tiles, stacked and split into slabs; short lists are padded with the table's empty row."""
-        depth = int(self.lengths[tiles].max())
-        return [self._slab(tiles, first, min(_SLAB, depth - first)) for first in range(0, depth, _SLAB)]
-
-    def _slab(self, tiles: Int[Tensor, " B"], first: int, depth: int) -> Int[Tensor, "B L"]:
-        position = first + torch.arange(depth, device=tiles.device)[None]
+        position = torch.arange(int(self.lengths[tiles].max()), device=tiles.device)[None]
         inside = position < self.lengths[tiles, None]
         pairs = torch.where(inside, self.starts[tiles, None] + position, 0)
-        return torch.where(inside, self.gaussians[pairs], len(self.visible))
+        return list(torch.where(inside, self.gaussians[pairs], len(self.visible)).split(_SLAB, 1))
 
 
 @torch.no_grad()

@@ -23,7 +23,7 @@ def replays(monkeypatch):
     """How often a pass of a drawing was replayed."""
     counted, replay = [], Recording.replay
     monkeypatch.setattr(Recording, "replay", lambda self: counted.append(self) or replay(self))
-    monkeypatch.setattr(replayed_drawing, "_threads", replayed_drawing._Threads())
+    monkeypatch.setattr(replayed_drawing, "_thread", replayed_drawing._Thread())
     return counted
 
 
