@@ -8,7 +8,7 @@ from __future__ import annotations
 import ctypes
 import math
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, lru_cache
 from itertools import pairwise
@@ -228,10 +228,12 @@ def _require_numbers(dtype: torch.dtype, kind: Any) -> None:
         raise TypeError(f"a kernel reads numbers of type {read.__name__}, got {given.__name__}: cast the tensor.")
 
 
-def struct(kind: Any, rows: Mapping[str, Tensor | None], **values: Any) -> Any:
-    """A Warp structure as a kernel argument: `rows` as arrays, numbers. What is not given is empty, or 0."""
-    arrays = {name: array(x, kind.vars[name].type) for name, x in rows.items() if x is not None}
-    return kind.ctype(**arrays, **values)
+def struct(kind: Any, /, **fields: Any) -> Any:
+    """A Warp structure as a kernel argument, of numbers, structures, and tensors for its arrays; what is None or not given is
+    empty, or 0.
+    """
+    tensors = {name: array(x, kind.vars[name].type) for name, x in fields.items() if isinstance(x, Tensor)}
+    return kind.ctype(**{name: x for name, x in fields.items() if x is not None} | tensors)
 
 
 def on_device(structure: Any, device: torch.device) -> Tensor:

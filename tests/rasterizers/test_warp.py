@@ -57,9 +57,9 @@ def test_numbers_of_another_type_than_a_kernel_reads_are_refused():
     from clear_strategies.kernels.gaussian_step.warp import passes
     from rasterizers.warp_runtime import struct
 
-    struct(passes.Attribute, {"p": torch.rand(5, 3)}, width=3)
+    struct(passes.Attribute, p=torch.rand(5, 3), width=3)
     with pytest.raises(TypeError, match="reads numbers of type float32, got float64: cast the tensor"):
-        struct(passes.Attribute, {"p": torch.rand(5, 3, dtype=torch.float64)}, width=3)
+        struct(passes.Attribute, p=torch.rand(5, 3, dtype=torch.float64), width=3)
 
 
 @installed
@@ -68,12 +68,12 @@ def test_structures_of_the_same_shapes_have_their_own_addresses():
     from rasterizers.warp_runtime import struct
 
     p, m, longer = torch.rand(5, 3), torch.rand(5, 3), torch.rand(6, 3)
-    made = [struct(passes.Attribute, {"p": x, "m": y, "v": None}, width=3) for x, y in ((p, m), (m, p), (longer, m))]
+    made = [struct(passes.Attribute, p=x, m=y, v=None, width=3) for x, y in ((p, m), (m, p), (longer, m))]
     assert [(s.p.data, s.m.data, s.v.data) for s in made] == [
         (x.data_ptr(), y.data_ptr(), 0) for x, y in ((p, m), (m, p), (longer, m))
     ]
     assert [s.p.shape[0] for s in made] == [15, 15, 18]
-    assert [struct(passes.Attribute, {"p": p}, width=k).width for k in (3, 4, 3)] == [3, 4, 3]
+    assert [struct(passes.Attribute, p=p, width=k).width for k in (3, 4, 3)] == [3, 4, 3]
 
 
 @installed

@@ -55,8 +55,8 @@ class Weights:
 
 def weights_of(tables: Sequence[WeightTable]) -> Any:
     """The weights as kernels take them."""
-    keep, remove = (struct(Weight, {"rows": rows}, number=number, stride=stride) for number, rows, stride in tables)
-    return struct(Weights, {}, keep=keep, remove=remove)
+    keep, remove = (struct(Weight, rows=rows, number=number, stride=stride) for number, rows, stride in tables)
+    return struct(Weights, keep=keep, remove=remove)
 
 
 def product_table(like: Tensor, n: int, blocks: int) -> tuple[Tensor, Tensor]:
@@ -272,13 +272,15 @@ def apply(
 
 
 def _options(lr: Grads, hr: Grads, lambda_hr: float = 1.0, keeps_lr: bool = True) -> Any:
-    low, high = (struct(Factors, {} if c is None else c._asdict()) for c in (lr.colour, hr.colour))
-    return struct(Options, {}, lr=low, hr=high, lambda_hr=lambda_hr, keeps_lr=keeps_lr)
+    low, high = (struct(Factors, **({} if c is None else c._asdict())) for c in (lr.colour, hr.colour))
+    return struct(Options, lr=low, hr=high, lambda_hr=lambda_hr, keeps_lr=keeps_lr)
 
 
 def _rows(name: str, width: int, lr: Grads, hr: Grads, plus: Grads, out: Tensor | None) -> Any:
     """An attribute for the kernels; one of width 0 is absent."""
     if width == 0:
-        return struct(Rows, {})
-    tensors = {"lr": lr.get(name), "hr": hr.get(name), "plus": plus.get(name), "out": out}
-    return struct(Rows, tensors, width=width, first_band=FIRST_BANDS.get(name, -1))
+        return struct(Rows)
+    first_band = FIRST_BANDS.get(name, -1)
+    return struct(
+        Rows, lr=lr.get(name), hr=hr.get(name), plus=plus.get(name), out=out, width=width, first_band=first_band
+    )

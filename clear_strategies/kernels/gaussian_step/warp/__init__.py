@@ -90,7 +90,7 @@ class WarpGaussianStep:
         if adam_step is None:
             adam_step = written(settings, {name: a.rate for name, a in attributes.items()}, device)
         options = struct(
-            passes.StepOptions, {}, skips=settings.skips, width=settings.width, merges=self._has_hr and settings.lambda_hr > 0
+            passes.StepOptions, skips=settings.skips, width=settings.width, merges=self._has_hr and settings.lambda_hr > 0
         )  # fmt: skip
         tables = weight_tables(weights, self._n, device)
         step = (
@@ -116,7 +116,7 @@ class WarpGaussianStep:
             if len(_attributes) >= _MOST_ATTRIBUTES:
                 _attributes.clear()
             _attributes[key] = struct(
-                passes.Attribute, tensors, width=width, bounded=a.keep != 1 or a.limit != math.inf, keep=a.keep, limit=a.limit
+                passes.Attribute, **tensors, width=width, bounded=a.keep != 1 or a.limit != math.inf, keep=a.keep, limit=a.limit
             )  # fmt: skip
         return _attributes[key]
 
@@ -124,7 +124,7 @@ class WarpGaussianStep:
         """A structure of type `kind` from tensors, which must have n rows of `widths` numbers."""
         for name, width in widths.items():
             self._require(name, tensors[name], width)
-        return struct(kind, tensors)
+        return struct(kind, **tensors)
 
     def _require(self, name: str, tensor: Tensor, width: int) -> None:
         """Check that a tensor has a row of `width` numbers for each Gaussian."""
@@ -147,7 +147,7 @@ def written(
     if out is None:
         out = torch.empty(1, sizeof(_STEP) // _BYTES, dtype=torch.float32, device=device)
     numbers = struct(
-        passes.AdamStep, {}, rates=struct(passes.Rates, {}, **{name: -rate for name, rate in rates.items()}), beta1=s.beta1,
+        passes.AdamStep, rates=struct(passes.Rates, **{name: -rate for name, rate in rates.items()}), beta1=s.beta1,
         beta2=s.beta2, gain1=1 - s.beta1, gain2=1 - s.beta2, per_bias2=1 / s.bias2, eps=s.eps, lambda_hr=s.lambda_hr,
         lambda_hf=lambda_hf,
     )  # fmt: skip
