@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Int
 from torch import Tensor
@@ -61,6 +61,7 @@ class StepSettings:
     changing: Tensor | None = None
 
 
+@runtime_checkable
 class GaussianStep(Protocol):
     """The gradients of one view's losses, and the passes over them. Constructors are as of `cpp.CppGaussianStep`."""
 
