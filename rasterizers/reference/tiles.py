@@ -75,7 +75,7 @@ class TileLists:
         position = torch.arange(int(self.lengths[tiles].max()), device=tiles.device)[None]
         inside = position < self.lengths[tiles, None]
         pairs = torch.where(inside, self.starts[tiles, None] + position, 0)
-        return list(torch.where(inside, self.gaussians[pairs], len(self.visible)).split(_SLAB, 1))
+        return list(torch.split(torch.where(inside, self.gaussians[pairs], len(self.visible)), _SLAB, 1))
 
 
 @torch.no_grad()

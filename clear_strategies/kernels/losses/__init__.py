@@ -70,7 +70,7 @@ def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], inset: int = 0) -
     Raises:
         ValueError: there is no such pixel.
     """
-    return (cpp if _fastest(x, y) == "cpp" else reference).ssim(x, y, inset)
+    return cpp.ssim(x, y, inset) if _fastest(x, y) == "cpp" else reference.ssim(x, y, inset)
 
 
 def haar_l1(
