@@ -115,8 +115,9 @@ class _Launch:
         self.command = wp.Launch(kernel, wp.device_from_torch(device), block_dim=block)
         self.on_cuda = device.type == "cuda"
         self.size: tuple[int, ...] = ()
-        # The type of each argument that is an array.
-        self.arrays = [a.type if wp.types.is_array(a.type) else None for a in kernel.adj.args]
+        self.kinds = [argument.type for argument in kernel.adj.args]
+        # For each argument that is an array: by type, shape and strides, its description, of which only the address changes.
+        self.arrays: list[dict[Any, Any] | None] = [{} if wp.types.is_array(kind) else None for kind in self.kinds]
 
     def prepare(self, size: tuple[int, ...], arguments: Sequence[Any]) -> Any:
         command = self.command
@@ -126,14 +127,28 @@ class _Launch:
             params[0] = command.bounds
             if self.on_cuda:
                 command.params_addr[0] = ctypes.addressof(command.bounds)
-        for index, (argument, kind) in enumerate(zip(arguments, self.arrays, strict=True), 1):
-            if kind is None and not isinstance(argument, ctypes.Structure):
+        for index, (argument, known) in enumerate(zip(arguments, self.arrays, strict=True), 1):
+            if known is None and not isinstance(argument, ctypes.Structure):
                 params[index].value = argument
                 continue
-            params[index] = argument if kind is None else array(argument, kind)
+            if known is None:
+                params[index] = argument
+            elif argument is None:
+                params[index] = _empty_array()
+            else:
+                layout = argument.dtype, argument.shape, argument.stride()
+                described = params[index] = known.get(layout) or self._described(index, layout, argument)
+                described.data = argument.data_ptr()
             if self.on_cuda:
                 command.params_addr[index] = ctypes.addressof(params[index])
         return command
+
+    def _described(self, index: int, layout: Any, tensor: Tensor) -> Any:
+        known = self.arrays[index - 1]
+        if known is None or len(known) >= _MOST_SHAPES:
+            known = self.arrays[index - 1] = {}
+        known[layout] = array(tensor, self.kinds[index - 1])
+        return known[layout]
 
 
 class _Kept(threading.local):
