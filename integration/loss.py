@@ -49,9 +49,9 @@ def joint_loss(
 ) -> tuple[Float[Tensor, ""], Update]:
     """λ_LR L_LR + λ_HR (L_base + λ_HF L_HF), whose gradient is the conductor's merged gradient, and the `Update`.
 
-    Other leaves that the host trains get the gradient of λ_LR L_LR, and, if the rasterizer's inputs were computed from them (a
-    network, an embedding), that of HR after routing, which is known where this package's rasterizers draw, or by
-    `AutogradShot.drawn`.
+    Other leaves that the host trains get the gradient of λ_LR L_LR. Those that the rasterizer's inputs are computed from (a
+    network, an embedding) also get that of HR after routing, if this package's rasterizers draw, or if `AutogradShot.drawn`
+    names these inputs.
 
     Args:
         params: the leaves of the Gaussians that the host optimizes, by gsplat's names (and "detail", if the host has it).
