@@ -23,7 +23,7 @@ def layers() -> dict[str, tuple[set[str], set[str]]]:
     found: dict[str, tuple[set[str], set[str]]] = {}
     for line in PAGE.split("| folder or file |")[1].split("\n\n")[0].splitlines()[2:]:
         folder, _, imported, libraries = line.split("|")[1:-1]
-        allowed = found.keys() - named(imported) if "all above" in imported else named(imported)
+        allowed = named(imported) if re.match(" (only|nothing) ", imported) else found.keys() - named(imported)
         found[min(named(folder))] = allowed, named(libraries)
     return found
 
