@@ -170,7 +170,8 @@ def _view(
             _log.info("%s: no SR image for this test view (%s); bicubic replaces it.", name, missing.problem)
             prior = Bicubic()
             sr = super_resolved(prior, name, lr.image, factor)
-        hr = Photo(lr.camera.scaled(factor), sr.image, transparency=through)
+        camera = lr.camera.scaled(factor) if lr is photo else photo.camera
+        hr = Photo(camera, sr.image, transparency=through)
         source, disagreement = prior.label, sr.disagreement
     if not trains:  # only training needs it
         lr, hr = replace(lr, transparency=None), replace(hr, transparency=None)

@@ -32,6 +32,15 @@ def wrong(**settings) -> DemoPrior:
     return DemoPrior(truth_of(ROOM, papers()), **settings)
 
 
+def test_the_hr_camera_is_that_of_the_photo_to_the_bit():
+    """30.8 / 3 times 3 is not 30.8."""
+    first, other = capture(2, 60, 60).frames
+    photo = Photo(replace(first.camera, cy=30.8), first.load().image)
+    frames = (replace(first, camera=photo.camera, load=lambda: photo), other)
+    scene = prepare(Capture("c", frames), papers(sr_scale=3, train=2, test_every=0), Bicubic(), POINTS)
+    assert scene.train[0].hr.camera.cy == 30.8
+
+
 @pytest.mark.parametrize(("prior", "least", "most"), [(Bicubic(), 0.0, 0.4), (wrong(), 1.0, 255.0)])  # 0.4: rounding
 def test_the_detail_of_sr_images_is_measured_and_its_absence_reported(prior, least, most, caplog):
     with caplog.at_level(logging.WARNING):
