@@ -73,11 +73,15 @@ def not_composed(error: Exception, overrides: Sequence[str], config: str) -> Set
     for theirs, ours in _IN_OUR_WORDS.items():
         if said := re.search(theirs, text):
             return SettingError(ours.format(*said.groups()))
-    if said := re.search(r"Could not (?:find|load) '([^']+)/([^'/]*)'", text):
-        # Of a list of options Hydra names the file alone, and not the options that there are.
-        listed = re.search("Available options in '[^']*':(.*?)Config search path", text)
-        known = [*options(said[1])] if listed is None else [o for o in listed[1].split() if not o.startswith("_")]
-        return SettingError(no_option(said[1], said[2], known, config))
+    if said := re.search(
+        r"Could not find '([^']+)/([^'/]*)' Available options in '[^']*':(.*?)Config search path", text
+    ):
+        group, name, listed = said.groups()
+        known = [option for option in listed.split() if not option.startswith("_")]
+        return SettingError(no_option(group, name, known, config))
+    # Of a list of options Hydra names the file alone, and not the options that there are.
+    if said := re.search(r"Could not load '(\w+)/([^']+)'", text):
+        return SettingError(no_option(said[1], said[2], [*options(said[1])], config))
     if said := re.match(r"Could not (?:override|delete from config\.) '([^']+)'", text):
         return SettingError(f"{said[1]}: {_no_setting(said[1], overrides, config)}")
     return SettingError(text)
