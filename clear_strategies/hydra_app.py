@@ -63,7 +63,9 @@ def main(overrides: Sequence[str] | None = None) -> None:
     if unknown:  # argparse's message names none of our commands
         raise SettingError(f"{unknown[0].partition('=')[0]}: there is no such flag. {WRITTEN}")
     options.overrides = [*map(readable, options.overrides), *["fit.verbose=true"] * options.verbose]
-    options.config_dir = options.config_dir and files.expanded(options.config_dir)
+    for name in ("config_dir", "config_path"):
+        folder = getattr(options, name)
+        setattr(options, name, folder and files.expanded(folder))
     exit_codes.require("train")
     version.setbase("1.3")
     try:

@@ -61,6 +61,12 @@ def test_a_tilde_that_no_shell_expanded_is_the_users_folder(tmp_path, monkeypatc
     assert f"data.path={tmp_path}/photos" in train.overrides(["~/photos"])
     for key in ("hydra.run.dir", "+hydra.sweep.dir"):
         assert hydra_app.readable(f"{key}=~/out/${{now:%H}}") == f"{key}={tmp_path}/out/${{now:%H}}"
+    given = []
+    monkeypatch.setattr(
+        hydra_app, "_run_hydra", lambda options, *_: given.extend([options.config_dir, options.config_path])
+    )
+    hydra_app.main(["--config-dir=~/more", "--config-path=~/own"])
+    assert given == [f"{tmp_path}/more", f"{tmp_path}/own"]
     assert commands.parser_of("view", "").parse_args(["~/run"]).run == tmp_path / "run"
     make_run(tmp_path / "done")
     assert Run(Path("~/done")).folder == tmp_path / "done"
