@@ -111,7 +111,10 @@ class _Job:
         choices = plan.describe_choices(self.chosen, self.conductor, source, asked.iterations, asked.seed)
         _log.log(level, "%s", choices)
         if settings.data.save_lr is not None:
-            save_lr(*scenes.read(settings.data, None), Path(settings.data.save_lr))
+            capture, views = scenes.read(settings.data, None)
+            if few := capture.notes.get(scenes.FEW_PLACED):
+                _log.warning("%s.", few)
+            save_lr(capture, views, Path(settings.data.save_lr))
             return None
         scene = load()
         if few := scene.notes.get(scenes.FEW_PLACED):

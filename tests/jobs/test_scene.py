@@ -250,3 +250,6 @@ def test_lr_images_are_saved_at_the_size_that_images_of_another_program_need_wit
         camera.height,
     )
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
+    monkeypatch.setattr("clear_strategies.jobs.scene._ENOUGH", 2.0)
+    job.run(composed(*words), tmp_path / "again", words)
+    assert "12 of 12 photos (100%) have a pose" in caplog.text
