@@ -37,6 +37,7 @@ from clear_strategies.strategies.base import (
     RunFacts,
     Scale,
     Strategy,
+    begin,
     by_class,
     by_exp_and_sigmoid,
     misspelled,
@@ -110,7 +111,7 @@ class Hooks:
         # Arithmetic with numpy's numbers overflows.
         self.run = RunFacts(self.work_log.device, int(seed), self.objective.lambda_hr, splats or by_exp_and_sigmoid)
         for s in self.strategies:
-            s.begin(self.run, n_views)
+            begin(s, self.run, n_views)
             if overrides(s, "on_views"):
                 with self.work_log.stage("views prepared"):
                     s.on_views(views)

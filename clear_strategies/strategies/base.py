@@ -110,9 +110,7 @@ class Strategy:
         return None
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
-        """Start a run, or resume one. A conductor calls `begin`; without one, this starts a run on the present device. Overriders
-        need not call `super()`.
-        """
+        """Start a run, or resume one; without a conductor, on the present device. Overriders need not call `super()`."""
         self._forget(RunFacts(self.device, int(seed)))  # arithmetic with numpy's numbers overflows
 
     def on_views(self, views: Sequence[View]) -> None:
@@ -233,13 +231,6 @@ class Strategy:
     def on_fit_end(self) -> None:
         """After the last iteration: release the memory that only training needs."""
 
-    def begin(self, run: RunFacts, n_views: int) -> None:
-        """Forget the last run, and start this one, whose facts other strategies share. A conductor calls it."""
-        self._forget(run)
-        self.on_fit_start(n_views, self.seed)
-        object.__setattr__(self, "of_run", run)  # an override that calls `super()` has replaced it
-        self.to(run.device)
-
     def _forget(self, run: RunFacts) -> None:
         for of_last_run in (self.state, self.run_state, self.cache, self.logs):
             of_last_run.clear()
@@ -328,11 +319,19 @@ def overrides(strategy: Strategy, hook: str) -> bool:
     return getattr(type(strategy), hook) is not getattr(Strategy, hook)
 
 
+def begin(s: Strategy, run: RunFacts, n_views: int) -> None:
+    """Make a strategy forget its last run and start this one, whose facts other strategies share."""
+    s._forget(run)
+    s.on_fit_start(n_views, s.seed)
+    object.__setattr__(s, "of_run", run)  # an override that calls `super()` has replaced it
+    s.to(run.device)
+
+
 def misspelled(cls: type[Strategy]) -> dict[str, str]:
     """Public methods that `Strategy` does not have, by the hook which each resembles and which the class does not override."""
     found = dict[str, str]()
     inherited = (name for name in vars(Strategy) if getattr(cls, name) is getattr(Strategy, name))
-    hooks = [name for name in inherited if name not in _OWN_NAMES | {"log", "to", "begin"} and name[0] != "_"]
+    hooks = [name for name in inherited if name not in _OWN_NAMES | {"log", "to"} and name[0] != "_"]
     for name, _ in inspect.getmembers(cls, inspect.isfunction):
         if name[0] != "_" and not hasattr(Strategy, name):
             found |= dict.fromkeys(get_close_matches(name, hooks, n=1, cutoff=_ALIKE), name)
