@@ -20,6 +20,7 @@ from clear_strategies.core.finite import require_finite, require_finite_losses
 from clear_strategies.core.gradients import Grads, ScreenGradients, Shot, screen_norm, screen_of, summed, to_ndc
 from clear_strategies.core.step import Losses, Step
 from clear_strategies.core.view import ExtraView, Photo, View
+from clear_strategies.core.work_log import WorkLog
 from clear_strategies.kernels import per_gaussian, reconcile
 from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.detail import DetailRates
@@ -33,7 +34,7 @@ from clear_strategies.merging.iteration import (
     guarded,
     require_finite_parts,
 )
-from clear_strategies.merging.logs import computed
+from clear_strategies.merging.logs import IterationLogs, computed
 from clear_strategies.merging.objective import Objective
 from clear_strategies.merging.skips import SkipPolicy, Skips
 from clear_strategies.strategies.base import RunFacts, Scale, Strategy
@@ -81,12 +82,10 @@ class Conductor(Hooks):
         self._hr_cotangents: Tensor | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """The settings. A copy of a conductor that takes part in a run has to begin its own."""
-        anew = Conductor(
-            *self.strategies, objective=self.objective, statistics_from=self.statistics_from, decorators=self.decorators,
-            detail=self.detail, skips=self.skips.skips,
-        )  # fmt: skip
-        return {**vars(self), **vars(anew), "run": None if self.run is None else RunFacts()}
+        """The settings, and the prior. A copy of a conductor that takes part in a run has to begin its own."""
+        of_run = {"logs": IterationLogs(self.strategies), "work_log": WorkLog(), "views": (), "_hr_cotangents": None}
+        run, skips = None if self.run is None else RunFacts(), SkipPolicy(self.skips.skips)
+        return {**vars(self), **of_run, "run": run, "skips": skips}
 
     def prior(self, prior: P) -> P:
         """The prior with every decorator around it, which makes the SR images of a run with this conductor."""

@@ -27,6 +27,7 @@ from clear_strategies import (
     Weights,
 )  # fmt: skip
 from clear_strategies.core.seeds import dropout_mask
+from clear_strategies.data.priors import BackProjected, Bicubic
 from clear_strategies.errors import AnswerError
 from clear_strategies.kernels.losses import reference
 from clear_strategies.merging.logs import computed
@@ -318,6 +319,18 @@ def test_a_strategy_takes_part_in_one_run_at_a_time_and_a_copy_in_none():
     assert list(given.trace(copies[1], 1, given.STEPS))
 
 
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])  # noqa: S301 - our own bytes
+def test_a_copy_of_a_conductor_keeps_its_prior_and_says_nothing_again(copied, caplog):
+    """The trainer enlarges renders by the network of `sr`; views that a copy trains on may have been made before."""
+    conductor = Conductor(Misspells(), decorators=(BackProjected,))
+    conductor.prior(Bicubic())
+    conductor.on_fit_start(1, 0)
+    caplog.clear()
+    copied = copied(conductor)
+    assert (copied.decorated, type(copied.sr)) == (True, Bicubic)
+    assert not caplog.records
+
+
 @dataclass(frozen=True)
 class LogsShare(Strategy):
     share: float
@@ -493,6 +506,18 @@ def test_what_a_checkpoint_could_not_give_back_is_refused(where, stored, message
 def test_settings_of_taken_names_are_refused():
     with pytest.raises(TypeError, match="a setting must not be called seed"):
         type("Mine", (Strategy,), {"__annotations__": {"seed": int}})
+
+
+def test_a_setting_may_be_called_begin():
+    class Late(Strategy):
+        begin = 500
+
+        def may_densify(self, t):
+            return t > self.begin
+
+    conductor = Conductor(Late())
+    conductor.on_fit_start(1, 0)
+    assert conductor.may_densify(501)
 
 
 def test_a_plain_mapping_is_an_answer_of_correct_and_of_regularize():
