@@ -104,7 +104,7 @@ def write_curves(path: Path, histories: Mapping[str, pd.DataFrame], title: str) 
                 marker = "o" if column == "psnr_test" else None
                 style = {"linewidth": 1.4, "marker": marker, "markersize": 3.5, **_STYLES[i % len(_STYLES)]}
                 (known[run],) = axis.plot(points[over], y, **style)
-        if column == "loss_lr":
+        if column == "loss_lr" and math.isfinite(axis.dataLim.minposy):  # a value is positive
             axis.set_yscale("log")  # after a reset of the opacities the loss is a hundred times as large
         _finish(axis)
     if known:

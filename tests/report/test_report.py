@@ -141,6 +141,7 @@ def history(**columns: float) -> pd.DataFrame:
 @pytest.mark.filterwarnings("error")
 def test_runs_without_history_are_not_drawn_and_dollars_are_no_mathematics(tmp_path: Path) -> None:
     runs = {f"run {i} $20_$": history(psnr_test=20.0 + i, conflict=0.1 * i, n_gaussians=100.0) for i in range(9)}
+    runs |= {"no LR": history(psnr_test=20.0).assign(loss_lr=0.0)}  # a logarithmic axis has no place for such a loss
     empty = {"empty": pd.DataFrame()}
     for name, shown in {"nine": runs, "ten": runs | empty, "none": empty}.items():
         write_curves(tmp_path / f"{name}.png", shown, "$20_$")
