@@ -205,16 +205,16 @@ def _spacing(field: GaussianField, cameras: Sequence[Camera]) -> float:
 
 
 def relocation(
-    opacities: Float[Tensor, " N"], scales: Float[Tensor, "N 3"], copies: Int[Tensor, " N"]
+    opacities: Float[Tensor, " N"], scales: Float[Tensor, "N 3"], copies: Int[Tensor, " N"], least: float = 0.0
 ) -> tuple[Float[Tensor, " N"], Float[Tensor, "N 3"]]:
     """Opacity and scale of each of `copies` Gaussians that together render like the one that they replace.  Eq. 9 of that paper
 
     o' = 1 - (1 - o)^(1/n), s' = s · o / Σ_j C(n, j) (-1)^(j-1) o'^j / √j: the paper's double sum with its inner sum of
-    binomials evaluated.
+    binomials evaluated. o' is at least `least`, as gsplat's loop asks for (`integration.on_cpu`).
     """
     n = copies.clamp(1, _MOST_COPIES)
     o = opacities.double()
-    shared = -torch.expm1(torch.log1p(-o) / n)
+    shared = (-torch.expm1(torch.log1p(-o) / n)).clamp_min(least)
     j = torch.arange(1, _MOST_COPIES + 1, dtype=torch.float64, device=o.device)
     signs = 1 - 2 * ((j - 1) % 2)
     total = (_BINOMIALS.to(o.device)[n, 1:] * signs * shared[:, None] ** j / j.sqrt()).sum(-1)

@@ -15,6 +15,7 @@ from clear_strategies.training.densifier import Densifier
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.optim import Adam, LearningRates
+from integration.on_cpu.gsplat_functions import _relocation
 from tests.helpers import toy
 from tests.helpers.short_run import start, tensors
 
@@ -70,6 +71,13 @@ def test_where_sampling_is_of_no_use_density_control_stays_and_that_is_said(capl
     theta.scales.data[:] = -6.0
     assert long.densifier(theta, shown(1.0, (1.0, 1.0, 1.0)), 0) is None
     assert "an object before a plain background" in caplog.text
+
+
+def test_gsplats_loop_on_a_cpu_keeps_its_least_opacity():
+    new, _ = _relocation(
+        torch.tensor([0.01, 0.5]), torch.ones(2, 3), torch.tensor([9, 2]), torch.ones(51, 51), 51, 0.005
+    )
+    assert new.tolist() == pytest.approx([0.005, 1 - 0.5**0.5])
 
 
 def test_relocation_is_equation_9_of_3dgs_mcmc_of_up_to_51_copies():
