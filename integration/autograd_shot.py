@@ -151,7 +151,7 @@ class AutogradShot:
             )  # fmt: skip
             screen = gradients[-1] if projected else torch.zeros_like(slot.tensor)
             values = dict(zip(tensors, gradients, strict=False))
-            if "detail" in self.params and "colors" in values:  # of which f_det is an offset
+            if "detail" in self.params and "detail" not in values and "colors" in values:  # of which f_det is an offset
                 rgb = values["colors"]
                 values["detail"] = rgb if rgb.dim() == 2 else rgb[:, 0] / SH_C0
             results.append(Grads(values, screen=slot.per_gaussian(screen, len(self.visible))))

@@ -26,6 +26,7 @@ from integration.autograd_shot import (
     AutogradShot,
     Graph,
     OfOthers,
+    are_in_order,
     every_number,
     graph_of,
     require_leaves,
@@ -50,8 +51,8 @@ def joint_loss(
     """λ_LR L_LR + λ_HR (L_base + λ_HF L_HF), whose gradient is the conductor's merged gradient, and the `Update`.
 
     Other leaves that the host trains get the gradient of λ_LR L_LR. Those that the rasterizer's inputs are computed from (a
-    network, an embedding) also get that of HR after routing, if this package's rasterizers draw, or if `AutogradShot.drawn`
-    names these inputs.
+    network, an embedding) also get that of HR after routing, if this package's rasterizers draw the rows of `params` in their
+    order, or if `AutogradShot.drawn` names these inputs.
 
     Args:
         params: the leaves of the Gaussians that the host optimizes, by gsplat's names (and "detail", if the host has it).
@@ -209,17 +210,19 @@ class _HrShot:
     """A host's rendering at HR, with one pass through the host's graph for both cotangents.
 
     Args:
-        graph: of its image, in which this package's only drawing has the rasterizer's inputs, if the shot does not name them.
+        graph: of its image. If the shot does not name the rasterizer's inputs, those of this package's only drawing are taken
+            where other leaves need them, and where their rows are those of the parameters.
 
     Attributes:
         of_others: the gradients of other leaves in the last pass.
     """
 
     def __init__(self, shot: AutogradShot, graph: Graph) -> None:
-        if shot.inputs is None and len(graph.drawn) == 1:
+        known = {id(shot.gradient_slot.tensor), *map(id, shot.params.values())}
+        if shot.inputs is None and len(graph.drawn) == 1 and any(id(leaf) not in known for leaf in graph.leaves):
             inputs = {name: x for name, x in graph.drawn[0].inputs._asdict().items() if x is not None}
-            if not any(map(is_hooked, inputs.values())):
-                shot = replace(shot, drawn=inputs)
+            if not any(map(is_hooked, inputs.values())) and are_in_order(inputs, shot.params):
+                shot = replace(shot, drawn=inputs | {name: x for name, x in shot.params.items() if name == "detail"})
         self.image, self.means2d, self.visible, self._shot = shot.image, shot.means2d, shot.visible, shot
         self.of_others: OfOthers = []
 

@@ -11,6 +11,7 @@ from clear_strategies import GCO, P2G, SVS, Conductor, Strategy
 from clear_strategies.core.step import Step
 from clear_strategies.training.field import GaussianField
 from integration import AutogradShot, HostError, ScoreScaler, extra_loss, joint_loss
+from integration.autograd_shot import ScreenGradientSlot
 from rasterizers import Splats, autograd
 from tests.helpers import toy
 from tests.helpers.host_parts import HR_FROM_START
@@ -130,6 +131,44 @@ def test_what_else_the_loop_trains_gets_its_gradient(share, strategies, hooked):
     for leaf, expected in ((exposure, of_exposure), (offset, of_offset)):
         assert expected.abs().max() > 1e-4
         torch.testing.assert_close(leaf.grad, 3 * expected)
+
+
+ROWS = {
+    "as they are": lambda x: x,
+    "in another order": lambda x: x.flip(0),
+    "some of them": lambda x: x[:15],
+    "a sky beside them": lambda x: torch.cat((x, x[:6].detach() + 0.1)),
+}
+
+
+@pytest.mark.parametrize("exposed", [False, True])
+@pytest.mark.parametrize("rows", ROWS.values(), ids=ROWS)
+def test_what_is_drawn_may_have_other_rows_than_the_parameters(rows, exposed):
+    """Each parameter gets its gradient by autograd, f_det also where it is drawn at half of its strength."""
+    scene = toy.scene(20)
+    host, view = Host(scene), scene.train[0]
+    conductor = Conductor(GCO(), P2G(patch=4), objective=HR_FROM_START)
+    conductor.on_fit_start(3, 0, views=scene.train)
+    exposure = torch.eye(3).requires_grad_()
+
+    def render(camera, detail):
+        p = host.params
+        each = (p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"], 0.5 * detail)
+        shot = autograd.draw(toy.RASTERIZER, Splats(*map(rows, each)), camera)
+        drawn = rows(torch.arange(20.0)).long()[:20]
+        slot = ScreenGradientSlot(shot.means2d[: len(drawn)], (camera.width, camera.height), rows=drawn)
+        visible = torch.zeros(20, dtype=torch.bool).index_copy_(0, drawn, shot.visible[: len(drawn)])
+        means2d = torch.zeros(20, 2).index_copy_(0, drawn, shot.means2d[: len(drawn)].detach())
+        return AutogradShot(shot.image @ exposure if exposed else shot.image, means2d, visible, p, slot)
+
+    lr, hr = render(view.lr.camera, torch.zeros(20, 3)), render(view.hr.camera, host.params["detail"])
+    joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
+    expected = conductor.update({name: p.detach() for name, p in host.params.items()}, lr, hr, view, 5).grads
+    for name, p in host.params.items():
+        atol = 1e-5 * float(expected[name].abs().max())
+        torch.testing.assert_close(
+            p.grad, expected[name], rtol=1e-4, atol=atol, msg=lambda found, name=name: f"{name}: {found}"
+        )
 
 
 def test_a_hook_of_a_parameter_is_called_once_with_the_merged_gradient():
