@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, NamedTuple
 
@@ -19,7 +20,7 @@ from integration.structure import rows_drawn
 from rasterizers.differentiable import Drawing, Rendered, outer
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, summed_vjp
-from rasterizers.torch_internals import accumulator, is_hooked, leaf_of
+from rasterizers.torch_internals import accumulator, hooks_on_gradient, is_hooked, leaf_of
 
 _GOLDEN: Final = 0.6180339887498949  # its multiples modulo 1 differ most for neighbouring rows
 _SAME_CODE: Final = 0.1  # tolerance of the ratio of a row's gradients, which e.g. the mean of all rows changes a little
@@ -143,12 +144,14 @@ class AutogradShot:
         slot = self.gradient_slot
         tensors = {name: x for name, x in (self.drawn or self.params).items() if x.requires_grad}
         projected = [slot.tensor] if slot.tensor.requires_grad else []  # gsplat's 3DGUT draws without projected centres
+        f_det = [x for name, x in self.params.items() if name == "detail"]
         results = []
         for cotangent in cotangents:
-            gradients = torch.autograd.grad(
-                self.image, [*tensors.values(), *projected], cotangent, retain_graph=True, allow_unused=True,
-                materialize_grads=True,
-            )  # fmt: skip
+            with without_hooks(f_det):  # which are called with its merged gradient
+                gradients = torch.autograd.grad(
+                    self.image, [*tensors.values(), *projected], cotangent, retain_graph=True, allow_unused=True,
+                    materialize_grads=True,
+                )  # fmt: skip
             screen = gradients[-1] if projected else torch.zeros_like(slot.tensor)
             values = dict(zip(tensors, gradients, strict=False))
             if "detail" in self.params and "detail" not in values and "colors" in values:  # of which f_det is an offset
@@ -294,6 +297,19 @@ def require_named(shot: object, params: Mapping[str, Tensor]) -> None:
             f"AutogradShot.params must hold the parameters themselves, got other tensors as {', '.join(other)}. Pass what is "
             "computed from them, e.g. activated scales, as drawn=."
         )
+
+
+@contextmanager
+def without_hooks(leaves: Sequence[Tensor]) -> Iterator[None]:
+    """A context in which gradients reach these leaves past their hooks, which are called with the merged gradient."""
+    held = [(hooks, dict(hooks)) for hooks in map(hooks_on_gradient, leaves)]
+    for hooks, _ in held:
+        hooks.clear()
+    try:
+        yield
+    finally:
+        for hooks, each in held:
+            hooks.update(each)
 
 
 class Graph(NamedTuple):

@@ -7,7 +7,6 @@ that must stay as it is, see attachment.py.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -32,11 +31,12 @@ from integration.autograd_shot import (
     require_leaves,
     require_named,
     to_leaves,
+    without_hooks,
 )
 from integration.densification import ScoreScaler, score_for_host
 from integration.views import SAME_POSE, require_intrinsics
 from rasterizers.interface import Camera
-from rasterizers.torch_internals import hooks_on_gradient, is_hooked
+from rasterizers.torch_internals import is_hooked
 
 
 def joint_loss(
@@ -77,7 +77,7 @@ def joint_loss(
     _require_detail(params.get("detail"), of_lr, of_hr)
     _require_view(conductor, view, lr=of_lr, hr=of_hr)
     _require_started(conductor)
-    with _without_hooks([*of_lr.leaves, *(() if of_hr is None else of_hr.leaves)]):
+    with without_hooks([*of_lr.leaves, *(() if of_hr is None else of_hr.leaves)]):
         to_others = _HrShot(hr, of_hr) if isinstance(hr, AutogradShot) and of_hr is not None else None
         update = conductor.update(values, lr, to_others or hr, view, t)
         others = [*_others(params, lr, of_lr.leaves, update)]
@@ -124,19 +124,6 @@ def with_gradients(value: Scalar, gradients: Sequence[Tensor], *tensors: Tensor)
     """A scalar that has these gradients with respect to the tensors; scaling it scales them."""
     scalar: Tensor = _WithGradients.apply(value, gradients, *tensors)  # type: ignore[no-untyped-call]
     return scalar
-
-
-@contextmanager
-def _without_hooks(leaves: Sequence[Tensor]) -> Iterator[None]:
-    """A context in which gradients reach these leaves past their hooks, which `backward()` calls with the merged gradient."""
-    held = [(hooks, dict(hooks)) for hooks in map(hooks_on_gradient, leaves)]
-    for hooks, _ in held:
-        hooks.clear()
-    try:
-        yield
-    finally:
-        for hooks, each in held:
-            hooks.update(each)
 
 
 def _require_shots(params: Mapping[str, Tensor], **shots: Shot | None) -> None:

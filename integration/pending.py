@@ -100,11 +100,12 @@ class BackwardPass:
         """Set `.grad`, in its memory, to what it was before the pass plus the merged gradient times `scale`."""
         for name, gradient in merged.items():
             p, scaled = self.params[name], gradient if scale == 1 else gradient.mul_(scale)
-            if name == "detail":  # no backward pass reaches it, and calls its hooks
+            if name == "detail":  # a pass over LR does not reach it, and calls no hook with HR's gradient
                 for hook in [*hooks_on_gradient(p).values()]:
                     changed = hook(scaled)
                     scaled = scaled if changed is None else changed
-                self.hooks += [partial(hook, p) for hook in hooks_after_accumulation(p).values()]
+                if not self.has_given(p):
+                    self.hooks += [partial(hook, p) for hook in hooks_after_accumulation(p).values()]
             g = scaled.add_(self.before[name]) if name in self.before else scaled
             if p.grad is None:
                 p.grad = g.to(p.dtype)

@@ -238,6 +238,17 @@ def test_hooks_that_freeze_some_gaussians_freeze_their_f_det(late):
     assert bool((host.splats["detail"][5:] != 0).any())
 
 
+def test_a_hook_after_accumulation_is_called_once_where_the_loss_reaches_f_det_too():
+    host, _, render = started()
+    found = []
+    host.splats["detail"].register_post_accumulate_grad_hook(lambda p: found.append(p.grad.clone()))
+    regularizer = (host.splats["detail"] + 1).sum()
+    (regularizer + render().mean()).backward()
+    (g,) = found
+    assert torch.equal(g, host.splats["detail"].grad)
+    assert bool((g != 1).any())
+
+
 def test_a_loop_that_trains_a_copy_of_what_was_attached_is_told_once(caplog):
     host, clear, render = started()
     render().mean().backward()

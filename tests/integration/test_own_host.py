@@ -28,8 +28,8 @@ class Adapter:
 
     def render_at(self, target, gate, view):
         p, camera = self.splats, view.lr.camera if target == "lr" else view.hr.camera
-        splats = Splats(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"])
-        drawn = draw(toy.RASTERIZER, splats, camera)
+        activated = p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"]
+        drawn = draw(toy.RASTERIZER, Splats(*activated, p.get("detail") if target == "hr" else None), camera)
         return HostOutput(AutogradShot(drawn.image, drawn.means2d, drawn.visible, p), drawn.image, [drawn.image])
 
     def step(self, change=lambda output: output):
@@ -67,6 +67,18 @@ def test_it_merges_until_it_is_removed():
     assert adapter.step() == 1
     adapter.attachment.remove()
     assert adapter.step() == 1
+
+
+def test_a_hook_on_f_det_is_called_once_with_its_merged_gradient():
+    found = []
+    for factor in (1, 3):
+        adapter = Adapter()
+        detail = adapter.splats["detail"] = torch.nn.Parameter(torch.zeros(20, 3))
+        detail.register_hook(lambda g, factor=factor: factor * g)
+        adapter.step()
+        found.append(detail.grad)
+    assert found[0].any()
+    torch.testing.assert_close(found[1], 3 * found[0], atol=0, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
