@@ -31,18 +31,13 @@ class HostSteps:
         begins: called when a step of the host begins, with whether gradients have been merged since the last step.
         after: called after an optimizer has stepped, also on extra views.
         counts: `Attachment.counts`, to which this class adds.
-
-    Attributes:
-        hooked: the optimizers whose steps can be seen.
-        stepped: the ids of those that have stepped since the last merge.
-        extra: the gradients of extra views, on which each of them makes a step after its own.
     """
 
     def __init__(self, begins: Callable[[bool], None], after: Callable[[], None], counts: Counter[str]) -> None:
         self._begins, self._after, self._counts = begins, after, counts
         self._hooks: list[Any] = []
         self._hooked: list[torch.optim.Optimizer] = []
-        self._stepped: set[int] = set()
+        self._stepped: set[int] = set()  # the ids of the optimizers that have made this step
         self._has_merged = False  # since the last step
         self._extra: list[Grads] = []
         self._rendered: Mapping[str, Tensor] = {}  # the leaves of `_extra`
