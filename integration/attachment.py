@@ -93,7 +93,7 @@ class Attachment:
         self._n = len(means)
         self._hr = HrDrawing(conductor, host, means.device, self.counts)
         self._merging = HostMerge(conductor, host, means.device, self.counts, self._merged)
-        self._steps = HostSteps(self._step_begins, self._after_optimizer, self.counts)
+        self._steps = HostSteps(self._before_optimizer, self._step_begins, self._after_optimizer, self.counts)
         self._step: Step | None = None  # of the rendering, until `after_step`
         self._logged: dict[str, Logged] = {}
         self._dropped = False  # the last pass found that the loop had dropped the gradients of those before
@@ -208,19 +208,22 @@ class Attachment:
         self._finalizer()
         self.undo.close()
 
-    def _step_begins(self, has_merged: bool) -> None:
-        """Raise an error if no strategy takes part in the host's first step; warn of a later one."""
+    def _before_optimizer(self) -> None:
+        """Raise an error if an optimizer steps before the gradients of the rendering are merged."""
         pending = self._merging.pending
         if current_pass() >= 0 and pending is not None and pending.output is not None:
             raise HostError(
                 "the host steps inside of its backward pass, where the gradients of the views are not merged yet. Step after "
                 "loss.backward() has returned, not in a hook of a gradient."
             )
+
+    def _step_begins(self, has_merged: bool) -> None:
+        """Raise an error if no strategy takes part in the host's first step; warn of a later one."""
         if has_merged:
             self._merging.fading.before_step(max(self.passes, self._host.accumulation))
             return
         names = [*trained(self._host.leaves())]
-        cause, remedy = why_nothing_was_merged(pending, names)
+        cause, remedy = why_nothing_was_merged(self._merging.pending, names)
         if not self.counts["merges"]:
             raise HostError(
                 f"the host makes its first optimizer step, but {cause}, so that no strategy would take part. {remedy}"

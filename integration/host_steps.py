@@ -28,13 +28,16 @@ class HostSteps:
     """Hooks on the host's optimizers. In a step of the host, each optimizer steps once, and then once for each extra view.
 
     Args:
+        before: called before each of the host's optimizers steps.
         begins: called when a step of the host begins, with whether gradients have been merged since the last step.
         after: called after an optimizer has stepped, also on extra views.
         counts: `Attachment.counts`, to which this class adds.
     """
 
-    def __init__(self, begins: Callable[[bool], None], after: Callable[[], None], counts: Counter[str]) -> None:
-        self._begins, self._after, self._counts = begins, after, counts
+    def __init__(
+        self, before: Callable[[], None], begins: Callable[[bool], None], after: Callable[[], None], counts: Counter[str]
+    ) -> None:  # fmt: skip
+        self._before, self._begins, self._after, self._counts = before, begins, after, counts
         self._hooks: list[Any] = []
         self._hooked: list[torch.optim.Optimizer] = []
         self._stepped: set[int] = set()  # the ids of the optimizers that have made this step
@@ -116,6 +119,7 @@ class HostSteps:
                 "the host gives its optimizer a closure, which renders inside of step(), but the gradients are merged before. "
                 "Render and call loss.backward(), then step() without a closure."
             )
+        self._before()
         if id(optimizer) in self._stepped:
             self._stepped.clear()
         begins = not self._stepped

@@ -276,6 +276,16 @@ def test_a_step_inside_of_the_backward_pass_is_refused():
         render().mean().backward()
 
 
+def test_a_step_inside_of_the_backward_pass_is_refused_also_after_another_optimizer_has_stepped():
+    host, _, render = started()
+    render().mean().backward()
+    host.optimizers["means"].step()
+    image = render()
+    image.register_hook(lambda g: host.optimizers["quats"].step() and None)
+    with pytest.raises(HostError, match=r"steps inside of its backward pass"):
+        image.mean().backward()
+
+
 @pytest.mark.parametrize("accumulation", [1, 2])
 def test_the_densifier_reads_a_score_that_has_the_scale_of_its_own_gradients(accumulation):
     """As `unscale_` and its mean over the passes expect it."""
