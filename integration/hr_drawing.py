@@ -204,7 +204,8 @@ class HrDrawing:
         hr, losses = self._done(asked, inputs, t, ("hr", view.factor), work)
         seen = hr.step if self.replays is None else hr.step.copied()
         # `losses` is a copy: those of a recording are overwritten by the next replay.
-        return replace(hr, step=replace(seen, t=t, view=view, params=step.params), losses=losses)
+        side: HrSide = replace(hr, step=replace(seen, t=t, view=view, params=step.params), losses=losses)
+        return side
 
     @in_full_precision
     @torch.no_grad()

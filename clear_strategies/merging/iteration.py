@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core.deferred import Number
+from clear_strategies.core.deferred import Number, Scalar
 from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.step import Step
@@ -31,7 +31,7 @@ class HrSide:
             λ_HF = 0.
         size: (width, height) of the image in whose pixels `.screen` counts.
         step: the iteration, with the answer of `observe`. m: the answer of `route`, [N] or 1.
-        losses: L_base and L_HF by name; of a replay, numbers that are not read yet.
+        losses: L_base and L_HF by name; of a replay in a host, `Number`s for its log.
         lr: ∇(λ_LR L_LR), if it passes through the HR render; else None.
     """
 
@@ -40,7 +40,7 @@ class HrSide:
     size: tuple[int, int]
     step: Step
     m: float | Float[Tensor, " N"] = 1.0
-    losses: Mapping[str, Number] = field(default_factory=dict)
+    losses: Mapping[str, Scalar] = field(default_factory=dict)
     lr: Grads | None = None
 
     @property
@@ -84,7 +84,7 @@ class Update:
     score: Float[Tensor, " N"] | None
     ordinary: Float[Tensor, " N"] | None
     conflict: Mapping[str, Number] = field(default_factory=dict)
-    losses: Mapping[str, Number] = field(default_factory=dict)
+    losses: Mapping[str, Scalar] = field(default_factory=dict)
     logs: Mapping[str, Number] = field(default_factory=dict)
     cotangents_lr: Float[Tensor, "1 H W 3"] | None = None
 

@@ -60,14 +60,14 @@ class Overrides:
 
 def proxy(model: Any, overrides: Overrides) -> Any:
     """An object of the model's class that shares its attributes and applies the overrides."""
-    result: Any = object.__new__(_proxy_class(type(model)))
+    result: Any = object.__new__(_proxy_class(type(model)))  # type: ignore[arg-type]
     object.__setattr__(result, "__dict__", vars(model))
     object.__setattr__(result, "_clear_overrides", overrides)
     return result
 
 
 @cache
-def _proxy_class(cls: type) -> Any:
+def _proxy_class(cls: Any) -> Any:
     def read(self: Any, name: str) -> Any:
         get = partial(cls.__getattribute__, self, name)
         if (role := _ROLES.get(name)) is None:
