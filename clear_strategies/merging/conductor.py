@@ -202,7 +202,8 @@ class Conductor(Hooks):
                 grads, conflict = merged.grads, merged.conflict
             else:
                 grads, conflict = None, stepper.step(params, rendered, g_lr, from_hr, t)
-        losses = {**l_lr.values, **({} if from_hr is None else from_hr.losses)}
+        of_hr: Any = {} if from_hr is None else from_hr.losses  # scalars, as of all that is no replay
+        losses = {**l_lr.values, **of_hr}
         logs = computed(self.logs.scalars(since_kept=True))
         return Update(step, grads, score, ordinary, conflict, losses, logs, l_lr.cotangents)
 

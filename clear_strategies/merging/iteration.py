@@ -31,7 +31,7 @@ class HrSide:
             λ_HF = 0.
         size: (width, height) of the image in whose pixels `.screen` counts.
         step: the iteration, with the answer of `observe`. m: the answer of `route`, [N] or 1.
-        losses: L_base and L_HF by name; of a replay in a host, `Number`s for its log.
+        losses: L_base and L_HF by name; of a replay in a host, numbers that are not read yet.
         lr: ∇(λ_LR L_LR), if it passes through the HR render; else None.
     """
 
@@ -40,7 +40,7 @@ class HrSide:
     size: tuple[int, int]
     step: Step
     m: float | Float[Tensor, " N"] = 1.0
-    losses: Mapping[str, Scalar] = field(default_factory=dict)
+    losses: Mapping[str, Number] = field(default_factory=dict)
     lr: Grads | None = None
 
     @property

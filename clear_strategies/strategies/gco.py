@@ -122,7 +122,7 @@ class GCO(Strategy):
 
         @cache
         def counted() -> tuple[Sequence[Number], ...]:
-            corrected = (below < 0).sum(0)
+            corrected = (below < 0).sum(0, dtype=ω.dtype)  # times a float, whole numbers would become float32
             kept = len(below) - corrected  # their ω is at its lower bound, too
             sums = corrected, ω.sum(0) - self.weight_min * kept, (ω <= self.weight_min).sum(0) - kept
             return (p.comparable, *map(deferred.elements, sums))
