@@ -172,10 +172,11 @@ class Conductor(Hooks):
                 "and wants_hr(t) ask for."
             )
         self.logs.keep()
-        step = Step(t, view, params=params, looked_up=looked_up)
+        known = Step(t, view, params=params, looked_up=looked_up)
+        step = self._told(known)
         _require_size(view, "hr" if reduced else "lr", rendered.image)
         image = rendered.image.detach()
-        l_lr = self._losses("lr", images.area_mean(image, view.factor) if reduced else image, step)  # Eq. 4
+        l_lr = self._losses("lr", images.area_mean(image, view.factor) if reduced else image, known, step)  # Eq. 4
         g_lr: Any = None
         from_hr: HrSide | None = None
         if not reduced:
@@ -186,7 +187,7 @@ class Conductor(Hooks):
         else:
             # Where Î_LR is the area mean of Î_HR, the cotangent of L_LR passes through the same HR render.
             through_mean = images.area_mean_transposed(l_lr.cotangents, view.factor) if reduced else None
-            from_hr = self.hr_gradients(hr, step, vjp, lr_cotangents=through_mean)
+            from_hr = self.hr_gradients(hr, known, vjp, lr_cotangents=through_mean)
             g_lr, step = from_hr.lr if reduced else g_lr, from_hr.step
         with stage("strategies" if stepper is None else "per-Gaussian pass"):
             score = ordinary = None
@@ -226,9 +227,10 @@ class Conductor(Hooks):
         """
         stage, λ_hf = self.work_log.stage, self.objective.lambda_hf
         _require_size(step.view, "hr", hr.image)
-        step = replace(step, visible=hr.visible)
-        losses = self._losses("hr", hr.image.detach(), step)  # Eq. 5
-        of_hr, step = losses.cotangents, self._told(step)
+        known = replace(step, visible=hr.visible)
+        step = self._told(known)
+        losses = self._losses("hr", hr.image.detach(), known, step)  # Eq. 5
+        of_hr = losses.cotangents
         if len(of_hr) == 2 and not (apart or self.owner("route") is not None or self.owner("score") is not None):
             of_hr = torch.add(of_hr[:1], of_hr[1:], alpha=λ_hf)
         has_hf, n = len(of_hr) == 2, len(hr.visible)
@@ -319,17 +321,21 @@ class Conductor(Hooks):
         self._hr_cotangents = None
         super().on_fit_end()
 
-    def _losses(self, scale: Scale, image: Float[Tensor, "H W 3"], step: Step) -> Losses:
-        """The losses of a render against the photo of its scale, which lies over the background of the iteration."""
-        view, is_lr = step.view, scale == "lr"
+    def _losses(self, scale: Scale, image: Float[Tensor, "H W 3"], known: Step, step: Step) -> Losses:
+        """The losses of a render against the photo of its scale, which lies over the background of the iteration.
+
+        Args:
+            known: the iteration. step: the same as strategies see it.
+        """
+        view, is_lr = known.view, scale == "lr"
         with self.work_log.stage(f"losses {scale.upper()}"):
-            photo = self._over_background(view.lr if is_lr else view.hr, step.t, view.background)
+            photo = self._over_background(view.lr if is_lr else view.hr, known.t, view.background)
             losses = self.objective.lr if is_lr else self._hr_losses
-            compare = self.comparison(scale, photo, self._told(step), lambda x: losses(x, photo.image, photo.shown))
+            compare = self.comparison(scale, photo, step, lambda x: losses(x, photo.image, photo.shown))
             found = compare(image)
         target = "the LR photo" if is_lr else "the SR image"
         compared = {target: photo.image, f"the {scale.upper()} render": image}
-        require_finite_losses(_where(view, step.t), found.values, compared)
+        require_finite_losses(_where(view, known.t), found.values, compared)
         return found
 
     def _hr_losses(
