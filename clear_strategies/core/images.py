@@ -105,6 +105,11 @@ def back_projected(
     return sr
 
 
+def as_rgb(layer: Float[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
+    """An image of three equal channels, to be resized as photos are."""
+    return layer[..., None].expand(-1, -1, 3).contiguous()
+
+
 def patch_means(values: Float[Tensor, "H W C"], patch: int) -> Float[Tensor, "ph pw"]:
     """Avg_p: mean over pixels and channels of each patch × patch square, aligned at the top-left.
 

@@ -89,8 +89,7 @@ class Photo:
         size = (camera.width, camera.height)
 
         def layer(values: Float[Tensor, "H W"]) -> Float[Tensor, "h w"]:
-            of_three = values[..., None].expand(-1, -1, 3).contiguous()
-            return images.resize(of_three, size, layers or kernel).mean(dim=2)
+            return images.resize(images.as_rgb(values), size, layers or kernel).mean(dim=2)
 
         shown = None if self.shown is None else layer(self.shown.float()) > _WHOLE
         through = None if self.transparency is None else layer(self.transparency)

@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies.core import images
 from clear_strategies.core.progress import Progress
 from clear_strategies.core.view import SMALLEST, Photo, View
 from clear_strategies.core.work_log import WorkLog
@@ -57,7 +58,7 @@ def prepare(
         DataError: the capture cannot be prepared with these settings.
     """
     train_frames, test_frames = split(capture, views)
-    frames = [*train_frames, *test_frames]
+    frames = [*train_frames, *map(_opaque, test_frames)]
     lr_files = check_headers(frames, views)
     require_source(cloud, capture.points)
     _check_positions(capture, [frame.camera for frame in train_frames], cloud)
@@ -153,6 +154,11 @@ def _loaded(
     forget_maps()
 
 
+def _opaque(frame: Frame) -> Frame:
+    """The frame without the photo's transparency, which only training needs."""
+    return replace(frame, load=lambda: replace(frame.load(), transparency=None))
+
+
 def _view(
     capture: Capture, views: ViewSettings, prior: Prior, name: str, photo: Photo, lr: Photo, *, trains: bool
 ) -> View:
@@ -161,7 +167,7 @@ def _view(
     hr, truth = replace(photo, shown=None), None if lr is photo or are_both else photo.image
     source, disagreement = "the photos themselves", None
     if not are_both:
-        through = _enlarged(prior, lr.transparency, name, factor) if trains else None
+        through = _enlarged(prior, lr.transparency, name, factor)
         try:
             sr = super_resolved(prior, name, lr.image, factor)
         except DataError as missing:
@@ -173,8 +179,6 @@ def _view(
         camera = lr.camera.scaled(factor) if lr is photo else photo.camera
         hr = Photo(camera, sr.image, transparency=through)
         source, disagreement = prior.label, sr.disagreement
-    if not trains:  # only training needs it
-        lr, hr = replace(lr, transparency=None), replace(hr, transparency=None)
     view = View(
         name, lr, hr, truth, source, disagreement=disagreement, background=capture.background, hr_is_photo=are_both
     )
@@ -189,7 +193,7 @@ def _enlarged(
     if transparency is None:
         return None
     enlarge = (kept_network_of(prior) if bool(transparency.any()) else None) or Bicubic()
-    return enlarge(name, transparency[..., None].expand(-1, -1, 3).contiguous(), factor).mean(dim=2)
+    return enlarge(name, images.as_rgb(transparency), factor).mean(dim=2)
 
 
 def _equalized(train: Sequence[View]) -> tuple[tuple[View, ...], dict[str, str]]:
