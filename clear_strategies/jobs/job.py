@@ -112,13 +112,11 @@ class _Job:
         _log.log(level, "%s", choices)
         if settings.data.save_lr is not None:
             capture, views = scenes.read(settings.data, None)
-            if few := capture.notes.get(scenes.FEW_PLACED):
-                _log.warning("%s.", few)
+            _warn_if_few_placed(capture.notes)
             save_lr(capture, views, Path(settings.data.save_lr))
             return None
         scene = load()
-        if few := scene.notes.get(scenes.FEW_PLACED):
-            _log.warning("%s.", few)
+        _warn_if_few_placed(scene.notes)
         device.log_choice(settings.rasterizer, self.ready)
         ready = self.ready.over(scene.background).among(scene.cloud.means)
         there = scene.to(ready.device)
@@ -132,8 +130,7 @@ class _Job:
         _log.log(level, "%s", metrics.describe(folder, evaluation, seconds, _parts(scene, state, training)))
         if in_sweep():
             _log.info("%s", metrics.describe_job(HydraConfig.get().job.num, folder, evaluation, seconds))
-        if few:
-            _log.warning("%s.", few)
+        _warn_if_few_placed(scene.notes)
         return evaluation.psnr
 
     def _start(self, scene: Scene, there: Scene, ready: device.ReadyRasterizer) -> TrainState:
@@ -209,6 +206,11 @@ class _Job:
 
 _PREPARED: Final = "views prepared"
 _AFTER: Final = ("maps", "evaluate", "video", "pictures")
+
+
+def _warn_if_few_placed(notes: Mapping[str, str]) -> None:
+    if few := notes.get(scenes.FEW_PLACED):
+        _log.warning("%s.", few)
 
 
 def _parts(scene: Scene, state: TrainState, training: float) -> dict[str, float]:
