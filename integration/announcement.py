@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
@@ -62,14 +63,20 @@ def announce(conductor: Conductor, views: Sequence[View], host: Host) -> None:
         _log.info("no strategy is attached: %s.", summed)
 
 
-def warn_without_hr(conductor: Conductor, counts: Mapping[str, int]) -> None:
-    """At the end of a loop, warn if HR took no part in it.
+def last_error() -> BaseException | None:
+    """The error that is on its way, or else the last that ended a program or a notebook's cell."""
+    return sys.exc_info()[1] or getattr(sys, "last_value", None)
+
+
+def warn_without_hr(conductor: Conductor, counts: Mapping[str, int], known: BaseException | None) -> None:
+    """At the end of a loop, warn if HR took no part in it, unless an error has ended the loop.
 
     Args:
-        counts: `Attachment.counts`.
+        counts: `Attachment.counts`. known: `last_error` before the loop.
     """
     first = _first_hr(conductor)
-    if first is not None and 0 < counts["merges"] < first and not counts["HR renders"]:
+    is_short = first is not None and 0 < counts["merges"] < first and not counts["HR renders"]
+    if is_short and last_error() in (None, known):
         _log.warning(
             "HR took no part in the %d steps of this loop: it would from step %d on. %s",
             counts["merges"],

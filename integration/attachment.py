@@ -44,7 +44,7 @@ from clear_strategies.errors import HostError, SettingError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.logs import computed
 from clear_strategies.strategies.base import Logged
-from integration.announcement import Once, announce, warn_without_hr
+from integration.announcement import Once, announce, last_error, warn_without_hr
 from integration.autograd_shot import HostOutput, OfOthers, Target, are_in_order, require_named, trained
 from integration.host import Host
 from integration.host_merge import HostMerge
@@ -100,7 +100,7 @@ class Attachment:
         conductor.on_fit_start(len(views), seed, means.device, views)
         self._run = conductor.run
         announce(conductor, views, host)
-        self._finalizer = finalize(self, warn_without_hr, conductor, self.counts)
+        self._finalizer = finalize(self, warn_without_hr, conductor, self.counts, last_error())
 
     def render_view(self, view: View, render_at: RenderAt) -> Any:
         """Render a training view at both scales; returns what the host's render function returns at LR.

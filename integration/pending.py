@@ -249,7 +249,8 @@ def why_nothing_was_merged(pending: Pending | None, trained: Sequence[str]) -> t
         return (
             "none of its renderings was recognised as that of a training view",
             "Check that the training loop renders with the function that was replaced, and with the cameras that were "
-            "passed. A loop with `attach` that moves its cameras names the view: with clear.rendering(view): …",
+            "passed. A loop with `attach` that moves its cameras names the view: with clear.rendering(view): … A loss that has a "
+            "step of its own, e.g. of the depth, belongs into the sum with that of the photo.",
         )
     drawings, names = pending.output.shot.drawings, ", ".join(trained)
     if not pending.output.marks and not any(x.requires_grad for d in drawings for x in d.inputs.values()):

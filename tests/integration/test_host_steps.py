@@ -2,6 +2,7 @@
 
 import functools
 import gc
+import sys
 from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
@@ -130,7 +131,10 @@ def detached(host, render):
 @pytest.mark.parametrize(
     ("does", "cause"),
     [
-        (lambda host, render: None, "none of its renderings was recognised.*cameras that were passed"),
+        (
+            lambda host, render: None,
+            "none of its renderings was recognised.*cameras that were passed.*the sum with",
+        ),
         (frozen, "all parameters of the Gaussians are frozen.*require gradients"),
         (asked, r"no backward\(\) has given means, quats.*view0.*by loss\.backward\(\)"),
         (detached, "the rendering of view0 does not depend on means, quats.*not detached"),
@@ -428,6 +432,27 @@ def test_hr_is_left_out_of_every_second_step_but_where_a_densifier_reads_its_sco
     assert clear.attachment.counts["HR renders"] == len(with_hr)
     assert clear.attachment.counts["merges"] == 6
     assert widths == {24, 48}
+
+
+@pytest.mark.parametrize("fails", ["by itself", "before it is removed"])
+def test_a_loop_that_an_error_ends_is_not_told_of_its_length(fails, caplog, monkeypatch):
+    scene = toy.scene(20)
+    host = Host(scene)
+    clear = attached(host, scene, composed_conductor("gco"))
+
+    def end():
+        try:
+            raise ValueError("of the loop")
+        finally:
+            if fails == "before it is removed":
+                clear.remove()
+
+    with pytest.raises(ValueError, match="of the loop"):
+        host.train([scene.train[0].name], between=end)
+    monkeypatch.setattr(sys, "last_value", ValueError(), raising=False)  # as Python does at the end of a program
+    clear.remove()
+    assert clear.attachment.counts["merges"] == 1
+    assert "HR took no part" not in caplog.text
 
 
 def test_a_loop_that_ends_before_hr_takes_part_is_told(caplog):
