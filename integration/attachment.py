@@ -45,7 +45,8 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.logs import computed
 from clear_strategies.strategies.base import Logged
 from integration.announcement import Once, announce, last_error, warn_without_hr
-from integration.autograd_shot import HostOutput, OfOthers, Target, are_in_order, require_named, trained
+from integration.autograd_shot import HostOutput, OfOthers, Target, require_named, trained
+from integration.graph import are_in_order
 from integration.host import Host
 from integration.host_merge import HostMerge
 from integration.host_steps import HostSteps

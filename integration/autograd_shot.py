@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,15 +15,15 @@ from clear_strategies.core.gradients import Grads, gradients_of, summed
 from clear_strategies.errors import HostError
 from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.iteration import HrSide
+from integration.announcement import Once
 from integration.colours import are_joined
-from integration.structure import rows_drawn
-from rasterizers.differentiable import Drawing, Rendered, outer
+from integration.graph import Edge, Inputs, edge_of, graph_of, has_gradient, inputs_of, without_hooks
+from rasterizers.differentiable import Drawing, outer
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, summed_vjp
-from rasterizers.torch_internals import accumulator, hooks_on_gradient, is_hooked, leaf_of
+from rasterizers.torch_internals import is_hooked
 
-_GOLDEN: Final = 0.6180339887498949  # its multiples modulo 1 differ most for neighbouring rows
-_SAME_CODE: Final = 0.1  # tolerance of the ratio of a row's gradients, which e.g. the mean of all rows changes a little
+_warn_once: Final = Once(logging.getLogger(__name__).warning)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,9 +88,10 @@ class AutogradShot:
         visible: Gaussians that contribute to the image.
         params: raw parameters by gsplat's names. A parameter that the image does not depend on has gradient 0.
         slot: where the host keeps the screen gradient; None: the image is a function of `means2d` itself.
-        drawn: the rasterizer's means, quats, scales, opacities and colors, none of them with a hook; None: the raw parameters.
-            `joint_loss` finds those of this package's rasterizers itself.
+        drawn: the rasterizer's means, quats, scales, opacities and colors, none of them with a hook or computed from another;
+            None: `joint_loss` and hosts find them where a network needs them, see `at_inputs`.
         drawings: of this image by this package's rasterizers; a single one takes all cotangents in one pass.
+        found: inputs of another rasterizer, see `at_inputs`.
         mask: the image is a drawing outside of any graph, times this mask.
     """
 
@@ -101,6 +102,7 @@ class AutogradShot:
     slot: ScreenGradientSlot | None = None
     drawn: Mapping[str, Tensor] | None = None
     drawings: Sequence[Drawing] = ()
+    found: Inputs | None = None
     mask: Float[Tensor, "H W 1"] | None = None
 
     @property
@@ -110,8 +112,13 @@ class AutogradShot:
 
     @property
     def inputs(self) -> Mapping[str, Tensor] | None:
-        """The tensors by whose names `gradients` are; None: the raw parameters."""
+        """The rasterizer's inputs, if they are known."""
         return self.drawn if self.drawing is None else self.drawing.inputs
+
+    @property
+    def edges(self) -> Mapping[str, Edge] | None:
+        """By whose names `gradients` are; None: the raw parameters."""
+        return self.inputs if self.found is None else self.found.edges
 
     @property
     def gradient_slot(self) -> ScreenGradientSlot:
@@ -122,8 +129,8 @@ class AutogradShot:
         """∇θ of every cotangent, each with `.screen`; the graph is kept. Frozen parameters have gradient 0."""
         results = []
         for g in self.gradients(cotangents):
-            raw, _ = to_leaves(g, self.inputs, self.params)
-            detail = g.get("detail") if g.colour is None else g.colour.rgb
+            raw, _ = to_leaves(g, self.edges, self.params)
+            detail = g.get("detail") if g.colour is None else self._of_detail(*g.colour)
             if "detail" in self.params and detail is not None:
                 raw["detail"] = detail
             results.append(Grads(every_number(raw, self.params), screen=g.screen))
@@ -136,29 +143,43 @@ class AutogradShot:
         factors. With `weight`, the result of `core.gradients.summed`.
         """
         if self.drawing is not None:
-            return gradients_of(summed_vjp(self.drawing.rendering, self._at_drawing(cotangents), weight))
+            drawn = gradients_of(summed_vjp(self.drawing.rendering, self._at_drawing(cotangents), weight))
+            if weight is not None and (colour := drawn[0].colour) is not None:
+                drawn[-1]["detail"] = self._of_detail(drawn[-1]["detail"], colour.basis)
+            return drawn
         each = self._gradients_of_host(cotangents)
         return each if weight is None else summed(each, weight)
 
     def _gradients_of_host(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
         slot = self.gradient_slot
-        tensors = {name: x for name, x in (self.drawn or self.params).items() if x.requires_grad}
+        f_det = {name: x for name, x in self.params.items() if name == "detail"}
+        asked = f_det if self.found is not None else self.drawn or self.params
+        tensors = {name: x for name, x in asked.items() if x.requires_grad}
         projected = [slot.tensor] if slot.tensor.requires_grad else []  # gsplat's 3DGUT draws without projected centres
-        f_det = [x for name, x in self.params.items() if name == "detail"]
         results = []
         for cotangent in cotangents:
-            with without_hooks(f_det):  # which are called with its merged gradient
+            hooks = without_hooks([*f_det.values()])  # which are called with its merged gradient
+            with hooks, (self.found or Inputs((), {})).collected() as found:
                 gradients = torch.autograd.grad(
                     self.image, [*tensors.values(), *projected], cotangent, retain_graph=True, allow_unused=True,
                     materialize_grads=True,
                 )  # fmt: skip
             screen = gradients[-1] if projected else torch.zeros_like(slot.tensor)
-            values = dict(zip(tensors, gradients, strict=False))
+            values = {**found, **dict(zip(tensors, gradients, strict=False))}
             if "detail" in self.params and "detail" not in values and "colors" in values:  # of which f_det is an offset
                 rgb = values["colors"]
                 values["detail"] = rgb if rgb.dim() == 2 else rgb[:, 0] / SH_C0
             results.append(Grads(values, screen=slot.per_gaussian(screen, len(self.visible))))
         return results
+
+    def _of_detail(self, rgb: Float[Tensor, "N 3"], basis: Float[Tensor, "N B1"]) -> Float[Tensor, "N 3"]:
+        """The gradient of f_det from that of the drawn colours, of which it is an offset, or which the host computes from it."""
+        detail, colors = self.params.get("detail"), self.drawing.inputs["colors"]  # type: ignore[union-attr]
+        if detail is None or not any(leaf is detail for leaf in graph_of(colors).leaves):
+            return rgb
+        with without_hooks([detail]):
+            of_colors = outer(rgb, basis, colors.shape[1])
+            return torch.autograd.grad(colors, detail, of_colors, retain_graph=True)[0]
 
     def _at_drawing(self, cotangents: Float[Tensor, "K H W 3"]) -> Float[Tensor, "K H W 3"]:
         """The cotangents of the rasterizer's image, from which the host may have computed `image`."""
@@ -170,12 +191,34 @@ class AutogradShot:
         return torch.stack([torch.autograd.grad(image, drawn, c, retain_graph=True)[0] for c in cotangents])
 
 
+def at_inputs(shot: AutogradShot) -> AutogradShot:
+    """The rendering with its gradients taken at the inputs of its rasterizer, where other leaves than the parameters lie behind
+    them (a network, an embedding), so that these learn from HR, too. Warns once if the inputs are not found.
+    """
+    centres = shot.gradient_slot.tensor
+    known = {*map(id, shot.params.values()), *(id(leaf) for leaf in graph_of(centres).leaves)}
+
+    def others(*edges: Edge) -> list[str]:
+        return [f"{leaf.dtype} {[*leaf.shape]}" for leaf in graph_of(*edges).leaves if id(leaf) not in known]
+
+    if shot.inputs is not None or not (found := others(shot.image)):
+        return shot
+    if (inputs := inputs_of(shot.image, centres, shot.params)) is None:
+        _warn_once(
+            "the loop trains %d tensors beside the Gaussians (%s), which learn from LR alone: the inputs of the rasterizer were "
+            "not found, or their rows are not those of the parameters. Name them by AutogradShot(drawn=…).",
+            len(found), ", ".join(found[:3]),
+        )  # fmt: skip
+        return shot
+    return replace(shot, found=inputs) if others(*inputs.edges.values()) else shot
+
+
 OfOthers = list[tuple[Tensor, Tensor]]
 """Other leaves that the loop trains (of a network, an embedding), each with its gradient."""
 
 
 def side_of_leaves(
-    hr: HrSide, drawn: Mapping[str, Tensor] | None, params: Mapping[str, Tensor], scale: float
+    hr: HrSide, drawn: Mapping[str, Edge] | None, params: Mapping[str, Tensor], scale: float
 ) -> tuple[HrSide, OfOthers]:
     """The HR side with the gradients of the raw parameters in place of those of the drawn tensors, each with its `.screen`; and
     those of other leaves.
@@ -191,7 +234,7 @@ def side_of_leaves(
 
 
 def to_leaves(
-    g: Grads, drawn: Mapping[str, Tensor] | None, params: Mapping[str, Tensor], scale: float = 1.0
+    g: Grads, drawn: Mapping[str, Edge] | None, params: Mapping[str, Tensor], scale: float = 1.0
 ) -> tuple[Grads, OfOthers]:
     """The gradients of the raw parameters, without f_det, from those of the drawn tensors, through the host's own graph; and
     those of the other leaves that the drawn tensors were computed from.
@@ -205,19 +248,22 @@ def to_leaves(
     if drawn is None:
         return Grads({name: g[name] for name in raw}), []  # which hooks may have changed
     if g.colour is not None:
-        if are_joined(drawn["colors"], params):
+        colors = cast(Tensor, drawn["colors"])
+        if are_joined(colors, params):
             colour = g.colour
         else:
-            g = Grads({**g, "colors": outer(g.colour.rgb, g.colour.basis, drawn["colors"].shape[1])})
+            g = Grads({**g, "colors": outer(g.colour.rgb, g.colour.basis, colors.shape[1])})
     direct = {name: g[name] for name, p in raw.items() if drawn.get(name) is p and not is_hooked(p)}
-    graph = {name: x for name, x in drawn.items() if name in g and name not in direct and x.requires_grad}
+    graph = {name: x for name, x in drawn.items() if name in g and name not in direct and has_gradient(x)}
     known = {id(p) for p in params.values()}
     others = [leaf for leaf in graph_of(*graph.values()).leaves if id(leaf) not in known]
     leaves = [*raw.values(), *others]
     if not graph or not leaves:
         return Grads(direct, colour=colour), []
     at_drawn = [g[name] if scale == 1 else g[name] * scale for name in graph]
-    through = torch.autograd.grad([*graph.values()], leaves, at_drawn, retain_graph=True, allow_unused=True)
+    through = torch.autograd.grad(
+        [*map(edge_of, graph.values())], leaves, at_drawn, retain_graph=True, allow_unused=True
+    )
     values = [x if x is None or scale == 1 else x / scale for x in through]
     found = {name: x for name, x in zip(raw, values, strict=False) if x is not None}
     both = {name: direct[name] + found[name] for name in direct.keys() & found.keys()}
@@ -231,62 +277,9 @@ def every_number(g: Grads, params: Mapping[str, Tensor]) -> Grads:
     return Grads({name: torch.zeros_like(p) for name, p in params.items() if name not in known} | known)
 
 
-def are_in_order(drawn: Mapping[str, Tensor] | None, params: Mapping[str, Tensor]) -> bool:
-    """Return True if row i of the drawn tensors is computed from row i of the parameters; None: the parameters are drawn.
-
-    A tensor with the parameter's memory is. Any other is tested by two cotangents, whose rows i are 1 and c_i: in the same order,
-    the gradients of the parameter's row i are g and c_i g, otherwise g and c_j g. If no tensor has a gradient, positions are
-    compared.
-    """
-    if drawn is None:
-        return True
-    asked = list[tuple[Tensor, Tensor]]()
-    for name in ("opacities", "scales", "means", "quats", "colors"):
-        x, p = drawn.get(name), params.get("sh0" if name == "colors" else name)
-        if x is None or p is None or x.shape[:1] != p.shape[:1]:
-            continue
-        if x.data_ptr() == p.data_ptr() and x.stride() == p.stride():
-            return True
-        if x.requires_grad and p.requires_grad and not is_hooked(p):
-            asked.append((x, p))
-    answers = set[bool | None]()
-    for x, p in asked:
-        if (answer := _is_in_order(x, p)) is True:
-            return True
-        answers.add(answer)
-    if asked or "means" not in drawn:
-        return False not in answers
-    return rows_drawn(drawn["means"].detach(), params["means"].detach()) is None
-
-
-def _is_in_order(x: Tensor, p: Tensor) -> bool | None:
-    """None: x does not depend on p."""
-    code = 1 + (torch.arange(len(x), device=x.device, dtype=torch.float64) * _GOLDEN).frac().to(x.dtype)
-    plain, coded = (
-        torch.autograd.grad(x, p, c, retain_graph=True, allow_unused=True)[0]
-        for c in (torch.ones_like(x), code.view(-1, *[1] * (x.dim() - 1)).expand_as(x))
-    )
-    if plain is None or not bool(plain.any()):
-        return None
-    plain, coded = plain.reshape(len(p), -1), coded.reshape(len(p), -1)
-    off = torch.addcmul(coded, code.to(plain)[:, None], plain, value=-1)
-    return bool((off.abs_().sum(1) <= _SAME_CODE * plain.abs_().sum(1)).all())
-
-
 def trained(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The parameters, except for f_det, that require gradients."""
     return {name: p for name, p in params.items() if p.requires_grad and name != "detail"}
-
-
-def require_leaves(params: Mapping[str, Tensor]) -> None:
-    """Raise a HostError if torch would give the gradient of a parameter to another tensor."""
-    for name, p in params.items():
-        if p.requires_grad and not p.is_leaf:
-            raise HostError(
-                f"{name} must be a leaf, whose .grad becomes the merged gradient, but it was computed from other tensors (a "
-                "slice or a product of a parameter, torch.func.functional_call). Make it a Parameter of its own, and compute "
-                "with that in the call of the renderer."
-            )
 
 
 def require_named(shot: object, params: Mapping[str, Tensor]) -> None:
@@ -297,41 +290,6 @@ def require_named(shot: object, params: Mapping[str, Tensor]) -> None:
             f"AutogradShot.params must hold the parameters themselves, got other tensors as {', '.join(other)}. Pass what is "
             "computed from them, e.g. activated scales, as drawn=."
         )
-
-
-@contextmanager
-def without_hooks(leaves: Sequence[Tensor]) -> Iterator[None]:
-    """A context in which gradients reach these leaves past their hooks, which are called with the merged gradient."""
-    held = [(hooks, dict(hooks)) for hooks in map(hooks_on_gradient, leaves)]
-    for hooks, _ in held:
-        hooks.clear()
-    try:
-        yield
-    finally:
-        for hooks, each in held:
-            hooks.update(each)
-
-
-class Graph(NamedTuple):
-    """The leaves that tensors were computed from, and what this package's rasterizers drew for them."""
-
-    leaves: list[Tensor]
-    drawn: list[Rendered]
-
-
-def graph_of(*tensors: Tensor) -> Graph:
-    """The leaves and drawings behind tensors, in one walk. A leaf is its own."""
-    graph, seen, nodes = Graph([], []), set[Any](), [accumulator(x) for x in tensors if x.requires_grad]
-    while nodes:
-        if (node := nodes.pop()) is None or node in seen:
-            continue
-        seen.add(node)
-        if (leaf := leaf_of(node)) is not None:
-            graph.leaves.append(leaf)
-        elif isinstance(drawn := getattr(node, "rendered", None), Rendered):
-            graph.drawn.append(drawn)
-        nodes += [before for before, _ in node.next_functions]
-    return graph
 
 
 Target = Literal["lr", "hr"] | Camera

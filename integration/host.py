@@ -11,7 +11,6 @@ from torch import Tensor
 from clear_strategies.core.checks import require_whole
 from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.errors import HostError
-from integration.autograd_shot import require_leaves
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,3 +68,14 @@ class Host:
     def scale(self) -> float:
         """The factor of the gradients of one backward pass. A gradient scaler reads its own from the device."""
         return (1.0 if self.loss_scale is None else self.loss_scale()) / self.accumulation
+
+
+def require_leaves(params: Mapping[str, Tensor]) -> None:
+    """Raise a HostError if torch would give the gradient of a parameter to another tensor."""
+    for name, p in params.items():
+        if p.requires_grad and not p.is_leaf:
+            raise HostError(
+                f"{name} must be a leaf, whose .grad becomes the merged gradient, but it was computed from other tensors (a "
+                "slice or a product of a parameter, torch.func.functional_call). Make it a Parameter of its own, and compute "
+                "with that in the call of the renderer."
+            )

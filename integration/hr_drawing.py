@@ -33,6 +33,7 @@ from integration.autograd_shot import (
     HostOutput,
     OfOthers,
     Target,
+    at_inputs,
     every_number,
     side_of_leaves,
     to_leaves,
@@ -160,7 +161,7 @@ class HrDrawing:
         mask, asked = self._masks.get(view.name), render_at("hr", gate, view)
         if mask is not None:
             mask = enlarged_mask(mask.to(step.params["means"]), view.factor)[..., None]
-        drawn: Drawable | AutogradShot = asked if isinstance(asked, Drawable) else asked.shot
+        drawn: Drawable | AutogradShot = asked if isinstance(asked, Drawable) else at_inputs(asked.shot)
         if isinstance(drawn, Drawable):
             hr = self._own_hr(drawn, step, mask)
         else:
@@ -176,7 +177,8 @@ class HrDrawing:
             hr = conductor.hr_gradients(shot, step, AutogradShot.gradients, apart=apart)
         if conductor.objective.lambda_hr(step.t) == 0:
             return hr, []
-        return side_of_leaves(hr, drawn.inputs, drawn.params, self._loss_scale())
+        edges = drawn.inputs if isinstance(drawn, Drawable) else drawn.edges
+        return side_of_leaves(hr, edges, drawn.params, self._loss_scale())
 
     def extra_view(self, extra: ExtraView, view: View, t: int, render_at: RenderAt) -> Grads:
         """The gradient of an extra view, which is drawn without gate and f_det."""

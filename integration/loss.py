@@ -7,7 +7,6 @@ that must stay as it is, see attachment.py.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -23,20 +22,17 @@ from clear_strategies.merging.iteration import Update
 from clear_strategies.strategies.base import overrides
 from integration.autograd_shot import (
     AutogradShot,
-    Graph,
     OfOthers,
-    are_in_order,
+    at_inputs,
     every_number,
-    graph_of,
-    require_leaves,
     require_named,
     to_leaves,
-    without_hooks,
 )
 from integration.densification import ScoreScaler, score_for_host
+from integration.graph import Graph, graph_of, require_apart, without_hooks
+from integration.host import require_leaves
 from integration.views import SAME_POSE, require_intrinsics
 from rasterizers.interface import Camera
-from rasterizers.torch_internals import is_hooked
 
 
 def joint_loss(
@@ -51,8 +47,8 @@ def joint_loss(
     """λ_LR L_LR + λ_HR (L_base + λ_HF L_HF), whose gradient is the conductor's merged gradient, and the `Update`.
 
     Other leaves that the host trains get the gradient of λ_LR L_LR. Those that the rasterizer's inputs are computed from (a
-    network, an embedding) also get that of HR after routing, if this package's rasterizers draw the rows of `params` in their
-    order, or if `AutogradShot.drawn` names these inputs.
+    network, an embedding) also get that of HR after routing, if these inputs have the rows of `params` in their order, and are
+    found in the graph or named by `AutogradShot.drawn`; otherwise a warning tells.
 
     Args:
         params: the leaves of the Gaussians that the host optimizes, by gsplat's names (and "detail", if the host has it).
@@ -78,7 +74,7 @@ def joint_loss(
     _require_view(conductor, view, lr=of_lr, hr=of_hr)
     _require_started(conductor)
     with without_hooks([*of_lr.leaves, *(() if of_hr is None else of_hr.leaves)]):
-        to_others = _HrShot(hr, of_hr) if isinstance(hr, AutogradShot) and of_hr is not None else None
+        to_others = _HrShot(hr) if isinstance(hr, AutogradShot) and of_hr is not None else None
         update = conductor.update(values, lr, to_others or hr, view, t)
         others = [*_others(params, lr, of_lr.leaves, update)]
     objective, λ = conductor.objective, conductor.objective.lambda_hr(t)
@@ -196,20 +192,13 @@ def _require_started(conductor: Conductor) -> None:
 class _HrShot:
     """A host's rendering at HR, with one pass through the host's graph for both cotangents.
 
-    Args:
-        graph: of its image. If the shot does not name the rasterizer's inputs, those of this package's only drawing are taken
-            where other leaves need them, and where their rows are those of the parameters.
-
     Attributes:
         of_others: the gradients of other leaves in the last pass.
     """
 
-    def __init__(self, shot: AutogradShot, graph: Graph) -> None:
-        known = {id(shot.gradient_slot.tensor), *map(id, shot.params.values())}
-        if shot.inputs is None and len(graph.drawn) == 1 and any(id(leaf) not in known for leaf in graph.leaves):
-            inputs = {name: x for name, x in graph.drawn[0].inputs._asdict().items() if x is not None}
-            if not any(map(is_hooked, inputs.values())) and are_in_order(inputs, shot.params):
-                shot = replace(shot, drawn=inputs | {name: x for name, x in shot.params.items() if name == "detail"})
+    def __init__(self, shot: AutogradShot) -> None:
+        require_apart(shot.drawn or {})
+        shot = at_inputs(shot)
         self.image, self.means2d, self.visible, self._shot = shot.image, shot.means2d, shot.visible, shot
         self.of_others: OfOthers = []
 
@@ -224,7 +213,7 @@ class _HrShot:
         return [*map(self._to_leaves, each), Grads(detail, screen=of_hf.screen)]
 
     def _to_leaves(self, g: Grads) -> Grads:
-        raw, self.of_others = to_leaves(g, self._shot.inputs, self._shot.params)
+        raw, self.of_others = to_leaves(g, self._shot.edges, self._shot.params)
         return Grads(every_number(raw, self._shot.params), screen=g.screen)
 
 

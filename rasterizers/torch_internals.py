@@ -45,6 +45,12 @@ def leaf_of(node: Any) -> Tensor | None:
     return leaf
 
 
+def of_gradient(edge: torch.autograd.graph.GradientEdge) -> tuple[torch.Size, torch.dtype]:
+    """The shape and the type of the gradient that arrives at an edge."""
+    metadata: Any = edge.node._input_metadata[edge.output_nr]
+    return torch.Size(metadata.shape), metadata.dtype
+
+
 def is_cat(node: Any) -> bool:
     """Whether a node is that of `torch.cat`."""
     return bool(node.name() == "CatBackward0")

@@ -7,6 +7,7 @@ import pickle
 import runpy
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -36,6 +37,8 @@ from integration.inria import attach
 from integration.inria.__main__ import main
 from integration.inria.cameras import HostViews, intrinsics
 from integration.inria.from_options import install
+from rasterizers import Splats, autograd
+from rasterizers.differentiable import outer
 from tests.helpers import toy
 from tests.helpers.gsplat_host import RASTERIZER, in_double
 from tests.helpers.host_parts import FOLDER, FROM_START, HR_FROM_START, WITHOUT_HR, N, loop, options
@@ -254,6 +257,63 @@ def test_a_copy_of_the_model_is_the_hosts_own(copied, inria_host, inria_attached
             getattr(model, name).__func__ is getattr(type(model), name) for name in ("save_ply", "_prune_optimizer")
         )
     assert clear.attachment.counts["merges"] == 3
+
+
+class OneNode(torch.autograd.Function):
+    """Draws by one node of autograd that this package does not know, as the CUDA rasterizer of 3DGS does."""
+
+    @staticmethod
+    def forward(ctx, points, colors, camera, *shapes):
+        ctx.drawn = RASTERIZER(Splats(*(x.detach() for x in (*shapes, colors[:, :1], colors[:, 1:]))), camera)
+        return ctx.drawn.image.clone()
+
+    @staticmethod
+    def backward(ctx, g):
+        of = ctx.drawn.vjp(g.contiguous()[None])
+        shapes = of.means[0], of.quats[0], of.scales[0], of.opacities[0]
+        return of.screen[0], outer(of.rgb[0], of.basis, 16), None, *shapes
+
+
+def test_a_network_before_the_rasterizer_learns_from_both_scales(inria_host, inria_attached, monkeypatch, caplog):
+    """It makes colours of directions, so that positions reach the image by two ways. Whoever draws, gradients are the same."""
+    renderer = sys.modules["gaussian_renderer"]
+
+    def one_node(rasterizer, splats, camera, points, colors):
+        visible = renderer.RASTERIZER(splats, camera).visible
+        shapes = splats.means, splats.quats, splats.scales, splats.opacities
+        return SimpleNamespace(image=OneNode.apply(points, colors, camera, *shapes), visible=visible)
+
+    def without_centres(rasterizer, splats, camera, points, colors):
+        return one_node(rasterizer, splats, camera, points.detach(), colors)
+
+    def gradients(draw, *, lr_alone=False):
+        monkeypatch.setattr(renderer, "autograd", SimpleNamespace(draw=draw))
+        strategies = () if lr_alone else (GCO(), P2G(patch=4))
+        clear, gaussians, scene = inria_attached(*strategies, objective=WITHOUT_HR if lr_alone else HR_FROM_START)
+        gaussians.active_sh_degree = 3
+        torch.manual_seed(0)
+        network = torch.nn.Linear(3, 3)
+
+        def features(self):
+            directions = torch.nn.functional.normalize(self._xyz, dim=1)
+            of_directions = network(directions + self._features_dc[:, 0])[:, None]
+            return torch.cat((self._features_dc + of_directions, self._features_rest), 1)
+
+        monkeypatch.setattr(type(gaussians), "get_features", property(features))
+        camera = scene.cameras[0]
+        image = clear.wrap(inria_host.render)(camera, gaussians, None, torch.zeros(3))["render"]
+        inria_host.photometric(image, camera.original_image).backward()
+        clear.remove()
+        return {name: p.grad for name, p in clear.params().items()} | {"network": network.weight.grad}
+
+    ours, other = gradients(autograd.draw), gradients(one_node)
+    for name, g in ours.items():
+        torch.testing.assert_close(other[name], g, rtol=1e-3, atol=1e-4 * float(g.abs().max()), msg=name)
+    assert "learn from LR alone" not in caplog.text
+    unknown, of_lr = gradients(without_centres), gradients(one_node, lr_alone=True)
+    assert "trains 2 tensors beside the Gaussians (torch.float32 [3, 3], torch.float32 [3])" in caplog.text
+    torch.testing.assert_close(unknown["network"], of_lr["network"])
+    assert float((other["network"] - of_lr["network"]).abs().max()) > 0.1 * float(of_lr["network"].abs().max())
 
 
 def test_a_renderer_that_does_not_read_the_getters_is_warned_of(inria_host, caplog, inria_attached):

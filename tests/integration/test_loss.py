@@ -133,6 +133,43 @@ def test_what_else_the_loop_trains_gets_its_gradient(share, strategies, hooked):
         torch.testing.assert_close(leaf.grad, 3 * expected)
 
 
+@pytest.mark.parametrize("named", [False, True])
+def test_what_reaches_the_colours_and_the_rasterizer_counts_once(named):
+    """The gradient of the positions, from whose directions a network computes colours."""
+    scene = toy.scene(20)
+    host, view, conductor = Host(scene), scene.train[0], Conductor(objective=HR_FROM_START)
+    conductor.on_fit_start(3, 0, views=scene.train)
+    network = torch.nn.Linear(3, 3)
+
+    def render(camera, detail=None):
+        p = host.params
+        sh0 = p["sh0"] + network(torch.nn.functional.normalize(p["means"], dim=1))[:, None]
+        splats = Splats(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), sh0, p["shN"], detail)
+        shot = autograd.draw(toy.RASTERIZER, splats, camera)
+        names = "means", "quats", "scales", "opacities", "sh0", "shN"
+        drawn = {name: getattr(splats, name) for name in names} | {"detail": p["detail"]} if named else None
+        return AutogradShot(shot.image, shot.means2d, shot.visible, p, drawn=drawn)
+
+    lr, hr = render(view.lr.camera), render(view.hr.camera, host.params["detail"])
+    if named:
+        with pytest.raises(HostError, match="means of drawn reaches sh0"):
+            joint_loss(conductor, host.params, lr, hr, view, 5)
+        return
+    joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
+    objective, leaves = conductor.objective, [host.params["means"], network.weight]
+    (of_lr,) = objective.lr(lr.image.detach(), view.lr.image, None).cotangents
+    of_hr = objective.hr(hr.image.detach(), view.hr.image, None).cotangents
+    at_hr = of_hr[0] + objective.lambda_hf * of_hr[1]
+    expected = [
+        a + b
+        for a, b in zip(
+            torch.autograd.grad(lr.image, leaves, of_lr), torch.autograd.grad(hr.image, leaves, at_hr), strict=True
+        )
+    ]
+    for leaf, g in zip(leaves, expected, strict=True):
+        torch.testing.assert_close(leaf.grad, g, rtol=1e-4, atol=1e-4 * float(g.abs().max()))
+
+
 ROWS = {
     "as they are": lambda x: x,
     "in another order": lambda x: x.flip(0),

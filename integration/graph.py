@@ -1,0 +1,207 @@
+"""The autograd graph of a host: what tensors were computed from, where a rasterizer draws them, and in which order of rows."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any, Final, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.graph import GradientEdge, get_gradient_edge
+
+from clear_strategies.errors import HostError
+from integration.structure import rows_drawn
+from rasterizers.differentiable import Rendered
+from rasterizers.torch_internals import hooks_on_gradient, is_hooked, leaf_of, of_gradient
+
+_GOLDEN: Final = 0.6180339887498949  # its multiples modulo 1 differ most for neighbouring rows
+_SAME_CODE: Final = 0.1  # tolerance of the ratio of a row's gradients, which e.g. the mean of all rows changes a little
+
+Edge = Tensor | GradientEdge
+"""A tensor in the graph, or where its gradient arrives."""
+
+
+class Graph(NamedTuple):
+    """What tensors were computed from.
+
+    Args:
+        nodes: of autograd.
+        drawn: what this package's rasterizers drew for them.
+    """
+
+    nodes: set[Any]
+    leaves: list[Tensor]
+    drawn: list[Rendered]
+
+
+def graph_of(*edges: Edge, before: Collection[Any] = ()) -> Graph:
+    """The graph behind tensors, in one walk that ends at the nodes `before`. A leaf is its own."""
+    graph = Graph({*before}, [], [])
+    nodes: list[Any] = [edge_of(x).node for x in edges if has_gradient(x)]
+    while nodes:
+        if (node := nodes.pop()) is None or node in graph.nodes:
+            continue
+        graph.nodes.add(node)
+        if (leaf := leaf_of(node)) is not None:
+            graph.leaves.append(leaf)
+        elif isinstance(drawn := getattr(node, "rendered", None), Rendered):
+            graph.drawn.append(drawn)
+        nodes += [behind for behind, _ in node.next_functions]
+    return graph
+
+
+class Inputs:
+    """The inputs of the rasterizer that drew an image in a host's graph, found without its help.
+
+    A rasterizer is a node of autograd that passes the screen gradient on to the tensor of projected centres, and stands between
+    the image and all parameters. Its gradients are those of its inputs alone, without what these get through one another, as
+    positions do through colours that are computed from directions.
+
+    Args:
+        nodes: of the rasterizer, one for each of its calls.
+        edges: where the gradients of its inputs with a row for each Gaussian go, by name.
+    """
+
+    def __init__(self, nodes: Sequence[Any], edges: Mapping[str, GradientEdge]) -> None:
+        self._nodes, self.edges = nodes, edges
+
+    @contextmanager
+    def collected(self) -> Iterator[dict[str, Tensor]]:
+        """The gradients of the edges by name, of the one backward pass in this context."""
+        found: dict[str, Tensor] = {}
+
+        def keep(i: int, of_inputs: Sequence[Tensor | None]) -> None:
+            of_node = {_name(i, j): g for j, g in enumerate(of_inputs)}
+            found.update({name: g for name, g in of_node.items() if g is not None and name in self.edges})
+
+        with ExitStack() as hooks:
+            for i, node in enumerate(self._nodes):
+                handle = node.register_hook(lambda of_inputs, _, i=i: keep(i, of_inputs))
+                hooks.callback(handle.remove)
+            yield found
+
+
+def inputs_of(image: Tensor, centres: Tensor, params: Mapping[str, Tensor]) -> Inputs | None:
+    """The inputs of the rasterizer that drew `image`; None: it is no single node, or its rows are not those of the parameters.
+
+    Args:
+        centres: through which it passes the screen gradient.
+        params: raw parameters by gsplat's names, with N rows.
+    """
+    if not centres.requires_grad or not image.requires_grad:
+        return None
+    graph, probe, n = graph_of(image).nodes, edge_of(centres), len(params["means"])
+    own = {id(p) for name, p in params.items() if name != "detail"}
+
+    def reaches_own(found: Graph) -> bool:
+        return any(id(leaf) in own for leaf in found.leaves)
+
+    nodes = [x for x in graph if (probe.node, probe.output_nr) in x.next_functions]
+    while nodes and reaches_own(graph_of(image, before=nodes)):  # on to what is computed from these
+        nodes = [x for x in graph if any(behind in nodes for behind, _ in x.next_functions)]
+    edges: dict[str, GradientEdge] = {}
+    for i, node in enumerate(nodes):
+        for j, (behind, nr) in enumerate(node.next_functions):
+            if behind is None:
+                continue
+            edge = GradientEdge(behind, nr)
+            found, shape = graph_of(edge), of_gradient(edge)[0]
+            if not found.nodes.isdisjoint(nodes):
+                return None
+            if probe.node in found.nodes:
+                continue
+            if shape[:1] == (n,):
+                edges[_name(i, j)] = edge
+            elif reaches_own(found):
+                return None
+    pairs = [(edge, p) for edge in edges.values() for p in graph_of(edge).leaves if id(p) in own]
+    is_same = any(edge == edge_of(p) for edge, p in pairs)
+    return Inputs(nodes, edges) if is_same or (pairs and _are_in_order(pairs)) else None
+
+
+def require_apart(drawn: Mapping[str, Tensor]) -> None:
+    """Raise a HostError if one of the drawn tensors is computed from another, whose gradient would count twice."""
+    nodes = {name: edge_of(x).node for name, x in drawn.items() if x.requires_grad}
+    for name, node in nodes.items():
+        behind = graph_of(drawn[name]).nodes - {node}
+        if reaching := [other for other, of_other in nodes.items() if of_other in behind]:
+            raise HostError(
+                f"AutogradShot: {reaching[0]} of drawn reaches {name} of drawn, too, so that its gradient would count twice. "
+                f"Draw an alias, x = {reaching[0]}.view_as({reaching[0]}), and name that."
+            )
+
+
+def are_in_order(drawn: Mapping[str, Tensor] | None, params: Mapping[str, Tensor]) -> bool:
+    """Return True if row i of the drawn tensors is computed from row i of the parameters; None: the parameters are drawn.
+
+    A tensor with the parameter's memory is. Any other is tested by two cotangents, whose rows i are 1 and c_i: in the same order,
+    the gradients of the parameter's row i are g and c_i g, otherwise g and c_j g. If no tensor has a gradient, positions are
+    compared.
+    """
+    if drawn is None:
+        return True
+    asked = list[tuple[Tensor, Tensor]]()
+    for name in ("opacities", "scales", "means", "quats", "colors"):
+        x, p = drawn.get(name), params.get("sh0" if name == "colors" else name)
+        if x is None or p is None or x.shape[:1] != p.shape[:1]:
+            continue
+        if x.data_ptr() == p.data_ptr() and x.stride() == p.stride():
+            return True
+        if x.requires_grad and p.requires_grad and not is_hooked(p):
+            asked.append((x, p))
+    if asked or "means" not in drawn:
+        return _are_in_order(asked)
+    return rows_drawn(drawn["means"].detach(), params["means"].detach()) is None
+
+
+def _are_in_order(pairs: Iterable[tuple[Edge, Tensor]]) -> bool:
+    """Whether row i of what is drawn is computed from row i of a parameter; also if nothing that is drawn depends on it."""
+    answers = set[bool | None]()
+    for x, p in pairs:
+        if (answer := _is_in_order(x, p)) is True:
+            return True
+        answers.add(answer)
+    return False not in answers
+
+
+def _is_in_order(x: Edge, p: Tensor) -> bool | None:
+    """None: x does not depend on p."""
+    shape, dtype = of_gradient(edge := edge_of(x))
+    code = 1 + (torch.arange(shape[0], device=p.device, dtype=torch.float64) * _GOLDEN).frac().to(dtype)
+    plain, coded = (
+        torch.autograd.grad([edge], p, [c], retain_graph=True, allow_unused=True)[0]
+        for c in (code.new_ones(shape), code.view(-1, *[1] * (len(shape) - 1)).expand(shape))
+    )
+    if plain is None or not bool(plain.any()):
+        return None
+    plain, coded = plain.reshape(len(p), -1), coded.reshape(len(p), -1)
+    off = torch.addcmul(coded, code.to(plain)[:, None], plain, value=-1)
+    return bool((off.abs_().sum(1) <= _SAME_CODE * plain.abs_().sum(1)).all())
+
+
+@contextmanager
+def without_hooks(leaves: Sequence[Tensor]) -> Iterator[None]:
+    """A context in which gradients reach these leaves past their hooks, which are called with the merged gradient."""
+    held = [(hooks, dict(hooks)) for hooks in map(hooks_on_gradient, leaves)]
+    for hooks, _ in held:
+        hooks.clear()
+    try:
+        yield
+    finally:
+        for hooks, each in held:
+            hooks.update(each)
+
+
+def _name(node: int, place: int) -> str:
+    return f"input {place} of call {node}"
+
+
+def has_gradient(x: Edge) -> bool:
+    """Whether it is in a graph."""
+    return isinstance(x, GradientEdge) or x.requires_grad
+
+
+def edge_of(x: Edge) -> GradientEdge:
+    """Where its gradient arrives."""
+    return x if isinstance(x, GradientEdge) else get_gradient_edge(x)
