@@ -46,7 +46,7 @@ from clear_strategies.merging.logs import computed
 from clear_strategies.strategies.base import Logged
 from integration.announcement import Once, announce, last_error, warn_without_hr
 from integration.autograd_shot import HostOutput, OfOthers, Target, require_named, trained
-from integration.graph import are_in_order
+from integration.graph import require_in_order
 from integration.host import Host
 from integration.host_merge import HostMerge
 from integration.host_steps import HostSteps
@@ -141,12 +141,7 @@ class Attachment:
             extra_views = conductor.extra_views(t)
             self._steps.follow_by(leaves, (self._hr.extra_view(x, view, t, apart) for x in extra_views))
         output = cast(HostOutput, render_at("lr", z, view))
-        if not are_in_order(output.shot.inputs, output.shot.params):
-            raise HostError(
-                f"{view.name} is rendered with its Gaussians in another order than that of the parameters, so that f_det and "
-                "dropout would go to others. Render them as they are, since the rasterizer sorts by depth itself, or sort the "
-                "parameters."
-            )
+        require_in_order(view.name, output.shot.inputs, output.shot.params)
         self.counts["LR renders"] += 1
         pending = Pending(self.counts["LR renders"], t, view.name, output, hr, others)
         self._merging.await_passes(pending, to_screen=hr is not None and self._hr.is_scored)

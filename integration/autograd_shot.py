@@ -19,7 +19,6 @@ from integration.announcement import Once
 from integration.colours import are_joined
 from integration.graph import Edge, Inputs, edge_of, graph_of, has_gradient, inputs_of, without_hooks
 from rasterizers.differentiable import Drawing, outer
-from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, summed_vjp
 from rasterizers.torch_internals import is_hooked
 
@@ -153,7 +152,7 @@ class AutogradShot:
     def _gradients_of_host(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
         slot = self.gradient_slot
         f_det = {name: x for name, x in self.params.items() if name == "detail"}
-        asked = f_det if self.found is not None else self.drawn or self.params
+        asked = {**({} if self.found is not None else self.drawn or self.params), **f_det}
         tensors = {name: x for name, x in asked.items() if x.requires_grad}
         projected = [slot.tensor] if slot.tensor.requires_grad else []  # gsplat's 3DGUT draws without projected centres
         results = []
@@ -166,20 +165,24 @@ class AutogradShot:
                 )  # fmt: skip
             screen = gradients[-1] if projected else torch.zeros_like(slot.tensor)
             values = {**found, **dict(zip(tensors, gradients, strict=False))}
-            if "detail" in self.params and "detail" not in values and "colors" in values:  # of which f_det is an offset
-                rgb = values["colors"]
-                values["detail"] = rgb if rgb.dim() == 2 else rgb[:, 0] / SH_C0
             results.append(Grads(values, screen=slot.per_gaussian(screen, len(self.visible))))
         return results
 
     def _of_detail(self, rgb: Float[Tensor, "N 3"], basis: Float[Tensor, "N B1"]) -> Float[Tensor, "N 3"]:
-        """The gradient of f_det from that of the drawn colours, of which it is an offset, or which the host computes from it."""
-        detail, colors = self.params.get("detail"), self.drawing.inputs["colors"]  # type: ignore[union-attr]
-        if detail is None or not any(leaf is detail for leaf in graph_of(colors).leaves):
+        """The gradient of f_det from that of the drawn colours: it is their offset, or both are computed from it."""
+        detail, colors, offset = self.params.get("detail"), self.drawing.inputs["colors"], self.drawing.offset  # type: ignore[union-attr]
+        of_colors = any(leaf is detail for leaf in graph_of(colors).leaves)
+        if detail is None or (offset is detail and not of_colors):
             return rgb
+        ways = [(colors, outer(rgb, basis, colors.shape[1]))] if of_colors else []
+        ways += [(offset, rgb)] if offset is not None and offset.requires_grad else []
+        total = torch.zeros_like(rgb)
         with without_hooks([detail]):
-            of_colors = outer(rgb, basis, colors.shape[1])
-            return torch.autograd.grad(colors, detail, of_colors, retain_graph=True)[0]
+            for x, g in ways:
+                total += torch.autograd.grad(
+                    x, detail, g, retain_graph=True, allow_unused=True, materialize_grads=True
+                )[0]
+        return total
 
     def _at_drawing(self, cotangents: Float[Tensor, "K H W 3"]) -> Float[Tensor, "K H W 3"]:
         """The cotangents of the rasterizer's image, from which the host may have computed `image`."""

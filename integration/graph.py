@@ -132,15 +132,25 @@ def require_apart(drawn: Mapping[str, Tensor]) -> None:
             )
 
 
-def are_in_order(drawn: Mapping[str, Tensor] | None, params: Mapping[str, Tensor]) -> bool:
-    """Return True if row i of the drawn tensors is computed from row i of the parameters; None: the parameters are drawn.
+def require_in_order(what: str, drawn: Mapping[str, Tensor] | None, params: Mapping[str, Tensor]) -> None:
+    """Raise a HostError unless row i of the drawn tensors is computed from row i of the parameters; None: the parameters are
+    drawn.
 
-    A tensor with the parameter's memory is. Any other is tested by two cotangents, whose rows i are 1 and c_i: in the same order,
-    the gradients of the parameter's row i are g and c_i g, otherwise g and c_j g. If no tensor has a gradient, positions are
-    compared.
+    Args:
+        what: is rendered.
     """
-    if drawn is None:
-        return True
+    if drawn is not None and not _are_drawn_in_order(drawn, params):
+        raise HostError(
+            f"{what} is rendered with its Gaussians in another order than that of the parameters, so that f_det and dropout "
+            "would go to others. Render them as they are, since the rasterizer sorts by depth itself, or sort the parameters."
+        )
+
+
+def _are_drawn_in_order(drawn: Mapping[str, Tensor], params: Mapping[str, Tensor]) -> bool:
+    """A tensor with the parameter's memory is. Any other is tested by two cotangents, whose rows i are 1 and c_i: in the same
+    order, the gradients of the parameter's row i are g and c_i g, otherwise g and c_j g. If no tensor has a gradient, positions
+    are compared.
+    """
     asked = list[tuple[Tensor, Tensor]]()
     for name in ("opacities", "scales", "means", "quats", "colors"):
         x, p = drawn.get(name), params.get("sh0" if name == "colors" else name)

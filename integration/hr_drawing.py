@@ -119,7 +119,7 @@ class _RenderInputs(NamedTuple):
             rasterizer = over(rasterizer, (red, green, blue))
         drawn = Inputs(self.means, self.quats, self.scales, self.opacities, self.colors, self.rgb_offset)
         r = rasterizer(drawn.splats(), self.camera)
-        drawing = Drawing(r, asked.inputs, r.image, BackwardHook())
+        drawing = Drawing(r, asked.inputs, r.image, BackwardHook(), asked.offset)
         image = r.image if self.mask is None else r.image * self.mask
         return AutogradShot(image, r.means2d, r.visible, asked.params, drawings=(drawing,), mask=self.mask)
 

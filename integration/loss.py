@@ -29,7 +29,7 @@ from integration.autograd_shot import (
     to_leaves,
 )
 from integration.densification import ScoreScaler, score_for_host
-from integration.graph import Graph, graph_of, require_apart, without_hooks
+from integration.graph import Graph, graph_of, require_apart, require_in_order, without_hooks
 from integration.host import require_leaves
 from integration.views import SAME_POSE, require_intrinsics
 from rasterizers.interface import Camera
@@ -198,6 +198,7 @@ class _HrShot:
 
     def __init__(self, shot: AutogradShot) -> None:
         require_apart(shot.drawn or {})
+        require_in_order("hr", shot.inputs, shot.params)
         shot = at_inputs(shot)
         self.image, self.means2d, self.visible, self._shot = shot.image, shot.means2d, shot.visible, shot
         self.of_others: OfOthers = []

@@ -59,7 +59,7 @@ class BackwardPass:
         leaves = [*self.params.values(), *self.others]
         self._found = {id(p): (p.grad, 0 if p.grad is None else version(p.grad)) for p in leaves}
         _PASSES[self.task] = self
-        for hooks in filter(None, map(hooks_after_accumulation, self.params.values())):
+        for hooks in filter(None, map(hooks_after_accumulation, leaves)):
             hooks.update({key: hook if isinstance(hook, _AtTheEnd) else _AtTheEnd(hook) for key, hook in hooks.items()})
 
     def take(self, rgb: Tensor, basis: Tensor) -> None:

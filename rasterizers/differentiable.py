@@ -69,12 +69,14 @@ class Drawing:
         inputs: means, quats, scales, opacities and colors [N, K, 3], the arguments of `draw` in the autograd graph.
         image: as `draw` returned it, in the autograd graph.
         hook: called by backward passes that reach the drawing.
+        offset: of the colours, in the graph.
     """
 
     rendering: Rendering
     inputs: Mapping[str, Tensor]
     image: Float[Tensor, "H W 3"]
     hook: BackwardHook
+    offset: Float[Tensor, "N 3"] | None = None
 
 
 _collecting: Final = ContextVar[tuple[list[Drawing], ...]]("collecting", default=())
@@ -153,9 +155,8 @@ def in_graph(
         rendered, rows, hook, absgrad, pose, means2d, *inputs
     )
     for drawings in _collecting.get() if image.grad_fn is not None else ():
-        drawings.append(
-            Drawing(rendered.rendering, {k: x for k, x in inputs._asdict().items() if k != "rgb_offset"}, image, hook)
-        )
+        drawn = {name: x for name, x in inputs._asdict().items() if name != "rgb_offset"}
+        drawings.append(Drawing(rendered.rendering, drawn, image, hook, inputs.rgb_offset))
     return Drawn(image, alpha, means2d, visible, depth)
 
 

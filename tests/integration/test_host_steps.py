@@ -224,6 +224,16 @@ def test_hooks_that_run_after_accumulation_change_the_merged_gradient():
     assert float(host.splats["means"].grad.abs().max()) == pytest.approx(1e-3)
 
 
+def test_a_hook_after_accumulation_of_what_colours_are_computed_from_gets_the_gradient_of_both_scales():
+    scene, offset, found = toy.scene(20), torch.nn.Parameter(torch.zeros(1, 1, 3)), []
+    host, _, _ = started(scene=scene)
+    offset.register_post_accumulate_grad_hook(lambda p: found.append(p.grad.clone()))
+    splats = host.splats | {"sh0": host.splats["sh0"] + offset}
+    gsplat_host.drawn(host.rasterization, splats, scene.train[0].lr.camera)[0].mean().backward()
+    (g,) = found
+    assert torch.equal(g, offset.grad)
+
+
 @pytest.mark.parametrize("late", [False, True])
 def test_hooks_that_freeze_some_gaussians_freeze_their_f_det(late):
     host, _, render = started()

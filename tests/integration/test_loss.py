@@ -178,10 +178,12 @@ ROWS = {
 }
 
 
-@pytest.mark.parametrize("exposed", [False, True])
+@pytest.mark.parametrize(("exposed", "known"), [(False, False), (True, False), (True, True)])
 @pytest.mark.parametrize("rows", ROWS.values(), ids=ROWS)
-def test_what_is_drawn_may_have_other_rows_than_the_parameters(rows, exposed):
-    """Each parameter gets its gradient by autograd, f_det also where it is drawn at half of its strength."""
+def test_what_is_drawn_may_have_other_rows_than_the_parameters(rows, exposed, known):
+    """Each parameter gets its gradient by autograd, f_det also where it is drawn at half of its strength; unless the shot has
+    `drawings`.
+    """
     scene = toy.scene(20)
     host, view = Host(scene), scene.train[0]
     conductor = Conductor(GCO(), P2G(patch=4), objective=HR_FROM_START)
@@ -191,15 +193,22 @@ def test_what_is_drawn_may_have_other_rows_than_the_parameters(rows, exposed):
     def render(camera, detail):
         p = host.params
         each = (p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"], 0.5 * detail)
-        shot = autograd.draw(toy.RASTERIZER, Splats(*map(rows, each)), camera)
+        with autograd.collected_drawings() as drawings:
+            shot = autograd.draw(toy.RASTERIZER, Splats(*map(rows, each)), camera)
         drawn = rows(torch.arange(20.0)).long()[:20]
         slot = ScreenGradientSlot(shot.means2d[: len(drawn)], (camera.width, camera.height), rows=drawn)
         visible = torch.zeros(20, dtype=torch.bool).index_copy_(0, drawn, shot.visible[: len(drawn)])
         means2d = torch.zeros(20, 2).index_copy_(0, drawn, shot.means2d[: len(drawn)].detach())
-        return AutogradShot(shot.image @ exposure if exposed else shot.image, means2d, visible, p, slot)
+        image = shot.image @ exposure if exposed else shot.image
+        return AutogradShot(image, means2d, visible, p, slot, drawings=drawings if known else ())
 
     lr, hr = render(view.lr.camera, torch.zeros(20, 3)), render(view.hr.camera, host.params["detail"])
+    if known and rows is not ROWS["as they are"]:
+        with pytest.raises(HostError, match="hr is rendered with its Gaussians in another order"):
+            joint_loss(conductor, host.params, lr, hr, view, 5)
+        return
     joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
+    lr, hr = replace(lr, drawings=()), replace(hr, drawings=())
     expected = conductor.update({name: p.detach() for name, p in host.params.items()}, lr, hr, view, 5).grads
     for name, p in host.params.items():
         atol = 1e-5 * float(expected[name].abs().max())

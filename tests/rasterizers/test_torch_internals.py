@@ -11,7 +11,9 @@ from torch.nn import Parameter
 from rasterizers import torch_internals as of_torch
 
 ROOT = Path(__file__).resolve().parents[2]
-HIDDEN = {"_version", "_backward_hooks", "_post_accumulate_grad_hooks", "_schema"}  # attributes of torch's objects
+HIDDEN = {  # attributes of torch's objects
+    "_version", "_backward_hooks", "_post_accumulate_grad_hooks", "_schema", "_input_metadata",
+}  # fmt: skip
 
 
 def in_a_pass(call, x=None, *, by=torch.Tensor.backward):
@@ -87,6 +89,13 @@ def test_a_node_is_that_of_a_leaf_or_of_cat_or_another():
     joined, added = torch.cat((x, x)).grad_fn, (x + x).grad_fn
     assert [of_torch.is_cat(node) for node in (joined, added)] == [True, False]
     assert (of_torch.leaf_of(joined), of_torch.leaf_of(added)) == (None, None)
+
+
+@pytest.mark.parametrize("leaf", [False, True])
+def test_the_gradient_of_an_edge_has_the_shape_and_type_of_its_tensor(leaf):
+    x = Parameter(torch.ones(2, 3, dtype=torch.float64))
+    edge = torch.autograd.graph.get_gradient_edge(x if leaf else x[:1])
+    assert of_torch.of_gradient(edge) == (torch.Size((2 if leaf else 1, 3)), torch.float64)
 
 
 def test_a_write_by_a_view_is_another_version():
