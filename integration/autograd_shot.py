@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal, cast
+from typing import Any, Literal, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,14 +14,11 @@ from clear_strategies.core.gradients import Grads, gradients_of, summed
 from clear_strategies.errors import HostError
 from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.iteration import HrSide
-from integration.announcement import Once
 from integration.colours import are_joined
 from integration.graph import Edge, Inputs, edge_of, graph_of, has_gradient, inputs_of, without_hooks
 from rasterizers.differentiable import Drawing, outer
 from rasterizers.interface import Camera, summed_vjp
 from rasterizers.torch_internals import is_hooked
-
-_warn_once: Final = Once(logging.getLogger(__name__).warning)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,17 +167,13 @@ class AutogradShot:
     def _of_detail(self, rgb: Float[Tensor, "N 3"], basis: Float[Tensor, "N B1"]) -> Float[Tensor, "N 3"]:
         """The gradient of f_det from that of the drawn colours: it is their offset, or both are computed from it."""
         detail, colors, offset = self.params.get("detail"), self.drawing.inputs["colors"], self.drawing.offset  # type: ignore[union-attr]
-        of_colors = any(leaf is detail for leaf in graph_of(colors).leaves)
-        if detail is None or (offset is detail and not of_colors):
+        if detail is None or (offset is detail and not graph_of(colors).reaches([detail])):
             return rgb
-        ways = [(colors, outer(rgb, basis, colors.shape[1]))] if of_colors else []
-        ways += [(offset, rgb)] if offset is not None and offset.requires_grad else []
+        ways = [(colors, outer(rgb, basis, colors.shape[1])), *([] if offset is None else [(offset, rgb)])]
         total = torch.zeros_like(rgb)
         with without_hooks([detail]):
-            for x, g in ways:
-                total += torch.autograd.grad(
-                    x, detail, g, retain_graph=True, allow_unused=True, materialize_grads=True
-                )[0]
+            for x, g in (way for way in ways if graph_of(way[0]).reaches([detail])):
+                total += torch.autograd.grad(x, detail, g, retain_graph=True)[0]
         return total
 
     def _at_drawing(self, cotangents: Float[Tensor, "K H W 3"]) -> Float[Tensor, "K H W 3"]:
@@ -194,12 +186,24 @@ class AutogradShot:
         return torch.stack([torch.autograd.grad(image, drawn, c, retain_graph=True)[0] for c in cotangents])
 
 
-def at_inputs(shot: AutogradShot) -> AutogradShot:
+def of_whole_image(shot: AutogradShot) -> AutogradShot:
+    """Without its drawing, if the image depends on parameters by another way, too."""
+    own, drawing = trained(shot.params).values(), shot.drawing
+    if drawing is None or not graph_of(shot.image, before=[drawing.image.grad_fn]).reaches(own):
+        return shot
+    return replace(shot, drawings=())
+
+
+def at_inputs(shot: AutogradShot, warn: Callable[..., None]) -> AutogradShot:
     """The rendering with its gradients taken at the inputs of its rasterizer, where other leaves than the parameters lie behind
-    them (a network, an embedding), so that these learn from HR, too. Warns once if the inputs are not found.
+    them (a network, an embedding), so that these learn from HR, too.
+
+    Args:
+        warn: called if the inputs are not found, with a message and its values.
     """
+    shot = of_whole_image(shot)
     centres = shot.gradient_slot.tensor
-    known = {*map(id, shot.params.values()), *(id(leaf) for leaf in graph_of(centres).leaves)}
+    known = {*map(id, shot.params.values()), *map(id, graph_of(centres).leaves)}
 
     def others(*edges: Edge) -> list[str]:
         return [f"{leaf.dtype} {[*leaf.shape]}" for leaf in graph_of(*edges).leaves if id(leaf) not in known]
@@ -207,7 +211,7 @@ def at_inputs(shot: AutogradShot) -> AutogradShot:
     if shot.inputs is not None or not (found := others(shot.image)):
         return shot
     if (inputs := inputs_of(shot.image, centres, shot.params)) is None:
-        _warn_once(
+        warn(
             "the loop trains %d tensors beside the Gaussians (%s), which learn from LR alone: the inputs of the rasterizer were "
             "not found, or their rows are not those of the parameters. Name them by AutogradShot(drawn=…).",
             len(found), ", ".join(found[:3]),

@@ -34,6 +34,10 @@ class Graph(NamedTuple):
     leaves: list[Tensor]
     drawn: list[Rendered]
 
+    def reaches(self, leaves: Iterable[Tensor]) -> bool:
+        """Whether one of these is among its leaves."""
+        return not {*map(id, leaves)}.isdisjoint(map(id, self.leaves))
+
 
 def graph_of(*edges: Edge, before: Collection[Any] = ()) -> Graph:
     """The graph behind tensors, in one walk that ends at the nodes `before`. A leaf is its own."""
@@ -92,13 +96,9 @@ def inputs_of(image: Tensor, centres: Tensor, params: Mapping[str, Tensor]) -> I
     if not centres.requires_grad or not image.requires_grad:
         return None
     graph, probe, n = graph_of(image).nodes, edge_of(centres), len(params["means"])
-    own = {id(p) for name, p in params.items() if name != "detail"}
-
-    def reaches_own(found: Graph) -> bool:
-        return any(id(leaf) in own for leaf in found.leaves)
-
+    own = [p for name, p in params.items() if name != "detail"]
     nodes = [x for x in graph if (probe.node, probe.output_nr) in x.next_functions]
-    while nodes and reaches_own(graph_of(image, before=nodes)):  # on to what is computed from these
+    while nodes and graph_of(image, before=nodes).reaches(own):  # on to what is computed from these
         nodes = [x for x in graph if any(behind in nodes for behind, _ in x.next_functions)]
     edges: dict[str, GradientEdge] = {}
     for i, node in enumerate(nodes):
@@ -113,9 +113,9 @@ def inputs_of(image: Tensor, centres: Tensor, params: Mapping[str, Tensor]) -> I
                 continue
             if shape[:1] == (n,):
                 edges[_name(i, j)] = edge
-            elif reaches_own(found):
+            elif found.reaches(own):
                 return None
-    pairs = [(edge, p) for edge in edges.values() for p in graph_of(edge).leaves if id(p) in own]
+    pairs = [(edge, p) for edge in edges.values() for p in own if graph_of(edge).reaches([p])]
     is_same = any(edge == edge_of(p) for edge, p in pairs)
     return Inputs(nodes, edges) if is_same or (pairs and _are_in_order(pairs)) else None
 

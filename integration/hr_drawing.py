@@ -143,7 +143,8 @@ class HrDrawing:
 
     def __init__(self, conductor: Conductor, host: Host, device: torch.device, counts: Counter[str]) -> None:
         self._conductor, self._masks, self._counts = conductor, host.masks, counts
-        self._loss_scale, self._log_once = host.loss_scale or (lambda: 1.0), Once(_log.info)
+        self._loss_scale = host.loss_scale or (lambda: 1.0)
+        self._log_once, self._warn_once = Once(_log.info), Once(_log.warning)
         self.is_scored = host.reads_score and conductor.owner("score") is not None
         self.replays = replays_on(device, conductor.work_log, "the replay of HR")
         if self.replays is not None and (reason := next(why_not_recorded(conductor), None)) is not None:
@@ -161,7 +162,9 @@ class HrDrawing:
         mask, asked = self._masks.get(view.name), render_at("hr", gate, view)
         if mask is not None:
             mask = enlarged_mask(mask.to(step.params["means"]), view.factor)[..., None]
-        drawn: Drawable | AutogradShot = asked if isinstance(asked, Drawable) else at_inputs(asked.shot)
+        drawn: Drawable | AutogradShot = (
+            asked if isinstance(asked, Drawable) else at_inputs(asked.shot, self._warn_once)
+        )
         if isinstance(drawn, Drawable):
             hr = self._own_hr(drawn, step, mask)
         else:

@@ -6,8 +6,10 @@ that must stay as it is, see attachment.py.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Final
+from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float
@@ -20,11 +22,13 @@ from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import Update
 from clear_strategies.strategies.base import overrides
+from integration.announcement import Once
 from integration.autograd_shot import (
     AutogradShot,
     OfOthers,
     at_inputs,
     every_number,
+    of_whole_image,
     require_named,
     to_leaves,
 )
@@ -33,6 +37,9 @@ from integration.graph import Graph, graph_of, require_apart, require_in_order, 
 from integration.host import require_leaves
 from integration.views import SAME_POSE, require_intrinsics
 from rasterizers.interface import Camera
+
+_log = logging.getLogger(__name__)
+_ONCE: Final = WeakKeyDictionary[Conductor, Once]()
 
 
 def joint_loss(
@@ -74,7 +81,9 @@ def joint_loss(
     _require_view(conductor, view, lr=of_lr, hr=of_hr)
     _require_started(conductor)
     with without_hooks([*of_lr.leaves, *(() if of_hr is None else of_hr.leaves)]):
-        to_others = _HrShot(hr) if isinstance(hr, AutogradShot) and of_hr is not None else None
+        lr = of_whole_image(lr) if isinstance(lr, AutogradShot) else lr
+        warn = _ONCE.setdefault(conductor, Once(_log.warning))
+        to_others = _HrShot(hr, warn) if isinstance(hr, AutogradShot) and of_hr is not None else None
         update = conductor.update(values, lr, to_others or hr, view, t)
         others = [*_others(params, lr, of_lr.leaves, update)]
     objective, λ = conductor.objective, conductor.objective.lambda_hr(t)
@@ -150,9 +159,9 @@ def _require_rows(params: Mapping[str, Tensor]) -> None:
 def _require_detail(detail: Tensor | None, lr: Graph, hr: Graph | None) -> None:
     if detail is None or not detail.requires_grad:
         return
-    if any(leaf is detail for leaf in lr.leaves):
+    if lr.reaches([detail]):
         raise ValueError("lr is drawn with f_det, which renders at HR alone show. Draw it without params['detail'].")
-    if hr is not None and not any(leaf is detail for leaf in hr.leaves):
+    if hr is not None and not hr.reaches([detail]):
         raise ValueError(
             "hr is drawn without f_det, which would learn nothing. Draw it with an offset of the colours by params['detail']."
         )
@@ -196,10 +205,10 @@ class _HrShot:
         of_others: the gradients of other leaves in the last pass.
     """
 
-    def __init__(self, shot: AutogradShot) -> None:
+    def __init__(self, shot: AutogradShot, warn: Callable[..., None]) -> None:
         require_apart(shot.drawn or {})
+        shot = at_inputs(shot, warn)
         require_in_order("hr", shot.inputs, shot.params)
-        shot = at_inputs(shot)
         self.image, self.means2d, self.visible, self._shot = shot.image, shot.means2d, shot.visible, shot
         self.of_others: OfOthers = []
 

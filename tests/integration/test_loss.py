@@ -178,11 +178,13 @@ ROWS = {
 }
 
 
-@pytest.mark.parametrize(("exposed", "known"), [(False, False), (True, False), (True, True)])
+@pytest.mark.parametrize(
+    ("made", "known"), [("drawn", False), ("exposed", False), ("exposed", True), ("brightened", True)]
+)
 @pytest.mark.parametrize("rows", ROWS.values(), ids=ROWS)
-def test_what_is_drawn_may_have_other_rows_than_the_parameters(rows, exposed, known):
-    """Each parameter gets its gradient by autograd, f_det also where it is drawn at half of its strength; unless the shot has
-    `drawings`.
+def test_what_is_drawn_may_have_other_rows_than_the_parameters(rows, made, known):
+    """Each parameter gets its gradient by autograd, f_det also where it is drawn at half of its strength, opacities also where
+    they reach the image beside its drawing. If the shot has `drawings`, other rows are refused.
     """
     scene = toy.scene(20)
     host, view = Host(scene), scene.train[0]
@@ -199,11 +201,15 @@ def test_what_is_drawn_may_have_other_rows_than_the_parameters(rows, exposed, kn
         slot = ScreenGradientSlot(shot.means2d[: len(drawn)], (camera.width, camera.height), rows=drawn)
         visible = torch.zeros(20, dtype=torch.bool).index_copy_(0, drawn, shot.visible[: len(drawn)])
         means2d = torch.zeros(20, 2).index_copy_(0, drawn, shot.means2d[: len(drawn)].detach())
-        image = shot.image @ exposure if exposed else shot.image
-        return AutogradShot(image, means2d, visible, p, slot, drawings=drawings if known else ())
+        images = {
+            "drawn": shot.image,
+            "exposed": shot.image @ exposure,
+            "brightened": shot.image + 0.1 * each[3].mean(),
+        }
+        return AutogradShot(images[made], means2d, visible, p, slot, drawings=drawings if known else ())
 
     lr, hr = render(view.lr.camera, torch.zeros(20, 3)), render(view.hr.camera, host.params["detail"])
-    if known and rows is not ROWS["as they are"]:
+    if known and made == "exposed" and rows is not ROWS["as they are"]:
         with pytest.raises(HostError, match="hr is rendered with its Gaussians in another order"):
             joint_loss(conductor, host.params, lr, hr, view, 5)
         return
