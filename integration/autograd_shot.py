@@ -15,7 +15,7 @@ from clear_strategies.errors import HostError
 from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.iteration import HrSide
 from integration.colours import are_joined
-from integration.graph import Edge, Inputs, edge_of, graph_of, has_gradient, inputs_of, without_hooks
+from integration.graph import Edge, Inputs, edge_of, graph_of, has_gradient, inputs_of, joined, without_hooks
 from rasterizers.differentiable import Drawing, outer
 from rasterizers.interface import Camera, summed_vjp
 from rasterizers.torch_internals import is_hooked
@@ -169,12 +169,15 @@ class AutogradShot:
         detail, colors, offset = self.params.get("detail"), self.drawing.inputs["colors"], self.drawing.offset  # type: ignore[union-attr]
         if detail is None or (offset is detail and not graph_of(colors).reaches([detail])):
             return rgb
-        ways = [(colors, outer(rgb, basis, colors.shape[1])), *([] if offset is None else [(offset, rgb)])]
-        total = torch.zeros_like(rgb)
+        ways = [(edge_of(x), bands) for x, bands in joined(colors) if graph_of(x).reaches([detail])]
+        edges = [edge for edge, _ in ways]
+        gradients = [outer(rgb, basis[:, bands], bands.stop - bands.start) for _, bands in ways]
+        if offset is not None and graph_of(offset).reaches([detail]):
+            edges, gradients = [*edges, edge_of(offset)], [*gradients, rgb]
+        if not edges:
+            return torch.zeros_like(rgb)
         with without_hooks([detail]):
-            for x, g in (way for way in ways if graph_of(way[0]).reaches([detail])):
-                total += torch.autograd.grad(x, detail, g, retain_graph=True)[0]
-        return total
+            return torch.autograd.grad(edges, detail, gradients, retain_graph=True)[0]
 
     def _at_drawing(self, cotangents: Float[Tensor, "K H W 3"]) -> Float[Tensor, "K H W 3"]:
         """The cotangents of the rasterizer's image, from which the host may have computed `image`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from itertools import accumulate
 from typing import Any, Final, NamedTuple
 
 import torch
@@ -13,7 +14,7 @@ from torch.autograd.graph import GradientEdge, get_gradient_edge
 from clear_strategies.errors import HostError
 from integration.structure import rows_drawn
 from rasterizers.differentiable import Rendered
-from rasterizers.torch_internals import hooks_on_gradient, is_hooked, leaf_of, of_gradient
+from rasterizers.torch_internals import hooks_on_gradient, is_cat, is_hooked, leaf_of, of_gradient
 
 _GOLDEN: Final = 0.6180339887498949  # its multiples modulo 1 differ most for neighbouring rows
 _SAME_CODE: Final = 0.1  # tolerance of the ratio of a row's gradients, which e.g. the mean of all rows changes a little
@@ -53,6 +54,16 @@ def graph_of(*edges: Edge, before: Collection[Any] = ()) -> Graph:
             graph.drawn.append(drawn)
         nodes += [behind for behind, _ in node.next_functions]
     return graph
+
+
+def joined(x: Tensor) -> list[tuple[Edge, slice]]:
+    """What `torch.cat` joined to this tensor along its second dimension, and where each lies there; else itself."""
+    nodes = x.grad_fn.next_functions if x.grad_fn is not None and is_cat(x.grad_fn) else ()
+    edges = [GradientEdge(node, nr) for node, nr in nodes if node is not None]
+    ends = [*accumulate(of_gradient(edge)[0][1] for edge in edges)]
+    if not edges or len(edges) < len(nodes) or ends[-1] != x.shape[1]:
+        return [(x, slice(0, x.shape[1]))]
+    return [*zip(edges, map(slice, [0, *ends], ends), strict=True)]
 
 
 class Inputs:
