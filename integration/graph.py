@@ -111,24 +111,23 @@ def inputs_of(image: Tensor, centres: Tensor, params: Mapping[str, Tensor]) -> I
     nodes = [x for x in graph if (probe.node, probe.output_nr) in x.next_functions]
     while nodes and graph_of(image, before=nodes).reaches(own):  # on to what is computed from these
         nodes = [x for x in graph if any(behind in nodes for behind, _ in x.next_functions)]
-    edges: dict[str, GradientEdge] = {}
-    for i, node in enumerate(nodes):
-        for j, (behind, nr) in enumerate(node.next_functions):
-            if behind is None:
-                continue
-            edge = GradientEdge(behind, nr)
-            found, shape = graph_of(edge), of_gradient(edge)[0]
-            if not found.nodes.isdisjoint(nodes):
-                return None
-            if probe.node in found.nodes:
-                continue
-            if shape[:1] == (n,):
-                edges[_name(i, j)] = edge
-            elif found.reaches(own):
-                return None
-    pairs = [(edge, p) for edge in edges.values() for p in own if graph_of(edge).reaches([p])]
-    is_same = any(edge == edge_of(p) for edge, p in pairs)
-    return Inputs(nodes, edges) if is_same or (pairs and _are_in_order(pairs)) else None
+    inputs = {
+        _name(i, j): GradientEdge(behind, nr)
+        for i, node in enumerate(nodes)
+        for j, (behind, nr) in enumerate(node.next_functions)
+        if behind is not None
+    }
+    graphs = {name: graph_of(edge) for name, edge in inputs.items()}
+    of_own = {name for name, found in graphs.items() if found.reaches(own)}
+    has_rows = {name for name, edge in inputs.items() if of_gradient(edge)[0][:1] == (n,)}
+    if of_own - has_rows or any(not found.nodes.isdisjoint(nodes) for found in graphs.values()):
+        return None
+    edges = {name: inputs[name] for name in has_rows if name in of_own or probe.node not in graphs[name].nodes}
+    pairs = [(inputs[name], p) for name in of_own for p in own if graphs[name].reaches([p])]
+    if any(edge == edge_of(p) for edge, p in pairs):
+        return Inputs(nodes, edges)
+    asked = [(edge, p) for edge, p in pairs if not is_hooked(p)]
+    return Inputs(nodes, edges) if asked and _are_in_order(asked) else None
 
 
 def require_apart(drawn: Mapping[str, Tensor]) -> None:

@@ -133,8 +133,8 @@ def test_what_else_the_loop_trains_gets_its_gradient(share, strategies, hooked):
         torch.testing.assert_close(leaf.grad, 3 * expected)
 
 
-@pytest.mark.parametrize("named", [False, True])
-def test_what_reaches_the_colours_and_the_rasterizer_counts_once(named):
+@pytest.mark.parametrize("found", ["in the graph", "behind the centres", "by name"])
+def test_what_reaches_the_colours_and_the_rasterizer_counts_once(found):
     """The gradient of the positions, from whose directions a network computes colours."""
     scene = toy.scene(20)
     host, view, conductor = Host(scene), scene.train[0], Conductor(objective=HR_FROM_START)
@@ -144,14 +144,16 @@ def test_what_reaches_the_colours_and_the_rasterizer_counts_once(named):
     def render(camera, detail=None):
         p = host.params
         sh0 = p["sh0"] + network(torch.nn.functional.normalize(p["means"], dim=1))[:, None]
-        splats = Splats(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), sh0, p["shN"], detail)
+        centres = p["means"] * 1 if found == "behind the centres" else p["means"]
+        splats = Splats(centres, p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), sh0, p["shN"], detail)
         shot = autograd.draw(toy.RASTERIZER, splats, camera)
+        slot = ScreenGradientSlot(shot.means2d if centres is p["means"] else centres, (camera.width, camera.height))
         names = "means", "quats", "scales", "opacities", "sh0", "shN"
-        drawn = {name: getattr(splats, name) for name in names} | {"detail": p["detail"]} if named else None
-        return AutogradShot(shot.image, shot.means2d, shot.visible, p, drawn=drawn)
+        drawn = {name: getattr(splats, name) for name in names} | {"detail": p["detail"]}
+        return AutogradShot(shot.image, shot.means2d, shot.visible, p, slot, drawn if found == "by name" else None)
 
     lr, hr = render(view.lr.camera), render(view.hr.camera, host.params["detail"])
-    if named:
+    if found == "by name":
         with pytest.raises(HostError, match="means of drawn reaches sh0"):
             joint_loss(conductor, host.params, lr, hr, view, 5)
         return
