@@ -13,7 +13,7 @@ One training iteration:
 
 What the adapter tells of the host is in host.py, HR and extra views in hr_drawing.py, what waits for `backward()` in
 pending.py, the backward passes and their merge in host_merge.py, the optimizers' steps in host_steps.py, changes of the structure
-in structure.py, and the first lines of the log in announcement.py.
+in structure.py, what is read of the host's autograd graph in graph.py, and the first lines of the log in announcement.py.
 
 The merge runs at the end of `backward()`, not in an optimizer hook. Gradient clipping therefore sees the merged gradient,
 optimizers other than `torch.optim.Optimizer` work, and so do hosts that densify before the step (3DGS) as well as hosts
