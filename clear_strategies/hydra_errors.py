@@ -93,10 +93,11 @@ def _no_setting(key: str, overrides: Sequence[str], config: str) -> str:
     if (CONF / key).is_dir():
         return f"no choice of this group is there to be replaced, so it is added: +{key}={value or '…'}."
     others, group = [o for o in overrides if _key(o) != key], key.partition(".")[0]
-    having = [o for o in options(group) if key in flat(_composed([*others, f"{group}={o}"], config))]
-    if having:
-        train = ", or let the command find it: clear-strategies train FOLDER" if key == "data.path" else ""
-        return f"there is no such setting without one of {', '.join(f'{group}={o}' for o in having)}. Add it{train}."
+    for choice in (group, *["+protocol"] * (group == "data")):  # a protocol's scenes have data.root
+        named = [f"{choice}={option}" for option in options(choice.lstrip("+"))]
+        if having := [word for word in named if key in flat(_composed([*others, word], config))]:
+            train = ", or let the command find it: clear-strategies train FOLDER" if key == "data.path" else ""
+            return f"there is no such setting without one of {', '.join(having)}. Add it{train}."
     return f"there is no such setting. {_remedy(key, value, overrides, _composed(others, config), config)}"
 
 
@@ -129,13 +130,19 @@ def _remedy(key: str, value: str, overrides: Sequence[str], known: Mapping[str, 
         remedy = f"A plus adds it: +{key}=…."
     elif f"~{key}" in overrides and beside:
         remedy = f"There are {', '.join(sorted(beside))}."
-    elif near := difflib.get_close_matches(key, [name for name in flat(known) if not name.endswith(TARGET)], 1, 0.8):
-        remedy = f"Did you mean {near[0]}?"
+    elif near := _similar(key, [known_key for known_key in flat(known) if not known_key.endswith(TARGET)]):
+        remedy = f"Did you mean {' or '.join(near)}?"
     elif known and config == "conductor":
         remedy = f"A conductor has settings of {', '.join(known)}."
     else:
         remedy = "clear-strategies --cfg job prints all of them."
     return remedy
+
+
+def _similar(key: str, known: Sequence[str]) -> list[str]:
+    """The key that is spelled most alike; if none is, those that end in the same name, as fit.viewer for viewer."""
+    alike = difflib.get_close_matches(key, known, 1, 0.8)
+    return alike or [other for other in known if other.rpartition(".")[2] == key.rpartition(".")[2]]
 
 
 def _key(override: str) -> str:

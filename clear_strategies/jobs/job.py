@@ -29,6 +29,7 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.outputs import metrics, plan, results
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.schedules import scaled
+from clear_strategies.settings import require_paths
 from clear_strategies.training import memory
 from clear_strategies.training.checkpoint import CHECKPOINTS
 from clear_strategies.training.loop import fit
@@ -105,6 +106,7 @@ class _Job:
         resumes = settings.fit.resume == resume.AUTO
         if resumes and (finished := resume.finished(folder, self.compared, load)) is not None:
             return finished.psnr
+        require_paths(self.compared.get)
         # In a sweep the console shows one line per job; the rest is in run.log.
         level = logging.DEBUG if in_sweep() else logging.INFO
         asked, source = settings.fit, settings.data.source
@@ -115,12 +117,16 @@ class _Job:
             _warn_if_few_placed(capture.notes)
             save_lr(capture, views, Path(settings.data.save_lr))
             return None
+        found = resume.found(settings.fit.resume, folder, self.compared)
         scene = load()
         _warn_if_few_placed(scene.notes)
         device.log_choice(settings.rasterizer, self.ready)
         ready = self.ready.over(scene.background).among(scene.cloud.means)
         there = scene.to(ready.device)
-        state = self._start(scene, there, ready)
+        state = self._start(there, ready)
+        if found is not None:
+            resume.restore(state, scene, *found)
+        del found  # its tensors
         self.claim()
         files.sweep(folder)
         self._announce(scene, state, ready, f"{threads} ({reason})", level)
@@ -133,20 +139,14 @@ class _Job:
         _warn_if_few_placed(scene.notes)
         return evaluation.psnr
 
-    def _start(self, scene: Scene, there: Scene, ready: device.ReadyRasterizer) -> TrainState:
-        """The state that training starts from: the initial one, or the checkpoint that `fit.resume` names.
-
-        Args:
-            scene: on the CPU. there: the same on the device of the drawing.
-        """
+    def _start(self, there: Scene, ready: device.ReadyRasterizer) -> TrainState:
+        """The initial state, on the device of the scene and of the drawing."""
         settings, stretch = self.settings, self.settings.fit.stretch
         rates = scaled(settings.optim, stretch).of_run(settings.fit.iterations)
-        state = TrainState.start(
+        return TrainState.start(
             there, self.conductor, settings=scaled(settings.fit, stretch), density=scaled(settings.density, stretch),
             rates=rates, mip=scaled(settings.mip, stretch), rules=ready.rules,
         )  # fmt: skip
-        resume.resume(state, scene, settings.fit.resume, self.folder, self.compared)
-        return state
 
     def _announce(
         self, scene: Scene, state: TrainState, ready: device.ReadyRasterizer, threads: str, level: int

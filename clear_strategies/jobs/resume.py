@@ -74,7 +74,7 @@ def finished(folder: Path, config: Mapping[str, Any], scene: Callable[[], Scene]
     if not path.exists():
         return None
     content = metrics.read(path, _TRAIN_AGAIN)
-    _require_same(folder, content.config, config)
+    require_same(folder, content.config, config)
     places = {key: config[key] for key in filter(_PLACE.fullmatch, config) if config[key]}
     moved = any(content.config.get(key) != place for key, place in places.items())
     read = [Path(place) for key, place in places.items() if key.endswith(_FILE)]
@@ -88,29 +88,29 @@ def finished(folder: Path, config: Mapping[str, Any], scene: Callable[[], Scene]
     return content
 
 
-def resume(state: TrainState, scene: Scene, source: str | None, folder: Path, config: Mapping[str, Any]) -> None:
-    """Restore the state from the checkpoint that `fit.resume` names.
+def found(source: str | None, folder: Path, config: Mapping[str, Any]) -> tuple[Checkpoint, Path] | None:
+    """The checkpoint that `fit.resume` names and its path; None if the run starts from the beginning.
 
     Args:
-        scene: of the state.
         source: a run's folder or one of its checkpoints; "auto": the newest undamaged checkpoint in `folder`, if there is one.
+        config: of this run, see `comparable`. A DataError if the checkpoint has another.
     """
     if source is None:
-        return
-    if source != AUTO:
-        restore(state, scene, checkpoint.load(Path(source)), Path(source), config)
-        return
-    checkpoints = checkpoint.saved(folder / CHECKPOINTS)
+        return None
+    checkpoints = [Path(source)] if source != AUTO else checkpoint.saved(folder / CHECKPOINTS)
     for path in reversed(checkpoints):
         try:
             saved = checkpoint.load(path)
         except DataError as error:
+            if source != AUTO:
+                raise
             _log.warning("%s; trying an earlier one.", error)
             continue
-        restore(state, scene, saved, path, config)
-        return
+        require_same(path, saved.config, config)
+        return saved, path
     if checkpoints:
         _log.warning("%s: no checkpoint is whole; the run starts from the beginning.", folder / CHECKPOINTS)
+    return None
 
 
 def folder_of(source: Path) -> Path:
@@ -123,9 +123,8 @@ def newest(folder: Path) -> Path | None:
     return next(reversed(checkpoint.saved(folder / CHECKPOINTS)), None)
 
 
-def restore(state: TrainState, scene: Scene, saved: Checkpoint, source: Path, config: Mapping[str, Any]) -> None:
-    """Continue from a checkpoint of the same configuration, on the same photos and poses."""
-    _require_same(source, saved.config, config)
+def restore(state: TrainState, scene: Scene, saved: Checkpoint, source: Path) -> None:
+    """Continue from a checkpoint of the same configuration, see `found`, on the same photos and poses."""
     _require_same_cameras(source, scene)
     _require_same_photos(source, saved, state.photos)
     state.restore(saved, source)
@@ -137,7 +136,8 @@ def restore(state: TrainState, scene: Scene, saved: Checkpoint, source: Path, co
         )  # fmt: skip
 
 
-def _require_same(source: Path, then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+def require_same(source: Path, then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Raise a DataError if two configurations, see `comparable`, differ in more than the places of their data."""
     keys = then.keys() | now.keys()
     moved = {key for key in keys if key + _DIGEST in then and key + _DIGEST in now}  # their content is compared
     moved |= {*filter(_PLACE.fullmatch, keys)} if (folder_of(source) / CAMERAS).is_file() else set()

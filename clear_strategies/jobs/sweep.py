@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import multiprocessing
 import os
 import re
@@ -27,10 +28,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from clear_strategies import signals
 from clear_strategies.errors import ClearError, DataError, SettingError
-from clear_strategies.files import FINISHED, expanded
+from clear_strategies.files import FINISHED
 from clear_strategies.hydra_errors import require_option
 from clear_strategies.options import UNNAMED
-from clear_strategies.settings import absent, missing
+from clear_strategies.settings import absent, missing, require_paths
 
 # Launchers whose jobs share the file system of the process that was started; nodes of a cluster may have another.
 _LOCAL: Final = ("basic", "cores", "joblib", "submitit_local")
@@ -130,12 +131,10 @@ def _lack(config: DictConfig) -> str | None:
         return None
     if config.fit.resume == "auto" and any(Path(config.hydra.sweep.dir).rglob(FINISHED)):
         return None  # a job that has finished reads nothing
-    for key in ("data.path", *["prior.path"] * (config.data.save_lr is None)):
-        if path := OmegaConf.select(config, key):
-            whole = Path(expanded(str(path)))
-            # The first folder of the path that is not there is the same for all scenes of a wrong data.root.
-            if gone := [part for part in (*reversed(whole.parents), whole) if not part.exists()]:
-                return str(DataError(gone[0], key, "is not there", "correct the path"))
+    try:
+        require_paths(functools.partial(OmegaConf.select, config))
+    except DataError as error:
+        return str(error)
     return None
 
 

@@ -152,7 +152,7 @@ def in_history(folder: Path, trap: Trap) -> Iterator[None]:
 
 def resumed(folder: Path) -> None:
     saved = checkpoint.load(folder)
-    resume.restore(start(()), SCENE, saved, folder, saved.config)
+    resume.restore(start(()), SCENE, saved, folder)
 
 
 def finished(folder: Path) -> None:
@@ -263,4 +263,4 @@ def test_a_run_with_classes_that_the_users_command_names_is_resumed(tmp_path, ca
     assert torch.is_tensor(Run(tmp_path, THEIRS).render())
     other = resume.comparable(tree(composed(*words[:-1])))
     with pytest.raises(DataError, match=r"rasterizer\._target_: "):
-        resume.restore(start(()), SCENE, checkpoint.load(tmp_path), tmp_path, other)
+        resume.found(str(tmp_path), tmp_path, other)

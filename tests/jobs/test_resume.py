@@ -1,6 +1,7 @@
 """Resuming a job: what must agree with the run before, and what may differ."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -31,25 +32,23 @@ def test_resuming_on_another_device_is_logged(caplog):
     state = start(())
     iterate(state, toy.RASTERIZER)
     saved = state.checkpoint({})
-    resume.restore(start(()), SCENE, saved, Path("there"), {})
+    resume.restore(start(()), SCENE, saved, Path("there"))
     assert "bit for bit" not in caplog.text
-    resume.restore(start(()), SCENE, replace(saved, device="cuda"), Path("there"), {})
+    resume.restore(start(()), SCENE, replace(saved, device="cuda"), Path("there"))
     assert "this run trained on cuda until now and continues on cpu" in caplog.text
 
 
 def test_device_threads_and_memory_may_differ_and_of_files_that_moved_the_content_is_compared(tmp_path):
     assert compared("fit.device=cpu", "fit.threads=1", "rasterizer.memory=512") == compared()
     assert compared()["fit.seed"] == 0  # a default of the class, which no file gives
-    saved = replace(start(()).checkpoint({}), config=compared("density.every=50"))
     with pytest.raises(DataError, match=r"density\.every: 50 then, 100 now"):
-        resume.restore(start(()), SCENE, saved, Path("there"), compared())
+        resume.require_same(Path("there"), compared("density.every=50"), compared())
     for name, content in (("a", b"1"), ("b", b"1"), ("c", b"2")):
         (tmp_path / name).write_bytes(content)
     a, b, c = (compared("data.cloud.init=ply", f"data.cloud.path={tmp_path / name}") for name in "abc")
-    saved = replace(start(()).checkpoint({}), config=a)
-    resume.restore(start(()), SCENE, saved, Path("there"), b)
+    resume.require_same(Path("there"), a, b)
     with pytest.raises(DataError, match=r"data\.cloud\.path digest: "):
-        resume.restore(start(()), SCENE, saved, Path("there"), c)
+        resume.require_same(Path("there"), a, c)
 
 
 @pytest.mark.parametrize("left", ["checkpoint", "finished"])
@@ -163,13 +162,13 @@ def test_rounding_is_no_change_of_a_photo_and_checkpoints_of_earlier_versions_kn
     saved = start(()).checkpoint({})
     earlier = {name: x[:3] if name.startswith("photos/") else x for name, x in saved.tensors.items()}  # without masks
     for of_version in (saved, replace(saved, tensors=earlier)):
-        resume.restore(brighter(1e-4), SCENE, of_version, Path("there"), {})
+        resume.restore(brighter(1e-4), SCENE, of_version, Path("there"))
         with pytest.raises(
             DataError, match=f"there: photos: 1 of 4 have another content, .* such as {SCENE.train[0].name}: "
         ):
-            resume.restore(brighter(1e-2), SCENE, of_version, Path("there"), {})
+            resume.restore(brighter(1e-2), SCENE, of_version, Path("there"))
     earlier = {name: x for name, x in saved.tensors.items() if not name.startswith("photos/")}
-    resume.restore(brighter(1e-2), SCENE, replace(saved, tensors=earlier), Path("there"), {})
+    resume.restore(brighter(1e-2), SCENE, replace(saved, tensors=earlier), Path("there"))
 
 
 def test_that_few_photos_have_a_pose_is_said_first_and_last(tmp_path: Path, monkeypatch, caplog) -> None:
@@ -242,3 +241,27 @@ def test_a_run_from_python_that_is_refused_leaves_no_folder(tmp_path: Path, monk
     with pytest.raises(SettingError, match=r"fit\.iterations: must be"):
         clear_strategies.train(None, "fit.iterations=0")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ("fit.resume=gone", "gone: checkpoint: no checkpoint is here: "),
+        (
+            "fit.resume=run density.every=50",
+            "config: this is not the configuration that wrote it: density.every: 100 then, 50",
+        ),
+        ("data.path=gone/fern", "gone: data.path: is not there: correct the path"),
+        ("prior=images prior.path=gone", "gone: prior.path: is not there: correct the path"),
+        ("data.cloud.init=ply data.cloud.path=gone.ply", "gone.ply: data.cloud.path: is not there: correct the path"),
+    ],
+)
+def test_what_is_not_there_and_another_configuration_are_told_before_data_are_read(
+    wrong: str, told: str, finished_run: Path, monkeypatch
+) -> None:
+    """To find poses and to make SR images takes minutes."""
+    monkeypatch.chdir(finished_run.parent)
+    monkeypatch.setattr(scenes, "load", lambda *_: pytest.fail("data are read"))
+    words = ["data=nerfstudio", f"data.path={finished_run.parent / 'photos'}", *MOVED, *wrong.split()]
+    with pytest.raises(DataError, match=re.escape(told)):
+        job.run(composed(*words), Path("other"), words)

@@ -64,7 +64,7 @@ LLFF = ["-m", "data=llff", "+strategy=clear,gco"]
         (LLFF, "data.path: is needed and missing. Add data.path=…."),
         ([*LLFF, "data.path=gone/fern,gone/horns"], "gone: data.path: is not there: correct the path"),
         (["-m", "+strategy=clear,gco", "prior=onnx", "prior.path=gone"], "gone: prior.path: is not there: correct the path"),
-        (["experiment=table1", "data.root=gone"], "gone: data.path: is not there: correct the path"),
+        (["experiment=table1", "data.root=gone"], "gone: data.root: is not there: correct the path"),
         (["experiment=llff_x4", "+hydra.sweeper.params.prior='auto,null'"],  # as of an experiment's file
          "prior=null: there is no such option. There are auto, bicubic, corrupted, demo, images, onnx, realesrgan, waifu2x."),
     ],
