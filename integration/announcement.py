@@ -55,7 +55,7 @@ def announce(conductor: Conductor, views: Sequence[View], host: Host) -> None:
         **({"background": "chooses its background itself"} if host.own_background else {}),
     }.items():
         for owner in (s for s in conductor.strategies if overrides(s, hook)):
-            _log.info("%s has no effect here: the host %s.", type(owner).__name__, reason)
+            _log.warning("%s has no effect here: the host %s.", type(owner).__name__, reason)
     if not conductor.strategies:
         summed = (
             "both losses are summed, as in the paper's baseline" if conductor.uses_hr else "the host trains as alone"

@@ -13,6 +13,7 @@ from clear_strategies import compose as compose_module
 from clear_strategies.compose import conductor, tree
 from clear_strategies.data.priors import BackProjected, Bicubic
 from clear_strategies.data.view_settings import ViewSettings
+from clear_strategies.density.mcmc import MCMC
 from clear_strategies.errors import SettingError
 from clear_strategies.hydra_errors import not_composed
 from clear_strategies.jobs.settings import settings_of
@@ -219,7 +220,7 @@ def test_a_host_gets_the_strategies_the_decorators_and_the_rates_of_what_it_name
     assert [type(s).__name__ for s in run.conductor(1.0).strategies] == [
         "GCO", "P2G", "SVS", "PseudoViews", "FadingOpacity", "MCMC", "RandomBackground",
     ]  # fmt: skip
-    assert [type(s) for s in best.strategies] == [type(s) for s in run.conductor(1.0).strategies][:-1]
+    assert [type(s) for s in best.strategies] == [type(s) for s in run.conductor(1.0).strategies][:-2]
     assert best.prior(Bicubic()) == run.conductor(1.0).prior(Bicubic()) == BackProjected(Bicubic())
     run = settings_of(tree(composed("+strategy=[p2g,back_projected]", "data.views.downsample=area")))
     assert run.strategies["p2g"].down == "area"
@@ -228,14 +229,15 @@ def test_a_host_gets_the_strategies_the_decorators_and_the_rates_of_what_it_name
     assert conductor("clear_paper", iterations=300).detail == DetailRates(rate=7.05e-4, steps=0, decay=0.0)
 
 
-def test_in_a_host_best_leaves_random_backgrounds_out_and_says_so_once_unless_they_are_named(caplog):
+def test_in_a_host_best_leaves_mcmc_and_random_backgrounds_out_and_says_so_once_unless_they_are_named(caplog):
     caplog.set_level("INFO")
     compose_module._say_left_out.cache_clear()
     without = [("best",), ("best",), ("best", "~strategies.random_background")]
-    assert not any(isinstance(s, RandomBackground) for names in without for s in conductor(*names).strategies)
+    assert not any(isinstance(s, MCMC | RandomBackground) for names in without for s in conductor(*names).strategies)
     for names in ("best", "strategies.random_background.until=8000"), (["gco", "random_background"],):
         assert isinstance(conductor(*names).strategies[-1], RandomBackground)
-    assert caplog.text.count("random_background is left out") == 1
+    assert any(isinstance(s, MCMC) for s in conductor("[clear,mcmc]").strategies)
+    assert (caplog.text.count("random_background is left out"), caplog.text.count("mcmc is left out")) == (1, 1)
 
 
 def test_a_file_of_options_that_is_edited_is_read_again_and_what_is_made_of_it_is_a_copy(tmp_path: Path) -> None:
