@@ -9,6 +9,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -32,6 +33,7 @@ The command trains +strategy=best on all photos for fit.iterations={_ITERATIONS}
 """
 # Beginnings of arguments that choose the strategies, and the number of iterations; each replaces the command's default.
 CHOOSE_STRATEGIES: Final = ("+strategy=", "+method=", "experiment=", "+experiment=")
+_BEFORE_FOLDERS: Final = ("--config-dir", "-cd", "--config-path", "-cp")  # flags of Hydra
 _CHOOSE_ITERATIONS: Final = ("fit.iterations=", "experiment=", "+experiment=", "+protocol=", "+scene=")
 
 
@@ -60,7 +62,9 @@ def overrides(arguments: Sequence[str]) -> list[str]:
         )
     if not path.exists():
         raise SettingError(f"train: {path} is not there. Name the folder of the photos or of the capture.")
-    if others := [word for word in rest if "=" not in word and path_of(word).is_dir()]:
+    # The value of a flag, as of --config-dir, is no folder of photos.
+    free = [word for before, word in pairwise(arguments) if before not in _BEFORE_FOLDERS]
+    if others := [word for word in free if "=" not in word and path_of(word).is_dir()]:
         raise SettingError(
             f"train: {others[0]} is a second folder. Put all photos of the scene into one folder, and give that."
         )

@@ -54,6 +54,16 @@ def test_a_path_is_quoted_only_where_hydra_would_read_something_else(tmp_path, m
     assert composed(overrides, "config").data.path == name
 
 
+@pytest.mark.parametrize("flag", ["--config-dir", "-cd"])
+def test_a_folder_of_options_is_no_second_folder_of_photos(tmp_path, monkeypatch, flag):
+    monkeypatch.chdir(tmp_path)
+    for name in ("photos", "mine"):
+        (tmp_path / name).mkdir()
+    assert train.overrides(["photos", flag, "mine", "fit.seed=1"])[-3:] == [flag, "mine", "fit.seed=1"]
+    with pytest.raises(SettingError, match="mine is a second folder"):
+        train.overrides(["photos", "mine"])
+
+
 def test_a_tilde_that_no_shell_expanded_is_the_users_folder(tmp_path, monkeypatch):
     """In the argument of `train`, in Hydra's own folders, and in the arguments of the other commands."""
     monkeypatch.setenv("HOME", str(tmp_path))
