@@ -68,7 +68,7 @@ class Settings:
             return conductor.prior(sr), self.factor
         if conductor.uses_hr:
             raise SettingError(
-                "sr: must be the folder of the SR images, got None, but HR is used. Pass the folder, or set objective=lr_only "
-                "and leave P2G out."
+                "sr: must be the folder of the SR images, got None, but HR is used. Pass the folder (save_lr writes the "
+                "photos for an SR tool), or set objective=lr_only and leave P2G out."
             )
         return lambda name, image, factor: image, 1

@@ -35,7 +35,7 @@ class Images:
     def __post_init__(self) -> None:
         require_path(self.path, "the folder of the SR images")
         remedy = "name the SR images like the views, or set prior.suffix"
-        resize = "super-resolve the very LR images that this run trains on (data.save_lr writes them)"
+        resize = "super-resolve the very LR images of this run, which data.save_lr or a host's save_lr writes"
         object.__setattr__(self, "_files", ViewFiles(Path(self.path), "SR image", remedy, resize, self.suffix))
 
     @property
