@@ -140,8 +140,11 @@ def _remedy(key: str, value: str, overrides: Sequence[str], known: Mapping[str, 
 
 
 def _similar(key: str, known: Sequence[str]) -> list[str]:
-    """The key that is spelled most alike; if none is, those that end in the same name, as fit.viewer for viewer."""
-    alike = difflib.get_close_matches(key, known, 1, 0.8)
+    """The keys that begin so; if there are none, the one that is spelled most alike, or those that end in the same name, as
+    fit.viewer for viewer.
+    """
+    begin_so = [other for other in known if other.startswith(key) and "." not in other[len(key) :]]
+    alike = begin_so or difflib.get_close_matches(key, known, 1, 0.8)
     return alike or [other for other in known if other.rpartition(".")[2] == key.rpartition(".")[2]]
 
 

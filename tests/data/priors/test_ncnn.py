@@ -70,12 +70,8 @@ def test_the_cache_knows_weights_tiles_and_the_version_of_ncnn(fake: Path, tmp_p
         Cached(prior, folder)("view", lr, 4)
         return len(list(folder.iterdir()))
 
-    assert [entries(Ncnn()), entries(Ncnn(tile=448)), entries(Ncnn(tile=80)), entries(Ncnn("realesrgan"))] == [
-        1,
-        1,
-        2,
-        3,
-    ]
+    priors = Ncnn(), Ncnn(tile=448), Ncnn(tile=80), Ncnn("realesrgan")
+    assert [*map(entries, priors)] == [1, 1, 2, 3]
     weights = Ncnn().files[1]
     weights.write_bytes(weights.read_bytes() + b" more")
     assert entries(Ncnn()) == 4
