@@ -37,8 +37,10 @@ def _checked(written: Any, typechecker: Callable[..., Any]) -> Any:
     if not hints:
         return written
     written.__annotations__ = {name: _resolved(hint, written.__globals__) for name, hint in hints.items()}
-    checked = typechecker(written)
+    checked, has_sizes = typechecker(written), "jaxtyping" in repr(written.__annotations__)
     written.__annotations__ = hints
+    if not has_sizes:
+        return checked
 
     @wraps(written)
     def called(*arguments: Any, **named: Any) -> Any:
