@@ -28,7 +28,6 @@ from beartype.door import is_bearable
 from beartype.roar import BeartypeDecorHintPep585DeprecationWarning, BeartypeException
 
 from clear_strategies.errors import DataError, SettingError, one_line
-from clear_strategies.files import expanded
 from rasterizers.interface import BackendUnavailable
 
 TARGET: Final = "_target_"
@@ -119,21 +118,6 @@ def missing(key: str, *, known: bool = True) -> SettingError:
         known: the configuration has the key; else Hydra adds it by a plus.
     """
     return SettingError(f"{key}: is needed and missing. Add {'' if known else '+'}{key}=….")
-
-
-def require_paths(setting: Callable[[str], Any]) -> None:
-    """Raise a DataError if a folder or file of the scene or of its SR images is not there.
-
-    It names the first folder of a path that is not there, which is the same for all scenes of a wrong data.root.
-
-    Args:
-        setting: the value of a dotted key; None where the configuration has no such key.
-    """
-    for key in ("data.root", "data.path", "data.cloud.path", *["prior.path"] * (setting("data.save_lr") is None)):
-        if path := setting(key):
-            whole = Path(expanded(str(path)))
-            if gone := [part for part in (*reversed(whole.parents), whole) if not part.exists()]:
-                raise DataError(gone[0], key, "is not there", "correct the path")
 
 
 def _called(node: Mapping[str, Any], key: str) -> Any:

@@ -30,8 +30,9 @@ from clear_strategies import signals
 from clear_strategies.errors import ClearError, DataError, SettingError
 from clear_strategies.files import FINISHED
 from clear_strategies.hydra_errors import require_option
+from clear_strategies.jobs.paths import require_paths
 from clear_strategies.options import UNNAMED
-from clear_strategies.settings import absent, missing, require_paths
+from clear_strategies.settings import absent, missing
 
 # Launchers whose jobs share the file system of the process that was started; nodes of a cluster may have another.
 _LOCAL: Final = ("basic", "cores", "joblib", "submitit_local")
