@@ -63,12 +63,15 @@ def announce(conductor: Conductor, views: Sequence[View], host: Host) -> None:
         _log.info("no strategy is attached: %s.", summed)
 
 
-def last_error() -> BaseException | None:
-    """The error that is on its way, or else the last that ended a program or a notebook's cell."""
-    return sys.exc_info()[1] or getattr(sys, "last_value", None)
+def last_error() -> int | None:
+    """The `id` of the error that is on its way, or else of the last that ended a program or a notebook's cell. The error itself
+    would keep alive what was computed where it was raised.
+    """
+    error = sys.exc_info()[1] or getattr(sys, "last_value", None)
+    return None if error is None else id(error)
 
 
-def warn_without_hr(conductor: Conductor, counts: Mapping[str, int], known: BaseException | None) -> None:
+def warn_without_hr(conductor: Conductor, counts: Mapping[str, int], known: int | None) -> None:
     """At the end of a loop, warn if HR took no part in it, unless an error has ended the loop.
 
     Args:

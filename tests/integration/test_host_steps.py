@@ -3,6 +3,7 @@
 import functools
 import gc
 import sys
+import weakref
 from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
@@ -463,6 +464,23 @@ def test_a_loop_that_an_error_ends_is_not_told_of_its_length(fails, caplog, monk
     clear.remove()
     assert clear.attachment.counts["merges"] == 1
     assert "HR took no part" not in caplog.text
+
+
+def test_what_an_earlier_error_holds_is_freed():
+    """As in a notebook, whose user attaches again after a cell ran out of memory."""
+
+    class Failed(Exception):
+        pass
+
+    scene = toy.scene(20)
+    try:
+        raise Failed
+    except Failed as error:
+        held = weakref.ref(error)
+        clear = attached(Host(scene), scene, composed_conductor("gco"))
+    gc.collect()
+    assert held() is None
+    clear.remove()
 
 
 def test_a_loop_that_ends_before_hr_takes_part_is_told(caplog):
