@@ -86,8 +86,8 @@ class AutogradShot:
         drawn: the rasterizer's means, quats, scales, opacities and colors, none of them with a hook or computed from another;
             None: `joint_loss` and hosts find them where a network needs them, see `at_inputs`.
         drawings: of this image by this package's rasterizers; a single one takes all cotangents in one pass.
-        found: inputs of another rasterizer, see `at_inputs`.
         mask: the image is a drawing outside of any graph, times this mask.
+        found: inputs of another rasterizer, see `at_inputs`.
     """
 
     image: Float[Tensor, "H W 3"]
@@ -97,8 +97,8 @@ class AutogradShot:
     slot: ScreenGradientSlot | None = None
     drawn: Mapping[str, Tensor] | None = None
     drawings: Sequence[Drawing] = ()
-    found: Inputs | None = None
     mask: Float[Tensor, "H W 1"] | None = None
+    found: Inputs | None = None
 
     @property
     def drawing(self) -> Drawing | None:
@@ -146,19 +146,22 @@ class AutogradShot:
         return each if weight is None else summed(each, weight)
 
     def _gradients_of_host(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
-        slot = self.gradient_slot
+        slot, inputs = self.gradient_slot, self.found or Inputs((), {})
         f_det = {name: x for name, x in self.params.items() if name == "detail"}
-        asked = {**({} if self.found is not None else self.drawn or self.params), **f_det}
-        tensors = {name: x for name, x in asked.items() if x.requires_grad}
+        named = {**({} if self.found is not None else self.drawn or self.params), **f_det}
+        tensors = {name: x for name, x in named.items() if x.requires_grad}
         projected = [slot.tensor] if slot.tensor.requires_grad else []  # gsplat's 3DGUT draws without projected centres
+        asked: list[Any] = [*tensors.values(), *projected]
+        # Those of f_det are called with its merged gradient, those of the others as `to_leaves` reaches them.
+        hooked = [*f_det.values()] if self.found is None else [*self.params.values()]
         results = []
         for cotangent in cotangents:
-            hooks = without_hooks([*f_det.values()])  # which are called with its merged gradient
-            with hooks, (self.found or Inputs((), {})).collected() as found:
-                gradients = torch.autograd.grad(
-                    self.image, [*tensors.values(), *projected], cotangent, retain_graph=True, allow_unused=True,
-                    materialize_grads=True,
-                )  # fmt: skip
+            with without_hooks(hooked), inputs.collected() as found:
+                # Torch's own nodes and those in C++ compute only what is asked for: the edges, too.
+                each = torch.autograd.grad(
+                    self.image, [*asked, *inputs.edges.values()], cotangent, retain_graph=True, allow_unused=True
+                )
+            gradients = [torch.zeros_like(x) if g is None else g for x, g in zip(asked, each, strict=False)]
             screen = gradients[-1] if projected else torch.zeros_like(slot.tensor)
             values = {**found, **dict(zip(tensors, gradients, strict=False))}
             results.append(Grads(values, screen=slot.per_gaussian(screen, len(self.visible))))
@@ -204,14 +207,15 @@ def at_inputs(shot: AutogradShot, warn: Callable[..., None]) -> AutogradShot:
     Args:
         warn: called if the inputs are not found, with a message and its values.
     """
-    shot = of_whole_image(shot)
+    if (shot := of_whole_image(shot)).inputs is not None:
+        return shot
     centres = shot.gradient_slot.tensor
     known = {*map(id, shot.params.values()), *map(id, graph_of(centres).leaves)}
 
     def others(*edges: Edge) -> list[str]:
         return [f"{leaf.dtype} {[*leaf.shape]}" for leaf in graph_of(*edges).leaves if id(leaf) not in known]
 
-    if shot.inputs is not None or not (found := others(shot.image)):
+    if not (found := others(shot.image)):
         return shot
     if (inputs := inputs_of(shot.image, centres, shot.params)) is None:
         warn(

@@ -14,7 +14,7 @@ from torch.autograd.graph import GradientEdge, get_gradient_edge
 from clear_strategies.errors import HostError
 from integration.structure import rows_drawn
 from rasterizers.differentiable import Rendered
-from rasterizers.torch_internals import hooks_on_gradient, is_cat, is_hooked, leaf_of, of_gradient
+from rasterizers.torch_internals import hooks_on_gradient, is_cat, leaf_of, of_gradient
 
 _GOLDEN: Final = 0.6180339887498949  # its multiples modulo 1 differ most for neighbouring rows
 _SAME_CODE: Final = 0.1  # tolerance of the ratio of a row's gradients, which e.g. the mean of all rows changes a little
@@ -92,8 +92,7 @@ class Inputs:
 
         with ExitStack() as hooks:
             for i, node in enumerate(self._nodes):
-                handle = node.register_hook(lambda of_inputs, _, i=i: keep(i, of_inputs))
-                hooks.callback(handle.remove)
+                hooks.callback(node.register_hook(lambda of_inputs, _, i=i: keep(i, of_inputs)).remove)
             yield found
 
 
@@ -123,16 +122,18 @@ def inputs_of(image: Tensor, centres: Tensor, params: Mapping[str, Tensor]) -> I
     if of_own - has_rows or any(not found.nodes.isdisjoint(nodes) for found in graphs.values()):
         return None
     edges = {name: inputs[name] for name in has_rows if name in of_own or probe.node not in graphs[name].nodes}
-    pairs = [(inputs[name], p) for name in of_own for p in own if graphs[name].reaches([p])]
+    near_first = sorted(of_own, key=lambda name: len(graphs[name].nodes))  # a network may lie between the others
+    pairs = [(inputs[name], p) for name in near_first for p in own if graphs[name].reaches([p])]
     if any(edge == edge_of(p) for edge, p in pairs):
         return Inputs(nodes, edges)
-    asked = [(edge, p) for edge, p in pairs if not is_hooked(p)]
-    return Inputs(nodes, edges) if asked and _are_in_order(asked) else None
+    return Inputs(nodes, edges) if pairs and _are_in_order(pairs) else None
 
 
 def require_apart(drawn: Mapping[str, Tensor]) -> None:
-    """Raise a HostError if one of the drawn tensors is computed from another, whose gradient would count twice."""
-    nodes = {name: edge_of(x).node for name, x in drawn.items() if x.requires_grad}
+    """Raise a HostError if one of the drawn tensors is computed from another, whose gradient would count twice; that of f_det
+    does not.
+    """
+    nodes = {name: edge_of(x).node for name, x in drawn.items() if x.requires_grad and name != "detail"}
     for name, node in nodes.items():
         behind = graph_of(drawn[name]).nodes - {node}
         if reaching := [other for other, of_other in nodes.items() if of_other in behind]:
@@ -168,7 +169,7 @@ def _are_drawn_in_order(drawn: Mapping[str, Tensor], params: Mapping[str, Tensor
             continue
         if x.data_ptr() == p.data_ptr() and x.stride() == p.stride():
             return True
-        if x.requires_grad and p.requires_grad and not is_hooked(p):
+        if x.requires_grad and p.requires_grad:
             asked.append((x, p))
     if asked or "means" not in drawn:
         return _are_in_order(asked)
@@ -189,10 +190,11 @@ def _is_in_order(x: Edge, p: Tensor) -> bool | None:
     """None: x does not depend on p."""
     shape, dtype = of_gradient(edge := edge_of(x))
     code = 1 + (torch.arange(shape[0], device=p.device, dtype=torch.float64) * _GOLDEN).frac().to(dtype)
-    plain, coded = (
-        torch.autograd.grad([edge], p, [c], retain_graph=True, allow_unused=True)[0]
-        for c in (code.new_ones(shape), code.view(-1, *[1] * (len(shape) - 1)).expand(shape))
-    )
+    with without_hooks([p]):
+        plain, coded = (
+            torch.autograd.grad([edge], p, [c], retain_graph=True, allow_unused=True)[0]
+            for c in (code.new_ones(shape), code.view(-1, *[1] * (len(shape) - 1)).expand(shape))
+        )
     if plain is None or not bool(plain.any()):
         return None
     plain, coded = plain.reshape(len(p), -1), coded.reshape(len(p), -1)

@@ -280,7 +280,7 @@ def test_a_network_before_the_rasterizer_learns_from_both_scales(inria_host, inr
 
     def one_node(rasterizer, splats, camera, points, colors):
         visible = renderer.RASTERIZER(splats, camera).visible
-        shapes = splats.means, splats.quats, splats.scales, splats.opacities
+        shapes = 1 * splats.means, splats.quats, splats.scales, splats.opacities
         return SimpleNamespace(image=OneNode.apply(points, colors, camera, *shapes), visible=visible)
 
     def without_centres(rasterizer, splats, camera, points, colors):
@@ -291,6 +291,8 @@ def test_a_network_before_the_rasterizer_learns_from_both_scales(inria_host, inr
         strategies = () if lr_alone else (GCO(), P2G(patch=4))
         clear, gaussians, scene = inria_attached(*strategies, objective=WITHOUT_HR if lr_alone else HR_FROM_START)
         gaussians.active_sh_degree = 3
+        for p in clear.params().values():
+            p.register_hook(lambda g: g)
         torch.manual_seed(0)
         network = torch.nn.Linear(3, 3)
 

@@ -133,18 +133,36 @@ def test_what_else_the_loop_trains_gets_its_gradient(share, strategies, hooked):
         torch.testing.assert_close(leaf.grad, 3 * expected)
 
 
-@pytest.mark.parametrize("found", ["in the graph", "behind the centres", "by name"])
+def sum_of_blobs(p, colours, camera):
+    """An image, many nodes of torch, and the projected centres that it is computed from."""
+    pose = camera.world_to_camera
+    x, y, z = (p["means"] @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
+    centres = torch.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), 1)
+    centres.retain_grad()
+    pixels = torch.stack(torch.meshgrid(torch.arange(camera.width), torch.arange(camera.height), indexing="xy"), -1)
+    distances = (pixels - centres[:, None, None]).square().sum(-1, keepdim=True)
+    sizes = camera.width * p["scales"].exp().mean(1)[:, None, None, None]
+    alphas = p["opacities"].sigmoid()[:, None, None, None] * torch.exp(-distances / sizes**2)
+    return (alphas * colours[:, None]).sum(0), centres
+
+
+@pytest.mark.parametrize("found", ["in the graph", "behind the centres", "in torch", "by name"])
 def test_what_reaches_the_colours_and_the_rasterizer_counts_once(found):
     """The gradient of the positions, from whose directions a network computes colours."""
     scene = toy.scene(20)
     host, view, conductor = Host(scene), scene.train[0], Conductor(objective=HR_FROM_START)
     conductor.on_fit_start(3, 0, views=scene.train)
     network = torch.nn.Linear(3, 3)
+    if found == "in torch":
+        del host.params["detail"], host.params["shN"]
 
     def render(camera, detail=None):
         p = host.params
         sh0 = p["sh0"] + network(torch.nn.functional.normalize(p["means"], dim=1))[:, None]
         centres = p["means"] * 1 if found == "behind the centres" else p["means"]
+        if found == "in torch":
+            image, centres = sum_of_blobs(p, sh0, camera)
+            return AutogradShot(image, centres, torch.ones(20, dtype=torch.bool), p)
         splats = Splats(centres, p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), sh0, p["shN"], detail)
         shot = autograd.draw(toy.RASTERIZER, splats, camera)
         slot = ScreenGradientSlot(shot.means2d if centres is p["means"] else centres, (camera.width, camera.height))
@@ -152,13 +170,13 @@ def test_what_reaches_the_colours_and_the_rasterizer_counts_once(found):
         drawn = {name: getattr(splats, name) for name in names} | {"detail": p["detail"]}
         return AutogradShot(shot.image, shot.means2d, shot.visible, p, slot, drawn if found == "by name" else None)
 
-    lr, hr = render(view.lr.camera), render(view.hr.camera, host.params["detail"])
+    lr, hr = render(view.lr.camera), render(view.hr.camera, host.params.get("detail"))
     if found == "by name":
         with pytest.raises(HostError, match="means of drawn reaches sh0"):
             joint_loss(conductor, host.params, lr, hr, view, 5)
         return
     joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
-    objective, leaves = conductor.objective, [host.params["means"], network.weight]
+    objective, leaves = conductor.objective, [*map(host.params.get, ("means", "opacities", "sh0")), network.weight]
     (of_lr,) = objective.lr(lr.image.detach(), view.lr.image, None).cotangents
     of_hr = objective.hr(hr.image.detach(), view.hr.image, None).cotangents
     at_hr = of_hr[0] + objective.lambda_hf * of_hr[1]
@@ -170,6 +188,25 @@ def test_what_reaches_the_colours_and_the_rasterizer_counts_once(found):
     ]
     for leaf, g in zip(leaves, expected, strict=True):
         torch.testing.assert_close(leaf.grad, g, rtol=1e-4, atol=1e-4 * float(g.abs().max()))
+
+
+def test_f_det_may_be_named_beside_the_colours_that_are_computed_from_it():
+    host, view = Host(scene := toy.scene(20)), scene.train[0]
+    conductor = Conductor(objective=HR_FROM_START)
+    own = host.render(view.lr.camera, detail=False)
+
+    def render(p, sh0, **offset):
+        drawn = dict(p, scales=p["scales"].exp(), opacities=p["opacities"].sigmoid(), sh0=sh0, **offset)
+        names = "means", "quats", "scales", "opacities", "sh0", "shN"
+        shot = autograd.draw(toy.RASTERIZER, Splats(*(drawn[name] for name in names)), view.hr.camera)
+        return AutogradShot(shot.image, shot.means2d, shot.visible, host.params, drawn=drawn)
+
+    detail = host.params["detail"]
+    hr = render(host.params, host.params["sh0"] + detail[:, None])
+    joint_loss(conductor, host.params, own, hr, view, 5)[0].backward()
+    hf = conductor.objective.hr(hr.image.detach(), view.hr.image, None).cotangents[1]
+    (expected,) = torch.autograd.grad(hr.image, detail, conductor.objective.lambda_hf * hf)
+    torch.testing.assert_close(detail.grad, expected * conductor.objective.lambda_hr(5))
 
 
 ROWS = {
