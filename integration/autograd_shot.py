@@ -15,7 +15,7 @@ from clear_strategies.errors import HostError
 from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.iteration import HrSide
 from integration.colours import are_joined
-from integration.graph import Edge, Inputs, edge_of, graph_of, has_gradient, inputs_of, joined, without_hooks
+from integration.graph import Edge, Inputs, edge_of, graph_of, has_gradient, inputs_of, joined, reaches, without_hooks
 from rasterizers.differentiable import Drawing, outer
 from rasterizers.interface import Camera, summed_vjp
 from rasterizers.torch_internals import is_hooked
@@ -195,7 +195,7 @@ class AutogradShot:
 def of_whole_image(shot: AutogradShot) -> AutogradShot:
     """Without its drawing, if the image depends on parameters by another way, too."""
     own, drawing = trained(shot.params).values(), shot.drawing
-    if drawing is None or not graph_of(shot.image, before=[drawing.image.grad_fn]).reaches(own):
+    if drawing is None or not reaches(shot.image, own, before=[drawing.image.grad_fn]):
         return shot
     return replace(shot, drawings=())
 

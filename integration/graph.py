@@ -17,6 +17,7 @@ from rasterizers.differentiable import Rendered
 from rasterizers.torch_internals import hooks_on_gradient, is_cat, leaf_of, of_gradient
 
 _GOLDEN: Final = 0.6180339887498949  # its multiples modulo 1 differ most for neighbouring rows
+_MOST: Final = 16  # calls of a rasterizer, and operations from the centres to it; one that loops in torch has thousands
 _SAME_CODE: Final = 0.1  # tolerance of the ratio of a row's gradients, which e.g. the mean of all rows changes a little
 
 Edge = Tensor | GradientEdge
@@ -40,20 +41,33 @@ class Graph(NamedTuple):
         return not {*map(id, leaves)}.isdisjoint(map(id, self.leaves))
 
 
-def graph_of(*edges: Edge, before: Collection[Any] = ()) -> Graph:
-    """The graph behind tensors, in one walk that ends at the nodes `before`. A leaf is its own."""
-    graph = Graph({*before}, [], [])
-    nodes: list[Any] = [edge_of(x).node for x in edges if has_gradient(x)]
-    while nodes:
-        if (node := nodes.pop()) is None or node in graph.nodes:
-            continue
+def graph_of(*edges: Edge) -> Graph:
+    """The graph behind tensors, in one walk. A leaf is its own."""
+    graph = Graph(set(), [], [])
+    for node in _behind(edges):
         graph.nodes.add(node)
         if (leaf := leaf_of(node)) is not None:
             graph.leaves.append(leaf)
         elif isinstance(drawn := getattr(node, "rendered", None), Rendered):
             graph.drawn.append(drawn)
-        nodes += [behind for behind, _ in node.next_functions]
     return graph
+
+
+def reaches(x: Tensor, leaves: Iterable[Tensor], *, before: Iterable[Any]) -> bool:
+    """Whether a tensor is computed from one of these leaves by a way around the nodes `before`."""
+    known = {*map(id, leaves)}
+    return any(id(leaf_of(node)) in known for node in _behind([x], before))
+
+
+def _behind(edges: Iterable[Edge], before: Iterable[Any] = ()) -> Iterator[Any]:
+    seen: set[Any] = {*before}
+    nodes: list[Any] = [edge_of(x).node for x in edges if has_gradient(x)]
+    while nodes:
+        if (node := nodes.pop()) is None or node in seen:
+            continue
+        seen.add(node)
+        yield node
+        nodes += [behind for behind, _ in node.next_functions]
 
 
 def joined(x: Tensor) -> list[tuple[Edge, slice]]:
@@ -78,7 +92,7 @@ class Inputs:
         edges: where the gradients of its inputs with a row for each Gaussian go, by name.
     """
 
-    def __init__(self, nodes: Sequence[Any], edges: Mapping[str, GradientEdge]) -> None:
+    def __init__(self, nodes: Collection[Any], edges: Mapping[str, GradientEdge]) -> None:
         self._nodes, self.edges = nodes, edges
 
     @contextmanager
@@ -107,9 +121,16 @@ def inputs_of(image: Tensor, centres: Tensor, params: Mapping[str, Tensor]) -> I
         return None
     graph, probe, n = graph_of(image).nodes, edge_of(centres), len(params["means"])
     own = [p for name, p in params.items() if name != "detail"]
-    nodes = [x for x in graph if (probe.node, probe.output_nr) in x.next_functions]
-    while nodes and graph_of(image, before=nodes).reaches(own):  # on to what is computed from these
-        nodes = [x for x in graph if any(behind in nodes for behind, _ in x.next_functions)]
+    readers = dict[Any, set[Any]]()
+    for x in graph:
+        for behind, _ in x.next_functions:
+            readers.setdefault(behind, set()).add(x)
+    nodes = {x for x in readers.get(probe.node, ()) if (probe.node, probe.output_nr) in x.next_functions}
+    steps = 0
+    while nodes and reaches(image, own, before=nodes):  # on to what is computed from these
+        nodes, steps = {reader for x in nodes for reader in readers.get(x, ())}, steps + 1
+        if max(steps, len(nodes)) > _MOST:
+            return None
     inputs = {
         _name(i, j): GradientEdge(behind, nr)
         for i, node in enumerate(nodes)

@@ -10,7 +10,7 @@ import torch
 from clear_strategies import GCO, P2G, SVS, Conductor, Strategy
 from clear_strategies.core.step import Step
 from clear_strategies.training.field import GaussianField
-from integration import AutogradShot, HostError, ScoreScaler, extra_loss, joint_loss
+from integration import AutogradShot, HostError, ScoreScaler, extra_loss, graph, joint_loss
 from integration.autograd_shot import ScreenGradientSlot
 from rasterizers import Splats, autograd
 from tests.helpers import toy
@@ -144,6 +144,23 @@ def sum_of_blobs(p, colours, camera):
     sizes = camera.width * p["scales"].exp().mean(1)[:, None, None, None]
     alphas = p["opacities"].sigmoid()[:, None, None, None] * torch.exp(-distances / sizes**2)
     return (alphas * colours[:, None]).sum(0), centres
+
+
+def test_the_graph_of_a_rasterizer_that_loops_in_torch_is_not_walked_at_each_of_its_nodes(monkeypatch, caplog):
+    """A network before it learns from LR alone. A walk at each node would take longer than the step."""
+    host, view, seen = Host(scene := toy.scene(20)), scene.train[0], []
+    conductor, offset, leaf_of = Conductor(objective=HR_FROM_START), torch.zeros(3, requires_grad=True), graph.leaf_of
+    monkeypatch.setattr(graph, "leaf_of", lambda node: (seen.append(node), leaf_of(node))[1])
+    del host.params["detail"], host.params["shN"]
+
+    def render(camera):
+        image, centres = sum_of_blobs(host.params, host.params["sh0"] + offset, camera)
+        looped = sum(image * centres[i % 20, 0] for i in range(200))
+        return AutogradShot(looped, centres, torch.ones(20, dtype=torch.bool), host.params)
+
+    joint_loss(conductor, host.params, render(view.lr.camera), render(view.hr.camera), view, 5)[0].backward()
+    assert len(seen) < 4 * len(set(seen))
+    assert "learn from LR alone" in caplog.text
 
 
 @pytest.mark.parametrize("found", ["in the graph", "behind the centres", "in torch", "by name"])
