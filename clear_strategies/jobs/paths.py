@@ -18,7 +18,8 @@ def require_paths(setting: Callable[[str], Any]) -> None:
     Args:
         setting: the value of a dotted key; None where the configuration has no such key.
     """
-    for key in ("data.root", "data.path", "data.cloud.path", *["prior.path"] * (setting("data.save_lr") is None)):
+    given = {"data.cloud.path": setting("data.cloud.init") == "ply", "prior.path": setting("data.save_lr") is None}
+    for key in ("data.root", "data.path", *(name for name, is_read in given.items() if is_read)):
         if path := setting(key):
             whole = Path(expanded(str(path)))
             if gone := [part for part in (*reversed(whole.parents), whole) if not part.exists()]:
