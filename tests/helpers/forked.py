@@ -14,6 +14,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
@@ -36,7 +37,8 @@ class Forked:
 
     Args:
         arguments: of python: `-m MODULE …` or `-c CODE …`.
-        session: whether it leads a process group. drawn: whether a run draws its pictures.
+        session: whether it leads a process group.
+        drawn: whether a run draws its pictures, and Python takes its objects apart at the end, see `_end`.
     """
 
     def __init__(
@@ -157,6 +159,18 @@ def _compute_ahead() -> None:
     demo.read(width=1, height=1).frames[0].load()
 
 
+def _end(code: int) -> None:
+    """End as Python does, but for its objects, the destruction of which one by one first copies what this process shares with
+    its parent: a third of a second. Returns where the output cannot be written, which Python tells itself.
+    """
+    threading._shutdown()
+    atexit._run_exitfuncs()
+    with suppress(OSError, ValueError):
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        os._exit(code)
+
+
 def main() -> None:
     """What `python -m tests.helpers.forked FILENO` does."""
     for name in _IMPORTED:
@@ -168,13 +182,19 @@ def main() -> None:
     if request is None:
         return
     kind, program, *arguments = request["arguments"]
-    sys.argv = ["-c", *arguments]
-    with nullcontext() if request["drawn"] else not_drawn():
-        if kind == "-c":
-            exec(program, {"__name__": "__main__"})  # noqa: S102 - a test's own
-        else:
-            sys.modules.pop(program, None)
-            runpy.run_module(program, run_name="__main__", alter_sys=True)
+    sys.argv, code = ["-c", *arguments], None
+    try:
+        with nullcontext() if request["drawn"] else not_drawn():
+            if kind == "-c":
+                exec(program, {"__name__": "__main__"})  # noqa: S102 - a test's own
+            else:
+                sys.modules.pop(program, None)
+                runpy.run_module(program, run_name="__main__", alter_sys=True)
+    except SystemExit as ended:
+        code = ended.code
+    if isinstance(code, int | None) and not request["drawn"]:
+        _end(code or 0)
+    sys.exit(code)
 
 
 if __name__ == "__main__":
