@@ -52,7 +52,7 @@ def _restored(
         tensors, facts = dict(saved.tensors), {**saved.facts, **stated.pop("facts", {})}
         change(tensors)
         path = checkpoint.save(folder, replace(saved, tensors=tensors, facts=facts, **stated))
-        return resume.restore(start(("gco", "svs")), SCENE, checkpoint.load(path), path, {})
+        return resume.restore(start(("gco", "svs")), SCENE, checkpoint.load(path), path)
 
     return give
 
