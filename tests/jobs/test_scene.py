@@ -216,9 +216,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory):
     return train
 
 
-@pytest.mark.parametrize(
-    "scale", [1e-5, 1e5, *(pytest.param(scale, marks=pytest.mark.slow) for scale in (0.003, 100.0))]
-)
+@pytest.mark.parametrize("scale", [1e-5, 1e5])
 def test_a_scene_in_other_units_gives_equal_results(scale: float, trained, caplog) -> None:
     score, folder = trained(scale)
     # Rounding alone moves 60 iterations by up to 0.3 dB (a scale of 100, with AVX2); a length in wrong units by several.
@@ -236,13 +234,12 @@ def test_lr_images_are_saved_at_the_size_that_images_of_another_program_need_wit
 ):
     monkeypatch.setattr("clear_strategies.data.prepare.initial_points", None)
     words = [
-        "data=demo",
-        "data.views.photos_are=lr",
-        f"data.save_lr={tmp_path / 'lr'}",
-        "data.views.max_hr_megapixels=0.2",
-    ]
+        "data=demo", "data.reader.width=128", "data.reader.height=96", "data.views.photos_are=lr",
+        f"data.save_lr={tmp_path / 'lr'}", "data.views.max_hr_megapixels=0.1",
+    ]  # fmt: skip
     assert job.run(composed(*words), tmp_path / "run", words) is None
-    used = read(DataSettings(reader=demo.read, views=ViewSettings(max_hr_megapixels=0.2)), Images(str(tmp_path)))[0]
+    reader = functools.partial(demo.read, width=128, height=96)
+    used = read(DataSettings(reader=reader, views=ViewSettings(max_hr_megapixels=0.1)), Images(str(tmp_path)))[0]
     assert {file.stem for file in (tmp_path / "lr").iterdir()} == {frame.name for frame in used.frames}
     camera = used.frames[0].camera
     assert photo_files.read_header(tmp_path / f"lr/{used.frames[0].name}.png").size(None) == (
