@@ -84,10 +84,10 @@ class AutogradShot:
         params: raw parameters by gsplat's names. A parameter that the image does not depend on has gradient 0.
         slot: where the host keeps the screen gradient; None: the image is a function of `means2d` itself.
         drawn: the rasterizer's means, quats, scales, opacities and colors, none of them with a hook or computed from another;
-            None: `joint_loss` and hosts find them where a network needs them, see `at_inputs`.
+            None: `joint_loss` and hosts find them where a network needs them.
         drawings: of this image by this package's rasterizers; a single one takes all cotangents in one pass.
         mask: the image is a drawing outside of any graph, times this mask.
-        found: inputs of another rasterizer, see `at_inputs`.
+        found: the inputs of another rasterizer, which `joint_loss` and hosts set.
     """
 
     image: Float[Tensor, "H W 3"]
