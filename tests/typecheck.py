@@ -38,9 +38,8 @@ def _checked(written: Any, typechecker: Callable[..., Any]) -> Any:
         return written
     written.__annotations__ = {name: _resolved(hint, written.__globals__) for name, hint in hints.items()}
     checked, has_sizes = typechecker(written), "jaxtyping" in repr(written.__annotations__)
-    written.__annotations__ = checked.__annotations__ = (
-        hints  # settings are checked against them, and pages made of them
-    )
+    # As written, since settings are checked against them, and pages are made of them.
+    written.__annotations__ = checked.__annotations__ = hints
     if not has_sizes:
         return checked
 
