@@ -15,7 +15,18 @@ from clear_strategies.errors import HostError
 from clear_strategies.kernels.reconcile import dense
 from clear_strategies.merging.iteration import HrSide
 from integration.colours import are_joined
-from integration.graph import Edge, Inputs, edge_of, graph_of, has_gradient, inputs_of, joined, reaches, without_hooks
+from integration.graph import (
+    Edge,
+    Graph,
+    Inputs,
+    edge_of,
+    graph_of,
+    has_gradient,
+    inputs_of,
+    joined,
+    reaches,
+    without_hooks,
+)
 from rasterizers.differentiable import Drawing, outer
 from rasterizers.interface import Camera, summed_vjp
 from rasterizers.torch_internals import is_hooked
@@ -209,22 +220,22 @@ def at_inputs(shot: AutogradShot, warn: Callable[..., None]) -> AutogradShot:
     """
     if (shot := of_whole_image(shot)).inputs is not None:
         return shot
-    centres = shot.gradient_slot.tensor
+    graph, centres = graph_of(shot.image), shot.gradient_slot.tensor
     known = {*map(id, shot.params.values()), *map(id, graph_of(centres).leaves)}
 
-    def others(*edges: Edge) -> list[str]:
-        return [f"{leaf.dtype} {[*leaf.shape]}" for leaf in graph_of(*edges).leaves if id(leaf) not in known]
+    def others(behind: Graph) -> list[str]:
+        return [f"{leaf.dtype} {[*leaf.shape]}" for leaf in behind.leaves if id(leaf) not in known]
 
-    if not (found := others(shot.image)):
+    if not (found := others(graph)):
         return shot
-    if (inputs := inputs_of(shot.image, centres, shot.params)) is None:
+    if (inputs := inputs_of(shot.image, graph, centres, shot.params)) is None:
         warn(
             "the loop trains %d tensors beside the Gaussians (%s), which learn from LR alone: the inputs of the rasterizer were "
             "not found, or their rows are not those of the parameters. Name them by AutogradShot(drawn=…).",
             len(found), ", ".join(found[:3]),
         )  # fmt: skip
         return shot
-    return replace(shot, found=inputs) if others(*inputs.edges.values()) else shot
+    return replace(shot, found=inputs) if others(graph_of(*inputs.edges.values())) else shot
 
 
 OfOthers = list[tuple[Tensor, Tensor]]

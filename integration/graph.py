@@ -110,19 +110,20 @@ class Inputs:
             yield found
 
 
-def inputs_of(image: Tensor, centres: Tensor, params: Mapping[str, Tensor]) -> Inputs | None:
+def inputs_of(image: Tensor, graph: Graph, centres: Tensor, params: Mapping[str, Tensor]) -> Inputs | None:
     """The inputs of the rasterizer that drew `image`; None: it is no single node, or its rows are not those of the parameters.
 
     Args:
+        graph: of the image.
         centres: through which it passes the screen gradient.
         params: raw parameters by gsplat's names, with N rows.
     """
     if not centres.requires_grad or not image.requires_grad:
         return None
-    graph, probe, n = graph_of(image).nodes, edge_of(centres), len(params["means"])
+    probe, n = edge_of(centres), len(params["means"])
     own = [p for name, p in params.items() if name != "detail"]
     readers = dict[Any, set[Any]]()
-    for x in graph:
+    for x in graph.nodes:
         for behind, _ in x.next_functions:
             readers.setdefault(behind, set()).add(x)
     nodes = {x for x in readers.get(probe.node, ()) if (probe.node, probe.output_nr) in x.next_functions}
