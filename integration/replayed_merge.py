@@ -43,7 +43,7 @@ class ReplayedMerge:
 
     def __init__(self, conductor: Conductor, device: torch.device) -> None:
         self._conductor, self._device = conductor, device
-        self.replays = replays_on(device, conductor.work_log, "the replay of the merge")
+        self.replays = replays_on(device, conductor, "the replay of the merge")
 
     def __call__(
         self, params: Mapping[str, Tensor], g_lr: Grads, g_hr: Grads, step: Step | None, t: int, out: Mapping[str, Tensor]

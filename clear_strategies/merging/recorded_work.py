@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import partial
 from typing import Any, Final, TypeVar
 
 import torch
@@ -12,7 +11,6 @@ from torch import Tensor
 
 from clear_strategies.core import deferred
 from clear_strategies.core.deferred import Number
-from clear_strategies.core.work_log import WorkLog
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.strategies.base import Strategy, overrides
 from rasterizers.guards import Guarded
@@ -45,13 +43,13 @@ class RecordedWork(Recorded[tuple[T, dict[str, Number]]]):
     ) -> None:  # fmt: skip
         static, self._t, self._count = StaticInputs(inputs, numbers_of), t, count
         count(t)
-        self._work_log, self._strategies, self._calls = conductor.work_log, conductor.strategies, [*calls]
+        self._conductor, self._calls = conductor, [*calls]
         self._stored = [*map(_stored_by, self._calls)]  # before the work, which may change it
         self._of_t: dict[str, Any] = {}  # numbers that Python computes from the iteration
 
         def gathered() -> tuple[Any, Tensor, Callable[[Tensor], dict[str, Number]]]:
             made, numbers = work(static.copies)
-            logged = [(s, name, x) for s in self._strategies for name, x in s.logs.items()]
+            logged = [(s, name, x) for s in conductor.strategies for name, x in s.logs.items()]
             self._logged = [(s, name) for s, name, _ in logged]
             row = {**numbers, **{f"log {k}": x() if callable(x) else x for k, (*_, x) in enumerate(logged)}}
             self._of_t = {name: x for name, x in row.items() if isinstance(x, Guarded)}
@@ -59,10 +57,10 @@ class RecordedWork(Recorded[tuple[T, dict[str, Number]]]):
 
         conductor.logs.keep()
         try:
-            with self._work_log.noted() as self._skips:
+            with conductor.work_log.noted() as self._skips:
                 super().__init__(Recording(device, gathered), static)
         finally:
-            for s in self._strategies:
+            for s in conductor.strategies:
                 s.logs.clear()  # they hold tensors of the recording
 
     def holds_at(self, t: int) -> bool:
@@ -71,7 +69,7 @@ class RecordedWork(Recorded[tuple[T, dict[str, Number]]]):
 
     def replay(self, inputs: Given) -> bool:
         self._count(self._t)
-        with self._work_log.stage("replayed"):
+        with self._conductor.work_log.stage("replayed"):
             return super().replay(inputs)
 
     def outcome(self) -> tuple[T, dict[str, Number]]:
@@ -79,7 +77,7 @@ class RecordedWork(Recorded[tuple[T, dict[str, Number]]]):
         made, numbers, row_of = self._recording.result
         row: dict[str, Number] = row_of(numbers.clone()) | {name: x.at(self._t) for name, x in self._of_t.items()}
         for skip in self._skips:
-            self._work_log.skip(*skip)
+            self._conductor.work_log.skip(*skip)
         for k, (s, name) in enumerate(self._logged):
             s.logs[name] = row.pop(f"log {k}")
         return made, row
@@ -111,9 +109,11 @@ def _comparable(x: Any) -> Any:
     return id(x), x, _comparable(getattr(x, "__dict__", None) or ())
 
 
-def replays_on(device: torch.device, work_log: WorkLog, name: str) -> Replays | None:
+def replays_on(device: torch.device, conductor: Conductor, name: str) -> Replays | None:
     """`Replays` whose live work the work log counts as `LIVE`; None if work on the device cannot be recorded."""
-    return Replays(device, name, partial(work_log.skip, LIVE)) if can_record(device) else None
+    if not can_record(device):
+        return None
+    return Replays(device, name, lambda reason: conductor.work_log.skip(LIVE, reason))
 
 
 def why_not_recorded(conductor: Conductor) -> Iterator[str]:

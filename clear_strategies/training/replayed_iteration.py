@@ -84,7 +84,7 @@ def replays_for(s: TrainState, rasterizer: Rasterizer) -> Replays | None:
     """
     reason = next(_why_not(s, rasterizer), None)
     if reason is None:
-        return replays_on(s.device, s.conductor.work_log, "fit.replay")
+        return replays_on(s.device, s.conductor, "fit.replay")
     _log.log(logging.WARNING if s.settings.replay else logging.INFO, "Iterations are not replayed: %s.", reason)
     return None
 

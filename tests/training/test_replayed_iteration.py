@@ -262,6 +262,13 @@ def test_stages_are_timed_by_events_and_none_in_a_recording(monkeypatch):
     assert all(entries[name].seconds > 0 for name in ("replayed", "render LR", "density and filter"))
 
 
+def test_replays_are_counted_in_the_work_log_that_the_conductor_has_by_then():
+    """As in `bench iteration`, where each turn has one of its own."""
+    state = trained(start(density=False), replayed=True, until=8)
+    state.conductor.work_log = work_log.WorkLog(DEVICE)
+    assert replays_of(trained(state, replayed=True, until=12)) == 4
+
+
 def test_where_lists_are_too_short_the_iteration_is_live_and_recorded_anew():
     live, replayed = start(density=False), start(density=False)
     for state in (live, replayed):
