@@ -185,6 +185,8 @@ class Attached:
                 calls.require_own_intrinsics(read()["Ks"], view)
             calls.require_pinhole(call, self.attachment.conductor.showing)
             self._follow_optimizers()
+            if is_ours and not call["viewmats"].requires_grad:
+                call |= read()  # which it would read from a device itself, and so wait for HR
             render_at = self._renderer(rasterization, call, read, is_ours=is_ours)
             with self._together(call) if is_ours else nullcontext():
                 return self.attachment.render_view(view, render_at)  # type: ignore[no-any-return]

@@ -15,7 +15,7 @@ from integration import HostError
 from integration.gsplat import calls
 from integration.gsplat.calls import Poses
 from integration.host_merge import HostMerge
-from rasterizers import autograd
+from rasterizers import as_gsplat, autograd
 from rasterizers.geometry import SH_C0
 from tests.helpers import gsplat_host, toy
 from tests.helpers.backends import needs
@@ -96,6 +96,18 @@ def test_a_step_reads_its_camera_in_one_transfer(monkeypatch):
     for name, x in calls.cameras_read(call).items():
         assert torch.equal(x, call[name])
         assert x.dtype == call[name].dtype
+
+
+def test_a_step_reads_its_cameras_once(monkeypatch):
+    """From a device, each read waits for what was launched before."""
+    read, cameras_read, asked, cameras_of = [], calls.cameras_read, [], as_gsplat.cameras_of
+    monkeypatch.setattr(calls, "cameras_read", lambda call: read.append(cameras_read(call)) or read[-1])
+    monkeypatch.setattr(as_gsplat, "cameras_of", lambda poses, *more: asked.append(poses) or cameras_of(poses, *more))
+    _, _, render = started()
+    render()
+    (cameras,) = read
+    assert len(asked) == 2  # HR and LR
+    assert all(poses is cameras["viewmats"] for poses in asked)
 
 
 @pytest.mark.parametrize(("ratio", "found"), [(8, False), (12, True)])
