@@ -11,6 +11,7 @@ import importlib
 import time
 from collections import Counter
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, Final
 
 import pandas as pd
@@ -22,8 +23,8 @@ from clear_strategies.bench.results import Results, interleaved
 from clear_strategies.compose import conductor
 from clear_strategies.data.priors import Bicubic
 from clear_strategies.errors import counted
-from clear_strategies.geometry import stereo
-from integration.examples.demo import load_demo, splats_with_optimizers
+from clear_strategies.geometry import Stereo, stereo
+from integration.examples.demo import Demo, load_demo, splats_with_optimizers
 from integration.gsplat import attach
 from integration.host_merge import HostMerge
 from integration.views import view
@@ -40,6 +41,12 @@ _COUNTED: Final = 6  # steps whose operations are counted: pseudo views come at 
 _IN_FLOAT64: Final = 2_000  # Gaussians of the loop whose merged gradient is compared
 
 
+@cache
+def _scene() -> tuple[Demo, Stereo]:
+    demo = load_demo()
+    return demo, stereo(demo.images, demo.viewmats, demo.Ks)
+
+
 class Loop:
     """A gsplat-style loop: it renders, `backward()`, and steps an Adam for each parameter.
 
@@ -52,12 +59,11 @@ class Loop:
     def __init__(
         self, strategies: str | None, n: int, width: int, device: str, dtype: torch.dtype = torch.float32, *, ours: bool = False
     ) -> None:  # fmt: skip
-        demo, noise = load_demo(), torch.Generator().manual_seed(0)
+        (demo, cloud), noise = _scene(), torch.Generator().manual_seed(0)
         scale = width / demo.images.shape[2]
         photos = F.interpolate(demo.images.movedim(-1, 1), scale_factor=scale, mode="bilinear" if scale > 1 else "area")
         photos = photos.movedim(1, -1).clamp(0, 1).contiguous()
         Ks = demo.Ks * torch.tensor([[scale], [scale], [1.0]])
-        cloud = stereo(demo.images, demo.viewmats, demo.Ks)
         rows = torch.randint(len(cloud.means), (n,), generator=noise)
         means = cloud.means[rows] + 0.02 * torch.randn(n, 3, generator=noise)
         splats, _ = splats_with_optimizers(means, cloud.colors[rows])
