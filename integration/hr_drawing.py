@@ -142,7 +142,7 @@ class HrDrawing:
     """
 
     def __init__(self, conductor: Conductor, host: Host, device: torch.device, counts: Counter[str]) -> None:
-        self._conductor, self._masks, self._counts = conductor, host.masks, counts
+        self._conductor, self._masks, self._counts = conductor, {**host.masks}, counts
         self._loss_scale = host.loss_scale or (lambda: 1.0)
         self._log_once, self._warn_once = Once(_log.info), Once(_log.warning)
         self.is_scored = host.reads_score and conductor.owner("score") is not None
@@ -161,7 +161,8 @@ class HrDrawing:
         conductor, view = self._conductor, step.view
         mask, asked = self._masks.get(view.name), render_at("hr", gate, view)
         if mask is not None:
-            mask = enlarged_mask(mask.to(step.params["means"]), view.factor)[..., None]
+            mask = self._masks[view.name] = mask.to(step.params["means"])  # once: to send it waits for the device
+            mask = enlarged_mask(mask, view.factor)[..., None]
         drawn: Drawable | AutogradShot = (
             asked if isinstance(asked, Drawable) else at_inputs(asked.shot, self._warn_once)
         )

@@ -319,6 +319,14 @@ def test_a_step_sends_no_number_that_the_host_waits_for(strict_cuda):
     assert clear.attachment.counts["extra views"] == 2 * 8
 
 
+def test_a_mask_is_sent_once(monkeypatch):
+    enlarged, given = hr_drawing.enlarged_mask, []
+    monkeypatch.setattr(hr_drawing, "enlarged_mask", lambda mask, factor: given.append(mask) or enlarged(mask, factor))
+    trained("host", masks={view.name: torch.ones(16, 24, dtype=torch.bool) for view in SCENE.train})
+    assert len(given) == 6
+    assert len({*map(id, given)}) == 3
+
+
 @needs_warp
 def test_replays_over_densification_resets_evaluation_and_resuming(monkeypatch, recorded_on):
     strategies = pytest.importorskip("gsplat.strategy")
