@@ -58,7 +58,6 @@ class HostSteps:
         for hook in self._hooks:
             hook.remove()
         self._hooked = distinct
-        self._stepped.clear()
         self._hooks = [
             *(o.register_step_pre_hook(lambda o, given, named: self._before_one(o, *given, *named.values())) for o in distinct),
             *(o.register_step_post_hook(lambda o, *_: self._after_one(o)) for o in distinct),
@@ -87,7 +86,7 @@ class HostSteps:
     @property
     def is_complete(self) -> bool:
         """True if all optimizers have stepped since the last merge."""
-        return len(self._stepped) == len(self._hooked)
+        return self._stepped.issuperset(map(id, self._hooked))
 
     def follow_by(self, params: Mapping[str, Tensor], gradients: Iterable[Grads]) -> None:
         """Set the gradients of this iteration's extra views. Warns if no optimizer has stepped on those of several iterations.

@@ -343,6 +343,13 @@ def test_an_iteration_ends_with_the_hosts_step_whatever_became_of_its_passes(set
     ends(2, steps=True, t=5)
     assert clear.attachment.t == 6
     assert clear.attachment.counts["extra views"] == 4
+    render(0).mean().backward()
+    host.optimizers["means"].step()  # it alone; then all are made anew
+    for optimizer in host.optimizers.values():
+        optimizer.zero_grad(set_to_none=set_to_none)
+    host.optimizers.update(separate(host.splats))
+    render(0)
+    assert clear.attachment.t == 7
 
 
 def test_a_step_of_sam_is_one_iteration_and_one_of_summed_views_is_several():
