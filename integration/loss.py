@@ -76,14 +76,14 @@ def joint_loss(
     _require_rows(values)
     require_leaves(params)
     _require_shots(params, lr=lr, hr=hr)
-    of_lr, of_hr = graph_of(lr.image), graph_of(hr.image) if hr is not None and hr.image.grad_fn is not None else None
+    of_lr, of_hr = graph_of(lr.image), graph_of(*(() if hr is None else [hr.image]))
     _require_detail(params.get("detail"), of_lr, of_hr)
     _require_view(conductor, view, lr=of_lr, hr=of_hr)
     _require_started(conductor)
-    with without_hooks([*of_lr.leaves, *(() if of_hr is None else of_hr.leaves)]):
+    with without_hooks([*of_lr.leaves, *of_hr.leaves]):
         lr = of_whole_image(lr) if isinstance(lr, AutogradShot) else lr
         warn = _ONCE.setdefault(conductor, Once(_log.warning))
-        to_others = _HrShot(hr, warn) if isinstance(hr, AutogradShot) and of_hr is not None else None
+        to_others = _HrShot(hr, warn) if isinstance(hr, AutogradShot) else None
         update = conductor.update(values, lr, to_others or hr, view, t)
         others = [*_others(params, lr, of_lr.leaves, update)]
     objective, λ = conductor.objective, conductor.objective.lambda_hr(t)
@@ -156,18 +156,18 @@ def _require_rows(params: Mapping[str, Tensor]) -> None:
             )
 
 
-def _require_detail(detail: Tensor | None, lr: Graph, hr: Graph | None) -> None:
+def _require_detail(detail: Tensor | None, lr: Graph, hr: Graph) -> None:
     if detail is None or not detail.requires_grad:
         return
     if lr.reaches([detail]):
         raise ValueError("lr is drawn with f_det, which renders at HR alone show. Draw it without params['detail'].")
-    if hr is not None and not hr.reaches([detail]):
+    if hr.nodes and not hr.reaches([detail]):
         raise ValueError(
             "hr is drawn without f_det, which would learn nothing. Draw it with an offset of the colours by params['detail']."
         )
 
 
-def _require_view(conductor: Conductor, view: View, **graphs: Graph | None) -> None:
+def _require_view(conductor: Conductor, view: View, **graphs: Graph) -> None:
     """Raise a ValueError for a render by another view's camera. A pose of no view is accepted: the host may optimize poses."""
 
     def with_pose(camera: Camera, views: Sequence[View]) -> list[View]:
@@ -178,7 +178,7 @@ def _require_view(conductor: Conductor, view: View, **graphs: Graph | None) -> N
         return [v for v, is_same in zip(views, same.flatten(1).all(1).tolist(), strict=True) if is_same]
 
     for name, graph in graphs.items():
-        for camera in () if graph is None else (drawn.camera for drawn in graph.drawn):
+        for camera in (drawn.camera for drawn in graph.drawn):
             if not with_pose(camera, [view]) and (drawn := with_pose(camera, conductor.views)):
                 raise ValueError(
                     f"{name} must be drawn by the camera of its view {view.name}, got that of {drawn[0].name}. Pass its view."

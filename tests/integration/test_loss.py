@@ -62,6 +62,9 @@ def test_backward_gives_the_conductors_gradient(strategies):
     for name, p in host.params.items():
         scale = float(expected[name].abs().max())
         assert torch.allclose(p.grad, 2 * expected[name], atol=1e-4 * scale, rtol=1e-3), name
+    own = {name: x.requires_grad_() for name, x in host.field.raw().items()}  # which no graph leads from
+    joint_loss(ours, own, *shots, view, 5, ScoreScaler(1e-4))[0].backward()
+    assert not [name for name, p in own.items() if not torch.equal(p.grad, expected[name])]
 
 
 def test_its_value_is_the_sum_of_the_losses_and_backward_writes_the_score_for_a_densifier():
@@ -343,6 +346,9 @@ def test_f_det_at_lr_or_not_at_hr_and_a_strategy_that_has_not_started_are_refuse
         joint_loss(conductor, host.params, host.render(view.lr.camera), hr, view, 5)
     with pytest.raises(ValueError, match="hr is drawn without f_det"):
         joint_loss(conductor, host.params, lr, host.render(view.hr.camera, detail=False), view, 5)
+    host.params["detail"].requires_grad_(False)
+    joint_loss(conductor, host.params, lr, host.render(view.hr.camera), view, 5)[0].backward()
+    assert host.params["detail"].grad is None
 
 
 def test_a_parameter_of_another_name_is_summed():
