@@ -23,7 +23,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Host:
+class Trainer:
     """A trainer whose scripts a launcher runs.
 
     Args:
@@ -38,9 +38,9 @@ class Host:
     otherwise: str
 
 
-def main(module: str, host: Host, arguments: Sequence[str] | None = None) -> int:
+def main(module: str, trainer: Trainer, arguments: Sequence[str] | None = None) -> int:
     """The program `python -m <module> [options] script [its arguments]`; returns its exit status."""
-    return run(parser(module, f"Run {host.script} with CLEAR.").parse_args(arguments), lambda: host)
+    return run(parser(module, f"Run {trainer.script} with CLEAR.").parse_args(arguments), lambda: trainer)
 
 
 def parser(module: str, description: str) -> argparse.ArgumentParser:
@@ -70,7 +70,7 @@ def parser(module: str, description: str) -> argparse.ArgumentParser:
     return made
 
 
-def run(options: argparse.Namespace, prepared: Callable[[], Host]) -> int:
+def run(options: argparse.Namespace, prepared: Callable[[], Trainer]) -> int:
     """Run the script; returns the exit status.
 
     Args:
@@ -88,15 +88,15 @@ def run(options: argparse.Namespace, prepared: Callable[[], Host]) -> int:
             replaced_attribute(sys, "argv", [str(options.script), *options.rest]),
             replaced_attribute(sys, "path", [folder, *sys.path]),
         ):
-            host = prepared()
-            with nullcontext() if settings is None else host.hook(options.save_lr, settings) as attached:
+            trainer = prepared()
+            with nullcontext() if settings is None else trainer.hook(options.save_lr, settings) as attached:
                 runpy.run_path(str(options.script), run_name="__main__")
     except ClearError as error:
         _log.error("%s", error)
         return 2
     if attached is None or any(each.attachment.counts["merges"] for each in attached):
         return 0
-    _log.error("%s trained without CLEAR: %s.", options.script, host.otherwise)
+    _log.error("%s trained without CLEAR: %s.", options.script, trainer.otherwise)
     return 1
 
 
@@ -112,8 +112,7 @@ def _settings(options: argparse.Namespace) -> Settings:
     Raises:
         SettingError: the configuration or `points` is refused, or HR is used without SR images.
     """
-    chosen = vars(options)
-    settings = Settings(**{f.name: chosen[f.name] for f in fields(Settings) if f.name in chosen})
+    settings = Settings(**{f.name: getattr(options, f.name) for f in fields(Settings)})
     if options.save_lr is None:
         settings.sr_source(settings.conductor())
     return settings

@@ -54,8 +54,8 @@ def _refuse_to_train(*_: Any) -> None:
     )
 
 
-HOST: Final = launcher.Host("gsplat's simple_trainer.py", _installed_by_cli, "no Runner was trained")
-main: Final = partial(launcher.main, "integration.gsplat", HOST)
+TRAINER: Final = launcher.Trainer("gsplat's simple_trainer.py", _installed_by_cli, "no Runner was trained")
+main: Final = partial(launcher.main, "integration.gsplat", TRAINER)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -86,12 +86,12 @@ def _installed_by_training_setup(save_lr: Path | None, settings: Settings) -> It
             _log.info("%s.", each.attachment.summary())
 
 
-HOST: Final = launcher.Host(
+TRAINER: Final = launcher.Trainer(
     "the train.py of a 3DGS-style trainer",
     _installed_by_training_setup,
     "it called no GaussianModel.training_setup, or made no step",
 )
-main: Final = functools.partial(launcher.main, "integration.inria", HOST)
+main: Final = functools.partial(launcher.main, "integration.inria", TRAINER)
 
 if __name__ == "__main__":
     sys.exit(main())

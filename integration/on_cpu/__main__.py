@@ -21,8 +21,8 @@ from typing import Any, Final
 import rasterizers
 from clear_strategies.errors import HostError
 from integration import launcher
-from integration.gsplat.__main__ import HOST as GSPLAT
-from integration.inria.__main__ import HOST as INRIA
+from integration.gsplat.__main__ import TRAINER as GSPLAT
+from integration.inria.__main__ import TRAINER as INRIA
 from integration.on_cpu import cuda, diff_gaussian_rasterization, fused_ssim, gsplat_functions
 from integration.on_cpu.simple_knn import distances_and_indices
 from integration.settings import Settings
@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return launcher.run(options, lambda: prepared(options.script, options.rest))
 
 
-def prepared(script: Path, arguments: Sequence[str] = ()) -> launcher.Host:
+def prepared(script: Path, arguments: Sequence[str] = ()) -> launcher.Trainer:
     """Replace what needs CUDA, for this script and from here on.
 
     Raises:
@@ -130,7 +130,7 @@ def _given(arguments: Sequence[str]) -> Iterator[str]:
 def _require_strategies(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Options of the strategies would do nothing without them."""
     for name in (*(f.name for f in fields(Settings)), "save_lr"):
-        if getattr(options, name, None) != parser.get_default(name):
+        if getattr(options, name) != parser.get_default(name):
             parser.error(f"--{name.replace('_', '-')} has no effect without --strategies, e.g. --strategies best.")
 
 
