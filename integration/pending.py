@@ -109,7 +109,7 @@ class BackwardPass:
             g = scaled.add_(self.before[name]) if name in self.before else scaled
             if p.grad is None:
                 p.grad = g.to(p.dtype)
-            elif p.grad.data_ptr() != g.data_ptr() or p.grad.dtype != g.dtype:
+            elif p.grad.data_ptr() != g.data_ptr():
                 p.grad.copy_(g)
 
 

@@ -65,8 +65,7 @@ def step_detail(
                 "optimizers: f_det becomes a group of the optimizer, whose learning rate scheduler exists already and counts its "
                 "groups. Make the scheduler after attach(), or attach(detail=False)."
             )
-        group = {"params": [detail], "name": _DETAIL, "lr": rates.rate}
-        only.add_param_group(group | ({"eps": DETAIL_EPS} if "eps" in only.defaults else {}))
+        only.add_param_group({"params": [detail], "name": _DETAIL, "lr": rates.rate, "eps": DETAIL_EPS})
         if not isinstance(given, torch.optim.Optimizer):
             given.setdefault(_DETAIL, only)
         return found

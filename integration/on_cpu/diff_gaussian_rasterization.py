@@ -220,7 +220,7 @@ def _sum(
         return autograd.draw(rasterizer, splats, camera, colors=colors).image[..., 0][None]
 
     shapes = inputs[:4]
-    if torch.is_grad_enabled() and any(x.requires_grad for x in shapes):
+    if any(x.requires_grad for x in shapes):
         return cast(Tensor, checkpoint(drawn, values, *shapes, use_reentrant=True, preserve_rng_state=False))
     return drawn(values, *shapes)
 
