@@ -471,6 +471,8 @@ def test_gaussians_that_are_looked_at_have_their_own_detail_feature_in_any_order
         assert torch.allclose(
             seen(host.rasterization, slice(None), stranger), seen(plain, slice(None), ours), atol=1e-6
         )
+        splats["means"][1], copies = splats["means"][0], torch.arange(20)  # a clone that no step has moved yet
+        assert torch.allclose(seen(host.rasterization, copies), seen(plain, copies, shown), atol=1e-6)
 
 
 def test_batches_of_scenes_are_looked_at_with_the_detail_feature_and_refused_as_a_photo():

@@ -276,6 +276,7 @@ def test_gaussians_that_a_host_adds_in_the_step_of_the_anchor_are_there_before_i
     host, clear, render = gsplat_host.started(SVS(anchor_start=5, anchor_strength=0.01))
     for t in range(1, 7):
         render(t % 3).mean().backward()
+        host.step()
         if t == last:
             for name, p in host.splats.items():
                 host.splats[name] = torch.nn.Parameter(p.detach()[1:], requires_grad=p.requires_grad)

@@ -119,14 +119,17 @@ def test_a_second_runner_in_one_process_trains_too(launched, tmp_path, monkeypat
     runner_class = type("Runner", (simple_trainer.Runner,), {})
     monkeypatch.setattr(simple_trainer, "rasterization", gsplat.rendering.rasterization)
     install(runner_class, sr=tmp_path / "sr", overrides=FROM_START)
-    drawn = []
+    drawn, shown = [], []
     for name in ("first", "second"):
         (tmp_path / name).mkdir()
         runner = runner_class(0, 0, 1, simple_trainer.Config(str(tmp_path / name)))
         runner.train()
         drawn.append(torch.load(tmp_path / name / "image.pt"))
         assert runner.clear.attachment.counts["merges"] == 8
+        shown.append((runner.splats, runner.splats.state_dict()["sh0"]))
     assert torch.equal(*drawn)
+    first, sh0 = shown[0]
+    assert torch.equal(first["sh0"], sh0)  # f_base + f_det, since nothing adds f_det to its pictures any more
     copied = copy.deepcopy(runner.splats)
     assert torch.equal(copied.state_dict()["sh0"], runner.splats.state_dict()["sh0"])  # f_base + f_det
     assert len(pickle.dumps(copied)) < 50_000  # without the photos

@@ -432,11 +432,14 @@ TRAINING = "    training(parser().parse_args())\n"
 
 def test_one_line_and_none_give_the_same_file(inria_host, inria_capture, inria_launched, caplog, monkeypatch):
     late, sr = "strategies.svs.anchor_start=7500", str(inria_capture / "sr")
+    for file in (inria_capture / "sr").iterdir():
+        file.rename(file.with_stem(f"{file.stem}_up"))
     script = ["--iterations", "8", "--densify_until_iter", "7", "--save"]
-    assert inria_launched(*script, inria_capture / "none", clear=["--overrides", late]) == 0
+    assert inria_launched(*script, inria_capture / "none", clear=["--overrides", late, "--suffix", "_up"]) == 0
     assert "8 merges" in caplog.text
+    assert "no effect" not in caplog.text
     assert not hasattr(inria_host.render, "__wrapped__")
-    line = f"; install(gaussians, scene, opt, overrides={[*FROM_START, late]!r}, sr={sr!r})"
+    line = f"; install(gaussians, scene, opt, overrides={[*FROM_START, late]!r}, sr={sr!r}, suffix='_up')"
     edited = inria_capture / "edited.py"
     source = (FOLDER / "train.py").read_text().replace(SETUP, SETUP + line, 1)
     edited.write_text("from integration.inria import install\n" + source)
@@ -493,9 +496,9 @@ def test_a_checkpoint_without_clear_is_refused(inria_host, inria_capture, inria_
     assert "written without CLEAR" in caplog.text
 
 
-def test_save_lr_writes_the_photos_as_they_are_trained_on_and_stops(inria_capture, inria_launched):
+def test_save_lr_writes_the_photos_as_they_are_trained_on_and_stops(inria_capture):
     with pytest.raises(SystemExit) as stopped:
-        inria_launched(clear=["--save-lr", inria_capture / "lr"])
+        main(["--save-lr", str(inria_capture / "lr"), str(FOLDER / "train.py"), "-s", str(inria_capture)])
     assert stopped.value.code == 0
     written = sorted((inria_capture / "lr").iterdir())
     assert [file.name for file in written] == [f"{view.name}.png" for view in toy.scene(N).train]

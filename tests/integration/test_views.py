@@ -15,7 +15,7 @@ from clear_strategies.errors import DataError, SettingError
 from clear_strategies.geometry.projection import intrinsics
 from integration.examples.demo import load_demo, splats_with_optimizers
 from integration.gsplat.simple_trainer import photos_of
-from integration.views import require_unique, save_photos, view
+from integration.views import save_photos, view
 from tests.helpers import gsplat_host, toy
 from tests.helpers.host_parts import as_item
 
@@ -55,8 +55,9 @@ def test_sr_images_may_overshoot_but_not_have_other_values_and_names_are_unique(
     sharp = of_host(image=1.1 * PHOTO.image - 0.03)
     assert float(sharp.lr.image.min()) >= 0
     P2G(patch=4).patch_maps(sharp)
-    with pytest.raises(DataError, match=r"0001.png: name: is that of two photos"):
-        require_unique(["0002.png", "0001.png", "0001.png"])
+    scene = toy.scene(20)
+    with pytest.raises(DataError, match="view0: name: is that of two photos"):
+        gsplat_host.started(scene=replace(scene, train=scene.train[:1] * 2))
 
 
 def test_arrays_of_numpy_are_taken_as_tensors_are():
