@@ -233,6 +233,7 @@ def test_remove_restores_the_loop(inria_host, inria_capture):
     clear = attach(attached[0], attached[1].cameras, Conductor(GCO()), sr=inria_capture / "sr", detail=False)
     clear.replace_everywhere(inria_host.render)
     clear.remove()
+    assert "clear" not in attached[0].optimizer.state_dict()
     for each in (alone, attached):
         inria_host.loop(opt, *each)
     assert torch.equal(alone[0]._xyz, attached[0]._xyz)
@@ -396,6 +397,10 @@ def test_unsupported_calls_are_refused(inria_host, inria_capture, inria_attached
     camera.image_width *= 2
     with pytest.raises(HostError, match=r"24x16 pixels, the size of its camera, got shape \(3, 16, 48\)"):
         render(camera, gaussians, None, None)
+    whole, gaussians._xyz.data = gaussians._xyz.data, gaussians._xyz.data[1:]
+    with pytest.raises(HostError, match=f"number of Gaussians from {N} to {N - 1} inside its parameters"):
+        render(camera, gaussians, None, None)
+    gaussians._xyz.data = whole
     with pytest.raises(HostError, match="attached already"):
         attach(gaussians, scene.cameras, Conductor(GCO()), sr=inria_capture / "sr")
     gaussians.optimizer = None

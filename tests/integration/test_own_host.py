@@ -107,6 +107,8 @@ def test_parameters_of_other_names_are_refused(change):
 def test_rows_that_come_from_none_and_optimizers_in_a_dict_are_refused():
     with pytest.raises(HostError, match="comes from row 39, but had 20 rows"):
         Adapter(parents=lambda: torch.arange(20) + 20).step()
+    with pytest.raises(HostError, match="says of 19 Gaussians which they come from, but has 20"):
+        Adapter(parents=lambda: torch.arange(19)).step()
     adapter = Adapter()
     with pytest.raises(TypeError, match="optimizers must be a sequence, got a dict"):
         adapter.attachment.hook({"means": torch.optim.SGD([adapter.splats["means"]])})

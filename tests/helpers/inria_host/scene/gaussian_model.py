@@ -148,6 +148,6 @@ class GaussianModel:
 class WithExposures(GaussianModel):
     """The signature of 3DGS since 2024, which keeps an exposure for each photo by its name."""
 
-    def create_from_pcd(self, pcd: BasicPointCloud, cam_infos: int, spatial_lr_scale: float):
+    def create_from_pcd(self, pcd: BasicPointCloud, cam_infos: int, spatial_lr_scale: float, degree=0, **_):
         super().create_from_pcd(pcd, spatial_lr_scale)
         self.exposed = [info.image_name for info in cam_infos]
