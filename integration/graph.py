@@ -146,6 +146,8 @@ def inputs_of(image: Tensor, graph: Graph, centres: Tensor, params: Mapping[str,
     edges = {name: inputs[name] for name in has_rows if name in of_own or probe.node not in graphs[name].nodes}
     near_first = sorted(of_own, key=lambda name: len(graphs[name].nodes))  # a network may lie between the others
     pairs = [(inputs[name], p) for name in near_first for p in own if graphs[name].reaches([p])]
+    if any(edge == edge_of(p) for edge, p in pairs):  # without the waits for the device of the test below
+        return Inputs(nodes, edges)
     return Inputs(nodes, edges) if pairs and _are_in_order(pairs) else None
 
 

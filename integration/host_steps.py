@@ -40,7 +40,7 @@ class HostSteps:
         self._before, self._begins, self._after, self._counts = before, begins, after, counts
         self._hooks: list[Any] = []
         self._hooked: list[torch.optim.Optimizer] = []
-        self._stepped: set[int] = set()  # the ids of the optimizers that have made this step
+        self._stepped: set[torch.optim.Optimizer] = set()  # in this step of the host
         self._has_merged = False  # since the last step
         self._extra: list[Grads] = []
         self._rendered: Mapping[str, Tensor] = {}  # the leaves of `_extra`
@@ -86,7 +86,7 @@ class HostSteps:
     @property
     def is_complete(self) -> bool:
         """True if all optimizers have stepped since the last merge."""
-        return self._stepped.issuperset(map(id, self._hooked))
+        return self._stepped.issuperset(self._hooked)
 
     def follow_by(self, params: Mapping[str, Tensor], gradients: Iterable[Grads]) -> None:
         """Set the gradients of this iteration's extra views. Warns if no optimizer has stepped on those of several iterations.
@@ -119,10 +119,10 @@ class HostSteps:
                 "Render and call loss.backward(), then step() without a closure."
             )
         self._before()
-        if id(optimizer) in self._stepped:
+        if optimizer in self._stepped:
             self._stepped.clear()
         begins = not self._stepped
-        self._stepped.add(id(optimizer))
+        self._stepped.add(optimizer)
         if begins:
             has_merged, self._has_merged = self._has_merged, False
             self._begins(has_merged)

@@ -185,7 +185,9 @@ def start_from_stereo(runner_class: Any) -> None:
 
     @functools.wraps(create)
     def create_from_stereo(parser: Any, *args: Any, **kwargs: Any) -> Any:
-        init_type = inspect.signature(create).bind(parser, *args, **kwargs).arguments.get("init_type", "sfm")
+        call = inspect.signature(create).bind(parser, *args, **kwargs)
+        call.apply_defaults()  # a fork may have another
+        init_type = call.arguments.get("init_type", "sfm")
         if init_type == "sfm":
             cloud = stereo_points(photos_of(dataset(parser, split="train")))
             parser = copy.copy(parser)  # other uses of its points (depths) need the original
