@@ -136,7 +136,6 @@ class SVS(Strategy):
                     if weight > 0 and name in params
                 }
             )
-            self.cache.pop("extent", None)
 
     def on_resize(self, parents: Tensor) -> None:
         if self.state:
@@ -144,10 +143,11 @@ class SVS(Strategy):
         super().on_resize(parents)
 
     def _extent(self) -> float:
-        if "extent" not in self.cache:
-            means = self.state["means"]
-            self.cache["extent"] = max(spread(means), torch.finfo(means.dtype).tiny ** 0.5)
-        return float(self.cache["extent"])
+        means = self.state["means"]
+        known: tuple[Tensor, float] | None = self.cache.get("extent")
+        if known is None or known[0] is not means:  # a checkpoint may bring another anchor
+            known = self.cache["extent"] = means, max(spread(means), torch.finfo(means.dtype).tiny ** 0.5)
+        return known[1]
 
     def _require_same_number(self, n: int) -> None:
         anchored = next(iter(self.state.values())).shape[0]

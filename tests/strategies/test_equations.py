@@ -120,7 +120,7 @@ def test_a_step_is_that_of_the_equations(fused, t, lambda_hr):
         weights.append(q * a)
     assert bool(svs.state) == (t >= 20)
     for k, anchor in svs.state.items():  # Eq. 16; positions in units of the anchor's extent
-        W = {"means": 1 / svs.cache["extent"] ** 2, "opacities": 0.1, "sh0": 0.01, "shN": 0.01}.get(k, 1.0)
+        W = {"means": 1 / svs.cache["extent"][1] ** 2, "opacities": 0.1, "sh0": 0.01, "shN": 0.01}.get(k, 1.0)
         expected[k] += 2 * 0.01 * W * (theta[k] - anchor.double().numpy())
     iterate(s, toy.RASTERIZER)
     assert 0.1 < np.mean(opposed) < 0.9
