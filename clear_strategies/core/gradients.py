@@ -167,7 +167,7 @@ def _plus_rows(
 
 def scale_rows(value: Float[Tensor, "N ..."], weight: float | Float[Tensor, " N"]) -> Float[Tensor, "N ..."]:
     """Each row times its weight."""
-    if isinstance(weight, Tensor) and weight.dim() == 1:
+    if isinstance(weight, Tensor):
         weight = weight.to(value).view(-1, *[1] * (value.dim() - 1))
     return value * weight
 

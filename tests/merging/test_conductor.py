@@ -295,9 +295,10 @@ class Misspells(Strategy):
         """A helper that resembles nothing."""
 
 
-def test_a_method_whose_name_is_nearly_that_of_a_hook_is_told(caplog):
-    Conductor(Misspells())
+def test_a_strategy_without_a_hook_is_told_and_a_method_whose_name_is_nearly_that_of_one(caplog):
+    Conductor(Misspells(), answering("weights", None)())
     assert sorted(r.getMessage() for r in caplog.records) == [
+        "Mine implements no hook; it has no effect.",
         "Misspells.on_resized() is no hook: nothing calls it. There is on_resize().",
         "Misspells.regularise() is no hook: nothing calls it. There is regularize().",
     ]
@@ -337,14 +338,17 @@ class LogsShare(Strategy):
 
     def regularize(self, params, t):
         self.log("share", self.share)
+        return {"means": self.share * params["means"]}
 
 
-def test_what_two_strategies_of_one_class_log_is_both_there():
+def test_what_two_strategies_of_one_class_log_and_add_is_both_there():
     conductor = Conductor(LogsShare(0.25), LogsShare(0.5))
-    conductor.regularized({}, 1)
+    assert conductor.regularized({"means": torch.tensor([[4.0, 0, 0]])}, 1)["means"].tolist() == [[3, 0, 0]]
     assert computed(conductor.logs.scalars()) == {"share": 0.25, "LogsShare2.share": 0.5}
     with pytest.raises(AnswerError, match="a strategy logs 'share', a column that the row has already"):
         conductor.logs.scalars({"t", "share"})  # else it would take the place of a loss, say
+    with pytest.raises(AnswerError, match=r"LogsShare.log\('share', …\) takes one number, got a tensor \[2\]"):
+        LogsShare(torch.ones(2)).regularize({}, 1)
 
 
 def test_a_parameter_that_is_replaced_in_place_of_changed_is_refused():
@@ -831,9 +835,11 @@ def test_tensors_of_the_run_have_any_shape_stay_when_the_structure_changes_and_a
     first.strategies[0].run_state.update(none=torch.zeros(0), nothing=torch.zeros(0, 3))
     first.on_resize(torch.arange(2))
     first.after_step({"means": torch.zeros(30, 3)}, toy.step())
+    second.strategies[0].state["of another"] = second.strategies[0].run_state["of another"] = torch.zeros(2)
     second.load_state_dict(first.state_dict())
     assert torch.equal(second.strategies[0].run_state["gain"], kept)
     assert not second.strategies[0].state
+    assert "of another" not in second.strategies[0].run_state
     first.on_fit_start(1, 0)
     assert not first.strategies[0].run_state
 
@@ -858,6 +864,12 @@ def test_a_strategy_draws_raw_parameters_as_the_run_does_and_gets_their_gradient
         gradients = torch.autograd.grad(found.image, [leaves[name] for name in names], cotangent)
         for name, gradient in zip(names, gradients, strict=True):
             torch.testing.assert_close(gradient, expected[name], rtol=1e-4, atol=1e-6)
+    state.conductor.on_fit_end()
+    assert not state.conductor.views
+    leaves = state.field.raw()
+    assert torch.equal(
+        strategy.splats(leaves).scales, leaves["scales"].exp()
+    )  # without the field, whose memory is free
 
 
 def test_a_host_activates_raw_parameters_by_exp_and_sigmoid():

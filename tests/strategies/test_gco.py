@@ -114,6 +114,7 @@ def test_zero_gradients_are_no_conflict_and_what_could_correct_nothing_is_refuse
         assert torch.equal(result[0], h)
         assert result.isfinite().all()
     g = torch.ones(2, 3)
+    assert [GCO().correct({}, {"means": g}), GCO().correct({"means": g}, {})] == [{"means": g}, {}]
     with pytest.raises(ValueError, match=r"groups means, .* are compared, .* lr has _xyz, hr has _xyz\. Name them so"):
         GCO().correct({"_xyz": g}, {"_xyz": -g})
 
