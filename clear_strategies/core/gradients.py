@@ -38,12 +38,11 @@ class Colour(NamedTuple):
 class Grads(dict[str, Tensor]):
     """attribute -> gradient [N, …] of one loss, with + and * by a number or by one number per Gaussian [N].
 
-    An absent attribute has gradient 0.
+    An absent attribute has gradient 0. Arithmetic is by name alone: its results have neither `colour` nor `screen`.
 
     Attributes:
         colour: the gradient of sh0 and shN as factors, in addition to what they have by name; None: there is none.
-        screen: the gradient of the projected centre [N, 2], 1/pixel; arithmetic drops it, since it is a statistic and not the
-            gradient of a parameter.
+        screen: the gradient of the projected centre [N, 2], 1/pixel; a statistic, not the gradient of a parameter.
     """
 
     screen: Float[Tensor, "N 2"] | None
@@ -64,21 +63,10 @@ class Grads(dict[str, Tensor]):
         return self.plus(other, 1.0)
 
     def plus(self, other: Mapping[str, Tensor], weight: float | Float[Tensor, " N"]) -> Grads:
-        """The sum with another, each of whose rows counts `weight` times.
-
-        Raises:
-            ValueError: both have `colour`, of two cameras.
-        """
-        total = Grads(self, colour=self.colour)
+        """The sum with another, each of whose rows counts `weight` times."""
+        total = Grads(self)
         for name, value in other.items():
             total[name] = _plus_rows(total[name], value, weight) if name in total else scale_rows(value, weight)
-        added = other.colour if isinstance(other, Grads) else None
-        if added is not None and total.colour is not None:
-            if total.colour.basis is not added.basis:
-                raise ValueError("colours that two cameras drew are not summed by their factors.")
-            total.colour = Colour(_plus_rows(total.colour.rgb, added.rgb, weight), added.basis)
-        elif added is not None:
-            total.colour = Colour(scale_rows(added.rgb, weight), added.basis)
         return total
 
     def __mul__(self, weight: float | Float[Tensor, " N"]) -> Grads:
