@@ -375,12 +375,8 @@ def _vjp(
 def _require_size(view: View, scale: Scale, render: Tensor) -> None:
     image = (view.lr if scale == "lr" else view.hr).image
     if render.shape != image.shape:
-        (h, w, *_), (height, width, *_) = render.shape, image.shape
-        rule = f"must have the {width}x{height} pixels of its {scale.upper()} image"
-        found = f"{w}x{h}" if render.shape[2:] == image.shape[2:] else f"the shape {[*render.shape]}"
-        raise ValueError(
-            f"view {view.name}: the {scale.upper()} rendering {rule}, got {found}. Draw it by view.{scale}.camera."
-        )
+        rule = f"the {scale.upper()} rendering must have the shape {[*image.shape]} of its {scale.upper()} image"
+        raise ValueError(f"view {view.name}: {rule}, got {[*render.shape]}. Draw it by view.{scale}.camera.")
 
 
 def _where(view: View, t: int) -> str:

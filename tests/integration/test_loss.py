@@ -314,7 +314,7 @@ def test_what_is_no_rendering_of_the_parameters_is_refused():
         frozen = host.render(view.hr.camera)
     with pytest.raises(HostError, match=r"hr must be drawn with gradients: leave torch\.no_grad\(\)"):
         joint(host.params, lr, frozen)
-    with pytest.raises(ValueError, match=r"must have the 24x16 pixels of its LR image, got the shape \[16, 24, 4\]"):
+    with pytest.raises(ValueError, match=r"must have the shape \[16, 24, 3\] of its LR image, got \[16, 24, 4\]"):
         joint(host.params, replace(lr, image=torch.cat((lr.image, lr.image[..., :1]), -1)), hr)
 
 
@@ -373,7 +373,9 @@ def test_a_parameter_of_another_name_is_summed():
 
 def test_a_rendering_of_another_size_is_refused():
     host, conductor, view, small, _ = drawn()
-    with pytest.raises(ValueError, match=r"view view0: the HR rendering must have the 96x64 .*, got 24x16"):
+    with pytest.raises(
+        ValueError, match=r"view view0: the HR rendering must have the shape \[64, 96, 3\] .*, got \[16, 24, 3\]"
+    ):
         joint_loss(conductor, host.params, small, host.render(view.lr.camera), view, 5)
 
 
