@@ -5,6 +5,7 @@ import inspect
 import pickle
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -341,12 +342,17 @@ class LogsShare(Strategy):
         return {"means": self.share * params["means"]}
 
 
-def test_what_two_strategies_of_one_class_log_and_add_is_both_there():
-    conductor = Conductor(LogsShare(0.25), LogsShare(0.5))
-    assert conductor.regularized({"means": torch.tensor([[4.0, 0, 0]])}, 1)["means"].tolist() == [[3, 0, 0]]
+def test_what_two_strategies_of_one_class_log_and_add_is_both_there_until_the_next_iteration():
+    conductor, params = Conductor(LogsShare(0.25), LogsShare(0.5)), {"means": torch.tensor([[4.0, 0, 0]])}
+    assert conductor.regularized(params, 1)["means"].tolist() == [[3, 0, 0]]
+    conductor.logs.keep()
+    assert not conductor.logs.scalars(since_kept=True)
     assert computed(conductor.logs.scalars()) == {"share": 0.25, "LogsShare2.share": 0.5}
     with pytest.raises(AnswerError, match="a strategy logs 'share', a column that the row has already"):
         conductor.logs.scalars({"t", "share"})  # else it would take the place of a loss, say
+    conductor.regularized(params, 1)
+    conductor.logs.forget()
+    assert not conductor.logs.scalars()
     with pytest.raises(AnswerError, match=r"LogsShare.log\('share', …\) takes one number, got a tensor \[2\]"):
         LogsShare(torch.ones(2)).regularize({}, 1)
 
@@ -661,11 +667,15 @@ def test_a_scale_that_the_objective_needs_is_asked_for_and_hr_only_while_it_has_
         Conductor(objective=Objective(lr_from="hr")).update(field.raw(), lr, None, view, 5)
     with pytest.raises(ValueError, match="needs the LR scale"):
         Conductor().update(field.raw(), None, hr, view, 5)
+    facts = {name: getattr(lr, name) for name in ("image", "means2d", "visible")}
+    with pytest.raises(ValueError, match=r"must set .screen on every Grads"):
+        Conductor().update(field.raw(), SimpleNamespace(**facts, vjp=lambda c: [*map(Grads, lr.vjp(c))]), None, view, 5)
     with pytest.raises(ValueError, match="L_base must act from the first iteration"):
         Objective(lambda_lr=0.0)
     objective = Objective(lambda_hr=WarmupDecay(start=10, full=20, decay_from=30, end=40))
     plain = Conductor(objective=objective, statistics_from=5)
     assert [plain.wants_hr(t) for t in (5, 6, 10, 11)] == [False, False, False, True]
+    assert plain.work_log.entries["render LR + HR"].skipped == {"lambda_HR = 0": 3}
     scoring = Conductor(P2G(), objective=objective, statistics_from=5)
     assert [scoring.wants_hr(t) for t in (5, 6, 10, 11)] == [False, True, True, True]
     never = Conductor(objective=Objective(lambda_hr=WarmupDecay(peak=0, final=0)))
@@ -715,8 +725,9 @@ def test_conflict_is_measured_before_correction_and_what_was_logged_belongs_to_i
     assert 0 < max(plain.values()) < 1
     field, view, lr, hr = drawn
     conductor = Conductor(P2G(), objective=Objective(lambda_hr=ALWAYS))
-    assert "mean_q" in conductor.update(field.raw(), lr, hr, view, 5).logs
+    assert {"mean_q", "mean_w"} <= conductor.update(field.raw(), lr, hr, view, 5).logs.keys()
     assert not conductor.update(field.raw(), lr, None, view, 6).logs
+    assert conductor.work_log.entries["backward HR"].skipped == {"HR was not drawn": 1}
 
 
 def test_two_strategies_of_one_class_keep_their_states_apart():

@@ -46,8 +46,12 @@ def test_without_evidence_it_says_once_that_lr_prevails(caplog):
     for t in (1, 2):
         left = gco.correct(lr, hr, toy.step(t))["means"][:, 0] / hr["means"][:, 0]
         assert left.tolist() == pytest.approx([0.2875, 0.2875], rel=1e-6)
-    (message,) = caplog.messages
-    assert "GCO corrects without evidence" in message
+        GCO(groups=["sh0"]).correct(lr, hr)
+    without, *others = caplog.messages
+    assert "GCO corrects without evidence" in without
+    assert ["compares sh0, and both scales have a gradient of means alone" in message for message in others] == [
+        True
+    ] * 2
 
 
 def by_the_equations(lr: Grads, hr: Grads, group: str, q: Tensor, s: GCO) -> tuple[Tensor, Tensor, Tensor]:

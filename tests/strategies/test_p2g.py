@@ -40,6 +40,9 @@ def test_a_relative_scale_counts_in_the_views_own_disagreement_and_eight_bit_uni
     hr[:, :64] += 0.05
     relative, absolute = (P2G(r, down="area").patch_evidence(lr, hr, 4)[0] for r in ("relative:2", 0.05))
     assert torch.allclose(relative, absolute, rtol=1e-5)
+    assert P2G().patch_evidence(lr, hr, 4, disagreement=torch.zeros_like(lr))[0].tolist() == [
+        [1, 1]
+    ]  # as measured before
     for low, high in ((0.0, 255.0), (-0.002, 1.0), (0.0, 1.002)):
         with pytest.raises(ValueError, match=r"I_HR must lie in \[0, 1\]"):
             P2G().patch_evidence(lr, torch.linspace(low, high, 64 * 128 * 3).view(64, 128, 3), 4)

@@ -76,6 +76,10 @@ def test_a_skip_that_cannot_act_is_logged_and_not_in_the_plan(caplog):
     assert not caplog.records
     odd = replace(view, hr=view.hr.reduced(4))  # by a factor of 1
     assert SkipPolicy(skips).descriptions([odd]) == [window]
+    faint = SkipPolicy(Skips(undrawn=0.1))
+    assert [faint.descriptions([odd], in_host=host) for host in (False, True)] == [
+        ["Gaussians too faint to be drawn, once densification has ended"], [],
+    ]  # fmt: skip
     assert SkipPolicy(scaled(skips, 0.03)).descriptions([odd] * 10) == []
     logged = {record.getMessage().partition(" ")[0]: record.levelname for record in caplog.records}
     assert logged == {"skips.coarse_until": "WARNING", "skips.plateau_gain": "DEBUG"}  # the latter is every short run's
