@@ -518,18 +518,6 @@ def test_settings_of_taken_names_are_refused():
         type("Mine", (Strategy,), {"__annotations__": {"seed": int}})
 
 
-def test_a_setting_may_be_called_begin():
-    class Late(Strategy):
-        begin = 500
-
-        def may_densify(self, t):
-            return t > self.begin
-
-    conductor = Conductor(Late())
-    conductor.on_fit_start(1, 0)
-    assert conductor.may_densify(501)
-
-
 def test_a_plain_mapping_is_an_answer_of_correct_and_of_regularize():
     made = [answering("correct", lambda lr, hr, step: {name: g * 0.5 for name, g in hr.items()}),
             answering("regularize", lambda params, t: {"means": 0.1 * params["means"]})]  # fmt: skip
@@ -731,19 +719,9 @@ def test_conflict_is_measured_before_correction_and_what_was_logged_belongs_to_i
 
 
 def test_two_strategies_of_one_class_keep_their_states_apart():
-    @dataclass(frozen=True)
-    class Remember(Strategy):
-        value: float = 0.0
-
-        def regularize(self, params, t):
-            return None
-
-        def after_step(self, params, step):
-            self.state["kept"] = torch.full((3,), self.value)
-
-    first = Conductor(Remember(1.0), Remember(2.0))
-    first.after_step({}, toy.step())
-    second = Conductor(Remember(1.0), Remember(2.0))
+    first, second = (Conductor(LogsShare(1.0), LogsShare(2.0)) for _ in range(2))
+    for s in first.strategies:
+        s.state["kept"] = torch.full((3,), s.share)
     second.load_state_dict(first.state_dict())
     assert [s.state["kept"][0].item() for s in second.strategies] == [1.0, 2.0]
 
