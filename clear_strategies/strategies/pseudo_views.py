@@ -100,8 +100,6 @@ class PseudoViews(Strategy):
         )
 
     def _moved_aside(self, views: Sequence[View], photos: dict[str, Photo]) -> list[Callable[[], Photo]]:
-        if len(photos) < 2:
-            return []
         return pseudo_views(
             photos,
             {name: depth.to(self.device) for name, depth in _depths(views).items()},

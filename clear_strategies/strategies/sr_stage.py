@@ -11,7 +11,6 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -76,13 +75,11 @@ class SRStage(Strategy):
         views: Sequence[View] = self.cache["views"]
         photos = [view.hr for view in views] if t % 2 or not self.count else self.cache["pictures"]
         photo: Photo = one_of(photos, hashed_generator_at(self.seed, t))
-        weight = torch.full_like(photo.image[..., 0], self.weight)
-        weight = weight if photo.shown is None else weight * photo.shown
+        weight = self.weight * photo.visible.to(photo.image)
         return (ExtraView(photo, weight, views[0].background, robust=True),)
 
     def on_fit_end(self) -> None:
-        for name in ("views", "pictures"):
-            self.cache.pop(name, None)
+        self.cache.clear()
 
     def summary(self) -> str | None:
         if not self.cache.get("views"):

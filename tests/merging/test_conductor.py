@@ -343,7 +343,7 @@ class LogsShare(Strategy):
 
 
 def test_what_two_strategies_of_one_class_log_and_add_is_both_there_until_the_next_iteration():
-    conductor, params = Conductor(LogsShare(0.25), LogsShare(0.5)), {"means": torch.tensor([[4.0, 0, 0]])}
+    conductor, params = Conductor(LogsShare(0.25), LogsShare(torch.tensor(0.5))), {"means": torch.tensor([[4.0, 0, 0]])}
     assert conductor.regularized(params, 1)["means"].tolist() == [[3, 0, 0]]
     conductor.logs.keep()
     assert not conductor.logs.scalars(since_kept=True)

@@ -76,6 +76,8 @@ def test_sr_images_and_enlarged_pictures_of_the_first_stage_come_in_turn(caplog)
         assert extra.robust
         assert (id(extra.photo) in of_photos) == bool(t % 2)
         assert extra.photo.camera.width == SCENE.train[0].hr.camera.width
+    Conductor(stage).on_fit_end()
+    assert not stage.extra_views(15)
     assert not caplog.records
     with caplog.at_level(logging.WARNING):
         staged(SRStage(start=4, count=5)).draw(9, SCENE.cloud.means, enlarged)
