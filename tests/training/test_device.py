@@ -136,7 +136,7 @@ def steadily(state: TrainState) -> None:
     for t in STEADY:
         for s in state.conductor.strategies:
             if isinstance(s, SVS):
-                s.cache["extent"] = 1.0  # of the anchor, read once
+                s.cache["extent"] = s.state.get("means"), 1.0  # of the anchor, read once
         state.t = t
         with Crossings() as crossings, Written() as written:
             iterate(state, Blank())
