@@ -134,6 +134,8 @@ class Hooks:
         s = self._answering["gate"]
         z = s.gate(t, n)
         if z is None:
+            if self.owner("gate") is not None:
+                self.work_log.skip("gate", "no Gaussian is dropped at this rate")
             return None
         shape, scales = ((n,), "") if s.shares_gate else ((2, n), ", a row for LR and one for HR,")
         if not is_real(z, shape):
@@ -167,12 +169,13 @@ class Hooks:
         """The step with the evidence q, a, w of the HR render.  Eq. 9, 10"""
         s = self._answering["observe"]
         e, n = s.observe(step, hr), len(hr.visible)
-        if e is not None:
-            if not isinstance(e, Evidence):
-                refuse(s, "observe", "an Evidence or None", e)
-            for name in ("reliability", "demand"):
-                if not is_real(getattr(e, name), (n,)):
-                    refuse(s, "observe", f"an Evidence whose {name} is a tensor [{n}]", getattr(e, name))
+        if e is None:
+            return replace(step, evidence=None)
+        if not isinstance(e, Evidence):
+            refuse(s, "observe", "an Evidence or None", e)
+        for name in ("reliability", "demand"):
+            if not is_real(getattr(e, name), (n,)):
+                refuse(s, "observe", f"an Evidence whose {name} is a tensor [{n}]", getattr(e, name))
         return replace(step, evidence=e)
 
     def route(self, step: Step, n: int) -> float | Float[Tensor, " N"]:
@@ -232,9 +235,11 @@ class Hooks:
         total = Grads()
         for s in self.regularizers:
             answer = s.regularize(params, iteration(t))
-            if answer is not None:
-                g = rows_like(s, "regularize", answer, params, "of the parameters", finite=finite)
-                total = total + g if total else g
+            if answer is None:
+                self.work_log.skip("regularize", "it adds nothing yet")
+                continue
+            g = rows_like(s, "regularize", answer, params, "of the parameters", finite=finite)
+            total = g if not total else total + g
         return total
 
     @apart_from_the_loop

@@ -69,10 +69,11 @@ class SplatSuRe(Strategy):
 
     def reconcile(self, products: Products, step: Step | None) -> Weights:
         """W g_HR."""
-        if step is None or step.visible is None or not self.state:
+        if step is None or not self.state:
             return Weights()
         w = self.weight(step.view.name)
-        self.log("mean_hr_weight", deferred.mean(w, step.visible))
+        if step.visible is not None:
+            self.log("mean_hr_weight", deferred.mean(w, step.visible))
         return Weights(keep=w)
 
     def weight(self, name: str) -> Float[Tensor, " N"]:

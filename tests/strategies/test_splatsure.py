@@ -77,6 +77,15 @@ def test_a_rate_is_that_of_the_last_iteration_that_showed_the_gaussian_before_th
     assert s.state["a"].tolist() == [0.0, 2.0]
 
 
+def test_the_weights_follow_their_gaussians():
+    s = started()
+    for name, distance in (("a", 1.0), ("b", 2.0), ("c", 4.0)):
+        visit(s, name, distance, [True, name != "b"])
+    before = s.weight("c")
+    s.on_resize(torch.tensor([1, 0, 0]))
+    assert torch.equal(s.weight("c"), before[[1, 0, 0]])
+
+
 def test_two_views_are_warned_of(caplog):
     started(3)
     assert not caplog.text
