@@ -28,10 +28,11 @@ def current_pass() -> int:
 
 
 def when_pass_ends(call: Callable[[], None]) -> None:
-    """Have the running backward pass call this once, after all of its gradients and before `backward()` returns, as torch's
-    DistributedDataParallel does. A pass that fails does not call it.
+    """Have the running backward pass call this once, after all of its gradients and what others have it call, and before
+    `backward()` returns: DistributedDataParallel then writes `.grad`. A pass that fails does not call it.
     """
-    torch.autograd.Variable._execution_engine.queue_callback(call)
+    queue = torch.autograd.Variable._execution_engine.queue_callback
+    queue(lambda: queue(call))
 
 
 def accumulator(leaf: Tensor) -> Any:

@@ -4,10 +4,13 @@ import re
 from contextlib import nullcontext
 
 import pytest
+import torch
+from torch.nn.parallel import DistributedDataParallel
 
+from clear_strategies.core.gradients import PARAMETERS
 from integration import HostError
 from tests.helpers.backends import needs
-from tests.helpers.loops import Loop, Running, of_any_two_parts, ordinary_but_for_one
+from tests.helpers.loops import PASSES, Loop, Running, of_any_two_parts, ordinary_but_for_one
 
 pytestmark = needs("cpp")
 STEPS = 2
@@ -46,3 +49,31 @@ def test_loops_in_which_any_two_parts_meet(fourth, caplog):
     for loop in of_any_two_parts()[fourth::4]:
         caplog.clear()
         require_right(loop, caplog)
+
+
+class Given(torch.nn.Module):
+    """A model that returns what it gets."""
+
+    def __init__(self, parameters):
+        super().__init__()
+        self.own = torch.nn.ParameterList(parameters)
+
+    def forward(self, loss):
+        return loss
+
+
+@pytest.mark.parametrize("as_view", [False, True])
+def test_what_data_parallel_writes_when_a_pass_ends_is_merged(as_view, tmp_path, monkeypatch):
+    torch.distributed.init_process_group("gloo", init_method=f"file://{tmp_path}/group", rank=0, world_size=1)
+    try:
+        running = Running(Loop(zeros=as_view))
+        own = [running.splats[name] for name in PARAMETERS]
+        parallel = DistributedDataParallel(Given(own), gradient_as_bucket_view=as_view)
+        monkeypatch.setitem(
+            PASSES, "one", lambda loss, p: (parallel(loss) if p["means"] is own[0] else loss).backward()
+        )
+        for number in range(STEPS):
+            running.step(number)
+        running.clear.remove()
+    finally:
+        torch.distributed.destroy_process_group()

@@ -37,6 +37,17 @@ def test_a_pass_calls_once_at_its_end_before_backward_returns():
     assert seen == [[2.0] * 3]
 
 
+def test_a_pass_calls_what_this_package_asks_for_after_what_others_ask_for():
+    seen = []
+
+    def ask():
+        of_torch.when_pass_ends(lambda: seen.append("this package"))
+        torch.autograd.Variable._execution_engine.queue_callback(lambda: seen.append("others"))
+
+    in_a_pass(ask)
+    assert seen == ["others", "this package"]
+
+
 @pytest.mark.parametrize(
     ("register", "hooks"),
     [
