@@ -19,6 +19,7 @@ from integration.graph import (
     Edge,
     Graph,
     Inputs,
+    copied_to,
     edge_of,
     graph_of,
     has_gradient,
@@ -221,18 +222,19 @@ def at_inputs(shot: AutogradShot, warn: Callable[..., None]) -> AutogradShot:
     if (shot := of_whole_image(shot)).inputs is not None:
         return shot
     graph, centres = graph_of(shot.image), shot.gradient_slot.tensor
-    known = {*map(id, shot.params.values()), *map(id, graph_of(centres).leaves)}
+    known = {*map(id, shot.params.values()), *map(id, copied_to(centres))}
 
-    def others(behind: Graph) -> list[str]:
-        return [f"{leaf.dtype} {[*leaf.shape]}" for leaf in behind.leaves if id(leaf) not in known]
+    def others(behind: Graph) -> list[Tensor]:
+        return [leaf for leaf in behind.leaves if id(leaf) not in known]
 
     if not (found := others(graph)):
         return shot
-    if (inputs := inputs_of(shot.image, graph, centres, shot.params)) is None:
+    if (inputs := inputs_of(shot.image, graph, centres, shot.params, found)) is None:
+        names = [f"{leaf.dtype} {[*leaf.shape]}" for leaf in found[:3]]
         warn(
             "the loop trains %d tensors beside the Gaussians (%s), which learn from LR alone: the inputs of the rasterizer were "
             "not found, or their rows are not those of the parameters. Name them by AutogradShot(drawn=…).",
-            len(found), ", ".join(found[:3]),
+            len(found), ", ".join(names),
         )  # fmt: skip
         return shot
     return replace(shot, found=inputs) if others(graph_of(*inputs.edges.values())) else shot

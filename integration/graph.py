@@ -110,13 +110,23 @@ class Inputs:
             yield found
 
 
-def inputs_of(image: Tensor, graph: Graph, centres: Tensor, params: Mapping[str, Tensor]) -> Inputs | None:
+def copied_to(centres: Tensor) -> list[Tensor]:
+    """The leaf whose copy a tensor is, as hosts make one for the screen gradient (`torch.zeros(n, 3, requires_grad=True) + 0`);
+    itself if it is a leaf. No optimizer steps it, unlike other leaves from which centres are computed.
+    """
+    leaves = graph_of(centres).leaves
+    return [x for x in leaves if x.shape == centres.shape and torch.equal(x.to(centres), centres)]
+
+
+def inputs_of(
+    image: Tensor, graph: Graph, centres: Tensor, params: Mapping[str, Tensor], others: Iterable[Tensor]
+) -> Inputs | None:  # fmt: skip
     """The inputs of the rasterizer that drew `image`; None: it is no single node, or its rows are not those of the parameters.
 
     Args:
         graph: of the image.
         centres: through which it passes the screen gradient.
-        params: raw parameters by gsplat's names, with N rows.
+        params: raw parameters by gsplat's names, with N rows. others: leaves that are trained beside them.
     """
     if not centres.requires_grad or not image.requires_grad:
         return None
@@ -143,7 +153,9 @@ def inputs_of(image: Tensor, graph: Graph, centres: Tensor, params: Mapping[str,
     has_rows = {name for name, edge in inputs.items() if of_gradient(edge)[0][:1] == (n,)}
     if of_own - has_rows or any(not found.nodes.isdisjoint(nodes) for found in graphs.values()):
         return None
-    edges = {name: inputs[name] for name in has_rows if name in of_own or probe.node not in graphs[name].nodes}
+    edges = {name: inputs[name] for name in has_rows if name in of_own or graphs[name].reaches(others)}
+    if reaches(image, graph_of(*edges.values()).leaves, before=nodes):  # beside the rasterizer, too
+        return None
     near_first = sorted(of_own, key=lambda name: len(graphs[name].nodes))  # a network may lie between the others
     pairs = [(inputs[name], p) for name in near_first for p in own if graphs[name].reaches([p])]
     if any(edge == edge_of(p) for edge, p in pairs):  # without the waits for the device of the test below

@@ -211,6 +211,45 @@ def test_what_reaches_the_colours_and_the_rasterizer_counts_once(found):
         torch.testing.assert_close(leaf.grad, g, rtol=1e-4, atol=1e-4 * float(g.abs().max()))
 
 
+@pytest.mark.parametrize("frozen", [False, True])
+def test_what_moves_the_means_also_learns_from_hr_where_a_rasterizer_takes_centres_that_are_computed_from_them(frozen):
+    host, conductor, view, *_ = drawn()
+    shift = torch.zeros(1, 3, requires_grad=True)
+    host.params["means"].requires_grad_(not frozen)
+
+    def render(camera, detail=None):
+        p, means = host.params, host.params["means"] + shift
+        splats = Splats(means, p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"], detail)
+        shot = autograd.draw(toy.RASTERIZER, splats, camera, means[:, :2] * 1)
+        return AutogradShot(shot.image, shot.means2d, shot.visible, p)
+
+    lr, hr = render(view.lr.camera), render(view.hr.camera, host.params["detail"])
+    joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
+    objective = conductor.objective
+    (of_lr,) = objective.lr(lr.image.detach(), view.lr.image, None).cotangents
+    base, hf = objective.hr(hr.image.detach(), view.hr.image, None).cotangents
+    (expected,) = torch.autograd.grad(lr.image, shift, of_lr)
+    (of_hr,) = torch.autograd.grad(hr.image, shift, base + objective.lambda_hf * hf)
+    torch.testing.assert_close(shift.grad, expected + objective.lambda_hr(5) * of_hr)
+
+
+def test_a_tensor_that_reaches_the_rasterizer_and_its_image_learns_from_lr_alone_and_a_warning_tells(caplog):
+    host, conductor, view, *_ = drawn()
+    gain = torch.ones(1, requires_grad=True)
+
+    def render(camera, detail=None):
+        p, colours = host.params, host.params["sh0"] * gain
+        splats = Splats(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), colours, p["shN"], detail)
+        shot = autograd.draw(toy.RASTERIZER, splats, camera)
+        return AutogradShot(shot.image * gain, shot.means2d, shot.visible, p)
+
+    lr, hr = render(view.lr.camera), render(view.hr.camera, host.params["detail"])
+    joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
+    (of_lr,) = conductor.objective.lr(lr.image.detach(), view.lr.image, None).cotangents
+    torch.testing.assert_close(gain.grad, torch.autograd.grad(lr.image, gain, of_lr)[0])
+    assert "learn from LR alone" in caplog.text
+
+
 def test_f_det_may_be_named_beside_the_colours_that_are_computed_from_it():
     host, view = Host(scene := toy.scene(20)), scene.train[0]
     conductor = Conductor(objective=HR_FROM_START)
