@@ -37,11 +37,13 @@ from integration.graph import Graph, graph_of, require_apart, require_in_order, 
 from integration.host import require_leaves
 from integration.views import SAME_POSE, require_intrinsics
 from rasterizers.interface import Camera
+from rasterizers.modes import uncompiled
 
 _log = logging.getLogger(__name__)
 _ONCE: Final = WeakKeyDictionary[Conductor, Once]()
 
 
+@uncompiled
 def joint_loss(
     conductor: Conductor,
     params: Mapping[str, Tensor],

@@ -250,6 +250,12 @@ def test_a_tensor_that_reaches_the_rasterizer_and_its_image_learns_from_lr_alone
     assert "learn from LR alone" in caplog.text
 
 
+def test_a_compiled_loop_calls_the_loss_outside_of_its_graph(recwarn):
+    host, conductor, view, lr, hr = drawn(GCO())
+    torch.compile(lambda: 2 * joint_loss(conductor, host.params, lr, hr, view, 5)[0], backend="eager")().backward()
+    assert not [warning for warning in recwarn if "ynamo" in str(warning.message)]
+
+
 def test_f_det_may_be_named_beside_the_colours_that_are_computed_from_it():
     host, view = Host(scene := toy.scene(20)), scene.train[0]
     conductor = Conductor(objective=HR_FROM_START)
