@@ -12,7 +12,7 @@ import rasterizers
 from rasterizers import BackendUnavailable, Camera, Rasterizer, RasterSettings, Rendering, Splats, Traits, autograd
 from rasterizers.gsplat_backend import GsplatRasterizer
 from rasterizers.reference import ReferenceRasterizer
-from rasterizers.testing import CHECKS, check_gradients_are_finite_differences, check_rasterizer, scene
+from rasterizers.testing import CHECKS, ContractError, check_gradients_are_finite_differences, check_rasterizer, scene
 from tests.helpers.backends import camera
 
 
@@ -49,6 +49,14 @@ class NeedsAutograd(ThirdParty):
         return ThirdParty.__call__(self, splats, camera, depth=depth)
 
 
+class Softer(ThirdParty):
+    """Draws other images than the reference, with the right gradients."""
+
+    @property
+    def inner(self) -> ReferenceRasterizer:
+        return replace(ThirdParty.inner.fget(self), kernel=self.kernel + 1)
+
+
 class Flat:
     """Draws no depth, and has no argument for it."""
 
@@ -81,6 +89,12 @@ def test_third_parties_rasterizers_pass_the_checks_and_are_refused_where_depth_i
     assert autograd.draw(Flat(), splats, camera).depth is None
     with pytest.raises(ValueError, match=r"Flat draws no depth \(its traits\.depth is False\)"):
         autograd.draw(Flat(), splats, camera, depth=True)
+
+
+def test_a_rasterizer_of_other_images_is_checked_without_the_reference():
+    check_rasterizer(Softer, reference=False)
+    with pytest.raises(ContractError, match=r"off|relative error"):
+        check_rasterizer(Softer)
 
 
 stand_in = functools.partial(GsplatRasterizer, rasterization=functools.partial(autograd.rasterization, backend="torch"))
