@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -16,12 +16,13 @@ from clear_strategies.core.checks import require_choice, require_number, require
 from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import Shot
 from clear_strategies.core.seeds import generator_at
+from clear_strategies.core.view import View
 from clear_strategies.density.threshold import count_passing, topk_mask
 from clear_strategies.errors import DensityError
 from clear_strategies.kernels import per_gaussian
 from clear_strategies.merging.iteration import Update
 from clear_strategies.schedules import milestone
-from clear_strategies.training.densifier import Densifier
+from clear_strategies.training.densifier import Densifier, cameras_extent
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.optim import Adam
 from rasterizers.geometry import rotation_matrix
@@ -86,10 +87,8 @@ class DensitySettings:
         """`every`, or less where the window would not hold 10 rounds."""
         return max(1, min(self.every, (self.stop - self.start) // _FEWEST_ROUNDS))
 
-    def densifier(
-        self, n: int, *, extent: float, seed: int, white_background: bool, device: torch.device | str = "cpu"
-    ) -> Density:
-        return Density(self, n, extent=extent, seed=seed, white_background=white_background, device=device)
+    def densifier(self, field: GaussianField, views: Sequence[View], seed: int) -> Density:
+        return Density.of(self, field, views, seed)
 
 
 class Density(Densifier):
@@ -116,6 +115,12 @@ class Density(Densifier):
         self.extent, self.seed, self.white_background = extent, seed, white_background
         self.score, self.ordinary, self.count = (torch.zeros(n, device=device) for _ in range(3))
         self.cap, self._warned_of_cap = settings.max_gaussians, False
+
+    @classmethod
+    def of(cls, settings: DensitySettings, field: GaussianField, views: Sequence[View], seed: int) -> Density:
+        """For the training of a field on these views."""
+        extent, white = cameras_extent(views), all(c == 1.0 for c in views[0].background)
+        return cls(settings, len(field), extent=extent, seed=seed, white_background=white, device=field.means.device)
 
     def collects(self, t: int) -> bool:
         return self.settings.statistics_from < t < self.settings.stop

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,6 +13,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from clear_strategies.core.checks import require_number
+from clear_strategies.core.view import View
 from clear_strategies.density.adaptive import Density, DensitySettings
 from clear_strategies.density.threshold import count_passing, topk_mask
 from clear_strategies.schedules import milestone
@@ -44,10 +45,8 @@ class ShuffleSettings(DensitySettings):
         DensitySettings.__post_init__(self)
         require_number("split_above", self.split_above, below=1)
 
-    def densifier(
-        self, n: int, *, extent: float, seed: int, white_background: bool, device: torch.device | str = "cpu"
-    ) -> ShuffleSplit:
-        return ShuffleSplit(self, n, extent=extent, seed=seed, white_background=white_background, device=device)
+    def densifier(self, field: GaussianField, views: Sequence[View], seed: int) -> Density:
+        return ShuffleSplit.of(self, field, views, seed)
 
 
 class ShuffleSplit(Density):

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from clear_strategies.core.gradients import Shot
+from clear_strategies.core.view import View
 from clear_strategies.merging.iteration import Update
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.optim import Adam
@@ -78,14 +79,13 @@ class Densifier:
 class DensifierSettings(Protocol):
     """Settings of a densifier: a frozen dataclass that makes the densifier once the scene is known."""
 
-    def densifier(
-        self, n: int, *, extent: float, seed: int, white_background: bool, device: torch.device | str = "cpu"
-    ) -> Densifier:
-        """For a field of n Gaussians on `device`; `extent` is 3DGS's cameras_extent, world units."""
+    def densifier(self, field: GaussianField, views: Sequence[View], seed: int) -> Densifier:
+        """See `Strategy.densifier`."""
         ...
 
 
-def cameras_extent(centers: Float[Tensor, "V 3"]) -> float:
+def cameras_extent(views: Sequence[View]) -> float:
     """3DGS's scene size: 1.1 times the largest distance of a training camera from their mean; a little where that is 0."""
+    centers = torch.stack([view.hr.camera.center.float() for view in views])
     radius = torch.linalg.vector_norm(centers - centers.mean(0), dim=-1).max()
     return 1.1 * float(radius) or 1e-6

@@ -20,6 +20,7 @@ from clear_strategies.data.scene import Scene
 from clear_strategies.errors import AnswerError, DataError, DivergedError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.skips import Plateau
+from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.checkpoint import Checkpoint
 from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for
 from clear_strategies.training.densifier import Densifier, DensifierSettings, cameras_extent
@@ -104,18 +105,14 @@ class TrainState:
         """
         device = scene.device
         theta = GaussianField.from_cloud(scene.cloud, max_degree=settings.max_degree).to(device)
-        extent = cameras_extent(torch.stack([view.hr.camera.center.float() for view in scene.train]))
-        owner = conductor.owner("densifier")
+        owner: Strategy | DensifierSettings | None = conductor.owner("densifier")
         densifier = None if owner is None else owner.densifier(theta, scene.train, settings.seed)
-        if densifier is not None and not isinstance(densifier, Densifier):
-            rule = f"must give a {Densifier.__module__}.Densifier or None"
-            raise AnswerError(f"{type(owner).__name__}.densifier() {rule}, got {densifier!r:.80}.")
         if densifier is None:
-            white = all(c == 1.0 for c in scene.background)
-            densifier = density.densifier(
-                len(theta), extent=extent, seed=settings.seed, white_background=white, device=device
-            )
-        optimizer = Adam(theta.raw(), rates, extent)
+            owner, densifier = density, density.densifier(theta, scene.train, settings.seed)
+        if not isinstance(densifier, Densifier):
+            rule = f"must give a {Densifier.__module__}.Densifier{'' if owner is density else ' or None'}"
+            raise AnswerError(f"{type(owner).__name__}.densifier() {rule}, got {densifier!r:.80}.")
+        optimizer = Adam(theta.raw(), rates, cameras_extent(scene.train))
         photos = fingerprints(scene)
         state = cls(theta, conductor, optimizer, densifier, settings, mip, scene.train, rules, photos=photos)
 

@@ -30,7 +30,7 @@ SUBSETS = [s for k in range(4) for s in itertools.combinations(("gco", "p2g", "s
 
 
 def _size_that_prunes_the_two_largest() -> float:
-    extent = cameras_extent(torch.stack([v.hr.camera.center for v in SCENE.train]))
+    extent = cameras_extent(SCENE.train)
     sizes = GaussianField.from_cloud(SCENE.cloud).scales.data.exp()[:, 0].sort().values
     return float(sizes[-3]) * 1.001 / extent
 

@@ -3,13 +3,14 @@
 import math
 import re
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clear_strategies import SVS, Grads, Photo, Strategy, Update
+from clear_strategies import SVS, Conductor, Grads, Photo, Strategy, Update
 from clear_strategies.core import deferred
 from clear_strategies.core.points import PointCloud
 from clear_strategies.density.adaptive import Density, DensitySettings
@@ -20,8 +21,10 @@ from clear_strategies.training.densifier import Densifier, cameras_extent
 from clear_strategies.training.evaluation import evaluate
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.loop import iterate
-from clear_strategies.training.mip import filter_std
+from clear_strategies.training.mip import MipFilter, filter_std
 from clear_strategies.training.optim import Adam, LearningRates
+from clear_strategies.training.settings import FitSettings
+from clear_strategies.training.state import TrainState
 from rasterizers.geometry import SH_C0
 from tests.helpers import short_run, toy
 
@@ -47,9 +50,14 @@ def test_start_and_extent_are_those_of_3dgs():
     assert torch.allclose(field.sh0.data[:, 0] * SH_C0 + 0.5, torch.full((4, 3), 0.75))
     assert not field.detail.data.any()
     assert field.max_degree == 3
-    centers = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 0, 0]])
-    assert cameras_extent(centers) == pytest.approx(1.1)
-    assert cameras_extent(centers[:1]) > 0
+    pose, view = torch.eye(4), short_run.SCENE.train[0]
+    views = []
+    for pose[0, 3] in (1.0, -1.0, 0.0):
+        at = {"world_to_camera": pose.clone()}
+        lr, hr = (replace(photo, camera=replace(photo.camera, **at)) for photo in (view.lr, view.hr))
+        views.append(replace(view, lr=lr, hr=hr))
+    assert cameras_extent(views) == pytest.approx(1.1)
+    assert cameras_extent(views[:1]) > 0
 
 
 @given(
@@ -372,6 +380,18 @@ def brings(make):
     """A strategy with this densifier."""
     strategy = type("Brings", (Strategy,), {"densifier": lambda self, field, views, seed: make(len(field))})
     return short_run.start((), more=[strategy()])
+
+
+def test_density_is_replaced_by_what_has_the_hook_of_a_strategy():
+    def density(made):
+        return type("Mine", (), {"densifier": lambda self, field, views, seed: made(len(field))})()
+
+    start = partial(
+        TrainState.start, short_run.SCENE, Conductor(), settings=FitSettings(), rates=LearningRates(), mip=MipFilter()
+    )
+    assert type(start(density=density(Doubles)).density) is Doubles
+    with pytest.raises(AnswerError, match=r"Mine.densifier\(\) must give a .*Densifier, got None"):
+        start(density=density(lambda n: None))
 
 
 def test_a_densifier_of_ones_own_gets_the_scores_that_it_collects():
