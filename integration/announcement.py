@@ -56,6 +56,8 @@ def announce(conductor: Conductor, views: Sequence[View], host: Host) -> None:
     }.items():
         for owner in (s for s in conductor.strategies if overrides(s, hook)):
             _log.warning("%s has no effect here: the host %s.", type(owner).__name__, reason)
+    for s in conductor.comparing:
+        _log.warning("%s.compare() is called at HR alone: the host has the loss at LR.", type(s).__name__)
     if not conductor.strategies:
         summed = (
             "both losses are summed, as in the paper's baseline" if conductor.uses_hr else "the host trains as alone"

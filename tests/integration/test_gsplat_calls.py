@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.utils.checkpoint import checkpoint
 
-from clear_strategies import P2G, SVS, Conductor, PseudoViews, RandomBackground, View
+from clear_strategies import P2G, SVS, Conductor, PseudoViews, RandomBackground, Strategy, View
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.schedules import Ramp
 from integration import HostError
@@ -398,6 +398,15 @@ def test_functions_that_are_wrapped_one_after_the_other_get_their_own_arguments(
     clear.wrap(autograd.rasterization)  # which takes an offset of the colours
     render().mean().backward()
     assert clear.attachment.counts["merges"] == 1
+
+
+def test_a_strategy_that_compares_images_hears_that_the_loss_at_lr_is_the_hosts(caplog):
+    compares = {"compare": lambda self, scale, image, photo, step, losses: losses(image)}
+    started(type("Compares", (Strategy,), compares)())
+    assert "Compares.compare() is called at HR alone: the host has the loss at LR." in caplog.text
+    caplog.clear()
+    started()
+    assert "compare()" not in caplog.text
 
 
 @pytest.mark.parametrize("own_background", [False, True])
