@@ -36,7 +36,7 @@ def test_the_mask_has_its_rate_which_ramps_linearly_and_changes_with_seed_and_it
     assert kept_share(svs, 400) == pytest.approx(1 - 0.08, abs=4e-3)
 
 
-def test_both_scales_lose_the_gaussians_of_a_mask_and_with_two_masks_each_those_of_its_own_as_do_its_gradients():
+def test_both_scales_lose_the_gaussians_of_a_mask_and_each_those_of_its_own_if_there_are_two():
     svs, scene = started(looks=0, shared=False), toy.scene()
     field = GaussianField.from_cloud(scene.cloud)
     z = Conductor(svs).gate(10_000, len(field))
