@@ -22,7 +22,7 @@ _IN_OUR_WORDS: Final = {
     r"Could not (?:load|find) 'hydra/launcher/((joblib|submitit|ray)(?:_local|_slurm|_aws)?)'": (
         "hydra/launcher: {} is not installed: pip install hydra-{}-launcher."
     ),
-    r"^(?:Error parsing override '|LexerNoViableAltException: )([^=~][^=]*?)(?:' missing EQUAL| \^ )": (
+    r"^(?:Error parsing override '|LexerNoViableAltException: )(.+?)(?:' missing EQUAL| \^ )": (
         f"{{}}: is no setting. {WRITTEN}"
     ),
     r"^Multiple values for (\S+)\. To override a value use 'override \S+: (\S+)'$": (
@@ -33,10 +33,12 @@ _SWEEPS: Final = re.compile(r"\+?(experiment=|strategy=[^\[]*,)")  # overrides b
 
 
 def require_option(override: Override) -> None:
-    """Raise a SettingError for an override that chooses nothing of a group of conf/, which is a bare error of Python's in Hydra,
-    or several experiments of which one sweeps.
+    """Raise a SettingError for an override that has no name or chooses nothing of a group of conf/, which are bare errors of
+    Python's in Hydra, or for several experiments of which one sweeps.
     """
     chosen, group = override.value(), override.key_or_group
+    if not group:
+        raise SettingError(f"{override.input_line}: names no setting. {WRITTEN}")
     each = chosen.list if isinstance(chosen, ChoiceSweep) else [chosen]
     nothing = [name for name in each if not name and not (override.is_add() and name == [])]  # +method=srgs,[]: a row
     if nothing and not override.is_delete() and (CONF / group).is_dir():
