@@ -119,7 +119,7 @@ class HostSteps:
                 "Render and call loss.backward(), then step() without a closure."
             )
         self._before()
-        if optimizer in self._stepped:
+        if optimizer in self._stepped or self._stepped.isdisjoint(self._hooked):  # all may have been made anew
             self._stepped.clear()
         begins = not self._stepped
         self._stepped.add(optimizer)

@@ -198,6 +198,11 @@ def test_a_step_begins_after_each_merge_whichever_optimizers_take_part():
     assert clear.attachment.counts["steps of the host alone"] == 0
     host.optimizers["scales"].step()
     assert clear.attachment.counts["steps of the host alone"] == 1
+    host.optimizers.update(separate(host.splats))
+    render()  # and no pass
+    for optimizer in host.optimizers.values():
+        optimizer.step()
+    assert clear.attachment.counts["steps of the host alone"] == 2
 
 
 def test_hooks_that_run_after_accumulation_change_the_merged_gradient():
