@@ -45,6 +45,7 @@ from rasterizers.inputs import Inputs
 from rasterizers.interface import Camera, Rasterizer, can_be_recorded, over
 from rasterizers.modes import in_full_precision
 from rasterizers.replays import GraphKey, shapes_of
+from rasterizers.torch_internals import version
 
 _log = logging.getLogger(__name__)
 
@@ -142,7 +143,8 @@ class HrDrawing:
     """
 
     def __init__(self, conductor: Conductor, host: Host, device: torch.device, counts: Counter[str]) -> None:
-        self._conductor, self._masks, self._counts = conductor, {**host.masks}, counts
+        self._conductor, self._masks, self._counts = conductor, host.masks, counts
+        self._sent: dict[str, tuple[Tensor, int, Tensor]] = {}  # masks: the host's, its version, and on the device
         self._loss_scale = host.loss_scale or (lambda: 1.0)
         self._log_once, self._warn_once = Once(_log.info), Once(_log.warning)
         self.is_scored = host.reads_score and conductor.owner("score") is not None
@@ -159,10 +161,7 @@ class HrDrawing:
         """The HR side, by the raw parameters if HR takes part in the merge; and its gradients of other leaves."""
         self._counts["HR renders"] += 1
         conductor, view = self._conductor, step.view
-        mask, asked = self._masks.get(view.name), render_at("hr", gate, view)
-        if mask is not None:
-            mask = self._masks[view.name] = mask.to(step.params["means"])  # once: to send it waits for the device
-            mask = enlarged_mask(mask, view.factor)[..., None]
+        mask, asked = self._mask(view, step.params["means"]), render_at("hr", gate, view)
         drawn: Drawable | AutogradShot = (
             asked if isinstance(asked, Drawable) else at_inputs(asked.shot, self._warn_once)
         )
@@ -191,6 +190,16 @@ class HrDrawing:
             return self._own_extra_view(asked, extra, t)
         (g,) = asked.shot.vjp(self._conductor.extra_loss(asked.shot.image, extra, t).cotangents)
         return g
+
+    def _mask(self, view: View, means: Tensor) -> Float[Tensor, "H W 1"] | None:
+        """The host's mask of a view, at HR. It is sent only if the host has changed it, since to send waits for the device."""
+        if (mask := self._masks.get(view.name)) is None:
+            return None
+        given, written, sent = self._sent.get(view.name, (None, 0, mask))
+        if given is not mask or written != version(mask):
+            sent = mask.to(means)
+            self._sent[view.name] = mask, version(mask), sent
+        return enlarged_mask(sent, view.factor)[..., None]
 
     @in_full_precision
     @torch.no_grad()

@@ -327,6 +327,22 @@ def test_a_mask_is_sent_once(monkeypatch):
     assert len({*map(id, given)}) == 3
 
 
+def test_a_mask_that_the_host_changes_or_adds_hides_from_then_on(monkeypatch):
+    enlarged, shown = hr_drawing.enlarged_mask, []
+    monkeypatch.setattr(
+        hr_drawing, "enlarged_mask", lambda mask, factor: shown.append(bool(mask.any())) or enlarged(mask, factor)
+    )
+    first, second = (view for view in SCENE.train[:2])
+    host, masks = Host(SCENE), {first.name: torch.ones(16, 24, dtype=torch.bool)}
+    attached(host, SCENE, Conductor(objective=HR_FROM_START), masks=masks)
+    host.train([first.name])
+    masks[first.name].zero_()
+    host.train([first.name])
+    masks |= {view.name: torch.ones(16, 24) for view in (first, second)}
+    host.train([first.name, second.name])
+    assert shown == [True, False, True, True]
+
+
 @needs_warp
 def test_replays_over_densification_resets_evaluation_and_resuming(monkeypatch, recorded_on):
     strategies = pytest.importorskip("gsplat.strategy")
