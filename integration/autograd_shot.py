@@ -222,7 +222,7 @@ def at_inputs(shot: AutogradShot, warn: Callable[..., None]) -> AutogradShot:
     if (shot := of_whole_image(shot)).inputs is not None:
         return shot
     graph, centres = graph_of(shot.image), shot.gradient_slot.tensor
-    known = {*map(id, shot.params.values()), *map(id, copied_to(centres))}
+    known = {*map(id, shot.params.values()), *map(id, copied_to(centres, shot.params["means"]))}
 
     def others(behind: Graph) -> list[Tensor]:
         return [leaf for leaf in behind.leaves if id(leaf) not in known]

@@ -110,11 +110,13 @@ class Inputs:
             yield found
 
 
-def copied_to(centres: Tensor) -> list[Tensor]:
+def copied_to(centres: Tensor, means: Tensor) -> list[Tensor]:
     """The leaf whose copy a tensor is, as hosts make one for the screen gradient (`torch.zeros(n, 3, requires_grad=True) + 0`);
-    itself if it is a leaf. No optimizer steps it, unlike other leaves from which centres are computed.
+    itself if it is a leaf. No optimizer steps it, unlike other leaves from which centres are computed, with those of `means`.
     """
     leaves = graph_of(centres).leaves
+    if means.requires_grad:  # without a wait for the device
+        return leaves if len(leaves) == 1 else []
     return [x for x in leaves if x.shape == centres.shape and torch.equal(x.to(centres), centres)]
 
 

@@ -250,6 +250,21 @@ def test_a_tensor_that_reaches_the_rasterizer_and_its_image_learns_from_lr_alone
     assert "learn from LR alone" in caplog.text
 
 
+def test_what_a_host_copies_for_the_screen_gradient_is_told_without_a_wait_for_the_device(monkeypatch):
+    host, conductor, view, *_ = drawn()
+
+    def render(camera, detail=None):
+        p, centres = host.params, torch.zeros(20, 3, requires_grad=True) + 0
+        splats = Splats(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"], detail)
+        shot = autograd.draw(toy.RASTERIZER, splats, camera, centres[:, :2])
+        slot = ScreenGradientSlot(centres, (camera.width, camera.height))
+        return AutogradShot(shot.image, shot.means2d.detach(), shot.visible, p, slot)
+
+    lr, hr = render(view.lr.camera), render(view.hr.camera, host.params["detail"])
+    monkeypatch.setattr(torch, "equal", None)
+    joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
+
+
 def test_a_compiled_loop_calls_the_loss_outside_of_its_graph(recwarn):
     host, conductor, view, lr, hr = drawn(GCO())
     torch.compile(lambda: 2 * joint_loss(conductor, host.params, lr, hr, view, 5)[0], backend="eager")().backward()
