@@ -78,7 +78,7 @@ def joint_loss(
     _require_rows(values)
     require_leaves(params)
     _require_shots(params, lr=lr, hr=hr)
-    of_lr, of_hr = graph_of(lr.image), graph_of(*(() if hr is None else [hr.image]))
+    of_lr, of_hr = graph_of(lr.image), graph_of(*(() if hr is None or hr.image.is_leaf else [hr.image]))
     _require_detail(params.get("detail"), of_lr, of_hr)
     _require_view(conductor, view, lr=of_lr, hr=of_hr)
     _require_started(conductor)

@@ -65,6 +65,8 @@ def test_backward_gives_the_conductors_gradient(strategies):
     own = {name: x.requires_grad_() for name, x in host.field.raw().items()}  # which no graph leads from
     joint_loss(ours, own, *shots, view, 5, ScoreScaler(1e-4))[0].backward()
     assert not [name for name, p in own.items() if not torch.equal(p.grad, expected[name])]
+    shots[1].image.requires_grad_()  # for its cotangents
+    joint_loss(ours, own, *shots, view, 5)
 
 
 def test_its_value_is_the_sum_of_the_losses_and_backward_writes_the_score_for_a_densifier():
