@@ -227,21 +227,32 @@ def at_inputs(shot: AutogradShot, warn: Callable[..., None]) -> AutogradShot:
     def others(behind: Graph) -> list[Tensor]:
         return [leaf for leaf in behind.leaves if id(leaf) not in known]
 
+    def names(leaves: Sequence[Tensor]) -> str:
+        return ", ".join(f"{leaf.dtype} {[*leaf.shape]}" for leaf in leaves[:3])
+
     if not (found := others(graph)):
         return shot
     if (inputs := inputs_of(shot.image, graph, centres, shot.params, found)) is None:
-        names = [f"{leaf.dtype} {[*leaf.shape]}" for leaf in found[:3]]
         warn(
             "the loop trains %d tensors beside the Gaussians (%s), which learn from LR alone: the inputs of the rasterizer were "
             "not found, or their rows are not those of the parameters. Name them by AutogradShot(drawn=…).",
-            len(found), ", ".join(names),
+            len(found), names(found),
         )  # fmt: skip
         return shot
+    if shared := inputs.shared:
+        told = "%d tensors (%s) reach the image beside the rasterizer, too, and learn from LR alone."
+        warn(told, len(shared), names(shared))
     return replace(shot, found=inputs) if others(graph_of(*inputs.edges.values())) else shot
 
 
 OfOthers = list[tuple[Tensor, Tensor]]
 """Other leaves that the loop trains (of a network, an embedding), each with its gradient."""
+
+
+def in_full(of_others: OfOthers, found: Inputs | None) -> OfOthers:
+    """Without the leaves of whose gradients the inputs bring a part."""
+    shared = () if found is None else {*map(id, found.shared)}
+    return [(leaf, g) for leaf, g in of_others if id(leaf) not in shared]
 
 
 def side_of_leaves(

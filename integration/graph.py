@@ -90,10 +90,13 @@ class Inputs:
     Args:
         nodes: of the rasterizer, one for each of its calls.
         edges: where the gradients of its inputs with a row for each Gaussian go, by name.
+        shared: leaves behind these that reach the image beside the rasterizer, too, of whose gradients the edges bring a part.
     """
 
-    def __init__(self, nodes: Collection[Any], edges: Mapping[str, GradientEdge]) -> None:
-        self._nodes, self.edges = nodes, edges
+    def __init__(
+        self, nodes: Collection[Any], edges: Mapping[str, GradientEdge], shared: Sequence[Tensor] = ()
+    ) -> None:  # fmt: skip
+        self._nodes, self.edges, self.shared = nodes, edges, shared
 
     @contextmanager
     def collected(self) -> Iterator[dict[str, Tensor]]:
@@ -156,13 +159,12 @@ def inputs_of(
     if of_own - has_rows or any(not found.nodes.isdisjoint(nodes) for found in graphs.values()):
         return None
     edges = {name: inputs[name] for name in has_rows if name in of_own or graphs[name].reaches(others)}
-    if reaches(image, graph_of(*edges.values()).leaves, before=nodes):  # beside the rasterizer, too
-        return None
+    shared = [leaf for leaf in graph_of(*edges.values()).leaves if reaches(image, [leaf], before=nodes)]
     near_first = sorted(of_own, key=lambda name: len(graphs[name].nodes))  # a network may lie between the others
     pairs = [(inputs[name], p) for name in near_first for p in own if graphs[name].reaches([p])]
     if any(edge == edge_of(p) for edge, p in pairs):  # without the waits for the device of the test below
-        return Inputs(nodes, edges)
-    return Inputs(nodes, edges) if pairs and _are_in_order(pairs) else None
+        return Inputs(nodes, edges, shared)
+    return Inputs(nodes, edges, shared) if pairs and _are_in_order(pairs) else None
 
 
 def require_apart(drawn: Mapping[str, Tensor]) -> None:

@@ -28,6 +28,7 @@ from integration.autograd_shot import (
     OfOthers,
     at_inputs,
     every_number,
+    in_full,
     of_whole_image,
     require_named,
     to_leaves,
@@ -225,7 +226,8 @@ class _HrShot:
         return [*map(self._to_leaves, each), Grads(detail, screen=of_hf.screen)]
 
     def _to_leaves(self, g: Grads) -> Grads:
-        raw, self.of_others = to_leaves(g, self._shot.edges, self._shot.params)
+        raw, others = to_leaves(g, self._shot.edges, self._shot.params)
+        self.of_others = in_full(others, self._shot.found)
         return Grads(every_number(raw, self._shot.params), screen=g.screen)
 
 

@@ -237,10 +237,10 @@ def test_what_moves_the_means_also_learns_from_hr_where_a_rasterizer_takes_centr
 
 def test_a_tensor_that_reaches_the_rasterizer_and_its_image_learns_from_lr_alone_and_a_warning_tells(caplog):
     host, conductor, view, *_ = drawn()
-    gain = torch.ones(1, requires_grad=True)
+    gain, network = torch.ones(1, requires_grad=True), torch.ones(3, requires_grad=True)
 
     def render(camera, detail=None):
-        p, colours = host.params, host.params["sh0"] * gain
+        p, colours = host.params, host.params["sh0"] * gain * network
         splats = Splats(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), colours, p["shN"], detail)
         shot = autograd.draw(toy.RASTERIZER, splats, camera)
         return AutogradShot(shot.image * gain, shot.means2d, shot.visible, p)
@@ -248,7 +248,11 @@ def test_a_tensor_that_reaches_the_rasterizer_and_its_image_learns_from_lr_alone
     lr, hr = render(view.lr.camera), render(view.hr.camera, host.params["detail"])
     joint_loss(conductor, host.params, lr, hr, view, 5)[0].backward()
     (of_lr,) = conductor.objective.lr(lr.image.detach(), view.lr.image, None).cotangents
-    torch.testing.assert_close(gain.grad, torch.autograd.grad(lr.image, gain, of_lr)[0])
+    torch.testing.assert_close(gain.grad, torch.autograd.grad(lr.image, gain, of_lr, retain_graph=True)[0])
+    base, hf = conductor.objective.hr(hr.image.detach(), view.hr.image, None).cotangents
+    (expected,) = torch.autograd.grad(lr.image, network, of_lr)
+    (of_hr,) = torch.autograd.grad(hr.image, network, base + conductor.objective.lambda_hf * hf)
+    torch.testing.assert_close(network.grad, expected + conductor.objective.lambda_hr(5) * of_hr)  # what is not shared
     assert "learn from LR alone" in caplog.text
 
 
