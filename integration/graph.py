@@ -159,7 +159,8 @@ def inputs_of(
     if of_own - has_rows or any(not found.nodes.isdisjoint(nodes) for found in graphs.values()):
         return None
     edges = {name: inputs[name] for name in has_rows if name in of_own or graphs[name].reaches(others)}
-    shared = [leaf for leaf in graph_of(*edges.values()).leaves if reaches(image, [leaf], before=nodes)]
+    beside = {id(leaf_of(node)) for node in _behind([image], nodes)}
+    shared = [leaf for leaf in graph_of(*edges.values()).leaves if id(leaf) in beside]
     near_first = sorted(of_own, key=lambda name: len(graphs[name].nodes))  # a network may lie between the others
     pairs = [(inputs[name], p) for name in near_first for p in own if graphs[name].reaches([p])]
     if any(edge == edge_of(p) for edge, p in pairs):  # without the waits for the device of the test below
