@@ -270,6 +270,16 @@ def test_a_gate_of_any_type_and_strides_is_what_it_is_as_float32(form):
     assert not [name for name, x in trained(form).items() if not torch.equal(x, expected[name])]
 
 
+def test_a_gate_is_checked_without_a_comparison_of_each_number():
+    """Ten times as slow, in every iteration."""
+    conductor = Conductor(answering("gate", lambda t, n: torch.ones(n))())
+    with toy.Operations() as operations:
+        conductor.gate(1, 30)
+        conductor.gate(1, 0)
+    assert "aminmax" in operations.count
+    assert not {"ge", "lt", "bitwise_and", "isfinite"} & operations.count.keys()
+
+
 def test_a_colour_may_be_a_list_and_a_forgotten_answer_does_not_end_densification():
     assert Conductor(answering("background", [0.25, 0.5, 0])()).background(1) == (0.25, 0.5, 0)
     with pytest.raises(AnswerError, match=r"may_densify\(\) must give True or False, got None"):
