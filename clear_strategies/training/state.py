@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from inspect import signature
 from pathlib import Path
 from typing import Any, Final
 
@@ -58,6 +59,16 @@ def _means(layers: Float[Tensor, "H W C"]) -> Float[Tensor, "C h w"]:
     return adaptive_avg_pool2d(torch.nan_to_num(layers, 0.0, 0.0, 0.0).permute(2, 0, 1), _CELLS).cpu()
 
 
+def _densifier_of(owner: Strategy | DensifierSettings, *arguments: Any) -> Any:
+    """Settings of an older version, say, take other arguments."""
+    try:
+        signature(owner.densifier).bind(*arguments)
+    except TypeError as error:
+        rule = f"must take (field, views, seed), got {signature(owner.densifier)}"
+        raise AnswerError(f"{type(owner).__name__}.densifier() {rule}. See Strategy.densifier.") from error
+    return owner.densifier(*arguments)
+
+
 @dataclass(slots=True)
 class TrainState:
     """Everything that changes while training, on the device of the views.
@@ -106,9 +117,9 @@ class TrainState:
         device = scene.device
         theta = GaussianField.from_cloud(scene.cloud, max_degree=settings.max_degree).to(device)
         owner: Strategy | DensifierSettings | None = conductor.owner("densifier")
-        densifier = None if owner is None else owner.densifier(theta, scene.train, settings.seed)
+        densifier = None if owner is None else _densifier_of(owner, theta, scene.train, settings.seed)
         if densifier is None:
-            owner, densifier = density, density.densifier(theta, scene.train, settings.seed)
+            owner, densifier = density, _densifier_of(density, theta, scene.train, settings.seed)
         if not isinstance(densifier, Densifier):
             rule = f"must give a {Densifier.__module__}.Densifier{'' if owner is density else ' or None'}"
             raise AnswerError(f"{type(owner).__name__}.densifier() {rule}, got {densifier!r:.80}.")
