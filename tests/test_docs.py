@@ -131,6 +131,12 @@ def run_block(tmp_path, monkeypatch):
     return run
 
 
+def test_options_begin_with_their_package_which_hydra_reads_nowhere_else():
+    options_shown = [b for page in PAGES for b in blocks(page, "yaml") if "@package" in b]
+    assert len(options_shown) >= 2
+    assert all(block.startswith("# @package ") for block in options_shown)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("block", PYTHON)
 def test_python_blocks_run(block, run_block):
