@@ -22,6 +22,9 @@ _IN_OUR_WORDS: Final = {
     r"Could not (?:load|find) 'hydra/launcher/((joblib|submitit|ray)(?:_local|_slurm|_aws)?)'": (
         "hydra/launcher: {} is not installed: pip install hydra-{}-launcher."
     ),
+    r"^LexerNoViableAltException: ([+~]*[\w./@]+)=(.+) \^ ": (
+        "{0}: its value {1} cannot be read. Quotation marks come in pairs, and special characters within them: '{0}=\"…\"'."
+    ),
     r"^(?:Error parsing override '|LexerNoViableAltException: )(.+?)(?:' missing EQUAL| \^ )": (
         f"{{}}: is no setting. {WRITTEN}"
     ),

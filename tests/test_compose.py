@@ -74,6 +74,7 @@ def test_names_and_overrides_are_those_of_the_command_line_and_milestones_stretc
         ),
         (("gco", r"C:\my photos"), r"^C:\\my photos: is no setting\. A setting is written name=value"),
         (("gco", "~strategies.[gco]"), r"^~strategies\.\[gco\]: is no setting\."),
+        (("gco", 'strategies.gco.drop="x'), r'^strategies\.gco\.drop: its value "x cannot be read\. Quotation marks'),
         (("gco", "=3"), r"^=3: names no setting\. A setting is written name=value"),
         (("gco", "+readings=paper"), r"\+readings=paper: .*: readings=paper\."),
     ],
