@@ -165,7 +165,8 @@ def test_opacity_reset_acts_on_what_is_drawn():
     ("white", "stop", "resets"), [(True, 5_000, [500, 3000]), (False, 5_000, [3000]), (True, 0, [])]
 )
 def test_white_backgrounds_get_an_early_reset(white, stop, resets):
-    density = Density(DensitySettings(stop=stop), 1, extent=1.0, seed=0, white_background=white)
+    views = [replace(short_run.SCENE.train[0], background=(1.0, 1.0, float(white)))]  # yellow is not white
+    density = DensitySettings(stop=stop).densifier(GaussianField.from_cloud(short_run.SCENE.cloud), views, 0)
     assert [t for t in range(1, 10_001) if density.reset_due(t)] == resets
 
 
