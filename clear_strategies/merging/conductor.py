@@ -236,7 +236,7 @@ class Conductor(Hooks):
         has_hf, n = len(of_hr) == 2, len(hr.visible)
         with stage("evidence"):
             step = self.observed(step, hr)  # q, a, w        Eq. 9, 10
-            m = self.route(step, n) if has_hf else 1.0  # Eq. 12
+            m = self.route(step, n) if has_hf else 1.0  # m              Eq. 12
         with stage("backward HR"):  # one pass for all cotangents
             cotangents = of_hr if lr_cotangents is None else torch.cat((lr_cotangents, of_hr))
             detail = None
@@ -246,7 +246,7 @@ class Conductor(Hooks):
             else:
                 *of_lr, g = (vjp or _vjp)(hr, cotangents)
         g_lr = of_lr[0] if of_lr else None
-        return HrSide(g.without_detail(), detail, _size(hr.image), step, losses.values, g_lr)
+        return HrSide(g.without_detail(), detail, _size(hr.image), step, m, losses.values, g_lr)
 
     @apart_from_the_loop
     def extra_loss(self, image: Float[Tensor, "h w 3"], extra: ExtraView, t: int) -> Losses:

@@ -185,7 +185,8 @@ class Hooks:
         if not (isinstance(answer, Real) or is_real(answer, (n,))):
             refuse(s, "route", f"a number or a tensor [{n}]", answer)
         m: float | Tensor = answer
-        require_finite(s, "route", {"m": m})
+        if not isinstance(m, Tensor):
+            require_finite(s, "route", {"m": m})
         return m
 
     def score(self, step: Step, screen: ScreenGradients) -> Float[Tensor, " N"]:

@@ -23,14 +23,14 @@ LossWeights = tuple[float, float] | Tensor
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HrSide:
-    """The HR side of one view: its gradients and the evidence.
+    """The HR side of one view: its gradients, the evidence and the routing weights.
 
     Args:
         g: g^HR, with the `.screen` of ∇L_base.  Eq. 13
         detail: m λ_HF ∇L_HF of f_det, which L_base does not move and nothing corrects, with the `.screen` of ∇L_HF; None if
             λ_HF = 0.
         size: (width, height) of the image in whose pixels `.screen` counts.
-        step: the iteration, with the answer of `observe`.
+        step: the iteration, with the answer of `observe`. m: the answer of `route`, [N] or 1.
         losses: L_base and L_HF by name; of a replay in a host, numbers that are not read yet.
         lr: ∇(λ_LR L_LR), if it passes through the HR render; else None.
     """
@@ -39,6 +39,7 @@ class HrSide:
     detail: Grads | None
     size: tuple[int, int]
     step: Step
+    m: float | Float[Tensor, " N"] = 1.0
     losses: Mapping[str, Number] = field(default_factory=dict)
     lr: Grads | None = None
 
@@ -114,11 +115,11 @@ class Stepper(Protocol):
 
 
 def require_finite_parts(where: str, g_lr: Grads, hr: HrSide | None) -> None:
-    """Check the gradients that are merged, and the evidence; those on a device are not read."""
+    """Check what is merged: gradients, evidence and routing weights; those on a device are not read."""
     parts: dict[str, Mapping[str, Tensor]] = {}
-    if hr is not None:  # the evidence first, since the gradients may contain it
-        e = hr.step.evidence
-        parts["the evidence"] = {} if e is None else {"reliability": e.reliability}
+    if hr is not None:  # evidence and weights first, since the gradients contain them
+        weights = {} if hr.step.evidence is None else {"reliability": hr.step.evidence.reliability}
+        parts["the evidence"] = weights | ({"m": hr.m} if isinstance(hr.m, Tensor) else {})
         parts |= {"∇L_HR": hr.g.tensors} | ({} if hr.detail is None else {"∇L_HF": hr.detail.tensors})
     parts["∇L_LR"] = g_lr.tensors
     for part, tensors in parts.items():

@@ -127,8 +127,7 @@ def test_what_else_the_loop_trains_gets_its_gradient(share, strategies, hooked):
     lr, hr = render(view.lr.camera), render(view.hr.camera, host.params["detail"])
     joint, _ = joint_loss(conductor, host.params, lr, hr, view, 5)
     (3 * joint).backward()
-    objective = conductor.objective
-    m = conductor.route(conductor.hr_gradients(hr, Step(5, view)).step, len(hr.visible))
+    objective, m = conductor.objective, conductor.hr_gradients(hr, Step(5, view)).m
     (cotangent,) = share * objective.lr(share * lr.image.detach(), view.lr.image, None).cotangents
     of_exposure, of_offset = torch.autograd.grad(lr.image, (exposure, offset), cotangent)
     base, hf = hr.vjp(share * objective.hr(share * hr.image.detach(), view.hr.image, None).cotangents)

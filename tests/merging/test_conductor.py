@@ -226,8 +226,7 @@ ANSWERS = {
         "reconcile", lambda p, step: Weights(keep=p.dot[:, 0] + 1j), "keep is a number or .*, got a complex tensor \\[30\\]"
     ),
     "gate, complex": ("gate", lambda t, n: torch.ones(n) + 0j, "must give a tensor .*, got a complex tensor \\[30\\]"),
-    "route NaN": ("route", lambda step: nan_of_first(step.visible.float()), "must give finite numbers, but m is not finite"),
-    "route, a number": ("route", float("nan"), "must give finite numbers, but m is nan"),
+    "route NaN": ("route", float("nan"), "must give finite numbers, but m is nan"),
     "correct": ("correct", None, "must give Grads, or a mapping from attributes to tensors, got None"),
     "correct, weights": ("correct", Weights(), "must give Grads, or a mapping"),
     "correct, names": ("correct", lambda lr, hr, step: {"mean": hr["means"]}, "must give attributes of g_HR, .*, got 'mean'"),
