@@ -128,6 +128,11 @@ class AutogradShot:
         return self.inputs if self.found is None else self.found.edges
 
     @property
+    def shared(self) -> Sequence[Tensor]:
+        """Leaves beside the parameters of whose gradients `gradients` bring a part only, see `Inputs`."""
+        return () if self.found is None else self.found.shared
+
+    @property
     def gradient_slot(self) -> ScreenGradientSlot:
         """`slot`, or `means2d` as one."""
         return self.slot or ScreenGradientSlot(self.means2d, (self.image.shape[1], self.image.shape[0]))
@@ -249,22 +254,16 @@ OfOthers = list[tuple[Tensor, Tensor]]
 """Other leaves that the loop trains (of a network, an embedding), each with its gradient."""
 
 
-def in_full(of_others: OfOthers, found: Inputs | None) -> OfOthers:
-    """Without the leaves of whose gradients the inputs bring a part."""
-    shared = () if found is None else {*map(id, found.shared)}
-    return [(leaf, g) for leaf, g in of_others if id(leaf) not in shared]
-
-
 def side_of_leaves(
-    hr: HrSide, drawn: Mapping[str, Edge] | None, params: Mapping[str, Tensor], scale: float
-) -> tuple[HrSide, OfOthers]:
+    hr: HrSide, drawn: Mapping[str, Edge] | None, params: Mapping[str, Tensor], scale: float, shared: Sequence[Tensor] = ()
+) -> tuple[HrSide, OfOthers]:  # fmt: skip
     """The HR side with the gradients of the raw parameters in place of those of the drawn tensors, each with its `.screen`; and
     those of other leaves.
 
     Args:
-        params: without "detail", f_det has no gradient. scale: see `to_leaves`.
+        params: without "detail", f_det has no gradient. scale, shared: see `to_leaves`.
     """
-    (g, others), detail = to_leaves(hr.g, drawn, params, scale), hr.detail
+    (g, others), detail = to_leaves(hr.g, drawn, params, scale, shared), hr.detail
     g.screen = hr.g.screen
     if detail is not None and "detail" not in params:
         detail = Grads(screen=detail.screen)
@@ -272,8 +271,8 @@ def side_of_leaves(
 
 
 def to_leaves(
-    g: Grads, drawn: Mapping[str, Edge] | None, params: Mapping[str, Tensor], scale: float = 1.0
-) -> tuple[Grads, OfOthers]:
+    g: Grads, drawn: Mapping[str, Edge] | None, params: Mapping[str, Tensor], scale: float = 1.0, shared: Sequence[Tensor] = ()
+) -> tuple[Grads, OfOthers]:  # fmt: skip
     """The gradients of the raw parameters, without f_det, from those of the drawn tensors, through the host's own graph; and
     those of the other leaves that the drawn tensors were computed from.
 
@@ -281,6 +280,7 @@ def to_leaves(
         g: by the names of `drawn`; the colours' gradient as factors if this package drew them. It stays so if `are_joined`.
         drawn: None: the raw parameters.
         scale: of a gradient scaler, so that small gradients pass through half precision in the graph.
+        shared: other leaves that are left out, see `AutogradShot.shared`.
     """
     raw, colour = trained(params), None
     if drawn is None:
@@ -293,7 +293,7 @@ def to_leaves(
             g = Grads({**g, "colors": outer(g.colour.rgb, g.colour.basis, colors.shape[1])})
     direct = {name: g[name] for name, p in raw.items() if drawn.get(name) is p and not is_hooked(p)}
     graph = {name: x for name, x in drawn.items() if name in g and name not in direct and has_gradient(x)}
-    known = {id(p) for p in params.values()}
+    known = {*map(id, params.values()), *map(id, shared)}
     others = [leaf for leaf in graph_of(*graph.values()).leaves if id(leaf) not in known]
     leaves = [*raw.values(), *others]
     if not graph or not leaves:

@@ -35,7 +35,6 @@ from integration.autograd_shot import (
     Target,
     at_inputs,
     every_number,
-    in_full,
     side_of_leaves,
     to_leaves,
 )
@@ -181,10 +180,8 @@ class HrDrawing:
             hr = conductor.hr_gradients(shot, step, AutogradShot.gradients, apart=apart)
         if conductor.objective.lambda_hr(step.t) == 0:
             return hr, []
-        if isinstance(drawn, Drawable):
-            return side_of_leaves(hr, drawn.inputs, drawn.params, self._loss_scale())
-        side, others = side_of_leaves(hr, drawn.edges, drawn.params, self._loss_scale())
-        return side, in_full(others, drawn.found)
+        edges, shared = (drawn.inputs, ()) if isinstance(drawn, Drawable) else (drawn.edges, drawn.shared)
+        return side_of_leaves(hr, edges, drawn.params, self._loss_scale(), shared)
 
     def extra_view(self, extra: ExtraView, view: View, t: int, render_at: RenderAt) -> Grads:
         """The gradient of an extra view, which is drawn without gate and f_det."""

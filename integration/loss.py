@@ -28,7 +28,6 @@ from integration.autograd_shot import (
     OfOthers,
     at_inputs,
     every_number,
-    in_full,
     of_whole_image,
     require_named,
     to_leaves,
@@ -226,9 +225,9 @@ class _HrShot:
         return [*map(self._to_leaves, each), Grads(detail, screen=of_hf.screen)]
 
     def _to_leaves(self, g: Grads) -> Grads:
-        raw, others = to_leaves(g, self._shot.edges, self._shot.params)
-        self.of_others = in_full(others, self._shot.found)
-        return Grads(every_number(raw, self._shot.params), screen=g.screen)
+        shot = self._shot
+        raw, self.of_others = to_leaves(g, shot.edges, shot.params, shared=shot.shared)
+        return Grads(every_number(raw, shot.params), screen=g.screen)
 
 
 def _others(
