@@ -528,6 +528,18 @@ def test_settings_of_taken_names_are_refused():
         type("Mine", (Strategy,), {"__annotations__": {"seed": int}})
 
 
+def test_a_setting_may_be_called_begin():
+    class Late(Strategy):
+        begin = 500
+
+        def may_densify(self, t):
+            return t > self.begin
+
+    conductor = Conductor(Late())
+    conductor.on_fit_start(1, 0)
+    assert conductor.may_densify(501)
+
+
 def test_a_plain_mapping_is_an_answer_of_correct_and_of_regularize():
     made = [answering("correct", lambda lr, hr, step: {name: g * 0.5 for name, g in hr.items()}),
             answering("regularize", lambda params, t: {"means": 0.1 * params["means"]})]  # fmt: skip
