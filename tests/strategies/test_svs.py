@@ -105,13 +105,16 @@ def test_anchor_pulls_back_with_twice_the_weighted_distance():
 
 
 def test_anchored_positions_do_not_depend_on_the_unit_of_the_world_and_the_mean_divides_by_the_number():
-    svs = started(anchor_start=1, anchor_strength=0.01, anchor_weights=PAPER_WEIGHTS)
+    loads = started(anchor_start=1, anchor_strength=0.01, anchor_weights=PAPER_WEIGHTS)
     for unit in (1.0, 1000.0):
+        svs = started(anchor_start=1, anchor_strength=0.01, anchor_weights=PAPER_WEIGHTS)
         theta = params()
         theta["means"] = theta["means"] * unit
-        Conductor(svs).load_state_dict({f"SVS.{name}": p for name, p in theta.items()})
+        svs.after_step(theta, toy.step(1))
+        Conductor(loads).load_state_dict({f"SVS.{name}": p for name, p in theta.items()})
         theta["means"] = theta["means"] * 1.1
         vjp = svs.regularize(theta, 2)["means"] * unit  # ∂/∂(x / unit)
+        assert torch.equal(loads.regularize(theta, 2)["means"] * unit, vjp)
         if unit == 1.0:
             expected = vjp
     assert torch.allclose(vjp, expected, rtol=1e-4)
