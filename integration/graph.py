@@ -163,9 +163,8 @@ def inputs_of(
     shared = [leaf for leaf in graph_of(*edges.values()).leaves if id(leaf) in beside]
     near_first = sorted(of_own, key=lambda name: len(graphs[name].nodes))  # a network may lie between the others
     pairs = [(inputs[name], p) for name in near_first for p in own if graphs[name].reaches([p])]
-    if any(edge == edge_of(p) for edge, p in pairs):  # without the waits for the device of the test below
-        return Inputs(nodes, edges, shared)
-    return Inputs(nodes, edges, shared) if pairs and _are_in_order(pairs) else None
+    is_drawn = any(edge == edge_of(p) for edge, p in pairs)  # without waits of the test for the device
+    return Inputs(nodes, edges, shared) if is_drawn or (pairs and _are_in_order(pairs)) else None
 
 
 def require_apart(drawn: Mapping[str, Tensor]) -> None:
