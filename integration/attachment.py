@@ -351,5 +351,5 @@ def _require_one_process() -> None:
     if distributed.is_available() and distributed.is_initialized() and (n := distributed.get_world_size()) > 1:
         raise SettingError(
             f"CLEAR trains in one process, got {n}. Start the training on one device: without torchrun, with "
-            "CUDA_VISIBLE_DEVICES=0, in nerfstudio with machine.num_devices=1."
+            "CUDA_VISIBLE_DEVICES=0, in nerfstudio with machine.num_devices=1. Or average the gradients of joint_loss."
         )

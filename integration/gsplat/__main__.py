@@ -19,7 +19,7 @@ from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from clear_strategies.errors import HostError
 from integration import launcher
-from integration.gsplat.simple_trainer import install, photos_of
+from integration.gsplat.simple_trainer import in_one_process, install, photos_of
 from integration.replacing import replaced_attribute
 from integration.settings import Settings
 
@@ -39,7 +39,7 @@ def _installed_by_cli(save_lr: Path | None, settings: Settings) -> Iterator[list
             runner.train = lambda self: launcher.save_lr(photos_of(self.trainset), save_lr)
         else:
             install(runner, settings, installed=attached.append)
-        return cli(train, *args, **kwargs)
+        return in_one_process(cli)(train, *args, **kwargs)
 
     with undo:
         undo.callback(register_optimizer_step_pre_hook(_refuse_to_train).remove)

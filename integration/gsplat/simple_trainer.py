@@ -107,6 +107,29 @@ def install(
             return rasterize_splats(runner, *args, **kwargs)
 
     runner_class.train, runner_class.rasterize_splats = train_with_clear, rasterize_the_view
+    module = _module_of(runner_class)
+    if "cli" in module:
+        module["cli"] = in_one_process(module["cli"])
+
+
+def in_one_process(cli: Callable[..., Any]) -> Callable[..., Any]:
+    """Gsplat's `cli`, which refuses to start a process for each GPU: none of them would call `install`."""
+
+    @functools.wraps(cli)
+    def started(*args: Any, **kwargs: Any) -> Any:
+        if (n := torch.cuda.device_count()) > 1:
+            raise SettingError(
+                f"CLEAR trains in one process, but gsplat would start {n} without it, one for each GPU. Set "
+                "CUDA_VISIBLE_DEVICES=0."
+            )
+        return cli(*args, **kwargs)
+
+    return started
+
+
+def _module_of(runner_class: Any) -> dict[str, Any]:
+    """The names of the module that defines the class; empty if it is unknown."""
+    return getattr(inspect.unwrap(runner_class.__init__), "__globals__", {})
 
 
 def require_supported(config: Any, *, from_stereo: bool) -> None:
@@ -176,7 +199,7 @@ def start_from_stereo(runner_class: Any) -> None:
     Raises:
         HostError: the module of the class has no create_splats_with_optimizers or no Dataset.
     """
-    module = getattr(inspect.unwrap(runner_class.__init__), "__globals__", {})
+    module = _module_of(runner_class)
     if missing := [name for name in (_CREATE, "Dataset") if name not in module]:
         raise no_stereo(
             f"the module of {runner_class.__name__} has no {missing[0]}, which gsplat's simple_trainer.py has"

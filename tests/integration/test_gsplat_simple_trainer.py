@@ -112,6 +112,20 @@ def test_a_script_without_a_runner_that_trains_exits_with_an_error(launched, cap
     assert "trained without CLEAR" in caplog.text
 
 
+def test_a_process_for_each_gpu_which_would_train_without_clear_is_refused(launched, tmp_path, monkeypatch, caplog):
+    from integration.gsplat import install
+    from tests.helpers import simple_trainer
+
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert launched() == 2
+    assert "CLEAR trains in one process, but gsplat would start 2 without it" in caplog.text
+    monkeypatch.setattr(simple_trainer, "cli", gsplat.distributed.cli)
+    install(type("Runner", (simple_trainer.Runner,), {}), sr=tmp_path / "sr", overrides=FROM_START)
+    with pytest.raises(SettingError, match="CUDA_VISIBLE_DEVICES=0"):
+        simple_trainer.cli(lambda *_: None, None)
+    assert not (tmp_path / "ckpt.pt").exists()
+
+
 def test_a_second_runner_in_one_process_trains_too(launched, tmp_path, monkeypatch):
     from integration.gsplat import install
     from tests.helpers import simple_trainer

@@ -13,7 +13,7 @@ from clear_strategies.training.field import GaussianField
 from integration import AutogradShot, HostError, ScoreScaler, extra_loss, graph, joint_loss
 from integration.autograd_shot import ScreenGradientSlot
 from rasterizers import Splats, autograd
-from tests.helpers import toy
+from tests.helpers import toy, two_processes
 from tests.helpers.host_parts import HR_FROM_START
 
 
@@ -456,3 +456,7 @@ def test_a_rendering_of_another_view_than_the_one_that_is_passed_is_refused(draw
     message = f"{drawn} must be drawn by the camera of its view {view.name}, got that of {other.name}"
     with pytest.raises(ValueError, match=message) if drawn in ("lr", "hr") else nullcontext():
         joint_loss(conductor, host.params, lr, hr, view, 5)
+
+
+def test_processes_that_average_its_gradients_train_the_same_field(tmp_path):
+    torch.multiprocessing.spawn(two_processes.train, (f"{tmp_path}/group",), nprocs=2)
