@@ -160,6 +160,6 @@ def warn_if_score_is_unused(conductor: Conductor, densifier: Any, threshold: flo
     scoring = conductor.owner("score")
     if scoring is not None and densifier is not None and threshold is None:
         _log.warning(
-            "%s does not read the screen gradient: the densification score of %s has no effect.",
-            type(densifier).__name__, type(scoring).__name__,
+            "%s has no threshold on the screen gradient (gsplat's grow_grad2d, 3DGS's opt.densify_grad_threshold): the "
+            "densification score of %s has no effect.", type(densifier).__name__, type(scoring).__name__,
         )  # fmt: skip

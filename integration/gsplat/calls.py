@@ -54,8 +54,13 @@ class Poses:
         """The view with this pose, in the CPU's memory; None: no training view has it.
 
         Raises:
-            HostError: there are several poses, or two views have this one.
+            HostError: there are several poses, two views have this one, or it is rounded to bfloat16.
         """
+        if viewmats.dtype is torch.bfloat16:
+            raise HostError(
+                "viewmats must be float32 or float64, got bfloat16, which moves a camera by up to 1 / 256 of its position. Leave "
+                "the cameras out of what is converted."
+            )
         poses = viewmats.reshape(-1, 4, 4).numpy()  # compared in numpy: a step has few torch operations
         if len(poses) != 1:
             raise HostError(

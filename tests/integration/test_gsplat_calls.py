@@ -118,6 +118,12 @@ def test_the_nearest_camera_is_the_one_that_is_rendered_if_the_next_is_ten_times
         assert Poses(views).find(pose[None]) is views[0]
 
 
+def test_a_pose_that_is_rounded_to_bfloat16_is_refused():
+    pose, views = beside(1e-5)
+    with pytest.raises(HostError, match="viewmats must be float32 or float64, got bfloat16"):
+        Poses(views).find(pose[None].bfloat16())
+
+
 def test_other_intrinsics_than_those_of_the_photo_are_refused_unless_the_view_is_named():
     host, clear, _ = started()
     view = clear.views[0]

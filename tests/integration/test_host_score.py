@@ -110,10 +110,17 @@ def screen_gradient(host, render, camera, gaussians, **settings):
     return package["viewspace_points"].grad
 
 
-@pytest.mark.parametrize("strategies", [(), (GCO(),)], ids=["baseline", "gco"])
-def test_without_a_score_the_densifier_reads_its_own_statistic(strategies, inria_host, inria_attached):
+@pytest.mark.parametrize(
+    ("strategies", "threshold"),
+    [((), 2e-4), ((GCO(),), 2e-4), ((P2G(patch=4),), None)],
+    ids=["baseline", "gco", "unknown"],
+)
+def test_without_a_score_or_a_threshold_the_densifier_reads_its_own_statistic(
+    strategies, threshold, inria_host, inria_attached, caplog
+):
     """Its threshold is meant for the gradient of the photo; with HR's gradient added, every host would grow more."""
-    clear, gaussians, scene = inria_attached(*strategies)
+    clear, gaussians, scene = inria_attached(*strategies, threshold=threshold)
+    assert ("(gsplat's grow_grad2d, 3DGS's opt.densify_grad_threshold)" in caplog.text) == (threshold is None)
     renders = inria_host.render, clear.wrap(inria_host.render)
     read = [screen_gradient(inria_host, render, scene.cameras[0], gaussians) for render in renders]
     assert clear.attachment.counts["HR renders"] == 1
