@@ -49,7 +49,7 @@ from integration.autograd_shot import HostOutput, OfOthers, Target, require_name
 from integration.graph import require_in_order
 from integration.host import Host
 from integration.host_merge import HostMerge
-from integration.host_steps import HostSteps
+from integration.host_steps import HostSteps, stepping_scaler
 from integration.hr_drawing import Drawable, HrDrawing, RenderAt
 from integration.pending import Pending, why_nothing_was_merged
 from integration.structure import resized
@@ -214,8 +214,15 @@ class Attachment:
             )
 
     def _step_begins(self, has_merged: bool) -> None:
-        """Raise an error if no strategy takes part in the host's first step; warn of a later one."""
+        """Raise an error if no strategy takes part in the host's first step, or a gradient scaler's scale is unknown; warn of a
+        later step without a strategy.
+        """
         if has_merged:
+            if self._host.loss_scale is None and (scaler := stepping_scaler()) and (scale := scaler.get_scale()) != 1:
+                raise HostError(
+                    f"the loop steps by a gradient scaler, which multiplies its loss by {scale:g}, but not that of HR. Pass "
+                    "loss_scale=scaler.get_scale; train a 3DGS-style loop without it."
+                )
             self._merging.fading.before_step(max(self.passes, self._host.accumulation))
             return
         names = [*trained(self._host.leaves())]
@@ -261,7 +268,9 @@ class Attachment:
         has_passed = (last is None or bool(last.merged)) and self.passes % self._host.accumulation == 0
         if has_stepped or (has_passed and not again):
             if self._step is not None:
-                self.conductor.after_step({name: _to_change(p) for name, p in params.items()}, self._step)
+                # Changed in place without a change of version, since the loop may have computed with them; frozen ones stay.
+                changed = {name: p.data if p.requires_grad else p.detach().clone() for name, p in params.items()}
+                self.conductor.after_step(changed, self._step)
             self.t += 1
         if are_dropped:
             self.passes = self._merging.fading.passes = 0
@@ -316,13 +325,6 @@ def _checked(render_at: RenderAt, params: Mapping[str, Tensor]) -> RenderAt:
         return output
 
     return render
-
-
-def _to_change(p: Tensor) -> Tensor:
-    """A parameter that strategies may change in place without a change of version, since the loop may have computed with it
-    before it renders; a copy if the host has frozen it.
-    """
-    return p.data if p.requires_grad else p.detach().clone()
 
 
 def _rows_of(step: Step | None) -> dict[str, Tensor]:

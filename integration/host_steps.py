@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import torch
 from torch import Tensor
+from torch.amp.grad_scaler import GradScaler
 
 from clear_strategies.core.gradients import Grads
 from clear_strategies.errors import HostError
@@ -107,10 +108,7 @@ class HostSteps:
         self._rendered = {name: p for name, p in params.items() if name != "detail"}
 
     def _before_one(self, optimizer: torch.optim.Optimizer, *given: Any) -> None:
-        """
-        Args:
-            given: the arguments of `step`.
-        """
+        """Called before an optimizer steps, with the arguments of its `step`."""
         if self._steps_on_extra:
             return
         if any(callable(x) for x in given):
@@ -165,6 +163,15 @@ class HostSteps:
         self._has_stepped = True
         if "means" in params:
             self._counts["extra views"] += len(self._extra)
+
+
+def stepping_scaler() -> GradScaler | None:
+    """Torch's gradient scaler by whose `step` an optimizer steps now; None: there is none, or it is disabled."""
+    frame = inspect.currentframe()
+    while frame is not None and frame.f_code is not GradScaler.step.__code__:
+        frame = frame.f_back
+    scaler: GradScaler | None = None if frame is None else frame.f_locals["self"]
+    return scaler if scaler is not None and scaler.is_enabled() else None
 
 
 @cache

@@ -55,6 +55,22 @@ def test_an_overflow_is_a_step_that_the_scaler_skips_for_f_det_too(clips, caplog
     assert all(bool(p.isfinite().all()) for p in host.splats.values())
 
 
+@pytest.mark.parametrize("fused", [False, True])
+def test_a_scaler_whose_scale_is_not_told_is_refused_before_the_first_step(fused):
+    host, _, render = started(GCO())
+    before = host.splats["means"].detach().clone()
+    for enabled, scale in ((False, 1024.0), (True, 1.0), (True, 1024.0)):
+        scaler = torch.amp.GradScaler("cpu", init_scale=scale, enabled=enabled)
+        optimizer = torch.optim.Adam([p for p in host.splats.values() if p.requires_grad], lr=0, fused=fused)
+        host.optimizers.update(all=optimizer)
+        scaler.scale(render().mean()).backward()
+        refused = pytest.raises(HostError, match=r"multiplies its loss by 1024, but not that of HR. Pass loss_scale=")
+        with refused if scaler.get_scale() > 1 else nullcontext():
+            scaler.step(optimizer)
+        optimizer.zero_grad()
+    assert torch.equal(host.splats["means"], before)
+
+
 def test_extra_views_are_stepped_on_by_optimizers_that_are_made_anew_and_it_is_told_where_they_no_longer_are(caplog):
     host, clear, render = started(toy.ShowsDark())
     for i in range(20):
@@ -459,6 +475,8 @@ def test_hr_is_left_out_of_every_second_step_but_where_a_densifier_reads_its_sco
 
 @pytest.mark.parametrize("fails", ["by itself", "before it is removed"])
 def test_a_loop_that_an_error_ends_is_not_told_of_its_length(fails, caplog, monkeypatch):
+    gc.collect()  # of earlier tests, whose attachments tell it when they are freed
+    caplog.clear()
     scene = toy.scene(20)
     host = Host(scene)
     clear = attached(host, scene, composed_conductor("gco"))

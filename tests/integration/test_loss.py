@@ -79,6 +79,25 @@ def test_its_value_is_the_sum_of_the_losses_and_backward_writes_the_score_for_a_
     assert torch.allclose(written.norm(dim=1), 2 * update.score)
 
 
+@pytest.mark.parametrize("search", [None, "strong_wolfe"])
+def test_lbfgs_trains_by_a_closure_that_is_called_several_times_in_a_step(search):
+    host, conductor, view, *_ = drawn(GCO(), P2G(patch=4), SVS())
+    conductor.on_fit_start(3, 0)
+    optimizer = torch.optim.LBFGS([*host.params.values()], lr=0.05 if search is None else 1, line_search_fn=search)
+
+    def closure():
+        optimizer.zero_grad()
+        shots = host.render(view.lr.camera, detail=False), host.render(view.hr.camera)
+        loss, _ = joint_loss(conductor, host.params, *shots, view, t)
+        loss.backward()
+        return loss
+
+    losses = []
+    for t in range(1, 4):  # noqa: B007 - of the closure
+        losses.append(float(optimizer.step(closure).detach()))
+    assert losses[-1] < 0.8 * losses[0]
+
+
 def test_an_extra_view_is_learned_from_in_a_step_of_its_own():
     scene = toy.scene(20)
     host, conductor = Host(scene), Conductor(toy.ShowsDark(), objective=HR_FROM_START)
