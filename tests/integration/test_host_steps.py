@@ -90,6 +90,16 @@ def test_extra_views_are_stepped_on_by_optimizers_that_are_made_anew_and_it_is_t
     assert "without an optimizer step" not in caplog.text
 
 
+def test_optimizers_that_are_none_of_torchs_step_without_hooks():
+    host, clear, render = started(GCO())
+    for name, o in host.optimizers.items():
+        host.optimizers[name] = SimpleNamespace(step=o.step, zero_grad=o.zero_grad, param_groups=o.param_groups)
+    for i in range(2):
+        render(i).mean().backward()
+        host.step()
+    assert clear.attachment.counts["merges"] == clear.attachment.t == 2
+
+
 def test_a_step_with_a_closure_is_refused():
     _, clear, render = started()
     optimizer = torch.optim.LBFGS([clear.params()["means"]])
