@@ -18,7 +18,7 @@ from clear_strategies.schedules import WarmupDecay
 from integration.host import Host
 from integration.host_merge import HostMerge
 from integration.pending import BackwardPass
-from tests.helpers import toy
+from tests.helpers import gsplat_host, toy
 from tests.helpers.backends import needs
 
 T, N = 50, 1003  # N: a last block of sixteen that is not full, and more than one chunk of 1,024 numbers
@@ -309,6 +309,21 @@ def test_on_a_device_nothing_is_read():
     assert not found["_local_scalar_dense"]
     assert not found["nonzero"]
     assert found.total() <= 300
+
+
+def test_parameters_whose_columns_lie_together_have_the_same_merged_gradients():
+    grads = []
+    for strided in (False, True):
+        host = gsplat_host.Host(toy.scene(20))
+        for name in ("means", "quats", "scales"):
+            rows = host.splats[name].detach() + torch.linspace(0, 0.5, host.splats[name].shape[1])
+            host.splats[name] = torch.nn.Parameter(rows.t().contiguous().t() if strided else rows)
+        _, _, render = gsplat_host.started(GCO(), host=host)
+        render().square().mean().backward()
+        grads.append({name: host.splats[name].grad for name in ("means", "quats", "scales")})
+        assert all(g.is_contiguous() != strided for g in grads[-1].values())
+    for name, g in grads[0].items():
+        torch.testing.assert_close(grads[1][name], g)
 
 
 def test_dense_gradients_are_the_factors_product():

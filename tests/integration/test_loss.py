@@ -231,14 +231,17 @@ def test_what_reaches_the_colours_and_the_rasterizer_counts_once(found):
         torch.testing.assert_close(leaf.grad, g, rtol=1e-4, atol=1e-4 * float(g.abs().max()))
 
 
+@pytest.mark.parametrize("rows", [1, 20])
 @pytest.mark.parametrize("frozen", [False, True])
-def test_what_moves_the_means_also_learns_from_hr_where_a_rasterizer_takes_centres_that_are_computed_from_them(frozen):
+def test_what_moves_the_means_also_learns_from_hr_where_a_rasterizer_takes_centres_that_are_computed_from_them(
+    frozen, rows
+):
     host, conductor, view, *_ = drawn()
-    shift = torch.zeros(1, 3, requires_grad=True)
+    shift = torch.zeros(rows, 2, requires_grad=True)  # of 20 rows it has the shape of the centres
     host.params["means"].requires_grad_(not frozen)
 
     def render(camera, detail=None):
-        p, means = host.params, host.params["means"] + shift
+        p, means = host.params, host.params["means"] + torch.nn.functional.pad(shift, (0, 1))
         splats = Splats(means, p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), p["sh0"], p["shN"], detail)
         shot = autograd.draw(toy.RASTERIZER, splats, camera, means[:, :2] * 1)
         return AutogradShot(shot.image, shot.means2d, shot.visible, p)
