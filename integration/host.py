@@ -25,8 +25,7 @@ class Host:
             say how.
         restart_parents: called after the host has loaded other parameters, which come from no earlier ones.
         remedy: for the error if strategies store something per Gaussian, but some Gaussians come from no other.
-        threshold: the densification threshold on the mean ‖∇_u‖ in NDC units; None: the score is not scaled.
-        reads_score: the densifier reads the screen gradient.
+        threshold: on the mean ‖∇_u‖ in NDC units, by which the host densifies; None: it reads no score.
         loss_scale: returns the factor of the loss (`scaler.get_scale` of an AMP gradient scaler).
         accumulation: backward passes per optimizer step, if the host divides each loss by this number, and the schedules count
             steps; 1: it sums the losses of several views, or a step has only one, and they count views.
@@ -43,7 +42,6 @@ class Host:
     restart_parents: Callable[[], None] = lambda: None
     remedy: str = "End densification first."
     threshold: float | None = None
-    reads_score: bool = True
     loss_scale: Callable[[], float] | None = None
     accumulation: int = 1
     masks: Mapping[str, Tensor] = field(default_factory=dict)

@@ -45,7 +45,7 @@ class HostMerge:
 
     Attributes:
         pending: the last rendering; None: there is none, or none is to be merged any more.
-        scaler: of the densification score; None: the score is not scaled.
+        scaler: of the densification score; None: the host reads none.
         fading: of f_det.
         replayed: merges by recordings on CUDA.
     """

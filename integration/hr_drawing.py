@@ -147,7 +147,7 @@ class HrDrawing:
         self._sent: dict[str, tuple[Tensor, int, Tensor]] = {}  # masks: the host's, its version, and on the device
         self._loss_scale = host.loss_scale or (lambda: 1.0)
         self._log_once, self._warn_once = Once(_log.info), Once(_log.warning)
-        self.is_scored = host.reads_score and conductor.owner("score") is not None
+        self.is_scored = host.threshold is not None and conductor.owner("score") is not None
         self.replays = replays_on(device, conductor, "the replay of HR")
         if self.replays is not None and (reason := next(why_not_recorded(conductor), None)) is not None:
             self.replays = None

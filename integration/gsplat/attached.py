@@ -137,8 +137,8 @@ class Attached:
         warn_if_score_is_unused(conductor, strategy, threshold)
         host = Host(
             self.params, self._rows.poll, restart_parents=self._rows.restart, remedy=self._rows.remedy, threshold=threshold,
-            reads_score=threshold is not None, loss_scale=loss_scale, accumulation=accumulation, masks=masks or {},
-            own_background=own_background, iterations=iterations,
+            loss_scale=loss_scale, accumulation=accumulation, masks=masks or {}, own_background=own_background,
+            iterations=iterations,
         )  # fmt: skip
         self.attachment: Attachment = Attachment(conductor, host, views, seed=seed)
         self.attachment.undo.callback(self._rows.remove)

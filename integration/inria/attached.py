@@ -105,9 +105,8 @@ class Attached:
         self.detail, self._trains_detail = DetailFeature(lambda: gaussians._xyz, self._rows, conductor.detail), detail
         self._warn_once = Once(_log.warning)
         host = Host(
-            self.params, self.detail.poll_parents, threshold=threshold, reads_score=threshold is not None,
-            accumulation=accumulation, masks=self.views.masks, own_background=own_background,
-            remedy="Nothing has their colour and rotation. End densification first.",
+            self.params, self.detail.poll_parents, threshold=threshold, accumulation=accumulation, masks=self.views.masks,
+            own_background=own_background, remedy="Nothing has their colour and rotation. End densification first.",
         )  # fmt: skip
         self.attachment = Attachment(conductor, host, self.views.all, seed=seed)
         undo = self.attachment.undo
