@@ -14,6 +14,7 @@ import sys
 import tomllib
 from pathlib import Path
 from types import ModuleType
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -211,6 +212,16 @@ def test_the_readmes_loop_prints_the_number_of_its_table():
     )
     torch.manual_seed(0)
     assert gsplat_loop.main(500, "best") == pytest.approx(float(shown), abs=0.15)
+
+
+def test_the_readmes_loop_does_not_prune_by_size(monkeypatch):
+    """DefaultStrategy does from `reset_every` on, in units of the scene: half of the demo's first Gaussians would go."""
+    gsplat_loop = pytest.importorskip("integration.examples.gsplat_loop")
+    strategy = Mock(side_effect=StopIteration)
+    monkeypatch.setattr(gsplat_loop, "DefaultStrategy", strategy)
+    with pytest.raises(StopIteration):
+        gsplat_loop.train(30_000, "best")
+    assert strategy.call_args.kwargs["reset_every"] >= strategy.call_args.kwargs["refine_stop_iter"]
 
 
 def test_the_readmes_diff_stands_in_the_example():

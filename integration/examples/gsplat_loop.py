@@ -40,9 +40,9 @@ def train(iterations: int, strategies: str | None, seed: int = 0) -> tuple[Demo,
     photos = list(zip(demo.names, demo.images, demo.viewmats, demo.Ks, strict=True))
     points = stereo(demo.images, demo.viewmats, demo.Ks)
     splats, optimizers = splats_with_optimizers(points.means, points.colors)
-    strategy = DefaultStrategy(
+    strategy = DefaultStrategy(  # its pruning by size, from `reset_every` on, would remove half of these points
         refine_start_iter=iterations // 20, refine_stop_iter=iterations // 2, refine_every=max(1, iterations // 40),
-        grow_grad2d=1.5e-3,
+        reset_every=iterations, grow_grad2d=1.5e-3,
     )  # fmt: skip
     strategy.check_sanity(splats, optimizers)
     state = strategy.initialize_state(scene_scale=1.0)
