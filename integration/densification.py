@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -19,6 +20,7 @@ from integration.autograd_shot import ScreenGradientSlot
 
 _log = logging.getLogger(__name__)
 _VIEWS_PER_FIT: Final = 10  # sorting N scores at every view would cost more than a newer factor gains
+_MANY: Final = 0.1  # of the first Gaussians
 
 
 def end_with_strategies(conductor: Conductor, settings: Any, name: str, first: int = 1) -> None:
@@ -162,4 +164,21 @@ def warn_if_score_is_unused(conductor: Conductor, densifier: Any, threshold: flo
         _log.warning(
             "%s has no threshold on the screen gradient (gsplat's grow_grad2d, 3DGS's opt.densify_grad_threshold): the "
             "densification score of %s has no effect.", type(densifier).__name__, type(scoring).__name__,
+        )  # fmt: skip
+
+
+def warn_of_pruning_by_size(strategy: Any, state: Mapping[str, Any], scales: Float[Tensor, "N 3"]) -> None:
+    """Warn if gsplat's strategy will remove many of the first Gaussians for their size.
+
+    Args:
+        state: of the strategy. scales: the logarithms.
+    """
+    begins, share = getattr(strategy, "reset_every", math.inf), getattr(strategy, "prune_scale3d", math.inf)
+    largest = share * state.get("scene_scale", math.inf)
+    removed = float((scales.detach().amax(1).exp() > largest).float().mean())
+    if begins < getattr(strategy, "refine_stop_iter", 0) and removed > _MANY:
+        _log.warning(
+            "after step %d, gsplat removes Gaussians larger than prune_scale3d times the scale of the scene, %.3g. Of the first "
+            "Gaussians, %.0f %% are. If the photos are few or small, this costs PSNR: set prune_scale3d=1e9.",
+            begins, largest, 100 * removed,
         )  # fmt: skip

@@ -18,7 +18,7 @@ from clear_strategies.console import show_in_host
 from clear_strategies.core.view import View
 from clear_strategies.errors import HostError, SettingError
 from clear_strategies.merging.conductor import Conductor
-from integration.densification import end_with_strategies
+from integration.densification import end_with_strategies, warn_of_pruning_by_size
 from integration.detail import sh0_offset
 from integration.gsplat.attached import Attached, require_bands
 from integration.replacing import replaced_everywhere
@@ -83,6 +83,7 @@ def install(
         require_bands(runner.splats)  # before SR images are made
         chosen = wanted.conductor(runner.cfg.max_steps)
         end_with_strategies(chosen, runner.cfg.strategy, "refine_stop_iter", first=0)
+        warn_of_pruning_by_size(runner.cfg.strategy, runner.strategy_state, runner.splats["scales"])
         source, scale = wanted.sr_source(chosen)
         photos = photos_of(runner.trainset, runner.device)
         masks = {photo.name: photo.mask for photo in photos if photo.mask is not None}

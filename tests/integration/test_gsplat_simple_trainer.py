@@ -3,6 +3,7 @@
 import copy
 import functools
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -59,6 +60,25 @@ def test_a_strategy_that_densifies_has_no_effect_and_says_so(launched, caplog):
     warned = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert "MCMC has no effect here: the host keeps its own density control." in warned
     assert "structure change" not in caplog.text
+
+
+@pytest.mark.parametrize(("reset_every", "largest", "is_told"), [(3, 0.01, True), (3, 10.0, False), (9, 0.01, False)])
+def test_pruning_by_size_that_would_remove_many_of_the_first_gaussians_is_told(
+    launched, tmp_path, caplog, reset_every, largest, is_told
+):
+    from integration.gsplat import install
+    from tests.helpers import simple_trainer
+
+    runner_class = type("Runner", (simple_trainer.Runner,), {})
+    install(runner_class, sr=tmp_path / "sr", overrides=FROM_START)
+    cfg = simple_trainer.Config(str(tmp_path))
+    cfg.strategy = replace(cfg.strategy, reset_every=reset_every, prune_scale3d=largest)
+    runner = runner_class(0, 0, 1, cfg)
+    runner.trainset = None  # so that it does not train
+    with pytest.raises(TypeError):
+        runner.train()
+    told = "after step 3, gsplat removes Gaussians larger than prune_scale3d times the scale of the scene, 0.04. Of the first"
+    assert (told in caplog.text) == ("Gaussians, 100 % are" in caplog.text) == is_told
 
 
 def test_options_that_do_not_work_with_two_scales_are_refused_before_the_first_step(launched, tmp_path, caplog):
