@@ -74,17 +74,19 @@ class Console(logging.StreamHandler[Any]):
     Args:
         stream: None: stdout.
         verbose: also details, which otherwise only run.log has.
+        tag: before each message and its prefix.
     """
 
-    def __init__(self, stream: TextIO | io.TextIOBase | None = None, *, verbose: bool = False) -> None:
+    def __init__(self, stream: TextIO | io.TextIOBase | None = None, *, verbose: bool = False, tag: str = "") -> None:
         if stream is None:
             harden_output()  # a launcher's processes do not pass `run.main`
         super().__init__(stream if stream is not None else sys.stdout)
+        self._tag = tag
         self.setLevel(logging.DEBUG if verbose else logging.INFO)
         self.addFilter(lambda record: record.levelno > logging.WARNING or record.name.split(".")[0] not in _LIBRARIES)
 
     def format(self, record: logging.LogRecord) -> str:
-        return _PREFIXES.get(record.levelno, "") + super().format(record)
+        return self._tag + _PREFIXES.get(record.levelno, "") + super().format(record)
 
     def emit(self, record: logging.LogRecord) -> None:
         bars = sys.modules.get("tqdm")  # not imported: there is no bar
@@ -100,11 +102,10 @@ def show(*, verbose: bool = False) -> None:
 
 
 def show_in_host() -> None:
-    """Print our messages as "[clear] …" to stderr in another trainer, unless it handles logging itself."""
+    """In another trainer, print our messages as "[clear] …" to stderr, above its bar, unless it handles logging itself."""
     if logging.getLogger().handlers:
         return
-    handler = logging.StreamHandler()
-    handler.setFormatter(logging.Formatter("[clear] %(message)s"))
+    handler = Console(sys.stderr, tag="[clear] ")
     for logger in map(logging.getLogger, _OURS):
         if not logger.handlers:
             logger.addHandler(handler)

@@ -210,3 +210,6 @@ def test_messages_are_shown_where_the_host_has_not_configured_logging(tmp_path):
     for name, code, shown in (("alone", alone, "[clear] said\n"), ("configured", configured, "theirs said\n")):
         assert started("-c", code, cwd=tmp_path, said=tmp_path / name).wait() == 0
         assert (tmp_path / name).read_text() == shown
+    beside_bar = f"from tqdm import tqdm; bar = tqdm(total=9); {alone}"
+    assert started("-c", beside_bar, cwd=tmp_path, said=tmp_path / "beside a bar").wait() == 0
+    assert "[clear] said" in (tmp_path / "beside a bar").read_text().splitlines()
