@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Override
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
@@ -14,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from clear_strategies.errors import SettingError, one_line
 from clear_strategies.options import CONF, composed_by_hydra, options, sweeps
-from clear_strategies.settings import TARGET, flat, has_parameter
+from clear_strategies.settings import TARGET, flat, has_parameter, key_of
 
 WRITTEN: Final = "A setting is written name=value, and clear-strategies --cfg job prints all of them."
 # What Hydra says, and what to say in place of it. Packages hydra-NAME-launcher bring launchers.
@@ -94,10 +95,10 @@ def not_composed(error: Exception, overrides: Sequence[str], config: str) -> Set
 
 def _no_setting(key: str, overrides: Sequence[str], config: str) -> str:
     """What to say of a setting that is not there."""
-    value = next((o.partition("=")[2] for o in overrides if _key(o) == key), "")
+    value = next((o.partition("=")[2] for o in overrides if key_of(o) == key), "")
     if (CONF / key).is_dir():
         return f"no choice of this group is there to be replaced, so it is added: +{key}={value or '…'}."
-    others, group = [o for o in overrides if _key(o) != key], key.partition(".")[0]
+    others, group = [o for o in overrides if key_of(o) != key], key.partition(".")[0]
     for choice in (group, *["+protocol"] * (group == "data")):  # a protocol's scenes have data.root
         named = [f"{choice}={option}" for option in options(choice.lstrip("+"))]
         if having := [word for word in named if key in flat(_composed([*others, word], config))]:
@@ -107,9 +108,11 @@ def _no_setting(key: str, overrides: Sequence[str], config: str) -> str:
 
 
 def _composed(overrides: Sequence[str], config: str) -> dict[str, Any]:
-    """The settings of overrides, none if another one is wrong as well."""
+    """The settings of overrides but for what is swept, none if another one is wrong as well."""
     try:
-        return OmegaConf.to_container(composed_by_hydra(overrides, config))  # type: ignore[return-value]
+        words = OverridesParser.create().parse_overrides(list(overrides))
+        fixed = [text for text, word in zip(overrides, words, strict=True) if not word.is_sweep_override()]
+        return OmegaConf.to_container(composed_by_hydra(fixed, config))  # type: ignore[return-value]
     except (HydraException, OmegaConfBaseException):
         return {}
 
@@ -151,7 +154,3 @@ def _similar(key: str, known: Sequence[str]) -> list[str]:
     begin_so = [other for other in known if other.startswith(key) and "." not in other[len(key) :]]
     alike = begin_so or difflib.get_close_matches(key, known, 1, 0.8)
     return alike or [other for other in known if other.rpartition(".")[2] == key.rpartition(".")[2]]
-
-
-def _key(override: str) -> str:
-    return override.lstrip("+~").partition("=")[0]

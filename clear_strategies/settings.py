@@ -85,6 +85,11 @@ def flat(node: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
     return leaves
 
 
+def key_of(override: str) -> str:
+    """The dotted key or the group of an override as it is written."""
+    return override.lstrip("+~").partition("=")[0]
+
+
 def build(node: Any, key: str = "") -> Any:
     """Build the object that a node describes, by calling its `_target_` after building the nodes inside it.
 
