@@ -70,13 +70,11 @@ def main(overrides: Sequence[str] | None = None) -> None:
     version.setbase("1.3")
     try:
         _run_hydra(options, parser, job, str(CONF), "config")
-    except Exception as error:
-        if isinstance(error, HydraException | OmegaConfBaseException):
-            overrides = [word for word in options.overrides if not word.startswith("hydra.")]
-            raise not_composed(error, overrides, "config") from error
-        if isinstance(error, BrokenProcessPool):
-            raise sweep.worker_ended(error) from error
-        raise
+    except (HydraException, OmegaConfBaseException) as error:
+        overrides = [word for word in options.overrides if not word.startswith("hydra.")]
+        raise not_composed(error, overrides, "config") from error
+    except BrokenProcessPool as error:
+        raise sweep.worker_ended(error) from error
 
 
 def readable(word: str) -> str:
@@ -172,6 +170,7 @@ class SweepCallback(Callback):
     """Runs at the beginning and end of a sweep, in the process that was started; jobs may run in other processes."""
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        sweep.leave_out_what_methods_set_aside(config)
         if refusal := sweep.refusal(config):
             _log.error("%s", refusal)  # of an error that a callback raises Hydra makes a warning
             sys.exit(exit_codes.UNUSABLE)

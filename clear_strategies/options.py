@@ -26,7 +26,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
 from clear_strategies.errors import SettingError
-from clear_strategies.settings import CHANGES_NO_RESULT, TARGET, defaults_of, with_defaults
+from clear_strategies.settings import CHANGES_NO_RESULT, TARGET, defaults_of, key_of, with_defaults
 
 _PACKAGE: Final = Path(__file__).resolve().parent
 # In a wheel conf/ lies inside the package, in a checkout beside it.
@@ -137,11 +137,14 @@ def _job_folder(*swept: str, _root_: Any) -> str:
     Args:
         swept: keys of `UNNAMED` in which the jobs of this sweep differ, and which are in it all the same.
     """
-    left_out = {*UNNAMED}.difference(swept)
-    if _root_.get("method") is not None:
-        left_out.add("strategy")  # it sets them aside
-    named = [word for word in _root_.hydra.overrides.task if word.lstrip("+~").partition("=")[0] not in left_out]
-    return _one_folder(",".join(sorted(named)) or "defaults")
+    words, left_out = list[str](), {*UNNAMED}.difference(swept)
+    for word in _root_.hydra.overrides.task:
+        key = key_of(word)
+        if key == "method" and _root_.get("method") is not None:  # it sets the strategies before it aside
+            words = [before for before in words if key_of(before) != "strategy"]
+        if key not in left_out:
+            words.append(word)
+    return _one_folder(",".join(sorted(words)) or "defaults")
 
 
 def _one_folder(name: str) -> str:

@@ -23,9 +23,8 @@ from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DataError
 from clear_strategies.jobs import device, exit_codes, resume
 from clear_strategies.jobs import scene as scenes
-from clear_strategies.jobs.paths import require_paths
 from clear_strategies.jobs.settings import JobSettings, settings_of
-from clear_strategies.jobs.sweep import in_sweep
+from clear_strategies.jobs.sweep import in_sweep, require_paths
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.outputs import metrics, plan, results
 from clear_strategies.outputs.metrics import Evaluation

@@ -9,7 +9,7 @@ import re
 import signal
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,7 +20,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, OverrideType
+from hydra.core.override_parser.types import ChoiceSweep, Override, OverrideType
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
@@ -28,9 +28,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from clear_strategies import signals
 from clear_strategies.errors import ClearError, DataError, SettingError
-from clear_strategies.files import FINISHED
+from clear_strategies.files import FINISHED, expanded
 from clear_strategies.hydra_errors import require_option
-from clear_strategies.jobs.paths import require_paths
 from clear_strategies.options import UNNAMED
 from clear_strategies.settings import absent, missing
 
@@ -67,6 +66,22 @@ def refusal(config: DictConfig) -> str | None:
         return str(error)
     except (HydraException, OmegaConfBaseException, OSError):
         return None  # Hydra, which composes all jobs next, or the jobs raise the error
+
+
+def leave_out_what_methods_set_aside(config: DictConfig) -> None:
+    """Sweep no strategies that each method of the sweep sets aside: the jobs of one method would all be the same run.
+
+    Args:
+        config: as of `refusal`.
+    """
+    words = {word.key_or_group: word for word in _words(config)}  # Hydra composes them in this order
+    strategy, method = words.get("strategy"), words.get("method")
+    if strategy is None or method is None or [*words].index("method") < [*words].index("strategy"):
+        return
+    chosen = method.value()
+    if strategy.is_sweep_override() and all(chosen.list if isinstance(chosen, ChoiceSweep) else [chosen]):
+        with read_write(config.hydra):  # of one key the last counts
+            config.hydra.overrides.task.append(f"{strategy.get_key_element()}=baseline")
 
 
 def name_by_all_that_is_swept(config: DictConfig) -> None:
@@ -137,6 +152,22 @@ def _lack(config: DictConfig) -> str | None:
     except DataError as error:
         return str(error)
     return None
+
+
+def require_paths(setting: Callable[[str], Any]) -> None:
+    """Raise a DataError if a folder or file of the scene or of its SR images is not there.
+
+    It names the first folder of a path that is not there, which is the same for all scenes of a wrong data.root.
+
+    Args:
+        setting: the value of a dotted key; None where the configuration has no such key.
+    """
+    given = {"data.cloud.path": setting("data.cloud.init") == "ply", "prior.path": setting("data.save_lr") is None}
+    for key in ("data.root", "data.path", *(name for name, is_read in given.items() if is_read)):
+        if path := setting(key):
+            whole = Path(expanded(str(path)))
+            if gone := [part for part in (*reversed(whole.parents), whole) if not part.exists()]:
+                raise DataError(gone[0], key, "is not there", "correct the path")
 
 
 def in_worker() -> bool:

@@ -58,6 +58,8 @@ class Chosen:
             key, _, value = override.lstrip("+~").partition("=")
             if key == "method" and value != "[]":  # replaces the strategies before it
                 given = [value]
+            elif key == "strategy" and value == "baseline" and given:  # no strategy, beside a method
+                continue
             elif key == "strategy":  # without a plus, it replaces the choice before it
                 given = [*(given if override.startswith("+") else []), value.strip("[]").replace(",", " + ")]
             elif (name := OF_STRATEGY.fullmatch(key)) is not None:
@@ -133,7 +135,7 @@ def _skipped(state: TrainState) -> Iterator[str]:
         yield f"HR scale until iteration {hr.start} (lambda_HR = 0)"
     if state.mip.variance == 0:
         yield "3D filter (variance 0)"
-    yield from state.conductor.skips.descriptions(state.views, uses_hr=state.conductor.uses_hr)
+    yield from state.conductor.skips.descriptions(state.views, hr_from=state.conductor.hr_from)
 
 
 def _marks(state: TrainState) -> dict[str, int]:

@@ -115,14 +115,27 @@ def test_a_sweep_whose_jobs_do_not_all_lack_the_same_begins_and_goes_on_after_a_
         (["prior=onnx", "prior.path=../a,b/c"], ["prior.path=.._a,prior=onnx", "prior.path=b_c,prior=onnx"]),
         (
             ["experiment=table5", "protocol=scenes", "data.root=a,b", "+method=srgs", "+scene=fern", "fit.seed=0"],
-            [f"+method=srgs,+scene=fern,data.root={root},fit.seed=0,protocol=scenes" for root in "aabbaabb"],
+            [f"+method=srgs,+scene=fern,data.root={root},fit.seed=0,protocol=scenes" for root in "ab"],
         ),
         (["fit.threads=1,2", "hydra.sweep.subdir=${hydra.job.num}"], ["0", "1"]),
+        (
+            ["experiment=table5", "+method=srgs,splatsure", "data.scene=room", "data.root=a", "fit.seed=0"],
+            [f"+method={m},data.scene=room,fit.seed=0" for m in ("srgs", "splatsure")],
+        ),
+        (
+            ["+method=srgs,splatsure", "+strategy=gco,svs"],
+            [f"+method={m},+strategy={s}" for m in ("srgs", "splatsure") for s in ("gco", "svs")],
+        ),
+        (
+            ["+strategy=gco,svs", "+method=srgs,[]"],
+            ["+method=srgs"] * 2 + [f"+method=[],+strategy={s}" for s in ("gco", "svs")],
+        ),
     ],
 )
 def test_the_folders_of_a_sweeps_jobs_are_named_by_all_in_which_they_differ(asked, folders, monkeypatch):
     monkeypatch.setattr(sweep.GlobalHydra, "instance", lambda: SimpleNamespace(config_loader=loader))
     config = loader().load_configuration("config", [w for w in asked if w != "-m"], run_mode=RunMode.MULTIRUN)
+    sweep.leave_out_what_methods_set_aside(config)
     sweep.name_by_all_that_is_swept(config)
     named = list[str]()
     for number, overrides in enumerate(sweep._overrides_of_jobs(config)):

@@ -40,7 +40,7 @@ def test_the_plan_names_strategies_and_milestones_and_a_run_as_the_command_line_
     assert "SVS anchor_start 7" in found["milestones"]
     assert "(the paper's baseline)" in lines(started())["strategies"]
     assert "(the paper's baseline)" not in lines(started(), method="srgs")["strategies"]
-    chosen = (["+strategy=best", "fit.seed=3"], ["+strategy=[gco,svs]"], ["+method=srgs"], None)
+    chosen = (["+strategy=best", "fit.seed=3"], ["+strategy=[gco,svs]"], ["+method=srgs", "+strategy=baseline"], None)
     titles = [plan.Chosen(None, ["gco", "p2g"], words).title for words in chosen]
     assert titles == ["best", "gco + svs", "srgs", "gco + p2g"]
 
