@@ -45,15 +45,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("folders", nargs="+", type=path_of, metavar="DIR", help="a run's folder, or a folder of runs")
     parser.add_argument("--out", type=path_of, metavar="FOLDER", help="where the report goes (default: the first DIR)")
+    against = "the method that Δ is the difference from (default: baseline, or without one the first)"
+    parser.add_argument("--against", metavar="METHOD", help=against)
     options = parser.parse_args(arguments)
     console.show()
     out = options.out or options.folders[0]
-    sys.stdout.write(write(collect(options.folders), out))
+    sys.stdout.write(write(collect(options.folders), out, options.against))
 
 
-def write(runs: Sequence[FinishedRun], out: Path) -> str:
-    """Write the files of a report into `out`; returns the text of report.md."""
-    table = compare(runs)
+def write(runs: Sequence[FinishedRun], out: Path, against: str | None = None) -> str:
+    """Write the files of a report into `out`; returns the text of report.md.
+
+    Args:
+        against: see `compare`.
+    """
+    table = compare(runs, against)
     text = markdown(layout(table), notes(table, runs))
     papers = {f"{data}, beside the paper's numbers": cells for data, cells in paper.beside(runs).items()}
     for title, cells in papers.items():

@@ -17,7 +17,7 @@ from clear_strategies.errors import DataError, counted
 from clear_strategies.files import FINISHED
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.plan import OF_STRATEGY, Chosen
-from clear_strategies.settings import CHANGES_NO_RESULT
+from clear_strategies.settings import CHANGES_NO_RESULT, key_of
 from clear_strategies.viewing.cameras import FILE as CAMERAS
 
 _log = logging.getLogger(__name__)
@@ -25,9 +25,8 @@ _log = logging.getLogger(__name__)
 OWN: Final = "metrics."
 """Prefix of the names of a run's own metrics."""
 _HYDRA: Final = ".hydra"
-_SEED: Final = "fit.seed="
-# The overrides that name a run; the others are its settings.
-_METHOD, _STRATEGY = "method=", "strategy="
+# The keys of a run's seed and name; other overrides are its settings.
+_COLUMNS: Final = ("fit.seed", "method", "strategy")
 _DATA: Final = ("data.path", "data.root")  # keys of a run's configuration
 # Suffixes of keys that never distinguish runs: seeds, and paths, whose content may have moved.
 _OF_SEED_OR_PLACE: Final = ("seed", "path", "root", "cache", "lr_folder")
@@ -86,7 +85,7 @@ class FinishedRun:
             marks=", ".join(marks),
             name=Chosen(content.method, content.strategies, overrides).title,
             protocol=_protocol(folder),
-            settings=tuple(filter(_is_setting, overrides)),
+            settings=tuple(filter(_is_setting, {key_of(word): word for word in overrides}.values())),
             seed=content.seed,
             numbers={
                 **ours,
@@ -187,11 +186,8 @@ def history(folder: Path) -> pd.DataFrame:
 
 
 def _is_setting(override: str) -> bool:
-    override = override.lstrip("+~")
-    key = override.partition("=")[0]
-    named_elsewhere = (
-        override.startswith((_SEED, _METHOD, _STRATEGY)) or _PATH.fullmatch(key) or OF_STRATEGY.fullmatch(key)
-    )
+    key = key_of(override)
+    named_elsewhere = key in _COLUMNS or _PATH.fullmatch(key) or OF_STRATEGY.fullmatch(key)
     return not (named_elsewhere or key.startswith(("hydra", OWN)) or key in CHANGES_NO_RESULT)
 
 

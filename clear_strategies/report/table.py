@@ -1,4 +1,4 @@
-"""The table of runs: one row per method, with its difference from the first method.
+"""The table of runs: one row per method, with its difference from a reference: the baseline, unless another is chosen.
 
 Differences are taken seed by seed if two methods share seeds, so that the effect of a seed on both methods is not part of the
 error.
@@ -14,6 +14,7 @@ from typing import Final
 
 import pandas as pd
 
+from clear_strategies.errors import SettingError
 from clear_strategies.outputs.metrics import NOTE
 from clear_strategies.report.runs import OWN, FinishedRun
 
@@ -27,26 +28,37 @@ _QUANTITIES: Final = {
 }  # fmt: skip
 _PAIRS: Final = 2  # the least number of pairs for which a difference has an error
 _UNPAIRED: Final = "*"
+_BASELINE: Final = "baseline"
 
 
-def compare(runs: Sequence[FinishedRun]) -> pd.DataFrame:
+def compare(runs: Sequence[FinishedRun], against: str | None = None) -> pd.DataFrame:
     """Summarize the runs: for each scene, in the order of the runs, one row per method; then the averages over scenes.
+
+    Args:
+        against: the method of the reference, as its row or its run is named; None, or in a scene that lacks it: the baseline, or
+            without one the first method.
 
     Returns:
         The columns scene; method: its name, then the settings that not all runs of the scene share; average: True for an average;
         run: the first of a method; runs: their number; seeds. The mean of each quantity, and its standard deviation over the
-        seeds of a method, `_std`. For PSNR also that of the best seed, `_best`, and the difference from the first method of the
-        scene, `_delta`, its standard error, `_delta_error`, and the number of its pairs, `_delta_pairs`: runs of the same seed,
-        in an average of the same scene and seed.
+        seeds of a method, `_std`. For PSNR also that of the best seed, `_best`, and the difference from the scene's reference,
+        `_delta`, its standard error, `_delta_error`, and the number of its pairs, `_delta_pairs`: runs of the same seed, in an
+        average of the same scene and seed. reference: True for the row of the reference.
+
+    Raises:
+        SettingError: no run is of the method `against`.
     """
     single = _each_seed_once(run_rows(runs))
-    tables = [_summary(rows) for _, rows in single.groupby("scene", sort=False)]
+    names = dict.fromkeys((*(run.name for run in single["run"]), *single["method"]))
+    if against is not None and against not in names:
+        raise SettingError(f"--against: must be a method of the runs, got {against}. There are {'; '.join(names)}.")
+    tables = [_summary(rows, against) for _, rows in single.groupby("scene", sort=False)]
     # Scores against LR photos, or of training views, are not averaged with others.
     for marks, alike in single.groupby("marks", sort=False):
         count = alike["scene"].nunique()
         title = f"average of {count} scenes" + (f" ({marks})" if marks else "")
         if count > 1 and len(comparable := _of_all_scenes(alike, title)):
-            tables.append(_average(comparable, title))
+            tables.append(_average(comparable, title, against))
     return pd.concat(tables, ignore_index=True).astype({"psnr_delta_pairs": "Int64"})
 
 
@@ -58,6 +70,7 @@ def layout(table: pd.DataFrame) -> pd.DataFrame:
         if quantity == "psnr":
             delta = _numbers(table["psnr_delta"], table["psnr_delta_error"], "+.2f")
             marked = [cell + _UNPAIRED * int(few) for cell, few in zip(delta, _unpaired(table), strict=True)]
+            marked = ["reference" if it else cell for cell, it in zip(marked, table["reference"], strict=True)]
             cells["Δ"] = marked if _differ(table) else [""] * len(table)
             cells["best"] = _numbers(table["psnr_best"], None, form)
     cells["seed"] = list(table["seeds"])
@@ -75,7 +88,8 @@ def notes(table: pd.DataFrame, runs: Sequence[FinishedRun]) -> list[str]:
     lines = [f"PSNR is also given of the enlarged LR photos (bicubic) and of the SR images (prior); {NOTE}."]
     if _differ(table):
         error = "; its ±: standard error of the differences seed by seed" * int(table["psnr_delta_error"].notna().any())
-        lines.append(f"Δ: PSNR over the scene's first method, dB{error}.")
+        references = " or ".join(dict.fromkeys(table.loc[table["reference"], "method"]))
+        lines.append(f"Δ: PSNR over the scene's reference, {references}, dB{error}.")
         if _unpaired(table).any():
             why = "fewer than two seeds are common to both methods"
             lines.append(f"Δ{_UNPAIRED}: {why}, so it is the difference of their means, and has no error.")
@@ -94,9 +108,8 @@ def _differ(table: pd.DataFrame) -> bool:
 
 
 def _unpaired(table: pd.DataFrame) -> pd.Series[bool]:
-    """The mask of rows, other than the first of a scene, whose Δ has too few pairs for an error."""
-    later = table.groupby("scene", sort=False).cumcount() > 0
-    return later & table["psnr_delta"].notna() & (table["psnr_delta_pairs"] < _PAIRS)
+    """The mask of rows, other than references, whose Δ has too few pairs for an error."""
+    return ~table["reference"] & table["psnr_delta"].notna() & (table["psnr_delta_pairs"] < _PAIRS)
 
 
 def markdown(cells: pd.DataFrame, lines: Sequence[str]) -> str:
@@ -156,7 +169,7 @@ def _each_seed_once(single: pd.DataFrame) -> pd.DataFrame:
     return single[~again]
 
 
-def _summary(single: pd.DataFrame) -> pd.DataFrame:
+def _summary(single: pd.DataFrame, against: str | None) -> pd.DataFrame:
     """A row for each method of one scene."""
     groups = single.groupby("key", sort=False)
     table = groups[["scene", "method", "run"]].first().assign(average=False, runs=groups.size())
@@ -168,7 +181,7 @@ def _summary(single: pd.DataFrame) -> pd.DataFrame:
     for quantity in _quantities(single):
         table[quantity], table[f"{quantity}_std"] = groups[quantity].mean(), groups[quantity].std()
     table["psnr_best"] = groups["psnr"].max().where(groups["psnr"].count() > 1)
-    return table.join(_differences(single, "key", table["psnr"])).reset_index(drop=True)
+    return table.join(_differences(single, "key", table["psnr"], against)).reset_index(drop=True)
 
 
 def _of_all_scenes(single: pd.DataFrame, title: str) -> pd.DataFrame:
@@ -180,7 +193,7 @@ def _of_all_scenes(single: pd.DataFrame, title: str) -> pd.DataFrame:
     return single[complete]
 
 
-def _average(single: pd.DataFrame, title: str) -> pd.DataFrame:
+def _average(single: pd.DataFrame, title: str, against: str | None) -> pd.DataFrame:
     """A row for each method, averaged over the scenes, all of which have it."""
     scenes = single["scene"].nunique()
     means = (
@@ -190,23 +203,24 @@ def _average(single: pd.DataFrame, title: str) -> pd.DataFrame:
     table = means.mean().where(means.count() == scenes).assign(average=True, runs=0, seeds="", scene=title)
     shared = _in_all([identity.split("\n")[1:] for identity in table.index])
     table["method"] = [_label(name, settings, shared) for name, *settings in table.index.str.split("\n")]
-    return table.join(_differences(single, "identity", table["psnr"])).reset_index(drop=True)
+    return table.join(_differences(single, "identity", table["psnr"], against)).reset_index(drop=True)
 
 
-def _differences(single: pd.DataFrame, key: str, means: pd.Series[float]) -> pd.DataFrame:
-    """PSNR of each method minus that of the first: over the pairs of one scene and seed, or, with fewer than two pairs, the
+def _differences(single: pd.DataFrame, key: str, means: pd.Series[float], against: str | None) -> pd.DataFrame:
+    """PSNR of each method minus that of the reference: over the pairs of one scene and seed, or, with fewer than two pairs, the
     difference of the two means, without an error.
     """
+    rows = zip(single[key], single["method"], (run.name for run in single["run"]), strict=True)
+    reference, *_ = max(rows, key=lambda row: (row[1] == against, row[2] == against, row[2] == _BASELINE))  # the first
     # A method whose PSNR is never finite must have a column as well.
     by_seed = single.groupby([key, "scene", "seed"], sort=False)["psnr"].mean().unstack(key, sort=False)
-    first = by_seed.columns[0]
-    pairs = by_seed.sub(by_seed[first], axis=0)
+    pairs = by_seed.sub(by_seed[reference], axis=0)
     table = pd.DataFrame(
         {"psnr_delta": pairs.mean(), "psnr_delta_error": pairs.sem(), "psnr_delta_pairs": pairs.count()}
-    )
+    ).assign(reference=by_seed.columns == reference)
     few = table["psnr_delta_pairs"] < _PAIRS
-    table.loc[few, "psnr_delta"] = means[few[few].index] - means[first]
-    table.loc[table.index == first, ["psnr_delta", "psnr_delta_error"]] = 0.0, math.nan
+    table.loc[few, "psnr_delta"] = means[few[few].index] - means[reference]
+    table.loc[table["reference"], ["psnr_delta", "psnr_delta_error"]] = 0.0, math.nan
     return table
 
 

@@ -20,6 +20,7 @@ from matplotlib.lines import Line2D
 
 from clear_strategies import DataError, files, report
 from clear_strategies.data.photo_files import write_png
+from clear_strategies.errors import SettingError
 from clear_strategies.outputs.figures import SheetRow, window, write_contact_sheet, write_curves
 from clear_strategies.settings import CHANGES_NO_RESULT
 from tests.helpers.finished_run import averages_of, cells, make_run, rows_of, scores, table_of
@@ -222,17 +223,56 @@ def test_scores_of_training_views_or_against_lr_photos_are_marked(tmp_path: Path
     assert scenes == {"a (against LR photos)", "b (training views, against LR photos)"}
 
 
-def test_methods_are_compared_with_the_first_of_their_scene(tmp_path: Path) -> None:
+def test_methods_are_compared_with_the_baseline_or_the_one_that_is_chosen_and_the_table_names_it(tmp_path, capsys):
+    for scene, rows in {
+        "demo": {"clear": 22.0, "baseline": 20.0, "gco": 21.0},
+        "fern": {"gco": 5.0, "clear": 6.0},
+    }.items():
+        for strategy, psnr in rows.items():
+            for seed in (0, 1):
+                make_run(
+                    tmp_path / scene / f"{strategy}{seed}", f"+strategy={strategy}", psnr=psnr, scene=scene, seed=seed
+                )
+    made = sorted(tmp_path.glob("*/*"), key=lambda run: ["clear", "baseline", "gco"].index(run.name[:-1]))
+    runs = report.collect(made)
+
+    def gains(against: str | None) -> dict[tuple[str, str], tuple[float, bool]]:
+        table = report.compare(runs, against)
+        return {(row.scene, row.method): (row.psnr_delta, row.reference) for row in table.itertuples()}
+
+    average = "average of 2 scenes"
+    assert gains(None) == {
+        ("demo", "clear"): (2.0, False), ("demo", "baseline"): (0.0, True), ("demo", "gco"): (1.0, False),
+        ("fern", "clear"): (0.0, True), ("fern", "gco"): (-1.0, False),
+        (average, "clear"): (0.0, True), (average, "gco"): (-1.0, False),
+    }  # fmt: skip
+    assert {row for row, (_, it) in gains("gco").items() if it} == {(s, "gco") for s in ("demo", "fern", average)}
+    assert gains("gco")["demo", "baseline"] == (-1.0, False)
+    report.main([str(tmp_path), "--against", "gco"])
+    printed = capsys.readouterr().out
+    assert {line["method"] for line in cells(printed) if line["Δ"] == "reference"} == {"gco"}
+    assert "Δ: PSNR over the scene's reference, gco, dB" in printed
+    with pytest.raises(SettingError, match=r"--against: must be a method of the runs, got svs. There are .*gco"):
+        report.compare(runs, "svs")
+
+
+def test_of_a_setting_that_is_given_twice_the_last_counts(tmp_path: Path) -> None:
+    make_run(tmp_path / "0", "+strategy=gco", "fit.iterations=20")
+    make_run(tmp_path / "1", "+strategy=gco", "fit.iterations=20", "fit.iterations=25")
+    assert set(rows_of(tmp_path)) == {"gco, fit.iterations=20", "gco, fit.iterations=25"}
+
+
+def test_without_a_baseline_methods_are_compared_with_the_first_of_their_scene(tmp_path: Path) -> None:
     for job, (strategy, psnr) in enumerate([("baseline", 20.0), *[("gco", 20.5)] * 9, ("clear", 19.25)]):
         make_run(tmp_path / str(job), f"+strategy={strategy}", psnr=psnr, seed=job)
     make_run(tmp_path / "fern", "+strategy=gco", psnr=25.0, scene="fern", synthetic_prior=True)
     lines = cells(table_of(tmp_path))
     assert [line["method"] for line in lines if line["scene"] == "demo"] == ["baseline", "gco", "clear"]
-    assert [line["Δ"] for line in lines if line["scene"] == "demo"] == ["+0.00", "+0.50*", "-0.75*"]
+    assert [line["Δ"] for line in lines if line["scene"] == "demo"] == ["reference", "+0.50*", "-0.75*"]
     assert "Δ*: fewer than two seeds are common to both methods" in table_of(tmp_path)
     assert lines[0]["bicubic (dB)"] == "18.00"
     fern = [line for line in lines if line["scene"] == "fern (synthetic prior)"]
-    assert (fern[-1]["method"], fern[-1]["Δ"]) == ("gco", "+0.00")
+    assert (fern[-1]["method"], fern[-1]["Δ"]) == ("gco", "reference")
 
 
 def test_differences_are_paired_by_seed(tmp_path: Path) -> None:
@@ -244,7 +284,7 @@ def test_differences_are_paired_by_seed(tmp_path: Path) -> None:
     assert (gco["psnr_delta"], gco["psnr_delta_pairs"]) == (0.75, 3)
     assert gco["psnr_delta_error"] == pytest.approx((0.875 / 2 / 3) ** 0.5)
     lines = {line["method"]: line for line in cells(table_of(tmp_path))}
-    assert (lines["baseline"]["Δ"], lines["gco"]["Δ"]) == ("+0.00", "+0.75 ± 0.38")
+    assert (lines["baseline"]["Δ"], lines["gco"]["Δ"]) == ("reference", "+0.75 ± 0.38")
     assert "Δ*" not in table_of(tmp_path)
 
 
