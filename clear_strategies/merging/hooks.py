@@ -222,7 +222,9 @@ class Hooks:
             refuse(s, "reconcile", "Weights(keep, remove)", weights)
         for name, w in weights._asdict().items():
             if not (isinstance(w, Real) or is_real(w, (), (n,), (n, groups))):
-                refuse(s, "reconcile", f"Weights whose {name} is a number or a tensor [{n}] or [{n}, {groups}]", w)
+                by_group = "; w.expand_as(products.dot) gives each Gaussian those of its groups" * is_real(w, (groups,))
+                rule = f"Weights whose {name} is a number or a tensor [{n}] or [{n}, {groups}]{by_group}"
+                refuse(s, "reconcile", rule, w)
         if finite:
             require_finite(s, "reconcile", weights._asdict())
         return weights
