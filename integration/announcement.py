@@ -47,7 +47,7 @@ def announce(conductor: Conductor, views: Sequence[View], host: Host) -> None:
             "%s has no effect: the views were made without it. Make them with sr=conductor.prior(sr).",
             ", ".join(getattr(getattr(d, "func", d), "__name__", str(d)) for d in conductor.decorators),
         )
-    for phrase in conductor.skips.descriptions(views, uses_hr=conductor.uses_hr, in_host=True):
+    for phrase in conductor.skips.descriptions(views, hr_from=conductor.hr_from, in_host=True):
         _log.info("Skipped: %s.", phrase)
     for hook, reason in {
         "densifier": "keeps its own density control",

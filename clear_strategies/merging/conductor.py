@@ -106,6 +106,16 @@ class Conductor(Hooks):
         λ = self.objective.lambda_hr
         return λ.peak > 0 or λ.final > 0 or not self.wants_lr or self.owner("score") is not None
 
+    @property
+    def hr_from(self) -> int | None:
+        """The iteration after which HR may have a use, see `wants_hr`; None: it has none in any."""
+        if not self.uses_hr:
+            return None
+        if not self.wants_lr:
+            return 0
+        start, collecting = self.objective.lambda_hr.start, self.statistics_from
+        return start if collecting is None or self.owner("score") is None else min(start, collecting)
+
     def wants_hr(self, t: int, *, scored: bool = True) -> bool:
         """Return True if the HR render is used at t: λ_HR > 0, Î_LR is its area mean, or a densification score needs it.
 

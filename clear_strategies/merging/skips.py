@@ -119,22 +119,25 @@ class SkipPolicy:
         self.skips = skips if skips is not None else Skips()
         self._coarse: dict[str, tuple[View, View]] = {}  # a view and its coarse one, by name
 
-    def descriptions(self, views: Sequence[View], *, uses_hr: bool = True, in_host: bool = False) -> list[str]:
+    def descriptions(self, views: Sequence[View], *, hr_from: int | None = 0, in_host: bool = False) -> list[str]:
         """A phrase for each skip that is on, for the plan; one that has no effect is logged.
 
         Args:
-            uses_hr: there is work on HR to leave out.
+            hr_from: the iteration after which there is work on HR to leave out; None: there is none.
             in_host: the iterations are a host's, so that none is left out.
         """
         s, phrases, plateau = self.skips, [], Plateau(self.skips, len(views))
-        if uses_hr and s.coarse_until > 0 and not any(map(_halves, views)):
+        hr_is_left_out = hr_from is not None and s.coarse_until > hr_from
+        if hr_from is not None and 0 < s.coarse_until <= hr_from:
+            _log.warning("skips.coarse_until has no effect: HR takes part after iteration %d only.", hr_from)
+        elif hr_is_left_out and not any(map(_halves, views)):
             _log.warning(
                 "skips.coarse_until has no effect: SR images are halved only where %s is even.",
                 "factor" if in_host else "data.views.sr_scale",
             )
-        elif uses_hr and s.coarse_until > 0:
+        elif hr_is_left_out:
             phrases.append(f"HR at half its size until iteration {s.coarse_until}")
-        if uses_hr and s.hr_every > 1 and s.coarse_until > 0:
+        if hr_is_left_out and s.hr_every > 1:
             phrases.append(
                 f"HR in one of {s.hr_every} iterations until iteration {s.coarse_until}, and in each whose scores "
                 "densification reads"

@@ -217,6 +217,10 @@ ANSWERS = {
     "route": ("route", torch.tensor(0.5), "must give a number or a tensor \\[30\\], got a tensor \\[\\]"),
     "reconcile": ("reconcile", {"keep": 1.0}, "must give Weights\\(keep, remove\\), got {'keep': 1.0}"),
     "keep": ("reconcile", Weights(keep=None), "keep is a number or a tensor \\[30\\] or \\[30, 6\\], got None"),
+    "keep, by group": (
+        "reconcile", Weights(keep=torch.ones(6)),
+        "\\[30, 6\\]; w.expand_as\\(products.dot\\) gives each Gaussian those of its groups, got a tensor \\[6\\]",
+    ),
     "keep NaN": (
         "reconcile", lambda p, step: Weights(keep=nan_of_first(p.dot[:, 0])),
         "must give finite numbers, but keep is not finite for 1 Gaussian, first Gaussian 3",
@@ -691,6 +695,7 @@ def test_a_scale_that_the_objective_needs_is_asked_for_and_hr_only_while_it_has_
     never = Conductor(objective=Objective(lambda_hr=WarmupDecay(peak=0, final=0)))
     assert not any(never.wants_hr(t) for t in range(0, 10_000, 100))
     assert [c.uses_hr for c in (plain, scoring, never)] == [True, True, False]
+    assert [c.hr_from for c in (plain, scoring, never)] == [10, 5, None]
     assert all(
         Conductor(*s, objective=replace(never.objective, lr_from=f)).uses_hr for s, f in [([P2G()], "lr"), ([], "hr")]
     )

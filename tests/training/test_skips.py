@@ -76,6 +76,15 @@ def test_a_skip_that_cannot_act_is_logged_and_not_in_the_plan(caplog):
     assert not caplog.records
     odd = replace(view, hr=view.hr.reduced(4))  # by a factor of 1
     assert SkipPolicy(skips).descriptions([odd]) == [window]
+    caplog.clear()
+    assert (
+        SkipPolicy(skips).descriptions([view], hr_from=None)
+        == SkipPolicy(skips).descriptions([view], hr_from=10)
+        == [window]
+    )
+    assert [record.getMessage() for record in caplog.records] == [
+        "skips.coarse_until has no effect: HR takes part after iteration 10 only."
+    ]
     faint = SkipPolicy(Skips(undrawn=0.1))
     assert [faint.descriptions([odd], in_host=host) for host in (False, True)] == [
         ["Gaussians too faint to be drawn, once densification has ended"], [],
