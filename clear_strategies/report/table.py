@@ -35,8 +35,8 @@ def compare(runs: Sequence[FinishedRun], against: str | None = None) -> pd.DataF
     """Summarize the runs: for each scene, in the order of the runs, one row per method; then the averages over scenes.
 
     Args:
-        against: the method of the reference, as its row or its run is named; None, or in a scene that lacks it: the baseline, or
-            without one the first method.
+        against: the reference, by the name of its row or its run; None, or in a scene that lacks it: the baseline, or without
+            one the first method. Of several with this name, a method is compared with the one of its own settings.
 
     Returns:
         The columns scene; method: its name, then the settings that not all runs of the scene share; average: True for an average;
@@ -88,8 +88,8 @@ def notes(table: pd.DataFrame, runs: Sequence[FinishedRun]) -> list[str]:
     lines = [f"PSNR is also given of the enlarged LR photos (bicubic) and of the SR images (prior); {NOTE}."]
     if _differ(table):
         error = "; its ±: standard error of the differences seed by seed" * int(table["psnr_delta_error"].notna().any())
-        references = " or ".join(dict.fromkeys(table.loc[table["reference"], "method"]))
-        lines.append(f"Δ: PSNR over the scene's reference, {references}, dB{error}.")
+        references = " or ".join(f"`{method}`" for method in dict.fromkeys(table.loc[table["reference"], "method"]))
+        lines.append(f"Δ: PSNR over the reference, {references}, dB{error}.")
         if _unpaired(table).any():
             why = "fewer than two seeds are common to both methods"
             lines.append(f"Δ{_UNPAIRED}: {why}, so it is the difference of their means, and has no error.")
@@ -207,21 +207,33 @@ def _average(single: pd.DataFrame, title: str, against: str | None) -> pd.DataFr
 
 
 def _differences(single: pd.DataFrame, key: str, means: pd.Series[float], against: str | None) -> pd.DataFrame:
-    """PSNR of each method minus that of the reference: over the pairs of one scene and seed, or, with fewer than two pairs, the
+    """PSNR of each method minus that of its reference: over the pairs of one scene and seed, or, with fewer than two pairs, the
     difference of the two means, without an error.
     """
-    rows = zip(single[key], single["method"], (run.name for run in single["run"]), strict=True)
-    reference, *_ = max(rows, key=lambda row: (row[1] == against, row[2] == against, row[2] == _BASELINE))  # the first
     # A method whose PSNR is never finite must have a column as well.
     by_seed = single.groupby([key, "scene", "seed"], sort=False)["psnr"].mean().unstack(key, sort=False)
-    pairs = by_seed.sub(by_seed[reference], axis=0)
+    references = [*map(_references(single, key, against).get, by_seed)]
+    pairs = by_seed - by_seed[references].to_numpy()
     table = pd.DataFrame(
         {"psnr_delta": pairs.mean(), "psnr_delta_error": pairs.sem(), "psnr_delta_pairs": pairs.count()}
-    ).assign(reference=by_seed.columns == reference)
-    few = table["psnr_delta_pairs"] < _PAIRS
-    table.loc[few, "psnr_delta"] = means[few[few].index] - means[reference]
+    ).assign(reference=by_seed.columns == references)
+    of_means = means[by_seed.columns] - means[references].to_numpy()
+    table["psnr_delta"] = table["psnr_delta"].where(table["psnr_delta_pairs"] >= _PAIRS, of_means)
     table.loc[table["reference"], ["psnr_delta", "psnr_delta_error"]] = 0.0, math.nan
     return table
+
+
+def _references(single: pd.DataFrame, key: str, against: str | None) -> dict[str, str]:
+    """The key of the reference of each method: the one called `against`, else the baseline, else the first; of several that
+    differ in their settings, the one that has the settings of the method.
+    """
+    rows = zip(single[key], single["method"], (run.name for run in single["run"]), strict=True)
+    first, label, name = max(rows, key=lambda row: (row[1] == against, row[2] == against, row[2] == _BASELINE))
+    settings = {method: "".join(method.partition("\n")[1:]) for method in single[key]}
+    if label == against != name:
+        return dict.fromkeys(settings, first)
+    compared = {its for method, its in settings.items() if method != name + its}
+    return {m: name + its if its in compared and name + its in settings else first for m, its in settings.items()}
 
 
 def _in_all(lists: Sequence[Sequence[str]]) -> list[str]:

@@ -251,9 +251,30 @@ def test_methods_are_compared_with_the_baseline_or_the_one_that_is_chosen_and_th
     report.main([str(tmp_path), "--against", "gco"])
     printed = capsys.readouterr().out
     assert {line["method"] for line in cells(printed) if line["Δ"] == "reference"} == {"gco"}
-    assert "Δ: PSNR over the scene's reference, gco, dB" in printed
+    assert "Δ: PSNR over the reference, `gco`, dB" in printed
     with pytest.raises(SettingError, match=r"--against: must be a method of the runs, got svs. There are .*gco"):
         report.compare(runs, "svs")
+
+
+def test_methods_of_two_settings_are_compared_with_the_baseline_of_their_own(tmp_path: Path) -> None:
+    for k, (readings, strategy, psnr) in enumerate(
+        [
+            ("paper", "baseline", 20.0),
+            ("measured", "baseline", 21.0),
+            ("paper", "clear", 19.5),
+            ("measured", "clear", 21.5),
+        ]
+    ):
+        make_run(tmp_path / str(k), f"+strategy={strategy}", f"readings={readings}", psnr=psnr)
+    make_run(tmp_path / "4", "+strategy=baseline", "readings=other", psnr=22.0)  # with nothing to compare it with
+    gains = {name: (row["psnr_delta"], row["reference"]) for name, row in rows_of(tmp_path).items()}
+    assert gains == {
+        "baseline, readings=paper": (0.0, True), "baseline, readings=measured": (0.0, True),
+        "clear, readings=paper": (-0.5, False), "clear, readings=measured": (0.5, False),
+        "baseline, readings=other": (2.0, False),
+    }  # fmt: skip
+    table = report.compare(report.collect([tmp_path]), "baseline, readings=measured")
+    assert list(table["psnr_delta"]) == [-1.0, 0.0, -1.5, 0.5, 1.0]
 
 
 def test_of_a_setting_that_is_given_twice_the_last_counts(tmp_path: Path) -> None:
