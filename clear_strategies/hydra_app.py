@@ -11,6 +11,7 @@ import gc
 import logging
 import os
 import re
+import shlex
 import signal
 import sys
 from collections import defaultdict
@@ -124,11 +125,7 @@ def _job(config: DictConfig, folder: Path) -> float | None:
         def claim() -> None:
             log()
             (folder / FAILED).unlink(missing_ok=True)
-            written = {
-                "config": config,
-                "hydra": HydraConfig.instance().cfg,
-                "overrides": HydraConfig.get().overrides.task,
-            }
+            written = {"config": config, "hydra": HydraConfig.instance().cfg, "overrides": overrides}
             for name, content in written.items():
                 files.write_text(folder / ".hydra" / f"{name}.yaml", OmegaConf.to_yaml(content))
 
@@ -163,7 +160,15 @@ def _end(error: BaseException, ending: exit_codes.Ending, folder: Path, *, resum
     if code > exit_codes.SIGNALS and sweep.in_worker():
         signals.told.append(code - exit_codes.SIGNALS)
         return
+    if sweep.in_sweep() and code > exit_codes.SIGNALS:
+        _tell_how_to_go_on(HydraConfig.get().sweep.dir)
     sys.exit(code)
+
+
+def _tell_how_to_go_on(folder: str) -> None:
+    _log.info(
+        "Go on with the sweep by the same command with %s fit.resume=auto.", shlex.quote(f"hydra.sweep.dir={folder}")
+    )
 
 
 class SweepCallback(Callback):
@@ -181,6 +186,7 @@ class SweepCallback(Callback):
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         if signals.told:
+            _tell_how_to_go_on(config.hydra.sweep.dir)
             sys.exit(exit_codes.SIGNALS + signals.told[0])
         folder = Path(config.hydra.sweep.dir)
         _report(folder)

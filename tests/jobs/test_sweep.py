@@ -199,6 +199,19 @@ def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, monkeypatch):
     assert not (tmp_path / "all" / "1" / "metrics.json").exists()
 
 
+GO_ON = "Go on with the sweep by the same command with hydra.sweep.dir=all fit.resume=auto."
+
+
+def test_a_sweep_that_is_stopped_starts_no_other_job_and_tells_how_to_go_on(tmp_path):
+    """The name of its folder is the time; a checkpoint, which its job names, is of no use to the others."""
+    code = stopped_by(signal.SIGINT, after=5)
+    every = ["-m", "+strategy=gco,svs", "hydra.sweep.dir=all", "hydra.sweep.subdir=${hydra.job.num}", *TINY]
+    process = started("-c", code, *every, cwd=tmp_path, said=tmp_path / "said")
+    assert process.wait() == 130
+    assert (tmp_path / "said").read_text().splitlines()[-1] == GO_ON
+    assert not (tmp_path / "all/1").exists()
+
+
 joblib = pytest.mark.skipif(
     find_spec("hydra_plugins") is None or find_spec("hydra_plugins.hydra_joblib_launcher") is None,
     reason="hydra-joblib-launcher is not installed: pip install -e '.[sweeps]'",
@@ -250,6 +263,7 @@ def test_a_stopped_joblib_sweep_saves_its_running_jobs_begins_no_other_and_leave
         return False
 
     wait_for(gone, what="the workers to end")
+    assert (tmp_path / "said").read_text().splitlines()[-1] == GO_ON
     assert "Traceback" not in (tmp_path / "said").read_text()
 
 
