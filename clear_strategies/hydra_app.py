@@ -32,7 +32,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from clear_strategies import console, files, signals
 from clear_strategies.compose import quoted, require_each_once
-from clear_strategies.errors import ClearError, SettingError, counted
+from clear_strategies.errors import ClearError, SettingError, counted, one_line
 from clear_strategies.hydra_errors import WRITTEN, not_composed, require_option
 from clear_strategies.jobs import exit_codes, sweep
 from clear_strategies.options import CONF
@@ -136,7 +136,10 @@ def _job(config: DictConfig, folder: Path) -> float | None:
             return job.run(config, folder, overrides, claim)
         except (Exception, KeyboardInterrupt) as error:
             if (ending := exit_codes.describe(error)) is None:
-                raise
+                if not sweep.in_sweep():
+                    raise
+                _log.exception("a bug, of a strategy or of this program; the other jobs go on.")
+                ending = exit_codes.Ending(exit_codes.UNUSABLE, f"{type(error).__name__}: {one_line(error)}")
             _end(error, ending, folder, resumes=config.fit.get("resume") == "auto")
             return None
 
@@ -155,13 +158,14 @@ def _end(error: BaseException, ending: exit_codes.Ending, folder: Path, *, resum
         note = folder.with_name(f"{folder.name}_{FAILED}") if finished else folder / FAILED
         files.write_text(note, f"job {HydraConfig.get().job.num}: {message}\n")
         return
-    if code > exit_codes.SIGNALS and code - exit_codes.SIGNALS not in signals.STOPS:
-        signal.raise_signal(code - exit_codes.SIGNALS)  # all is saved: now the launcher's handler may resubmit the job
-    if code > exit_codes.SIGNALS and sweep.in_worker():
-        signals.told.append(code - exit_codes.SIGNALS)
-        return
-    if sweep.in_sweep() and code > exit_codes.SIGNALS:
-        _tell_how_to_go_on(HydraConfig.get().sweep.dir)
+    if (signum := code - exit_codes.SIGNALS) > 0:
+        if signum not in signals.STOPS:
+            signal.raise_signal(signum)  # all is saved: now the launcher's handler may resubmit the job
+        if sweep.in_worker():
+            signals.told.append(signum)
+            return
+        if sweep.in_sweep():
+            _tell_how_to_go_on(HydraConfig.get().sweep.dir)
     sys.exit(code)
 
 

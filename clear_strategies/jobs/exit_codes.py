@@ -1,7 +1,8 @@
 """Exit codes of the process, and one-line messages of errors.
 
 0: done. 2: a setting, a file or a sweep's job cannot be used, or memory ran out. 3: the disk is full or read-only.
-128 + n: stopped by signal n. Any other error is a bug: Python shows its traceback, and exits with 1.
+128 + n: stopped by signal n. Any other error is a bug: Python shows its traceback, and exits with 1; in a sweep the other
+jobs go on.
 """
 
 from __future__ import annotations

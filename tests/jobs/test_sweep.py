@@ -199,6 +199,21 @@ def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, monkeypatch):
     assert not (tmp_path / "all" / "1" / "metrics.json").exists()
 
 
+def test_a_sweep_goes_on_after_a_job_with_a_bug_shows_its_traceback_and_reports_the_others(tmp_path):
+    (tmp_path / "broken.py").write_text(
+        "from dataclasses import dataclass\n\nfrom clear_strategies import Strategy, Weights\n\n\n"
+        "@dataclass(frozen=True)\nclass Veto(Strategy):\n    fails: bool\n\n"
+        "    def reconcile(self, products, step):\n        return Weights(keep=1 / (not self.fails))\n"
+    )
+    words = ["-m", "+strategies.x._target_=broken.Veto", "+strategies.x.fails=true,false", "hydra.sweep.dir=all", *TINY]
+    ended = run(*words, cwd=tmp_path)
+    assert ended.returncode == 2, ended.stdout + ended.stderr
+    assert ended.stdout.count('broken.py", line') == 1
+    assert ended.stdout.splitlines()[-1] == "error: 1 job failed: job 0: ZeroDivisionError: division by zero"
+    assert len(list(tmp_path.glob("all/*/metrics.json"))) == 1
+    assert (tmp_path / "all/report.md").exists()
+
+
 GO_ON = "Go on with the sweep by the same command with hydra.sweep.dir=all fit.resume=auto."
 
 
