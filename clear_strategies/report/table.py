@@ -69,8 +69,8 @@ def layout(table: pd.DataFrame) -> pd.DataFrame:
         cells[header] = _numbers(table[quantity], table[f"{quantity}_std"], form)
         if quantity == "psnr":
             delta = _numbers(table["psnr_delta"], table["psnr_delta_error"], "+.2f")
-            marked = [cell + _UNPAIRED * int(few) for cell, few in zip(delta, _unpaired(table), strict=True)]
-            marked = ["reference" if it else cell for cell, it in zip(marked, table["reference"], strict=True)]
+            rows = zip(delta, _unpaired(table), table["reference"], strict=True)
+            marked = ["reference" if it else cell + _UNPAIRED * int(few) for cell, few, it in rows]
             cells["Δ"] = marked if _differ(table) else [""] * len(table)
             cells["best"] = _numbers(table["psnr_best"], None, form)
     cells["seed"] = list(table["seeds"])
