@@ -74,6 +74,8 @@ def leave_out_what_methods_set_aside(config: DictConfig) -> None:
     Args:
         config: as of `refusal`.
     """
+    if config.hydra.runtime.choices["hydra/sweeper"] != "basic":  # others may have no `params`
+        return
     words = {word.key_or_group: word for word in _words(config)}  # Hydra composes them in this order
     strategy, method = words.get("strategy"), words.get("method")
     if strategy is None or method is None or [*words].index("method") < [*words].index("strategy"):
