@@ -52,10 +52,12 @@ def statements(path: Path) -> list[set[str]]:
 
     `from a import b` is the module a.b, or a name that the module a defines.
     """
-    tree, found = ast.parse(path.read_text()), []
+    tree, found, for_types = ast.parse(path.read_text()), [], set[ast.stmt]()
     for node in ast.walk(tree):
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
-            node.body = []
+            for_types.update(node.body)
+        elif node in for_types:
+            continue
         elif isinstance(node, ast.Import):
             found += [{alias.name} for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from rasterizers.warp_backend.settings import TILE
+from rasterizers.warp_backend.sizes import TILE
 from rasterizers.warp_backend.types import FAR, Cuts, Ellipse, Grid
 
 wp.set_module_options({"enable_backward": False})

@@ -23,7 +23,7 @@ from typing import Any, Final
 import warp as wp
 
 from rasterizers.warp_backend.bins import exponent
-from rasterizers.warp_backend.settings import SEGMENT, TILE
+from rasterizers.warp_backend.sizes import SEGMENT, TILE
 from rasterizers.warp_backend.types import PIXELS, SUMS, Cuts, Ellipse, Grid, Moments, width_of
 
 wp.set_module_options({"enable_backward": False})

@@ -16,7 +16,7 @@ import math
 import struct
 from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache
-from typing import Any, Final, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
 import torch
 import warp as wp
@@ -32,8 +32,11 @@ from rasterizers.warp_backend.bins import find_tiles, list_pairs
 from rasterizers.warp_backend.blend import blend, blend_pieces, blend_vjp
 from rasterizers.warp_backend.colour import basis
 from rasterizers.warp_backend.project import fold, project, project_vjp, radii
-from rasterizers.warp_backend.settings import PAIR_BYTES, SEGMENT, SUMS_BYTES, TILE, WarpSettings, mebibytes, padded
+from rasterizers.warp_backend.sizes import PAIR_BYTES, SEGMENT, SUMS_BYTES, TILE, mebibytes, padded
 from rasterizers.warp_runtime import lanes_on, launch, on_device, on_stream, sort_pairs
+
+if TYPE_CHECKING:
+    from rasterizers.warp_backend import WarpRasterizer
 
 _ELLIPSE: Final = ctypes.sizeof(cast(Any, types.Ellipse).ctype) // 4
 """Numbers of a `types.Ellipse`."""
@@ -83,7 +86,7 @@ class _Lists(NamedTuple):
 class WarpFrame:
     """One depth order for several pixel grids, and the tensors that the VJP reads again."""
 
-    def __init__(self, settings: WarpSettings, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> None:
+    def __init__(self, settings: WarpRasterizer, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> None:
         splats, camera = jobs[0]
         for job, _ in jobs:
             require_splats(job, settings.traits)
@@ -384,7 +387,7 @@ def numbers_of(camera: Camera, device: torch.device) -> CameraNumbers:
 
 
 @lru_cache(maxsize=1024)
-def _cuts_struct(settings: WarpSettings) -> Any:
+def _cuts_struct(settings: WarpRasterizer) -> Any:
     cuts = types.Cuts()
     cuts.kernel, cuts.near, cuts.antialiased = settings.kernel, settings.near, settings.antialiased
     cuts.near_bits = int.from_bytes(struct.pack("<d", settings.near), "little")

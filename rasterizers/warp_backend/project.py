@@ -18,7 +18,7 @@ from rasterizers.warp_backend.geometry import (
     geometry_vjp,
     screen_vjp,
 )
-from rasterizers.warp_backend.settings import SEGMENT
+from rasterizers.warp_backend.sizes import SEGMENT
 from rasterizers.warp_backend.types import FAR, SUMS, Cuts, Ellipse, Grid, Moments, Pose, width_of
 
 wp.set_module_options({"enable_backward": False})

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import warp as wp
 
-from rasterizers.warp_backend.settings import TILE
+from rasterizers.warp_backend.sizes import TILE
 
 wp.set_module_options({"enable_backward": False})
 

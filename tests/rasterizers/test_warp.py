@@ -190,7 +190,7 @@ def test_long_lists_and_large_gaussians_are_summed_in_short_chains():
     """
     from clear_strategies.bench import scenes
     from rasterizers.warp_backend import frame, project
-    from rasterizers.warp_backend.settings import SEGMENT
+    from rasterizers.warp_backend.sizes import SEGMENT
 
     tails = scenes.load("tails")
     v = cotangents(1, tails.camera.height, tails.camera.width)
