@@ -48,12 +48,6 @@ class Backend(RasterSettings):
         return [self(*job, depth=z) for job, z in zip(jobs, depths, strict=True)]
 
 
-def require_device(device: str) -> None:
-    """Raise a ValueError unless it is "cpu" or "cuda". A number is refused, too: splats are drawn on the device they are on."""
-    if device not in ("cpu", "cuda"):
-        raise ValueError(f"device must be cpu or cuda, got {device!r}.")
-
-
 def require_splats(splats: Splats, traits: Traits) -> None:
     """Refuse splats whose tensors differ in dtype, device or number of rows, or that the backend does not draw.
 

@@ -15,12 +15,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import Backend, require_cotangents, require_device, require_finite, require_splats
+from rasterizers.checks import Backend, require_cotangents, require_finite, require_splats
 from rasterizers.geometry import SH_C0, spherical_harmonics
 from rasterizers.interface import BackendUnavailable, Camera, Rendering, SplatGradients, Splats, Traits
 
 _FIXED: Final = {"alpha_min": (1 / 255,), "alpha_max": (0.999, 0.99), "transmittance_min": (1e-4,)}
 """The values that a setting may have; 0.99, the default of RasterSettings, is drawn as 0.999."""
+_TRAITS: Final = Traits(devices=frozenset({"cuda"}), dtypes=frozenset({torch.float32}), depth=True)
 
 
 def _gsplat_rasterization() -> Callable[..., Any]:
@@ -42,39 +43,30 @@ def _gsplat_rasterization() -> Callable[..., Any]:
 class GsplatRasterizer(Backend):
     """gsplat's `rasterization` as a rasterizer.
 
-    Args:
-        device: "cuda", or "cpu" with a `rasterization` for it: where the splats' tensors are.
-        rasterization: a function with the signature of gsplat's, for tests; None: gsplat's own.
-
     Raises:
         BackendUnavailable: gsplat is not installed, or there is no CUDA.
         ValueError: a setting is out of range, or a cut-off is not the default, which gsplat cannot change.
     """
 
-    device: str = "cuda"
-    rasterization: Callable[..., Any] | None = None
-
     def __post_init__(self) -> None:
         Backend.__post_init__(self)
-        require_device(self.device)
         for name, fixed in _FIXED.items():
             if getattr(self, name) not in fixed:
                 raise ValueError(
                     f"gsplat's cut-offs cannot be chosen; {name} must stay {fixed[0]:g}, got {getattr(self, name):g}."
                 )
-        if self.rasterization is None:
-            _gsplat_rasterization()
+        _gsplat_rasterization()
 
     @property
     def traits(self) -> Traits:
-        return Traits(devices=frozenset({self.device}), dtypes=frozenset({torch.float32}), depth=True)
+        return _TRAITS
 
     def draw(self, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> list[Rendering]:
         """Jobs share nothing; depth is drawn by gsplat's render mode "RGB+ED"."""
         return [self._drawn(*job, z) for job, z in zip(jobs, depth, strict=True)]
 
     def _drawn(self, splats: Splats, camera: Camera, depth: bool) -> GsplatRendering:
-        require_splats(splats, self.traits)
+        require_splats(splats, _TRAITS)
         require_finite(splats)
         names = ("means", "quats", "scales", "opacities")
         with torch.enable_grad():
@@ -86,7 +78,7 @@ class GsplatRasterizer(Backend):
             quats = torch.where(leaves["quats"].abs().amax(-1, keepdim=True) > 0, leaves["quats"], identity)
             base = splats.sh0.detach() + leaves["rgb"][:, None] / SH_C0
             K = splats.means.new_tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-            images, alphas, info = (self.rasterization or _gsplat_rasterization())(
+            images, alphas, info = _gsplat_rasterization()(
                 leaves["means"], quats, leaves["scales"], leaves["opacities"],
                 torch.cat((base, splats.shN.detach()), 1),
                 camera.world_to_camera.to(splats.means)[None], K[None], camera.width, camera.height,

@@ -22,9 +22,6 @@ from rasterizers.torch_internals import copy_each
 
 _log = logging.getLogger(__name__)
 
-DEVICES: Final = {"cuda"}
-"""The kinds of devices whose work can be recorded; tests add the CPU."""
-
 _FAILED: Final = "a recording failed"
 _MOST_MOVES: Final = 20  # changes of addresses without a replay between them; no structure changes so often
 _MOST_RECORDINGS: Final = 8  # a recording keeps the memory of its work
@@ -55,7 +52,7 @@ class GraphKey:
 
 def can_record(device: torch.device) -> bool:
     """Return True if work on the device can be recorded."""
-    return device.type in DEVICES
+    return device.type == "cuda"
 
 
 def shapes_of(inputs: Given, rows: int) -> tuple[Any, ...]:

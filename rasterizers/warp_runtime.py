@@ -66,13 +66,11 @@ def runs_warp(device: str) -> bool:
     return True
 
 
-BLOCKS: Final = {"cuda"}
-"""The kinds of devices on which Warp's blocks have several threads; tests add the CPU."""
-
-
 def lanes_on(device: torch.device, block: int) -> int:
-    """The number of threads in a block on this device: `block`, or 1."""
-    return block if device.type in BLOCKS else 1
+    """The number of threads in a block on this device: `block` on CUDA; on a CPU 1, unless Warp's configuration allows more."""
+    import warp as wp
+
+    return block if device.type == "cuda" or getattr(wp.config, "enable_cpu_blocks", False) else 1
 
 
 def launch(

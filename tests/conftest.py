@@ -69,16 +69,10 @@ def whole_blocks(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     """Called, lets kernels run with as many threads per block as on CUDA, where lanes sum together."""
     import warp as wp
 
-    from rasterizers import warp_runtime
-
     if not hasattr(wp.config, "enable_cpu_blocks"):
         pytest.skip("this Warp has no blocks of several threads on a CPU")
 
-    def use() -> None:
-        monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
-        monkeypatch.setattr(warp_runtime, "BLOCKS", {"cpu"})
-
-    return use
+    return lambda: monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
 
 
 @pytest.fixture(params=[80, 120], ids="sm_{}".format)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib import import_module
 from types import ModuleType
-from typing import Final, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -13,15 +13,12 @@ from rasterizers.interface import BackendUnavailable
 from rasterizers.native import empty_for, load_kernels
 from rasterizers.warp_runtime import runs_warp
 
-ON_WARP: Final = {"cuda"}
-"""The kinds of devices for which Warp's kernels are used; tests add the CPU."""
-
 
 def fastest(device: torch.device) -> Literal["cpp", "warp", "torch"]:
     """What computes float32 on this device: C++ on a CPU, Warp on CUDA, torch where these do not run."""
     if device.type == "cpu" and available():
         return "cpp"
-    return "warp" if device.type in ON_WARP and runs_warp(device.type) else "torch"
+    return "warp" if device.type == "cuda" and runs_warp("cuda") else "torch"
 
 
 def implementation(package: str, device: torch.device) -> ModuleType:

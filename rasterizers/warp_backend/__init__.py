@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rasterizers.checks import Backend, require_device
+from rasterizers.checks import Backend
 from rasterizers.interface import Camera, Color, Rendering, Splats, Traits
 from rasterizers.sending import color_on
 from rasterizers.warp_backend.sizes import mebibytes
@@ -52,7 +52,8 @@ class WarpRasterizer(Backend):
         Backend.__post_init__(self)
         if self.memory < 1:
             raise ValueError(f"memory must be at least 1 MiB, got {self.memory}.")
-        require_device(self.device)
+        if self.device not in _TRAITS:  # without a number: splats are drawn on the device they are on
+            raise ValueError(f"device must be cpu or cuda, got {self.device!r}.")
         require_warp("the warp rasterizer", self.device, "device=cpu runs here, slowly")
 
     @property

@@ -40,8 +40,6 @@ if TYPE_CHECKING:
 
 _ELLIPSE: Final = ctypes.sizeof(cast(Any, types.Ellipse).ctype) // 4
 """Numbers of a `types.Ellipse`."""
-DEFERRED_COUNTS: Final = {"cuda": True, "cpu": False}
-"""Whether the host reads the number of pairs only when an image is accessed."""
 LANES: Final = 32
 """Threads per segment of the blending VJP, see `lanes_on`: a warp on CUDA."""
 TILE_LANES: Final = TILE**2
@@ -126,7 +124,7 @@ class WarpFrame:
                 return [WarpRendering(self, view) for view in self.views]
             self._read = _read_deferred(self.totals)
             capacities = [self.settings.capacity(view.camera) for view in self.views]
-            if DEFERRED_COUNTS[self.settings.device] and min(capacities) >= 0:
+            if min(capacities) >= 0:
                 for nth, capacity in enumerate(capacities):
                     self._list(nth, capacity)
             else:

@@ -311,7 +311,8 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
     import rasterizers.native
     from clear_strategies.core import deferred
     from clear_strategies.kernels import native
-    from rasterizers import recording, replayed_drawing, replays, sending, warp_runtime
+    from clear_strategies.merging import recorded_work
+    from rasterizers import recording, replayed_drawing, sending, warp_runtime
     from rasterizers.warp_backend import frame
 
     cuda, autograd, loaded = StrictCuda(), _Elsewhere(), set[Any]()
@@ -394,11 +395,11 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[StrictCuda]:
         warp_runtime._Launch: {"__init__": constructed, "prepare": prepared},
         recording: {"_side_stream": cache(lambda device: Stream(cuda, records=True))},
         deferred: {"is_immediate": lambda x: False},
-        native: {"available": lambda: False, "ON_WARP": {"cpu"}},
-        replays: {"DEVICES": {"cpu"}},
-        replayed_drawing: {"_thread": replayed_drawing._Thread()},
+        native: {"available": lambda: False, "fastest": lambda device: "warp"},
+        recorded_work: {"can_record": lambda device: True},
+        replayed_drawing: {"can_record": lambda device: True, "_thread": replayed_drawing._Thread()},
         rasterizers.native: {"empty": on_no_cpu},
-        frame: {"DEFERRED_COUNTS": {"cpu": True}, "_read_deferred": reads},
+        frame: {"_read_deferred": reads},
         sending: {"sent": sends},
         warp_runtime: {"sent": sends, "_kept": warp_runtime._Kept()},
     }  # fmt: skip

@@ -11,12 +11,13 @@ import clear_strategies as cs
 import rasterizers
 from clear_strategies import Conductor
 from clear_strategies.core.view import ExtraView
+from clear_strategies.merging import recorded_work
 from clear_strategies.merging.recorded_work import LIVE, RecordedWork
 from clear_strategies.merging.skips import Skips
 from clear_strategies.schedules import Ramp, WarmupDecay
 from integration import hr_drawing, replayed_merge
 from integration.autograd_shot import to_leaves
-from rasterizers import replays
+from rasterizers import replayed_drawing
 from rasterizers.recording import running
 from tests.helpers import toy
 from tests.helpers.backends import needs
@@ -244,11 +245,16 @@ def scene(recorded_on):
     return SCENE.to(recorded_on)
 
 
+def record_nothing(monkeypatch):
+    for module in (recorded_work, replayed_drawing):
+        monkeypatch.setattr(module, "can_record", lambda device: False)
+
+
 def both(monkeypatch, **settings):
     """The replayed training, after a comparison with the live one: the same bits."""
     settings = {"objective": WARP, "lr_by": "warp", **settings}
     replayed = trained("warp", **settings)
-    monkeypatch.setattr(replays, "DEVICES", set())
+    record_nothing(monkeypatch)
     live = trained("warp", **settings)
     assert not [name for name, x in live[0].items() if not torch.equal(x, replayed[0][name])]
     assert replayed[1] == live[1]
@@ -377,7 +383,7 @@ def test_replays_over_densification_resets_evaluation_and_resuming(monkeypatch, 
 
         host.train(names, between=evaluate)
         logs = [clear.attachment.conductor.work_log]
-        assert len(living) == (2 if replays.can_record(recorded_on) else 0)
+        assert len(living) == (2 if recorded_work.can_record(recorded_on) else 0)
         clear.remove()
         assert not living
         resumed = Host(scene, rasterization=drawn_by("warp"), extent=4.0)
@@ -391,7 +397,7 @@ def test_replays_over_densification_resets_evaluation_and_resuming(monkeypatch, 
         return {name: p.detach() for name, p in resumed.splats.items()}, logs
 
     replayed, logs = run()
-    monkeypatch.setattr(replays, "DEVICES", set())
+    record_nothing(monkeypatch)
     live, _ = run()
     assert len(live["means"]) not in (40, 0)
     assert not [name for name, x in live.items() if not torch.equal(x, replayed[name])]

@@ -28,7 +28,7 @@ def lanes(request, monkeypatch):
     if request.param == "cpp":
         return request.param
     monkeypatch.setattr(native, "available", lambda: False)
-    monkeypatch.setattr(native, "ON_WARP", {"cpu"})
+    monkeypatch.setattr(native, "fastest", lambda device: "warp")
     if request.param == "many":
         request.getfixturevalue("whole_blocks")()
     return request.param
@@ -174,7 +174,7 @@ def test_other_tensors_take_torch(monkeypatch):
     monkeypatch.setattr(native, "available", lambda: False)  # not C++
     x = [torch.zeros(1, 3), torch.zeros(1), torch.zeros(1)]
     assert activate(*x, None) != "Warp's"
-    monkeypatch.setattr(native, "ON_WARP", {"cpu"})
+    monkeypatch.setattr(native, "fastest", lambda device: "warp")
     assert activate(*x, None) == "Warp's"
     assert activate(*x, torch.zeros(1, dtype=torch.float64)) != "Warp's"
 

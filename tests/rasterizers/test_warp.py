@@ -1,4 +1,4 @@
-"""The backend "warp" alone: where it runs, its blocks of many threads, and the deferred counts that CUDA uses."""
+"""The backend "warp" alone: where it runs, its blocks of many threads, and the counts that are read when an image is accessed."""
 
 import dataclasses
 import sys
@@ -158,17 +158,9 @@ def test_unused_places_do_not_change_the_image(monkeypatch, sevens):
     require_same_bits(everything(rasterizers.load("warp", device="cpu")(splats, view), v), expected)
 
 
-@pytest.fixture
-def deferred(monkeypatch, sevens):
-    """Counts are read when an image is accessed, as on CUDA."""
-    from rasterizers.warp_backend import frame
-
-    monkeypatch.setitem(frame.DEFERRED_COUNTS, "cpu", True)
-
-
 @installed
 @pytest.mark.parametrize("capacity", [None, 0, 1, 1000, 50_000])
-def test_an_image_does_not_depend_on_the_capacity_of_its_lists(capacity, deferred):
+def test_an_image_does_not_depend_on_the_capacity_of_its_lists(capacity, sevens):
     splats, view = dense_scene(200)
     jobs = [(splats, view), (splats, camera(64, 48))]
     v = [cotangents(2, c.height, c.width) for _, c in jobs]
@@ -211,7 +203,7 @@ def test_long_lists_and_large_gaussians_are_summed_in_short_chains():
 
 
 @installed
-def test_errors_are_raised_when_an_image_is_accessed(deferred):
+def test_errors_are_raised_when_an_image_is_accessed(sevens):
     from rasterizers.warp_backend import frame
 
     splats, view = dense_scene(200)
@@ -232,7 +224,7 @@ def test_errors_are_raised_when_an_image_is_accessed(deferred):
 
 
 @installed
-def test_a_copy_over_another_background_has_the_capacities(deferred):
+def test_a_copy_over_another_background_has_the_capacities():
     """Random backgrounds make one in every iteration; without them the host waited for the device each time."""
     splats, view = dense_scene(200)
     rasterizer = rasterizers.load("warp", device="cpu")
@@ -260,3 +252,8 @@ def test_the_kernels_compile_for_cuda_on_a_machine_without(ptx_of):
     ptx_of(blend.blend_vjp(1, 32, True, absolute=True).module, 32)
     for kernel in (project.fold(1, absolute=True), project.project_vjp(1, absolute=True)):
         ptx_of(kernel.module)
+
+
+def test_numbered_devices_are_refused():
+    with pytest.raises(ValueError, match="device must be cpu or cuda, got 'cuda:1'"):
+        rasterizers.load("warp", device="cuda:1")
