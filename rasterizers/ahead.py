@@ -12,8 +12,7 @@ from typing import Any, Final
 from jaxtyping import Float
 from torch import Tensor
 
-from rasterizers.checks import drawing
-from rasterizers.interface import Camera, Rasterizer, Rendering, Splats
+from rasterizers.interface import Camera, Rasterizer, Rendering, Splats, with_depth
 from rasterizers.torch_internals import version
 
 
@@ -59,6 +58,7 @@ def drawing_ahead(viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width:
 
 
 def is_drawing_ahead() -> bool:
+    """Whether an image is to be drawn ahead, or has been and is not yet asked for."""
     return _ahead.wanted is not None or _ahead.kept is not None
 
 
@@ -69,10 +69,10 @@ def draw_or_take(rasterizer: Rasterizer, splats: Splats, camera: Camera, *, dept
         return rendering
     wanted = _ahead.wanted
     if wanted is None or camera.world_to_camera.tolist() != wanted.world_to_camera.tolist():
-        return drawing(rasterizer, depth)(splats, camera)
+        return with_depth(rasterizer, depth)(splats, camera)
     _ahead.wanted = None
     if splats.rgb_offset is None and _grid(camera) == _grid(wanted):  # this is the image itself
-        return drawing(rasterizer, depth)(splats, camera)
+        return with_depth(rasterizer, depth)(splats, camera)
     plain = replace(splats, rgb_offset=None)
     other = replace(wanted, world_to_camera=camera.world_to_camera)  # so that both share a tensor
     together = functools.partial(rasterizer.render_scales, depth=[True] * 2) if depth else rasterizer.render_scales

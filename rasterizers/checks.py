@@ -1,51 +1,18 @@
-"""The base class of this package's backends, and checks of their inputs."""
+"""Checks of what backends are given."""
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
 from dataclasses import fields
-from itertools import pairwise
 from typing import Final
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from rasterizers.interface import Camera, Rasterizer, RasterSettings, Rendering, Splats, Traits
+from rasterizers.interface import Rasterizer, Splats, Traits
 
 _SHAPES: Final = {  # of a row; B is the number of higher bands
     "means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": ("B", 3), "rgb_offset": (3,),
 }  # fmt: skip
-
-
-class Backend(RasterSettings):
-    """A rasterizer that implements `draw`."""
-
-    __slots__ = ()
-
-    def draw(self, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> list[Rendering]:
-        """Draw jobs with the same pose and tensor objects, which may share work; opacities and offsets may differ."""
-        raise NotImplementedError
-
-    def __call__(self, splats: Splats, camera: Camera, *, depth: bool = False) -> Rendering:
-        return self.draw([(splats, camera)], [depth])[0]
-
-    def render_scales(
-        self, jobs: Sequence[tuple[Splats, Camera]], *, depth: Sequence[bool] | None = None
-    ) -> list[Rendering]:
-        """See `Rasterizer.render_scales`. Jobs of different poses or tensor objects are drawn one by one."""
-        depths = depth or [False] * len(jobs)
-        if all(
-            (
-                from_a.world_to_camera is from_b.world_to_camera
-                or torch.equal(from_a.world_to_camera, from_b.world_to_camera)
-            )
-            and all(getattr(a, name) is getattr(b, name) for name in ("means", "quats", "scales", "sh0", "shN"))
-            for (a, from_a), (b, from_b) in pairwise(jobs)
-        ):
-            return self.draw(jobs, depths)
-        return [self(*job, depth=z) for job, z in zip(jobs, depths, strict=True)]
 
 
 def require_splats(splats: Splats, traits: Traits) -> None:
@@ -83,7 +50,7 @@ def _dtype_and_device(tensor: Tensor) -> str:
     return f"{str(tensor.dtype).removeprefix('torch.')} on {tensor.device}"
 
 
-def require_finite(splats: Splats) -> None:
+def require_finite_splats(splats: Splats) -> None:
     """Raise a ValueError for NaN and infinity, which would leave holes in the image. Costs one reduction per tensor."""
     for field in fields(splats):
         value = getattr(splats, field.name)
@@ -102,30 +69,6 @@ def require_cotangents(cotangents: Tensor, image: Tensor) -> None:
         raise ValueError(f"cotangents must be [K, {height}, {width}, 3], got {tuple(cotangents.shape)}.")
 
 
-def of_accumulated(
-    rendering: Rendering, alpha: Float[Tensor, "K H W"] | None, depth: Float[Tensor, "K H W"] | None
-) -> tuple[Float[Tensor, "K H W"] | None, Float[Tensor, "K H W"] | None]:
-    """The cotangents of alpha A and of the accumulated depth D = A E from those of A and of the expected depth E = D / A.
-
-    Raises:
-        ValueError: the rendering has no depth, or a cotangent is not [K, H, W].
-    """
-    for name, cotangent in (("alpha", alpha), ("depth", depth)):
-        drawn = getattr(rendering, name)
-        if cotangent is not None and (drawn is None or cotangent.dim() != 3 or cotangent.shape[1:] != drawn.shape):
-            raise ValueError(
-                f"cotangents of {name} must be [K, {', '.join(map(str, rendering.alpha.shape))}] of a rendering that has it, "
-                f"got {tuple(cotangent.shape)} of one {'without; draw with depth=True' if drawn is None else 'with it'}."
-            )
-    like = rendering.alpha
-    alpha = None if alpha is None else alpha.detach().to(like)
-    if depth is None or rendering.depth is None:
-        return alpha, None
-    d_D = torch.where(like > 0, depth.detach().to(like) / like, 0.0)
-    d_A = -rendering.depth * d_D
-    return d_A if alpha is None else d_A + alpha, d_D
-
-
 _WITH: Final = {
     "depth": ("draws no depth", "cpp, torch, warp and gsplat do"),
     "absgrad": ("has no absolute gradients", "cpp, torch and warp do"),
@@ -137,13 +80,3 @@ def require_trait(rasterizer: Rasterizer, name: str) -> None:
     if not getattr(rasterizer.traits, name):
         lacks, others = _WITH[name]
         raise ValueError(f"{type(rasterizer).__name__} {lacks} (its traits.{name} is False); {others}.")
-
-
-def packed_rows(sh: Float[Tensor, "N B 3"]) -> Float[Tensor, "N B 3"]:
-    """The tensor with contiguous rows. A view of the active bands has gaps between its rows, and is returned as it is."""
-    return sh if sh.numel() == 0 or sh.stride()[1:] == (3, 1) else sh.contiguous()
-
-
-def drawing(rasterizer: Rasterizer, depth: bool) -> Callable[..., Rendering]:
-    """The rasterizer, called with `depth=True` if depth is True: without the trait it may not have the argument."""
-    return functools.partial(rasterizer, depth=True) if depth else rasterizer

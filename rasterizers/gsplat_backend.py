@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import Backend, require_cotangents, require_finite, require_splats
+from rasterizers.backend import Backend
+from rasterizers.checks import require_cotangents, require_finite_splats, require_splats
 from rasterizers.geometry import SH_C0, spherical_harmonics
 from rasterizers.interface import BackendUnavailable, Camera, Rendering, SplatGradients, Splats, Traits
 
@@ -67,7 +68,7 @@ class GsplatRasterizer(Backend):
 
     def _drawn(self, splats: Splats, camera: Camera, depth: bool) -> GsplatRendering:
         require_splats(splats, _TRAITS)
-        require_finite(splats)
+        require_finite_splats(splats)
         names = ("means", "quats", "scales", "opacities")
         with torch.enable_grad():
             leaves = {name: getattr(splats, name).detach().requires_grad_() for name in names}

@@ -3,10 +3,11 @@
 A `Rasterizer` maps `Splats` and a `Camera` to a `Rendering`; `rendering.vjp` maps gradients of the image to gradients of
 the splats. Every backend in this package implements this interface, and so can a third party:
 
-1. Write a class whose constructor takes the fields of `RasterSettings` by keyword. A frozen dataclass that inherits from
-   `RasterSettings` gets them, their defaults and their checks; it may add settings of its own. Raise `BackendUnavailable`
-   in the constructor if the class cannot run on this machine.
-2. Implement the members of `Rasterizer`, and return objects with the members of `Rendering`.
+1. Write a frozen dataclass that inherits from `rasterizers.backend.Backend`. It has the fields of `RasterSettings`, their
+   defaults and their checks, and may add settings of its own. Raise `BackendUnavailable` in the constructor if the class
+   cannot run on this machine.
+2. Implement `traits` and `draw`, which returns objects with the members of `Rendering`. A class that does not inherit from
+   `Backend` takes the fields by keyword, and implements the members of `Rasterizer`.
 3. Run `rasterizers.testing.check_rasterizer(MyRasterizer)`.
 4. Use it by its path, like a strategy: `rasterizer._target_=my_package.MyRasterizer`, or a file `rasterizer/mine.yaml` in
    a Hydra config folder with `_target_` and the settings that differ from the class's defaults.
@@ -14,9 +15,10 @@ the splats. Every backend in this package implements this interface, and so can 
 
 from __future__ import annotations
 
+import functools
 import math
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import chain
 from typing import Final, Protocol, TypeGuard, cast, runtime_checkable
@@ -428,6 +430,11 @@ def over(rasterizer: Rasterizer, background: Color | None) -> Rasterizer:
             f"{type(rasterizer).__name__} has no background that could change; derive it from RasterSettings."
         )
     return cast(Rasterizer, rasterizer.with_background(background))
+
+
+def with_depth(rasterizer: Rasterizer, depth: bool) -> Callable[..., Rendering]:
+    """The rasterizer, called with `depth=True` if depth is True: without the trait it may not have the argument."""
+    return functools.partial(rasterizer, depth=True) if depth else rasterizer
 
 
 PRESETS: Final[Mapping[str, Mapping[str, float]]] = {

@@ -19,9 +19,17 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from rasterizers.checks import drawing
 from rasterizers.inputs import Inputs
-from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, WithTraits, can_be_recorded, over
+from rasterizers.interface import (
+    Camera,
+    Rasterizer,
+    Rendering,
+    SplatGradients,
+    WithTraits,
+    can_be_recorded,
+    over,
+    with_depth,
+)
 from rasterizers.recording import Recording, on_side_stream, running
 from rasterizers.replays import Given, GraphKey, Recorded, Replays, StaticInputs, can_record, shapes_of, write
 
@@ -80,7 +88,7 @@ class _Call:
         return [*self.inputs, self.camera, self.rasterizer.background_on(self.inputs.means.device)]
 
     def live(self) -> Rendering:
-        return drawing(self.rasterizer, self.depth)(self.inputs.splats(), self.camera)
+        return with_depth(self.rasterizer, self.depth)(self.inputs.splats(), self.camera)
 
 
 class _RecordedDrawing(Recorded[Rendering]):

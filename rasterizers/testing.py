@@ -20,8 +20,7 @@ from typing import Any, Final, cast
 import torch
 from torch import Tensor
 
-from rasterizers.checks import drawing
-from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, summed_vjp
+from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats, summed_vjp, with_depth
 from rasterizers.reference import ReferenceRasterizer
 
 Make = Callable[..., Rasterizer]
@@ -65,7 +64,7 @@ def check_gradients_are_finite_differences(make: Make) -> None:
     splats, camera = scene(24, dtype=dtype, seed=1), _camera(40, 30)
     g = torch.Generator().manual_seed(2)
     whole = rasterizer.traits.depth_gradient
-    draw = drawing(rasterizer, whole)
+    draw = with_depth(rasterizer, whole)
     rendering = draw(splats, camera)
     v = _cotangents(rendering, 1, g)
     # Where little is drawn, depth is far from linear.
@@ -127,7 +126,7 @@ def check_dropped_equals_absent(make: Make, *, depth: bool = False) -> None:
     splats, camera = scene(50, dtype=dtype), _camera(48, 33)
     kept = torch.arange(50) % 3 != 0
     gated = replace(splats, opacities=splats.opacities * kept)
-    draw = drawing(rasterizer, depth)
+    draw = with_depth(rasterizer, depth)
     rendering, without = draw(gated, camera), draw(select(splats, kept), camera)
     _close(pixels_of(rendering), pixels_of(without), 1e-6, "the image")
     require(not bool(rendering.visible[~kept].any()), "a dropped Gaussian counts as visible")
@@ -147,7 +146,7 @@ def check_nothing_to_draw(make: Make, *, depth: bool = False) -> None:
     behind = scene(5, dtype=dtype)
     behind = replace(behind, means=behind.means - torch.tensor([0, 0, 100.0], dtype=dtype))
     for splats in (select(behind, torch.zeros(5, dtype=torch.bool)), behind):
-        rendering = drawing(rasterizer, depth)(splats, camera)
+        rendering = with_depth(rasterizer, depth)(splats, camera)
         _close(rendering.image, torch.tensor(background, dtype=dtype).expand(11, 19, 3), 1e-7, "the background")
         require(float(rendering.alpha.abs().max()) == 0, "alpha is not 0 where nothing is")
         require(rendering.depth is None or not bool(rendering.depth.any()), "depth is not 0 where nothing is")
@@ -168,7 +167,7 @@ def check_scales_together_equal_one_by_one(make: Make, *, depth: bool = False) -
     _close(low.image, rasterizer(*jobs[0]).image, 1e-6, "an image drawn together with a larger one")
     _close(
         pixels_of(high),
-        pixels_of(drawing(rasterizer, depth)(*jobs[1])),
+        pixels_of(with_depth(rasterizer, depth)(*jobs[1])),
         1e-6,
         "an image drawn together with a smaller one",
     )
@@ -193,7 +192,7 @@ def check_agrees_with_the_reference(make: Make, *, depth: bool = False) -> None:
         splats, camera = scene(300, bands=bands), _camera(65, 47)
         exact = ReferenceRasterizer()(splats.to(torch.float64), camera, depth=depth)
         dtype = torch.float32 if torch.float32 in rasterizer.traits.dtypes else torch.float64
-        found = drawing(rasterizer, depth)(splats.to(dtype), camera)
+        found = with_depth(rasterizer, depth)(splats.to(dtype), camera)
         error = (pixels_of(found).double() - pixels_of(exact)).abs() / magnitude(exact)
         require(float((error <= 5e-6).double().mean()) >= 0.999, f"{bands} bands: more than 0.1 % of values are off")
         require(float(error.max()) <= 8e-3, f"{bands} bands: a value is off by {float(error.max()):.2g}")

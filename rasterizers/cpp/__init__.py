@@ -20,7 +20,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils.dlpack import from_dlpack
 
-from rasterizers.checks import Backend, of_accumulated, packed_rows, require_cotangents, require_finite, require_splats
+from rasterizers.backend import Backend, of_accumulated, packed_rows
+from rasterizers.checks import require_cotangents, require_finite_splats, require_splats
 from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradients, Splats, Traits
 from rasterizers.native import load_kernels, threads
 
@@ -111,7 +112,7 @@ class _Frame:
             *self.shared, grids, self.opacities, self.offsets, self.means2d, self.visible, self.threads
         ):
             for job, _ in jobs:
-                require_finite(job)
+                require_finite_splats(job)
 
     def empty(self, *shape: int) -> Tensor:
         """An uninitialised tensor in recycled memory, because fresh pages cost more than filling them."""

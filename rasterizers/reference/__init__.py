@@ -17,7 +17,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import Backend, of_accumulated, require_cotangents, require_finite, require_splats
+from rasterizers.backend import Backend, of_accumulated
+from rasterizers.checks import require_cotangents, require_finite_splats, require_splats
 from rasterizers.interface import Camera, Rendering, SplatGradients, Splats, Traits
 from rasterizers.reference.blend import blend, blend_vjp
 from rasterizers.reference.projection import project
@@ -62,7 +63,7 @@ class ReferenceRendering:
 
     def __init__(self, settings: ReferenceRasterizer, splats: Splats, camera: Camera, *, depth: bool) -> None:
         require_splats(splats, _TRAITS)
-        require_finite(splats)
+        require_finite_splats(splats)
         self._settings = settings
         self._grid = grid = TileGrid(camera.width, camera.height, _TILE)
         self._projection = projection = project(splats, camera, settings, depth=depth)

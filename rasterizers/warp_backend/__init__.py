@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rasterizers.checks import Backend
+from rasterizers.backend import Backend
 from rasterizers.interface import Camera, Color, Rendering, Splats, Traits
 from rasterizers.sending import color_on
 from rasterizers.warp_backend.sizes import mebibytes

@@ -23,7 +23,8 @@ import warp as wp
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from rasterizers.checks import packed_rows, require_cotangents, require_finite, require_splats
+from rasterizers.backend import packed_rows
+from rasterizers.checks import require_cotangents, require_finite_splats, require_splats
 from rasterizers.geometry import tangent_limits
 from rasterizers.interface import Camera, SplatGradients, Splats
 from rasterizers.recording import running
@@ -147,7 +148,7 @@ class WarpFrame:
         self.folds = (1,) * (recorded or is_long) + (SEGMENT,) * (recorded or is_longer)
         if not_finite:
             for splats, _ in self.jobs:
-                require_finite(splats)
+                require_finite_splats(splats)
         for nth, (view, count) in enumerate(zip(self.views, pairs, strict=True)):
             self._require_memory(view, count)
             self.settings.remember(view.camera, count)
